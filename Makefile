@@ -1,0 +1,48 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+BUILT  := $(VENV)/.built
+# A package index with CPU builds of PyTorch, for those whose default index brings CUDA packages.
+TORCH_INDEX ?=
+NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check build bench proto
+
+help:  ## show the targets
+	@awk -F':.*## ' '/^[a-z-]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+demo: build  ## run the main job: two processes, one field, two drives; writes out/demo
+	$(BIN)/rfedge demo
+
+test: build  ## run the test suite
+	$(BIN)/python -m pytest
+
+check: build  ## lint, types, layers, generated files
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: build  ## measure kernels and codec: correctness first, then time
+	$(BIN)/rfedge bench raster
+	$(BIN)/rfedge bench train
+	$(BIN)/rfedge bench codec
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(STAMP): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install -q --upgrade "pip>=25.1"
+	$(BIN)/python -m pip install -q $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch==2.13.0
+	$(BIN)/python -m pip install -q --group dev
+	touch $@
+
+# An editable install does not rebuild C++ by itself; this does, incrementally, under build/.
+$(BUILT): $(STAMP) $(NATIVE)
+	$(BIN)/python -m pip install -q --no-build-isolation -e .
+	touch $@
+
+build: $(BUILT)  ## set up .venv and compile the kernels

@@ -1,0 +1,102 @@
+"""Every error rfedge raises on purpose, as one tree.
+
+::
+
+    RfedgeError
+    ├── InvalidInput            a caller's value is outside its contract (also a ValueError)
+    ├── InvalidData             a file or archive cannot be what it claims to be
+    │   ├── FieldFormatError        radiance field archive, .ply
+    │   └── DatasetError            posed pictures on disk
+    ├── UnknownField            a field id that no store here holds
+    ├── PacketRejected          a delta packet that must not be shown; carries a RejectReason
+    ├── ProtocolError           the peer broke the session's rules
+    ├── BackendUnavailable      an instruction set or device this machine does not have
+    └── CodecError              encoder or decoder did not do what its configuration promises
+
+A message names the offending value, the limit it broke and what to do about it. Commands print
+it as one line and exit with status 2; services map it to one gRPC status (``rfcore.wire``).
+"""
+
+from enum import StrEnum
+
+__all__ = [
+    "BackendUnavailable",
+    "CodecError",
+    "DatasetError",
+    "FieldFormatError",
+    "InvalidData",
+    "InvalidInput",
+    "PacketRejected",
+    "ProtocolError",
+    "RejectReason",
+    "RfedgeError",
+    "UnknownField",
+]
+
+
+class RfedgeError(Exception):
+    """Base of all errors rfedge raises on purpose."""
+
+
+class InvalidInput(RfedgeError, ValueError):
+    """A caller's value is outside its contract.
+
+    ``field`` is the dotted name of the value, as the caller knows it (``pose.rotation``).
+    """
+
+    def __init__(self, field: str, problem: str) -> None:
+        super().__init__(f"{field}: {problem}")
+        self.field = field
+        self.problem = problem
+
+
+class InvalidData(RfedgeError):
+    """A file or archive cannot be what it claims to be."""
+
+
+class FieldFormatError(InvalidData):
+    """A radiance field file is damaged, truncated or of another format."""
+
+
+class DatasetError(InvalidData):
+    """A dataset on disk is incomplete or inconsistent."""
+
+
+class UnknownField(RfedgeError):
+    """No store here holds the radiance field asked for."""
+
+
+class RejectReason(StrEnum):
+    """Why a delta packet was refused. The wire's Nack carries the same names."""
+
+    STALE_EPOCH = "stale_epoch"
+    STALE_SEQUENCE = "stale_sequence"
+    SEQUENCE_GAP = "sequence_gap"
+    CRC_MISMATCH = "crc_mismatch"
+    REFERENCE_MISMATCH = "reference_mismatch"
+    MALFORMED_PAYLOAD = "malformed_payload"
+    DECODER_FAILED = "decoder_failed"
+    RECONSTRUCTION_MISMATCH = "reconstruction_mismatch"
+    INVALID_ARGUMENT = "invalid_argument"
+    OVERLOADED = "overloaded"
+
+
+class PacketRejected(RfedgeError):
+    """A delta packet that must not become a shown frame."""
+
+    def __init__(self, reason: RejectReason, problem: str) -> None:
+        super().__init__(f"{reason}: {problem}")
+        self.reason = reason
+        self.problem = problem
+
+
+class ProtocolError(RfedgeError):
+    """The peer broke the rules of the session."""
+
+
+class BackendUnavailable(RfedgeError):
+    """This machine lacks the instruction set or device that was asked for."""
+
+
+class CodecError(RfedgeError):
+    """The encoder or decoder did not do what its configuration promises."""

@@ -1,0 +1,87 @@
+"""Pictures in memory and in files.
+
+Two forms: RGB, uint8 [H, W, 3], as cameras and files have it; and ``I420``, 8-bit YUV 4:2:0 with
+BT.709 coefficients and limited range, as the codec has it. The exact conversion between them is
+``rfcore.native.yuv``. Files are read and written with PyAV, so that the services need no OpenCV.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from av.error import FFmpegError
+from numpy.typing import NDArray
+
+from rfcore.errors import DatasetError, InvalidInput
+
+__all__ = ["I420", "Rgb", "read_rgb", "write_png"]
+
+Rgb = NDArray[np.uint8]
+Plane = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class I420:
+    """An 8-bit YUV 4:2:0 picture: ``y`` [H, W], ``u`` and ``v`` [ceil(H/2), ceil(W/2)].
+
+    Raises ``InvalidInput`` when the planes do not belong together.
+    """
+
+    y: Plane
+    u: Plane
+    v: Plane
+
+    def __post_init__(self) -> None:
+        height, width = self.y.shape
+        half = ((height + 1) // 2, (width + 1) // 2)
+        if self.u.shape != half or self.v.shape != half:
+            raise InvalidInput(
+                "i420", f"chroma planes {self.u.shape}, {self.v.shape} of luma {self.y.shape}"
+            )
+        if any(plane.dtype != np.uint8 for plane in self.planes):
+            raise InvalidInput("i420", "planes must be uint8")
+
+    @property
+    def planes(self) -> tuple[Plane, Plane, Plane]:
+        """The planes in storage order."""
+        return (self.y, self.u, self.v)
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height)."""
+        return (self.y.shape[1], self.y.shape[0])
+
+    def digest(self) -> bytes:
+        """Return BLAKE2b-128 of the size and the three planes: equal pictures, equal 16 bytes."""
+        state = hashlib.blake2b(digest_size=16)
+        state.update(f"{self.size_px}".encode())
+        for plane in self.planes:
+            state.update(np.ascontiguousarray(plane).data)
+        return state.digest()
+
+
+def read_rgb(path: Path) -> Rgb:
+    """Read a picture file as uint8 [H, W, 3]; raise ``DatasetError`` if it cannot be decoded."""
+    try:
+        with av.open(str(path)) as container:
+            frame = next(container.decode(video=0))
+            return np.ascontiguousarray(frame.to_ndarray(format="rgb24"))
+    except (FFmpegError, OSError, StopIteration, IndexError) as error:
+        raise DatasetError(f"{path}: not a readable picture ({error})") from error
+
+
+def write_png(path: Path, rgb: Rgb) -> None:
+    """Write uint8 [H, W, 3] as PNG; the file appears whole or not at all."""
+    encoder = av.CodecContext.create("png", "w")
+    encoder.width, encoder.height, encoder.pix_fmt = rgb.shape[1], rgb.shape[0], "rgb24"
+    encoder.time_base = Fraction(1, 1)
+    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
+    packets = [*encoder.encode(frame), *encoder.encode(None)]
+    partial = path.with_suffix(path.suffix + ".part")
+    partial.write_bytes(b"".join(bytes(packet) for packet in packets))
+    partial.replace(path)

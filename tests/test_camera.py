@@ -1,0 +1,132 @@
+"""Laws of poses and cameras: groups, golden points, and refusals that name the value."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
+from rfcore.errors import InvalidInput
+
+coordinate = st.floats(-1e7, 1e7)
+component = st.floats(-1, 1)
+
+
+@st.composite
+def poses(draw: st.DrawFn) -> Pose:
+    q = draw(st.tuples(component, component, component, component))
+    norm = math.sqrt(sum(v * v for v in q))
+    if norm < 0.1:
+        q, norm = (1.0, 0.0, 0.0, 0.0), 1.0
+    rotation = (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+    return Pose(draw(st.tuples(coordinate, coordinate, coordinate)), rotation)
+
+
+def matrix_of(pose: Pose) -> list[list[float]]:
+    rows = zip(pose.rotation_matrix(), pose.translation_m, strict=True)
+    return [[*row, t] for row, t in rows]
+
+
+@given(poses())
+def test_a_pose_after_its_inverse_is_the_identity(pose: Pose) -> None:
+    product = pose.compose(pose.inverse())
+    size = 1.0 + max(map(abs, pose.translation_m))
+    assert max(map(abs, product.translation_m)) < 1e-14 * size * 10
+    assert abs(product.rotation[0]) == pytest.approx(1.0, abs=1e-12)
+
+
+@given(poses(), st.tuples(component, component, component))
+def test_composition_acts_as_one_map_after_the_other(
+    pose: Pose, point: tuple[float, float, float]
+) -> None:
+    turn = Pose((1.0, -2.0, 3.0), (0.5, 0.5, -0.5, 0.5))
+    assert turn.compose(pose).apply(point) == pytest.approx(
+        turn.apply(pose.apply(point)), rel=1e-12, abs=1e-6
+    )
+
+
+@given(poses())
+def test_a_quaternion_and_its_negative_are_the_same_rotation(pose: Pose) -> None:
+    w, x, y, z = pose.rotation
+    assert Pose(pose.translation_m, (-w, -x, -y, -z)).rotation_matrix() == pose.rotation_matrix()
+
+
+@given(poses())
+def test_a_pose_survives_the_way_through_its_matrix(pose: Pose) -> None:
+    back = Pose.from_matrix(matrix_of(pose))
+    assert back.translation_m == pose.translation_m
+    for got, want in zip(back.rotation_matrix(), pose.rotation_matrix(), strict=True):
+        assert got == pytest.approx(want, abs=1e-12)
+
+
+@pytest.mark.parametrize("angle_rad", [math.pi, math.pi - 1e-9, 1e-9, 0.0])
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1)])
+def test_matrices_near_a_half_turn_give_a_unit_quaternion(
+    angle_rad: float, axis: tuple[int, int, int]
+) -> None:
+    s = math.sin(angle_rad / 2)
+    pose = Pose((0, 0, 0), (math.cos(angle_rad / 2), s * axis[0], s * axis[1], s * axis[2]))
+    back = Pose.from_matrix(matrix_of(pose))
+    for got, want in zip(back.rotation_matrix(), pose.rotation_matrix(), strict=True):
+        assert got == pytest.approx(want, abs=1e-9)
+
+
+def test_a_point_on_the_axis_lands_on_the_principal_point() -> None:
+    camera = Camera(Intrinsics(640, 360, 320, 320, 320, 180), Pose.identity())
+    assert camera.project((0, 0, 5)) == (320, 180, 5)
+    assert camera.project((1, 0, 2)) == (480, 180, 2), "x to the right"
+    assert camera.project((0, 1, 2)) == (320, 340, 2), "y down"
+
+
+def test_utm_magnitudes_keep_their_millimetres_after_the_tile_origin_is_taken_off() -> None:
+    origin = TileOrigin(east_m=691_608.0, north_m=5_334_760.0, up_m=520.0)
+    pose = Pose((691_608.125, 5_334_759.5, 521.001), (1.0, 0.0, 0.0, 0.0))
+    assert origin.localise(pose).translation_m == pytest.approx((0.125, -0.5, 1.001), abs=1e-9)
+
+
+def test_resizing_keeps_the_ray_of_a_pixel() -> None:
+    full = Intrinsics(1920, 1080, 960.0, 970.0, 955.0, 541.0)
+    small = full.resized(720, 404)
+    assert (0.5 * small.width_px - small.cx_px) / small.fx_px == pytest.approx(
+        (0.5 * full.width_px - full.cx_px) / full.fx_px
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"width_px": 0}, "intrinsics.width_px: 0 px"),
+        ({"height_px": 8193}, "intrinsics.height_px: 8193 px"),
+        ({"fx_px": -1.0}, "intrinsics.fx_px: -1.0"),
+        ({"fy_px": math.inf}, "intrinsics.fy_px: inf"),
+        ({"cx_px": math.nan}, "intrinsics.cx_px: nan"),
+    ],
+)
+def test_bad_intrinsics_are_refused_by_name(change: dict[str, float], named: str) -> None:
+    good = {"width_px": 64, "height_px": 36, "fx_px": 32.0, "fy_px": 32.0, "cx_px": 32.0}
+    with pytest.raises(InvalidInput, match=named):
+        Intrinsics(**{**good, "cy_px": 18.0, **change})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("translation_m", "rotation", "named"),
+    [
+        ((math.nan, 0, 0), (1, 0, 0, 0), "pose.translation_m"),
+        ((0, 0, 0), (math.inf, 0, 0, 0), "pose.rotation"),
+        ((0, 0, 0), (1.0, 0.1, 0, 0), "norm 1.00498"),
+        ((0, 0, 0), (0, 0, 0, 0), "norm 0"),
+    ],
+)
+def test_bad_poses_are_refused_by_name(
+    translation_m: tuple[float, float, float],
+    rotation: tuple[float, float, float, float],
+    named: str,
+) -> None:
+    with pytest.raises(InvalidInput, match=named):
+        Pose(translation_m, rotation)
+
+
+def test_a_mirrored_matrix_is_refused_as_left_handed() -> None:
+    with pytest.raises(InvalidInput, match="left-handed"):
+        Pose.from_matrix([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]])
