@@ -504,6 +504,7 @@ class Nack(_message.Message):
     REASON_FIELD_NUMBER: _builtins.int
     PROBLEM_FIELD_NUMBER: _builtins.int
     LAST_GOOD_SEQUENCE_FIELD_NUMBER: _builtins.int
+    CURRENT_EPOCH_FIELD_NUMBER: _builtins.int
     camera_id: _builtins.str
     """Empty when the message could not even be parsed."""
     epoch: _builtins.int
@@ -514,6 +515,8 @@ class Nack(_message.Message):
     """Names the offending value and the limit it broke."""
     last_good_sequence: _builtins.int
     """The last sequence of this epoch that was reconstructed; absent if none was."""
+    current_epoch: _builtins.int
+    """The epoch the server is in; a sender that starts afresh goes above it."""
     def __init__(
         self,
         *,
@@ -524,10 +527,11 @@ class Nack(_message.Message):
         reason: Global___RejectReason.ValueType = ...,
         problem: _builtins.str = ...,
         last_good_sequence: _builtins.int | None = ...,
+        current_epoch: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_last_good_sequence", b"_last_good_sequence", "last_good_sequence", b"last_good_sequence"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_last_good_sequence", b"_last_good_sequence", "camera_id", b"camera_id", "count", b"count", "epoch", b"epoch", "last_good_sequence", b"last_good_sequence", "problem", b"problem", "reason", b"reason", "sequence", b"sequence"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_last_good_sequence", b"_last_good_sequence", "camera_id", b"camera_id", "count", b"count", "current_epoch", b"current_epoch", "epoch", b"epoch", "last_good_sequence", b"last_good_sequence", "problem", b"problem", "reason", b"reason", "sequence", b"sequence"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__last_good_sequence: _TypeAlias = _typing.Literal["last_good_sequence"]  # noqa: Y015
     _WhichOneofArgType__last_good_sequence: _TypeAlias = _typing.Literal["_last_good_sequence", b"_last_good_sequence"]  # noqa: Y015
