@@ -1,0 +1,64 @@
+"""The committed sample is whole, small enough, and its poses fit its pictures."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera
+from rfcore.dataset import read_transforms, verify_manifest
+from rfcore.views import PointCloud, PosedPicture
+
+SAMPLE = Path(__file__).parents[2] / "samples" / "street"
+
+pytestmark = pytest.mark.sample
+
+
+def test_every_file_is_as_it_was_listed() -> None:
+    verify_manifest(SAMPLE)
+    size_bytes = sum(path.stat().st_size for path in SAMPLE.rglob("*") if path.is_file())
+    assert size_bytes <= 24_000_000
+
+
+def test_the_training_views_come_with_points() -> None:
+    train = read_transforms(SAMPLE / "transforms_train.json")
+    assert len(train.pictures) == 120
+    assert train.points is not None
+    assert len(train.points.xyz_m) == 150_000
+
+
+@pytest.mark.parametrize("name", ["empty", "vehicles"])
+def test_a_drive_is_24_pictures_at_10_hz(name: str) -> None:
+    drive = read_transforms(SAMPLE / f"transforms_drive_{name}.json")
+    assert len(drive.pictures) == 24
+    assert drive.rate_hz == pytest.approx(10.0)
+    assert drive.pictures[-1].read().shape == (360, 640, 3)
+
+
+def test_the_two_drives_take_the_same_path() -> None:
+    empty, vehicles = (
+        read_transforms(SAMPLE / f"transforms_drive_{name}.json").pictures
+        for name in ("empty", "vehicles")
+    )
+    assert [p.camera for p in empty] == [p.camera for p in vehicles]
+    assert (empty[0].read() != vehicles[0].read()).any()
+
+
+def test_the_points_have_the_colour_of_the_pixels_they_land_on() -> None:
+    """Some are occluded, so the median is asked; the poses of other views give 50 levels or more."""
+    train = read_transforms(SAMPLE / "transforms_train.json")
+    assert train.points is not None
+    for picture in train.pictures[::40]:
+        assert median_colour_error(picture, train.points) < 15
+
+
+def median_colour_error(picture: PosedPicture, points: PointCloud) -> float:
+    u, v, depth_m = projected(picture.camera, points.xyz_m[::20])
+    height, width = picture.read().shape[:2]
+    seen = (depth_m > 0.1) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    there = picture.read()[v[seen].astype(int), u[seen].astype(int)]
+    return float(np.median(np.abs(there.astype(int) - points.rgb[::20][seen])))
+
+
+def projected(camera: Camera, xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return tuple(np.array([camera.project(point) for point in xyz_m.tolist()]).T)

@@ -1,0 +1,181 @@
+"""Reading transforms.json: golden pixels, defaults of the format, and refusals by name."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rfcore.camera import TileOrigin
+from rfcore.dataset import read_transforms
+from rfcore.errors import DatasetError
+from rfcore.image import write_png
+
+Content = dict[str, Any]
+Write = Callable[..., Path]
+
+
+def test_a_known_point_lands_on_the_known_pixel(write: Write, content: Content) -> None:
+    """OpenGL looks along -z with y up: (1, 1, -4) is right of and above the middle."""
+    first, second = read_transforms(write(content)).pictures
+    assert first.camera.project((1, 1, -4)) == pytest.approx((4 + 10 / 4, 3 - 12 / 4, 4))
+    assert second.camera.project((3, 1, -4)) == pytest.approx((4 + 10 / 4, 3 - 12 / 4, 4))
+
+
+def test_a_rotated_camera_keeps_its_place_and_turns_its_axes(
+    write: Write, content: Content
+) -> None:
+    """Yaw by 90 degrees about z-up: a camera at (5, 6, 7) that looks along world +x."""
+    content["frames"][0]["transform_matrix"] = [
+        [0, 0, -1, 5],
+        [-1, 0, 0, 6],
+        [0, 1, 0, 7],
+        [0, 0, 0, 1],
+    ]
+    camera = read_transforms(write(content)).pictures[0].camera
+    assert camera.world_from_cam.translation_m == (5, 6, 7)
+    assert camera.project((15, 6, 7)) == pytest.approx((4, 3, 10)), "straight ahead"
+    assert camera.project((15, 5, 7)) == pytest.approx((5, 3, 10)), "world -y is to the right"
+    assert camera.project((15, 6, 8)) == pytest.approx((4, 1.8, 10)), "world z is up"
+
+
+def test_pixels_times_rate_and_points_come_with_it(write: Write, content: Content) -> None:
+    dataset = read_transforms(write(content))
+    assert [picture.name for picture in dataset.pictures] == ["a.png", "b.png"]
+    assert [picture.time_ns for picture in dataset.pictures] == [0, 100_000_000]
+    assert dataset.rate_hz == pytest.approx(10.0)
+    assert (dataset.pictures[1].read() == 20).all()
+    assert dataset.points is not None
+    np.testing.assert_array_equal(dataset.points.xyz_m, [[0, 0, 1], [4, 5, 6], [0.5, 0, -1]])
+    np.testing.assert_array_equal(dataset.points.rgb, [[1, 2, 3], [7, 8, 9], [255, 0, 0]])
+
+
+def test_a_directory_stands_for_its_transforms_file(write: Write, content: Content) -> None:
+    assert len(read_transforms(write(content).parent).pictures) == 2
+    named = write(content, "transforms_drive.json")
+    assert len(read_transforms(named.parent).pictures) == 2, "transforms.json goes first"
+
+
+def test_a_directory_with_several_drives_asks_which(write: Write, content: Content) -> None:
+    write(content, "transforms_one.json")
+    directory = write(content, "transforms_two.json").parent
+    with pytest.raises(DatasetError, match=r"transforms_one\.json, transforms_two\.json"):
+        read_transforms(directory)
+
+
+def test_a_frame_may_override_the_intrinsics(write: Write, content: Content) -> None:
+    content["frames"][1] |= {"fl_x": 20.0, "cx": 1.5}
+    first, second = (p.camera.intrinsics for p in read_transforms(write(content)).pictures)
+    assert (first.fx_px, first.cx_px) == (10.0, 4.0)
+    assert (second.fx_px, second.cx_px, second.fy_px) == (20.0, 1.5, 12.0)
+
+
+def test_a_field_of_view_stands_for_the_focal_length(write: Write, content: Content) -> None:
+    for key in ("fl_x", "fl_y", "cx", "cy"):
+        del content[key]
+    content["camera_angle_x"] = math.pi / 2
+    k = read_transforms(write(content)).pictures[0].camera.intrinsics
+    assert (k.fx_px, k.cx_px, k.cy_px) == (pytest.approx(4.0), 4.0, 3.0)
+    assert k.fy_px == k.fx_px
+
+
+def test_pictures_without_times_have_no_rate(write: Write, content: Content) -> None:
+    del content["frames"][0]["time"]
+    assert read_transforms(write(content)).rate_hz is None
+
+
+def test_the_tile_origin_is_taken_off_poses_and_points(write: Write, content: Content) -> None:
+    content["frames"][0]["transform_matrix"][0][3] = 691_608.125
+    content["frames"][1]["transform_matrix"][0][3] = 691_609.125
+    origin = TileOrigin(east_m=691_608.0)
+    dataset = read_transforms(write(content), origin)
+    assert dataset.tile_origin == origin
+    assert dataset.pictures[0].camera.world_from_cam.translation_m == (0.125, 0, 0)
+    assert dataset.points is not None
+    assert dataset.points.xyz_m[1, 0] == np.float32(4.0 - 691_608.0)
+
+
+def frame_change(key: str, value: object) -> Callable[[Content], None]:
+    def change(content: Content) -> None:
+        content["frames"][1][key] = value
+
+    return change
+
+
+def top_change(key: str, value: object) -> Callable[[Content], None]:
+    def change(content: Content) -> None:
+        content[key] = value
+
+    return change
+
+
+def without(key: str) -> Callable[[Content], None]:
+    return lambda content: content.pop(key)
+
+
+BAD_MATRIX = [[1, 0, 0, math.nan], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+MIRRORED = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]
+FAR = [[1, 0, 0, 7e5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (without("frames"), "'frames'"),
+        (top_change("frames", []), "'frames'"),
+        (without("w"), r"frames\[0\] \(a.png\): key 'w' is missing"),
+        (without("fl_x"), "key 'fl_x' is missing"),
+        (top_change("h", 6.5), "'h' is 6.5"),
+        (top_change("w", 0), "intrinsics.width_px: 0 px"),
+        (top_change("fl_x", "wide"), "'fl_x' is 'wide', not a number"),
+        (top_change("cx", math.nan), "'cx' is nan"),
+        (top_change("camera_model", "OPENCV_FISHEYE"), "OPENCV_FISHEYE.*undistort"),
+        (top_change("k1", 0.01), "distortion k1 = 0.01 is not supported yet"),
+        (top_change("ply_file_path", "absent.ply"), "absent.ply"),
+        (frame_change("file_path", 3), r"frames\[1\]: key 'file_path'"),
+        (frame_change("file_path", "absent.png"), r"frames\[1\] \(absent.png\): picture .*missing"),
+        (frame_change("time", -1.0), "'time' is -1.0"),
+        (frame_change("transform_matrix", None), "'transform_matrix' is missing or not 4x4"),
+        (frame_change("transform_matrix", BAD_MATRIX), r"transform_matrix\[0\]\[3\] is nan"),
+        (frame_change("transform_matrix", MIRRORED), "left-handed"),
+        (frame_change("transform_matrix", FAR), "700000 m from the tile's origin.*tile_origin"),
+    ],
+)
+def test_what_is_wrong_is_named(
+    write: Write, content: Content, change: Callable[[Content], None], named: str
+) -> None:
+    change(content)
+    with pytest.raises(DatasetError, match=named) as caught:
+        read_transforms(write(content))
+    assert "transforms.json" in str(caught.value) or "absent.ply" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_distortion_of_zero_is_no_distortion(write: Write, content: Content) -> None:
+    content |= {"k1": 0.0, "k2": 0, "p1": 0.0}
+    assert len(read_transforms(write(content)).pictures) == 2
+
+
+def test_a_picture_of_another_size_is_refused_when_it_is_read(
+    write: Write, content: Content
+) -> None:
+    file = write(content)
+    write_png(file.parent / "b.png", np.zeros((7, 8, 3), np.uint8))
+    picture = read_transforms(file).pictures[1]
+    with pytest.raises(DatasetError, match=r"b.png: picture is 8x7 px, its camera says 8x6"):
+        picture.read()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3"])
+def test_a_file_that_is_no_transforms_file_is_refused(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "transforms.json"
+    file.write_text(text)
+    with pytest.raises(DatasetError, match=r"transforms.json"):
+        read_transforms(file)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="cannot be read"):
+        read_transforms(tmp_path / "transforms_x.json")
