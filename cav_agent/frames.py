@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from rfcore.codec import DeltaPacket
 from rfcore.views import PosedPicture
-from rfcore.wire.codec_types import DeltaPacket
 from rfcore.wire.messages import StageTimes
 
 __all__ = ["Capture", "EncodeJob", "EncodedFrame", "FrameResult", "Outcome"]

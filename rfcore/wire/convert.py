@@ -10,6 +10,7 @@ from __future__ import annotations
 from google.protobuf.message import DecodeError
 
 from rfcore.camera import MAX_SIDE_PX, Intrinsics, Pose
+from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import (
     FIELD_ID_PREFIX_BYTES,
@@ -22,7 +23,6 @@ from rfcore.wire.checks import (
     check_name,
     check_range,
 )
-from rfcore.wire.codec_types import CodecConfig, DeltaPacket, StreamHeader
 from rfcore.wire.messages import (
     CameraDescription,
     ClientMessage,

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.codec import DeltaPacket, StreamHeader
 from rfcore.errors import RejectReason
-from rfcore.wire.codec_types import DeltaPacket, StreamHeader
 
 __all__ = [
     "Ack",

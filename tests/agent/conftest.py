@@ -9,8 +9,8 @@ import pytest
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob
 from cav_agent.session import AgentSession
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
 from rfcore.views import PosedPicture
-from rfcore.wire.codec_types import CodecConfig, DeltaPacket, StreamHeader
 from rfcore.wire.messages import CameraDescription, Credit, Hello, RendererContract, Welcome
 
 INTRINSICS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)

@@ -7,7 +7,7 @@ import pytest
 
 from mec_server.session import ServerSession
 from rfcore.camera import Intrinsics, Pose
-from rfcore.wire.codec_types import CodecConfig, DeltaPacket, StreamHeader
+from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
 
 FIELD = "ab" * 32

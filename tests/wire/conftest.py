@@ -5,7 +5,7 @@ import zlib
 import pytest
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.wire.codec_types import CodecConfig, DeltaPacket, StreamHeader
+from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
 
 INTRINSICS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)

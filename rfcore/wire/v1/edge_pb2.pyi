@@ -373,7 +373,7 @@ class Frame(_message.Message):
     """BLAKE2b-128 of the picture that the receiver must end up with."""
     payload: _builtins.bytes
     crc32: _builtins.int
-    """zlib.crc32 of payload."""
+    """CRC-32 (zlib) of everything above that the codec relies on; see rfcore.codec.packet."""
     @_builtins.property
     def pose(self) -> Global___Pose: ...
     def __init__(
