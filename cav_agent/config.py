@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+from rfcore.codec.config import CRF_RANGE, PRESETS
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import check_field_id, check_name
 
@@ -68,6 +69,7 @@ class AgentConfig:
     threads: int = 1
     isa: str | None = None
     metrics_port: int | None = None
+    metrics_host: str = "127.0.0.1"
     report: Path | None = None
     allow_insecure: bool = False
     limits: AgentLimits = AgentLimits()
@@ -79,8 +81,10 @@ class AgentConfig:
             check_field_id("field", self.field)
         if not 0.01 <= self.rate <= 1000:
             raise InvalidInput("rate", f"{self.rate} Hz is outside 0.01..1000 Hz")
-        if not 0 <= self.crf <= 51:
-            raise InvalidInput("crf", f"{self.crf} is outside 0..51")
+        if not CRF_RANGE[0] <= self.crf <= CRF_RANGE[1]:
+            raise InvalidInput("crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}")
+        if self.preset not in PRESETS:
+            raise InvalidInput("preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
         if not 1 <= self.threads <= 256:
             raise InvalidInput("threads", f"{self.threads} is outside 1..256")
         if self.metrics_port is not None and not 0 <= self.metrics_port <= 65535:

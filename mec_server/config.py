@@ -44,6 +44,7 @@ class ServerConfig:
     listen: str = "127.0.0.1:50051"
     save: Path | None = None
     metrics_port: int | None = None
+    metrics_host: str = "127.0.0.1"
     threads: int = 1
     workers: int = 2
     isa: str | None = None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from google.protobuf.message import DecodeError
 
-from rfcore.camera import MAX_SIDE_PX, Intrinsics, Pose
+from rfcore.camera import Intrinsics, Pose
 from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import (
@@ -104,9 +104,6 @@ def _camera_from_wire(field: str, camera: pb.CameraDescription) -> CameraDescrip
 
 
 def _codec_from_wire(header: pb.CodecHeader) -> StreamHeader:
-    check_range("codec.width_px", header.width_px, 2, MAX_SIDE_PX)
-    check_range("codec.height_px", header.height_px, 2, MAX_SIDE_PX)
-    check_range("codec.crf", header.crf, 0, 51)
     return StreamHeader(
         CodecConfig(
             header.width_px, header.height_px, check_name("codec.preset", header.preset), header.crf
