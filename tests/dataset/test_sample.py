@@ -45,7 +45,7 @@ def test_the_two_drives_take_the_same_path() -> None:
 
 
 def test_the_points_have_the_colour_of_the_pixels_they_land_on() -> None:
-    """Some are occluded, so the median is asked; the poses of other views give 50 levels or more."""
+    """Some are occluded, so the median is asked; poses of other views give 50 levels or more."""
     train = read_transforms(SAMPLE / "transforms_train.json")
     assert train.points is not None
     for picture in train.pictures[::40]:

@@ -1,0 +1,100 @@
+"""3D Gaussians in the PLY layout of the INRIA reference implementation (Kerbl et al. 2023).
+
+Vertex properties by name, in any order: ``x y z``, ``f_dc_0..2``, ``f_rest_0..``, ``opacity``
+(logit), ``scale_0..2`` (log), ``rot_0..3`` (w, x, y, z). ``f_rest`` is channel-major: all
+coefficients of red, then green, then blue. Normals and other properties are ignored when read;
+normals are written as zeros because viewers ask for them.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import TileOrigin
+from rfcore.errors import FieldFormatError, InvalidInput
+from rfcore.field.ply_table import Table, read_vertices, write_vertices
+from rfcore.raster.gaussians import Gaussians
+
+__all__ = ["read_ply", "write_ply"]
+
+XYZ = ("x", "y", "z")
+NORMALS = ("nx", "ny", "nz")
+DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALES = ("scale_0", "scale_1", "scale_2")
+ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+REST_COUNTS = (0, 9, 24, 45)
+"""3 ((D + 1)^2 - 1) coefficients beyond the first band for SH degree D = 0..3."""
+
+F32 = NDArray[np.float32]
+
+
+def read_ply(path: Path, tile_origin: TileOrigin | None = None) -> Gaussians:
+    """Read Gaussians of SH degree 0..3; ``tile_origin`` is taken off the means in float64.
+
+    Raises ``FieldFormatError`` naming the file and the property or Gaussian at fault.
+    """
+    table = read_vertices(path, (*XYZ, *DC, "opacity", *SCALES, *ROTATION))
+    rest = _rest_names(path, table)
+    origin = tile_origin if tile_origin is not None else TileOrigin()
+    offset_m = np.array([origin.east_m, origin.north_m, origin.up_m])
+    try:
+        return Gaussians(
+            means=_single(_columns(table, XYZ) - offset_m),
+            quaternions=_single(_columns(table, ROTATION)),
+            log_scales=_single(_columns(table, SCALES)),
+            opacity_logits=_single(_columns(table, ("opacity",))[:, 0]),
+            sh=_single(_coefficients(table, rest)),
+        )
+    except InvalidInput as error:
+        raise FieldFormatError(f"{path}: {error}") from error
+
+
+def write_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write Gaussians as the reference implementation does; float32 survives exactly."""
+    rest_count = 3 * (gaussians.sh.shape[1] - 1)
+    rest = tuple(f"f_rest_{i}" for i in range(rest_count))
+    names = (*XYZ, *NORMALS, *DC, *rest, "opacity", *SCALES, *ROTATION)
+    parts = [
+        gaussians.means,
+        np.zeros_like(gaussians.means),
+        gaussians.sh[:, 0],
+        gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(len(gaussians), rest_count),
+        gaussians.opacity_logits[:, None],
+        gaussians.log_scales,
+        gaussians.quaternions,
+    ]
+    rows = np.concatenate(parts, axis=1).astype("<f4")
+    write_vertices(path, rows.view([(name, "<f4") for name in names])[:, 0])
+
+
+def _rest_names(path: Path, table: Table) -> tuple[str, ...]:
+    present = {name for name in table.dtype.names or () if re.fullmatch(r"f_rest_\d+", name)}
+    names = tuple(f"f_rest_{i}" for i in range(len(present)))
+    if len(present) not in REST_COUNTS or present != set(names):
+        raise FieldFormatError(
+            f"{path}: {len(present)} f_rest properties, SH degrees 0..3 have "
+            f"{', '.join(map(str, REST_COUNTS))}, numbered from 0 without a gap"
+        )
+    return names
+
+
+def _columns(table: Table, names: tuple[str, ...]) -> NDArray[np.float64]:
+    if not names:
+        return np.empty((len(table), 0))
+    return np.stack([table[name].astype(np.float64) for name in names], axis=1)
+
+
+def _coefficients(table: Table, rest: tuple[str, ...]) -> NDArray[np.float64]:
+    """Return [N, K, 3] from channel-major columns."""
+    bands = _columns(table, rest).reshape(len(table), 3, len(rest) // 3)
+    return np.concatenate([_columns(table, DC)[:, None], bands.transpose(0, 2, 1)], axis=1)
+
+
+def _single(values: NDArray[np.float64]) -> F32:
+    """Round to float32; a value beyond its range becomes infinite and is refused as such."""
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(values, dtype=np.float32)

@@ -1,0 +1,152 @@
+"""INRIA .ply files: exact both ways, by header name, refused with a reason."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rfcore.camera import TileOrigin
+from rfcore.errors import FieldFormatError
+from rfcore.field.ply import read_ply, write_ply
+from rfcore.field.ply_table import read_vertices, write_vertices
+from rfcore.raster.gaussians import Gaussians
+
+NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+
+
+def assert_equal(a: Gaussians, b: Gaussians) -> None:
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [0, 1, 7])
+def test_gaussians_survive_a_ply(make_gaussians, tmp_path: Path, n: int, sh_degree: int) -> None:
+    gaussians = make_gaussians(n, sh_degree)
+    write_ply(tmp_path / "a.ply", gaussians)
+    assert_equal(read_ply(tmp_path / "a.ply"), gaussians)
+
+
+def test_the_columns_are_those_of_the_reference_implementation(
+    make_gaussians, tmp_path: Path
+) -> None:
+    gaussians = make_gaussians(3, 3)
+    write_ply(tmp_path / "a.ply", gaussians)
+    table = read_vertices(tmp_path / "a.ply", ())
+    names = table.dtype.names
+    assert names is not None
+    assert names[:9] == ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
+    assert names[9:54] == tuple(f"f_rest_{i}" for i in range(45))
+    assert names[54:] == (
+        *("opacity", "scale_0", "scale_1", "scale_2"),
+        *("rot_0", "rot_1", "rot_2", "rot_3"),
+    )
+    np.testing.assert_array_equal(table["f_dc_1"], gaussians.sh[:, 0, 1])
+    np.testing.assert_array_equal(table["f_rest_0"], gaussians.sh[:, 1, 0])
+    np.testing.assert_array_equal(table["f_rest_14"], gaussians.sh[:, 15, 0], "red goes first")
+    np.testing.assert_array_equal(table["f_rest_15"], gaussians.sh[:, 1, 1], "then green")
+    np.testing.assert_array_equal(table["nx"], 0)
+
+
+@given(st.permutations(range(17)), st.sampled_from(["<f4", "<f8"]))
+def test_order_type_and_further_properties_do_not_matter(
+    make_gaussians, tmp_path_factory, order: list[int], dtype: str
+) -> None:
+    directory = tmp_path_factory.mktemp("ply")
+    gaussians = make_gaussians(4, 0)
+    write_ply(directory / "a.ply", gaussians)
+    table = read_vertices(directory / "a.ply", ())
+    names = [table.dtype.names[i] for i in order]  # type: ignore[index]
+    names = [name for name in names if name not in ("nx", "ny", "nz")] + ["label"]
+    other = np.zeros(len(table), [(name, "u1" if name == "label" else dtype) for name in names])
+    for name in names[:-1]:
+        other[name] = table[name]
+    header = ["ply", "format binary_little_endian 1.0", "comment made by hand", "element vertex 4"]
+    kinds = {"<f4": "float", "<f8": "double", "u1": "uchar"}
+    header += [f"property {kinds['u1' if n == 'label' else dtype]} {n}" for n in names]
+    header += ["element face 0", "property list uchar int vertex_indices", "end_header", ""]
+    (directory / "b.ply").write_bytes("\n".join(header).encode() + other.tobytes())
+    assert_equal(read_ply(directory / "b.ply"), gaussians)
+
+
+def test_the_tile_origin_is_taken_off_in_float64(make_gaussians, tmp_path: Path) -> None:
+    gaussians = make_gaussians(2, 0)
+    write_ply(tmp_path / "a.ply", gaussians)
+    moved = read_ply(tmp_path / "a.ply", TileOrigin(1.0, 2.0, 3.0))
+    want = (gaussians.means.astype(np.float64) - [1, 2, 3]).astype(np.float32)
+    np.testing.assert_array_equal(moved.means, want)
+
+
+def edited(path: Path, old: str, new: str) -> None:
+    path.write_bytes(path.read_bytes().replace(old.encode(), new.encode(), 1))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("binary_little_endian", "binary_big_endian", "'format binary_big_endian 1.0' where"),
+        ("binary_little_endian", "ascii", "convert"),
+        ("ply\n", "plx\n", "does not start with 'ply'"),
+        ("end_header", "end_of_it", "no 'end_header'|not a scalar"),
+        ("element vertex 4", "element vertex many", "does not state a count"),
+        ("element vertex 4", "element vertex -4", "does not state a count"),
+        ("element vertex 4", "element vertex 2000000000", "header claims 496000000000 bytes"),
+        ("element vertex 4", "element face 4", "must be 'vertex'"),
+        ("property float opacity", "property list uchar float opacity", "lists are not read"),
+        ("property float opacity", "property half opacity", "not a scalar property"),
+        ("property float opacity", "property float transparency", "no vertex property opacity"),
+        ("property float nx", "property float x", "repeated"),
+        ("property float f_rest_44", "property float f_rest_45", "without a gap"),
+        ("property float f_rest_44", "property float other", "44 f_rest properties"),
+    ],
+)
+def test_a_header_that_cannot_be_read_is_refused_by_name(
+    make_gaussians, tmp_path: Path, old: str, new: str, named: str
+) -> None:
+    file = tmp_path / "a.ply"
+    write_ply(file, make_gaussians(4, 3))
+    edited(file, old, new)
+    with pytest.raises(FieldFormatError, match=named) as caught:
+        read_ply(file)
+    assert "a.ply" in str(caught.value)
+
+
+def test_every_truncation_is_refused(make_gaussians, tmp_path: Path) -> None:
+    file = tmp_path / "a.ply"
+    write_ply(file, make_gaussians(2, 0))
+    data = file.read_bytes()
+    for length in range(len(data)):
+        file.write_bytes(data[:length])
+        with pytest.raises(FieldFormatError):
+            read_ply(file)
+
+
+@given(st.binary(max_size=200))
+def test_noise_is_refused(tmp_path_factory, noise: bytes) -> None:
+    file = tmp_path_factory.mktemp("ply") / "noise.ply"
+    for data in (noise, b"ply\nformat binary_little_endian 1.0\n" + noise):
+        file.write_bytes(data)
+        with pytest.raises(FieldFormatError):
+            read_ply(file)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
+def test_values_that_are_not_finite_are_refused(make_gaussians, tmp_path: Path, bad: float) -> None:
+    write_ply(tmp_path / "a.ply", make_gaussians(3, 0))
+    table = read_vertices(tmp_path / "a.ply", ())
+    names = table.dtype.names or ()
+    wide = np.zeros(3, [(name, "<f4") for name in names])
+    for name in names:
+        wide[name] = table[name]
+    with np.errstate(over="ignore"):
+        wide["scale_1"][2] = np.float32(bad)
+    write_vertices(tmp_path / "a.ply", wide)
+    with pytest.raises(FieldFormatError, match=r"log_scales: 1 of 3 .* number 2"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FieldFormatError, match=r"none\.ply: cannot be read"):
+        read_ply(tmp_path / "none.ply")

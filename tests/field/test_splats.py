@@ -1,0 +1,109 @@
+"""A field keeps its parameters and metadata through a file; damage is one clear error."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfcore.camera import TileOrigin
+from rfcore.errors import FieldFormatError, InvalidInput
+from rfcore.field import FieldMetadata, SplatField, load_field, save_field
+from rfcore.field.archive import Archive, encode_archive
+from rfcore.field.splats import Bounds, encode_field
+from rfcore.raster.gaussians import Gaussians
+
+METADATA = FieldMetadata("street", TileOrigin(691_608.0, 5_334_760.0, 520.5), "ab" * 32, 26.25)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [0, 1, 20])
+def test_a_field_survives_its_file(make_gaussians, tmp_path: Path, n: int, sh_degree: int) -> None:
+    field = SplatField(make_gaussians(n, sh_degree), METADATA)
+    field_id = save_field(field, tmp_path / "street.rff")
+    back = load_field(tmp_path / "street.rff")
+    assert field_id == field.field_id == back.field_id
+    assert back.metadata == METADATA
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(back.gaussians, name), getattr(field.gaussians, name))
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_an_unmeasured_field_says_so(make_gaussians, tmp_path: Path) -> None:
+    save_field(SplatField(make_gaussians()), tmp_path / "a.rff")
+    assert load_field(tmp_path / "a.rff").metadata.held_out_psnr_db is None
+
+
+def test_any_difference_gives_another_id(make_gaussians) -> None:
+    gaussians = make_gaussians()
+    ids = {
+        SplatField(gaussians, METADATA).field_id,
+        SplatField(gaussians, FieldMetadata("avenue")).field_id,
+        SplatField(make_gaussians(seed=1), METADATA).field_id,
+    }
+    assert len(ids) == 3
+
+
+def test_the_bounds_hold_every_mean(make_gaussians) -> None:
+    gaussians = make_gaussians(9)
+    bounds = SplatField(gaussians).bounds
+    assert (gaussians.means >= np.array(bounds.low_m)).all()
+    assert (gaussians.means <= np.array(bounds.high_m)).all()
+    assert (gaussians.means == np.array(bounds.low_m)).any(axis=0).all()
+    assert Bounds.around(make_gaussians(0)).low_m == (0, 0, 0)
+
+
+def archive_of(gaussians: Gaussians, **change: np.ndarray) -> dict[str, np.ndarray]:
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    return {**{name: getattr(gaussians, name) for name in names}, **change}
+
+
+PLAIN = {
+    "name": "",
+    "training_digest": "",
+    "held_out_psnr_db": None,
+    "tile_origin": {"east_m": 0, "north_m": 0, "up_m": 0},
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "metadata", "named"),
+    [
+        ("ngp", {}, PLAIN, "kind 'ngp'"),
+        ("splats", {"means": np.zeros((4, 3), np.float32)}, PLAIN, "gaussians.quaternions"),
+        ("splats", {"sh": np.zeros((5, 5, 3), np.float32)}, PLAIN, "gaussians.sh"),
+        ("splats", {"means": np.zeros((5, 3))}, PLAIN, "gaussians.means: must be contiguous float"),
+        ("splats", {"means": np.full((5, 3), np.nan, np.float32)}, PLAIN, "5 of 5 .*not finite"),
+        ("splats", {"more": np.zeros(1)}, PLAIN, "are not splats"),
+        ("splats", {}, {}, "name"),
+        ("splats", {}, {**PLAIN, "name": 3}, "field.name: 3 is not text"),
+        ("splats", {}, {**PLAIN, "held_out_psnr_db": "good"}, "held_out_psnr_db"),
+        ("splats", {}, {**PLAIN, "tile_origin": {"east": 0}}, "east"),
+        ("splats", {}, {**PLAIN, "tile_origin": 0}, "items"),
+    ],
+)
+def test_an_archive_that_is_no_field_is_refused(
+    make_gaussians, tmp_path: Path, kind: str, change: dict, metadata: dict, named: str
+) -> None:
+    arrays = archive_of(make_gaussians(5), **change)
+    file = tmp_path / "bad.rff"
+    file.write_bytes(encode_archive(Archive(kind, metadata, arrays)))
+    with pytest.raises(FieldFormatError, match=named) as caught:
+        load_field(file)
+    assert "bad.rff" in str(caught.value)
+
+
+def test_a_truncated_file_is_refused_by_its_name(make_gaussians, tmp_path: Path) -> None:
+    data = encode_field(SplatField(make_gaussians()))
+    (tmp_path / "cut.rff").write_bytes(data[: len(data) // 2])
+    with pytest.raises(FieldFormatError, match=r"cut\.rff"):
+        load_field(tmp_path / "cut.rff")
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FieldFormatError, match=r"none\.rff: cannot be read"):
+        load_field(tmp_path / "none.rff")
+
+
+def test_metadata_that_is_not_finite_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="held_out_psnr_db"):
+        FieldMetadata(held_out_psnr_db=float("inf"))

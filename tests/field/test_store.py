@@ -1,0 +1,69 @@
+"""A store gives back what was added, by id, and is never left with half a field."""
+
+from pathlib import Path
+
+import pytest
+
+from rfcore.errors import FieldFormatError, UnknownField
+from rfcore.field import FieldStore, SplatField, save_field
+from rfcore.field.splats import encode_field
+
+
+def test_an_added_field_is_listed_found_and_loaded(make_gaussians, tmp_path: Path) -> None:
+    store = FieldStore(tmp_path / "fields")
+    assert store.ids() == ()
+    field = SplatField(make_gaussians())
+    assert store.add(encode_field(field)) == field.field_id
+    assert store.ids() == (field.field_id,)
+    assert store.path(field.field_id).name == f"{field.field_id}.rff"
+    assert store.load(field.field_id).field_id == field.field_id
+
+
+def test_a_file_may_be_added_under_its_expected_id(make_gaussians, tmp_path: Path) -> None:
+    field_id = save_field(SplatField(make_gaussians()), tmp_path / "street.rff")
+    store = FieldStore(tmp_path / "fields")
+    assert store.add(tmp_path / "street.rff", field_id) == field_id
+    assert store.add(tmp_path / "street.rff", field_id) == field_id, "adding twice is harmless"
+    assert store.ids() == (field_id,)
+
+
+def test_a_file_of_any_name_is_found_by_its_content(make_gaussians, tmp_path: Path) -> None:
+    field_id = save_field(SplatField(make_gaussians()), tmp_path / "street.rff")
+    store = FieldStore(tmp_path)
+    assert store.path(field_id) == tmp_path / "street.rff"
+    other_id = save_field(SplatField(make_gaussians(seed=1)), tmp_path / "street.rff")
+    assert store.ids() == (other_id,), "a file that changes is looked at again"
+
+
+@pytest.mark.parametrize("name", ["0" * 64, "../secret", "", "nonsense"])
+def test_an_unknown_id_names_itself_and_what_is_here(
+    make_gaussians, tmp_path: Path, name: str
+) -> None:
+    store = FieldStore(tmp_path)
+    with pytest.raises(UnknownField, match="holds nothing"):
+        store.path(name)
+    here = store.add(encode_field(SplatField(make_gaussians())))
+    with pytest.raises(UnknownField, match=here) as caught:
+        store.load(name)
+    assert repr(name) in str(caught.value)
+
+
+def test_damaged_bytes_are_not_added(make_gaussians, tmp_path: Path) -> None:
+    store = FieldStore(tmp_path)
+    field = SplatField(make_gaussians())
+    data = bytearray(encode_field(field))
+    data[-100] ^= 1
+    with pytest.raises(FieldFormatError, match="damaged"):
+        store.add(bytes(data))
+    with pytest.raises(FieldFormatError, match=f"not the field id {field.field_id}"):
+        store.add(bytes(data), field.field_id)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_field_damaged_in_the_store_is_refused(make_gaussians, tmp_path: Path) -> None:
+    store = FieldStore(tmp_path)
+    field_id = store.add(encode_field(SplatField(make_gaussians())))
+    path = store.path(field_id)
+    path.write_bytes(path.read_bytes()[:-64])
+    with pytest.raises(FieldFormatError, match="not the field id"):
+        store.load(field_id)
