@@ -157,6 +157,12 @@ class AgentSession:
             self._results.append(FrameResult(dropped, Outcome.DROPPED, "superseded"))
         self._slot.append(capture)
 
+    def stop(self) -> None:
+        """Drop what waits for the encoder; what is being encoded or unanswered goes on."""
+        while self._slot:
+            waiting = self._slot.popleft()
+            self._results.append(FrameResult(waiting, Outcome.DROPPED, "stopping"))
+
     def job_to_start(self) -> EncodeJob | None:
         """Return the picture to encode now, or None without picture, credit or free encoder."""
         ready = self.state is LinkState.STREAMING and self._job is None

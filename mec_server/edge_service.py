@@ -57,7 +57,9 @@ class EdgeService:
     def register(self, server: grpc.aio.Server) -> None:
         """Add the service to a server that has not started."""
         _, service, method = STREAM_METHOD.split("/")
-        handler = grpc.stream_stream_rpc_method_handler(self._handle)
+        handler: grpc.RpcMethodHandler[bytes, bytes] = grpc.stream_stream_rpc_method_handler(
+            self._handle
+        )
         server.add_generic_rpc_handlers(
             (grpc.method_handlers_generic_handler(service, {method: handler}),)
         )

@@ -26,7 +26,7 @@ class FieldService(field_pb2_grpc.FieldServiceServicer):
 
     def register(self, server: grpc.aio.Server) -> None:
         """Add the service to a server that has not started."""
-        field_pb2_grpc.add_FieldServiceServicer_to_server(self, server)  # type: ignore[no-untyped-call]
+        field_pb2_grpc.add_FieldServiceServicer_to_server(self, server)
 
     async def ListFields(  # noqa: N802
         self,

@@ -33,9 +33,9 @@ class Store(Protocol):
 
 
 class FieldShelf:
-    """Fields of ``store`` opened by ``load``; the least recently asked for leaves first."""
+    """Fields of ``store``, opened by ``load``; the least recently asked for leaves first."""
 
-    def __init__(self, store: Store, load: Callable[[Path], Renderer]) -> None:
+    def __init__(self, store: Store, load: Callable[[str], Renderer]) -> None:
         self._store = store
         self._load = load
         self._open: OrderedDict[str, Renderer] = OrderedDict()
@@ -45,7 +45,7 @@ class FieldShelf:
         """Return a field, ready to render; raise ``UnknownField`` or ``FieldFormatError``."""
         with self._lock:
             if field_id not in self._open:
-                self._open[field_id] = self._load(self._store.path(field_id))
+                self._open[field_id] = self._load(field_id)
                 if len(self._open) > MAX_OPEN_FIELDS:
                     self._open.popitem(last=False)
             self._open.move_to_end(field_id)

@@ -16,7 +16,6 @@ from mec_server.config import ServerConfig
 from mec_server.edge_service import EdgeService, Surroundings
 from mec_server.field_service import FieldService
 from mec_server.fields import FieldShelf, Store
-from mec_server.handlers import Renderer
 from mec_server.metrics import ServerMetrics
 from mec_server.recorder import Recorder
 from rfcore.errors import RfedgeError

@@ -249,7 +249,7 @@ class ServerSession:
         return self._deadline_s if self.state in timed else None
 
     def handle_timer(self, now: float) -> None:
-        """Close a stream whose vehicle says nothing; keep one whose frames are in work."""
+        """Let a vehicle go that says nothing, unless its frames are in work; it may come back."""
         timer = self.get_timer()
         if timer is None or now < timer:
             return
@@ -258,7 +258,7 @@ class ServerSession:
         elif self.state is SessionState.AWAITING_HELLO:
             self._close(ProtocolError(f"no Hello within {self._limits.hello_s:g} s"))
         else:
-            self._close(ProtocolError(f"no frame within {self._limits.idle_s:g} s"))
+            self._close(None)
 
     def _alive(self, now: float) -> None:
         if self.state is SessionState.OPEN:

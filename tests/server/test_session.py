@@ -364,7 +364,7 @@ def test_an_idle_stream_is_closed_but_not_while_a_frame_is_in_work(
     session.decoded(job, DecodeOutcome(0, b"d" * 16, StageTimes()), 111.0)
     session.handle_timer(171.0)
     assert session.closed is not None
-    assert "no frame within 60 s" in str(session.closed.error)
+    assert session.closed.error is None, "it has broken no rule"
 
 
 def test_draining_finishes_what_was_taken_and_takes_no_more(
