@@ -3,6 +3,11 @@
 
 namespace nb = nanobind;
 
+namespace rfcore {
+void bind_yuv(nb::module_& m);
+}
+
 NB_MODULE(_native, m) {
     m.doc() = "Bit-exact kernels of rfcore; use the wrappers in rfcore.native.";
+    rfcore::bind_yuv(m);
 }
