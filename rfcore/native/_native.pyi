@@ -1,9 +1,35 @@
 """Bit-exact kernels of rfcore; use the wrappers in rfcore.native."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 # --- raster -----------------------------------------------------------------
+
+_F32 = NDArray[np.float32]
+
+def available_isas() -> list[str]: ...
+
+class RasterCamera:
+    def __init__(self, numbers: Sequence[float], width: int, height: int) -> None: ...
+
+class Rasterizer:
+    def __init__(
+        self,
+        means: _F32,
+        quaternions: _F32,
+        log_scales: _F32,
+        opacity_logits: _F32,
+        sh: _F32,
+        threads: int,
+        isa: str,
+    ) -> None: ...
+    @property
+    def isa(self) -> str: ...
+    def render(self, camera: RasterCamera, colour: _F32, depth: _F32, opacity: _F32) -> None: ...
+    def render_colour(self, camera: RasterCamera, colour: _F32) -> None: ...
+    def statistics(self, camera: RasterCamera) -> tuple[int, int, int, int, int]: ...
 
 # --- yuv --------------------------------------------------------------------
 
