@@ -46,3 +46,10 @@ $(BUILT): $(STAMP) $(NATIVE)
 	touch $@
 
 build: $(BUILT)  ## set up .venv and compile the kernels
+
+# The stubs are committed, so that installing needs no protoc; tests/wire/test_stubs.py sees drift.
+STUBS ?= .
+proto: $(STAMP)  ## regenerate the gRPC stubs in rfcore/wire/v1
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m grpc_tools.protoc -I proto \
+		--python_out=$(STUBS) --grpc_python_out=$(STUBS) --mypy_out=$(STUBS) \
+		--mypy_grpc_out=$(STUBS) proto/rfcore/wire/v1/*.proto

@@ -5,6 +5,7 @@
     RfedgeError
     ├── InvalidInput            a caller's value is outside its contract (also a ValueError)
     ├── InvalidData             a file or archive cannot be what it claims to be
+    │   ├── BitstreamError          H.264 bytes that break the syntax
     │   ├── FieldFormatError        radiance field archive, .ply
     │   └── DatasetError            posed pictures on disk
     ├── UnknownField            a field id that no store here holds
@@ -21,6 +22,7 @@ from enum import StrEnum
 
 __all__ = [
     "BackendUnavailable",
+    "BitstreamError",
     "CodecError",
     "DatasetError",
     "FieldFormatError",
@@ -52,6 +54,10 @@ class InvalidInput(RfedgeError, ValueError):
 
 class InvalidData(RfedgeError):
     """A file or archive cannot be what it claims to be."""
+
+
+class BitstreamError(InvalidData):
+    """H.264 bytes break the syntax, or use a part of it that is not used here."""
 
 
 class FieldFormatError(InvalidData):

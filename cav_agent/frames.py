@@ -1,0 +1,74 @@
+"""A picture's way through the agent: captured, taken for encoding, encoded, answered.
+
+Values only. ``captured_s`` and the like are seconds on the agent's monotonic clock; ``_ns`` fields
+are nanoseconds of the Unix epoch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from rfcore.codec import DeltaPacket
+from rfcore.views import PosedPicture
+from rfcore.wire.messages import StageTimes
+
+__all__ = ["Capture", "EncodeJob", "EncodedFrame", "FrameResult", "Outcome"]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A picture the camera has taken; pixels are read when it is encoded."""
+
+    index: int
+    picture: PosedPicture
+    captured_s: float
+    capture_time_ns: int
+
+
+@dataclass(frozen=True)
+class EncodeJob:
+    """Code ``capture`` in ``epoch``; a new epoch starts the encoder's state afresh."""
+
+    capture: Capture
+    epoch: int
+    connection: int
+
+
+@dataclass(frozen=True)
+class EncodedFrame:
+    """What the pipeline made of a picture; ``stage_s`` has load, render, encode, closed_loop."""
+
+    packet: DeltaPacket
+    stage_s: Mapping[str, float]
+
+
+class Outcome(StrEnum):
+    """How a captured picture ended."""
+
+    ACKED = "acked"
+    NACKED = "nacked"
+    DROPPED = "dropped"
+    LOST = "lost"
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """The end of one captured picture.
+
+    ``reason`` is empty for an acknowledged frame. Packet, sizes and times are there as far as the
+    frame got. ``latency_s`` runs from capture to answer, ``link_s`` from sending to answer without
+    the server's own time.
+    """
+
+    capture: Capture
+    outcome: Outcome
+    reason: str = ""
+    packet: DeltaPacket | None = None
+    packet_bytes: int = 0
+    stage_s: Mapping[str, float] = field(default_factory=dict)
+    server: StageTimes | None = None
+    server_digest: bytes = b""
+    latency_s: float | None = None
+    link_s: float | None = None

@@ -1,0 +1,80 @@
+"""From a captured picture to a packet: load, render, encode. Runs on a worker thread.
+
+The encoder's state is a value; it starts afresh whenever the session asks for another epoch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from cav_agent.frames import EncodedFrame, EncodeJob
+from rfcore.camera import Camera, Intrinsics
+from rfcore.codec import CodecConfig, DeltaEncoder, EncoderState, StreamHeader
+from rfcore.errors import InvalidInput
+from rfcore.image import I420
+from rfcore.native.yuv import i420_from_colour, i420_from_rgb
+from rfcore.views import PosedPicture, View
+
+__all__ = ["Pipeline", "Renderer"]
+
+ClockNs = Callable[[], int]
+
+
+class Renderer(Protocol):
+    """A radiance field, ready to be looked at."""
+
+    def render(self, camera: Camera) -> View:
+        """Return the view from ``camera``."""
+
+
+class Pipeline:
+    """Codes the pictures of one camera against renders of one field; one caller at a time."""
+
+    def __init__(self, renderer: Renderer, config: CodecConfig, clock_ns: ClockNs) -> None:
+        self._renderer = renderer
+        self._config = config
+        self._clock_ns = clock_ns
+        self._encoder = DeltaEncoder(config, clock_ns)
+        self._state: EncoderState | None = None
+
+    @property
+    def header(self) -> StreamHeader:
+        """What the server needs before the first packet."""
+        return self._encoder.header
+
+    def encode(self, job: EncodeJob) -> EncodedFrame:
+        """Return the packet of ``job``'s picture.
+
+        Raises ``DatasetError`` for a picture that cannot be read, ``InvalidInput`` for one of
+        another size, ``CodecError`` when x264 fails.
+        """
+        started_ns = self._clock_ns()
+        frame = self._load(job.capture.picture)
+        loaded_ns = self._clock_ns()
+        render = i420_from_colour(self._renderer.render(job.capture.picture.camera).colour)
+        rendered_ns = self._clock_ns()
+        state = self._state
+        if state is None or state.epoch != job.epoch:
+            state = self._encoder.start(job.epoch)
+        encoded = self._encoder.encode(state, frame, render)
+        self._state = encoded.state
+        return EncodedFrame(
+            encoded.packet,
+            {
+                "load": (loaded_ns - started_ns) / 1e9,
+                "render": (rendered_ns - loaded_ns) / 1e9,
+                "encode": encoded.stage_ns["encode"] / 1e9,
+                "closed_loop": encoded.stage_ns["closed_loop"] / 1e9,
+            },
+        )
+
+    def _load(self, picture: PosedPicture) -> I420:
+        k: Intrinsics = picture.camera.intrinsics
+        if (k.width_px, k.height_px) != self._config.size_px:
+            raise InvalidInput(
+                picture.name,
+                f"{k.width_px}x{k.height_px} px, the stream is coded at "
+                f"{self._config.width_px}x{self._config.height_px} px",
+            )
+        return i420_from_rgb(picture.read())

@@ -1,0 +1,144 @@
+"""One vehicle: gets its field, opens its drive, and streams it to the server."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import grpc
+import structlog
+from prometheus_client import CollectorRegistry, start_http_server
+
+from cav_agent.client import Agent, Equipment
+from cav_agent.config import AgentConfig, PaceKind
+from cav_agent.field_fetch import choose_field, fetch_field
+from cav_agent.frames import FrameResult
+from cav_agent.metrics import AgentMetrics
+from cav_agent.pace import Lockstep, Pace, Realtime
+from cav_agent.pipeline import Pipeline
+from cav_agent.report import Report
+from cav_agent.session import AgentSession
+from rfcore.codec import CodecConfig
+from rfcore.dataset import read_transforms
+from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.field import FieldStore, SplatField
+from rfcore.views import PosedPicture
+from rfcore.wire.address import Address
+from rfcore.wire.conventions import CHANNEL_OPTIONS, RENDERER_CONTRACT
+from rfcore.wire.messages import CameraDescription, Hello, RendererContract
+
+__all__ = ["Vehicle"]
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True)
+class Journey:
+    """What was made ready before the first frame."""
+
+    pictures: tuple[PosedPicture, ...]
+    pipeline: Pipeline
+    hello: Hello
+
+
+class Vehicle:
+    """Runs ``config`` from connecting to the end of the drive; ``stop`` ends it early."""
+
+    def __init__(self, config: AgentConfig) -> None:
+        self.registry = CollectorRegistry()
+        self._address = Address.parse("server", config.server)
+        self._address.require_private("server", config.allow_insecure)
+        self._config = config
+        self._metrics = AgentMetrics(self.registry)
+        self._stopped = asyncio.Event()
+
+    def stop(self) -> None:
+        """Finish the frame in flight, then end."""
+        self._stopped.set()
+
+    async def run(self) -> Counter[str]:
+        """Drive; return how many pictures ended how. Raises ``RfedgeError``."""
+        if self._config.metrics_port is not None:
+            start_http_server(self._config.metrics_port, self._config.metrics_host, self.registry)
+        executor = ThreadPoolExecutor(1, "encoder")
+        try:
+            async with grpc.aio.insecure_channel(
+                str(self._address), options=CHANNEL_OPTIONS
+            ) as channel:
+                field = await self._field(channel)
+                loop = asyncio.get_running_loop()
+                journey = await loop.run_in_executor(executor, self._prepare, field)
+                return await self._drive(channel, journey, executor)
+        finally:
+            executor.shutdown()
+
+    async def _field(self, channel: grpc.aio.Channel) -> SplatField:
+        """Load the field, fetched from the server if it is not here."""
+        config = self._config
+        store = FieldStore(config.fields)
+        try:
+            async with asyncio.timeout(config.limits.give_up_s or None):
+                field_id = await choose_field(channel, config.field)
+        except TimeoutError as error:
+            raise RfedgeError(
+                f"no server at {self._address} within {config.limits.give_up_s:g} s"
+            ) from error
+        if field_id not in store.ids():
+            await fetch_field(channel, store, field_id, config.fields)
+        return await asyncio.to_thread(store.load, field_id, threads=config.threads, isa=config.isa)
+
+    def _prepare(self, field: SplatField) -> Journey:
+        config = self._config
+        pictures = read_transforms(config.drive, field.metadata.tile_origin).pictures
+        intrinsics = pictures[0].camera.intrinsics
+        for picture in pictures:
+            if picture.camera.intrinsics != intrinsics:
+                raise InvalidInput(
+                    "drive",
+                    f"{picture.name} has other intrinsics than {pictures[0].name}; "
+                    "one stream is one camera",
+                )
+        codec = CodecConfig(intrinsics.width_px, intrinsics.height_px, config.preset, config.crf)
+        pipeline = Pipeline(field, codec, time.perf_counter_ns)
+        camera = CameraDescription(config.camera, intrinsics, pipeline.header)
+        contract = RendererContract(RENDERER_CONTRACT, exact=True)
+        hello = Hello(config.vehicle, (camera,), (field.field_id,), contract)
+        log.info("ready", pictures=len(pictures), field=field.field_id, isa=field.rasterizer.isa)
+        return Journey(pictures, pipeline, hello)
+
+    async def _drive(
+        self, channel: grpc.aio.Channel, journey: Journey, executor: ThreadPoolExecutor
+    ) -> Counter[str]:
+        config = self._config
+        report = Report(config.report) if config.report is not None else None
+
+        def ended(result: FrameResult) -> None:
+            self._metrics.ended(result)
+            if report is not None:
+                report.ended(result)
+
+        pace = _pace(config, len(journey.pictures))
+        equipment = Equipment(journey.pictures, pace, journey.pipeline.encode, executor, ended)
+        session = AgentSession(journey.hello, config.limits)
+        agent = Agent(channel, session, equipment, config.limits)
+        stopping = asyncio.create_task(self._pass_on_stop(agent))
+        try:
+            await agent.run()
+        finally:
+            stopping.cancel()
+            if report is not None:
+                report.close()
+        return agent.counts
+
+    async def _pass_on_stop(self, agent: Agent) -> None:
+        await self._stopped.wait()
+        agent.stop()
+
+
+def _pace(config: AgentConfig, pictures: int) -> Pace:
+    if config.pace is PaceKind.LOCKSTEP:
+        return Lockstep(pictures, loop=config.loop)
+    return Realtime(pictures, config.rate, loop=config.loop)

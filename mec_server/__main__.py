@@ -1,0 +1,96 @@
+"""``mec-server``: the edge server's command."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import structlog
+import tyro
+
+from mec_server.config import ServerConfig
+from mec_server.fields import FieldShelf
+from mec_server.server import EdgeServer
+from rfcore.errors import RfedgeError
+from rfcore.field import FieldStore, SplatField
+from rfcore.wire.logs import configure_logs
+
+__all__ = ["main"]
+
+
+def run(
+    fields: Path,
+    listen: str = "127.0.0.1:50051",
+    save: Path | None = None,
+    metrics_port: int | None = None,
+    metrics_host: str = "127.0.0.1",
+    threads: int = 1,
+    workers: int = 2,
+    isa: str | None = None,
+    ready_file: Path | None = None,
+    allow_insecure: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+) -> ServerConfig:
+    """Reconstruct what vehicles see, against the radiance fields held here.
+
+    Args:
+        fields: Directory of field archives (.rff).
+        listen: HOST:PORT to accept vehicles on; port 0 takes a free one.
+        save: Directory for reconstructed pictures (PNG) and their index; none without it.
+        metrics_port: Port for Prometheus; 0 takes a free one, none are served without it.
+        metrics_host: Address the metrics are served on.
+        threads: Threads per render; the pictures do not depend on it.
+        workers: Frames reconstructed at once.
+        isa: Instruction set to force (avx512, avx2, scalar); the best of this machine without it.
+        ready_file: File that receives HOST:PORT once vehicles are accepted.
+        allow_insecure: Accept plaintext from other machines.
+    """
+    return ServerConfig(
+        fields=fields,
+        listen=listen,
+        save=save,
+        metrics_port=metrics_port,
+        metrics_host=metrics_host,
+        threads=threads,
+        workers=workers,
+        isa=isa,
+        ready_file=ready_file,
+        allow_insecure=allow_insecure,
+    )
+
+
+def main() -> None:
+    """Parse the command line and serve until SIGTERM or SIGINT; exit 2 on a user's mistake."""
+    configure_logs(sys.stderr)
+    try:
+        config = tyro.cli(run, prog="mec-server")
+        asyncio.run(serve(config))
+    except (RfedgeError, OSError) as error:
+        print(f"mec-server: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+async def serve(config: ServerConfig) -> None:
+    """Serve until told to stop, then drain."""
+    store = FieldStore(config.fields)
+
+    def load(field_id: str) -> SplatField:
+        field = store.load(field_id, threads=config.threads, isa=config.isa)
+        structlog.get_logger().info(
+            "field opened", field=field_id, gaussians=len(field.gaussians), isa=field.rasterizer.isa
+        )
+        return field
+
+    server = EdgeServer(config, store, FieldShelf(store, load))
+    stopped = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    await server.start()
+    await stopped.wait()
+    await server.stop()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""What the edge server can be told; parsed once, in ``__main__``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rfcore.errors import InvalidInput
+
+__all__ = ["ServerConfig", "SessionLimits"]
+
+
+@dataclass(frozen=True)
+class SessionLimits:
+    """Deadlines in seconds and the window of one session.
+
+    ``window_frames``: frames of one camera on their way or being decoded; two keep the link busy
+    while one is decoded, more would only be older.
+    """
+
+    hello_s: float = 5.0
+    idle_s: float = 60.0
+    window_frames: int = 2
+
+    def __post_init__(self) -> None:
+        for name in ("hello_s", "idle_s"):
+            if not getattr(self, name) > 0:
+                raise InvalidInput(f"limits.{name}", f"{getattr(self, name)} must be above 0 s")
+        if not 1 <= self.window_frames <= 64:
+            raise InvalidInput("limits.window_frames", f"{self.window_frames} is outside 1..64")
+
+
+@dataclass(frozen=True)
+class ServerConfig:
+    """One edge server process.
+
+    ``fields``: directory of field archives. ``save``: directory for reconstructed pictures, none
+    are written without it. ``listen`` and ``metrics_port``: port 0 takes a free one; no metrics are
+    served without a port. ``threads`` per render, ``workers`` frames at once. ``isa`` forces an
+    instruction set. ``ready_file`` receives the address once connections are accepted.
+    """
+
+    fields: Path
+    listen: str = "127.0.0.1:50051"
+    save: Path | None = None
+    metrics_port: int | None = None
+    metrics_host: str = "127.0.0.1"
+    threads: int = 1
+    workers: int = 2
+    isa: str | None = None
+    ready_file: Path | None = None
+    allow_insecure: bool = False
+    drain_s: float = 5.0
+    limits: SessionLimits = SessionLimits()
+
+    def __post_init__(self) -> None:
+        for name, highest in (("threads", 256), ("workers", 256)):
+            value = getattr(self, name)
+            if not 1 <= value <= highest:
+                raise InvalidInput(name, f"{value} is outside 1..{highest}")
+        if self.metrics_port is not None and not 0 <= self.metrics_port <= 65535:
+            raise InvalidInput("metrics_port", f"{self.metrics_port} is outside 0..65535")
+        if not self.fields.is_dir():
+            raise InvalidInput("fields", f"{self.fields} is not a directory")
+        if not self.drain_s >= 0:
+            raise InvalidInput("drain_s", f"{self.drain_s} must not be negative")

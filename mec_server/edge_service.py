@@ -1,0 +1,198 @@
+"""EdgeService over grpc.aio: moves bytes between streams and sessions, and work to threads.
+
+Messages travel as bytes here and are parsed by ``rfcore.wire.convert``: a message that cannot be
+parsed is then a Nack like any other, instead of the end of the stream.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import uuid
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import grpc
+import structlog
+
+from mec_server.config import SessionLimits
+from mec_server.handlers import CameraDecoder, FieldSource, Reconstruction, open_cameras
+from mec_server.jobs import DecodeJob, End, OpenJob
+from mec_server.metrics import ServerMetrics
+from mec_server.recorder import Recorder, Recording
+from mec_server.session import ServerSession
+from rfcore.errors import InvalidInput, PacketRejected, RfedgeError
+from rfcore.wire.conventions import STREAM_METHOD
+from rfcore.wire.convert import client_message_from_bytes
+from rfcore.wire.convert_answers import server_message_to_bytes
+from rfcore.wire.messages import Frame
+from rfcore.wire.status import status_of
+
+__all__ = ["EdgeService", "Surroundings"]
+
+log = structlog.get_logger()
+Context = grpc.aio.ServicerContext[bytes, bytes]
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What the sessions of one server share."""
+
+    fields: FieldSource
+    held_field_ids: Callable[[], tuple[str, ...]]
+    executor: Executor
+    metrics: ServerMetrics
+    limits: SessionLimits
+    recorder: Recorder | None = None
+
+
+class EdgeService:
+    """Accepts streams and lets them go when the server drains."""
+
+    def __init__(self, around: Surroundings) -> None:
+        self._around = around
+        self._streams: set[_Stream] = set()
+
+    def register(self, server: grpc.aio.Server) -> None:
+        """Add the service to a server that has not started."""
+        _, service, method = STREAM_METHOD.split("/")
+        handler: grpc.RpcMethodHandler[bytes, bytes] = grpc.stream_stream_rpc_method_handler(
+            self._handle
+        )
+        server.add_generic_rpc_handlers(
+            (grpc.method_handlers_generic_handler(service, {method: handler}),)
+        )
+
+    def drain(self) -> None:
+        """Let every stream finish what it has taken, then end it."""
+        for stream in self._streams:
+            stream.drain()
+
+    async def _handle(self, requests: AsyncIterator[bytes], context: Context) -> None:
+        stream = _Stream(self._around, context)
+        self._streams.add(stream)
+        self._around.metrics.sessions.inc()
+        try:
+            end = await stream.run(requests)
+        finally:
+            self._streams.discard(stream)
+            self._around.metrics.sessions.dec()
+        if end.error is not None:
+            await context.abort(status_of(end.error), str(end.error))
+
+
+class _Stream:
+    """Pumps one session: one reader, one writer, and tasks that wait for worker threads."""
+
+    def __init__(self, around: Surroundings, context: Context) -> None:
+        self._around = around
+        self._context = context
+        self._wake = asyncio.Event()
+        self._decoders: dict[str, CameraDecoder] = {}
+        session_id = uuid.uuid4().hex[:12]
+        self._log = log.bind(session=session_id, peer=context.peer())
+        self._session = ServerSession(
+            session_id, around.held_field_ids(), time.monotonic(), around.limits
+        )
+
+    def drain(self) -> None:
+        """Take no more frames and end when those taken are answered."""
+        self._session.drain()
+        self._wake.set()
+
+    async def run(self, requests: AsyncIterator[bytes]) -> End:
+        """Serve until the session is closed; return how it ended."""
+        self._log.info("stream opened")
+        async with asyncio.TaskGroup() as tasks:
+            reader = tasks.create_task(self._read(requests))
+            while self._session.closed is None:
+                for job in self._session.jobs_to_start(time.monotonic()):
+                    tasks.create_task(self._work(job))
+                await self._write()
+                await self._rest()
+            await self._write()
+            reader.cancel()
+        end = self._session.closed
+        self._log.info("stream closed", error=str(end.error) if end.error else None)
+        return end
+
+    async def _read(self, requests: AsyncIterator[bytes]) -> None:
+        async for data in requests:
+            now = time.monotonic()
+            try:
+                message = client_message_from_bytes(data)
+            except InvalidInput as error:
+                self._log.warning("message refused", problem=str(error))
+                self._session.refuse(error, now)
+            else:
+                if isinstance(message, Frame):
+                    self._count(message, len(data))
+                self._session.receive(message, now)
+            self._wake.set()
+        self.drain()
+
+    async def _write(self) -> None:
+        messages = self._session.messages_to_send(time.monotonic())
+        self._around.metrics.answered(messages)
+        for message in messages:
+            await self._context.write(server_message_to_bytes(message))
+
+    async def _rest(self) -> None:
+        """Wait until something happens or the session's timer runs out."""
+        if self._session.closed is not None:
+            return
+        timer = self._session.get_timer()
+        timeout = None if timer is None else max(0.0, timer - time.monotonic())
+        try:
+            async with asyncio.timeout(timeout):
+                await self._wake.wait()
+        except TimeoutError:
+            self._session.handle_timer(time.monotonic())
+        self._wake.clear()
+
+    async def _work(self, job: OpenJob | DecodeJob) -> None:
+        if isinstance(job, OpenJob):
+            await self._open(job)
+        else:
+            await self._decode(job)
+        self._wake.set()
+
+    async def _open(self, job: OpenJob) -> None:
+        around = self._around
+        try:
+            self._decoders = await asyncio.get_running_loop().run_in_executor(
+                around.executor, open_cameras, job, around.fields, time.perf_counter_ns
+            )
+        except RfedgeError as error:
+            self._session.open_failed(error, time.monotonic())
+            return
+        self._log = self._log.bind(vehicle=job.hello.vehicle_id)
+        self._log.info("vehicle welcomed", fields=job.hello.field_ids, exact=job.exact)
+        self._session.opened(job, time.monotonic())
+
+    async def _decode(self, job: DecodeJob) -> None:
+        try:
+            outcome = (await self._reconstruct(job)).outcome
+        except PacketRejected as error:
+            self._log.warning("frame rejected", reason=str(error.reason), problem=error.problem)
+            self._session.rejected(job, error, time.monotonic())
+            return
+        self._session.decoded(job, outcome, time.monotonic())
+        self._around.metrics.stages.labels("end_to_end").observe(
+            max(0.0, (time.time_ns() - job.frame.capture_time_ns) / 1e9)
+        )
+
+    async def _reconstruct(self, job: DecodeJob) -> Reconstruction:
+        decoder = self._decoders[job.frame.camera_id]
+        loop, executor = asyncio.get_running_loop(), self._around.executor
+        done = await loop.run_in_executor(executor, decoder.reconstruct, job)
+        recorder, hello = self._around.recorder, self._session.hello
+        if recorder is not None and hello is not None:
+            kept = Recording(hello.vehicle_id, job.frame, done.picture)
+            await loop.run_in_executor(executor, recorder.save, kept)
+        return done
+
+    def _count(self, frame: Frame, packet_bytes: int) -> None:
+        self._around.metrics.bytes.labels("payload").inc(len(frame.packet.payload))
+        self._around.metrics.bytes.labels("packet").inc(packet_bytes)

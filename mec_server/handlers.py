@@ -1,0 +1,106 @@
+"""The numerical work of one session: render, convert, splice, decode. Runs on worker threads.
+
+Plain functions of values; nothing here knows asyncio or gRPC. One ``CameraDecoder`` is used by one
+thread at a time (the session has one frame of a camera in work).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from mec_server.jobs import DecodeJob, DecodeOutcome, OpenJob
+from rfcore.camera import Camera
+from rfcore.codec import DecoderState, DeltaDecoder
+from rfcore.errors import InvalidInput, PacketRejected, RejectReason
+from rfcore.image import I420
+from rfcore.native.yuv import i420_from_colour
+from rfcore.views import View
+from rfcore.wire.messages import CameraDescription, StageTimes
+
+__all__ = ["CameraDecoder", "FieldSource", "Reconstruction", "Renderer", "open_cameras"]
+
+ClockNs = Callable[[], int]
+
+
+class Renderer(Protocol):
+    """A radiance field, ready to be looked at."""
+
+    def render(self, camera: Camera) -> View:
+        """Return the view from ``camera``."""
+
+
+class FieldSource(Protocol):
+    """Where fields come from."""
+
+    def open(self, field_id: str) -> Renderer:
+        """Return the field; raise ``UnknownField`` or ``InvalidData``."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A frame as the vehicle's closed loop holds it, with what the session answers."""
+
+    picture: I420
+    outcome: DecodeOutcome
+
+
+class CameraDecoder:
+    """Reconstructs the frames of one camera against this server's own renders."""
+
+    def __init__(
+        self,
+        camera: CameraDescription,
+        renderers: Mapping[str, Renderer],
+        exact: bool,
+        clock_ns: ClockNs,
+    ) -> None:
+        self._camera = camera
+        self._renderers = renderers
+        self._clock_ns = clock_ns
+        self._decoder = DeltaDecoder(camera.codec, exact, clock_ns)
+        self._state: DecoderState | None = None
+
+    def reconstruct(self, job: DecodeJob) -> Reconstruction:
+        """Return the frame of ``job``; raise ``PacketRejected`` and stay good for the next."""
+        started_ns = self._clock_ns()
+        render = self._render(job)
+        rendered_ns = self._clock_ns()
+        packet = job.frame.packet
+        state = self._state
+        if state is None or state.epoch != packet.epoch:
+            state = self._decoder.start(packet.epoch)
+        decoded = self._decoder.decode(state, packet, render)
+        self._state = decoded.state
+        times = StageTimes(
+            render_ns=rendered_ns - started_ns,
+            splice_ns=decoded.stage_ns.get("splice", 0),
+            decode_ns=decoded.stage_ns.get("decode", 0),
+        )
+        outcome = DecodeOutcome(decoded.lost, decoded.frame.digest(), times)
+        return Reconstruction(decoded.frame, outcome)
+
+    def _render(self, job: DecodeJob) -> I420:
+        camera = job.frame.camera(self._camera.intrinsics)
+        try:
+            return i420_from_colour(self._renderers[job.field_id].render(camera).colour)
+        except InvalidInput as error:
+            raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
+
+
+def open_cameras(job: OpenJob, fields: FieldSource, clock_ns: ClockNs) -> dict[str, CameraDecoder]:
+    """Return a decoder for each camera of a Hello.
+
+    Raises ``InvalidInput`` for a codec header that our encoder would not have made, and what
+    ``fields`` raises.
+    """
+    renderers = {field_id: fields.open(field_id) for field_id in job.hello.field_ids}
+    decoders: dict[str, CameraDecoder] = {}
+    for index, camera in enumerate(job.hello.cameras):
+        try:
+            decoders[camera.camera_id] = CameraDecoder(camera, renderers, job.exact, clock_ns)
+        except InvalidInput as error:
+            name = f"hello.cameras[{index}].{error.field}"
+            raise InvalidInput(name, error.problem) from error
+    return decoders

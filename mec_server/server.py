@@ -1,0 +1,113 @@
+"""One edge server: builds its parts, serves, and drains when told to stop."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import grpc
+import structlog
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_health.v1.health import aio as health_aio
+from prometheus_client import CollectorRegistry, start_http_server
+
+from mec_server.config import ServerConfig
+from mec_server.edge_service import EdgeService, Surroundings
+from mec_server.field_service import FieldService
+from mec_server.fields import FieldShelf, Store
+from mec_server.metrics import ServerMetrics
+from mec_server.recorder import Recorder
+from rfcore.errors import RfedgeError
+from rfcore.wire.address import Address
+from rfcore.wire.conventions import SERVER_OPTIONS
+
+__all__ = ["EdgeServer"]
+
+log = structlog.get_logger()
+SERVICES = ("", "rfcore.wire.v1.EdgeService", "rfcore.wire.v1.FieldService")
+
+
+class EdgeServer:
+    """Serves the fields of ``store``, opened by ``shelf``; ``start``, then ``stop``."""
+
+    def __init__(self, config: ServerConfig, store: Store, shelf: FieldShelf) -> None:
+        self.registry = CollectorRegistry()
+        self.address = Address.parse("listen", config.listen)
+        self.address.require_private("listen", config.allow_insecure)
+        self._config = config
+        self._shelf = shelf
+        self._metrics = ServerMetrics(self.registry)
+        self._executor = ThreadPoolExecutor(config.workers, "worker")
+        self._recorder = self._open_recorder(config.save)
+        self._health = health_aio.HealthServicer()
+        self._edge = EdgeService(
+            Surroundings(
+                shelf,
+                lambda: tuple(store.ids()),
+                self._executor,
+                self._metrics,
+                config.limits,
+                self._recorder,
+            )
+        )
+        self._server = grpc.aio.server(options=SERVER_OPTIONS)
+        self._edge.register(self._server)
+        FieldService(store).register(self._server)
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+
+    async def start(self) -> Address:
+        """Open the fields, then the port; return the address, with the port that was taken.
+
+        Raises ``RfedgeError`` for a damaged field or a port that cannot be had.
+        """
+        count = await asyncio.to_thread(self._shelf.warm_up)
+        try:
+            port = self._server.add_insecure_port(str(self.address))
+        except RuntimeError as error:
+            raise RfedgeError(f"cannot listen on {self.address}: {error}") from error
+        self.address = Address(self.address.host, port)
+        await self._server.start()
+        self._serve_metrics()
+        await self._set_health(health_pb2.HealthCheckResponse.SERVING)
+        if self._config.ready_file is not None:
+            _write_whole(self._config.ready_file, f"{self.address}\n")
+        log.info("serving", address=str(self.address), fields=count)
+        return self.address
+
+    async def stop(self) -> None:
+        """Take no more frames, finish those taken within ``drain_s``, then close."""
+        log.info("draining", within_s=self._config.drain_s)
+        await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
+        self._edge.drain()
+        await self._server.stop(self._config.drain_s)
+        await asyncio.to_thread(self._executor.shutdown)
+        if self._recorder is not None:
+            await asyncio.to_thread(self._recorder.close)
+        log.info("stopped")
+
+    def _open_recorder(self, directory: Path | None) -> Recorder | None:
+        if directory is None:
+            return None
+        self._metrics.recording.set(1)
+        return Recorder(directory, self._recording_failed)
+
+    def _recording_failed(self, error: OSError) -> None:
+        self._metrics.recording.set(0)
+        log.error("recording stopped, streaming goes on", problem=str(error))
+
+    def _serve_metrics(self) -> None:
+        port = self._config.metrics_port
+        if port is not None:
+            server, _ = start_http_server(port, self._config.metrics_host, self.registry)
+            log.info("metrics", port=server.server_port)
+
+    async def _set_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
+        for service in SERVICES:
+            await self._health.set(service, status)
+
+
+def _write_whole(path: Path, text: str) -> None:
+    partial = path.with_suffix(path.suffix + ".part")
+    partial.write_text(text)
+    partial.replace(path)

@@ -1,0 +1,148 @@
+"""Bytes and bits of an H.264 stream. Clause numbers are those of ITU-T H.264 (08/2021).
+
+A NAL unit here is ``bytes`` without its start code: one header byte, then the payload with
+emulation prevention bytes. An RBSP is that payload without them. Everything that reads raises
+``BitstreamError`` and nothing else, whatever the bytes are.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+from rfcore.errors import BitstreamError, InvalidInput
+
+__all__ = ["BitReader", "BitWriter", "join_nals", "nal_of_rbsp", "rbsp_of_nal", "split_nals"]
+
+START_CODE = b"\x00\x00\x00\x01"
+_START = re.compile(rb"\x00\x00\x01")
+_FORBIDDEN = re.compile(rb"\x00\x00[\x00-\x02]")
+_NEEDS_PREVENTION = re.compile(rb"\x00\x00(?=[\x00-\x03])")
+_MAX_EXP_GOLOMB_ZEROS = 31
+
+
+def split_nals(stream: bytes) -> list[bytes]:
+    """Return the NAL units of a byte stream (annex B); raise if it does not start with one."""
+    starts = [match.start() for match in _START.finditer(stream)]
+    if not starts or stream[: starts[0]].strip(b"\x00"):
+        raise BitstreamError(f"byte stream of {len(stream)} bytes does not begin with a start code")
+    ends = [*starts[1:], len(stream)]
+    nals = [
+        stream[start + 3 : end].rstrip(b"\x00") for start, end in zip(starts, ends, strict=True)
+    ]
+    if not all(nals):
+        raise BitstreamError(f"NAL unit {nals.index(b'')} of the byte stream is empty")
+    return nals
+
+
+def join_nals(nals: Iterable[bytes]) -> bytes:
+    """Return the byte stream of NAL units, each after a four-byte start code (annex B)."""
+    return b"".join(START_CODE + nal for nal in nals)
+
+
+def nal_of_rbsp(header: int, rbsp: bytes) -> bytes:
+    """Return a NAL unit: the header byte and ``rbsp`` with emulation prevention (7.4.1.1).
+
+    An RBSP ends with its stop bit, so one that is empty or ends in a zero byte is refused.
+    """
+    if not rbsp or rbsp[-1] == 0:
+        raise InvalidInput("rbsp", "must end with the byte that holds its stop bit")
+    return bytes([header]) + _NEEDS_PREVENTION.sub(b"\x00\x00\x03", rbsp)
+
+
+def rbsp_of_nal(nal: bytes) -> bytes:
+    """Return the payload without emulation prevention (7.3.1).
+
+    Raises when the unit holds no payload, a start code, or ends in a zero byte: what a receiver
+    takes for one NAL unit is one.
+    """
+    if len(nal) < 2 or nal[-1] == 0:
+        raise BitstreamError(f"NAL unit of {len(nal)} bytes is empty or ends in a zero byte")
+    if found := _FORBIDDEN.search(nal):
+        raise BitstreamError(f"start code or reserved zeros inside a NAL unit at {found.start()}")
+    return nal[1:].replace(b"\x00\x00\x03", b"\x00\x00")
+
+
+class BitWriter:
+    """Collects bits, most significant first."""
+
+    def __init__(self) -> None:
+        self._bits: list[str] = []
+
+    def u(self, width: int, value: int) -> BitWriter:
+        """Append an unsigned integer of ``width`` bits."""
+        if not 0 <= value < 1 << width:
+            raise InvalidInput("bits", f"{value} does not fit {width} bits")
+        if width:
+            self._bits.append(f"{value:0{width}b}")
+        return self
+
+    def ue(self, value: int) -> BitWriter:
+        """Append an unsigned Exp-Golomb code (9.1)."""
+        if value < 0:
+            raise InvalidInput("bits", f"ue({value}) must not be negative")
+        width = (value + 1).bit_length()
+        return self.u(2 * width - 1, value + 1)
+
+    def se(self, value: int) -> BitWriter:
+        """Append a signed Exp-Golomb code (9.1.1)."""
+        return self.ue(2 * value - 1 if value > 0 else -2 * value)
+
+    def align(self) -> BitWriter:
+        """Append zero bits up to the next byte."""
+        return self.u(-sum(map(len, self._bits)) % 8, 0)
+
+    def stop(self) -> BitWriter:
+        """Append the RBSP's stop bit and align (7.3.2.11)."""
+        return self.u(1, 1).align()
+
+    def to_bytes(self) -> bytes:
+        """Return the bytes; the bits must be aligned."""
+        bits = "".join(self._bits)
+        if len(bits) % 8:
+            raise InvalidInput("bits", f"{len(bits)} bits are not whole bytes; align first")
+        return int(bits or "0", 2).to_bytes(len(bits) // 8, "big")
+
+
+class BitReader:
+    """Reads bits, most significant first; raises ``BitstreamError`` at the end of the data."""
+
+    def __init__(self, data: bytes) -> None:
+        self._value = int.from_bytes(data, "big")
+        self._left = 8 * len(data)
+
+    def u(self, width: int) -> int:
+        """Read an unsigned integer of ``width`` bits."""
+        if width > self._left:
+            raise BitstreamError(f"{width} bits wanted, {self._left} left")
+        self._left -= width
+        return (self._value >> self._left) & ((1 << width) - 1)
+
+    def flag(self) -> bool:
+        """Read one bit."""
+        return self.u(1) == 1
+
+    def ue(self) -> int:
+        """Read an unsigned Exp-Golomb code (9.1), at most 2**32 - 2."""
+        zeros = 0
+        while not self.flag():
+            zeros += 1
+            if zeros > _MAX_EXP_GOLOMB_ZEROS:
+                raise BitstreamError(f"Exp-Golomb code with more than {zeros - 1} leading zeros")
+        return (1 << zeros) - 1 + self.u(zeros)
+
+    def se(self) -> int:
+        """Read a signed Exp-Golomb code (9.1.1)."""
+        code = self.ue()
+        return (code + 1) // 2 if code % 2 else -(code // 2)
+
+    def more_rbsp_data(self) -> bool:
+        """Tell whether anything precedes the stop bit (7.2)."""
+        rest = self._value & ((1 << self._left) - 1)
+        return self._left > 0 and rest != 1 << (self._left - 1)
+
+    def stop(self) -> None:
+        """Read the stop bit and its zeros; raise if anything else is left (7.3.2.11)."""
+        rest = self._value & ((1 << self._left) - 1)
+        if self._left == 0 or self._left > 8 or rest != 1 << (self._left - 1):
+            raise BitstreamError(f"{self._left} bits left where the RBSP should stop")

@@ -1,0 +1,97 @@
+"""The I_PCM picture: a render as an H.264 picture that decodes to exactly itself.
+
+The receiver never gets the picture its P slice predicts from; it makes one from its own render. An
+I_PCM macroblock holds its 384 samples as they are (ITU-T H.264, 7.3.5 and 7.4.5), so every
+standard decoder reproduces them bit for bit. The picture is one IDR slice under a picture
+parameter set of its own (id 1: CAVLC, so that macroblocks need no arithmetic coder, and deblocking
+off), beside x264's (id 0), which the P slice names.
+
+In CAVLC each macroblock after the first begins byte-aligned with mb_type ue(25), nine bits, and
+seven zero bits: 0x0D 0x00. So the picture is one array of rows of 386 bytes. Samples are clamped to
+at least 1; then no two zero bytes meet and no emulation prevention is needed (7.4.1).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.codec.bitstream import BitWriter, nal_of_rbsp
+from rfcore.codec.parameter_sets import NAL_IDR, NAL_PPS
+from rfcore.image import I420
+
+__all__ = ["PCM_PPS_ID", "pcm_picture", "pcm_pps", "without_zeros"]
+
+PCM_PPS_ID = 1
+_NAL_REF_IDC = 3 << 5
+_I_SLICE_ONLY = 7
+_MB_TYPE_I_PCM = 25
+_MB_HEADER = (0x0D, 0x00)
+_MB_BYTES = 2 + 256 + 64 + 64
+
+
+def pcm_pps() -> bytes:
+    """Return the NAL unit of picture parameter set 1, referring to SPS 0 (7.3.2.2)."""
+    w = BitWriter()
+    w.ue(PCM_PPS_ID).ue(0)
+    w.u(1, 0).u(1, 0)  # entropy_coding_mode_flag: CAVLC; no field order
+    w.ue(0)  # one slice group
+    w.ue(0).ue(0)  # default reference counts - 1
+    w.u(1, 0).u(2, 0)  # no weighted prediction
+    w.se(0).se(0).se(0)  # pic_init_qp - 26, pic_init_qs - 26, chroma_qp_index_offset
+    w.u(1, 1)  # deblocking_filter_control_present_flag
+    w.u(1, 0).u(1, 0)  # constrained_intra_pred_flag, redundant_pic_cnt_present_flag
+    return nal_of_rbsp(_NAL_REF_IDC | NAL_PPS, w.stop().to_bytes())
+
+
+def pcm_picture(picture: I420, log2_max_frame_num: int, idr_pic_id: int) -> bytes:
+    """Return the NAL unit of an IDR picture that decodes to ``picture``, samples raised to >= 1.
+
+    The coded area is the size rounded up to whole macroblocks by repeating the last row and column.
+    ``idr_pic_id`` must differ between IDR pictures that follow each other (7.4.3). The sequence
+    must use picture order count type 2.
+    """
+    header = _slice_header(log2_max_frame_num, idr_pic_id)
+    return header + _macroblocks(picture).tobytes()[len(_MB_HEADER) :] + b"\x80"
+
+
+def without_zeros(picture: I420) -> I420:
+    """Return ``picture`` with its samples raised to at least 1: what ``pcm_picture`` decodes to."""
+    y, u, v = (np.maximum(plane, 1) for plane in picture.planes)
+    return I420(y, u, v)
+
+
+def _slice_header(log2_max_frame_num: int, idr_pic_id: int) -> bytes:
+    """Return the NAL unit up to the first macroblock's samples (7.3.3, 7.3.5)."""
+    w = BitWriter()
+    w.ue(0).ue(_I_SLICE_ONLY).ue(PCM_PPS_ID)
+    w.u(log2_max_frame_num, 0)  # frame_num of an IDR picture
+    w.ue(idr_pic_id)
+    w.u(1, 0).u(1, 0)  # no_output_of_prior_pics_flag, long_term_reference_flag
+    w.se(0)  # slice_qp_delta
+    w.ue(1)  # disable_deblocking_filter_idc
+    w.ue(_MB_TYPE_I_PCM).align()
+    # The sample that follows is >= 1 and the last byte is not zero unless the bits were: a final
+    # one bit stands in for what follows while emulation prevention is applied.
+    return nal_of_rbsp(_NAL_REF_IDC | NAL_IDR, w.to_bytes() + b"\x01")[:-1]
+
+
+def _macroblocks(picture: I420) -> NDArray[np.uint8]:
+    """Return uint8 [MBs, 386]: two header bytes, then Y, Cb, Cr of each macroblock."""
+    width_px, height_px = picture.size_px
+    rows, columns = (height_px + 15) // 16, (width_px + 15) // 16
+    out = np.empty((rows, columns, _MB_BYTES), np.uint8)
+    out[..., :2] = _MB_HEADER
+    start = 2
+    for plane, side in zip(picture.planes, (16, 8, 8), strict=True):
+        area = out[..., start : start + side * side]
+        padded = _pad_to(np.maximum(plane, 1), rows * side, columns * side)
+        blocks = padded.reshape(rows, side, columns, side).transpose(0, 2, 1, 3)
+        area[...] = blocks.reshape(rows, columns, side * side)
+        start += side * side
+    return out.reshape(rows * columns, _MB_BYTES)
+
+
+def _pad_to(plane: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    missing = ((0, height - plane.shape[0]), (0, width - plane.shape[1]))
+    return np.pad(plane, missing, mode="edge") if missing != ((0, 0), (0, 0)) else plane

@@ -1,0 +1,22 @@
+// Stable radix sort of splats by depth; equal depths keep the order of their ids.
+#pragma once
+
+#include <vector>
+
+#include "raster/aligned_buffer.h"
+#include "raster/thread_pool.h"
+#include "raster/types.h"
+
+namespace rfcore::raster {
+
+class DepthSort {
+  public:
+    // Sort items[0..count); positive floats order as their bits do.
+    void sort(ThreadPool& pool, AlignedBuffer<SortItem>& items, int count);
+
+  private:
+    AlignedBuffer<SortItem> other_;
+    std::vector<uint32_t> starts_;
+};
+
+}  // namespace rfcore::raster

@@ -1,0 +1,125 @@
+#include "raster/front_end.h"
+
+#include <algorithm>
+#include <cstring>
+#include <stdexcept>
+#include <string>
+
+namespace rfcore::raster {
+namespace {
+
+constexpr int kBlocksPerTask = 128;
+constexpr int kItemsPerCall = 64;
+constexpr int kMinItemsPerPart = 2048;
+constexpr uint64_t kMaxEntries = 1ull << 30;
+constexpr int kReadableBehind = 64;  // gather() prefetches past the end of a list
+
+}  // namespace
+
+void FrontEnd::run(const Kernels& kernels, ThreadPool& pool, ProjectJob job, int blocks,
+                   int degree, bool keep_positions) {
+    splats_.reserve(static_cast<size_t>(blocks) * kLanes);
+    job.splats = splats_.data();
+    project(kernels, pool, job, blocks, degree);
+    sort_.sort(pool, items_, visible_);
+
+    const Camera& camera = *job.camera;
+    const int parts = std::clamp(visible_ / kMinItemsPerPart, 1, pool.threads());
+    const size_t tiles = static_cast<size_t>(camera.tiles_x()) * camera.tiles_y();
+    spans_.resize(std::max(spans_.size(), static_cast<size_t>(parts)));
+    part_entries_.assign(static_cast<size_t>(parts), 0);
+    tile_next_.reserve(tiles * static_cast<size_t>(parts));
+    pool.run(parts, [&](int part) { find_spans(kernels, camera, part, parts); });
+    count_to_offsets(camera, parts);
+    if (keep_positions) {
+        positions_.reserve(entry_count_);
+        first_position_.reserve(static_cast<size_t>(visible_) + 1);
+        first_position_[static_cast<size_t>(visible_)] = entry_count_;
+    }
+    pool.run(parts, [&](int part) { scatter(camera, part, parts, keep_positions); });
+}
+
+void FrontEnd::project(const Kernels& kernels, ThreadPool& pool, const ProjectJob& job, int blocks,
+                       int degree) {
+    projected_.reserve(static_cast<size_t>(blocks) * kLanes);
+    items_.reserve(static_cast<size_t>(blocks) * kLanes);
+    const auto kernel = kernels.project[job.parameters != nullptr][degree];
+    const int tasks = (blocks + kBlocksPerTask - 1) / kBlocksPerTask;
+    std::vector<int> counts(static_cast<size_t>(tasks));
+    pool.run(tasks, [&](int task) {
+        const int begin = task * kBlocksPerTask, end = std::min(blocks, begin + kBlocksPerTask);
+        counts[static_cast<size_t>(task)] =
+            kernel(job, begin, end, projected_.data() + static_cast<size_t>(begin) * kLanes);
+    });
+    visible_ = 0;
+    for (int task = 0; task < tasks; ++task) {
+        const SortItem* from = projected_.data() + static_cast<size_t>(task) * kBlocksPerTask * kLanes;
+        const int count = counts[static_cast<size_t>(task)];
+        std::memcpy(items_.data() + visible_, from, static_cast<size_t>(count) * sizeof(SortItem));
+        visible_ += count;
+    }
+}
+
+void FrontEnd::find_spans(const Kernels& kernels, const Camera& camera, int part, int parts) {
+    const size_t tiles = static_cast<size_t>(camera.tiles_x()) * camera.tiles_y();
+    const SpanJob job{&camera, splats_.data(),
+                      tile_next_.data() + static_cast<size_t>(part) * tiles};
+    std::memset(job.tile_counts, 0, tiles * sizeof(uint32_t));
+    std::vector<uint32_t>& words = spans_[static_cast<size_t>(part)];
+    const size_t most = static_cast<size_t>(kItemsPerCall) * (1 + camera.tiles_y());
+    size_t used = 0;
+    const int end = share_begin(visible_, part + 1, parts);
+    for (int i = share_begin(visible_, part, parts); i < end; i += kItemsPerCall) {
+        if (words.size() < used + most) words.resize(2 * words.size() + most);
+        const int count = std::min(kItemsPerCall, end - i);
+        used += kernels.find_spans(job, items_.data() + i, count, words.data() + used);
+    }
+}
+
+// Turn counts per part and tile into the position of the first entry of each.
+void FrontEnd::count_to_offsets(const Camera& camera, int parts) {
+    const size_t tiles = static_cast<size_t>(camera.tiles_x()) * camera.tiles_y();
+    tile_offsets_.reserve(tiles + 1);
+    uint64_t next = 0;
+    for (size_t tile = 0; tile < tiles; ++tile) {
+        tile_offsets_[tile] = static_cast<uint32_t>(next);
+        for (int part = 0; part < parts; ++part) {
+            uint32_t& count = tile_next_[static_cast<size_t>(part) * tiles + tile];
+            part_entries_[static_cast<size_t>(part)] += count;
+            next += std::exchange(count, static_cast<uint32_t>(next));
+        }
+        if (next > kMaxEntries) {
+            throw std::length_error("more than " + std::to_string(kMaxEntries) +
+                                    " overlaps of Gaussians and 16x16 tiles; the Gaussians are too "
+                                    "large or too many for this picture size");
+        }
+    }
+    entry_count_ = static_cast<uint32_t>(next);
+    tile_offsets_[tiles] = entry_count_;
+    entries_.reserve(next + kReadableBehind);
+    std::memset(entries_.data() + next, 0, kReadableBehind * sizeof(uint32_t));
+}
+
+void FrontEnd::scatter(const Camera& camera, int part, int parts, bool keep_positions) {
+    const size_t tiles_x = static_cast<size_t>(camera.tiles_x());
+    uint32_t* next = tile_next_.data() + static_cast<size_t>(part) * tiles_x * camera.tiles_y();
+    const uint32_t* word = spans_[static_cast<size_t>(part)].data();
+    uint32_t position = 0;
+    for (int p = 0; p < part; ++p) position += part_entries_[static_cast<size_t>(p)];
+    const int end = share_begin(visible_, part + 1, parts);
+    for (int i = share_begin(visible_, part, parts); i < end; ++i) {
+        const uint32_t id = items_[static_cast<size_t>(i)].id;
+        if (keep_positions) first_position_[static_cast<size_t>(i)] = position;
+        for (uint32_t left = *word++; left != 0; --left) {
+            const uint32_t span = *word++;
+            uint32_t* row = next + span_row(span) * tiles_x;
+            for (uint32_t x = span_first(span); x <= span_last(span); ++x) {
+                const uint32_t at = row[x]++;
+                entries_[at] = id;
+                if (keep_positions) positions_[position++] = at;
+            }
+        }
+    }
+}
+
+}  // namespace rfcore::raster

@@ -1,0 +1,37 @@
+// The kernels as tables of function pointers, one table per instruction set.
+#pragma once
+
+#include "raster/types.h"
+
+namespace rfcore::raster {
+
+struct Kernels {
+    const char* isa;
+    // Fill `geometry` of blocks begin..end from their parameters.
+    void (*prepare)(const float* parameters, int planes, float* geometry, int begin, int end);
+    // Project blocks begin..end, append the visible ones to `out`, return how many.
+    // [training][degree]
+    int (*project[2][kMaxDegree + 1])(const ProjectJob&, int begin, int end, SortItem* out);
+    // Append the spans of `count` items to `out` and count them per tile; return the words used.
+    // `out` must have room for count * (1 + tile rows) words.
+    size_t (*find_spans)(const SpanJob&, const SortItem* items, int count, uint32_t* out);
+    void (*blend_colour)(const BlendJob&, int tile);
+    void (*blend_view)(const BlendJob&, int tile);
+    void (*blend_counting)(const BlendJob&, int tile);
+};
+
+extern const Kernels kScalarKernels;
+#if defined(RF_HAVE_X86)
+extern const Kernels kAvx2Kernels;
+extern const Kernels kAvx512Kernels;
+#endif
+#if defined(RF_HAVE_NEON)
+extern const Kernels kNeonKernels;
+#endif
+
+// Kernels this machine can run, best first; null-terminated.
+const Kernels* const* available_kernels();
+// The table named `isa`, or null.
+const Kernels* kernels_named(const char* isa);
+
+}  // namespace rfcore::raster

@@ -1,0 +1,308 @@
+// From Gaussians to splats: EWA projection (Zwicker et al. 2002), 16 Gaussians at a time.
+//
+// The projected covariance is M M^T + 0.3 I with M = J W R S (2x3). Its determinant is summed from
+// the squared minors of M, none of them negative (Cauchy-Binet), because c_xx c_yy - c_xy^2 of a
+// needle has no correct digit in float32.
+#pragma once
+
+#include "raster/math.h"
+#include "raster/types.h"
+
+namespace {
+
+using namespace rfcore::raster;
+
+constexpr float kNear = 0.01f;          // m; centres not beyond this are not drawn
+constexpr float kFar = 1e9f;            // m; nor those beyond this
+constexpr float kMaxVariance = 1e18f;   // px^2; wider splats would overflow and are not drawn
+constexpr float kMaxColour = 1e18f;     // keeps a picture finite whatever the coefficients
+constexpr float kDilation = 0.3f;       // px^2
+constexpr float kFrustumMargin = 0.3f;  // of the half field of view
+constexpr float kMinQuaternionNorm = 1e-12f;
+constexpr float kLog2Of255 = 7.99435344f;
+constexpr float kHalfLog2ERoot = 0.849321800288f;  // sqrt(log2(e) / 2)
+constexpr float kTwoLn2 = 1.386294361f;
+constexpr float kCutoffScale = 1.00002f;  // margins that make every culling test conservative
+constexpr float kCutoffOffset = 1e-5f;
+
+struct Vec3 {
+    Lanes x, y, z;
+};
+RF_INLINE Lanes dot(Vec3 p, Vec3 q) { return fma(p.x, q.x, fma(p.y, q.y, p.z * q.z)); }
+RF_INLINE Lanes dot(const float* row, Vec3 q, float offset) {
+    return fma(splat(row[0]), q.x, fma(splat(row[1]), q.y, fma(splat(row[2]), q.z, splat(offset))));
+}
+RF_INLINE Vec3 cross(Vec3 p, Vec3 q) {
+    return {fnma(p.z, q.y, p.y * q.z), fnma(p.x, q.z, p.z * q.x), fnma(p.y, q.x, p.x * q.y)};
+}
+RF_INLINE const float* plane(const float* block, int index) { return block + index * kLanes; }
+RF_INLINE float* plane(float* block, int index) { return block + index * kLanes; }
+RF_INLINE Vec3 load_vec3(const float* block, int first) {
+    return {load(plane(block, first)), load(plane(block, first + 1)),
+            load(plane(block, first + 2))};
+}
+
+// Rotation, scales and their product R S (row-major), as training needs them again going back.
+struct CovarianceRoot {
+    Lanes rotation[9];
+    Lanes scale[3];
+    Lanes quaternion[4];   // normalised
+    Lanes inverse_norm;
+    Mask norm_is_free;     // the norm was not clamped
+    Lanes root[9];
+};
+
+RF_INLINE void rotation_from(const Lanes* q, Lanes* r) {
+    const Lanes one = splat(1.0f), two = splat(2.0f);
+    const Lanes w = q[0], x = q[1], y = q[2], z = q[3];
+    r[0] = one - two * (y * y + z * z);
+    r[1] = two * (x * y - w * z);
+    r[2] = two * (x * z + w * y);
+    r[3] = two * (x * y + w * z);
+    r[4] = one - two * (x * x + z * z);
+    r[5] = two * (y * z - w * x);
+    r[6] = two * (x * z - w * y);
+    r[7] = two * (y * z + w * x);
+    r[8] = one - two * (x * x + y * y);
+}
+
+RF_INLINE void covariance_root(const float* block, CovarianceRoot* c) {
+    for (int k = 0; k < 3; ++k) {
+        c->scale[k] = exp2_accurate(load(plane(block, kScalePlane + k)) * splat(kLog2E));
+    }
+    Lanes q[4];
+    for (int k = 0; k < 4; ++k) q[k] = load(plane(block, kQuaternionPlane + k));
+    const Lanes norm = sqrt(fma(q[0], q[0], fma(q[1], q[1], fma(q[2], q[2], q[3] * q[3]))));
+    c->norm_is_free = gt(norm, splat(kMinQuaternionNorm));
+    c->inverse_norm = splat(1.0f) / max(norm, splat(kMinQuaternionNorm));
+    for (int k = 0; k < 4; ++k) c->quaternion[k] = q[k] * c->inverse_norm;
+    rotation_from(c->quaternion, c->rotation);
+    for (int i = 0; i < 9; ++i) c->root[i] = c->rotation[i] * c->scale[i % 3];
+}
+
+RF_INLINE Lanes log2_opacity(const float* block) {
+    return log2_accurate(sigmoid(load(plane(block, kLogitPlane))));
+}
+
+static void prepare(const float* parameters, int planes, float* geometry, int begin, int end) {
+    for (int b = begin; b < end; ++b) {
+        const float* block = parameters + static_cast<size_t>(b) * planes * kLanes;
+        float* out = geometry + static_cast<size_t>(b) * kGeometryPlanes * kLanes;
+        CovarianceRoot c;
+        covariance_root(block, &c);
+        for (int k = 0; k < 3; ++k) store(plane(out, k), load(plane(block, kMeanPlane + k)));
+        for (int k = 0; k < 9; ++k) store(plane(out, kRootPlane + k), c.root[k]);
+        store(plane(out, kLog2OpacityPlane), log2_opacity(block));
+    }
+}
+
+struct Projection {
+    Vec3 in_camera;
+    Lanes inverse_z;
+    Lanes slope_x, slope_y;        // of the point of linearisation, clamped
+    Mask free_x, free_y;           // the slope was not clamped
+    Lanes j00, j02, j11, j12;      // the non-zero entries of J
+    Vec3 world_row0, world_row1;   // J W
+    Vec3 m0, m1;                   // J W R S
+    Lanes c_xx, c_xy, c_yy, det;   // dilated covariance
+    Lanes centre_x, centre_y;
+};
+
+RF_INLINE Vec3 to_camera(const Camera& camera, Vec3 mean) {
+    const float* r = camera.rotation;
+    const float* t = camera.translation;
+    return {dot(r, mean, t[0]), dot(r + 3, mean, t[1]), dot(r + 6, mean, t[2])};
+}
+
+RF_INLINE Lanes clamped_slope(Lanes slope, float focal, float centre, int side, Mask* is_free) {
+    const float half = 0.5f * static_cast<float>(side) / focal;
+    const Lanes high =
+        splat((static_cast<float>(side) - centre) / focal + kFrustumMargin * half);
+    const Lanes low = splat(-(centre / focal + kFrustumMargin * half));
+    *is_free = both(ge(high, slope), ge(slope, low));
+    return clamp(slope, low, high);
+}
+
+RF_INLINE Vec3 row_times(Vec3 row, const Lanes* matrix) {
+    const Lanes* m = matrix;
+    return {fma(row.x, m[0], fma(row.y, m[3], row.z * m[6])),
+            fma(row.x, m[1], fma(row.y, m[4], row.z * m[7])),
+            fma(row.x, m[2], fma(row.y, m[5], row.z * m[8]))};
+}
+
+// Row i of J W: diagonal entry of J on row i of W plus the entry in its third column on row 2.
+RF_INLINE Vec3 jacobian_row(const float* w, int i, Lanes diagonal, Lanes third) {
+    return {fma(diagonal, splat(w[3 * i]), third * splat(w[6])),
+            fma(diagonal, splat(w[3 * i + 1]), third * splat(w[7])),
+            fma(diagonal, splat(w[3 * i + 2]), third * splat(w[8]))};
+}
+
+// Fill everything of `p` behind in_camera.
+RF_INLINE void project_covariance(const Camera& camera, const Lanes* root, Projection* p) {
+    p->inverse_z = splat(1.0f) / p->in_camera.z;
+    const Lanes x = p->in_camera.x * p->inverse_z, y = p->in_camera.y * p->inverse_z;
+    p->slope_x = clamped_slope(x, camera.fx, camera.cx, camera.width, &p->free_x);
+    p->slope_y = clamped_slope(y, camera.fy, camera.cy, camera.height, &p->free_y);
+    p->j00 = splat(camera.fx) * p->inverse_z;
+    p->j11 = splat(camera.fy) * p->inverse_z;
+    p->j02 = negate(p->j00 * p->slope_x);
+    p->j12 = negate(p->j11 * p->slope_y);
+    p->world_row0 = jacobian_row(camera.rotation, 0, p->j00, p->j02);
+    p->world_row1 = jacobian_row(camera.rotation, 1, p->j11, p->j12);
+    p->m0 = row_times(p->world_row0, root);
+    p->m1 = row_times(p->world_row1, root);
+    const Lanes xx = dot(p->m0, p->m0), yy = dot(p->m1, p->m1);
+    const Vec3 minors = cross(p->m0, p->m1);
+    p->c_xx = xx + splat(kDilation);
+    p->c_yy = yy + splat(kDilation);
+    p->c_xy = dot(p->m0, p->m1);
+    p->det = fma(splat(kDilation), xx + p->c_yy, dot(minors, minors));
+    p->centre_x = fma(splat(camera.fx), x, splat(camera.cx));
+    p->centre_y = fma(splat(camera.fy), y, splat(camera.cy));
+}
+
+// Unit vector from the camera to the mean, and one over the distance.
+RF_INLINE Vec3 view_direction(const Camera& camera, Vec3 mean, Lanes* inverse_distance) {
+    const Vec3 d = {mean.x - splat(camera.position[0]), mean.y - splat(camera.position[1]),
+                    mean.z - splat(camera.position[2])};
+    *inverse_distance = splat(1.0f) / sqrt(dot(d, d));
+    return {d.x * *inverse_distance, d.y * *inverse_distance, d.z * *inverse_distance};
+}
+
+// SH(direction) + 0.5 before clamping, [3].
+template <int kDegree>
+RF_INLINE void sh_colour(const float* harmonics, const Lanes* basis, Lanes* colour) {
+    for (int c = 0; c < 3; ++c) colour[c] = splat(0.5f);
+    for (int k = 0; k < coefficients_of(kDegree); ++k) {
+        for (int c = 0; c < 3; ++c) {
+            colour[c] = fma(basis[k], load(plane(harmonics, 3 * k + c)), colour[c]);
+        }
+    }
+}
+
+struct Box {
+    Lanes x0, x1, y0, y1;  // first and last pixel of a splat, clipped to the picture, px
+};
+
+// Which lanes can colour a pixel; every comparison is false for a value that is not a number.
+RF_INLINE Mask find_visible(const Camera& camera, const Projection& p, Lanes headroom, Lanes half_x,
+                            Lanes half_y, Box* box) {
+    const Lanes half = splat(0.5f);
+    box->x0 = p.centre_x - half_x - half;
+    box->x1 = p.centre_x + half_x - half;
+    box->y0 = p.centre_y - half_y - half;
+    box->y1 = p.centre_y + half_y - half;
+    const Lanes last_x = splat(static_cast<float>(camera.width - 1));
+    const Lanes last_y = splat(static_cast<float>(camera.height - 1));
+    Mask m = both(gt(p.in_camera.z, splat(kNear)), ge(splat(kFar), p.in_camera.z));
+    m = both(m, gt(headroom, zero()));
+    m = both(m, both(ge(splat(kMaxVariance), p.c_xx), ge(splat(kMaxVariance), p.c_yy)));
+    m = both(m, both(ge(box->x1, zero()), ge(last_x, box->x0)));
+    m = both(m, both(ge(box->y1, zero()), ge(last_y, box->y0)));
+    box->x0 = max(box->x0, zero());
+    box->y0 = max(box->y0, zero());
+    box->x1 = min(box->x1, last_x);
+    box->y1 = min(box->y1, last_y);
+    return m;
+}
+
+// Append the visible lanes whose box holds a pixel centre; return how many.
+RF_INLINE int append_visible(uint32_t visible, int first_id, Lanes depth, const Box& box,
+                             SortItem* out) {
+    alignas(64) float z[16], x0[16], x1[16], y0[16], y1[16];
+    store(z, depth);
+    // ceil(x) = x + above_floor(-x); the largest integers here are below 2^14.
+    store(x0, box.x0 + above_floor(negate(box.x0)));
+    store(y0, box.y0 + above_floor(negate(box.y0)));
+    store(x1, box.x1);
+    store(y1, box.y1);
+    int count = 0;
+    for (; visible != 0; visible &= visible - 1) {
+        const int i = __builtin_ctz(visible);
+        const int px0 = static_cast<int>(x0[i]), px1 = static_cast<int>(x1[i]);
+        const int py0 = static_cast<int>(y0[i]), py1 = static_cast<int>(y1[i]);
+        SortItem* item = out + count;
+        memcpy(&item->depth_bits, &z[i], sizeof item->depth_bits);
+        item->id = static_cast<uint32_t>(first_id + i);
+        item->tile_x0 = static_cast<uint16_t>(px0 / kTileSide);
+        item->tile_x1 = static_cast<uint16_t>(px1 / kTileSide);
+        item->tile_y0 = static_cast<uint16_t>(py0 / kTileSide);
+        item->tile_y1 = static_cast<uint16_t>(py1 / kTileSide);
+        count += (px0 <= px1) & (py0 <= py1);
+    }
+    return count;
+}
+
+RF_INLINE void store_splats(const Projection& p, Lanes log2_alpha, Lanes headroom, Lanes half_x,
+                            Lanes half_y, const Lanes* colour, Splat* out) {
+    const Lanes a = splat(kHalfLog2ERoot) * sqrt(p.c_yy / p.det);
+    const Lanes b_over_a = negate(p.c_xy / p.c_yy);
+    const Lanes b = a * b_over_a;
+    const Lanes c = splat(kHalfLog2ERoot) / sqrt(p.c_yy);
+    const Lanes limit = splat(kMaxColour);
+    alignas(64) float rows[16 * 16];
+    store(rows, a);
+    store(rows + 16, b);
+    store(rows + 32, c);
+    store(rows + 48, log2_alpha + splat(kAlphaBits));
+    for (int k = 0; k < 3; ++k) store(rows + 64 + 16 * k, min(max(colour[k], zero()), limit));
+    store(rows + 112, p.in_camera.z);
+    store(rows + 128, p.centre_x);
+    store(rows + 144, p.centre_y);
+    store(rows + 160, half_x);
+    store(rows + 176, half_y);
+    store(rows + 192, fma(headroom, splat(kCutoffScale), splat(kCutoffOffset)));
+    store(rows + 208, negate(a * b) / fma(b, b, c * c));
+    store(rows + 224, negate(b_over_a));
+    store(rows + 240, zero());
+    Lanes columns[16];
+    transpose(rows, columns);
+    for (int i = 0; i < kLanes; ++i) store(reinterpret_cast<float*>(out + i), columns[i]);
+}
+
+template <int kDegree, bool kTraining>
+static int project(const ProjectJob& job, int begin, int end, SortItem* out) {
+    const Camera& camera = *job.camera;
+    const int sh_planes = 3 * coefficients_of(job.stored_degree);
+    int count = 0;
+    for (int b = begin; b < end; ++b) {
+        const float* block =
+            kTraining ? job.parameters + static_cast<size_t>(b) * (kShPlane + sh_planes) * kLanes
+                      : job.geometry + static_cast<size_t>(b) * kGeometryPlanes * kLanes;
+        const Vec3 mean = load_vec3(block, kMeanPlane);
+        Projection p;
+        p.in_camera = to_camera(camera, mean);
+        if (!any(gt(p.in_camera.z, splat(kNear)))) continue;
+        Lanes log2_alpha;
+        if (kTraining) {
+            CovarianceRoot c;
+            covariance_root(block, &c);
+            log2_alpha = log2_opacity(block);
+            project_covariance(camera, c.root, &p);
+        } else {
+            Lanes root[9];
+            for (int k = 0; k < 9; ++k) root[k] = load(plane(block, kRootPlane + k));
+            log2_alpha = load(plane(block, kLog2OpacityPlane));
+            project_covariance(camera, root, &p);
+        }
+        const Lanes headroom = log2_alpha + splat(kLog2Of255);
+        const Lanes reach = splat(kTwoLn2 * kCutoffScale) * max(headroom, zero());
+        const Lanes half_x = sqrt(reach * p.c_xx), half_y = sqrt(reach * p.c_yy);
+        Box box;
+        const uint32_t visible =
+            bits(find_visible(camera, p, headroom, half_x, half_y, &box));
+        if (visible == 0) continue;
+        Lanes inverse_distance, basis[coefficients_of(kDegree)], colour[3];
+        const Vec3 d = view_direction(camera, mean, &inverse_distance);
+        sh_basis<kDegree>(d.x, d.y, d.z, basis);
+        const float* harmonics =
+            kTraining ? plane(block, kShPlane)
+                      : job.harmonics + static_cast<size_t>(b) * sh_planes * kLanes;
+        sh_colour<kDegree>(harmonics, basis, colour);
+        store_splats(p, log2_alpha, headroom, half_x, half_y, colour, job.splats + b * kLanes);
+        count += append_visible(visible, b * kLanes, p.in_camera.z, box, out + count);
+    }
+    return count;
+}
+
+}  // namespace

@@ -1,0 +1,104 @@
+#include "raster/rasterizer.h"
+
+#include <algorithm>
+#include <cstring>
+
+namespace rfcore::raster {
+namespace {
+
+constexpr float kTransparentLogit = -100.0f;
+constexpr int kTilesPerBatch = 4;
+
+void pack_gaussian(const GaussianArrays& from, size_t n, float* lane) {
+    const int sh_count = 3 * coefficients_of(from.degree);
+    for (size_t k = 0; k < 3; ++k) {
+        lane[(kMeanPlane + k) * kLanes] = from.means[3 * n + k];
+        lane[(kScalePlane + k) * kLanes] = from.log_scales[3 * n + k];
+    }
+    for (size_t k = 0; k < 4; ++k) {
+        lane[(kQuaternionPlane + k) * kLanes] = from.quaternions[4 * n + k];
+    }
+    lane[kLogitPlane * kLanes] = from.opacity_logits[n];
+    const float* sh = from.sh + n * static_cast<size_t>(sh_count);
+    for (int k = 0; k < sh_count; ++k) lane[(kShPlane + k) * kLanes] = sh[k];
+}
+
+}  // namespace
+
+void pack_parameters(const GaussianArrays& from, float* blocks) {
+    const size_t stride = static_cast<size_t>(parameter_planes(from.degree)) * kLanes;
+    const size_t count = static_cast<size_t>(from.count);
+    const size_t padded = (count + kLanes - 1) / kLanes * kLanes;
+    std::memset(blocks, 0, padded / kLanes * stride * sizeof(float));
+    for (size_t n = 0; n < padded; ++n) {
+        float* lane = blocks + n / kLanes * stride + n % kLanes;
+        if (n < count) {
+            pack_gaussian(from, n, lane);
+        } else {
+            lane[kLogitPlane * kLanes] = kTransparentLogit;
+        }
+    }
+}
+
+Rasterizer::Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads)
+    : kernels_(kernels),
+      pool_(threads),
+      blocks_((gaussians.count + kLanes - 1) / kLanes),
+      degree_(gaussians.degree) {
+    const int planes = parameter_planes(degree_);
+    const size_t stride = static_cast<size_t>(planes) * kLanes;
+    const size_t sh_size = static_cast<size_t>(planes - kShPlane) * kLanes;
+    AlignedBuffer<float> parameters;
+    parameters.reserve(static_cast<size_t>(blocks_) * stride);
+    pack_parameters(gaussians, parameters.data());
+    geometry_.reserve(static_cast<size_t>(blocks_) * kGeometryPlanes * kLanes);
+    harmonics_.reserve(static_cast<size_t>(blocks_) * sh_size);
+    pool_.run(threads, [&](int part) {
+        const int begin = share_begin(blocks_, part, threads);
+        const int end = share_begin(blocks_, part + 1, threads);
+        kernels_.prepare(parameters.data(), planes, geometry_.data(), begin, end);
+    });
+    for (size_t b = 0; b < static_cast<size_t>(blocks_); ++b) {
+        std::memcpy(harmonics_.data() + b * sh_size,
+                    parameters.data() + b * stride + kShPlane * kLanes, sh_size * sizeof(float));
+    }
+}
+
+void Rasterizer::run_front_end(const Camera& camera) {
+    const ProjectJob job{&camera, geometry_.data(), harmonics_.data(), nullptr, degree_, nullptr};
+    front_end_.run(kernels_, pool_, job, blocks_, degree_, false);
+}
+
+void Rasterizer::render(const Camera& camera, float* colour, float* depth, float* opacity) {
+    run_front_end(camera);
+    const BlendJob job{&camera, front_end_.splats(),  front_end_.entries(),
+                       front_end_.tile_offsets(), colour, depth, opacity, nullptr};
+    blend_tiles(pool_, depth == nullptr ? kernels_.blend_colour : kernels_.blend_view, job);
+}
+
+Statistics Rasterizer::statistics(const Camera& camera) {
+    run_front_end(camera);
+    const size_t pixels = static_cast<size_t>(camera.width) * camera.height;
+    AlignedBuffer<float> picture;
+    picture.reserve(5 * pixels);
+    BlendCounts counts{};
+    const BlendJob job{&camera,
+                       front_end_.splats(),
+                       front_end_.entries(),
+                       front_end_.tile_offsets(),
+                       picture.data(),
+                       picture.data() + 3 * pixels,
+                       picture.data() + 4 * pixels,
+                       &counts};
+    const int tiles = camera.tiles_x() * camera.tiles_y();
+    for (int tile = 0; tile < tiles; ++tile) kernels_.blend_counting(job, tile);
+    return {front_end_.visible(), front_end_.entry_count(), counts.tile_entries, counts.useful,
+            counts.evaluated};
+}
+
+void blend_tiles(ThreadPool& pool, void (*kernel)(const BlendJob&, int), const BlendJob& job) {
+    const int tiles = job.camera->tiles_x() * job.camera->tiles_y();
+    pool.run(tiles, [&](int tile) { kernel(job, tile); }, kTilesPerBatch);
+}
+
+}  // namespace rfcore::raster

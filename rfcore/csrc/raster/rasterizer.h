@@ -1,0 +1,55 @@
+// A set of Gaussians ready to be rendered from any camera.
+#pragma once
+
+#include "raster/front_end.h"
+
+namespace rfcore::raster {
+
+// Parameters as they are stored in files: one row per Gaussian.
+struct GaussianArrays {
+    const float* means;           // [N, 3]
+    const float* quaternions;     // [N, 4]
+    const float* log_scales;      // [N, 3]
+    const float* opacity_logits;  // [N]
+    const float* sh;              // [N, K, 3]
+    int count;
+    int degree;
+};
+
+struct Statistics {
+    int visible;
+    uint32_t tile_entries;          // overlaps of splats and tiles
+    uint64_t tile_entries_visited;  // before the tile was opaque
+    uint64_t useful_blends;
+    uint64_t evaluated_blends;
+};
+
+// Copy `from` into blocks of 16, [blocks][parameter_planes(degree)][16]; the lanes behind the last
+// Gaussian are transparent.
+void pack_parameters(const GaussianArrays& from, float* blocks);
+
+class Rasterizer {
+  public:
+    Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads);
+
+    // Render colour [H, W, 3]; with depth and opacity [H, W] both or neither.
+    void render(const Camera& camera, float* colour, float* depth, float* opacity);
+    Statistics statistics(const Camera& camera);
+
+    const Kernels& kernels() const { return kernels_; }
+    int threads() const { return pool_.threads(); }
+
+  private:
+    void run_front_end(const Camera& camera);
+
+    const Kernels& kernels_;
+    ThreadPool pool_;
+    int blocks_, degree_;
+    AlignedBuffer<float> geometry_, harmonics_;
+    FrontEnd front_end_;
+};
+
+// Run `kernel` over every tile of the picture.
+void blend_tiles(ThreadPool& pool, void (*kernel)(const BlendJob&, int), const BlendJob& job);
+
+}  // namespace rfcore::raster

@@ -1,0 +1,43 @@
+// Sixteen float lanes with one meaning on every instruction set.
+//
+// Every operation below is IEEE-754 exact (or a comparison, a move or an integer operation), so
+// the same sequence of calls gives the same bits on every machine. min and max return the second
+// operand when one of the two is not a number, as x86 does. The wrapper and everything that
+// includes it live in anonymous namespaces: the units are compiled with different machine flags,
+// and a weak symbol would let the linker pick the copy of the wrong one.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+
+#define RF_INLINE static inline __attribute__((always_inline))
+
+#if defined(RF_ISA_AVX512)
+#include "raster/simd_avx512.h"
+#elif defined(RF_ISA_AVX2)
+#include "raster/simd_avx2.h"
+#elif defined(RF_ISA_NEON)
+#include "raster/simd_neon.h"
+#else
+#include "raster/simd_scalar.h"
+#endif
+
+namespace {
+
+RF_INLINE Lanes zero() { return splat(0.0f); }
+RF_INLINE Lanes negate(Lanes a) { return zero() - a; }
+RF_INLINE Lanes clamp(Lanes a, Lanes low, Lanes high) { return max(min(a, high), low); }
+RF_INLINE Lanes absolute(Lanes a) { return max(a, negate(a)); }
+RF_INLINE bool any(Mask m) { return bits(m) != 0; }
+
+// Return the sum of the lanes in a fixed order.
+RF_INLINE double sum_in_order(Lanes a) {
+    alignas(64) float lane[16];
+    store(lane, a);
+    double sum = 0.0;
+    for (int i = 0; i < 16; ++i) sum += static_cast<double>(lane[i]);
+    return sum;
+}
+
+}  // namespace

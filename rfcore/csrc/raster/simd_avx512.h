@@ -1,0 +1,101 @@
+// Sixteen lanes as one 512-bit register (AVX-512 F, BW, DQ, VL).
+#pragma once
+
+#include <immintrin.h>
+
+namespace {
+
+struct Lanes {
+    __m512 v;
+};
+using Mask = __mmask16;
+
+RF_INLINE Lanes splat(float a) { return {_mm512_set1_ps(a)}; }
+RF_INLINE Lanes load(const float* p) { return {_mm512_load_ps(p)}; }
+RF_INLINE Lanes load_unaligned(const float* p) { return {_mm512_loadu_ps(p)}; }
+// Four floats, repeated four times: lane i holds p[i & 3].
+RF_INLINE Lanes load_repeated(const float* p) { return {_mm512_broadcast_f32x4(_mm_load_ps(p))}; }
+RF_INLINE void store(float* p, Lanes a) { _mm512_store_ps(p, a.v); }
+RF_INLINE void store_unaligned(float* p, Lanes a) { _mm512_storeu_ps(p, a.v); }
+RF_INLINE void store_where(float* p, Mask m, Lanes a) { _mm512_mask_store_ps(p, m, a.v); }
+
+RF_INLINE Lanes operator+(Lanes a, Lanes b) { return {_mm512_add_ps(a.v, b.v)}; }
+RF_INLINE Lanes operator-(Lanes a, Lanes b) { return {_mm512_sub_ps(a.v, b.v)}; }
+RF_INLINE Lanes operator*(Lanes a, Lanes b) { return {_mm512_mul_ps(a.v, b.v)}; }
+RF_INLINE Lanes operator/(Lanes a, Lanes b) { return {_mm512_div_ps(a.v, b.v)}; }
+RF_INLINE Lanes fma(Lanes a, Lanes b, Lanes c) { return {_mm512_fmadd_ps(a.v, b.v, c.v)}; }
+RF_INLINE Lanes fnma(Lanes a, Lanes b, Lanes c) { return {_mm512_fnmadd_ps(a.v, b.v, c.v)}; }
+RF_INLINE Lanes sqrt(Lanes a) { return {_mm512_sqrt_ps(a.v)}; }
+RF_INLINE Lanes min(Lanes a, Lanes b) { return {_mm512_min_ps(a.v, b.v)}; }
+RF_INLINE Lanes max(Lanes a, Lanes b) { return {_mm512_max_ps(a.v, b.v)}; }
+
+RF_INLINE Mask ge(Lanes a, Lanes b) { return _mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ); }
+RF_INLINE Mask gt(Lanes a, Lanes b) { return _mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ); }
+RF_INLINE Mask both(Mask a, Mask b) { return a & b; }
+RF_INLINE uint32_t bits(Mask m) { return m; }
+RF_INLINE Mask mask_from_bits(uint32_t m) { return static_cast<Mask>(m); }
+RF_INLINE Lanes select(Mask m, Lanes a, Lanes b) { return {_mm512_mask_blend_ps(m, b.v, a.v)}; }
+// a where the mask is set, 0 elsewhere; the fused forms cost no instruction of their own.
+RF_INLINE Lanes keep(Mask m, Lanes a) { return {_mm512_maskz_mov_ps(m, a.v)}; }
+RF_INLINE Lanes keep_min(Mask m, Lanes a, Lanes b) { return {_mm512_maskz_min_ps(m, a.v, b.v)}; }
+RF_INLINE Lanes keep_mul(Mask m, Lanes a, Lanes b) { return {_mm512_maskz_mul_ps(m, a.v, b.v)}; }
+
+// p - floor(p), rounded once.
+RF_INLINE Lanes above_floor(Lanes p) {
+    constexpr int kFloor = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+    return {_mm512_sub_ps(p.v, _mm512_roundscale_ps(p.v, kFloor))};
+}
+// The same for p >= 0, where it is exact; the one-instruction form rounds downwards below 0.
+RF_INLINE Lanes above_floor_of_positive(Lanes p) {
+    return {_mm512_reduce_ps(p.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)};
+}
+// a * 2^floor(p), exact while normal.
+RF_INLINE Lanes times_exp2_floor(Lanes a, Lanes p) { return {_mm512_scalef_ps(a.v, p.v)}; }
+// Split x > 0 (normal) into mantissa in [sqrt(1/2), sqrt(2)) and exponent.
+RF_INLINE Lanes split_exponent(Lanes x, Lanes* mantissa) {
+    const __m512i root_half = _mm512_set1_epi32(0x3f3504f3);
+    const __m512i shifted = _mm512_sub_epi32(_mm512_castps_si512(x.v), root_half);
+    const __m512i fraction = _mm512_and_si512(shifted, _mm512_set1_epi32(0x007fffff));
+    mantissa->v = _mm512_castsi512_ps(_mm512_add_epi32(fraction, root_half));
+    return {_mm512_cvtepi32_ps(_mm512_srai_epi32(shifted, 23))};
+}
+
+// Append to `out` base + step * lane for every lane set; may write 16 entries; return the count.
+RF_INLINE int append_offsets(uint16_t* out, uint32_t mask, int base, int step) {
+    const __m512i lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    const __m512i offset = _mm512_add_epi32(
+        _mm512_set1_epi32(base), _mm512_mullo_epi32(lane, _mm512_set1_epi32(step)));
+    const __m512i packed = _mm512_maskz_compress_epi32(static_cast<Mask>(mask), offset);
+    _mm256_storeu_si256(reinterpret_cast<__m256i*>(out), _mm512_cvtepi32_epi16(packed));
+    return __builtin_popcount(mask);
+}
+
+// columns[j] lane i = rows[16 * i + j].
+RF_INLINE void transpose(const float* rows, Lanes* columns) {
+    __m512 a[16], t[16];
+    for (int i = 0; i < 16; ++i) a[i] = _mm512_load_ps(rows + 16 * i);
+    for (int i = 0; i < 8; ++i) {
+        t[2 * i] = _mm512_unpacklo_ps(a[2 * i], a[2 * i + 1]);
+        t[2 * i + 1] = _mm512_unpackhi_ps(a[2 * i], a[2 * i + 1]);
+    }
+    for (int i = 0; i < 4; ++i) {
+        for (int h = 0; h < 2; ++h) {
+            const __m512d low = _mm512_castps_pd(t[4 * i + h]);
+            const __m512d high = _mm512_castps_pd(t[4 * i + 2 + h]);
+            a[4 * i + 2 * h] = _mm512_castpd_ps(_mm512_unpacklo_pd(low, high));
+            a[4 * i + 2 * h + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(low, high));
+        }
+    }
+    for (int j = 0; j < 4; ++j) {
+        const __m512 x0 = _mm512_shuffle_f32x4(a[j], a[4 + j], 0x88);
+        const __m512 x1 = _mm512_shuffle_f32x4(a[j], a[4 + j], 0xdd);
+        const __m512 y0 = _mm512_shuffle_f32x4(a[8 + j], a[12 + j], 0x88);
+        const __m512 y1 = _mm512_shuffle_f32x4(a[8 + j], a[12 + j], 0xdd);
+        columns[j].v = _mm512_shuffle_f32x4(x0, y0, 0x88);
+        columns[8 + j].v = _mm512_shuffle_f32x4(x0, y0, 0xdd);
+        columns[4 + j].v = _mm512_shuffle_f32x4(x1, y1, 0x88);
+        columns[12 + j].v = _mm512_shuffle_f32x4(x1, y1, 0xdd);
+    }
+}
+
+}  // namespace

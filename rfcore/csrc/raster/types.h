@@ -1,0 +1,106 @@
+// What the kernels of every instruction set and the code around them share: plain data only.
+//
+// Gaussians are held in blocks of 16: every quantity is a plane of 16 floats, the planes of one
+// block follow each other (array of structures of arrays), so one vector load reads one quantity
+// of 16 Gaussians. Lane i of block b is Gaussian 16 b + i.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace rfcore::raster {
+
+constexpr int kLanes = 16;
+constexpr int kTileSide = 16;
+constexpr int kBlockSide = 4;
+constexpr int kBlocksPerTile = 16;
+constexpr int kMaxDegree = 3;
+
+constexpr int coefficients_of(int degree) { return (degree + 1) * (degree + 1); }
+
+// Planes of a block of parameters; the 3 K planes of spherical harmonics follow, k-th coefficient,
+// channel c at kShPlane + 3 k + c.
+enum ParameterPlane { kMeanPlane = 0, kScalePlane = 3, kQuaternionPlane = 6, kLogitPlane = 10 };
+constexpr int kShPlane = 11;
+constexpr int parameter_planes(int degree) { return kShPlane + 3 * coefficients_of(degree); }
+
+// Planes of a block of geometry, what rendering needs instead of scales, quaternion and logit:
+// mean, the root R S of the covariance (row-major), log2 of the opacity.
+enum GeometryPlane { kRootPlane = 3, kLog2OpacityPlane = 12 };
+constexpr int kGeometryPlanes = 13;
+
+struct Camera {
+    float rotation[9];     // cam_from_world, row-major
+    float translation[3];  // cam_from_world, m
+    float position[3];     // of the camera in the world, m
+    float fx, fy, cx, cy;  // px
+    int width, height;     // px
+
+    int tiles_x() const { return (width + kTileSide - 1) / kTileSide; }
+    int tiles_y() const { return (height + kTileSide - 1) / kTileSide; }
+};
+
+// One projected Gaussian. With d = pixel - centre, u = a dx + b dy and v = c dy, its alpha is
+// 2^(power - 8 - u^2 - v^2): the Cholesky factor of the conic, scaled by sqrt(log2(e) / 2).
+struct alignas(64) Splat {
+    float a, b, c;
+    float power;  // log2(256 opacity)
+    float red, green, blue;
+    float depth;               // z in the camera, m
+    float centre_x, centre_y;  // px
+    float half_x, half_y;      // half sides of the box outside which alpha < 1/255, px
+    float cutoff;              // u^2 + v^2 above this means alpha < 1/255, with a margin
+    float y_per_x;             // where alpha is largest on a vertical line: dy = y_per_x dx
+    float x_per_y;             // and on a horizontal one: dx = x_per_y dy
+    float unused;
+};
+static_assert(sizeof(Splat) == 64, "one cache line");
+
+// A visible splat on its way through the depth sort, with the tiles its box covers (inclusive).
+struct SortItem {
+    uint32_t depth_bits;
+    uint32_t id;
+    uint16_t tile_x0, tile_x1, tile_y0, tile_y1;
+};
+
+struct ProjectJob {
+    const Camera* camera;
+    const float* geometry;    // rendering: [blocks][kGeometryPlanes][16]
+    const float* harmonics;   // rendering: [blocks][3 K][16]
+    const float* parameters;  // training: [blocks][11 + 3 K][16]; the two above are unused then
+    int stored_degree;        // K = coefficients_of(stored_degree)
+    Splat* splats;            // [16 blocks]
+};
+
+// Tiles of one splat, row by row, as a stream of words: the number of spans, then the spans.
+constexpr uint32_t pack_span(uint32_t row, uint32_t first, uint32_t last) {
+    return row << 20 | first << 10 | last;
+}
+constexpr uint32_t span_row(uint32_t span) { return span >> 20; }
+constexpr uint32_t span_first(uint32_t span) { return span >> 10 & 1023; }
+constexpr uint32_t span_last(uint32_t span) { return span & 1023; }
+
+struct SpanJob {
+    const Camera* camera;
+    const Splat* splats;
+    uint32_t* tile_counts;  // [tiles], incremented
+};
+
+struct BlendCounts {
+    uint64_t useful;      // (pixel, splat) pairs that changed the picture
+    uint64_t evaluated;   // lanes evaluated for them
+    uint64_t tile_entries;  // (tile, splat) pairs looked at
+};
+
+struct BlendJob {
+    const Camera* camera;
+    const Splat* splats;
+    const uint32_t* entries;       // splat ids, tile by tile, front to back
+    const uint32_t* tile_offsets;  // [tiles + 1]
+    float* colour;                 // [H, W, 3]
+    float* depth;                  // [H, W], null when not wanted
+    float* opacity;                // [H, W], null when not wanted
+    BlendCounts* counts;           // null when not wanted
+};
+
+}  // namespace rfcore::raster

@@ -1,0 +1,44 @@
+"""Bit-exact kernels of rfcore; use the wrappers in rfcore.native."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+# --- raster -----------------------------------------------------------------
+
+_F32 = NDArray[np.float32]
+
+def available_isas() -> list[str]: ...
+
+class RasterCamera:
+    def __init__(self, numbers: Sequence[float], width: int, height: int) -> None: ...
+
+class Rasterizer:
+    def __init__(
+        self,
+        means: _F32,
+        quaternions: _F32,
+        log_scales: _F32,
+        opacity_logits: _F32,
+        sh: _F32,
+        threads: int,
+        isa: str,
+    ) -> None: ...
+    @property
+    def isa(self) -> str: ...
+    def render(self, camera: RasterCamera, colour: _F32, depth: _F32, opacity: _F32) -> None: ...
+    def render_colour(self, camera: RasterCamera, colour: _F32) -> None: ...
+    def statistics(self, camera: RasterCamera) -> tuple[int, int, int, int, int]: ...
+
+# --- yuv --------------------------------------------------------------------
+
+def i420_from_colour(
+    colour: NDArray[np.float32], y: NDArray[np.uint8], u: NDArray[np.uint8], v: NDArray[np.uint8]
+) -> int: ...
+def i420_from_rgb(
+    rgb: NDArray[np.uint8], y: NDArray[np.uint8], u: NDArray[np.uint8], v: NDArray[np.uint8]
+) -> None: ...
+def rgb_from_i420(
+    y: NDArray[np.uint8], u: NDArray[np.uint8], v: NDArray[np.uint8], rgb: NDArray[np.uint8]
+) -> None: ...

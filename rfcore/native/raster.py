@@ -1,0 +1,136 @@
+"""The compiled 3D Gaussian Splatting rasterizer, arrays in and arrays out.
+
+Same function as ``rfcore.raster.reference``, in float32 and bit-exact: the same Gaussians and
+camera give the same bytes on every instruction set and for every number of threads.
+
+What float32 cannot express is not drawn: Gaussians nearer than 0.01 m or beyond 1e9 m along the
+optical axis, or wider than 1e9 px in the picture. Colours are limited to 0..1e18. A quaternion
+shorter than 1e-12 is not normalised; zero means no rotation.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera
+from rfcore.errors import BackendUnavailable, InvalidInput
+from rfcore.native import _native
+
+__all__ = [
+    "MAX_THREADS",
+    "GaussianArrays",
+    "NativeRasterizer",
+    "RasterStatistics",
+    "available_isas",
+    "check_backend",
+    "native_camera",
+]
+
+F32 = NDArray[np.float32]
+GaussianArrays = tuple[F32, F32, F32, F32, F32]
+"""means [N, 3], quaternions [N, 4], log scales [N, 3], opacity logits [N], SH [N, K, 3]."""
+
+MAX_THREADS = 256
+
+
+@dataclass(frozen=True)
+class RasterStatistics:
+    """What one picture cost, counted by the same loop that draws it."""
+
+    visible: int
+    """Gaussians that could colour a pixel."""
+    tile_entries: int
+    """Overlaps of Gaussians and 16x16 tiles."""
+    tile_entries_visited: int
+    """Those looked at before their tile was opaque."""
+    useful_blends: int
+    """(pixel, Gaussian) pairs that changed the picture."""
+    evaluated_blends: int
+    """Lanes evaluated for them."""
+    blends_per_px: float
+    """Useful blends per pixel."""
+
+
+def available_isas() -> tuple[str, ...]:
+    """Return the instruction sets this machine can run, best first, ``scalar`` last."""
+    return tuple(_native.available_isas())
+
+
+def check_backend(threads: int, isa: str | None) -> str:
+    """Return the instruction set to use.
+
+    Raises ``BackendUnavailable`` for one this machine lacks, ``InvalidInput`` for a number of
+    threads outside 1..256.
+    """
+    if not 1 <= threads <= MAX_THREADS:
+        raise InvalidInput("threads", f"{threads} is outside 1..{MAX_THREADS}")
+    present = available_isas()
+    if isa is not None and isa not in present:
+        raise BackendUnavailable(
+            f"instruction set {isa!r} is not available here; choose from {', '.join(present)}"
+        )
+    return present[0] if isa is None else isa
+
+
+def native_camera(camera: Camera) -> _native.RasterCamera:
+    """Return the camera as the kernels take it: float32, rounded once from float64."""
+    k, pose = camera.intrinsics, camera.cam_from_world()
+    rotation = [value for row in pose.rotation_matrix() for value in row]
+    numbers = [*rotation, *pose.translation_m, *camera.world_from_cam.translation_m]
+    numbers += [k.fx_px, k.fy_px, k.cx_px, k.cy_px]
+    if not np.isfinite(np.array(numbers, dtype=np.float32)).all():
+        raise InvalidInput("camera", "a value is beyond the range of float32; move the tile origin")
+    return _native.RasterCamera(numbers, k.width_px, k.height_px)
+
+
+class NativeRasterizer:
+    """A copy of one set of Gaussians, prepared for rendering; calls are serialised by a lock."""
+
+    def __init__(self, arrays: GaussianArrays, *, threads: int, isa: str | None) -> None:
+        self.isa = check_backend(threads, isa)
+        self.threads = threads
+        self._native = _native.Rasterizer(*arrays, threads, self.isa)
+        self._lock = threading.Lock()
+
+    def render(self, camera: Camera) -> tuple[F32, F32, F32]:
+        """Render colour [H, W, 3], depth [H, W] in metres and opacity [H, W].
+
+        Raises ``InvalidInput`` when the Gaussians overlap more than 2^30 tiles.
+        """
+        shape = (camera.intrinsics.height_px, camera.intrinsics.width_px)
+        colour, depth, opacity = (np.empty(s, np.float32) for s in ((*shape, 3), shape, shape))
+        view = native_camera(camera)
+        with self._lock, overlaps_limited():
+            self._native.render(view, colour, depth, opacity)
+        return colour, depth, opacity
+
+    def render_colour(self, camera: Camera) -> F32:
+        """Render colour [H, W, 3] alone: the same bytes as ``render``'s, a little sooner."""
+        colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
+        view = native_camera(camera)
+        with self._lock, overlaps_limited():
+            self._native.render_colour(view, colour)
+        return colour
+
+    def statistics(self, camera: Camera) -> RasterStatistics:
+        """Count what rendering this view takes; slower than rendering it."""
+        view = native_camera(camera)
+        with self._lock, overlaps_limited():
+            counts = self._native.statistics(view)
+        pixels = camera.intrinsics.width_px * camera.intrinsics.height_px
+        return RasterStatistics(*counts, blends_per_px=counts[3] / pixels)
+
+
+class overlaps_limited:  # noqa: N801 - reads as a condition in a with statement
+    """Turn the kernels' refusal of too many overlaps into ``InvalidInput``."""
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, ValueError) and not isinstance(error, InvalidInput):
+            raise InvalidInput("gaussians", str(error)) from error

@@ -1,0 +1,82 @@
+"""Checks of single values that came from a peer or a file.
+
+Each raises ``InvalidInput`` naming the field, the value and the limit. What a dataclass of
+``rfcore`` already checks (intrinsics, poses) is left to it.
+"""
+
+from __future__ import annotations
+
+import re
+
+from rfcore.errors import InvalidInput
+
+__all__ = [
+    "FIELD_ID_PREFIX_BYTES",
+    "MAX_CAMERAS",
+    "MAX_FIELDS",
+    "MAX_PAYLOAD_BYTES",
+    "MAX_TRANSLATION_M",
+    "check_bytes",
+    "check_field_id",
+    "check_name",
+    "check_range",
+    "shown",
+]
+
+MAX_CAMERAS = 16
+"""Cameras in one Hello."""
+
+MAX_FIELDS = 64
+"""Fields in one Hello or FieldNotice."""
+
+MAX_PAYLOAD_BYTES = 1_000_000
+"""One picture's P slice; with its header it stays below the 1 MiB receive limit."""
+
+MAX_TRANSLATION_M = 1e6
+"""A pose this far from its tile's origin belongs to another tile."""
+
+FIELD_ID_PREFIX_BYTES = 8
+"""Of the 32 bytes of a field's sha256, how many each frame repeats."""
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+FIELD_ID = re.compile(r"[0-9a-f]{64}")
+
+
+def shown(text: str) -> str:
+    """Return untrusted text as it may stand in a message: quoted, escaped, at most 80 long."""
+    return ascii(text if len(text) <= 80 else text[:77] + "...")
+
+
+def check_name(field: str, name: str) -> str:
+    """Return a vehicle or camera id; it also has to serve as the name of a folder."""
+    if not NAME.fullmatch(name):
+        raise InvalidInput(
+            field,
+            f"{shown(name)} must be 1 to 64 letters, digits, '.', '_' or '-', "
+            "beginning with a letter or digit",
+        )
+    return name
+
+
+def check_field_id(field: str, field_id: str) -> str:
+    """Return a field id."""
+    if not FIELD_ID.fullmatch(field_id):
+        raise InvalidInput(
+            field, f"{shown(field_id)} must be the 64 hexadecimal digits of a sha256"
+        )
+    return field_id
+
+
+def check_bytes(field: str, value: bytes, shortest: int, longest: int) -> bytes:
+    """Return ``value`` if it is ``shortest..longest`` bytes long."""
+    if not shortest <= len(value) <= longest:
+        limit = f"{shortest}" if shortest == longest else f"{shortest}..{longest}"
+        raise InvalidInput(field, f"{len(value)} bytes, expected {limit}")
+    return value
+
+
+def check_range(field: str, value: float, lowest: float, highest: float) -> float:
+    """Return ``value`` if it is in ``lowest..highest``; NaN never is."""
+    if not lowest <= value <= highest:
+        raise InvalidInput(field, f"{value} is outside {lowest:g}..{highest:g}")
+    return value

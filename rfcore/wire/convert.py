@@ -1,0 +1,222 @@
+"""Vehicle to server: between protobuf and the values of ``rfcore.wire.messages``, both ways.
+
+Everything that comes from a peer is checked here, once: finite, unit quaternion, ranges, sizes,
+names. A bad value raises ``InvalidInput`` with the dotted name of the field as the proto has it;
+one that spoils a single frame raises ``FrameRefused``, which also says which frame to answer for.
+"""
+
+from __future__ import annotations
+
+from google.protobuf.message import DecodeError
+
+from rfcore.camera import Intrinsics, Pose
+from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
+from rfcore.errors import InvalidInput
+from rfcore.wire.checks import (
+    FIELD_ID_PREFIX_BYTES,
+    MAX_CAMERAS,
+    MAX_FIELDS,
+    MAX_PAYLOAD_BYTES,
+    MAX_TRANSLATION_M,
+    check_bytes,
+    check_field_id,
+    check_name,
+    check_range,
+)
+from rfcore.wire.messages import (
+    CameraDescription,
+    ClientMessage,
+    Frame,
+    FrameAddress,
+    Hello,
+    RendererContract,
+)
+from rfcore.wire.v1 import edge_pb2 as pb
+
+__all__ = ["FrameRefused", "client_message_from_bytes", "client_message_to_bytes"]
+
+
+class FrameRefused(InvalidInput):
+    """One frame carries a value that cannot be; ``address`` says which frame."""
+
+    def __init__(self, error: InvalidInput, address: FrameAddress) -> None:
+        super().__init__(error.field, error.problem)
+        self.address = address
+
+
+def client_message_from_bytes(data: bytes) -> ClientMessage:
+    """Parse and check what a vehicle sent.
+
+    Raises ``FrameRefused`` for a frame with a bad value, ``InvalidInput`` for anything else.
+    """
+    request = pb.StreamRequest()
+    try:
+        request.ParseFromString(data)
+    except DecodeError as error:
+        raise InvalidInput("message", f"{len(data)} bytes are not a StreamRequest") from error
+    match request.WhichOneof("message"):
+        case "hello":
+            return _hello_from_wire(request.hello)
+        case "frame":
+            return _frame_or_refusal(request.frame)
+    raise InvalidInput("message", "is neither hello nor frame")
+
+
+def client_message_to_bytes(message: ClientMessage) -> bytes:
+    """Serialise a vehicle's message; its length is the packet size."""
+    if isinstance(message, Hello):
+        return pb.StreamRequest(hello=_hello_to_wire(message)).SerializeToString()
+    return pb.StreamRequest(frame=_frame_to_wire(message)).SerializeToString()
+
+
+def _hello_from_wire(hello: pb.Hello) -> Hello:
+    check_range("hello.cameras", len(hello.cameras), 1, MAX_CAMERAS)
+    check_range("hello.field_ids", len(hello.field_ids), 1, MAX_FIELDS)
+    cameras = tuple(
+        _camera_from_wire(f"hello.cameras[{i}]", camera) for i, camera in enumerate(hello.cameras)
+    )
+    if len({camera.camera_id for camera in cameras}) != len(cameras):
+        raise InvalidInput("hello.cameras", "two cameras have the same camera_id")
+    return Hello(
+        check_name("hello.vehicle_id", hello.vehicle_id),
+        cameras,
+        tuple(check_field_id(f"hello.field_ids[{i}]", f) for i, f in enumerate(hello.field_ids)),
+        RendererContract(
+            check_name("hello.renderer.name", hello.renderer.name), hello.renderer.exact
+        ),
+    )
+
+
+def _camera_from_wire(field: str, camera: pb.CameraDescription) -> CameraDescription:
+    k, header = camera.intrinsics, camera.codec
+    try:
+        intrinsics = Intrinsics(k.width_px, k.height_px, k.fx_px, k.fy_px, k.cx_px, k.cy_px)
+        codec = _codec_from_wire(header)
+    except InvalidInput as error:
+        raise InvalidInput(f"{field}.{error.field}", error.problem) from error
+    for side in ("width_px", "height_px"):
+        if getattr(header, side) != getattr(k, side):
+            raise InvalidInput(
+                f"{field}.codec.{side}",
+                f"{getattr(header, side)} px, but intrinsics.{side} is {getattr(k, side)} px",
+            )
+    return CameraDescription(check_name(f"{field}.camera_id", camera.camera_id), intrinsics, codec)
+
+
+def _codec_from_wire(header: pb.CodecHeader) -> StreamHeader:
+    return StreamHeader(
+        CodecConfig(
+            header.width_px, header.height_px, check_name("codec.preset", header.preset), header.crf
+        ),
+        check_bytes("codec.sps", header.sps, 4, 1024),
+        check_bytes("codec.pps", header.pps, 2, 1024),
+    )
+
+
+def _hello_to_wire(hello: Hello) -> pb.Hello:
+    return pb.Hello(
+        vehicle_id=hello.vehicle_id,
+        cameras=[_camera_to_wire(camera) for camera in hello.cameras],
+        field_ids=hello.field_ids,
+        renderer=pb.RendererContract(name=hello.renderer.name, exact=hello.renderer.exact),
+    )
+
+
+def _camera_to_wire(camera: CameraDescription) -> pb.CameraDescription:
+    k, config = camera.intrinsics, camera.codec.config
+    return pb.CameraDescription(
+        camera_id=camera.camera_id,
+        intrinsics=pb.Intrinsics(
+            width_px=k.width_px,
+            height_px=k.height_px,
+            fx_px=k.fx_px,
+            fy_px=k.fy_px,
+            cx_px=k.cx_px,
+            cy_px=k.cy_px,
+        ),
+        codec=pb.CodecHeader(
+            width_px=config.width_px,
+            height_px=config.height_px,
+            preset=config.preset,
+            crf=config.crf,
+            sps=camera.codec.sps,
+            pps=camera.codec.pps,
+        ),
+    )
+
+
+def _frame_or_refusal(frame: pb.Frame) -> Frame:
+    try:
+        return _frame_from_wire(frame)
+    except InvalidInput as error:
+        address = FrameAddress(frame.camera_id[:64], frame.epoch, frame.sequence)
+        raise FrameRefused(error, address) from error
+
+
+def _frame_from_wire(frame: pb.Frame) -> Frame:
+    if frame.references != pb.REFERENCES_RENDER:
+        raise InvalidInput(
+            "frame.references", f"{frame.references} is not REFERENCES_RENDER (the only one here)"
+        )
+    check_range("frame.capture_time_ns", frame.capture_time_ns, 0, 2**63 - 1)
+    prefix = check_bytes(
+        "frame.field_id_prefix",
+        frame.field_id_prefix,
+        FIELD_ID_PREFIX_BYTES,
+        FIELD_ID_PREFIX_BYTES,
+    )
+    return Frame(
+        check_name("frame.camera_id", frame.camera_id),
+        frame.capture_time_ns,
+        _pose_from_wire(frame.pose),
+        prefix,
+        _packet_from_wire(frame),
+    )
+
+
+def _pose_from_wire(pose: pb.Pose) -> Pose:
+    """Return a checked pose; ``Pose`` itself refuses what is not finite or not a rotation."""
+    checked = Pose(
+        (pose.x_m, pose.y_m, pose.z_m),
+        (pose.rotation_w, pose.rotation_x, pose.rotation_y, pose.rotation_z),
+    )
+    for axis, value in zip("xyz", checked.translation_m, strict=True):
+        check_range(f"pose.{axis}_m", value, -MAX_TRANSLATION_M, MAX_TRANSLATION_M)
+    return checked
+
+
+def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
+    check_range("frame.sequence", frame.sequence, 0, 2**63 - 1)
+    return DeltaPacket(
+        epoch=frame.epoch,
+        sequence=frame.sequence,
+        reference_digest=check_bytes("frame.reference_digest", frame.reference_digest, 16, 16),
+        reference_coarse=check_bytes("frame.reference_coarse", frame.reference_coarse, 64, 64),
+        reconstruction_digest=check_bytes(
+            "frame.reconstruction_digest", frame.reconstruction_digest, 16, 16
+        ),
+        payload=check_bytes("frame.payload", frame.payload, 1, MAX_PAYLOAD_BYTES),
+        crc32=frame.crc32,
+    )
+
+
+def _frame_to_wire(frame: Frame) -> pb.Frame:
+    packet, pose = frame.packet, frame.pose
+    x_m, y_m, z_m = pose.translation_m
+    w, x, y, z = pose.rotation
+    return pb.Frame(
+        camera_id=frame.camera_id,
+        epoch=packet.epoch,
+        sequence=packet.sequence,
+        capture_time_ns=frame.capture_time_ns,
+        pose=pb.Pose(
+            x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
+        ),
+        field_id_prefix=frame.field_id_prefix,
+        references=pb.References.Value(f"REFERENCES_{frame.references.name}"),
+        reference_digest=packet.reference_digest,
+        reference_coarse=packet.reference_coarse,
+        reconstruction_digest=packet.reconstruction_digest,
+        payload=packet.payload,
+        crc32=packet.crc32,
+    )

@@ -1,0 +1,1 @@
+"""Generated from proto/rfcore/wire/v1 by `make proto`; do not edit."""

@@ -1,0 +1,85 @@
+"""When pictures are captured, on a clock that the test holds."""
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cav_agent.frames import Capture, FrameResult, Outcome
+from cav_agent.pace import Lockstep, Realtime
+from rfcore.errors import InvalidInput, RfedgeError
+
+MakeCapture = Callable[..., Capture]
+
+
+def test_realtime_captures_on_the_beat_and_does_not_drift() -> None:
+    pace = Realtime(3, rate_hz=10.0)
+    assert pace.next_capture(100.0) == 0
+    assert pace.next_capture(100.05) is None
+    assert pace.get_timer() == pytest.approx(100.1)
+    assert pace.next_capture(100.17) == 1
+    assert pace.get_timer() == pytest.approx(100.2), "lateness does not move the beat"
+    assert pace.next_capture(100.2) == 2
+    assert pace.finished
+    assert pace.get_timer() is None
+
+
+@given(st.integers(1, 20), st.floats(0.5, 100), st.lists(st.floats(0, 5), max_size=40))
+def test_realtime_captures_each_picture_once_and_never_early(
+    pictures: int, rate_hz: float, steps: list[float]
+) -> None:
+    pace, now, captured = Realtime(pictures, rate_hz), 0.0, []
+    for step in steps:
+        while (index := pace.next_capture(now)) is not None:
+            assert now * rate_hz >= index - 1e-9
+            captured.append(index)
+        now += step
+    assert captured == list(range(len(captured)))
+
+
+def test_a_loop_begins_again() -> None:
+    pace = Realtime(2, rate_hz=1.0, loop=True)
+    assert [pace.next_capture(float(t)) for t in range(5)] == [0, 1, 0, 1, 0]
+    assert not pace.finished
+
+
+def test_lockstep_waits_for_the_answer(make_capture: MakeCapture) -> None:
+    pace = Lockstep(2)
+    assert pace.next_capture(0.0) == 0
+    assert pace.next_capture(9.0) is None
+    pace.ended(FrameResult(make_capture(0), Outcome.ACKED))
+    assert pace.next_capture(9.0) == 1
+    pace.ended(FrameResult(make_capture(1), Outcome.NACKED, "crc_mismatch"))
+    assert pace.finished
+
+
+def test_lockstep_captures_a_lost_picture_again(make_capture: MakeCapture) -> None:
+    pace = Lockstep(2)
+    assert pace.next_capture(0.0) == 0
+    pace.ended(FrameResult(make_capture(0), Outcome.LOST, "UNAVAILABLE"))
+    assert pace.next_capture(1.0) == 0
+
+
+def test_lockstep_gives_up_a_picture_that_is_always_lost(make_capture: MakeCapture) -> None:
+    pace = Lockstep(2)
+    for _ in range(4):
+        pace.next_capture(0.0)
+        pace.ended(FrameResult(make_capture(0), Outcome.LOST, "no answer"))
+    pace.next_capture(0.0)
+    with pytest.raises(RfedgeError, match=r"picture 000.png was lost 5 times: no answer"):
+        pace.ended(FrameResult(make_capture(0), Outcome.LOST, "no answer"))
+
+
+def test_lockstep_stops_at_a_picture_that_cannot_be_coded(make_capture: MakeCapture) -> None:
+    pace = Lockstep(2)
+    pace.next_capture(0.0)
+    with pytest.raises(RfedgeError, match=r"000.png could not be coded: not a readable picture"):
+        pace.ended(FrameResult(make_capture(0), Outcome.DROPPED, "not a readable picture"))
+
+
+def test_an_empty_drive_and_a_senseless_rate_are_refused() -> None:
+    with pytest.raises(InvalidInput, match="drive: has no pictures"):
+        Lockstep(0)
+    with pytest.raises(InvalidInput, match=r"rate: 0.0 Hz"):
+        Realtime(1, 0.0)

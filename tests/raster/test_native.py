@@ -1,0 +1,180 @@
+"""The native renderer: equal to the float64 definition, and to itself wherever it runs."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.errors import BackendUnavailable, InvalidInput
+from rfcore.raster import reference
+from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.native import Rasterizer, available_isas
+from rfcore.views import View
+
+SceneMaker = Callable[..., Gaussians]
+CameraMaker = Callable[..., Camera]
+
+FORWARD_TOLERANCE = 1e-5
+"""exp2 is good to 2.6e-6; weights sum to at most 1, colours here stay below 3."""
+
+
+def view_bytes(view: View) -> bytes:
+    return view.colour.tobytes() + view.depth.tobytes() + view.opacity.tobytes()
+
+
+def on_axis(opacity_logit: float = 0.0, depth_m: float = 4.0, scale_m: float = 0.2) -> Gaussians:
+    f32 = np.float32
+    return Gaussians(
+        np.array([[0, 0, depth_m]], f32),
+        np.array([[1, 0, 0, 0]], f32),
+        np.full((1, 3), np.log(scale_m), f32),
+        np.array([opacity_logit], f32),
+        np.full((1, 1, 3), 1.0, f32),
+    )
+
+
+def forward_camera(width_px: int = 33, height_px: int = 17) -> Camera:
+    half = (0.5 * width_px, 0.5 * height_px)
+    return Camera(Intrinsics(width_px, height_px, 40.0, 40.0, *half), Pose.identity())
+
+
+def test_every_instruction_set_and_thread_count_gives_the_same_bytes(
+    scene: SceneMaker, camera: CameraMaker, isa: str, threads: int
+) -> None:
+    definition = Rasterizer(scene(700), isa="scalar").render(camera())
+    view = Rasterizer(scene(700), threads=threads, isa=isa).render(camera())
+    assert view_bytes(view) == view_bytes(definition)
+    assert 0.2 < float(view.opacity.mean()) < 0.95
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("size_px", [(67, 45), (16, 16), (1, 1), (3, 50)])
+def test_colour_depth_and_opacity_follow_the_float64_definition(
+    scene: SceneMaker, camera: CameraMaker, degree: int, size_px: tuple[int, int]
+) -> None:
+    gaussians, view_from = scene(200, degree), camera(*size_px)
+    view = Rasterizer(gaussians).render(view_from)
+    colour, depth, opacity = reference.render(reference.parameters(gaussians), view_from)
+    error = np.abs(view.colour - colour.numpy()).max(axis=2)
+    assert_close_but_for_flips(error, view.depth - depth.numpy(), view.opacity - opacity.numpy())
+
+
+def assert_close_but_for_flips(
+    colour_error: np.ndarray, depth_error: np.ndarray, opacity_error: np.ndarray
+) -> None:
+    """A pixel whose alpha or transmittance rounds across a threshold may differ by one weight."""
+    flipped = np.abs(opacity_error) > FORWARD_TOLERANCE
+    assert flipped.mean() <= 0.002
+    assert colour_error[~flipped].max(initial=0) < FORWARD_TOLERANCE
+    assert np.abs(depth_error[~flipped]).max(initial=0) < 7.0 * FORWARD_TOLERANCE
+
+
+def test_one_gaussian_on_the_axis_has_the_value_of_algebra() -> None:
+    view = Rasterizer(on_axis()).render(forward_camera())
+    variance_px2 = (40.0 * 0.2 / 4.0) ** 2 + 0.3
+    colour = 0.5 + 0.28209479177387814
+    for dx, dy in [(0, 0), (1, 0), (0, -2), (-3, 2)]:
+        alpha = 0.5 * np.exp(-0.5 * (dx * dx + dy * dy) / variance_px2)
+        pixel = (8 + dy, 16 + dx)
+        assert view.opacity[pixel] == pytest.approx(alpha, abs=3e-6)
+        assert view.colour[pixel] == pytest.approx(np.full(3, alpha * colour), abs=3e-6)
+        assert view.depth[pixel] == pytest.approx(4.0, rel=1e-6)
+
+
+def test_an_empty_field_is_black_transparent_and_at_depth_zero() -> None:
+    empty = Gaussians(*(a[:0] for a in _arrays(on_axis())))
+    view = Rasterizer(empty).render(forward_camera())
+    assert not view.colour.any()
+    assert not view.opacity.any()
+    assert not view.depth.any()
+
+
+def test_a_field_behind_the_camera_draws_nothing(scene: SceneMaker) -> None:
+    turned = Camera(forward_camera().intrinsics, Pose((0, 0, -1), (0.0, 0.0, 1.0, 0.0)))
+    view = Rasterizer(scene(100)).render(turned)
+    assert not view.opacity.any()
+
+
+def test_splats_behind_an_opaque_wall_change_nothing(scene: SceneMaker) -> None:
+    wall = on_axis(opacity_logit=20.0, depth_m=0.5, scale_m=50.0)
+    walls = _joined(*[wall] * 6, degree=3)
+    behind = _joined(*[wall] * 6, scene(300), degree=3)
+    alone = Rasterizer(walls).render(forward_camera())
+    assert view_bytes(Rasterizer(behind).render(forward_camera())) == view_bytes(alone)
+
+
+def test_the_order_of_the_input_matters_to_ties_only(
+    scene: SceneMaker, camera: CameraMaker
+) -> None:
+    gaussians = scene(400)
+    order = np.random.default_rng(7).permutation(400)
+    shuffled = Gaussians(*(np.ascontiguousarray(a[order]) for a in _arrays(gaussians)))
+    assert view_bytes(Rasterizer(shuffled).render(camera())) == view_bytes(
+        Rasterizer(gaussians).render(camera())
+    )
+
+
+def test_equal_depths_are_drawn_in_index_order() -> None:
+    red, blue = on_axis(3.0), on_axis(3.0)
+    red.sh[0, 0] = (1.5, -1.5, -1.5)
+    blue.sh[0, 0] = (-1.5, -1.5, 1.5)
+    first = Rasterizer(_joined(red, blue)).render(forward_camera()).colour[8, 16]
+    second = Rasterizer(_joined(blue, red)).render(forward_camera()).colour[8, 16]
+    assert first[0] > 5 * first[2]
+    assert second[2] > 5 * second[0]
+
+
+def test_colour_alone_is_the_colour_of_the_view(scene: SceneMaker, camera: CameraMaker) -> None:
+    rasterizer = Rasterizer(scene(300))
+    view = rasterizer.render(camera())
+    assert rasterizer.render_colour(camera()).tobytes() == view.colour.tobytes()
+
+
+def test_statistics_count_every_weight_of_a_picture() -> None:
+    statistics = Rasterizer(on_axis()).statistics(forward_camera())
+    opacity = Rasterizer(on_axis()).render(forward_camera()).opacity
+    assert statistics.visible == 1
+    assert statistics.useful_blends == np.count_nonzero(opacity)
+    assert statistics.blends_per_px == pytest.approx(np.mean(opacity > 0))
+
+
+def test_an_instruction_set_this_machine_lacks_is_refused_by_name() -> None:
+    with pytest.raises(BackendUnavailable, match="'vax'.*scalar"):
+        Rasterizer(on_axis(), isa="vax")
+
+
+@pytest.mark.parametrize("threads", [0, -1, 257])
+def test_a_number_of_threads_out_of_range_is_refused(threads: int) -> None:
+    with pytest.raises(InvalidInput, match=f"threads: {threads}"):
+        Rasterizer(on_axis(), threads=threads)
+
+
+def test_the_scalar_kernels_are_always_there() -> None:
+    assert available_isas()[-1] == "scalar"
+
+
+def _arrays(g: Gaussians) -> tuple[np.ndarray, ...]:
+    return (g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh)
+
+
+def _joined(*parts: Gaussians, degree: int = 0) -> Gaussians:
+    coefficients = (degree + 1) ** 2
+    padded = [
+        (*_arrays(p)[:4], np.pad(p.sh, ((0, 0), (0, coefficients - p.sh.shape[1]), (0, 0))))
+        for p in parts
+    ]
+    return Gaussians(*(np.concatenate(column) for column in zip(*padded, strict=True)))
+
+
+def test_torch_runs_beside_the_threads_of_the_rasterizer(
+    scene: SceneMaker, camera: CameraMaker
+) -> None:
+    rasterizer = Rasterizer(scene(50), threads=2)
+    before = view_bytes(rasterizer.render(camera()))
+    torch.set_flush_denormal(True)
+    try:
+        assert view_bytes(rasterizer.render(camera())) == before
+    finally:
+        torch.set_flush_denormal(False)

@@ -1,0 +1,38 @@
+"""A plain Hello and a plain Frame, for the tests to vary."""
+
+import zlib
+
+import pytest
+
+from rfcore.camera import Intrinsics, Pose
+from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
+from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
+
+INTRINSICS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)
+PAYLOAD = bytes(range(200))
+
+
+@pytest.fixture
+def hello() -> Hello:
+    header = StreamHeader(CodecConfig(32, 16, "medium", 23.0), b"\x67" * 20, b"\x68" * 5)
+    return Hello(
+        "cav-1",
+        (CameraDescription("front", INTRINSICS, header),),
+        ("ab" * 32,),
+        RendererContract("splats-f32-1", exact=True),
+    )
+
+
+@pytest.fixture
+def frame() -> Frame:
+    packet = DeltaPacket(
+        epoch=3,
+        sequence=41,
+        reference_digest=b"r" * 16,
+        reference_coarse=b"c" * 64,
+        reconstruction_digest=b"d" * 16,
+        payload=PAYLOAD,
+        crc32=zlib.crc32(PAYLOAD),
+    )
+    pose = Pose((1.5, -2.25, 1.6), (0.5, 0.5, -0.5, 0.5))
+    return Frame("front", 1_700_000_000_000_000_000, pose, bytes.fromhex("ab" * 8), packet)

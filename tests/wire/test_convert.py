@@ -1,0 +1,188 @@
+"""What goes over the wire comes back equal; what cannot be is refused by name."""
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rfcore.camera import Pose
+from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
+from rfcore.wire.convert import (
+    FrameRefused,
+    client_message_from_bytes,
+    client_message_to_bytes,
+)
+from rfcore.wire.convert_answers import server_message_from_bytes, server_message_to_bytes
+from rfcore.wire.messages import (
+    Ack,
+    Credit,
+    FieldNotice,
+    Frame,
+    FrameAddress,
+    Hello,
+    Nack,
+    ServerMessage,
+    StageTimes,
+    Welcome,
+)
+from rfcore.wire.v1 import edge_pb2 as pb
+
+fixtures_are_frozen = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def test_a_hello_survives_the_wire(hello: Hello) -> None:
+    assert client_message_from_bytes(client_message_to_bytes(hello)) == hello
+
+
+def test_a_frame_survives_the_wire(frame: Frame) -> None:
+    assert client_message_from_bytes(client_message_to_bytes(frame)) == frame
+
+
+@pytest.mark.parametrize("field", ["reference_digest", "reconstruction_digest", "payload"])
+def test_a_frame_costs_little_more_than_its_parts(frame: Frame, field: str) -> None:
+    assert getattr(frame.packet, field) in client_message_to_bytes(frame)
+    assert len(client_message_to_bytes(frame)) - len(frame.packet.payload) < 220
+
+
+ADDRESS = FrameAddress("front", 2, 7)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Welcome("s-1", exact=True),
+        Ack(ADDRESS, StageTimes(1, 2, 3, 4, 10), b"d" * 16),
+        *[Nack(ADDRESS, reason, "why", count=2) for reason in RejectReason],
+        Nack(ADDRESS, RejectReason.CRC_MISMATCH, "why", last_good_sequence=0, current_epoch=9),
+        FieldNotice(("ab" * 32, "cd" * 32)),
+        Credit("front", 12),
+    ],
+    ids=str,
+)
+def test_an_answer_survives_the_wire(message: ServerMessage) -> None:
+    assert server_message_from_bytes(server_message_to_bytes(message)) == message
+
+
+Change = Callable[[pb.StreamRequest], object]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda m: setattr(m.frame.pose, "x_m", math.nan), "pose.translation_m: .nan"),
+        (lambda m: setattr(m.frame.pose, "y_m", math.inf), "pose.translation_m"),
+        (lambda m: setattr(m.frame.pose, "z_m", 2e6), r"pose.z_m: 2000000.0 is outside"),
+        (lambda m: setattr(m.frame.pose, "rotation_w", 0.9), "pose.rotation: quaternion of norm"),
+        (lambda m: m.frame.ClearField("pose"), "pose.rotation: quaternion of norm 0"),
+        (lambda m: setattr(m.frame, "camera_id", "../etc"), "frame.camera_id: '../etc'"),
+        (lambda m: setattr(m.frame, "camera_id", "a" * 65), "frame.camera_id"),
+        (lambda m: setattr(m.frame, "payload", b""), "frame.payload: 0 bytes"),
+        (lambda m: setattr(m.frame, "payload", b"x" * 1_000_001), "frame.payload: 1000001 bytes"),
+        (lambda m: setattr(m.frame, "reference_digest", b"x"), "frame.reference_digest: 1 bytes"),
+        (lambda m: setattr(m.frame, "reference_coarse", b"x"), "frame.reference_coarse"),
+        (lambda m: setattr(m.frame, "reconstruction_digest", b""), "frame.reconstruction_digest"),
+        (lambda m: setattr(m.frame, "field_id_prefix", b"x"), "frame.field_id_prefix: 1 bytes"),
+        (lambda m: setattr(m.frame, "references", 77), "frame.references: 77"),
+        (lambda m: setattr(m.frame, "sequence", 2**63), "frame.sequence"),
+        (lambda m: setattr(m.frame, "capture_time_ns", 2**64 - 1), "frame.capture_time_ns"),
+    ],
+)
+def test_a_bad_value_refuses_the_frame_by_name(frame: Frame, change: Change, named: str) -> None:
+    request = pb.StreamRequest.FromString(client_message_to_bytes(frame))
+    change(request)
+    with pytest.raises(FrameRefused, match=named) as caught:
+        client_message_from_bytes(request.SerializeToString())
+    address = caught.value.address
+    assert (address.epoch, address.sequence) == (3, request.frame.sequence)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda m: m.hello.ClearField("cameras"), "hello.cameras: 0"),
+        (lambda m: m.hello.cameras.extend([m.hello.cameras[0]] * 16), "hello.cameras: 17"),
+        (lambda m: m.hello.cameras.extend([m.hello.cameras[0]]), "same camera_id"),
+        (lambda m: setattr(m.hello, "vehicle_id", ""), "hello.vehicle_id: ''"),
+        (lambda m: setattr(m.hello, "vehicle_id", ".hidden"), "hello.vehicle_id"),
+        (lambda m: m.hello.ClearField("field_ids"), "hello.field_ids: 0"),
+        (lambda m: m.hello.field_ids.append("AB" * 32), r"hello.field_ids\[1\]"),
+        (
+            lambda m: setattr(m.hello.cameras[0].codec, "width_px", 640),
+            r"hello.cameras\[0\].codec.width_px: 640 px, but intrinsics.width_px is 32 px",
+        ),
+        (
+            lambda m: setattr(m.hello.cameras[0].intrinsics, "width_px", 9000),
+            r"hello.cameras\[0\].intrinsics.width_px: 9000 px",
+        ),
+        (
+            lambda m: setattr(m.hello.cameras[0].intrinsics, "fx_px", math.nan),
+            r"hello.cameras\[0\].intrinsics.fx_px: nan",
+        ),
+        (lambda m: setattr(m.hello.cameras[0].codec, "crf", math.nan), "codec.crf: nan"),
+        (lambda m: setattr(m.hello.cameras[0].codec, "sps", b""), "codec.sps: 0 bytes"),
+        (lambda m: setattr(m.hello.cameras[0].codec, "pps", b"x" * 2000), "codec.pps: 2000"),
+    ],
+)
+def test_a_bad_hello_is_refused_by_name(hello: Hello, change: Change, named: str) -> None:
+    request = pb.StreamRequest.FromString(client_message_to_bytes(hello))
+    change(request)
+    with pytest.raises(InvalidInput, match=named):
+        client_message_from_bytes(request.SerializeToString())
+
+
+@given(data=st.binary(max_size=400))
+def test_arbitrary_bytes_from_a_vehicle_raise_our_errors_only(data: bytes) -> None:
+    with suppress(InvalidInput):
+        client_message_from_bytes(data)
+
+
+@given(data=st.binary(max_size=200))
+def test_arbitrary_bytes_from_a_server_raise_our_errors_only(data: bytes) -> None:
+    with suppress(ProtocolError):
+        server_message_from_bytes(data)
+
+
+def test_untrusted_text_is_escaped_and_cut_short_in_messages(frame: Frame) -> None:
+    request = pb.StreamRequest.FromString(client_message_to_bytes(frame))
+    request.frame.camera_id = "\n\x1b" * 50_000
+    with pytest.raises(FrameRefused) as caught:
+        client_message_from_bytes(request.SerializeToString())
+    assert len(str(caught.value)) < 700
+    assert str(caught.value).isprintable()
+
+
+@fixtures_are_frozen
+@given(
+    edits=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=8),
+    cut=st.integers(0, 500),
+)
+def test_a_damaged_frame_is_a_frame_or_a_refusal(
+    frame: Frame, edits: list[tuple[int, int]], cut: int
+) -> None:
+    data = bytearray(client_message_to_bytes(frame))
+    for position, value in edits:
+        data[position % len(data)] = value
+    try:
+        message = client_message_from_bytes(bytes(data[: len(data) - cut]))
+    except RfedgeError:
+        return
+    if isinstance(message, Frame):
+        assert math.isfinite(sum(message.pose.translation_m))
+
+
+@fixtures_are_frozen
+@given(turn=st.tuples(*[st.floats(-1, 1)] * 4), away=st.tuples(*[st.floats(-1e6, 1e6)] * 3))
+def test_a_pose_keeps_every_bit(
+    frame: Frame,
+    turn: tuple[float, float, float, float],
+    away: tuple[float, float, float],
+) -> None:
+    norm = math.sqrt(sum(v * v for v in turn))
+    w, x, y, z = (v / norm for v in turn) if norm > 0.1 else (1.0, 0.0, 0.0, 0.0)
+    sent = Frame("front", 0, Pose(away, (w, x, y, z)), frame.field_id_prefix, frame.packet)
+    got = client_message_from_bytes(client_message_to_bytes(sent))
+    assert isinstance(got, Frame)
+    assert (got.pose.translation_m, got.pose.rotation) == (away, (w, x, y, z))

@@ -1,0 +1,82 @@
+"""A coded drive comes back as it was written; anything less is one clear error."""
+
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rfcore.errors import InvalidData
+from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.drive_file import MAGIC, CodedDrive, read_drive, write_drive
+from rfcore.wire.messages import Frame, Hello
+
+
+@pytest.fixture
+def drive(hello: Hello, frame: Frame) -> CodedDrive:
+    packets = [replace(frame.packet, sequence=i, payload=b"p" * (i * 90 + 1)) for i in range(4)]
+    return CodedDrive(hello, tuple(replace(frame, packet=packet) for packet in packets))
+
+
+def test_a_drive_survives_the_file(drive: CodedDrive, tmp_path: Path) -> None:
+    write_drive(tmp_path / "a.rfv", drive)
+    assert read_drive(tmp_path / "a.rfv") == drive
+    assert [p.name for p in tmp_path.iterdir()] == ["a.rfv"], "no partial file is left"
+
+
+def test_every_truncation_is_noticed_except_between_messages(
+    drive: CodedDrive, tmp_path: Path
+) -> None:
+    write_drive(tmp_path / "a.rfv", drive)
+    whole = (tmp_path / "a.rfv").read_bytes()
+    read_back = []
+    for end in range(len(whole)):
+        (tmp_path / "b.rfv").write_bytes(whole[:end])
+        with suppress(InvalidData):
+            read_back.append(len(read_drive(tmp_path / "b.rfv").frames))
+    assert read_back == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        (b"", "first bytes are wrong"),
+        (b"RFV1\n\n\x1a\n", "first bytes are wrong"),
+        (MAGIC, "message 0 is not a Hello"),
+        (MAGIC + b"\xff\xff\xff\x7f" + b"x", "message 0 claims 268435455 bytes"),
+        (MAGIC + b"\xff" * 10, "length of message 0 is not a length"),
+        (MAGIC + b"\x80", "truncated in the length of message 0"),
+        (MAGIC + b"\x05abc", "message 0 has 3 of its 5 bytes"),
+        (MAGIC + b"\x03abc", "message 0: message: 3 bytes are not a StreamRequest"),
+    ],
+)
+def test_what_is_no_drive_is_refused(tmp_path: Path, content: bytes, named: str) -> None:
+    (tmp_path / "a.rfv").write_bytes(content)
+    with pytest.raises(InvalidData, match=named):
+        read_drive(tmp_path / "a.rfv")
+
+
+def test_a_frame_of_an_unnamed_camera_is_refused(drive: CodedDrive, tmp_path: Path) -> None:
+    stranger = replace(drive.frames[0], camera_id="rear")
+    write_drive(tmp_path / "a.rfv", CodedDrive(drive.hello, (stranger,)))
+    with pytest.raises(InvalidData, match="message 1 is of a camera"):
+        read_drive(tmp_path / "a.rfv")
+
+
+def test_a_second_hello_is_refused(drive: CodedDrive, tmp_path: Path) -> None:
+    write_drive(tmp_path / "a.rfv", CodedDrive(drive.hello, ()))
+    data = client_message_to_bytes(drive.hello)
+    with (tmp_path / "a.rfv").open("ab") as file:
+        file.write(bytes([len(data) & 0x7F | 0x80, len(data) >> 7]) + data)
+    with pytest.raises(InvalidData, match="message 1 is a second Hello"):
+        read_drive(tmp_path / "a.rfv")
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(tail=st.binary(max_size=300))
+def test_garbage_after_the_magic_raises_our_error_only(tmp_path: Path, tail: bytes) -> None:
+    (tmp_path / "a.rfv").write_bytes(MAGIC + tail)
+    with pytest.raises(InvalidData):
+        read_drive(tmp_path / "a.rfv")
