@@ -90,8 +90,8 @@ class DeltaEncoder:
 
         Raises ``InvalidInput`` for another size, ``CodecError`` if x264 fails.
         """
-        self._require_size("frame", frame)
-        self._require_size("render", render)
+        _require_size("frame", frame, self._config)
+        _require_size("render", render, self._config)
         started_ns = self._clock_ns()
         header, payload = encode_pair(self._config, render, frame)
         if header != self._header:
@@ -107,12 +107,6 @@ class DeltaEncoder:
         following = replace(state, next_sequence=state.next_sequence + 1)
         return Encoded(packet, reconstruction, following, stage_ns)
 
-    def _require_size(self, name: str, picture: I420) -> None:
-        if picture.size_px != self._config.size_px:
-            raise InvalidInput(
-                name, f"{picture.size_px} px where the stream has {self._config.size_px} px"
-            )
-
 
 class DeltaDecoder:
     """The receiver. Raises ``InvalidInput`` for a header our encoder would not make.
@@ -124,6 +118,7 @@ class DeltaDecoder:
     def __init__(
         self, header: StreamHeader, exact: bool = True, clock_ns: Clock = _stopped_clock
     ) -> None:
+        self._config = header.config
         self._splice = SpliceDecoder(header)
         self._exact = exact
         self._clock_ns = clock_ns
@@ -138,6 +133,7 @@ class DeltaDecoder:
         Raises ``PacketRejected`` with the reason; ``state`` stays good for the next packet.
         Raises ``InvalidInput`` if the render is not of the stream's size.
         """
+        _require_size("render", render, self._config)
         started_ns = self._clock_ns()
         _check_order(state, packet)
         _check_crc(packet)
@@ -145,6 +141,7 @@ class DeltaDecoder:
         self._check_payload(packet)
         spliced_ns, frame = self._reconstruct(packet, render)
         if same_reference and frame.digest() != packet.reconstruction_digest:
+            self._splice.reset()
             raise PacketRejected(
                 RejectReason.RECONSTRUCTION_MISMATCH,
                 f"packet {packet.sequence} decodes to another picture than the sender's",
@@ -190,6 +187,11 @@ class DeltaDecoder:
             return spliced_ns, self._splice.decode(packet.payload)
         except CodecError as error:
             raise PacketRejected(RejectReason.DECODER_FAILED, str(error)) from error
+
+
+def _require_size(name: str, picture: I420, config: CodecConfig) -> None:
+    if picture.size_px != config.size_px:
+        raise InvalidInput(name, f"{picture.size_px} px where the stream has {config.size_px} px")
 
 
 def _check_order(state: DecoderState, packet: DeltaPacket) -> None:

@@ -22,10 +22,11 @@ from rfcore.codec.config import REFERENCE_FRAMES, CodecConfig
 from rfcore.codec.h264 import EncoderOptions, PictureKind, encode_pictures
 from rfcore.codec.header import StreamHeader
 from rfcore.codec.parameter_sets import NAL_P, NAL_PPS, NAL_SPS, nal_type
+from rfcore.codec.reference import without_zeros
 from rfcore.errors import CodecError
 from rfcore.image import I420
 
-__all__ = ["encode_pair"]
+__all__ = ["encode_pair", "pair_options"]
 
 _ANALYSIS = {
     "ultrafast": (0, 0),
@@ -47,9 +48,8 @@ def encode_pair(config: CodecConfig, render: I420, frame: I420) -> tuple[StreamH
     Raises ``CodecError`` if x264 makes anything but one slice of the second picture. The caller
     checks the header.
     """
-    unsent, sent = encode_pictures(
-        _options(config), [(render, PictureKind.I), (frame, PictureKind.P)]
-    )
+    clip = [(without_zeros(render), PictureKind.I), (frame, PictureKind.P)]
+    unsent, sent = encode_pictures(pair_options(config), clip)
     slices = split_nals(sent)
     if [nal_type(nal) for nal in slices] != [NAL_P]:
         raise CodecError(f"x264 made NAL units {[nal_type(n) for n in slices]} of a P picture")
@@ -59,7 +59,8 @@ def encode_pair(config: CodecConfig, render: I420, frame: I420) -> tuple[StreamH
     return StreamHeader(config, first[NAL_SPS], first[NAL_PPS]), slices[0]
 
 
-def _options(config: CodecConfig) -> EncoderOptions:
+def pair_options(config: CodecConfig) -> EncoderOptions:
+    """Return the x264 options of a stream."""
     subme, trellis = _ANALYSIS[config.preset]
     params = {
         "keyint": "infinite",

@@ -20,7 +20,7 @@ from rfcore.codec.bitstream import BitWriter, nal_of_rbsp
 from rfcore.codec.parameter_sets import NAL_IDR, NAL_PPS
 from rfcore.image import I420
 
-__all__ = ["PCM_PPS_ID", "pcm_picture", "pcm_pps"]
+__all__ = ["PCM_PPS_ID", "pcm_picture", "pcm_pps", "without_zeros"]
 
 PCM_PPS_ID = 1
 _NAL_REF_IDC = 3 << 5
@@ -53,6 +53,12 @@ def pcm_picture(picture: I420, log2_max_frame_num: int, idr_pic_id: int) -> byte
     """
     header = _slice_header(log2_max_frame_num, idr_pic_id)
     return header + _macroblocks(picture).tobytes()[len(_MB_HEADER) :] + b"\x80"
+
+
+def without_zeros(picture: I420) -> I420:
+    """Return ``picture`` with its samples raised to at least 1: what ``pcm_picture`` decodes to."""
+    y, u, v = (np.maximum(plane, 1) for plane in picture.planes)
+    return I420(y, u, v)
 
 
 def _slice_header(log2_max_frame_num: int, idr_pic_id: int) -> bytes:

@@ -12,7 +12,7 @@ from rfcore.codec.h264 import H264Decoder
 from rfcore.codec.header import StreamHeader, check_header
 from rfcore.codec.parameter_sets import NAL_P, nal_type, parse_slice_start
 from rfcore.codec.reference import pcm_picture, pcm_pps
-from rfcore.errors import BitstreamError, CodecError, InvalidInput
+from rfcore.errors import BitstreamError, CodecError
 from rfcore.image import I420
 
 __all__ = ["SpliceDecoder"]
@@ -48,11 +48,10 @@ class SpliceDecoder:
             )
 
     def predict_from(self, render: I420) -> None:
-        """Make ``render`` the reference picture; raise ``CodecError`` if the decoder fails."""
-        if render.size_px != self._config.size_px:
-            raise InvalidInput(
-                "render", f"{render.size_px} px where the stream has {self._config.size_px} px"
-            )
+        """Make ``render`` the reference picture; raise ``CodecError`` if the decoder fails.
+
+        The caller checks the render's size.
+        """
         self._idr_pic_id ^= 1
         picture = join_nals([pcm_picture(render, self._log2_max_frame_num, self._idr_pic_id)])
         known = self._knows_parameter_sets
@@ -73,10 +72,14 @@ class SpliceDecoder:
             picture.v[:half_height, :half_width],
         )
 
+    def reset(self) -> None:
+        """Start over with a fresh decoder, whatever the last payload did to the old one."""
+        self._decoder.reset()
+        self._knows_parameter_sets = False
+
     def _decode(self, access_unit: bytes) -> I420:
         try:
             return self._decoder.decode(access_unit)
         except CodecError:
-            self._decoder.reset()
-            self._knows_parameter_sets = False
+            self.reset()
             raise

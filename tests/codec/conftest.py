@@ -1,0 +1,70 @@
+"""Procedural street-like pictures: smooth shading, edges, texture; all seeded."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from rfcore.image import I420
+from rfcore.native.yuv import i420_from_colour
+
+PictureMaker = Callable[..., I420]
+PairMaker = Callable[..., tuple[I420, I420]]
+
+
+def make_picture(width_px: int, height_px: int, shift_px: float = 0.0, cars: int = 0) -> I420:
+    """Facades, road and sky seen by a camera moved ``shift_px`` to the side, with ``cars``."""
+    x, y = np.meshgrid(np.arange(width_px) + shift_px, np.arange(height_px))
+    scale = 640 / max(width_px, height_px)
+    x, y = x * scale, y * scale
+    luma = 0.45 + 0.2 * np.sin(x / 47) * np.cos(y / 31)
+    luma += 0.15 * (np.sin(x / 9) > 0.6) * (np.sin(y / 11) > 0.3)
+    luma += 0.05 * np.sin(x * 1.3) * np.sin(y * 0.9)
+    for car in range(cars):
+        inside = (np.abs(x - 120 - 150 * car) < 45) & (np.abs(y - 220) < 25)
+        luma = np.where(inside, 0.8 - 0.3 * car, luma)
+    tint = np.stack([1 + 0.1 * np.sin(x / 80), np.ones_like(x), 1 - 0.1 * np.sin(y / 60)], -1)
+    return i420_from_colour((luma[..., None] * tint).astype(np.float32))
+
+
+def make_pair(width_px: int, height_px: int, shift_px: float = 0.0) -> tuple[I420, I420]:
+    """Return (camera frame, render): the camera sees two cars and noise the field does not know."""
+    camera = make_picture(width_px, height_px, shift_px, cars=2)
+    rng = np.random.default_rng(7)
+    noise = np.rint(rng.normal(0, 2, camera.y.shape))
+    noisy = np.clip(camera.y + noise, 0, 255).astype(np.uint8)
+    render = make_picture(width_px, height_px, shift_px)
+    return I420(noisy, camera.u, camera.v), render
+
+
+def make_flat(width_px: int, height_px: int, level: int) -> I420:
+    half = ((height_px + 1) // 2, (width_px + 1) // 2)
+    return I420(*(np.full(s, level, np.uint8) for s in ((height_px, width_px), half, half)))
+
+
+def make_noise(width_px: int, height_px: int, seed: int) -> I420:
+    """Uniform noise over all 256 values, zero included."""
+    rng = np.random.default_rng(seed)
+    half = ((height_px + 1) // 2, (width_px + 1) // 2)
+    shapes = ((height_px, width_px), half, half)
+    return I420(*(rng.integers(0, 256, s, dtype=np.uint8) for s in shapes))
+
+
+@pytest.fixture(scope="session")
+def picture() -> PictureMaker:
+    return make_picture
+
+
+@pytest.fixture(scope="session")
+def pair() -> PairMaker:
+    return make_pair
+
+
+@pytest.fixture(scope="session")
+def flat() -> PictureMaker:
+    return make_flat
+
+
+@pytest.fixture(scope="session")
+def noise() -> PictureMaker:
+    return make_noise

@@ -1,0 +1,194 @@
+"""Each check of the receiver, in its order, with the reason it gives; and inexact renderers."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, Encoded
+from rfcore.errors import InvalidInput, PacketRejected, RejectReason
+from rfcore.image import I420
+
+PictureMaker = Callable[..., I420]
+PairMaker = Callable[..., tuple[I420, I420]]
+SIZE_PX = (160, 96)
+
+
+@pytest.fixture(scope="module")
+def encoder() -> DeltaEncoder:
+    return DeltaEncoder(CodecConfig(*SIZE_PX))
+
+
+@pytest.fixture(scope="module")
+def sent(encoder: DeltaEncoder, pair: PairMaker) -> Encoded:
+    state = replace(encoder.start(5), next_sequence=10)
+    return encoder.encode(state, *pair(*SIZE_PX))
+
+
+def perturbed(picture: I420, seed: int = 0) -> I420:
+    """Move every sample by -1, 0 or +1 level."""
+    rng = np.random.default_rng(seed)
+    y, u, v = (
+        np.clip(p.astype(np.int16) + rng.integers(-1, 2, p.shape), 0, 255).astype(np.uint8)
+        for p in picture.planes
+    )
+    return I420(y, u, v)
+
+
+def psnr_y_db(a: I420, b: I420) -> float:
+    return float(10 * np.log10(255**2 / np.mean((a.y.astype(float) - b.y) ** 2)))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"epoch": 6}, RejectReason.STALE_EPOCH),
+        ({"epoch": 4, "sequence": 3, "crc32": 0}, RejectReason.STALE_EPOCH),
+        ({"sequence": 9, "crc32": 0}, RejectReason.STALE_SEQUENCE),
+        ({"crc32": 0}, RejectReason.CRC_MISMATCH),
+        ({"reference_digest": bytes(16), "crc32": 0}, RejectReason.CRC_MISMATCH),
+        ({"reference_digest": bytes(16), "payload": b""}, RejectReason.REFERENCE_MISMATCH),
+        ({"payload": b""}, RejectReason.MALFORMED_PAYLOAD),
+        ({"payload": b"\x41"}, RejectReason.MALFORMED_PAYLOAD),
+        ({"payload": b"\x41\x9a\x22"}, RejectReason.DECODER_FAILED),
+        ({"reconstruction_digest": bytes(16)}, RejectReason.RECONSTRUCTION_MISMATCH),
+    ],
+)
+def test_the_first_check_that_fails_gives_the_reason(
+    encoder: DeltaEncoder,
+    sent: Encoded,
+    pair: PairMaker,
+    change: dict[str, object],
+    reason: RejectReason,
+) -> None:
+    decoder = DeltaDecoder(encoder.header)
+    state = replace(decoder.start(5), next_sequence=10)
+    packet = replace(sent.packet, **change)  # type: ignore[arg-type]
+    _, render = pair(*SIZE_PX)
+    with pytest.raises(PacketRejected) as caught:
+        decoder.decode(state, packet if "crc32" in change else packet.sealed(), render)
+    assert caught.value.reason == reason
+    good = decoder.decode(state, sent.packet, render)
+    assert good.frame.digest() == sent.reconstruction.digest()
+
+
+@pytest.mark.parametrize("nal_type", [0, 2, 5, 6, 7, 8, 9, 20, 31])
+def test_only_slices_of_predicted_pictures_reach_the_decoder(
+    encoder: DeltaEncoder, sent: Encoded, pair: PairMaker, nal_type: int
+) -> None:
+    decoder = DeltaDecoder(encoder.header)
+    payload = bytes([0x60 | nal_type]) + sent.packet.payload[1:]
+    packet = replace(sent.packet, payload=payload).sealed()
+    with pytest.raises(PacketRejected, match=rf"NAL unit type {nal_type} is not a P picture"):
+        decoder.decode(decoder.start(5), packet, pair(*SIZE_PX)[1])
+
+
+@pytest.mark.parametrize("start_code", [b"\0\0\1", b"\0\0\0\1"])
+def test_a_second_nal_unit_in_the_payload_is_refused(
+    encoder: DeltaEncoder, sent: Encoded, pair: PairMaker, start_code: bytes
+) -> None:
+    decoder = DeltaDecoder(encoder.header)
+    payload = sent.packet.payload + start_code + encoder.header.sps
+    with pytest.raises(PacketRejected, match="start code") as caught:
+        decoder.decode(
+            decoder.start(5), replace(sent.packet, payload=payload).sealed(), pair(*SIZE_PX)[1]
+        )
+    assert caught.value.reason == RejectReason.MALFORMED_PAYLOAD
+
+
+def test_lost_packets_are_counted_and_the_rest_decodes(
+    encoder: DeltaEncoder, sent: Encoded, pair: PairMaker
+) -> None:
+    decoder = DeltaDecoder(encoder.header)
+    decoded = decoder.decode(decoder.start(5), sent.packet, pair(*SIZE_PX)[1])
+    assert (decoded.lost, decoded.state.next_sequence) == (10, 11)
+    with pytest.raises(PacketRejected, match="sequence 10 where 11 or later"):
+        decoder.decode(decoded.state, sent.packet, pair(*SIZE_PX)[1])
+
+
+def test_an_inexact_receiver_takes_rounding_and_loses_little(
+    encoder: DeltaEncoder, sent: Encoded, pair: PairMaker
+) -> None:
+    """+-1 level of the render is noise of variance 2/3; where the P slice corrects nothing it adds
+    to the error. At 255**2 / (2/3) that is 49.9 dB, so a frame of q dB keeps at least
+    -10 log10(10**(-q/10) + 10**(-4.99)) before motion compensation, which only averages."""
+    frame, render = pair(*SIZE_PX)
+    decoder = DeltaDecoder(encoder.header, exact=False)
+    decoded = decoder.decode(decoder.start(5), sent.packet, perturbed(render))
+    exact_db = psnr_y_db(sent.reconstruction, frame)
+    floor_db = -10 * np.log10(10 ** (-exact_db / 10) + 10**-4.99)
+    assert floor_db - 0.3 < psnr_y_db(decoded.frame, frame) < exact_db + 0.3
+
+
+def test_an_exact_receiver_refuses_rounding_and_says_what_it_is(
+    encoder: DeltaEncoder, sent: Encoded, pair: PairMaker
+) -> None:
+    decoder = DeltaDecoder(encoder.header)
+    with pytest.raises(PacketRejected, match="rounding-sized") as caught:
+        decoder.decode(decoder.start(5), sent.packet, perturbed(pair(*SIZE_PX)[1]))
+    assert caught.value.reason == RejectReason.REFERENCE_MISMATCH
+
+
+@pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.parametrize("wrong", ["4 px off", "16 px off", "black", "noise"])
+def test_a_render_of_another_pose_or_field_is_refused(
+    encoder: DeltaEncoder,
+    sent: Encoded,
+    picture: PictureMaker,
+    flat: PictureMaker,
+    noise: PictureMaker,
+    exact: bool,
+    wrong: str,
+) -> None:
+    render = {
+        "4 px off": lambda: picture(*SIZE_PX, 4.0),
+        "16 px off": lambda: picture(*SIZE_PX, 16.0),
+        "black": lambda: flat(*SIZE_PX, 16),
+        "noise": lambda: noise(*SIZE_PX, 1),
+    }[wrong]()
+    decoder = DeltaDecoder(encoder.header, exact=exact)
+    with pytest.raises(PacketRejected, match="another pose, field or camera") as caught:
+        decoder.decode(decoder.start(5), sent.packet, render)
+    assert caught.value.reason == RejectReason.REFERENCE_MISMATCH
+
+
+def test_an_inexact_receiver_still_checks_what_it_can(
+    encoder: DeltaEncoder, sent: Encoded, pair: PairMaker
+) -> None:
+    decoder = DeltaDecoder(encoder.header, exact=False)
+    packet = replace(sent.packet, reconstruction_digest=bytes(16)).sealed()
+    with pytest.raises(PacketRejected, match="another picture than the sender's"):
+        decoder.decode(decoder.start(5), packet, pair(*SIZE_PX)[1])
+
+
+def test_pictures_of_another_size_are_the_callers_mistake(
+    encoder: DeltaEncoder, sent: Encoded, pair: PairMaker
+) -> None:
+    frame, render = pair(*SIZE_PX)
+    small = pair(32, 32)[0]
+    with pytest.raises(InvalidInput, match=r"frame: \(32, 32\) px where the stream has"):
+        encoder.encode(encoder.start(0), small, render)
+    with pytest.raises(InvalidInput, match="render: "):
+        encoder.encode(encoder.start(0), frame, small)
+    decoder = DeltaDecoder(encoder.header)
+    with pytest.raises(InvalidInput, match="render: "):
+        decoder.decode(decoder.start(5), sent.packet, small)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"epoch": -1}, "packet.epoch: -1"),
+        ({"sequence": 1 << 64}, "packet.sequence"),
+        ({"crc32": 1 << 32}, "packet.crc32"),
+        ({"reference_digest": b"short"}, "packet.reference_digest: 5 bytes where 16"),
+        ({"reference_coarse": b""}, "packet.reference_coarse: 0 bytes where 64"),
+        ({"reconstruction_digest": bytes(17)}, "packet.reconstruction_digest: 17 bytes"),
+    ],
+)
+def test_packets_that_cannot_be_are_refused_by_field(
+    sent: Encoded, change: dict[str, object], named: str
+) -> None:
+    with pytest.raises(InvalidInput, match=named):
+        replace(sent.packet, **change)  # type: ignore[arg-type]
