@@ -25,7 +25,7 @@ from rfcore.link import Link, LinkProfile
 from rfcore.link.meter import BusyMeter
 from rfcore.wire.address import Address
 
-__all__ = ["LinkProxy", "LinkProxyConfig", "run_link"]
+__all__ = ["LinkProxy", "ProxySettings", "run_proxy"]
 
 SEGMENT_BYTES = 4096
 """Bytes released at once: 8 ms at 4 Mbit/s, so that a long message does not arrive in one lump."""
@@ -37,25 +37,41 @@ SPIN_S = 0.0015
 
 
 @dataclass(frozen=True)
-class LinkProxyConfig:
-    """Where the link begins and ends, and what it is like in each direction.
+class ProxySettings:
+    """Where the link begins (``listen``) and ends (``to``), HOST:PORT, and what it is like.
 
-    ``report`` receives JSON after each connection and at the end; ``ready_file`` receives HOST:PORT
-    once connections are accepted.
+    ``delay_ms`` is one-way, in either direction. ``report`` receives JSON after each connection and
+    at the end; ``ready_file`` receives HOST:PORT once connections are accepted.
     """
 
-    listen: str
-    server: str
-    uplink: LinkProfile
-    downlink: LinkProfile
+    to: str
+    listen: str = "127.0.0.1:0"
+    uplink_bps: float = 4e6
+    downlink_bps: float = 4e6
+    delay_ms: float = 20.0
     report: Path | None = None
     ready_file: Path | None = None
     allow_insecure: bool = False
 
     def __post_init__(self) -> None:
-        for field in ("listen", "server"):
+        for field in ("listen", "to"):
             address = Address.parse(field, getattr(self, field))
             address.require_private(field, self.allow_insecure)
+        for rate_bps in (self.uplink_bps, self.downlink_bps):
+            self._profile(rate_bps)
+
+    @property
+    def uplink(self) -> LinkProfile:
+        """The link from the accepting side to ``to``."""
+        return self._profile(self.uplink_bps)
+
+    @property
+    def downlink(self) -> LinkProfile:
+        """The link back."""
+        return self._profile(self.downlink_bps)
+
+    def _profile(self, rate_bps: float) -> LinkProfile:
+        return LinkProfile(rate_bps, self.delay_ms / 1e3)
 
 
 class Direction:
@@ -102,7 +118,7 @@ class Direction:
         return {
             "rate_bps": profile.rate_bps,
             "delay_s": profile.delay_s,
-            "wire_bytes": meter.wire_bytes,
+            "bytes": meter.wire_bytes,
             "busy_s": meter.busy_s,
             "expected_s": meter.expected_s,
             "tau_error_percent": meter.tau_error_percent,
@@ -195,12 +211,12 @@ class Side(asyncio.BufferedProtocol):
 class LinkProxy:
     """The proxy; ``start``, then ``stop``."""
 
-    def __init__(self, config: LinkProxyConfig) -> None:
-        self.address = Address.parse("listen", config.listen)
-        self._server_address = Address.parse("server", config.server)
-        self._config = config
-        self._up = Direction(config.uplink)
-        self._down = Direction(config.downlink)
+    def __init__(self, settings: ProxySettings) -> None:
+        self.address = Address.parse("listen", settings.listen)
+        self._server_address = Address.parse("to", settings.to)
+        self._settings = settings
+        self._up = Direction(settings.uplink)
+        self._down = Direction(settings.downlink)
         self._connections = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._listener: asyncio.Server | None = None
@@ -218,8 +234,8 @@ class LinkProxy:
         self.address = Address(self.address.host, sock.getsockname()[1])
         for direction in (self._up, self._down):
             self._keep(asyncio.create_task(direction.pump()))
-        if self._config.ready_file is not None:
-            _write_whole(self._config.ready_file, f"{self.address}\n")
+        if self._settings.ready_file is not None:
+            _write_whole(self._settings.ready_file, f"{self.address}\n")
         return self.address
 
     async def stop(self) -> None:
@@ -244,8 +260,8 @@ class LinkProxy:
 
     def write_report(self) -> None:
         """Write the report, whole, if one was asked for."""
-        if self._config.report is not None:
-            _write_whole(self._config.report, json.dumps(self.report(), indent=1) + "\n")
+        if self._settings.report is not None:
+            _write_whole(self._settings.report, json.dumps(self.report(), indent=1) + "\n")
 
     def _accept(self) -> Side:
         side = Side(self._up, self.write_report)
@@ -275,12 +291,16 @@ class LinkProxy:
         task.add_done_callback(self._tasks.discard)
 
 
-async def run_link(config: LinkProxyConfig) -> None:
-    """Run the proxy until SIGTERM or SIGINT."""
+def run_proxy(settings: ProxySettings) -> None:
+    """Run the proxy until SIGTERM or SIGINT; raise ``RfedgeError`` if it cannot listen."""
+    asyncio.run(_run(settings))
+
+
+async def _run(settings: ProxySettings) -> None:
     stopped = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
-    proxy = LinkProxy(config)
+    proxy = LinkProxy(settings)
     await proxy.start()
     await stopped.wait()
     await proxy.stop()

@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.link import LinkProfile
-from rfedge.link_proxy import LinkProxy, LinkProxyConfig
+from rfedge.link_proxy import LinkProxy, ProxySettings
 
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
-FAST = LinkProfile(1e9)
+FAST: dict[str, float] = {"uplink_bps": 1e9, "downlink_bps": 1e9, "delay_ms": 0.0}
 
 
 async def echo(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -27,13 +26,10 @@ async def echo(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> No
 
 
 @asynccontextmanager
-async def linked(
-    handler: Handler, uplink: LinkProfile, downlink: LinkProfile, **more: Any
-) -> AsyncIterator[LinkProxy]:
+async def linked(handler: Handler, **changes: Any) -> AsyncIterator[LinkProxy]:
     server = await asyncio.start_server(handler, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
-    config = LinkProxyConfig("127.0.0.1:0", f"127.0.0.1:{port}", uplink, downlink, **more)
-    proxy = LinkProxy(config)
+    proxy = LinkProxy(ProxySettings(f"127.0.0.1:{port}", **{**FAST, **changes}))
     await proxy.start()
     try:
         yield proxy
@@ -55,18 +51,18 @@ async def exchange(proxy: LinkProxy, data: bytes) -> bytes:
 
 async def test_bytes_come_back_whole_and_in_order() -> None:
     data = bytes(i % 251 for i in range(300_000))
-    async with linked(echo, FAST, FAST) as proxy:
+    async with linked(echo) as proxy:
         got = await asyncio.gather(*(exchange(proxy, data[i:]) for i in range(3)))
     assert got == [data[i:] for i in range(3)]
     report = proxy.report()
     assert report["connections"] == 3
-    assert report["uplink"]["wire_bytes"] == report["downlink"]["wire_bytes"] == 900_000 - 3
+    assert report["uplink"]["bytes"] == report["downlink"]["bytes"] == 900_000 - 3
 
 
 async def test_a_transfer_takes_bytes_over_rate_and_the_report_measures_it() -> None:
     """0.4 s of uplink; a late pump may only make it longer, and the report has to say so."""
     clock = asyncio.get_running_loop().time
-    async with linked(echo, LinkProfile(4e6, 0.02), FAST) as proxy:
+    async with linked(echo, uplink_bps=4e6, delay_ms=20.0) as proxy:
         started_s = clock()
         await exchange(proxy, bytes(200_000))
         took_s = clock() - started_s
@@ -79,31 +75,30 @@ async def test_a_transfer_takes_bytes_over_rate_and_the_report_measures_it() -> 
 
 async def test_a_full_link_holds_the_sender_back() -> None:
     """The server's side of a slow link takes nothing; what was read is bounded by the queue."""
-    slow = LinkProfile(8e3, queue_limit_bytes=16_384)
-    async with linked(echo, slow, FAST) as proxy:
+    async with linked(echo, uplink_bps=8e3) as proxy:
         _, writer = await asyncio.open_connection(proxy.address.host, proxy.address.port)
         writer.transport.set_write_buffer_limits(0)
         writer.write(bytes(8_000_000))
         with pytest.raises(TimeoutError):
             async with asyncio.timeout(0.3):
                 await writer.drain()
-        assert proxy._up._link.held_bytes <= 16_384
+        assert proxy._up._link.held_bytes <= 65_536
         writer.transport.abort()
 
 
 async def test_the_reports_are_written_whole(tmp_path: Path) -> None:
     report, ready = tmp_path / "link.json", tmp_path / "ready"
-    async with linked(echo, FAST, FAST, report=report, ready_file=ready) as proxy:
+    async with linked(echo, report=report, ready_file=ready) as proxy:
         assert ready.read_text().strip() == str(proxy.address)
         await exchange(proxy, b"x" * 1000)
     written = json.loads(report.read_text())
-    assert written["uplink"]["wire_bytes"] == 1000
+    assert written["uplink"]["bytes"] == 1000
     assert written["uplink"]["rate_bps"] == 1e9
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link.json", "ready"]
 
 
 async def test_a_connection_is_refused_while_the_server_is_away() -> None:
-    proxy = LinkProxy(LinkProxyConfig("127.0.0.1:0", "127.0.0.1:1", FAST, FAST))
+    proxy = LinkProxy(ProxySettings("127.0.0.1:1"))
     await proxy.start()
     with pytest.raises(ConnectionError):
         await exchange(proxy, b"hello")
@@ -115,33 +110,33 @@ async def test_a_server_that_closes_closes_the_vehicle_s_end_behind_its_last_byt
         writer.write(b"goodbye" * 1000)
         writer.close()
 
-    async with linked(farewell, FAST, LinkProfile(4e6)) as proxy:
+    async with linked(farewell, downlink_bps=4e6) as proxy:
         reader, writer = await asyncio.open_connection(proxy.address.host, proxy.address.port)
         assert await reader.read(-1) == b"goodbye" * 1000
         writer.close()
 
 
 async def test_a_taken_port_is_one_clear_error() -> None:
-    async with linked(echo, FAST, FAST) as proxy:
-        again = LinkProxyConfig(str(proxy.address), "127.0.0.1:1", FAST, FAST)
+    async with linked(echo) as proxy:
+        again = ProxySettings("127.0.0.1:1", listen=str(proxy.address))
         with pytest.raises(RfedgeError, match=r"cannot listen on 127\.0\.0\.1:"):
             await LinkProxy(again).start()
 
 
 @pytest.mark.parametrize(
-    ("listen", "server", "named"),
+    ("listen", "to", "named"),
     [
         ("127.0.0.1", "127.0.0.1:1", "listen: '127.0.0.1' must be HOST:PORT"),
-        ("127.0.0.1:1", "127.0.0.1:99999", "server: port '99999'"),
+        ("127.0.0.1:1", "127.0.0.1:99999", "to: port '99999'"),
         ("0.0.0.0:1", "127.0.0.1:1", "listen: 0.0.0.0:1 is not a loopback address"),
-        ("[::1]:1", "example.org:1", "server: example.org:1 is not a loopback address"),
+        ("[::1]:1", "example.org:1", "to: example.org:1 is not a loopback address"),
     ],
 )
-def test_addresses_are_checked_by_name(listen: str, server: str, named: str) -> None:
+def test_addresses_are_checked_by_name(listen: str, to: str, named: str) -> None:
     with pytest.raises(InvalidInput) as caught:
-        LinkProxyConfig(listen, server, FAST, FAST)
+        ProxySettings(to, listen)
     assert str(caught.value).startswith(named)
 
 
 def test_another_machine_is_reached_when_plaintext_is_allowed() -> None:
-    LinkProxyConfig("0.0.0.0:1", "example.org:1", FAST, FAST, allow_insecure=True)
+    ProxySettings("example.org:1", "0.0.0.0:1", allow_insecure=True)
