@@ -23,7 +23,7 @@ from rfcore.raster.gaussians import Gaussians
 from rfcore.views import View
 
 if TYPE_CHECKING:
-    from rfcore.raster.native import Rasterizer  # type: ignore[import-untyped]
+    from rfcore.raster.native import Rasterizer
 
 __all__ = [
     "Bounds",
@@ -121,7 +121,7 @@ class SplatField:
 
     def render(self, camera: Camera) -> View:
         """Render colour, depth and opacity as ``camera`` sees them."""
-        return self.rasterizer.render(camera)  # type: ignore[no-any-return]
+        return self.rasterizer.render(camera)
 
 
 def encode_field(splats: SplatField) -> bytes:
