@@ -9,16 +9,19 @@ TORCH_INDEX ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check build bench proto
+.PHONY: help demo test test-slow check build bench proto figures
 
 help:  ## show the targets
-	@awk -F':.*## ' '/^[a-z-]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: build  ## run the main job: two processes, one field, two drives; writes out/demo
 	$(BIN)/rfedge demo
 
 test: build  ## run the test suite
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -m "not slow"
+
+test-slow: build  ## run the tests that take more than ten seconds each
+	$(BIN)/python -m pytest -m slow --timeout 600
 
 check: build  ## lint, types, layers, generated files
 	$(BIN)/ruff format --check .
@@ -32,6 +35,10 @@ bench: build  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench raster
 	$(BIN)/rfedge bench train
 	$(BIN)/rfedge bench codec
+
+figures: build  ## regenerate docs/results.md from results/*.json
+	$(BIN)/python -m rfedge.report.markdown results > docs/results.md.part
+	mv docs/results.md.part docs/results.md
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -19,7 +19,10 @@ from rfcore.image import I420, Rgb
 from rfcore.metrics import psnr, ssim
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 
-__all__ = ["DriveOutcome", "Pictures", "measure_drive"]
+__all__ = ["DriveOutcome", "FrameAddress", "Pictures", "measure_drive"]
+
+FrameAddress = tuple[int, int]
+"""(epoch, sequence)"""
 
 INTRA_CRFS = (14.0, 18.0, 22.0, 26.0, 30.0, 34.0)
 
@@ -39,13 +42,13 @@ class DriveOutcome:
     """What the processes reported of one drive.
 
     ``agent_rows``: one mapping a frame, in order, from the agent's report; ``server_digests``: the
-    reconstruction digest the server wrote for each sequence number; ``link``: the link's report;
+    digest of each picture the server wrote; ``link``: the link's report;
     ``pictures``: the frames the server reconstructed; ``wrong_street``: a render of the same field
     somewhere else.
     """
 
     agent_rows: Sequence[Mapping[str, Any]]
-    server_digests: Mapping[int, str]
+    server_digests: Mapping[FrameAddress, str]
     link: Mapping[str, Any]
     pictures: Sequence[Pictures]
     wrong_street: Rgb
@@ -55,12 +58,12 @@ class DriveOutcome:
 
 def measure_drive(outcome: DriveOutcome) -> dict[str, Any]:
     """Return the drive's entry of ``result.json``."""
-    rows = {row["name"]: row for row in outcome.agent_rows}
+    rows = {row["name"]: row for row in outcome.agent_rows}  # a lost picture is captured again
     frames = [_measure_frame(rows[pictures.name], pictures) for pictures in outcome.pictures]
     packet_bytes = sum(frame["packet_bytes"] for frame in frames)
     psnr_db = statistics.fmean(frame["psnr_db"] for frame in frames)
     return {
-        "frames": len(outcome.agent_rows),
+        "frames": len(rows),
         "frames_reconstructed": len(outcome.pictures),
         "digest_matches": _digest_matches(outcome),
         "payload_bytes": sum(frame["payload_bytes"] for frame in frames),
@@ -94,7 +97,7 @@ def _measure_frame(row: Mapping[str, Any], pictures: Pictures) -> dict[str, Any]
 
 def _digest_matches(outcome: DriveOutcome) -> int:
     return sum(
-        outcome.server_digests.get(row["sequence"]) == row["reconstruction_digest"]
+        outcome.server_digests.get((row["epoch"], row["sequence"])) == row["reconstruction_digest"]
         for row in outcome.agent_rows
     )
 

@@ -20,7 +20,7 @@ from rfcore.image import Rgb, read_rgb
 from rfcore.native.yuv import i420_from_colour, rgb_from_i420
 from rfcore.train import SplatTrainingConfig
 from rfedge.demo.field import cached_or_trained
-from rfedge.demo.measure import DriveOutcome, Pictures, measure_drive
+from rfedge.demo.measure import DriveOutcome, FrameAddress, Pictures, measure_drive
 from rfedge.demo.processes import command_of, run_to_end, service
 from rfedge.demo.video import write_video
 from rfedge.provenance import host, revision
@@ -123,16 +123,19 @@ def _drive_outcome(
     _run_processes(settings, drive_path, field_path, field.field_id, work)
     agent_rows = _json_lines(work / "agent.jsonl")
     saved = work / "saved" / VEHICLE / CAMERA
-    index = {row["sequence"]: row for row in _json_lines(saved / "index.jsonl")}
+    index = {_address(row): row for row in _json_lines(saved / "index.jsonl")}
     dataset = read_transforms(drive_path)
     if not index:
         raise RfedgeError(f"drive {drive}: the server reconstructed nothing, see {work}")
     return DriveOutcome(
         agent_rows=agent_rows,
-        server_digests={sequence: row["digest"] for sequence, row in index.items()},
+        server_digests={address: row["digest"] for address, row in index.items()},
         link=json.loads((work / "link.json").read_text()),
         pictures=_pictures(
-            dataset, field, agent_rows, {s: saved / row["file"] for s, row in index.items()}
+            dataset,
+            field,
+            agent_rows,
+            {address: saved / row["file"] for address, row in index.items()},
         ),
         wrong_street=_wrong_street(settings.sample, field),
         preset=settings.preset,
@@ -167,6 +170,10 @@ def _run_processes(
             run_to_end("cav-agent", agent_command, work, DRIVE_TIMEOUT_S)
 
 
+def _address(row: Mapping[str, Any]) -> FrameAddress:
+    return (row["epoch"], row["sequence"])
+
+
 def _json_lines(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         raise RfedgeError(f"{path} was not written: the processes reported nothing")
@@ -177,7 +184,7 @@ def _pictures(
     dataset: Dataset,
     field: SplatField,
     agent_rows: list[dict[str, Any]],
-    saved: Mapping[int, Path],
+    saved: Mapping[FrameAddress, Path],
 ) -> list[Pictures]:
     """Pair each reconstructed frame with its camera picture and its render."""
     posed = {picture.name: picture for picture in dataset.pictures}
@@ -186,10 +193,10 @@ def _pictures(
             row["name"],
             posed[row["name"]].read(),
             _rendered(field, posed[row["name"]].camera),
-            read_rgb(saved[row["sequence"]]),
+            read_rgb(saved[_address(row)]),
         )
         for row in agent_rows
-        if row["sequence"] in saved
+        if _address(row) in saved
     ]
 
 
