@@ -50,8 +50,10 @@ CHANNEL_OPTIONS: Final[Options] = (
     # After an outage the stream is back in half a second instead of 2.7 s. The longest wait is
     # half a second, since with jitter and the greeting a whole one would miss the promised second.
     ("grpc.initial_reconnect_backoff_ms", 100),
-    ("grpc.min_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 500),
+    # Despite its name, how long one attempt may take (20 s by default). Two seconds let links of
+    # half a second of round trip in; 100 ms would shut them out for ever.
+    ("grpc.min_reconnect_backoff_ms", 2_000),
     # A process that reconnects shall not inherit another channel's backoff or connection.
     ("grpc.use_local_subchannel_pool", 1),
 )
