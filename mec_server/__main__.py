@@ -8,14 +8,11 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import structlog
 import tyro
 
 from mec_server.config import ServerConfig
-from mec_server.fields import FieldShelf
 from mec_server.server import EdgeServer
 from rfcore.errors import RfedgeError
-from rfcore.field import FieldStore, SplatField
 from rfcore.wire.logs import configure_logs
 
 __all__ = ["main"]
@@ -74,16 +71,7 @@ def main() -> None:
 
 async def serve(config: ServerConfig) -> None:
     """Serve until told to stop, then drain."""
-    store = FieldStore(config.fields)
-
-    def load(field_id: str) -> SplatField:
-        field = store.load(field_id, threads=config.threads, isa=config.isa)
-        structlog.get_logger().info(
-            "field opened", field=field_id, gaussians=len(field.gaussians), isa=field.rasterizer.isa
-        )
-        return field
-
-    server = EdgeServer(config, store, FieldShelf(store, load))
+    server = EdgeServer(config)
     stopped = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)

@@ -11,10 +11,15 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
+import structlog
+
 from mec_server.handlers import Renderer
 from rfcore.errors import InvalidInput
+from rfcore.field import FieldStore, SplatField
 
-__all__ = ["CHUNK_BYTES", "FieldShelf", "Store", "read_chunks"]
+__all__ = ["CHUNK_BYTES", "FieldShelf", "Store", "read_chunks", "splat_loader"]
+
+log = structlog.get_logger()
 
 CHUNK_BYTES = 256 * 1024
 """A quarter of the receive limit."""
@@ -57,6 +62,23 @@ class FieldShelf:
         for field_id in ids:
             self.open(field_id)
         return len(ids)
+
+
+def splat_loader(
+    store: FieldStore, *, threads: int, isa: str | None
+) -> Callable[[str], SplatField]:
+    """Return how a shelf opens fields of ``store``: whole, checked, and with a renderer built.
+
+    What it returns raises ``UnknownField``, ``FieldFormatError`` or ``BackendUnavailable``.
+    """
+
+    def load(field_id: str) -> SplatField:
+        field = store.load(field_id, threads=threads, isa=isa)
+        isa_used = field.rasterizer.isa
+        log.info("field opened", field=field_id, gaussians=len(field.gaussians), isa=isa_used)
+        return field
+
+    return load
 
 
 def read_chunks(path: Path, offset_bytes: int) -> Iterator[tuple[int, bytes]]:

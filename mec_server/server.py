@@ -15,10 +15,11 @@ from prometheus_client import CollectorRegistry, start_http_server
 from mec_server.config import ServerConfig
 from mec_server.edge_service import EdgeService, Surroundings
 from mec_server.field_service import FieldService
-from mec_server.fields import FieldShelf, Store
+from mec_server.fields import FieldShelf, splat_loader
 from mec_server.metrics import ServerMetrics
 from mec_server.recorder import Recorder
 from rfcore.errors import RfedgeError
+from rfcore.field import FieldStore
 from rfcore.wire.address import Address
 from rfcore.wire.conventions import SERVER_OPTIONS
 
@@ -29,22 +30,23 @@ SERVICES = ("", "rfcore.wire.v1.EdgeService", "rfcore.wire.v1.FieldService")
 
 
 class EdgeServer:
-    """Serves the fields of ``store``, opened by ``shelf``; ``start``, then ``stop``."""
+    """Serves the fields of ``config.fields``; ``start``, then ``stop``."""
 
-    def __init__(self, config: ServerConfig, store: Store, shelf: FieldShelf) -> None:
+    def __init__(self, config: ServerConfig) -> None:
         self.registry = CollectorRegistry()
         self.address = Address.parse("listen", config.listen)
         self.address.require_private("listen", config.allow_insecure)
         self._config = config
-        self._shelf = shelf
+        store = FieldStore(config.fields)
+        self._shelf = FieldShelf(store, splat_loader(store, threads=config.threads, isa=config.isa))
         self._metrics = ServerMetrics(self.registry)
         self._executor = ThreadPoolExecutor(config.workers, "worker")
         self._recorder = self._open_recorder(config.save)
         self._health = health_aio.HealthServicer()
         self._edge = EdgeService(
             Surroundings(
-                shelf,
-                lambda: tuple(store.ids()),
+                self._shelf,
+                store.ids,
                 self._executor,
                 self._metrics,
                 config.limits,

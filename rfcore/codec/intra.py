@@ -18,6 +18,7 @@ from rfcore.codec.h264 import EncoderOptions, H264Decoder, PictureKind, encode_p
 from rfcore.codec.paper import slice_nals
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfcore.metrics import psnr
 
 __all__ = ["IntraPoint", "intra_curve", "luma_psnr_db", "saving_at_equal_psnr"]
 
@@ -36,8 +37,7 @@ class IntraPoint:
 
 def luma_psnr_db(a: I420, b: I420) -> float:
     """Return the PSNR of the luma planes, peak 255; infinite for identical planes."""
-    error = float(np.mean((a.y.astype(np.float64) - b.y) ** 2))
-    return 10 * math.log10(255.0**2 / error) if error else math.inf
+    return psnr(a.y, b.y)
 
 
 def intra_curve(

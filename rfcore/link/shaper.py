@@ -58,11 +58,12 @@ class Link(Generic[Item]):
         """Accept ``item`` at ``now`` and return when it will be transmitted and delivered.
 
         Raises ``InvalidInput`` for a negative size, and when the link is full: a plain link drops
-        nothing, so its driver has to hold the sender back (see ``is_full``).
+        nothing, so its driver has to hold the sender back (see ``is_full``). An empty packet, which
+        takes no room, is always accepted.
         """
         if size_bytes < 0:
             raise InvalidInput("link.size_bytes", f"{size_bytes} must not be negative")
-        if self.is_full:
+        if size_bytes and self.is_full:
             raise InvalidInput(
                 "link.queue",
                 f"{self._held_bytes} bytes are held, the limit is "

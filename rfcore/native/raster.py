@@ -10,11 +10,9 @@ shorter than 1e-12 is not normalised; zero means no rotation.
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.errors import BackendUnavailable, InvalidInput
@@ -22,17 +20,17 @@ from rfcore.native import _native
 
 __all__ = [
     "MAX_THREADS",
-    "GaussianArrays",
     "NativeRasterizer",
+    "NativeTrainable",
     "RasterStatistics",
     "available_isas",
     "check_backend",
     "native_camera",
+    "overlaps_limited",
 ]
 
-F32 = NDArray[np.float32]
-GaussianArrays = tuple[F32, F32, F32, F32, F32]
-"""means [N, 3], quaternions [N, 4], log scales [N, 3], opacity logits [N], SH [N, K, 3]."""
+NativeRasterizer = _native.Rasterizer
+NativeTrainable = _native.TrainableRasterizer
 
 MAX_THREADS = 256
 
@@ -85,44 +83,6 @@ def native_camera(camera: Camera) -> _native.RasterCamera:
     if not np.isfinite(np.array(numbers, dtype=np.float32)).all():
         raise InvalidInput("camera", "a value is beyond the range of float32; move the tile origin")
     return _native.RasterCamera(numbers, k.width_px, k.height_px)
-
-
-class NativeRasterizer:
-    """A copy of one set of Gaussians, prepared for rendering; calls are serialised by a lock."""
-
-    def __init__(self, arrays: GaussianArrays, *, threads: int, isa: str | None) -> None:
-        self.isa = check_backend(threads, isa)
-        self.threads = threads
-        self._native = _native.Rasterizer(*arrays, threads, self.isa)
-        self._lock = threading.Lock()
-
-    def render(self, camera: Camera) -> tuple[F32, F32, F32]:
-        """Render colour [H, W, 3], depth [H, W] in metres and opacity [H, W].
-
-        Raises ``InvalidInput`` when the Gaussians overlap more than 2^30 tiles.
-        """
-        shape = (camera.intrinsics.height_px, camera.intrinsics.width_px)
-        colour, depth, opacity = (np.empty(s, np.float32) for s in ((*shape, 3), shape, shape))
-        view = native_camera(camera)
-        with self._lock, overlaps_limited():
-            self._native.render(view, colour, depth, opacity)
-        return colour, depth, opacity
-
-    def render_colour(self, camera: Camera) -> F32:
-        """Render colour [H, W, 3] alone: the same bytes as ``render``'s, a little sooner."""
-        colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
-        view = native_camera(camera)
-        with self._lock, overlaps_limited():
-            self._native.render_colour(view, colour)
-        return colour
-
-    def statistics(self, camera: Camera) -> RasterStatistics:
-        """Count what rendering this view takes; slower than rendering it."""
-        view = native_camera(camera)
-        with self._lock, overlaps_limited():
-            counts = self._native.statistics(view)
-        pixels = camera.intrinsics.width_px * camera.intrinsics.height_px
-        return RasterStatistics(*counts, blends_per_px=counts[3] / pixels)
 
 
 class overlaps_limited:  # noqa: N801 - reads as a condition in a with statement

@@ -1,56 +1,75 @@
-"""The native rasterizer: what everything but tests and training renders with.
+"""The native rasterizer: what everything but tests renders and trains with.
 
-The same function as ``rfcore.raster.reference``, whose docstrings define it.
+The same function as ``rfcore.raster.reference``, whose docstrings define it; what float32 adds to
+the definition is in ``rfcore.native.raster``.
 """
 
 from __future__ import annotations
 
+from threading import Lock
+
+import numpy as np
+
 from rfcore.camera import Camera
 from rfcore.native.raster import (
-    GaussianArrays,
     NativeRasterizer,
     RasterStatistics,
     available_isas,
+    check_backend,
+    native_camera,
+    overlaps_limited,
 )
 from rfcore.raster.gaussians import F32, Gaussians
+from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfcore.views import View
 
-__all__ = ["RasterStatistics", "Rasterizer", "available_isas"]
+__all__ = [
+    "LearningRates",
+    "RasterStatistics",
+    "Rasterizer",
+    "TrainableRasterizer",
+    "available_isas",
+]
 
 
 class Rasterizer:
     """A copy of one set of Gaussians, ready to be rendered; may be shared between threads.
 
     ``isa`` forces one of ``available_isas()`` (default: the best); ``threads`` is 1..256. Neither
-    changes a byte of any picture. Raises ``BackendUnavailable`` or ``InvalidInput``.
+    changes a byte of any picture. Raises ``BackendUnavailable`` or ``InvalidInput``. Rendering
+    raises ``InvalidInput`` when the Gaussians overlap more than 2^30 tiles of 16x16 pixels.
     """
 
     def __init__(self, gaussians: Gaussians, *, threads: int = 1, isa: str | None = None) -> None:
-        self._native = NativeRasterizer(_arrays(gaussians), threads=threads, isa=isa)
-
-    @property
-    def isa(self) -> str:
-        """The instruction set in use."""
-        return self._native.isa
-
-    @property
-    def threads(self) -> int:
-        """Number of threads in use."""
-        return self._native.threads
+        self.isa = check_backend(threads, isa)
+        self.threads = threads
+        g = gaussians
+        self._native = NativeRasterizer(
+            g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh, threads, self.isa
+        )
+        self._lock = Lock()
 
     def render(self, camera: Camera) -> View:
         """Render colour, depth and opacity from ``camera``."""
-        return View(*self._native.render(camera))
+        shape = (camera.intrinsics.height_px, camera.intrinsics.width_px)
+        view = View(*(np.empty(s, np.float32) for s in ((*shape, 3), shape, shape)))
+        seen_from = native_camera(camera)
+        with self._lock, overlaps_limited():
+            self._native.render(seen_from, view.colour, view.depth, view.opacity)
+        return view
 
     def render_colour(self, camera: Camera) -> F32:
         """Render colour [H, W, 3] alone: the same bytes as ``render``'s, a little sooner."""
-        return self._native.render_colour(camera)
+        colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
+        seen_from = native_camera(camera)
+        with self._lock, overlaps_limited():
+            self._native.render_colour(seen_from, colour)
+        return colour
 
     def statistics(self, camera: Camera) -> RasterStatistics:
-        """Count what rendering this view takes."""
-        return self._native.statistics(camera)
-
-
-def _arrays(gaussians: Gaussians) -> GaussianArrays:
-    g = gaussians
-    return (g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh)
+        """Count what rendering this view takes; slower than rendering it."""
+        seen_from = native_camera(camera)
+        with self._lock, overlaps_limited():
+            counts = self._native.statistics(seen_from)
+        pixels = camera.intrinsics.width_px * camera.intrinsics.height_px
+        return RasterStatistics(*counts, blends_per_px=counts[3] / pixels)

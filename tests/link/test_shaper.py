@@ -103,6 +103,7 @@ def test_a_full_link_refuses_more_and_takes_it_after_a_pop() -> None:
     assert link.is_full
     with pytest.raises(InvalidInput, match="1000 bytes are held"):
         link.push("b", 1, now=0.0)
+    link.push("end", 0, now=0.0)
     link.pop_due(1.0)
     link.push("b", 1, now=1.0)
 

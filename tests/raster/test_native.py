@@ -141,7 +141,7 @@ def test_statistics_count_every_weight_of_a_picture() -> None:
 
 
 def test_an_instruction_set_this_machine_lacks_is_refused_by_name() -> None:
-    with pytest.raises(BackendUnavailable, match="'vax'.*scalar"):
+    with pytest.raises(BackendUnavailable, match=r"'vax'.*scalar"):
         Rasterizer(on_axis(), isa="vax")
 
 

@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "raster/rasterizer.h"
+#include "raster/trainable.h"
 
 namespace nb = nanobind;
 
@@ -22,8 +23,10 @@ namespace {
 using raster::Camera;
 using raster::GaussianArrays;
 using raster::Kernels;
+using raster::LearningRates;
 using raster::Rasterizer;
 using raster::Statistics;
+using raster::TrainableRasterizer;
 using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using FloatsOut = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 
@@ -70,9 +73,7 @@ Camera make_camera(const std::vector<double>& numbers, int width, int height) {
 }
 
 
-}  // namespace
-
-void bind_raster(nb::module_& m) {
+void bind_rasterizer(nb::module_& m) {
     using nb::literals::operator""_a;
     m.def("available_isas", &available_isas, "Instruction sets this machine can run, best first.");
 
@@ -119,6 +120,100 @@ void bind_raster(nb::module_& m) {
                                         s.useful_blends, s.evaluated_blends);
              },
              "camera"_a);
+}
+
+// The five parameter arrays as writable floats, for results in the same layout.
+GaussianArrays writable_arrays_of(const TrainableRasterizer& self, const FloatsOut& means,
+                                  const FloatsOut& quaternions, const FloatsOut& log_scales,
+                                  const FloatsOut& opacity_logits, const FloatsOut& sh) {
+    return {means.data(), quaternions.data(), log_scales.data(), opacity_logits.data(), sh.data(),
+            self.count(), self.degree()};
+}
+
+void bind_trainable(nb::module_& m) {
+    using nb::literals::operator""_a;
+    nb::class_<TrainableRasterizer>(m, "TrainableRasterizer")
+        .def("__init__",
+             [](TrainableRasterizer* self, const Floats& means, const Floats& quaternions,
+                const Floats& log_scales, const Floats& opacity_logits, const Floats& sh,
+                int threads, const std::string& isa) {
+                 const Kernels& kernels = kernels_or_best(isa);
+                 const GaussianArrays arrays =
+                     arrays_of(means, quaternions, log_scales, opacity_logits, sh);
+                 const nb::gil_scoped_release release;
+                 new (self) TrainableRasterizer(arrays, kernels, threads);
+             },
+             "means"_a, "quaternions"_a, "log_scales"_a, "opacity_logits"_a, "sh"_a, "threads"_a,
+             "isa"_a)
+        .def("forward",
+             [](TrainableRasterizer& self, const Camera& camera, int degree,
+                const FloatsOut& colour, const FloatsOut& depth, const FloatsOut& opacity) {
+                 const nb::gil_scoped_release release;
+                 self.forward(camera, degree, colour.data(), depth.data(), opacity.data());
+             },
+             "camera"_a, "degree"_a, "colour"_a, "depth"_a, "opacity"_a)
+        .def("forward_colour",
+             [](TrainableRasterizer& self, const Camera& camera, int degree,
+                const FloatsOut& colour) {
+                 const nb::gil_scoped_release release;
+                 self.forward(camera, degree, colour.data(), nullptr, nullptr);
+             },
+             "camera"_a, "degree"_a, "colour"_a)
+        .def("loss",
+             [](TrainableRasterizer& self, const Floats& colour, const Floats& target,
+                float dssim_weight) {
+                 const nb::gil_scoped_release release;
+                 return self.loss(colour.data(), target.data(), dssim_weight);
+             },
+             "colour"_a, "target"_a, "dssim_weight"_a)
+        .def("set_colour_gradient",
+             [](TrainableRasterizer& self, const Floats& d_colour) {
+                 const nb::gil_scoped_release release;
+                 self.set_colour_gradient(d_colour.data());
+             },
+             "d_colour"_a)
+        .def("backward",
+             [](TrainableRasterizer& self, const Floats& colour) {
+                 const nb::gil_scoped_release release;
+                 self.backward(colour.data());
+             },
+             "colour"_a)
+        .def("adam_step",
+             [](TrainableRasterizer& self, const std::vector<float>& rates) {
+                 if (rates.size() != 9) throw std::invalid_argument("rates are 9 numbers");
+                 const LearningRates r{rates[0], rates[1], rates[2], rates[3], rates[4],
+                                       rates[5], rates[6], rates[7], rates[8]};
+                 const nb::gil_scoped_release release;
+                 self.adam_step(r);
+             },
+             "rates"_a)
+        .def("gradients",
+             [](TrainableRasterizer& self, const FloatsOut& means, const FloatsOut& quaternions,
+                const FloatsOut& log_scales, const FloatsOut& opacity_logits,
+                const FloatsOut& sh) {
+                 const GaussianArrays out = writable_arrays_of(self, means, quaternions,
+                                                               log_scales, opacity_logits, sh);
+                 const nb::gil_scoped_release release;
+                 self.gradients(out);
+             },
+             "means"_a, "quaternions"_a, "log_scales"_a, "opacity_logits"_a, "sh"_a)
+        .def("parameters",
+             [](const TrainableRasterizer& self, const FloatsOut& means,
+                const FloatsOut& quaternions, const FloatsOut& log_scales,
+                const FloatsOut& opacity_logits, const FloatsOut& sh) {
+                 const GaussianArrays out = writable_arrays_of(self, means, quaternions,
+                                                               log_scales, opacity_logits, sh);
+                 const nb::gil_scoped_release release;
+                 self.parameters(out);
+             },
+             "means"_a, "quaternions"_a, "log_scales"_a, "opacity_logits"_a, "sh"_a);
+}
+
+}  // namespace
+
+void bind_raster(nb::module_& m) {
+    bind_rasterizer(m);
+    bind_trainable(m);
 }
 
 }  // namespace rfcore

@@ -12,7 +12,7 @@ constexpr int kBlocksPerTask = 128;
 constexpr int kItemsPerCall = 64;
 constexpr int kMinItemsPerPart = 2048;
 constexpr uint64_t kMaxEntries = 1ull << 30;
-constexpr int kReadableBehind = 64;  // gather() prefetches past the end of a list
+constexpr int kReadableBehind = 64;  // the kernels prefetch past the end of a list
 
 }  // namespace
 
@@ -32,9 +32,11 @@ void FrontEnd::run(const Kernels& kernels, ThreadPool& pool, ProjectJob job, int
     pool.run(parts, [&](int part) { find_spans(kernels, camera, part, parts); });
     count_to_offsets(camera, parts);
     if (keep_positions) {
-        positions_.reserve(entry_count_);
-        first_position_.reserve(static_cast<size_t>(visible_) + 1);
-        first_position_[static_cast<size_t>(visible_)] = entry_count_;
+        const size_t count = static_cast<size_t>(blocks) * kLanes;
+        positions_.reserve(size_t{entry_count_} + kReadableBehind);
+        std::memset(positions_.data() + entry_count_, 0, kReadableBehind * sizeof(uint32_t));
+        ranges_.reserve(count);
+        std::memset(ranges_.data(), 0xff, count * sizeof(EntryRange));  // kNotVisible
     }
     pool.run(parts, [&](int part) { scatter(camera, part, parts, keep_positions); });
 }
@@ -109,7 +111,7 @@ void FrontEnd::scatter(const Camera& camera, int part, int parts, bool keep_posi
     const int end = share_begin(visible_, part + 1, parts);
     for (int i = share_begin(visible_, part, parts); i < end; ++i) {
         const uint32_t id = items_[static_cast<size_t>(i)].id;
-        if (keep_positions) first_position_[static_cast<size_t>(i)] = position;
+        const uint32_t first_position = position;
         for (uint32_t left = *word++; left != 0; --left) {
             const uint32_t span = *word++;
             uint32_t* row = next + span_row(span) * tiles_x;
@@ -119,6 +121,7 @@ void FrontEnd::scatter(const Camera& camera, int part, int parts, bool keep_posi
                 if (keep_positions) positions_[position++] = at;
             }
         }
+        if (keep_positions) ranges_[id] = {first_position, position};
     }
 }
 

@@ -25,8 +25,8 @@ class FrontEnd {
     const Splat* splats() const { return splats_.data(); }
     const uint32_t* entries() const { return entries_.data(); }
     const uint32_t* tile_offsets() const { return tile_offsets_.data(); }
-    // The entries of items()[i] are positions()[first_position()[i] .. first_position()[i + 1]).
-    const uint32_t* first_position() const { return first_position_.data(); }
+    // With `keep_positions`: Gaussian `id` has the entries positions()[begin .. end) of its range.
+    const EntryRange* ranges() const { return ranges_.data(); }
     const uint32_t* positions() const { return positions_.data(); }
 
   private:
@@ -42,7 +42,8 @@ class FrontEnd {
     std::vector<std::vector<uint32_t>> spans_;  // per part: the stream of find_spans
     std::vector<uint32_t> part_entries_;        // per part
     AlignedBuffer<uint32_t> tile_next_;         // [parts][tiles]
-    AlignedBuffer<uint32_t> tile_offsets_, entries_, first_position_, positions_;
+    AlignedBuffer<uint32_t> tile_offsets_, entries_, positions_;
+    AlignedBuffer<EntryRange> ranges_;
     uint32_t entry_count_ = 0;
 };
 

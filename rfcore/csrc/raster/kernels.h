@@ -18,6 +18,12 @@ struct Kernels {
     void (*blend_colour)(const BlendJob&, int tile);
     void (*blend_view)(const BlendJob&, int tile);
     void (*blend_counting)(const BlendJob&, int tile);
+    void (*blend_backward)(const BlendBackwardJob&, int tile);
+    // [degree]; blocks begin..end
+    void (*project_backward[kMaxDegree + 1])(const ProjectBackwardJob&, int begin, int end);
+    // Rows begin..end of a channel; `scratch` holds kLossRows * loss_stride(width) zeros before
+    // the first call and is left ready for the next one of the same width.
+    void (*loss_strip)(const LossJob&, int channel, int begin, int end, float* scratch);
 };
 
 extern const Kernels kScalarKernels;

@@ -11,7 +11,12 @@
 #include <cstdint>
 #include <cstring>
 
+#if defined(RF_ISA_SCALAR)
+// Sixteen lanes unrolled into every caller take the compiler minutes.
+#define RF_INLINE static inline __attribute__((unused))
+#else
 #define RF_INLINE static inline __attribute__((always_inline))
+#endif
 
 #if defined(RF_ISA_AVX512)
 #include "raster/simd_avx512.h"

@@ -103,4 +103,68 @@ struct BlendJob {
     BlendCounts* counts;           // null when not wanted
 };
 
+// Gradients of one (tile, splat) entry, or their sum over the entries of a splat. s is dL/d(ln
+// alpha) of a pixel, (dx, dy) the pixel minus the centre of the splat.
+struct alignas(64) EntryGradient {
+    float s, sx, sy, sxx, sxy, syy;  // sums of s, s dx, s dy, s dx^2, s dx dy, s dy^2
+    float red, green, blue;          // sums of dL/dcolour times the weight of the splat
+    float unused[7];
+};
+static_assert(sizeof(EntryGradient) == 64, "one cache line");
+
+struct BlendBackwardJob {
+    const Camera* camera;
+    const Splat* splats;
+    const uint32_t* entries;
+    const uint32_t* tile_offsets;
+    const float* colour;            // [H, W, 3], as blended
+    const float* d_colour;          // [3, H, W]
+    EntryGradient* entry_gradients;  // [entries], all of them written
+};
+
+// Where the entries of one Gaussian are in the list of positions; empty when it is not visible.
+struct EntryRange {
+    uint32_t begin, end;
+};
+constexpr uint32_t kNotVisible = 0xffffffffu;
+
+// Adam (Kingma and Ba 2015): one rate per plane, bias corrections 1 / (1 - beta^t) included.
+struct AdamStep {
+    float rate[parameter_planes(kMaxDegree)];  // times the correction of the first moment
+    float beta1, beta2, epsilon;
+    float second_correction;
+    float* first_moments;   // as the parameters
+    float* second_moments;
+};
+
+struct ProjectBackwardJob {
+    const Camera* camera;
+    float* parameters;  // [blocks][planes][16]
+    int stored_degree;
+    const EntryRange* ranges;   // [16 blocks]
+    const uint32_t* positions;  // into entry_gradients
+    const EntryGradient* entry_gradients;
+    float* gradients;      // as the parameters, or null
+    const AdamStep* adam;  // or null
+};
+
+// One strip of rows of one channel of the training loss.
+struct LossJob {
+    int width, height;
+    const float* colour;  // [H, W, 3]
+    const float* target;  // [H, W, 3]
+    float dssim_weight;
+    float* d_colour;      // [3, H, W]
+    double* l1_of_row;    // [3, H] sums of |colour - target|
+    double* dssim_of_row;  // [3, H] sums of 1 - SSIM
+};
+constexpr int kLossPad = 16;    // floats on either side of a row
+constexpr int kLossRadius = 5;  // of the window
+constexpr int kLossRing = 2 * kLossRadius + 1;
+constexpr int kLossPlanes = 8;  // 5 blurred moments, 3 blurred derivatives
+constexpr int kLossRows = kLossPlanes * kLossRing + 5;  // rows of scratch per strip
+constexpr int loss_stride(int width) {
+    return (width + kLanes - 1) / kLanes * kLanes + 2 * kLossPad;
+}
+
 }  // namespace rfcore::raster

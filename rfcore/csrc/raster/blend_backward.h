@@ -1,0 +1,220 @@
+// Gradients of one tile by replaying its blending front to back.
+//
+// What lies behind a splat is the final colour minus what has been drawn so far, so no list per
+// pixel is kept and nothing is divided by a vanishing transmittance. Gradients are summed over
+// the pixels of a tile here and over tiles later, both in a fixed order: no atomics.
+#pragma once
+
+#include "raster/tile.h"
+
+namespace {
+
+// The pixels of a tile going back.
+struct TileGradient {
+    alignas(64) float transmittance[kBlocksPerTile][16];
+    alignas(64) float behind[kBlocksPerTile][16];  // dL/dcolour . (colour not yet drawn)
+    alignas(64) float red[kBlocksPerTile][16];     // dL/dcolour
+    alignas(64) float green[kBlocksPerTile][16];
+    alignas(64) float blue[kBlocksPerTile][16];
+};
+
+// Per splat of a chunk and lane of the block in hand.
+struct Replay {
+    alignas(64) float s[(kChunk + kLanes) * 16];       // dL/d(ln alpha)
+    alignas(64) float weight[(kChunk + kLanes) * 16];  // alpha T
+};
+
+RF_INLINE uint32_t start_gradient(const BlendBackwardJob& job, int tile_x, int tile_y,
+                                  TileGradient* g) {
+    const int width = job.camera->width, height = job.camera->height;
+    const size_t pixels = static_cast<size_t>(width) * height;
+    uint32_t outside = 0;
+    for (int b = 0; b < kBlocksPerTile; ++b) {
+        const int left = tile_x * kTileSide + (b & 3) * kBlockSide;
+        const int top = tile_y * kTileSide + (b >> 2) * kBlockSide;
+        if (left >= width || top >= height) outside |= 1u << b;
+        alignas(64) float colour[3][16];
+        for (int lane = 0; lane < kLanes; ++lane) {
+            const int x = left + (lane >> 2), y = top + (lane & 3);
+            const bool inside = x < width && y < height;
+            const size_t at = inside ? static_cast<size_t>(y) * width + x : 0;
+            g->transmittance[b][lane] = inside ? 1.0f : 0.0f;
+            g->red[b][lane] = inside ? job.d_colour[at] : 0.0f;
+            g->green[b][lane] = inside ? job.d_colour[pixels + at] : 0.0f;
+            g->blue[b][lane] = inside ? job.d_colour[2 * pixels + at] : 0.0f;
+            for (int c = 0; c < 3; ++c) colour[c][lane] = inside ? job.colour[3 * at + c] : 0.0f;
+        }
+        const Lanes green_blue =
+            fma(load(g->green[b]), load(colour[1]), load(g->blue[b]) * load(colour[2]));
+        store(g->behind[b], fma(load(g->red[b]), load(colour[0]), green_blue));
+    }
+    return outside;
+}
+
+// Replay `listed` splats over block `b`; return how many were replayed before the block was opaque
+// (a multiple of kUnroll unless the list ended).
+RF_INLINE int replay_block(const TileChunk& chunk, int b, int listed, TileGradient* g,
+                           Replay* replay, bool* opaque) {
+    constexpr int kCheckEvery = 4;
+    const Lanes x = load(kLaneX) + splat(static_cast<float>((b & 3) * kBlockSide));
+    const Lanes one = splat(1.0f), max_alpha = splat(kMaxAlpha), min_power = splat(kMinPower);
+    const Lanes min_t = splat(kMinTransmittance);
+    const Lanes red = load(g->red[b]), green = load(g->green[b]), blue = load(g->blue[b]);
+    Lanes t = load(g->transmittance[b]), behind = load(g->behind[b]);
+    int k = 0;
+    while (k < listed) {
+        const TileEntry& e = chunk.at(k);
+        const Lanes p = power_at(e, x, b >> 2);
+        const Lanes unclamped = alpha_from_log2(p);
+        const Lanes alpha = keep_min(ge(p, min_power), unclamped, max_alpha);
+        const Lanes after = fnma(t, alpha, t);
+        const Mask lit = gt(after, min_t);
+        const Lanes weight = keep_mul(lit, alpha, t);
+        const Lanes own = fma(red, splat(e.splat.red),
+                              fma(green, splat(e.splat.green), blue * splat(e.splat.blue)));
+        behind = fnma(weight, own, behind);
+        const Lanes d_alpha = fma(t, own, negate(behind / (one - alpha)));
+        store(replay->s + 16 * k, keep_mul(both(lit, ge(max_alpha, unclamped)), alpha, d_alpha));
+        store(replay->weight + 16 * k, weight);
+        t = after;
+        ++k;
+        if (k % kCheckEvery == 0) {
+            t = keep(lit, t);
+            if (!any(lit)) break;
+        }
+    }
+    store(g->transmittance[b], t);
+    store(g->behind[b], behind);
+    *opaque = !any(gt(t, min_t));
+    return k;
+}
+
+// Moments of s over the pixels of a block, for 16 splats; coordinates relative to the tile.
+struct Moments {
+    Lanes one, x, y, xx, xy, yy;
+};
+
+// `s[lane]` holds pixel `lane` of 16 splats; lane 4 x + y is pixel (x, y) of the block.
+RF_INLINE Moments block_moments(const Lanes* s, float left, float top) {
+    Lanes column[4], column_y[4], column_yy[4];  // sums of s, s y, s y^2 down each column
+    const Lanes two = splat(2.0f), three = splat(3.0f), four = splat(4.0f), nine = splat(9.0f);
+    for (int j = 0; j < 4; ++j) {
+        const Lanes* c = s + 4 * j;
+        column[j] = (c[0] + c[1]) + (c[2] + c[3]);
+        column_y[j] = fma(c[3], three, fma(c[2], two, c[1]));
+        column_yy[j] = fma(c[3], nine, fma(c[2], four, c[1]));
+    }
+    const Lanes one = (column[0] + column[1]) + (column[2] + column[3]);
+    const Lanes x = fma(column[3], three, fma(column[2], two, column[1]));
+    const Lanes xx = fma(column[3], nine, fma(column[2], four, column[1]));
+    const Lanes y = (column_y[0] + column_y[1]) + (column_y[2] + column_y[3]);
+    const Lanes xy = fma(column_y[3], three, fma(column_y[2], two, column_y[1]));
+    const Lanes yy = (column_yy[0] + column_yy[1]) + (column_yy[2] + column_yy[3]);
+    const Lanes x0 = splat(left + 0.5f), y0 = splat(top + 0.5f);
+    Moments m;
+    m.one = one;
+    m.x = fma(x0, one, x);
+    m.y = fma(y0, one, y);
+    m.xx = fma(x0, x + m.x, xx);
+    m.yy = fma(y0, y + m.y, yy);
+    m.xy = fma(x0, m.y, fma(y0, x, xy));
+    return m;
+}
+
+// Store nine planes of 16 values and read them back as the first nine floats of 16 rows.
+RF_INLINE void planes_to_rows(const Moments& m, Lanes red, Lanes green, Lanes blue, Lanes* rows) {
+    alignas(64) float planes[256];
+    const Lanes all[9] = {m.one, m.x, m.y, m.xx, m.xy, m.yy, red, green, blue};
+    for (int j = 0; j < 9; ++j) store(planes + 16 * j, all[j]);
+    for (int j = 9; j < 16; ++j) store(planes + 16 * j, zero());
+    transpose(planes, rows);
+}
+
+// Add the gradients of the replayed splats of block `b` to their sums over the tile.
+RF_INLINE void reduce_block(const TileChunk& chunk, int b, int replayed, const TileGradient& g,
+                            Replay* replay, float* sums) {
+    constexpr int kStep = static_cast<int>(sizeof(TileEntry));
+    const int padded = (replayed + kLanes - 1) / kLanes * kLanes;
+    for (int k = replayed; k < padded; ++k) {
+        store(replay->s + 16 * k, zero());
+        store(replay->weight + 16 * k, zero());
+    }
+    for (int first = 0; first < replayed; first += kLanes) {
+        Lanes lanes[16], rows[16];
+        transpose(replay->s + 16 * first, lanes);
+        const Moments m = block_moments(lanes, static_cast<float>((b & 3) * kBlockSide),
+                                        static_cast<float>((b >> 2) * kBlockSide));
+        transpose(replay->weight + 16 * first, lanes);
+        Lanes red = zero(), green = zero(), blue = zero();
+        for (int lane = 0; lane < kLanes; ++lane) {
+            red = fma(lanes[lane], splat(g.red[b][lane]), red);
+            green = fma(lanes[lane], splat(g.green[b][lane]), green);
+            blue = fma(lanes[lane], splat(g.blue[b][lane]), blue);
+        }
+        planes_to_rows(m, red, green, blue, rows);
+        const int count = replayed - first < kLanes ? replayed - first : kLanes;
+        for (int i = 0; i < count; ++i) {
+            float* sum = sums + 16 * (chunk.offsets[first + i] / kStep);
+            store(sum, load(sum) + rows[i]);
+        }
+    }
+}
+
+// Move the moments of a chunk from the tile's origin to each splat's centre and write them out.
+RF_INLINE void flush_sums(const TileChunk& chunk, const float* sums, int count, float left,
+                          float top, EntryGradient* out) {
+    for (int first = 0; first < count; first += kLanes) {
+        alignas(64) float centre_x[16], centre_y[16];
+        for (int i = 0; i < kLanes; ++i) {
+            centre_x[i] = chunk.entries[first + i].splat.centre_x - left;
+            centre_y[i] = chunk.entries[first + i].splat.centre_y - top;
+        }
+        const Lanes x = load(centre_x), y = load(centre_y);
+        Lanes sum[16], rows[16];
+        transpose(sums + 16 * first, sum);
+        Moments m;
+        m.one = sum[0];
+        m.x = fnma(x, m.one, sum[1]);
+        m.y = fnma(y, m.one, sum[2]);
+        m.xx = fnma(x, sum[1] + m.x, sum[3]);
+        m.yy = fnma(y, sum[2] + m.y, sum[5]);
+        m.xy = fnma(x, m.y, fnma(y, sum[1], sum[4]));
+        planes_to_rows(m, sum[6], sum[7], sum[8], rows);
+        const int last = count - first < kLanes ? count - first : kLanes;
+        for (int i = 0; i < last; ++i) {
+            store(reinterpret_cast<float*>(out + first + i), rows[i]);
+        }
+    }
+}
+
+static void blend_backward(const BlendBackwardJob& job, int tile) {
+    const int tile_x = tile % job.camera->tiles_x(), tile_y = tile / job.camera->tiles_x();
+    const float left = static_cast<float>(tile_x * kTileSide);
+    const float top = static_cast<float>(tile_y * kTileSide);
+    constexpr uint32_t kAllDone = (1u << kBlocksPerTile) - 1;
+    alignas(64) TileChunk chunk;
+    TileGradient gradient;
+    Replay replay;
+    alignas(64) float sums[kChunk * 16];
+    uint32_t done = start_gradient(job, tile_x, tile_y, &gradient);
+    const uint32_t end = job.tile_offsets[tile + 1];
+    uint32_t e = job.tile_offsets[tile];
+    for (; e < end && done != kAllDone; e += kChunk) {
+        const int count = end - e < kChunk ? static_cast<int>(end - e) : kChunk;
+        gather(job.splats, job.entries + e, count, left, top, &chunk);
+        find_touching(count, left, top, &chunk);
+        memset(sums, 0, sizeof sums);
+        for (int b = 0; b < kBlocksPerTile; ++b) {
+            if (done >> b & 1) continue;
+            const int listed = list_block(&chunk, b, count, 1);
+            bool opaque;
+            const int replayed = replay_block(chunk, b, listed, &gradient, &replay, &opaque);
+            reduce_block(chunk, b, replayed, gradient, &replay, sums);
+            if (opaque) done |= 1u << b;
+        }
+        flush_sums(chunk, sums, count, left, top, job.entry_gradients + e);
+    }
+    if (e < end) memset(job.entry_gradients + e, 0, (end - e) * sizeof(EntryGradient));
+}
+
+}  // namespace

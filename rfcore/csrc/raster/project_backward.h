@@ -1,0 +1,254 @@
+// From gradients of splats to gradients of parameters, and the Adam step, 16 Gaussians at a time.
+//
+// Notation: X is the conic, M = J W R S as in project.h, and d_q stands for dL/dq. Only Gaussians
+// that were visible move (sparse Adam); a gradient that is not a number or beyond 1e15 counts as 0.
+#pragma once
+
+#include "raster/project.h"
+
+namespace {
+
+constexpr float kMaxGradient = 1e15f;  // its square stays finite
+
+// Sums over the entries of 16 Gaussians, and the quantities the backward pass starts from.
+struct SplatGradient {
+    Lanes s, sx, sy, sxx, sxy, syy, colour[3];
+};
+
+// Add up entries in the order of the tiles; return the visible lanes.
+RF_INLINE uint32_t gather_entries(const ProjectBackwardJob& job, int block, SplatGradient* g) {
+    constexpr uint32_t kAhead = 8;
+    alignas(64) float rows[256];
+    uint32_t visible = 0;
+    for (int i = 0; i < kLanes; ++i) {
+        const EntryRange range = job.ranges[block * kLanes + i];
+        Lanes sum = zero();
+        if (range.begin != kNotVisible) {
+            visible |= 1u << i;
+            for (uint32_t e = range.begin; e < range.end; ++e) {
+                __builtin_prefetch(&job.entry_gradients[job.positions[e + kAhead]]);
+                sum = sum + load(reinterpret_cast<const float*>(
+                                &job.entry_gradients[job.positions[e]]));
+            }
+        }
+        store(rows + 16 * i, sum);
+    }
+    Lanes field[16];
+    transpose(rows, field);
+    g->s = field[0];
+    g->sx = field[1];
+    g->sy = field[2];
+    g->sxx = field[3];
+    g->sxy = field[4];
+    g->syy = field[5];
+    for (int c = 0; c < 3; ++c) g->colour[c] = field[6 + c];
+    return visible;
+}
+
+// A symmetric 2x2 matrix.
+struct Symmetric {
+    Lanes xx, xy, yy;
+};
+
+// -X G X for symmetric X and G: how a gradient of a matrix becomes one of its inverse.
+RF_INLINE Symmetric minus_sandwich(const Symmetric& x, const Symmetric& g) {
+    const Lanes e0 = fma(x.xx, g.xx, x.xy * g.xy), e1 = fma(x.xx, g.xy, x.xy * g.yy);
+    const Lanes f0 = fma(x.xy, g.xx, x.yy * g.xy), f1 = fma(x.xy, g.xy, x.yy * g.yy);
+    return {negate(fma(e0, x.xx, e1 * x.xy)), negate(fma(e0, x.xy, e1 * x.yy)),
+            negate(fma(f0, x.xy, f1 * x.yy))};
+}
+
+RF_INLINE Vec3 combine(Lanes p, Vec3 a, Lanes q, Vec3 b) {
+    return {fma(p, a.x, q * b.x), fma(p, a.y, q * b.y), fma(p, a.z, q * b.z)};
+}
+
+RF_INLINE Vec3 matrix_times(const Lanes* m, Vec3 v) {
+    return {fma(m[0], v.x, fma(m[1], v.y, m[2] * v.z)),
+            fma(m[3], v.x, fma(m[4], v.y, m[5] * v.z)),
+            fma(m[6], v.x, fma(m[7], v.y, m[8] * v.z))};
+}
+
+// Through the pinhole and its linearisation: gradient of the position in the camera.
+RF_INLINE Vec3 d_in_camera(const Camera& camera, const Projection& p, Lanes d_centre_x,
+                           Lanes d_centre_y, Vec3 d_row0, Vec3 d_row1) {
+    const float* w = camera.rotation;
+    const Lanes d_j00 = dot(w, d_row0, 0.0f), d_j02 = dot(w + 6, d_row0, 0.0f);
+    const Lanes d_j11 = dot(w + 3, d_row1, 0.0f), d_j12 = dot(w + 6, d_row1, 0.0f);
+    const Lanes fx = splat(camera.fx), fy = splat(camera.fy), rz = p.inverse_z, rz2 = rz * rz;
+    const Lanes shift_x = fx * rz2 * d_j02, shift_y = fy * rz2 * d_j12;
+    const Lanes along_x = shift_x * p.slope_x, along_y = shift_y * p.slope_y;
+    Vec3 d;
+    d.x = fx * rz * d_centre_x - keep(p.free_x, shift_x);
+    d.y = fy * rz * d_centre_y - keep(p.free_y, shift_y);
+    d.z = negate(rz2 * fma(fx * p.in_camera.x, d_centre_x, fy * p.in_camera.y * d_centre_y));
+    d.z = d.z - rz2 * fma(fx, d_j00, fy * d_j11);
+    // A free slope x / z brings a second 1 / z, a clamped one does not.
+    d.z = d.z + along_x + keep(p.free_x, along_x) + along_y + keep(p.free_y, along_y);
+    return d;
+}
+
+// Through R S: gradients of log scales and quaternion from that of the root, row-major.
+RF_INLINE void d_covariance_root(const CovarianceRoot& c, const Lanes* d_root, float* out) {
+    Lanes r[9];  // gradient of the rotation
+    for (int k = 0; k < 3; ++k) {
+        const Lanes d_scale = fma(d_root[k], c.rotation[k],
+                                  fma(d_root[3 + k], c.rotation[3 + k],
+                                      d_root[6 + k] * c.rotation[6 + k]));
+        store(plane(out, kScalePlane + k), c.scale[k] * d_scale);
+        for (int i = 0; i < 3; ++i) r[3 * i + k] = d_root[3 * i + k] * c.scale[k];
+    }
+    const Lanes two = splat(2.0f), minus_two = splat(-2.0f);
+    const Lanes *q = c.quaternion, w = q[0], x = q[1], y = q[2], z = q[3];
+    const Lanes sum01 = r[1] + r[3], sum02 = r[2] + r[6], sum12 = r[5] + r[7];
+    const Lanes dif21 = r[7] - r[5], dif02 = r[2] - r[6], dif10 = r[3] - r[1];
+    Lanes d[4];
+    d[0] = two * fma(x, dif21, fma(y, dif02, z * dif10));
+    d[1] = two * fma(minus_two * x, r[4] + r[8], fma(y, sum01, fma(z, sum02, w * dif21)));
+    d[2] = two * fma(x, sum01, fma(minus_two * y, r[0] + r[8], fma(z, sum12, w * dif02)));
+    d[3] = two * fma(x, sum02, fma(y, sum12, fma(minus_two * z, r[0] + r[4], w * dif10)));
+    // Normalisation takes away the part along q, unless the norm was clamped.
+    const Lanes along = fma(w, d[0], fma(x, d[1], fma(y, d[2], z * d[3])));
+    const Lanes removed = keep(c.norm_is_free, along);
+    for (int k = 0; k < 4; ++k) {
+        store(plane(out, kQuaternionPlane + k), c.inverse_norm * fnma(q[k], removed, d[k]));
+    }
+}
+
+// Gradient of sum_k f[k] Y_k(x, y, z) with respect to the unit vector.
+template <int kDegree>
+RF_INLINE Vec3 d_sh_basis(Lanes x, Lanes y, Lanes z, const Lanes* f) {
+    const Lanes c1 = splat(kSh1), two = splat(2.0f);
+    Vec3 d = {negate(c1 * f[3]), negate(c1 * f[1]), c1 * f[2]};
+    if (kDegree > 1) {
+        const Lanes a = splat(kSh2[0]), b6 = splat(kSh2[2]) * f[6], b8 = splat(2 * kSh2[4]) * f[8];
+        d.x = d.x + a * (y * f[4] - z * f[7]) - two * x * b6 + x * b8;
+        d.y = d.y + a * (x * f[4] - z * f[5]) - two * y * b6 - y * b8;
+        d.z = d.z - a * (y * f[5] + x * f[7]) + splat(4.0f) * z * b6;
+    }
+    if (kDegree > 2) {
+        const Lanes three = splat(3.0f), four = splat(4.0f), six = splat(6.0f);
+        const Lanes xx = x * x, yy = y * y, zz = z * z, xy = x * y, yz = y * z, xz = x * z;
+        Lanes k[7];
+        for (int i = 0; i < 7; ++i) k[i] = splat(kSh3[i]) * f[9 + i];
+        d.x = d.x + k[0] * six * xy + k[1] * yz - k[2] * two * xy - k[3] * six * xz +
+              k[4] * (four * zz - three * xx - yy) + k[5] * two * xz +
+              k[6] * three * (xx - yy);
+        d.y = d.y + k[0] * three * (xx - yy) + k[1] * xz + k[2] * (four * zz - xx - three * yy) -
+              k[3] * six * yz - k[4] * two * xy - k[5] * two * yz - k[6] * six * xy;
+        d.z = d.z + k[1] * xy + k[2] * splat(8.0f) * yz +
+              k[3] * (six * zz - three * xx - three * yy) + k[4] * splat(8.0f) * xz +
+              k[5] * (xx - yy);
+    }
+    return d;
+}
+
+// Through the colour: gradients of the coefficients (written to `out`) and of the mean (returned).
+template <int kDegree>
+RF_INLINE Vec3 d_colour(const Camera& camera, const float* block, Vec3 mean, const Lanes* d_rgb,
+                        float* out) {
+    constexpr int kCoefficients = coefficients_of(kDegree);
+    const float* harmonics = plane(block, kShPlane);
+    Lanes inverse_distance, basis[kCoefficients], colour[3], along[kCoefficients];
+    const Vec3 v = view_direction(camera, mean, &inverse_distance);
+    sh_basis<kDegree>(v.x, v.y, v.z, basis);
+    sh_colour<kDegree>(harmonics, basis, colour);
+    Lanes d[3];
+    for (int c = 0; c < 3; ++c) d[c] = keep(gt(colour[c], zero()), d_rgb[c]);
+    for (int k = 0; k < kCoefficients; ++k) {
+        for (int c = 0; c < 3; ++c) store(plane(out, kShPlane + 3 * k + c), basis[k] * d[c]);
+        along[k] = fma(d[0], load(plane(harmonics, 3 * k)),
+                       fma(d[1], load(plane(harmonics, 3 * k + 1)),
+                           d[2] * load(plane(harmonics, 3 * k + 2))));
+    }
+    if (kDegree == 0) return {zero(), zero(), zero()};
+    const Vec3 u = d_sh_basis<kDegree>(v.x, v.y, v.z, along);
+    const Lanes radial = dot(u, v);
+    return {inverse_distance * fnma(v.x, radial, u.x), inverse_distance * fnma(v.y, radial, u.y),
+            inverse_distance * fnma(v.z, radial, u.z)};
+}
+
+// Gradients of the parameters of one block into `out`, [planes][16].
+template <int kDegree>
+RF_INLINE void block_gradient(const Camera& camera, const float* block, const SplatGradient& g,
+                              float* out) {
+    const Vec3 mean = load_vec3(block, kMeanPlane);
+    CovarianceRoot c;
+    covariance_root(block, &c);
+    Projection p;
+    p.in_camera = to_camera(camera, mean);
+    project_covariance(camera, c.root, &p);
+    const Lanes inverse_det = splat(1.0f) / p.det;
+    const Symmetric conic = {p.c_yy * inverse_det, negate(p.c_xy * inverse_det),
+                             p.c_xx * inverse_det};
+    const Lanes minus_half = splat(-0.5f), two = splat(2.0f);
+    const Symmetric d_conic = {minus_half * g.sxx, minus_half * g.sxy, minus_half * g.syy};
+    const Symmetric h = minus_sandwich(conic, d_conic);
+    const Lanes d_centre_x = fma(conic.xx, g.sx, conic.xy * g.sy);
+    const Lanes d_centre_y = fma(conic.xy, g.sx, conic.yy * g.sy);
+    const Vec3 d_m0 = combine(two * h.xx, p.m0, two * h.xy, p.m1);
+    const Vec3 d_m1 = combine(two * h.xy, p.m0, two * h.yy, p.m1);
+    const Vec3 d_row0 = matrix_times(c.root, d_m0), d_row1 = matrix_times(c.root, d_m1);
+    const Vec3 d_cam = d_in_camera(camera, p, d_centre_x, d_centre_y, d_row0, d_row1);
+    const Vec3 &a = p.world_row0, &b = p.world_row1;
+    const Vec3 rows[3] = {combine(a.x, d_m0, b.x, d_m1), combine(a.y, d_m0, b.y, d_m1),
+                          combine(a.z, d_m0, b.z, d_m1)};
+    Lanes d_root[9];
+    for (int i = 0; i < 3; ++i) {
+        d_root[3 * i] = rows[i].x;
+        d_root[3 * i + 1] = rows[i].y;
+        d_root[3 * i + 2] = rows[i].z;
+    }
+    d_covariance_root(c, d_root, out);
+    store(plane(out, kLogitPlane), g.s * (splat(1.0f) - sigmoid(load(plane(block, kLogitPlane)))));
+    const Vec3 d_mean = d_colour<kDegree>(camera, block, mean, g.colour, out);
+    const float* w = camera.rotation;
+    const Lanes by_view[3] = {d_mean.x, d_mean.y, d_mean.z};
+    for (int j = 0; j < 3; ++j) {
+        const float column[3] = {w[j], w[3 + j], w[6 + j]};
+        store(plane(out, kMeanPlane + j), dot(column, d_cam, 0.0f) + by_view[j]);
+    }
+}
+
+// A usable gradient: 0 where the Gaussian is not visible, or the value is not.
+RF_INLINE Lanes usable(Mask visible, Lanes gradient) {
+    return keep(both(visible, ge(splat(kMaxGradient), absolute(gradient))), gradient);
+}
+
+RF_INLINE void adam_plane(const AdamStep& step, int index, Mask visible, Lanes gradient,
+                          size_t offset, float* parameters) {
+    float* first = step.first_moments + offset;
+    float* second = step.second_moments + offset;
+    const Lanes one = splat(1.0f), beta1 = splat(step.beta1), beta2 = splat(step.beta2);
+    const Lanes m = fma(beta1, load(first), (one - beta1) * gradient);
+    const Lanes v = fma(beta2, load(second), (one - beta2) * (gradient * gradient));
+    const Lanes root = sqrt(v * splat(step.second_correction)) + splat(step.epsilon);
+    store_where(first, visible, m);
+    store_where(second, visible, v);
+    store_where(parameters, visible,
+                fnma(splat(step.rate[index]), m / root, load(parameters)));
+}
+
+template <int kDegree>
+static void project_backward(const ProjectBackwardJob& job, int begin, int end) {
+    constexpr int kPlanes = parameter_planes(kDegree);
+    const size_t stride = static_cast<size_t>(parameter_planes(job.stored_degree)) * kLanes;
+    for (int b = begin; b < end; ++b) {
+        SplatGradient g;
+        const uint32_t visible_bits = gather_entries(job, b, &g);
+        if (visible_bits == 0) continue;
+        const Mask visible = mask_from_bits(visible_bits);
+        const size_t offset = static_cast<size_t>(b) * stride;
+        alignas(64) float gradient[kPlanes * kLanes];
+        block_gradient<kDegree>(*job.camera, job.parameters + offset, g, gradient);
+        for (int k = 0; k < kPlanes; ++k) {
+            const Lanes value = usable(visible, load(plane(gradient, k)));
+            const size_t at = offset + static_cast<size_t>(k) * kLanes;
+            if (job.gradients != nullptr) store(job.gradients + at, value);
+            if (job.adam != nullptr) {
+                adam_plane(*job.adam, k, visible, value, at, job.parameters + at);
+            }
+        }
+    }
+}
+
+}  // namespace

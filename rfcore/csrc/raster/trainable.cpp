@@ -1,0 +1,178 @@
+#include "raster/trainable.h"
+
+#include <algorithm>
+#include <cstring>
+
+namespace rfcore::raster {
+namespace {
+
+constexpr int kTilesPerBatch = 4;
+constexpr int kBlocksPerTask = 64;
+constexpr int kMinRowsPerStrip = 64;  // a strip computes 20 rows twice
+
+// `from` is the layout of `blocks`, one row per Gaussian; the inverse of pack_parameters.
+void unpack_parameters(const float* blocks, const GaussianArrays& to) {
+    const size_t stride = static_cast<size_t>(parameter_planes(to.degree)) * kLanes;
+    const size_t sh_count = 3 * static_cast<size_t>(coefficients_of(to.degree));
+    const auto writable = [](const float* p) { return const_cast<float*>(p); };
+    for (size_t n = 0; n < static_cast<size_t>(to.count); ++n) {
+        const float* lane = blocks + n / kLanes * stride + n % kLanes;
+        for (size_t k = 0; k < 3; ++k) {
+            writable(to.means)[3 * n + k] = lane[(kMeanPlane + k) * kLanes];
+            writable(to.log_scales)[3 * n + k] = lane[(kScalePlane + k) * kLanes];
+        }
+        for (size_t k = 0; k < 4; ++k) {
+            writable(to.quaternions)[4 * n + k] = lane[(kQuaternionPlane + k) * kLanes];
+        }
+        writable(to.opacity_logits)[n] = lane[kLogitPlane * kLanes];
+        for (size_t k = 0; k < sh_count; ++k) {
+            writable(to.sh)[sh_count * n + k] = lane[(kShPlane + k) * kLanes];
+        }
+    }
+}
+
+}  // namespace
+
+TrainableRasterizer::TrainableRasterizer(const GaussianArrays& gaussians, const Kernels& kernels,
+                                         int threads)
+    : kernels_(kernels),
+      pool_(threads),
+      count_(gaussians.count),
+      blocks_((gaussians.count + kLanes - 1) / kLanes),
+      degree_(gaussians.degree) {
+    const size_t size =
+        static_cast<size_t>(blocks_) * static_cast<size_t>(parameter_planes(degree_)) * kLanes;
+    for (AlignedBuffer<float>* buffer : {&parameters_, &first_moments_, &second_moments_}) {
+        buffer->reserve(size);
+        std::memset(buffer->data(), 0, size * sizeof(float));
+    }
+    pack_parameters(gaussians, parameters_.data());
+}
+
+void TrainableRasterizer::forward(const Camera& camera, int degree, float* colour, float* depth,
+                                  float* opacity) {
+    camera_ = camera;
+    active_degree_ = degree;
+    const ProjectJob job{&camera_, nullptr, nullptr, parameters_.data(), degree_, nullptr};
+    front_end_.run(kernels_, pool_, job, blocks_, degree, true);
+    const BlendJob blend{&camera_, front_end_.splats(),  front_end_.entries(),
+                         front_end_.tile_offsets(), colour, depth, opacity, nullptr};
+    blend_tiles(pool_, depth == nullptr ? kernels_.blend_colour : kernels_.blend_view, blend);
+}
+
+double TrainableRasterizer::loss(const float* colour, const float* target, float dssim_weight) {
+    const int width = camera_.width, height = camera_.height;
+    const size_t pixels = static_cast<size_t>(width) * height;
+    const size_t strip_floats = static_cast<size_t>(kLossRows) * loss_stride(width);
+    const int strips = std::clamp(height / kMinRowsPerStrip, 1, pool_.threads());
+    const int tasks = 3 * strips;
+    d_colour_.reserve(3 * pixels);
+    const size_t scratch = strip_floats * static_cast<size_t>(tasks) + kLanes;
+    if (loss_scratch_width_ != width || loss_scratch_.size() < scratch) {
+        loss_scratch_.assign(scratch, 0.0f);
+        loss_scratch_width_ = width;
+    }
+    row_sums_.assign(6 * static_cast<size_t>(height), 0.0);
+    double* const l1 = row_sums_.data();
+    double* const dssim = l1 + 3 * static_cast<size_t>(height);
+    const LossJob job{width, height, colour, target, dssim_weight, d_colour_.data(), l1, dssim};
+    const auto address = reinterpret_cast<uintptr_t>(loss_scratch_.data());
+    float* const aligned = reinterpret_cast<float*>((address + 63) / 64 * 64);
+    pool_.run(tasks, [&](int task) {
+        const int channel = task % 3, strip = task / 3;
+        kernels_.loss_strip(job, channel, share_begin(height, strip, strips),
+                            share_begin(height, strip + 1, strips),
+                            aligned + static_cast<size_t>(task) * strip_floats);
+    });
+    double l1_sum = 0.0, dssim_sum = 0.0;
+    for (int i = 0; i < 3 * height; ++i) {
+        l1_sum += l1[i];
+        dssim_sum += dssim[i];
+    }
+    const double weight = static_cast<double>(dssim_weight);
+    return ((1.0 - weight) * l1_sum + weight * dssim_sum) / (3.0 * static_cast<double>(pixels));
+}
+
+void TrainableRasterizer::set_colour_gradient(const float* d_colour) {
+    const size_t pixels = static_cast<size_t>(camera_.width) * camera_.height;
+    d_colour_.reserve(3 * pixels);
+    for (size_t i = 0; i < pixels; ++i) {
+        for (size_t c = 0; c < 3; ++c) d_colour_[c * pixels + i] = d_colour[3 * i + c];
+    }
+}
+
+void TrainableRasterizer::backward(const float* colour) {
+    entry_gradients_.reserve(front_end_.entry_count() + 1);
+    const BlendBackwardJob job{&camera_,
+                               front_end_.splats(),
+                               front_end_.entries(),
+                               front_end_.tile_offsets(),
+                               colour,
+                               d_colour_.data(),
+                               entry_gradients_.data()};
+    pool_.run(
+        camera_.tiles_x() * camera_.tiles_y(),
+        [&](int tile) { kernels_.blend_backward(job, tile); }, kTilesPerBatch);
+}
+
+void TrainableRasterizer::project_backward(float* gradients, const AdamStep* adam) {
+    const ProjectBackwardJob job{&camera_,
+                                 parameters_.data(),
+                                 degree_,
+                                 front_end_.ranges(),
+                                 front_end_.positions(),
+                                 entry_gradients_.data(),
+                                 gradients,
+                                 adam};
+    const int tasks = (blocks_ + kBlocksPerTask - 1) / kBlocksPerTask;
+    pool_.run(tasks, [&](int task) {
+        const int begin = task * kBlocksPerTask;
+        kernels_.project_backward[active_degree_](job, begin,
+                                                  std::min(blocks_, begin + kBlocksPerTask));
+    });
+}
+
+void TrainableRasterizer::gradients(const GaussianArrays& out_as_floats) {
+    const size_t size =
+        static_cast<size_t>(blocks_) * static_cast<size_t>(parameter_planes(degree_)) * kLanes;
+    AlignedBuffer<float> blocks;
+    blocks.reserve(size);
+    std::memset(blocks.data(), 0, size * sizeof(float));
+    project_backward(blocks.data(), nullptr);
+    unpack_parameters(blocks.data(), out_as_floats);
+}
+
+// Powers of beta by multiplication: pow() of two C libraries need not agree.
+AdamStep TrainableRasterizer::next_step(const LearningRates& rates) {
+    beta1_power_ *= static_cast<double>(rates.beta1);
+    beta2_power_ *= static_cast<double>(rates.beta2);
+    const double first_correction = 1.0 / (1.0 - beta1_power_);
+    AdamStep step{};
+    step.beta1 = rates.beta1;
+    step.beta2 = rates.beta2;
+    step.epsilon = rates.epsilon;
+    step.second_correction = static_cast<float>(1.0 / (1.0 - beta2_power_));
+    step.first_moments = first_moments_.data();
+    step.second_moments = second_moments_.data();
+    for (int plane = 0; plane < parameter_planes(degree_); ++plane) {
+        const float rate = plane < kScalePlane        ? rates.mean
+                           : plane < kQuaternionPlane ? rates.log_scale
+                           : plane < kLogitPlane      ? rates.quaternion
+                           : plane < kShPlane         ? rates.opacity
+                           : plane < kShPlane + 3     ? rates.sh_dc
+                                                      : rates.sh_rest;
+        step.rate[plane] = static_cast<float>(static_cast<double>(rate) * first_correction);
+    }
+    return step;
+}
+
+void TrainableRasterizer::adam_step(const LearningRates& rates) {
+    const AdamStep step = next_step(rates);
+    project_backward(nullptr, &step);
+}
+
+void TrainableRasterizer::parameters(const GaussianArrays& out_as_floats) const {
+    unpack_parameters(parameters_.data(), out_as_floats);
+}
+
+}  // namespace rfcore::raster

@@ -1,0 +1,52 @@
+"""The ``rfedge`` command: one module a verb.
+
+A verb module holds one frozen dataclass, the verb's options (its docstrings are the ``--help``),
+with a ``run`` method. Heavy imports happen inside ``run``, so that ``rfedge --help`` is immediate.
+A user's mistake ends in one line on stderr and exit status 2, never in a traceback.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import tyro
+from tyro.conf import OmitSubcommandPrefixes, subcommand
+
+from rfcore.errors import RfedgeError
+from rfedge.cli.bench import Bench
+from rfedge.cli.decode import Decode
+from rfedge.cli.demo import Demo
+from rfedge.cli.encode import Encode
+from rfedge.cli.link import Link
+from rfedge.cli.render import Render
+from rfedge.cli.train import Train
+
+__all__ = ["main"]
+
+Verb = (
+    Annotated[Demo, subcommand("demo")]
+    | Annotated[Train, subcommand("train")]
+    | Annotated[Render, subcommand("render")]
+    | Annotated[Encode, subcommand("encode")]
+    | Annotated[Decode, subcommand("decode")]
+    | Annotated[Link, subcommand("link")]
+    | Annotated[Bench, subcommand("bench")]
+)
+
+DESCRIPTION = """Distributed radiance fields for edge video: H.264 deltas against a shared render,
+from vehicle to roadside server. Start with `rfedge demo`."""
+
+
+def main() -> int:
+    """Parse the command line, run one verb, and return its exit status."""
+    verb = tyro.cli(Verb, prog="rfedge", description=DESCRIPTION, config=(OmitSubcommandPrefixes,))
+    try:
+        verb.run()
+    except (RfedgeError, OSError) as error:
+        print(f"rfedge: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("rfedge: interrupted", file=sys.stderr)
+        return 130
+    return 0

@@ -1,0 +1,32 @@
+"""``rfedge bench``: correctness first, then time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from tyro.conf import Positional
+
+__all__ = ["Bench"]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Check a part against its definition, then time it: medians of at least 20 repetitions."""
+
+    case: Annotated[Literal["raster", "train", "codec"], Positional]
+    """What to measure."""
+    rows: Literal["all", "native"] = "all"
+    """`native` leaves out the timing of the slow torch reference (raster only)."""
+    json: str | None = None
+    """Write one JSON object to this file; `-` is standard output."""
+
+    def run(self) -> None:
+        """Run one case and print its rows."""
+        from rfedge.bench import print_rows, run_case, write_json
+
+        result = run_case(self.case, rows=self.rows)
+        if self.json is None:
+            print_rows(result)
+        else:
+            write_json(result, self.json)

@@ -1,0 +1,65 @@
+"""``rfedge demo``: the main job, end to end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Demo"]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Train the sample's field, run server, link and vehicle on two drives, and report."""
+
+    sample: Path = Path("samples/street")
+    """Dataset folder: training views, points, and the drives `empty` and `vehicles`."""
+    out: Path = Path("out/demo")
+    """Folder for report.html, reconstructed.mp4 and result.json; replaced on every run."""
+    cache: Path = Path("out/cache")
+    """Folder that keeps the trained field between runs."""
+    train: bool = False
+    """Train the field anew even if a trained one is cached."""
+    gaussians: int | None = None
+    """At most how many Gaussians to train; default: the trainer's own."""
+    iterations: int | None = None
+    """Training iterations; default: the trainer's own."""
+    rate_hz: float = 10.0
+    """Camera frames per second of the drives."""
+    link_bps: float = 4e6
+    """Throughput of the link in either direction, bit/s."""
+    link_delay_ms: float = 20.0
+    """One-way delay of the link, ms."""
+    preset: str = "medium"
+    """x264 preset of the P pictures."""
+    crf: float = 23.0
+    """x264 constant rate factor, 0 (best) to 51."""
+    threads: int = 2
+    """Threads of each renderer."""
+
+    def run(self) -> None:
+        """Run the demo, write its report and print its table."""
+        from rich.console import Console
+
+        from rfedge.demo import DemoSettings, run_demo
+        from rfedge.report import print_table, write_report
+        from rfedge.training import training_config
+
+        console = Console()
+        settings = DemoSettings(
+            sample=self.sample,
+            out=self.out,
+            cache=self.cache,
+            train_anew=self.train,
+            training=training_config(self.gaussians, self.iterations, self.threads),
+            rate_hz=self.rate_hz,
+            link_bps=self.link_bps,
+            link_delay_ms=self.link_delay_ms,
+            preset=self.preset,
+            crf=self.crf,
+            threads=self.threads,
+        )
+        run = run_demo(settings, console)
+        write_report(self.out / "report.html", run.result, run.pictures)
+        print_table(console, run.result, self.out)
+        run.require_complete()

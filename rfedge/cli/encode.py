@@ -1,0 +1,46 @@
+"""``rfedge encode``: a drive into a file, without a network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+__all__ = ["Encode"]
+
+
+@dataclass(frozen=True)
+class Encode:
+    """Code a drive against a field's renders; write the vehicle's messages as a .rfv file."""
+
+    drive: Annotated[Path, Positional]
+    """A transforms.json with posed pictures in time order."""
+    field: Path
+    """The field archive (.rff)."""
+    out: Path
+    """The coded drive to write (.rfv)."""
+    preset: str = "medium"
+    """x264 preset of the P pictures."""
+    crf: float = 23.0
+    """x264 constant rate factor, 0 (best) to 51."""
+    threads: int = 2
+    """Threads of the rasterizer."""
+
+    def run(self) -> None:
+        """Code the drive and print its size."""
+        from rfcore.dataset import read_transforms
+        from rfcore.field import load_field
+        from rfcore.wire.drive_file import write_drive
+        from rfedge.offline import CodingSettings, encode_drive
+
+        dataset = read_transforms(self.drive)
+        field = load_field(self.field, threads=self.threads)
+        coded = encode_drive(dataset, field, CodingSettings(self.preset, self.crf))
+        write_drive(self.out, coded)
+        payload_bytes = sum(len(frame.packet.payload) for frame in coded.frames)
+        print(
+            f"{self.out}: {len(coded.frames)} frames, {self.out.stat().st_size:,} bytes, "
+            f"of which payload {payload_bytes:,}"
+        )

@@ -1,0 +1,44 @@
+"""``rfedge link``: the throughput-limited link as a TCP proxy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Link"]
+
+
+@dataclass(frozen=True)
+class Link:
+    """Forward TCP between a vehicle and a server at a limited throughput and with a delay."""
+
+    to: str
+    """Where to connect for each accepted connection, HOST:PORT."""
+    listen: str = "127.0.0.1:0"
+    """Where to accept connections, HOST:PORT; port 0 takes a free one."""
+    uplink_bps: float = 4e6
+    """Throughput from the accepting side to `--to`, bit/s."""
+    downlink_bps: float = 4e6
+    """Throughput of the way back, bit/s."""
+    delay_ms: float = 20.0
+    """One-way delay in either direction, ms."""
+    report: Path | None = None
+    """Write bytes, busy time and timing error here as JSON."""
+    ready_file: Path | None = None
+    """Write HOST:PORT here once listening."""
+
+    def run(self) -> None:
+        """Forward until SIGTERM or SIGINT."""
+        from rfedge.link_proxy import ProxySettings, run_proxy
+
+        run_proxy(
+            ProxySettings(
+                listen=self.listen,
+                to=self.to,
+                uplink_bps=self.uplink_bps,
+                downlink_bps=self.downlink_bps,
+                delay_ms=self.delay_ms,
+                report=self.report,
+                ready_file=self.ready_file,
+            )
+        )

@@ -1,0 +1,231 @@
+"""Orchestrate the demo: field, processes, measurements, and what is left on disk."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from rfcore.camera import Camera
+from rfcore.dataset import Dataset, read_transforms, verify_manifest
+from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.field import SplatField, load_field
+from rfcore.image import Rgb, read_rgb
+from rfcore.native.yuv import i420_from_colour, rgb_from_i420
+from rfcore.train import SplatTrainingConfig
+from rfedge.demo.field import cached_or_trained
+from rfedge.demo.measure import DriveOutcome, Pictures, measure_drive
+from rfedge.demo.processes import command_of, run_to_end, service
+from rfedge.demo.video import write_video
+from rfedge.provenance import host, revision
+
+__all__ = ["DRIVES", "DemoRun", "DemoSettings", "run_demo"]
+
+DRIVES = ("empty", "vehicles")
+VEHICLE = "demo"
+CAMERA = "front"
+DRIVE_TIMEOUT_S = 300.0
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """What the demo runs with; units in the names."""
+
+    sample: Path
+    out: Path
+    cache: Path
+    train_anew: bool
+    training: SplatTrainingConfig
+    rate_hz: float
+    link_bps: float
+    link_delay_ms: float
+    preset: str
+    crf: float
+    threads: int
+
+    def __post_init__(self) -> None:
+        if not self.link_bps > 0:
+            raise InvalidInput("link-bps", f"{self.link_bps:g} must be above 0 bit/s")
+        if not self.rate_hz > 0:
+            raise InvalidInput("rate-hz", f"{self.rate_hz:g} must be above 0 Hz")
+
+
+@dataclass(frozen=True)
+class DemoRun:
+    """A finished demo: the content of ``result.json`` and the pictures of each drive."""
+
+    result: Mapping[str, Any]
+    pictures: Mapping[str, Sequence[Pictures]]
+
+    def require_complete(self) -> None:
+        """Raise ``RfedgeError`` unless every frame was reconstructed with a matching digest."""
+        for name, entry in self.result["sequences"].items():
+            for key in ("frames_reconstructed", "digest_matches"):
+                if entry[key] != entry["frames"]:
+                    raise RfedgeError(
+                        f"drive {name}: {key} is {entry[key]} of {entry['frames']} frames"
+                    )
+
+
+def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
+    """Run the processes, measure, and write ``result.json`` and ``reconstructed.mp4``.
+
+    Raises ``RfedgeError`` naming the process or file that failed. Nothing is written to
+    ``settings.out`` before the sample has been verified.
+    """
+    console.print(f"[bold]Sample[/] {settings.sample}: verifying")
+    verify_manifest(settings.sample)
+    _refuse_foreign_folder(settings.out)
+    field_path = cached_or_trained(
+        settings.sample, settings.cache, settings.training, settings.train_anew, console
+    )
+    _empty_folder(settings.out)
+    field = load_field(field_path, threads=settings.threads)
+    sequences: dict[str, Any] = {}
+    pictures: dict[str, list[Pictures]] = {}
+    for drive in DRIVES:
+        console.print(f"[bold]Drive[/] {drive}: server, link and vehicle as processes")
+        outcome = _drive_outcome(settings, drive, field_path, field)
+        sequences[drive] = measure_drive(outcome)
+        pictures[drive] = list(outcome.pictures)
+    result = _result(settings, field, sequences)
+    write_video(settings.out / "reconstructed.mp4", pictures, settings.rate_hz)
+    (settings.out / "result.json").write_text(json.dumps(result, indent=2) + "\n")
+    return DemoRun(result, pictures)
+
+
+def _refuse_foreign_folder(folder: Path) -> None:
+    """Raise ``InvalidInput`` for a folder whose content no demo made: it would be deleted."""
+    content = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if content - {"work"} and "result.json" not in content:
+        raise InvalidInput(
+            "out", f"{folder} is not empty and holds no result.json; name another folder"
+        )
+
+
+def _empty_folder(folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "work").mkdir(parents=True)
+
+
+def _drive_outcome(
+    settings: DemoSettings, drive: str, field_path: Path, field: SplatField
+) -> DriveOutcome:
+    work = settings.out / "work" / drive
+    work.mkdir(parents=True)
+    drive_path = settings.sample / f"transforms_drive_{drive}.json"
+    _run_processes(settings, drive_path, field_path, field.field_id, work)
+    agent_rows = _json_lines(work / "agent.jsonl")
+    saved = work / "saved" / VEHICLE / CAMERA
+    index = {row["sequence"]: row for row in _json_lines(saved / "index.jsonl")}
+    dataset = read_transforms(drive_path)
+    if not index:
+        raise RfedgeError(f"drive {drive}: the server reconstructed nothing, see {work}")
+    return DriveOutcome(
+        agent_rows=agent_rows,
+        server_digests={sequence: row["digest"] for sequence, row in index.items()},
+        link=json.loads((work / "link.json").read_text()),
+        pictures=_pictures(
+            dataset, field, agent_rows, {s: saved / row["file"] for s, row in index.items()}
+        ),
+        wrong_street=_wrong_street(settings.sample, field),
+        preset=settings.preset,
+        crf=settings.crf,
+    )
+
+
+def _run_processes(
+    settings: DemoSettings, drive_path: Path, field_path: Path, field_id: str, work: Path
+) -> None:
+    server_command = [
+        *command_of("mec-server"),
+        *("--fields", str(field_path.parent), "--save", str(work / "saved")),
+        *("--listen", "127.0.0.1:0", "--threads", str(settings.threads)),
+    ]
+    with service("mec-server", server_command, work) as server:
+        link_command = [
+            *command_of("rfedge"),
+            *("link", "--listen", "127.0.0.1:0", "--to", server.address),
+            *("--uplink-bps", str(settings.link_bps), "--downlink-bps", str(settings.link_bps)),
+            *("--delay-ms", str(settings.link_delay_ms), "--report", str(work / "link.json")),
+        ]
+        with service("link", link_command, work) as link:
+            agent_command = [
+                *command_of("cav-agent"),
+                *("--server", link.address, "--drive", str(drive_path), "--camera", CAMERA),
+                *("--fields", str(field_path.parent), "--field", field_id, "--vehicle", VEHICLE),
+                *("--rate", str(settings.rate_hz), "--pace", "lockstep"),
+                *("--crf", str(settings.crf), "--preset", settings.preset),
+                *("--threads", str(settings.threads), "--report", str(work / "agent.jsonl")),
+            ]
+            run_to_end("cav-agent", agent_command, work, DRIVE_TIMEOUT_S)
+
+
+def _json_lines(path: Path) -> list[dict[str, Any]]:
+    if not path.exists():
+        raise RfedgeError(f"{path} was not written: the processes reported nothing")
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def _pictures(
+    dataset: Dataset,
+    field: SplatField,
+    agent_rows: list[dict[str, Any]],
+    saved: Mapping[int, Path],
+) -> list[Pictures]:
+    """Pair each reconstructed frame with its camera picture and its render."""
+    posed = {picture.name: picture for picture in dataset.pictures}
+    return [
+        Pictures(
+            row["name"],
+            posed[row["name"]].read(),
+            _rendered(field, posed[row["name"]].camera),
+            read_rgb(saved[row["sequence"]]),
+        )
+        for row in agent_rows
+        if row["sequence"] in saved
+    ]
+
+
+def _rendered(field: SplatField, camera: Camera) -> Rgb:
+    """The render as the codec sees it: through YUV 4:2:0 and back."""
+    return rgb_from_i420(i420_from_colour(field.render(camera).colour))
+
+
+def _wrong_street(sample: Path, field: SplatField) -> Rgb:
+    """A render of the same field from a training view far from the drive."""
+    train = read_transforms(sample / "transforms_train.json")
+    drive = read_transforms(sample / f"transforms_drive_{DRIVES[0]}.json")
+    start = drive.pictures[0].camera.world_from_cam.translation_m
+    farthest = max(
+        train.pictures,
+        key=lambda view: sum(
+            (a - b) ** 2
+            for a, b in zip(view.camera.world_from_cam.translation_m, start, strict=True)
+        ),
+    )
+    return _rendered(field, farthest.camera)
+
+
+def _result(
+    settings: DemoSettings, field: SplatField, sequences: Mapping[str, Any]
+) -> dict[str, Any]:
+    return {
+        "format": "rfedge-demo-1",
+        "command": " ".join(["rfedge", *sys.argv[1:]]),
+        "revision": revision(),
+        "host": host(),
+        "settings": {k: str(v) if isinstance(v, Path) else v for k, v in asdict(settings).items()},
+        "field": {
+            "id": field.field_id,
+            "gaussians": len(field.gaussians),
+            "held_out_psnr_db": field.metadata.held_out_psnr_db,
+        },
+        "sequences": sequences,
+    }

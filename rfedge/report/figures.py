@@ -1,0 +1,106 @@
+"""The demo report's charts, as inline SVG.
+
+One palette, one axis per chart, direct labels where a legend would be read twice.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib as mpl
+
+mpl.use("svg")
+
+from matplotlib import pyplot as plt
+
+__all__ = ["bytes_chart", "quality_chart", "stages_chart"]
+
+INK, MUTED, GRID = "#1c2733", "#6b7785", "#dfe4ea"
+PAYLOAD, HEADER, RECONSTRUCTION, RENDER = "#2563eb", "#93b4f5", "#2563eb", "#d97706"
+STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "rfedge",
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "axes.edgecolor": GRID,
+    "axes.labelcolor": MUTED,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "grid.color": GRID,
+    "axes.axisbelow": True,
+}
+
+Frame = Mapping[str, Any]
+
+
+def bytes_chart(frames: Sequence[Frame]) -> str:
+    """Return a bar chart of payload and header bytes of every frame."""
+    with mpl.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(7.2, 2.4))
+        number = range(len(frames))
+        payload = [frame["payload_bytes"] for frame in frames]
+        header = [frame["packet_bytes"] - frame["payload_bytes"] for frame in frames]
+        axes.bar(number, payload, color=PAYLOAD, label="payload: the P slice")
+        axes.bar(number, header, bottom=payload, color=HEADER, label="pose and header")
+        axes.set(xlabel="frame", ylabel="bytes")
+        axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
+        return _svg(figure)
+
+
+def quality_chart(frames: Sequence[Frame]) -> str:
+    """Return PSNR over frames, of the reconstruction and of the render it was predicted from."""
+    with mpl.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(7.2, 2.4))
+        for key, colour, label in (
+            ("psnr_db", RECONSTRUCTION, "reconstruction"),
+            ("rf_psnr_db", RENDER, "render alone"),
+        ):
+            values = [frame[key] for frame in frames]
+            axes.plot(values, color=colour, linewidth=2, marker="o", markersize=3)
+            axes.annotate(
+                label,
+                (len(values) - 1, values[-1]),
+                xytext=(8, 0),
+                textcoords="offset points",
+                color=colour,
+                va="center",
+            )
+        axes.set(xlabel="frame", ylabel="PSNR against the camera, dB")
+        axes.margins(x=0.02)
+        return _svg(figure)
+
+
+def stages_chart(stages_ms: Mapping[str, float]) -> str:
+    """Return one horizontal bar that splits a frame's milliseconds by stage (medians)."""
+    with mpl.rc_context({**STYLE, "axes.grid.axis": "x"}):
+        figure, axes = plt.subplots(figsize=(7.2, 0.42 * len(stages_ms) + 0.6))
+        names = list(stages_ms)
+        axes.barh(names, list(stages_ms.values()), color=PAYLOAD, height=0.6)
+        for position, value in enumerate(stages_ms.values()):
+            axes.annotate(
+                f"{value:.1f}",
+                (value, position),
+                xytext=(4, 0),
+                textcoords="offset points",
+                va="center",
+                color=INK,
+            )
+        axes.invert_yaxis()
+        axes.set_xlabel("ms, median over the drive")
+        return _svg(figure)
+
+
+def _svg(figure: Any) -> str:
+    buffer = io.StringIO()
+    figure.savefig(
+        buffer, format="svg", bbox_inches="tight", transparent=True, metadata={"Date": None}
+    )
+    plt.close(figure)
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]

@@ -1,0 +1,107 @@
+"""Write ``docs/results.md`` from the result files: figures are generated, never typed.
+
+``python -m rfedge.report.markdown results > docs/results.md`` (``make figures``). A test holds the
+committed page to the committed files.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rfcore.errors import InvalidInput
+from rfedge.report.summary import METRIC, SUMMARY
+
+__all__ = ["results_page"]
+
+INTRODUCTION = """# Measured figures
+
+Generated from `results/*.json` by `make figures`; each table names its command, revision and host.
+Machines are shared and noisy: compare within a table, not across hosts.
+"""
+
+Row = Mapping[str, Any]
+
+
+def results_page(folder: Path) -> str:
+    """Return the page of every result file in ``folder``, in the order of their names.
+
+    Raises ``InvalidInput`` for a file that is neither a demo nor a bench result.
+    """
+    sections = [_section(path) for path in sorted(folder.glob("*.json"))]
+    return "\n".join([INTRODUCTION, *sections])
+
+
+def _section(path: Path) -> str:
+    result = json.loads(path.read_text())
+    if result.get("format") == "rfedge-demo-1":
+        return _demo(path, result)
+    if "case" in result:
+        return _bench(path, result)
+    raise InvalidInput("results", f"{path} is neither a demo nor a bench result")
+
+
+def _demo(path: Path, result: Row) -> str:
+    sequences = result["sequences"]
+    rows = [
+        [f"{label} ({note})", *(show(entry) for entry in sequences.values())]
+        for label, note, show in SUMMARY
+    ]
+    rows += [
+        [f"100·I/(I+P) with {label}", *(f"{s[key]:.1f} %" for s in sequences.values())]
+        for label, key in METRIC
+    ]
+    settings, field = result["settings"], result["field"]
+    facts = (
+        f"Field of {field['gaussians']:,} Gaussians, {field['held_out_psnr_db']:.2f} dB on the "
+        f"held-out empty drive; x264 {settings['preset']}, CRF {settings['crf']:g}, "
+        f"{settings['rate_hz']:g} Hz, link {settings['link_bps'] / 1e6:g} Mbit/s and "
+        f"{settings['link_delay_ms']:g} ms."
+    )
+    return "\n\n".join([_heading(path, result), facts, _table(["", *sequences], rows), ""])
+
+
+def _bench(path: Path, result: Row) -> str:
+    rows = [_flat(row) for row in result["rows"]]
+    columns = list(rows[0])
+    cells = [[_cell(row[column]) for column in columns] for row in rows]
+    return "\n\n".join([_heading(path, result), _table(columns, cells), ""])
+
+
+def _heading(path: Path, result: Row) -> str:
+    command = result.get("command") or f"rfedge bench {result['case']}"
+    host = result["host"]
+    return (
+        f"## {path.stem}\n\n`{command}` at `{result['revision']}`; {host['cpu']}, "
+        f"{host['cores']} cores, {host['isa']}."
+    )
+
+
+def _flat(row: Row) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in row.items():
+        if isinstance(value, Mapping):
+            flat.update({f"{key}.{name}": part for name, part in value.items()})
+        else:
+            flat[key] = value
+    return flat
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "not run"
+    if isinstance(value, float):
+        return f"{value:.3g}" if abs(value) < 0.01 else f"{value:.2f}"
+    return str(value)
+
+
+def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [list(columns), ["---", *["---:"] * (len(columns) - 1)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(results_page(Path(sys.argv[1])))

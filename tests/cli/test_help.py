@@ -1,0 +1,56 @@
+"""The commands say what they take, fast, and turn mistakes into one line."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+VERBS = ("demo", "train", "render", "encode", "decode", "link", "bench")
+HEAVY = ("torch", "cv2", "matplotlib", "av", "grpc")
+
+
+def rfedge(*arguments: str) -> subprocess.CompletedProcess[str]:
+    code = "import sys; from rfedge.cli import main; sys.exit(main())"
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help_with_defaults(verb: str) -> None:
+    done = rfedge(verb, "--help")
+    assert done.returncode == 0, done.stderr
+    assert "default" in done.stdout
+
+
+def test_the_help_loads_nothing_heavy() -> None:
+    """What makes ``--help`` slow is imports (torch alone takes seconds), so those are counted."""
+    code = (
+        f"import sys; import rfedge.cli; print([name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("render", "missing.rff", "--drive", "d", "--out", "o"), "missing.rff"),
+        (("train", "nowhere", "--out", "field.rff"), "nowhere"),
+        (("train", "nowhere", "--out", "field.txt"), "must end in .rff"),
+        (("demo", "--sample", "nowhere"), "nowhere"),
+        (("demo", "--link-bps", "0"), "above 0 bit/s"),
+        (("decode", "missing.rfv", "--field", "f.rff", "--out", "o"), "missing.rfv"),
+        (("link", "--to", "nonsense"), "nonsense"),
+    ],
+)
+def test_a_users_mistake_is_one_line_and_exit_status_2(
+    arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = rfedge(*arguments)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert list(tmp_path.iterdir()) == [], "a refused command leaves nothing behind"

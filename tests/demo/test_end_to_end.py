@@ -1,0 +1,81 @@
+"""The whole demo on a tiny street: real processes, a real link, a real decoder."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+KEYS = {
+    "frames",
+    "frames_reconstructed",
+    "digest_matches",
+    "payload_bytes",
+    "packet_bytes",
+    "wire_bytes",
+    "psnr_db",
+    "ssim",
+    "rf_psnr_db",
+    "paper_savings_percent",
+    "saving_vs_intra_percent",
+    "latency_ms",
+    "link_tau_error_percent",
+}
+
+
+def demo(sample: Path, work: Path) -> subprocess.CompletedProcess[str]:
+    code = "import sys; from rfedge.cli import main; sys.exit(main())"
+    options = {"sample": sample, "out": work / "demo", "cache": work / "cache"}
+    options |= {"iterations": 60, "gaussians": 400, "link-bps": 4e6, "link-delay-ms": 1}
+    arguments = [part for name, value in options.items() for part in (f"--{name}", str(value))]
+    return subprocess.run(
+        [sys.executable, "-c", code, "demo", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_the_server_ends_up_with_the_vehicles_pictures(tiny_sample: Path, tmp_path: Path) -> None:
+    done = demo(tiny_sample, tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    result = json.loads((tmp_path / "demo" / "result.json").read_text())
+    assert set(result["sequences"]) == {"empty", "vehicles"}
+    for entry in result["sequences"].values():
+        assert set(entry) >= KEYS
+        assert entry["frames"] == entry["frames_reconstructed"] == entry["digest_matches"] == 4
+        assert entry["payload_bytes"] < entry["packet_bytes"] < entry["wire_bytes"]
+        assert entry["psnr_db"] > entry["rf_psnr_db"], "the delta improves on the render"
+        assert set(entry["latency_ms"]) == {"p50", "p99"}
+    page = (tmp_path / "demo" / "report.html").read_text()
+    assert "http://" not in page.replace("http://www.w3.org", ""), "the page is self-contained"
+    assert (tmp_path / "demo" / "reconstructed.mp4").stat().st_size > 0
+
+
+def test_a_damaged_sample_is_one_clear_error_and_nothing_is_written(
+    tiny_sample: Path, tmp_path: Path
+) -> None:
+    victim = tiny_sample / "drive_empty" / "001.png"
+    data = bytearray(victim.read_bytes())
+    data[len(data) // 2] ^= 1
+    victim.write_bytes(data)
+    done = demo(tiny_sample, tmp_path)
+    assert done.returncode == 2
+    assert "drive_empty/001.png" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "demo").exists()
+    assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.parametrize("keeper", ["thesis.tex", "sub/notes.txt"])
+def test_a_folder_the_demo_did_not_make_is_not_emptied(
+    tiny_sample: Path, tmp_path: Path, keeper: str
+) -> None:
+    precious = tmp_path / "demo" / keeper
+    precious.parent.mkdir(parents=True)
+    precious.write_text("mine")
+    done = demo(tiny_sample, tmp_path)
+    assert done.returncode == 2
+    assert "name another folder" in done.stderr
+    assert precious.read_text() == "mine"

@@ -1,0 +1,240 @@
+"""A small street on disk, a server on a free port, and vehicles that drive past it."""
+
+import itertools
+import json
+import math
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+
+from cav_agent.config import AgentConfig, PaceKind
+from cav_agent.frames import Capture, EncodeJob
+from cav_agent.pipeline import Pipeline
+from cav_agent.vehicle import Vehicle
+from mec_server.config import ServerConfig
+from mec_server.server import EdgeServer
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.codec import CodecConfig
+from rfcore.dataset import read_transforms
+from rfcore.field import SplatField, save_field
+from rfcore.image import write_png
+from rfcore.raster.gaussians import Gaussians
+from rfcore.wire.conventions import CHANNEL_OPTIONS, RENDERER_CONTRACT, STREAM_METHOD
+from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert_answers import server_message_from_bytes
+from rfcore.wire.messages import (
+    Ack,
+    CameraDescription,
+    Credit,
+    Frame,
+    Hello,
+    Nack,
+    RendererContract,
+    ServerMessage,
+    Welcome,
+)
+
+INTRINSICS = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
+FRAMES = 6
+
+
+def random_field(seed: int) -> SplatField:
+    """A cloud of 400 Gaussians in front of the origin."""
+    rng = np.random.default_rng(seed)
+    n = 400
+    arrays = {
+        "means": rng.uniform((-3, -2, 2), (3, 2, 8), (n, 3)),
+        "quaternions": rng.normal(size=(n, 4)),
+        "log_scales": rng.uniform(-2.5, -1.0, (n, 3)),
+        "opacity_logits": rng.uniform(0, 4, n),
+        "sh": rng.normal(scale=0.8, size=(n, 4, 3)),
+    }
+    return SplatField(Gaussians(**{name: a.astype(np.float32) for name, a in arrays.items()}))
+
+
+def write_drive(folder: Path, field: SplatField) -> None:
+    """Write pictures that look like the field, with noise and a box it has never seen."""
+    rng = np.random.default_rng(7)
+    frames = []
+    for i in range(FRAMES):
+        angle = 0.02 * i
+        pose = Pose((0.1 * i, 0.0, -0.3 * i), (math.cos(angle), 0.0, math.sin(angle), 0.0))
+        colour = field.render(Camera(INTRINSICS, pose)).colour
+        rgb = np.clip(colour * 255 + rng.normal(scale=4, size=colour.shape), 0, 255)
+        rgb[20:35, 10 + 5 * i : 25 + 5 * i] = (200, 40, 30)
+        write_png(folder / f"{i:03}.png", rgb.astype(np.uint8))
+        rows = zip(pose.rotation_matrix(), pose.translation_m, strict=True)
+        opengl = [[r[0], -r[1], -r[2], t] for r, t in rows]
+        frames.append({"file_path": f"{i:03}.png", "transform_matrix": [*opengl, [0, 0, 0, 1]]})
+    top = {"w": 76, "h": 52, "fl_x": 50.0, "fl_y": 50.0, "cx": 38.0, "cy": 26.0}
+    (folder / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
+
+
+@dataclass(frozen=True)
+class Street:
+    """A field with its id, a store that holds it, a drive, and a store with another field."""
+
+    field: SplatField
+    field_id: str
+    store: Path
+    drive: Path
+    other_id: str
+    other_store: Path
+
+
+@pytest.fixture(scope="session")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Street:
+    root = tmp_path_factory.mktemp("street")
+    field = random_field(1)
+    for name in ("drive", "store", "other"):
+        (root / name).mkdir()
+    write_drive(root / "drive", field)
+    return Street(
+        field,
+        save_field(field, root / "store" / "street.rff"),
+        root / "store",
+        root / "drive",
+        save_field(random_field(2), root / "other" / "other.rff"),
+        root / "other",
+    )
+
+
+@dataclass(frozen=True)
+class CodedStreet:
+    """What a vehicle would say on the drive."""
+
+    hello: Hello
+    frames: list[Frame]
+
+
+@pytest.fixture(scope="session")
+def coded(street: Street) -> CodedStreet:
+    pictures = read_transforms(street.drive).pictures
+    pipeline = Pipeline(street.field, CodecConfig(76, 52, "ultrafast"), time.perf_counter_ns)
+    camera = CameraDescription("front", INTRINSICS, pipeline.header)
+    contract = RendererContract(RENDERER_CONTRACT, exact=True)
+    hello = Hello("cav-raw", (camera,), (street.field_id,), contract)
+    prefix = bytes.fromhex(street.field_id)[:8]
+    frames = []
+    for i, picture in enumerate(pictures):
+        job = EncodeJob(Capture(i, picture, 0.0, i), 0, 1)
+        packet = pipeline.encode(job).packet
+        frames.append(Frame("front", i, picture.camera.world_from_cam, prefix, packet))
+    return CodedStreet(hello, frames)
+
+
+@pytest.fixture
+def serve(street: Street) -> Callable[..., Any]:
+    """Return a context manager that runs a server in this process."""
+
+    @asynccontextmanager
+    async def run(**changes: Any) -> AsyncIterator[EdgeServer]:
+        config = replace(ServerConfig(street.store, "127.0.0.1:0"), **changes)
+        server = EdgeServer(config)
+        await server.start()
+        try:
+            yield server
+        finally:
+            await server.stop()
+
+    return run
+
+
+@dataclass(frozen=True)
+class Trip:
+    """What a vehicle brought home."""
+
+    counts: Counter[str]
+    lines: list[dict[str, Any]]
+
+
+@pytest.fixture
+def travel(street: Street, tmp_path: Path) -> Callable[..., Awaitable[Trip]]:
+    """Return a coroutine that drives the street past a server, in lockstep."""
+    numbers = itertools.count()
+
+    async def run(address: object, **changes: Any) -> Trip:
+        report = tmp_path / f"report{next(numbers)}.jsonl"
+        config = AgentConfig(
+            str(address),
+            street.drive,
+            street.store,
+            pace=PaceKind.LOCKSTEP,
+            field=street.field_id,
+            preset="ultrafast",
+            report=report,
+        )
+        counts = await Vehicle(replace(config, **changes)).run()
+        return Trip(counts, [json.loads(line) for line in report.read_text().splitlines()])
+
+    return run
+
+
+class RawVehicle:
+    """A vehicle that says exactly what the test wants."""
+
+    def __init__(self, stream: grpc.aio.StreamStreamCall[bytes, bytes]) -> None:
+        self.stream = stream
+
+    async def say(self, message: Hello | Frame | bytes) -> None:
+        """Send a message, or bytes that only claim to be one."""
+        data = message if isinstance(message, bytes) else client_message_to_bytes(message)
+        await self.stream.write(data)
+
+    async def hear(self) -> ServerMessage:
+        """Return the next message that is not a Credit."""
+        while True:
+            data = await self.stream.read()
+            assert data is not grpc.aio.EOF, "the server closed the stream"
+            message = server_message_from_bytes(data)
+            if not isinstance(message, Credit):
+                return message
+
+    async def ask(self, message: Hello | Frame | bytes) -> ServerMessage:
+        """Send a message and return the answer."""
+        await self.say(message)
+        return await self.hear()
+
+    async def greet(self, hello: Hello) -> None:
+        """Say hello and expect to be welcome."""
+        assert isinstance(await self.ask(hello), Welcome)
+
+    async def told(self, message: Frame | bytes) -> tuple[str, int]:
+        """Send a frame and return ("ack" or the reason, sequence)."""
+        answer = await self.ask(message)
+        if isinstance(answer, Ack):
+            return ("ack", answer.address.sequence)
+        assert isinstance(answer, Nack)
+        return (str(answer.reason), answer.address.sequence)
+
+    async def end(self) -> grpc.StatusCode:
+        """Read what is left and return the status of the stream."""
+        with suppress(grpc.aio.AioRpcError):
+            while await self.stream.read() is not grpc.aio.EOF:
+                pass
+        return await self.stream.code()
+
+    async def farewell(self) -> grpc.StatusCode:
+        """Say that nothing more comes, and return the status of the stream."""
+        await self.stream.done_writing()
+        return await self.end()
+
+
+@pytest.fixture
+def raw_vehicle() -> Callable[..., Any]:
+    """Return a context manager that opens a raw stream to an address."""
+
+    @asynccontextmanager
+    async def run(address: object) -> AsyncIterator[RawVehicle]:
+        async with grpc.aio.insecure_channel(str(address), options=CHANNEL_OPTIONS) as channel:
+            yield RawVehicle(channel.stream_stream(STREAM_METHOD)())
+
+    return run

@@ -1,0 +1,195 @@
+"""What a careless or hostile peer sends: refused by name, and the next frame is right again."""
+
+import asyncio
+from dataclasses import replace
+from typing import Any
+
+import grpc
+import pytest
+
+from rfcore.codec import CodecConfig, StreamHeader
+from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.messages import Ack, FieldNotice, Frame, Nack
+from rfcore.wire.v1 import edge_pb2 as pb
+
+
+def flipped(frame: Frame, bit: int) -> Frame:
+    payload = bytearray(frame.packet.payload)
+    payload[(bit // 8) % len(payload)] ^= 1 << (bit % 8)
+    return replace(frame, packet=replace(frame.packet, payload=bytes(payload)))
+
+
+def repaired(frame: Frame) -> Frame:
+    return replace(frame, packet=frame.packet.sealed())
+
+
+def truncated(frame: Frame) -> Frame:
+    packet = frame.packet
+    return replace(
+        frame, packet=replace(packet, payload=packet.payload[: -len(packet.payload) // 2])
+    )
+
+
+def changed(frame: Frame, **fields: float) -> bytes:
+    """Return the frame's bytes with numbers of its pose replaced, unchecked."""
+    request = pb.StreamRequest.FromString(client_message_to_bytes(frame))
+    for name, value in fields.items():
+        setattr(request.frame.pose, name, value)
+    return request.SerializeToString()
+
+
+async def test_damaged_packets_are_refused_and_the_next_is_right_again(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    """Every frame of this list is answered; what is acknowledged is what the vehicle meant."""
+    f = coded.frames
+    moved = replace(f[5], pose=f[0].pose)
+    said = [
+        (f[0], "ack"),
+        (f[0], "stale_sequence"),
+        (flipped(f[1], 100), "crc_mismatch"),
+        (truncated(f[1]), "crc_mismatch"),
+        (f[1], "ack"),
+        (f[2], "ack"),
+        (f[1], "stale_sequence"),
+        (moved, "reference_mismatch"),
+        (changed(f[3], x_m=float("nan")), "invalid_argument"),
+        (changed(f[3], rotation_w=2.0), "invalid_argument"),
+        (b"\xffgarbage", "invalid_argument"),
+        (b"", "invalid_argument"),
+        (f[3], "ack"),
+    ]
+    async with serve() as server, raw_vehicle(server.address) as vehicle:
+        await vehicle.greet(coded.hello)
+        heard = [(await vehicle.told(message))[0] for message, _ in said]
+        assert heard == [reason for _, reason in said]
+        await vehicle.say(f[5])
+        gap, ack = await vehicle.hear(), await vehicle.hear()
+        assert isinstance(gap, Nack)
+        assert (str(gap.reason), gap.address.sequence, gap.count) == ("sequence_gap", 4, 1)
+        assert isinstance(ack, Ack)
+        assert ack.reconstruction_digest == f[5].packet.reconstruction_digest
+        assert await vehicle.farewell() is grpc.StatusCode.OK
+
+
+async def test_no_flipped_bit_becomes_a_wrong_picture_even_when_its_crc_was_repaired(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    right = coded.frames[0].packet.reconstruction_digest
+    async with serve() as server, raw_vehicle(server.address) as vehicle:
+        await vehicle.greet(coded.hello)
+        for number, bit in enumerate(range(0, 8 * len(coded.frames[0].packet.payload), 997)):
+            frame = coded.frames[0]
+            frame = replace(frame, packet=replace(frame.packet, epoch=number))
+            answer = await vehicle.ask(repaired(flipped(frame, bit)))
+            if isinstance(answer, Ack):
+                assert answer.reconstruction_digest == right
+            else:
+                assert isinstance(answer, Nack)
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"x_m": float("inf")}, "pose.translation_m"),
+        ({"y_m": -3e6}, "pose.y_m: -3000000.0 is outside"),
+        ({"rotation_x": 0.5}, "pose.rotation: quaternion of norm 1.118"),
+        ({"rotation_w": float("nan")}, "pose.rotation"),
+    ],
+)
+async def test_a_bad_pose_is_an_invalid_argument_naming_the_field(
+    coded: Any, serve: Any, raw_vehicle: Any, fields: dict[str, float], named: str
+) -> None:
+    async with serve() as server, raw_vehicle(server.address) as vehicle:
+        await vehicle.greet(coded.hello)
+        identity = {"rotation_w": 1.0, "rotation_x": 0.0, "rotation_y": 0.0, "rotation_z": 0.0}
+        nack = await vehicle.ask(changed(coded.frames[0], **{**identity, **fields}))
+        assert isinstance(nack, Nack)
+        assert nack.problem.startswith(named)
+        assert await vehicle.told(coded.frames[0]) == ("ack", 0)
+
+
+async def test_a_hello_of_another_resolution_is_refused_by_name_and_may_be_corrected(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    camera = coded.hello.cameras[0]
+    header = camera.codec
+    codecs = [
+        (replace(header.config, width_px=640), "hello.cameras[0].codec.width_px: 640 px, but"),
+        (replace(header.config, height_px=2), "hello.cameras[0].codec.height_px: 2 px, but"),
+    ]
+    async with serve() as server, raw_vehicle(server.address) as vehicle:
+        for config, named in codecs:
+            bad = replace(camera, codec=replace(header, config=config))
+            nack = await vehicle.ask(replace(coded.hello, cameras=(bad,)))
+            assert isinstance(nack, Nack)
+            assert nack.problem.startswith(named)
+        large = replace(camera.intrinsics, width_px=152)
+        config = CodecConfig(152, 52, "ultrafast")
+        bad = replace(camera, intrinsics=large, codec=StreamHeader(config, header.sps, header.pps))
+        nack = await vehicle.ask(replace(coded.hello, cameras=(bad,)))
+        assert isinstance(nack, Nack)
+        assert nack.problem.startswith("hello.cameras[0].stream_header.sps"), "of another size"
+        await vehicle.greet(coded.hello)
+        assert await vehicle.told(coded.frames[0]) == ("ack", 0)
+
+
+async def test_an_unknown_field_ends_the_stream_with_both_ids_named(
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    async with serve() as server, raw_vehicle(server.address) as vehicle:
+        asked = replace(coded.hello, field_ids=(street.other_id,))
+        assert await vehicle.ask(asked) == FieldNotice((street.field_id,))
+        assert await vehicle.end() is grpc.StatusCode.NOT_FOUND
+        details = await vehicle.stream.details()
+        assert street.field_id in details
+        assert street.other_id in details
+
+
+async def test_an_oversize_message_ends_its_stream_and_no_other(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    async with serve() as server, raw_vehicle(server.address) as other:
+        await other.greet(coded.hello)
+        async with raw_vehicle(server.address) as vehicle:
+            await vehicle.greet(coded.hello)
+            await vehicle.say(bytes(2 << 20))
+            assert await vehicle.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert await other.told(coded.frames[0]) == ("ack", 0)
+
+
+async def test_a_vehicle_that_vanishes_leaves_the_others_alone(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    async with serve() as server, raw_vehicle(server.address) as other:
+        await other.greet(coded.hello)
+        async with raw_vehicle(server.address) as vehicle:
+            await vehicle.greet(coded.hello)
+            await vehicle.say(coded.frames[0])
+            vehicle.stream.cancel()
+        assert await other.told(coded.frames[0]) == ("ack", 0)
+        assert await other.farewell() is grpc.StatusCode.OK
+
+
+async def test_a_frame_before_hello_is_a_failed_precondition(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    async with serve() as server, raw_vehicle(server.address) as vehicle:
+        await vehicle.say(coded.frames[0])
+        assert await vehicle.end() is grpc.StatusCode.FAILED_PRECONDITION
+        assert "before Hello" in await vehicle.stream.details()
+
+
+async def test_a_draining_server_answers_what_it_has_taken(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    async with serve() as server, raw_vehicle(server.address) as vehicle:
+        await vehicle.greet(coded.hello)
+        await vehicle.say(coded.frames[0])
+        await vehicle.say(coded.frames[1])
+        first = await vehicle.hear()
+        draining = asyncio.create_task(server.stop())
+        second = await vehicle.hear()
+        assert [a.address.sequence for a in (first, second) if isinstance(a, Ack)] == [0, 1]
+        assert await vehicle.end() is grpc.StatusCode.OK
+        await draining

@@ -1,0 +1,121 @@
+"""A real vehicle and a real server in one process, over loopback, with all their real parts."""
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cav_agent.config import PaceKind
+from rfcore.dataset import read_transforms
+from rfcore.errors import BackendUnavailable
+from rfcore.image import read_rgb
+from rfcore.raster.native import available_isas
+from rfedge.link_proxy import LinkProxy, ProxySettings
+
+
+def index_of(saved: Path, vehicle: str = "cav-1") -> list[dict[str, Any]]:
+    lines = (saved / vehicle / "front" / "index.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines]
+
+
+async def test_the_server_ends_up_with_the_pictures_of_the_vehicles_closed_loop(
+    street: Any, serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    async with serve(save=tmp_path) as server:
+        trip = await travel(server.address)
+    assert trip.counts == {"acked": 6}
+    index = index_of(tmp_path)
+    assert [line["file"] for line in index] == [f"{i:06}.png" for i in range(6)]
+    assert [line["digest"] for line in index] == [
+        line["reconstruction_digest"] for line in trip.lines
+    ]
+    for line, picture in zip(index, read_transforms(street.drive).pictures, strict=True):
+        shown = read_rgb(tmp_path / "cav-1/front" / line["file"])
+        error = np.abs(shown.astype(int) - picture.read()).mean()
+        assert error < 12, "CRF 23 of a noisy picture stays within a few levels of it"
+        assert tuple(line["translation_m"]) == picture.camera.world_from_cam.translation_m
+
+
+async def test_neither_instruction_set_nor_threads_at_either_end_change_a_byte(
+    serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    pairs = list(itertools.product(available_isas(), repeat=2))
+    threads = list(itertools.product((1, 2, 5), repeat=2))
+    digests = set()
+    for number in range(max(len(pairs), len(threads))):
+        agent_isa, server_isa = pairs[number % len(pairs)]
+        agent_threads, server_threads = threads[number % len(threads)]
+        saved = tmp_path / str(number)
+        async with serve(save=saved, isa=server_isa, threads=server_threads) as server:
+            trip = await travel(server.address, isa=agent_isa, threads=agent_threads)
+        assert trip.counts == {"acked": 6}
+        closed_loop = [line["reconstruction_digest"] for line in trip.lines]
+        assert [line["digest"] for line in index_of(saved)] == closed_loop
+        digests.add(tuple(closed_loop))
+    assert len(digests) == 1
+
+
+async def test_the_report_keeps_the_sizes_apart_and_says_where_the_time_went(
+    serve: Any, travel: Any
+) -> None:
+    async with serve() as server:
+        trip = await travel(server.address)
+    for number, line in enumerate(trip.lines):
+        assert (line["sequence"], line["epoch"], line["result"]) == (number, 0, "acked")
+        assert line["name"].endswith(f"{number:03}.png")
+        assert 0 < line["payload_bytes"] < line["packet_bytes"] < line["payload_bytes"] + 260
+        assert line["server_digest"] == line["reconstruction_digest"]
+        assert len(bytes.fromhex(line["reference_digest"])) == 16
+        own = {"load", "render", "encode", "closed_loop", "link"}
+        server_s = {f"server_{s}" for s in ("queue", "render", "splice", "decode", "total")}
+        assert set(line["stage_ms"]) == own | server_s
+        assert all(spent_ms >= 0 for spent_ms in line["stage_ms"].values())
+        assert line["latency_ms"] >= line["stage_ms"]["encode"] + line["stage_ms"]["server_total"]
+
+
+async def test_a_drive_through_the_link_is_whole_and_its_wire_bytes_exceed_its_packets(
+    serve: Any, travel: Any
+) -> None:
+    async with serve() as server:
+        proxy = LinkProxy(ProxySettings(str(server.address), delay_ms=1.0))
+        await proxy.start()
+        trip = await travel(proxy.address)
+        await proxy.stop()
+    assert trip.counts == {"acked": 6}
+    uplink = proxy.report()["uplink"]
+    assert uplink["bytes"] > sum(line["packet_bytes"] for line in trip.lines)
+
+
+async def test_in_realtime_what_the_link_cannot_take_is_dropped_before_it_is_encoded(
+    serve: Any, travel: Any
+) -> None:
+    async with serve() as server:
+        proxy = LinkProxy(ProxySettings(str(server.address), uplink_bps=60e3, delay_ms=1.0))
+        await proxy.start()
+        trip = await travel(proxy.address, pace=PaceKind.REALTIME, rate=200.0)
+        await proxy.stop()
+    assert trip.counts["acked"] + trip.counts["dropped"] == 6
+    assert trip.counts["dropped"] > 0
+    for line in trip.lines:
+        if line["result"] == "dropped":
+            assert (line["reason"], line["packet_bytes"]) == ("superseded", None)
+
+
+async def test_the_server_counts_frames_bytes_and_seconds(serve: Any, travel: Any) -> None:
+    async with serve() as server:
+        await travel(server.address)
+        value = server.registry.get_sample_value
+        acked = {"result": "acked", "reason": ""}
+        assert value("rfedge_server_frames_total", acked) == 6
+        assert value("rfedge_server_received_bytes_total", {"kind": "payload"}) > 0
+        for stage in ("queue", "render", "splice", "decode", "total", "end_to_end"):
+            assert value("rfedge_server_stage_seconds_count", {"stage": stage}) == 6
+
+
+async def test_a_server_that_forces_a_missing_instruction_set_does_not_start(serve: Any) -> None:
+    with pytest.raises(BackendUnavailable):
+        async with serve(isa="neon"):
+            pass

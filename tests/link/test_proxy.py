@@ -1,0 +1,142 @@
+"""The proxy on real sockets: what goes in comes out, on time, both ways."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rfcore.errors import InvalidInput, RfedgeError
+from rfedge.link_proxy import LinkProxy, ProxySettings
+
+Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+FAST: dict[str, float] = {"uplink_bps": 1e9, "downlink_bps": 1e9, "delay_ms": 0.0}
+
+
+async def echo(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    while data := await reader.read(65536):
+        writer.write(data)
+        await writer.drain()
+    writer.write_eof()
+    await writer.drain()
+    writer.close()
+
+
+@asynccontextmanager
+async def linked(handler: Handler, **changes: Any) -> AsyncIterator[LinkProxy]:
+    server = await asyncio.start_server(handler, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    proxy = LinkProxy(ProxySettings(f"127.0.0.1:{port}", **{**FAST, **changes}))
+    await proxy.start()
+    try:
+        yield proxy
+    finally:
+        await proxy.stop()
+        server.close()
+
+
+async def exchange(proxy: LinkProxy, data: bytes) -> bytes:
+    """Send ``data`` and the end; return everything that comes back."""
+    reader, writer = await asyncio.open_connection(proxy.address.host, proxy.address.port)
+    writer.write(data)
+    writer.write_eof()
+    got = await reader.read(-1)
+    writer.close()
+    await writer.wait_closed()
+    return got
+
+
+async def test_bytes_come_back_whole_and_in_order() -> None:
+    data = bytes(i % 251 for i in range(300_000))
+    async with linked(echo) as proxy:
+        got = await asyncio.gather(*(exchange(proxy, data[i:]) for i in range(3)))
+    assert got == [data[i:] for i in range(3)]
+    report = proxy.report()
+    assert report["connections"] == 3
+    assert report["uplink"]["bytes"] == report["downlink"]["bytes"] == 900_000 - 3
+
+
+async def test_a_transfer_takes_bytes_over_rate_and_the_report_measures_it() -> None:
+    """0.4 s of uplink; a late pump may only make it longer, and the report has to say so."""
+    clock = asyncio.get_running_loop().time
+    async with linked(echo, uplink_bps=4e6, delay_ms=20.0) as proxy:
+        started_s = clock()
+        await exchange(proxy, bytes(200_000))
+        took_s = clock() - started_s
+    uplink = proxy.report()["uplink"]
+    assert uplink["expected_s"] == pytest.approx(0.4)
+    assert took_s >= 0.42
+    assert uplink["busy_s"] >= uplink["expected_s"] - 1e-6, "a link is never faster than its rate"
+    assert uplink["busy_s"] - uplink["expected_s"] <= 10 * uplink["largest_lateness_s"] + 1e-6
+
+
+async def test_a_full_link_holds_the_sender_back() -> None:
+    """The server's side of a slow link takes nothing; what was read is bounded by the queue."""
+    async with linked(echo, uplink_bps=8e3) as proxy:
+        _, writer = await asyncio.open_connection(proxy.address.host, proxy.address.port)
+        writer.transport.set_write_buffer_limits(0)
+        writer.write(bytes(8_000_000))
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.3):
+                await writer.drain()
+        assert proxy._up._link.held_bytes <= 65_536
+        writer.transport.abort()
+
+
+async def test_the_reports_are_written_whole(tmp_path: Path) -> None:
+    report, ready = tmp_path / "link.json", tmp_path / "ready"
+    async with linked(echo, report=report, ready_file=ready) as proxy:
+        assert ready.read_text().strip() == str(proxy.address)
+        await exchange(proxy, b"x" * 1000)
+    written = json.loads(report.read_text())
+    assert written["uplink"]["bytes"] == 1000
+    assert written["uplink"]["rate_bps"] == 1e9
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link.json", "ready"]
+
+
+async def test_a_connection_is_refused_while_the_server_is_away() -> None:
+    proxy = LinkProxy(ProxySettings("127.0.0.1:1"))
+    await proxy.start()
+    with pytest.raises(ConnectionError):
+        await exchange(proxy, b"hello")
+    await proxy.stop()
+
+
+async def test_a_server_that_closes_closes_the_vehicle_s_end_behind_its_last_bytes() -> None:
+    async def farewell(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"goodbye" * 1000)
+        writer.close()
+
+    async with linked(farewell, downlink_bps=4e6) as proxy:
+        reader, writer = await asyncio.open_connection(proxy.address.host, proxy.address.port)
+        assert await reader.read(-1) == b"goodbye" * 1000
+        writer.close()
+
+
+async def test_a_taken_port_is_one_clear_error() -> None:
+    async with linked(echo) as proxy:
+        again = ProxySettings("127.0.0.1:1", listen=str(proxy.address))
+        with pytest.raises(RfedgeError, match=r"cannot listen on 127\.0\.0\.1:"):
+            await LinkProxy(again).start()
+
+
+@pytest.mark.parametrize(
+    ("listen", "to", "named"),
+    [
+        ("127.0.0.1", "127.0.0.1:1", "listen: '127.0.0.1' must be HOST:PORT"),
+        ("127.0.0.1:1", "127.0.0.1:99999", "to: port '99999'"),
+        ("0.0.0.0:1", "127.0.0.1:1", "listen: 0.0.0.0:1 is not a loopback address"),
+        ("[::1]:1", "example.org:1", "to: example.org:1 is not a loopback address"),
+    ],
+)
+def test_addresses_are_checked_by_name(listen: str, to: str, named: str) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        ProxySettings(to, listen)
+    assert str(caught.value).startswith(named)
+
+
+def test_another_machine_is_reached_when_plaintext_is_allowed() -> None:
+    ProxySettings("example.org:1", "0.0.0.0:1", allow_insecure=True)
