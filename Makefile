@@ -28,6 +28,8 @@ check: build  ## lint, types, layers, generated files
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	@if npx --yes @bufbuild/buf --version >/dev/null 2>&1; then npx --yes @bufbuild/buf lint proto; \
+		else echo "buf lint was not run: it needs node and its registry"; fi
 
 bench: build  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench raster

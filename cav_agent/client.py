@@ -27,6 +27,7 @@ from rfcore.views import PosedPicture
 from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.convert_answers import server_message_from_bytes
+from rfcore.wire.messages import Welcome
 
 __all__ = ["Agent", "Equipment"]
 
@@ -52,13 +53,17 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.02, 1.0
 
 @dataclass(frozen=True)
 class Equipment:
-    """What the agent works with: a drive, a way to encode, and who wants to know of results."""
+    """What the agent works with: a drive, a way to encode, and who wants to know.
+
+    ``ended`` is told of every picture's end, ``connected`` when the server welcomed us or was lost.
+    """
 
     pictures: tuple[PosedPicture, ...]
     pace: Pace
     encode: Callable[[EncodeJob], EncodedFrame]
     executor: Executor
     ended: Callable[[FrameResult], None]
+    connected: Callable[[bool], None]
 
 
 class Agent:
@@ -178,6 +183,7 @@ class Agent:
             welcomed = self._session.state is LinkState.STREAMING
             if welcomed:
                 self._streaming_at_s = time.monotonic()
+                self._equipment.connected(False)
             self._session.connection_lost(reason, time.monotonic())
             self._drive_wake.set()
             log.warning("stream lost", reason=reason)
@@ -219,7 +225,10 @@ class Agent:
 
     async def _read(self, stream: Stream) -> None:
         async for data in stream:
-            self._session.receive(server_message_from_bytes(data), time.monotonic())
+            message = server_message_from_bytes(data)
+            self._session.receive(message, time.monotonic())
+            if isinstance(message, Welcome):
+                self._equipment.connected(True)
             self._drive_wake.set()
 
     async def _write(self, stream: Stream) -> None:

@@ -14,10 +14,10 @@ class AgentMetrics:
     """Counters and histograms on a registry of their own."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
-        self.connected = Gauge(
+        self._connected = Gauge(
             "rfedge_agent_connected", "1 while the server has welcomed us", registry=registry
         )
-        self.reconnects = Counter(
+        self._lost = Counter(
             "rfedge_agent_connections_lost", "Streams that ended too early", registry=registry
         )
         self.frames = Counter(
@@ -39,6 +39,12 @@ class AgentMetrics:
             buckets=FRAME_BUDGET_BUCKETS_S,
             registry=registry,
         )
+
+    def connected(self, is_connected: bool) -> None:
+        """Note that the server welcomed us, or was lost."""
+        self._connected.set(is_connected)
+        if not is_connected:
+            self._lost.inc()
 
     def ended(self, result: FrameResult) -> None:
         """Count a picture that came to its end."""

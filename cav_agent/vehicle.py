@@ -61,8 +61,7 @@ class Vehicle:
 
     async def run(self) -> Counter[str]:
         """Drive; return how many pictures ended how. Raises ``RfedgeError``."""
-        if self._config.metrics_port is not None:
-            start_http_server(self._config.metrics_port, self._config.metrics_host, self.registry)
+        self._serve_metrics()
         executor = ThreadPoolExecutor(1, "encoder")
         try:
             async with grpc.aio.insecure_channel(
@@ -74,6 +73,12 @@ class Vehicle:
                 return await self._drive(channel, journey, executor)
         finally:
             executor.shutdown()
+
+    def _serve_metrics(self) -> None:
+        port = self._config.metrics_port
+        if port is not None:
+            server, _ = start_http_server(port, self._config.metrics_host, self.registry)
+            log.info("metrics", port=server.server_port)
 
     async def _field(self, channel: grpc.aio.Channel) -> SplatField:
         """Load the field, fetched from the server if it is not here."""
@@ -121,7 +126,14 @@ class Vehicle:
                 report.ended(result)
 
         pace = _pace(config, len(journey.pictures))
-        equipment = Equipment(journey.pictures, pace, journey.pipeline.encode, executor, ended)
+        equipment = Equipment(
+            journey.pictures,
+            pace,
+            journey.pipeline.encode,
+            executor,
+            ended,
+            self._metrics.connected,
+        )
         session = AgentSession(journey.hello, config.limits)
         agent = Agent(channel, session, equipment, config.limits)
         stopping = asyncio.create_task(self._pass_on_stop(agent))

@@ -4,36 +4,39 @@ An asyncio TCP proxy around two ``rfcore.link`` machines, one a direction, share
 connections as one radio link would be. Sizes are wire bytes (HTTP/2 and all). Nothing is lost or
 reordered; when a direction holds as much as it may, its senders are not read, and TCP tells them.
 
-epoll wakes a sleeper up to a millisecond late, so the pump sleeps until a little before a packet is
-due and then yields in a loop; the report says how late the latest release was.
+A release that is late makes the link look slower than it is. So the command sleeps with select(),
+which is exact to the microsecond where epoll rounds up to milliseconds, and asks for a real-time
+priority; the report says whether it got one and how late the latest release was. Beside two busy
+processes on two cores the latest of 24 frames was 0.2 ms late with the priority and 13 ms without.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
+import os
+import selectors
 import signal
 import socket
-import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rfcore.errors import RfedgeError
-from rfcore.link import Link, LinkProfile
-from rfcore.link.meter import BusyMeter
+from rfcore.link import LinkProfile
 from rfcore.wire.address import Address
+from rfedge.link_direction import Direction
 
 __all__ = ["LinkProxy", "ProxySettings", "run_proxy"]
 
 SEGMENT_BYTES = 4096
 """Bytes released at once: 8 ms at 4 Mbit/s, so that a long message does not arrive in one lump."""
 
+SCHEDULERS = {os.SCHED_OTHER: "other", os.SCHED_FIFO: "fifo", os.SCHED_RR: "rr"}
 READ_BYTES = 16 * 1024
 SOCKET_BUFFER_BYTES = 64 * 1024
-SPIN_S = 0.0015
-"""How long before a release the pump stops sleeping: epoll's millisecond and half for the loop."""
 
 
 @dataclass(frozen=True)
@@ -74,58 +77,6 @@ class ProxySettings:
         return LinkProfile(rate_bps, self.delay_ms / 1e3)
 
 
-class Direction:
-    """One direction of the link: senders push, the pump releases to receivers on time."""
-
-    def __init__(self, profile: LinkProfile) -> None:
-        self.meter = BusyMeter(profile)
-        self.senders: set[Side] = set()
-        self._link: Link[Callable[[], None]] = Link(profile)
-        self._arrived = asyncio.Event()
-
-    @property
-    def room_bytes(self) -> int:
-        """How much may still be pushed."""
-        return self._link.profile.held_limit_bytes - self._link.held_bytes
-
-    def push(self, release: Callable[[], None], size_bytes: int) -> None:
-        """Let ``release`` be called when ``size_bytes`` have been through the link."""
-        self._link.push(release, size_bytes, time.perf_counter())
-        self._arrived.set()
-        if self._link.is_full:
-            for sender in self.senders:
-                sender.hold("link")
-
-    async def pump(self) -> None:
-        """Release packets when they are due, for ever."""
-        while True:
-            due_s = self._link.next_event_at()
-            if due_s is None:
-                self._arrived.clear()
-                await self._arrived.wait()
-                continue
-            await _sleep_until(due_s)
-            for delivery in self._link.pop_due(time.perf_counter()):
-                delivery.item()
-                self.meter.released(delivery, time.perf_counter())
-            if not self._link.is_full:
-                for sender in self.senders:
-                    sender.go_on("link")
-
-    def report(self) -> dict[str, float | int | None]:
-        """Return what was measured."""
-        meter, profile = self.meter, self._link.profile
-        return {
-            "rate_bps": profile.rate_bps,
-            "delay_s": profile.delay_s,
-            "bytes": meter.wire_bytes,
-            "busy_s": meter.busy_s,
-            "expected_s": meter.expected_s,
-            "tau_error_percent": meter.tau_error_percent,
-            "largest_lateness_s": meter.largest_lateness_s,
-        }
-
-
 class Side(asyncio.BufferedProtocol):
     """One end of one connection: what it sends goes into ``outward``, to ``peer``."""
 
@@ -161,6 +112,11 @@ class Side(asyncio.BufferedProtocol):
         if self._held == {reason} and self.transport is not None:
             self.transport.resume_reading()
         self._held.discard(reason)
+
+    def abort(self) -> None:
+        """Close at once."""
+        if self.transport is not None:
+            self.transport.abort()
 
     def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
         """Offer no more than the link has room for."""
@@ -242,9 +198,8 @@ class LinkProxy:
         """Close everything and write the report."""
         if self._listener is not None:
             self._listener.close()
-        for side in (*self._up.senders, *self._down.senders):
-            if side.transport is not None:
-                side.transport.abort()
+        for sender in (*self._up.senders, *self._down.senders):
+            sender.abort()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -253,6 +208,7 @@ class LinkProxy:
     def report(self) -> dict[str, Any]:
         """Return what was measured so far."""
         return {
+            "scheduler": SCHEDULERS.get(os.sched_getscheduler(0), "unknown"),
             "connections": self._connections,
             "uplink": self._up.report(),
             "downlink": self._down.report(),
@@ -278,8 +234,7 @@ class LinkProxy:
                 lambda: Side(self._down, self.write_report), address.host, address.port
             )
         except OSError:
-            if near.transport is not None:
-                near.transport.abort()
+            near.abort()
             return
         for side in (near, far):
             _bound_receive_buffer(side)
@@ -293,7 +248,12 @@ class LinkProxy:
 
 def run_proxy(settings: ProxySettings) -> None:
     """Run the proxy until SIGTERM or SIGINT; raise ``RfedgeError`` if it cannot listen."""
-    asyncio.run(_run(settings))
+    with suppress(PermissionError):  # the report names the scheduler that was granted
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    # select() sleeps to the microsecond where epoll rounds up to the next millisecond.
+    loop = asyncio.SelectorEventLoop(selectors.SelectSelector())
+    with asyncio.Runner(loop_factory=lambda: loop) as runner:
+        runner.run(_run(settings))
 
 
 async def _run(settings: ProxySettings) -> None:
@@ -304,14 +264,6 @@ async def _run(settings: ProxySettings) -> None:
     await proxy.start()
     await stopped.wait()
     await proxy.stop()
-
-
-async def _sleep_until(due_s: float) -> None:
-    ahead_s = due_s - time.perf_counter() - SPIN_S
-    if ahead_s > 0:
-        await asyncio.sleep(ahead_s)
-    while time.perf_counter() < due_s:
-        await asyncio.sleep(0)
 
 
 def _bound_receive_buffer(side: Side) -> None:

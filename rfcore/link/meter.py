@@ -25,11 +25,13 @@ class BusyMeter:
         self._measured_end_s = float("-inf")
         self._closed_s = 0.0
         self.wire_bytes = 0
+        self.periods = 0
         self.largest_lateness_s = 0.0
 
     def released(self, delivery: Delivery[Any], at_s: float) -> None:
         """``delivery`` left the link at ``at_s``."""
         if delivery.start_s > self._scheduled_end_s:
+            self.periods += 1
             self._closed_s = self.busy_s
             self._period_start_s = max(delivery.start_s, self._measured_end_s)
         self._scheduled_end_s = delivery.end_s

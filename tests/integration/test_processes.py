@@ -1,0 +1,241 @@
+"""The commands as processes: signals, crashes, and what they load.
+
+The only tests here that look at the clock: how fast a vehicle comes back is the requirement.
+"""
+
+import asyncio
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from cav_agent.config import AgentConfig, AgentLimits, PaceKind
+from cav_agent.vehicle import Vehicle
+from rfcore.errors import InvalidInput, RfedgeError
+
+Process = asyncio.subprocess.Process
+
+
+async def start(module: str, *arguments: str) -> Process:
+    return await asyncio.create_subprocess_exec(
+        sys.executable, "-m", module, *arguments, stderr=subprocess.PIPE
+    )
+
+
+async def appears(condition: Callable[[], Any], process: Process | None = None) -> Any:
+    """Return the first true value of ``condition``; the test's timeout bounds the wait."""
+    while not (value := condition()):
+        assert process is None or process.returncode is None, await process.stderr.read()
+        await asyncio.sleep(0.005)
+    return value
+
+
+@asynccontextmanager
+async def server_process(street: Any, ready: Path, *more: str) -> AsyncIterator[Process]:
+    ready.unlink(missing_ok=True)
+    process = await start(
+        "mec_server", "--fields", str(street.store), "--ready-file", str(ready), *more
+    )
+    try:
+        await appears(ready.exists, process)
+        yield process
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.communicate()
+
+
+def agent_arguments(street: Any, address: str, report: Path) -> list[str]:
+    given = {"server": address, "drive": street.drive, "fields": street.store}
+    given |= {"camera": "front", "rate": 10, "pace": "lockstep", "field": street.field_id}
+    given |= {"preset": "ultrafast", "report": report}
+    return [part for name, value in given.items() for part in (f"--{name}", str(value))]
+
+
+def acked_at_s(report: Path) -> list[float]:
+    """Return when each acknowledged picture was, in seconds of the Unix epoch."""
+    lines = [json.loads(line) for line in report.read_text().splitlines()]
+    return [
+        line["capture_time_ns"] / 1e9 + line["latency_ms"] / 1e3
+        for line in lines
+        if line["result"] == "acked"
+    ]
+
+
+async def port_opens(host: str, port: int) -> float:
+    """Return the second at which a connection to the port succeeds."""
+    while True:
+        try:
+            _, writer = await asyncio.open_connection(host, port)
+        except OSError:
+            await asyncio.sleep(0.005)
+        else:
+            opened_s = time.time()
+            writer.close()
+            return opened_s
+
+
+async def test_a_vehicle_goes_on_within_a_second_of_its_killed_server_coming_back(
+    street: Any, tmp_path: Path
+) -> None:
+    ready, report = tmp_path / "ready", tmp_path / "report.jsonl"
+    async with server_process(street, ready, "--listen", "127.0.0.1:0") as first:
+        address = ready.read_text().strip()
+        config = AgentConfig(
+            address,
+            street.drive,
+            street.store,
+            pace=PaceKind.LOCKSTEP,
+            loop=True,
+            field=street.field_id,
+            preset="ultrafast",
+            report=report,
+        )
+        vehicle = Vehicle(config)
+        driving = asyncio.create_task(vehicle.run())
+        await appears(lambda: report.exists() and len(acked_at_s(report)) >= 3)
+        first.send_signal(signal.SIGKILL)
+        await first.wait()
+    host, _, port = address.rpartition(":")
+    opening = asyncio.create_task(port_opens(host, int(port)))
+    before = len(acked_at_s(report))
+    async with server_process(street, ready, "--listen", address):
+        opened_s = await opening
+        await appears(lambda: len(acked_at_s(report)) > before)
+        back_s = acked_at_s(report)[before] - opened_s
+        vehicle.stop()
+        counts = await driving
+        lost = vehicle.registry.get_sample_value("rfedge_agent_connections_lost_total")
+    print(f"back after {back_s:.3f} s")
+    assert back_s <= 1.0
+    assert lost == 1
+    assert counts["nacked"] == counts["dropped"] == 0
+
+
+async def test_a_drive_ends_with_exit_0_and_a_server_told_to_stop_does_too(
+    street: Any, tmp_path: Path
+) -> None:
+    ready, report = tmp_path / "ready", tmp_path / "report.jsonl"
+    saved = tmp_path / "saved"
+    options = ("--listen", "127.0.0.1:0", "--save", str(saved), "--metrics-port", "0")
+    async with server_process(street, ready, *options) as server:
+        agent = await start(
+            "cav_agent", *agent_arguments(street, ready.read_text().strip(), report)
+        )
+        _, told = await agent.communicate()
+        assert agent.returncode == 0, told
+        server.terminate()
+        _, log = await server.communicate()
+        assert server.returncode == 0, log
+    assert len(acked_at_s(report)) == 6
+    assert len(list((saved / "cav-1/front").glob("*.png"))) == 6
+    for line in log.decode().splitlines():
+        assert json.loads(line)["level"] in ("info", "warning"), "logs are JSON off a terminal"
+
+
+async def test_an_agent_told_to_stop_finishes_its_frame_and_ends_cleanly(
+    street: Any, tmp_path: Path
+) -> None:
+    ready, report = tmp_path / "ready", tmp_path / "report.jsonl"
+    async with server_process(street, ready, "--listen", "127.0.0.1:0"):
+        arguments = agent_arguments(street, ready.read_text().strip(), report)
+        agent = await start("cav_agent", *arguments, "--loop")
+        await appears(lambda: report.exists() and len(acked_at_s(report)) >= 2, agent)
+        agent.terminate()
+        _, told = await agent.communicate()
+        assert agent.returncode == 0, told
+    results = [json.loads(line)["result"] for line in report.read_text().splitlines()]
+    assert set(results) <= {"acked", "dropped"}, "nothing that was encoded was lost"
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"--server": "192.0.2.1:50051"}, "not encrypted; give --allow-insecure"),
+        ({"--rate": "0"}, "rate: 0.0 Hz is outside"),
+        ({"--drive": "/nonexistent"}, "/nonexistent"),
+    ],
+)
+async def test_a_users_mistake_is_one_line_and_exit_2(
+    street: Any, tmp_path: Path, change: dict[str, str], named: str
+) -> None:
+    arguments = agent_arguments(street, "127.0.0.1:1", tmp_path / "report.jsonl")
+    for name, value in change.items():
+        arguments[arguments.index(name) + 1] = value
+    agent = await start("cav_agent", *arguments)
+    _, told = await agent.communicate()
+    lines = [line for line in told.decode().splitlines() if not line.startswith("{")]
+    assert agent.returncode == 2
+    assert len(lines) == 1
+    assert lines[0].startswith("cav-agent: ")
+    assert named in lines[0]
+
+
+@pytest.mark.parametrize("module", ["cav_agent.__main__", "mec_server.__main__"])
+def test_the_services_load_no_heavy_library(module: str) -> None:
+    code = f"import sys, {module}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert not loaded & {"torch", "cv2", "matplotlib", "mitsuba", "jinja2"}
+
+
+async def test_no_server_is_an_error_after_the_time_allowed(street: Any) -> None:
+    config = AgentConfig(
+        "127.0.0.1:1",
+        street.drive,
+        street.store,
+        field=street.field_id,
+        preset="ultrafast",
+        limits=AgentLimits(give_up_s=0.3),
+    )
+    with pytest.raises(RfedgeError, match=r"no server welcomed this vehicle within 0\.3 s"):
+        await Vehicle(config).run()
+
+
+async def test_health_is_serving_until_the_server_drains(serve: Any) -> None:
+    async with serve() as server, grpc.aio.insecure_channel(str(server.address)) as channel:
+        stub = health_pb2_grpc.HealthStub(channel)
+        request = health_pb2.HealthCheckRequest(service="rfcore.wire.v1.EdgeService")
+        watch = stub.Watch(request)
+        first = await watch.read()
+        assert first.status == health_pb2.HealthCheckResponse.SERVING
+        stopping = asyncio.create_task(server.stop())
+        second = await watch.read()
+        assert second.status == health_pb2.HealthCheckResponse.NOT_SERVING
+        watch.cancel()
+        await stopping
+
+
+async def test_a_disk_that_refuses_stops_the_recording_and_not_the_streaming(
+    serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    (tmp_path / "cav-1").write_text("a file where the pictures' folder should be")
+    async with serve(save=tmp_path) as server:
+        assert server.registry.get_sample_value("rfedge_server_recording") == 1
+        trip = await travel(server.address)
+    assert trip.counts == {"acked": 6}
+    assert server.registry.get_sample_value("rfedge_server_recording") == 0
+
+
+async def test_plaintext_is_served_to_this_machine_only_unless_allowed(serve: Any) -> None:
+    with pytest.raises(InvalidInput, match=r"listen: 0\.0\.0\.0:0 is not a loopback address"):
+        async with serve(listen="0.0.0.0:0"):
+            pass
+    async with serve(listen="0.0.0.0:0", allow_insecure=True) as server:
+        assert server.address.port > 0
+
+
+async def test_a_taken_port_is_one_clear_error(serve: Any) -> None:
+    async with serve() as server:
+        with pytest.raises(RfedgeError, match=r"cannot listen on 127\.0\.0\.1:"):
+            async with serve(listen=str(server.address)):
+                pass
