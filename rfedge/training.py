@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import monotonic
 
 from rich.console import Console
@@ -31,9 +31,12 @@ def training_config(
     gaussians: int | None, iterations: int | None, threads: int
 ) -> SplatTrainingConfig:
     """Return the trainer's own settings with what the user chose instead."""
-    chosen = {"gaussians": gaussians, "iterations": iterations}
-    given = {name: value for name, value in chosen.items() if value is not None}
-    return SplatTrainingConfig(**given, threads=threads)
+    config = SplatTrainingConfig(threads=threads)
+    if gaussians is not None:
+        config = replace(config, gaussians=gaussians)
+    if iterations is not None:
+        config = replace(config, iterations=iterations)
+    return config
 
 
 def train_field(job: TrainingJob, console: Console) -> SplatField:

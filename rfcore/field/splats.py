@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import FieldFormatError, InvalidInput
@@ -19,11 +19,10 @@ from rfcore.field.archive import (
     read_file,
     write_atomically,
 )
+from rfcore.native.raster import check_backend
 from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.native import Rasterizer
 from rfcore.views import View
-
-if TYPE_CHECKING:
-    from rfcore.raster.native import Rasterizer
 
 __all__ = [
     "Bounds",
@@ -86,7 +85,7 @@ class SplatField:
     """Gaussians with metadata, ready to render.
 
     ``threads`` and ``isa`` choose how it renders, never what: every choice gives the same bytes.
-    Raises ``BackendUnavailable`` on the first render if this machine lacks ``isa``.
+    Raises ``BackendUnavailable`` if this machine lacks ``isa``. Safe to share between threads.
     """
 
     def __init__(
@@ -99,8 +98,8 @@ class SplatField:
     ) -> None:
         self.gaussians = gaussians
         self.metadata = metadata if metadata is not None else FieldMetadata()
+        self._isa = check_backend(threads, isa)
         self._threads = threads
-        self._isa = isa
 
     @cached_property
     def field_id(self) -> str:
@@ -114,9 +113,7 @@ class SplatField:
 
     @cached_property
     def rasterizer(self) -> Rasterizer:
-        """The renderer of this field."""
-        from rfcore.raster.native import Rasterizer
-
+        """The renderer of this field, made when it is first needed."""
         return Rasterizer(self.gaussians, threads=self._threads, isa=self._isa)
 
     def render(self, camera: Camera) -> View:

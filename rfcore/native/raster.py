@@ -33,6 +33,7 @@ NativeRasterizer = _native.Rasterizer
 NativeTrainable = _native.TrainableRasterizer
 
 MAX_THREADS = 256
+FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def native_camera(camera: Camera) -> _native.RasterCamera:
     rotation = [value for row in pose.rotation_matrix() for value in row]
     numbers = [*rotation, *pose.translation_m, *camera.world_from_cam.translation_m]
     numbers += [k.fx_px, k.fy_px, k.cx_px, k.cy_px]
-    if not np.isfinite(np.array(numbers, dtype=np.float32)).all():
+    if not all(abs(number) <= FLOAT32_MAX for number in numbers):
         raise InvalidInput("camera", "a value is beyond the range of float32; move the tile origin")
     return _native.RasterCamera(numbers, k.width_px, k.height_px)
 

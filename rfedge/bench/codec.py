@@ -8,7 +8,7 @@ receiver's picture must equal the sender's closed loop on every frame.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any, TypeVar
@@ -105,7 +105,7 @@ def _timed(call: Callable[[], T]) -> tuple[float, T]:
 
 
 def _note(
-    series: dict[str, list[float]], render_ms: float, coding_ms: float, stage_ns: dict[str, int]
+    series: dict[str, list[float]], render_ms: float, coding_ms: float, stage_ns: Mapping[str, int]
 ) -> None:
     stages = {"render": render_ms, **{name: ns / 1e6 for name, ns in stage_ns.items()}}
     for name, ms in {**stages, "total": render_ms + coding_ms}.items():

@@ -133,7 +133,7 @@ def _saving_vs_intra(outcome: DriveOutcome, packet_bytes: int, psnr_db: float) -
         i420_from_rgb(pictures.camera).digest(): pictures.camera for pictures in outcome.pictures
     }
 
-    def rgb_psnr_db(frame: I420, decoded: I420) -> float:
+    def rgb_psnr_db(decoded: I420, frame: I420) -> float:
         return psnr(rgb_from_i420(decoded), cameras[frame.digest()])
 
     frames = [i420_from_rgb(pictures.camera) for pictures in outcome.pictures]

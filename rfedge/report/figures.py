@@ -99,7 +99,11 @@ def stages_chart(stages_ms: Mapping[str, float]) -> str:
 def _svg(figure: Any) -> str:
     buffer = io.StringIO()
     figure.savefig(
-        buffer, format="svg", bbox_inches="tight", transparent=True, metadata={"Date": None}
+        buffer,
+        format="svg",
+        bbox_inches="tight",
+        transparent=True,
+        metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")),
     )
     plt.close(figure)
     text = buffer.getvalue()

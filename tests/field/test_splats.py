@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rfcore.camera import TileOrigin
-from rfcore.errors import FieldFormatError, InvalidInput
+from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
+from rfcore.errors import BackendUnavailable, FieldFormatError, InvalidInput
 from rfcore.field import FieldMetadata, SplatField, load_field, save_field
 from rfcore.field.archive import Archive, encode_archive
 from rfcore.field.splats import Bounds, encode_field
 from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.native import Rasterizer
 
 METADATA = FieldMetadata("street", TileOrigin(691_608.0, 5_334_760.0, 520.5), "ab" * 32, 26.25)
 
@@ -50,6 +51,24 @@ def test_the_bounds_hold_every_mean(make_gaussians) -> None:
     assert (gaussians.means <= np.array(bounds.high_m)).all()
     assert (gaussians.means == np.array(bounds.low_m)).any(axis=0).all()
     assert Bounds.around(make_gaussians(0)).low_m == (0, 0, 0)
+
+
+def test_a_field_shows_what_its_gaussians_show(make_gaussians, tmp_path: Path) -> None:
+    gaussians = make_gaussians(40)
+    camera = Camera(Intrinsics(30, 20, 20.0, 20.0, 15.0, 10.0), Pose((0, 0, -4), (1, 0, 0, 0)))
+    save_field(SplatField(gaussians), tmp_path / "a.rff")
+    view = load_field(tmp_path / "a.rff", threads=2).render(camera)
+    want = Rasterizer(gaussians).render(camera)
+    assert view.colour.any()
+    for name in ("colour", "depth", "opacity"):
+        np.testing.assert_array_equal(getattr(view, name), getattr(want, name))
+
+
+def test_an_instruction_set_nobody_has_is_refused_at_once(make_gaussians) -> None:
+    with pytest.raises(BackendUnavailable, match="mmx"):
+        SplatField(make_gaussians(), isa="mmx")
+    with pytest.raises(InvalidInput, match="threads"):
+        SplatField(make_gaussians(), threads=0)
 
 
 def archive_of(gaussians: Gaussians, **change: np.ndarray) -> dict[str, np.ndarray]:

@@ -1,0 +1,100 @@
+"""Time the native renderer on the synthetic street, beside the torch reference.
+
+Before anything is timed, a small picture must follow the reference in float64: every pixel within
+1e-5, but for those where an alpha or a transmittance rounds across a threshold.
+"""
+
+from __future__ import annotations
+
+from time import perf_counter_ns
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera
+from rfcore.errors import RfedgeError
+from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.native import Rasterizer
+from rfcore.raster.street import street_camera, street_gaussians
+from rfedge.bench.results import Rows
+from rfedge.bench.timing import median_ms
+
+__all__ = ["check_against_reference", "raster_rows"]
+
+SIZES_PX = ((300, 168), (640, 360), (1280, 720), (1920, 1080))
+THREADS = (1, 2)
+REFERENCE_SIZES_PX = ((300, 168), (640, 360))
+"""The reference takes tens of seconds beyond; it is run once a size."""
+CHECK_SIZE_PX = (96, 54)
+TOLERANCE = 1e-5
+MAX_FLIPPED = 0.01
+"""Share of pixels that may differ by more: each takes about 50 comparisons with a threshold."""
+
+
+def raster_rows(rows: Rows = "all") -> list[dict[str, Any]]:
+    """Return one row per size and number of threads; ``native`` leaves the reference out.
+
+    Raises ``RfedgeError`` when the renderer is wrong.
+    """
+    gaussians = street_gaussians()
+    check_against_reference(gaussians, street_camera(*CHECK_SIZE_PX))
+    rasterizers = [Rasterizer(gaussians, threads=threads) for threads in THREADS]
+    result = []
+    for size in SIZES_PX:
+        reference_ms, error = None, None
+        if rows == "all" and size in REFERENCE_SIZES_PX:
+            reference_ms, error = _against_reference(gaussians, rasterizers[0], size)
+        for rasterizer in rasterizers:
+            row = _native_row(rasterizer, size, len(gaussians))
+            result.append({**row, "reference_ms": reference_ms, "max_abs_error": error})
+    return result
+
+
+def check_against_reference(gaussians: Gaussians, camera: Camera) -> None:
+    """Raise ``RfedgeError`` unless the native colours follow the float64 reference."""
+    got = Rasterizer(gaussians).render_colour(camera)
+    error = np.abs(got - _reference_colour(gaussians, camera)).max(axis=2)
+    flipped = float((error > TOLERANCE).mean())
+    if not flipped <= MAX_FLIPPED:
+        raise RfedgeError(
+            f"the native renderer is off by up to {error.max():.2g} from the reference on "
+            f"{flipped:.2%} of the pixels (limit {MAX_FLIPPED:.0%}): nothing was timed"
+        )
+
+
+def _reference_colour(gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
+    import torch
+
+    from rfcore.raster import reference
+
+    with torch.no_grad():
+        colour, _, _ = reference.render(reference.parameters(gaussians), camera)
+    picture: NDArray[np.float64] = colour.numpy()
+    return picture
+
+
+def _native_row(rasterizer: Rasterizer, size: tuple[int, int], count: int) -> dict[str, Any]:
+    camera = street_camera(*size)
+    statistics = rasterizer.statistics(camera)
+    return {
+        "width": size[0],
+        "height": size[1],
+        "gaussians": count,
+        "visible": statistics.visible,
+        "blends_per_px": round(statistics.blends_per_px, 3),
+        "threads": rasterizer.threads,
+        "isa": rasterizer.isa,
+        "native_ms": median_ms(lambda: rasterizer.render(camera)),
+    }
+
+
+def _against_reference(
+    gaussians: Gaussians, rasterizer: Rasterizer, size: tuple[int, int]
+) -> tuple[float, float]:
+    """Return the reference's duration in ms and the largest difference of a colour."""
+    camera = street_camera(*size)
+    start = perf_counter_ns()
+    want = _reference_colour(gaussians, camera)
+    reference_ms = (perf_counter_ns() - start) / 1e6
+    return reference_ms, float(np.abs(rasterizer.render_colour(camera) - want).max())

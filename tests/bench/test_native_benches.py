@@ -1,0 +1,88 @@
+"""Benches check before they time, and their rows have the published keys."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.raster.gaussians import F32, Gaussians
+from rfcore.raster.native import Rasterizer
+from rfcore.raster.street import street_camera, street_gaussians
+from rfedge.bench import print_rows, raster, results, run_case, timing, train, write_json
+
+RASTER_KEYS = [
+    *("width", "height", "gaussians", "visible", "blends_per_px", "threads", "isa"),
+    *("native_ms", "reference_ms", "max_abs_error"),
+]
+TRAIN_KEYS = ["width", "height", "gaussians", "threads", "iteration_ms"]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same benches on a street of a thousand Gaussians and thumbnails."""
+
+    def street() -> Gaussians:
+        return street_gaussians(1000)
+
+    monkeypatch.setattr(raster, "street_gaussians", street)
+    monkeypatch.setattr(raster, "SIZES_PX", ((30, 20), (48, 32)))
+    monkeypatch.setattr(raster, "REFERENCE_SIZES_PX", ((30, 20),))
+    monkeypatch.setattr(train, "SIZES_PX", ((48, 32),))
+
+
+@pytest.mark.usefixtures("small")
+def test_raster_rows_have_the_published_keys_and_null_where_not_run() -> None:
+    rows = run_case("raster", rows="all")["rows"]
+    assert [list(row) for row in rows] == [RASTER_KEYS] * 4
+    assert [(row["width"], row["threads"]) for row in rows] == [(30, 1), (30, 2), (48, 1), (48, 2)]
+    assert rows[0]["max_abs_error"] < 0.05
+    assert rows[0]["reference_ms"] > 0
+    assert rows[2]["reference_ms"] is rows[2]["max_abs_error"] is None
+    native = run_case("raster", rows="native")["rows"]
+    assert all(row["reference_ms"] is None and row["native_ms"] > 0 for row in native)
+
+
+@pytest.mark.usefixtures("small")
+def test_a_result_says_where_it_came_from_and_survives_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "street_gaussians", lambda count=1000: street_gaussians(count))
+    result = run_case("train")
+    assert [list(row) for row in result["rows"]] == [TRAIN_KEYS] * 2
+    write_json(result, str(tmp_path / "train.json"))
+    assert json.loads((tmp_path / "train.json").read_text()) == result
+    write_json(result, "-")
+    assert json.loads(capsys.readouterr().out) == result
+    assert list(result) == ["case", "host", "revision", "rows"]
+    print_rows(result)
+    assert "iteration_ms" in capsys.readouterr().out
+
+
+def test_a_wrong_renderer_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Wrong(Rasterizer):
+        def render_colour(self, camera: object) -> F32:
+            return super().render_colour(camera) + 1e-3  # type: ignore[arg-type]
+
+    monkeypatch.setattr(raster, "Rasterizer", Wrong)
+    with pytest.raises(RfedgeError, match="nothing was timed"):
+        raster.check_against_reference(street_gaussians(500), street_camera(20, 12))
+
+
+def test_an_unknown_case_is_refused_by_name() -> None:
+    with pytest.raises(InvalidInput, match="'speed' is not one of raster, train, codec"):
+        results.run_case("speed")
+
+
+def test_a_median_takes_every_repetition_but_not_the_warm_up() -> None:
+    calls: list[None] = []
+    assert timing.median_ms(lambda: calls.append(None), repetitions=5) >= 0
+    assert len(calls) == 5 + timing.WARM_UP
+    assert timing.REPETITIONS >= 20
+
+
+def test_the_street_has_the_density_it_promises() -> None:
+    """47 +- 3 useful blends per pixel at every size; a quarter of the 640x360 bench here."""
+    statistics = Rasterizer(street_gaussians()).statistics(street_camera(320, 180))
+    assert statistics.blends_per_px == pytest.approx(47, abs=3)
+    assert statistics.visible == pytest.approx(130_300, rel=0.01)

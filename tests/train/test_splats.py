@@ -1,0 +1,149 @@
+"""Training lowers the loss, repeats itself to the last bit, and survives poison."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rfcore.camera import TileOrigin
+from rfcore.errors import InvalidInput
+from rfcore.field import SplatField
+from rfcore.raster.gaussians import Gaussians
+from rfcore.train import SplatTrainer, SplatTrainingConfig, mean_psnr_db
+from rfcore.views import PointCloud
+
+SHORT = SplatTrainingConfig(gaussians=300, iterations=60)
+
+
+def checked(level: int) -> np.ndarray:
+    """A picture of coarse squares."""
+    y, x = np.mgrid[:24, :40]
+    squares = 60 + 120 * ((x // 8 + y // 8 + level) % 2)
+    return np.repeat(squares[..., None], 3, axis=2).astype(np.uint8)
+
+
+def trained(pictures, points, config=SHORT, seed: int = 0) -> SplatTrainer:
+    trainer = SplatTrainer(pictures, points, config, seed=seed)
+    for _ in trainer.steps():
+        pass
+    return trainer
+
+
+def painted(posed, cameras, points):
+    """Pictures of a field, so that the right answer exists."""
+    start = SplatTrainer(posed(lambda _: checked(0)), points, SHORT).gaussians()
+    colours = np.random.default_rng(4).normal(size=start.sh[:, :1].shape).astype(np.float32)
+    truth = SplatField(replace(start, sh=np.concatenate([colours, start.sh[:, 1:]], axis=1)))
+    views = [np.clip(truth.render(camera).colour, 0, 1) for camera in cameras]
+    return posed(lambda i: np.round(255 * views[i]).astype(np.uint8))
+
+
+def test_training_raises_the_quality_of_the_views(posed, cameras, points) -> None:
+    pictures = painted(posed, cameras, points)
+    config = replace(SHORT, iterations=150)
+    before = SplatTrainer(pictures, points, config).field()
+    after = trained(pictures, points, config).field()
+    assert mean_psnr_db(after, pictures) > mean_psnr_db(before, pictures) + 6
+
+
+def test_progress_counts_every_iteration_and_the_loss_falls(posed, cameras, points) -> None:
+    trainer = SplatTrainer(painted(posed, cameras, points), points, SHORT)
+    progress = list(trainer.steps())
+    assert [p.iteration for p in progress] == list(range(1, 61))
+    assert {p.total for p in progress} == {60}
+    losses = [p.loss for p in progress]
+    assert np.mean(losses[-8:]) < 0.7 * np.mean(losses[:8])
+    assert trainer.finished
+    with pytest.raises(InvalidInput, match="all 60 iterations"):
+        trainer.step()
+
+
+@pytest.mark.parametrize("change", [{}, {"threads": 2}, {"threads": 5}])
+def test_the_same_seed_gives_the_same_bytes(posed, points, change) -> None:
+    pictures = posed(checked)
+    first = trained(pictures, points).field(name="a")
+    again = trained(pictures, points, replace(SHORT, **change)).field(name="a")
+    assert again.field_id == first.field_id
+
+
+def test_another_seed_gives_another_field(posed, points) -> None:
+    pictures = posed(checked)
+    first, other = (trained(pictures, points, seed=seed) for seed in (0, 1))
+    assert first.field().field_id != other.field().field_id
+    assert first.training_digest != other.training_digest
+
+
+def test_the_field_says_where_it_comes_from(posed, points) -> None:
+    trainer = SplatTrainer(posed(checked), points, SHORT)
+    field = trainer.field("wall", TileOrigin(1.0, 2.0, 3.0), held_out_psnr_db=20.0)
+    assert field.metadata.name == "wall"
+    assert field.metadata.tile_origin == TileOrigin(1.0, 2.0, 3.0)
+    assert field.metadata.training_digest == trainer.training_digest
+    assert field.metadata.held_out_psnr_db == 20.0
+
+
+def test_gaussians_may_be_trained_further(posed, points) -> None:
+    first = trained(posed(checked), points).gaussians()
+    assert len(trained(posed(checked), first).gaussians()) == len(first)
+
+
+def poisonous_gaussians() -> Gaussians:
+    """Needles, discs, dust, giants, zero quaternions, extreme opacities, bad places."""
+    rng = np.random.default_rng(0)
+    n = 256
+    log_scales = rng.uniform(np.log(1e-8), np.log(1e4), (n, 3))
+    means = rng.normal(size=(n, 3)) * [2, 1, 1] + [0, 0, 3]
+    quaternions = rng.normal(size=(n, 4)) * 10.0 ** rng.uniform(-20, 15, (n, 1))
+    logits = rng.normal(size=n) * 10
+    quaternions[:16], logits[16:48], logits[48:80] = 0, 30, -30
+    means[80:96], means[96:112], means[112:120] = 0, [-0.4, 0, 0], [0, 0, 0.01]
+    means[120:136], means[136:152], means[152:184] = [0, 0, -2], [0, 0, 1e6], [0.1, 0.1, 2]
+    means[184:192] = [1e4, 0, 0.02]
+    sh = rng.normal(size=(n, 16, 3)) * 10
+    values = (means, quaternions, log_scales, logits, sh)
+    return Gaussians(*(np.ascontiguousarray(v, dtype=np.float32) for v in values))
+
+
+def poisonous_points() -> PointCloud:
+    xyz = np.zeros((64, 3), np.float32)
+    xyz[:8, 2], xyz[8:16], xyz[16:24, 2], xyz[24:32] = 3, 1e6, 0.01, [-0.4, 0, 0]
+    return PointCloud(xyz, np.zeros((64, 3), np.uint8))
+
+
+PAINTS = {
+    "black": lambda _: np.zeros((24, 40, 3), np.uint8),
+    "white": lambda _: np.full((24, 40, 3), 255, np.uint8),
+    "noise": lambda i: np.random.default_rng(i).integers(0, 256, (24, 40, 3), dtype=np.uint8),
+}
+
+
+@pytest.mark.parametrize("paint", PAINTS.values(), ids=PAINTS.keys())
+@pytest.mark.parametrize("start", [poisonous_gaussians(), poisonous_points()], ids=["g", "p"])
+def test_no_step_on_poison_makes_a_parameter_infinite(posed, start, paint) -> None:
+    trainer = SplatTrainer(posed(paint), start, replace(SHORT, iterations=300))
+    for progress in trainer.steps():
+        assert np.isfinite(progress.loss)
+        trainer.gaussians()  # raises on a value that is not finite
+    assert trainer.finished
+
+
+def test_an_empty_field_against_grey_has_the_closed_form_quality(posed) -> None:
+    nothing = Gaussians(
+        *(np.zeros(s, np.float32) for s in ((0, 3), (0, 4), (0, 3), (0,), (0, 16, 3)))
+    )
+    pictures = posed(lambda _: np.full((24, 40, 3), 51, np.uint8))
+    want = -20 * np.log10(0.2)
+    assert mean_psnr_db(SplatField(nothing), pictures) == pytest.approx(want)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"gaussians": 0}, "training.gaussians: 0"),
+        ({"iterations": 0}, "training.iterations: 0"),
+        ({"initial_scale": float("nan")}, "training.initial_scale: nan"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_by_name(change, named: str) -> None:
+    with pytest.raises(InvalidInput, match=named):
+        SplatTrainingConfig(**change)
