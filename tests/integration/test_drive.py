@@ -1,5 +1,6 @@
 """A real vehicle and a real server in one process, over loopback, with all their real parts."""
 
+import asyncio
 import itertools
 import json
 from pathlib import Path
@@ -56,6 +57,19 @@ async def test_neither_instruction_set_nor_threads_at_either_end_change_a_byte(
         assert [line["digest"] for line in index_of(saved)] == closed_loop
         digests.add(tuple(closed_loop))
     assert len(digests) == 1
+
+
+async def test_two_vehicles_share_a_server_and_a_field(
+    serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    async with serve(save=tmp_path) as server:
+        trips = await asyncio.gather(
+            *(travel(server.address, vehicle=name) for name in ("cav-1", "cav-2"))
+        )
+    for name, trip in zip(("cav-1", "cav-2"), trips, strict=True):
+        assert trip.counts == {"acked": 6}
+        digests = [line["reconstruction_digest"] for line in trip.lines]
+        assert [line["digest"] for line in index_of(tmp_path, name)] == digests
 
 
 async def test_the_report_keeps_the_sizes_apart_and_says_where_the_time_went(

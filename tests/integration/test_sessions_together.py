@@ -1,0 +1,170 @@
+"""Both ends' sessions on a channel that loses, repeats and damages; no socket, no clock, no codec.
+
+The channel follows a list of faults, then behaves. Whatever the list: every picture ends exactly
+once, nothing damaged is acknowledged, and afterwards pictures are acknowledged again.
+"""
+
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
+from cav_agent.session import AgentSession
+from mec_server.jobs import DecodeJob, DecodeOutcome, OpenJob
+from mec_server.session import ServerSession
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
+from rfcore.errors import InvalidInput, PacketRejected, RejectReason
+from rfcore.views import PosedPicture
+from rfcore.wire.convert import client_message_from_bytes, client_message_to_bytes
+from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract, StageTimes
+
+FIELD = "ab" * 32
+INTRINSICS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)
+HEADER = StreamHeader(CodecConfig(32, 16), b"\x67" * 20, b"\x68" * 5)
+HELLO = Hello(
+    "cav-1",
+    (CameraDescription("front", INTRINSICS, HEADER),),
+    (FIELD,),
+    RendererContract("splats-f32-1", exact=True),
+)
+
+faults = st.sampled_from(["deliver", "lose", "repeat", "delay", "flip", "cut", "answer lost"])
+
+
+class World:
+    """A vehicle, a server, and a channel between them."""
+
+    def __init__(self, plan: list[str]) -> None:
+        self.now = 0.0
+        self.plan: Iterator[str] = iter(plan)
+        self.agent = AgentSession(HELLO)
+        self.results: list[FrameResult] = []
+        self.delayed: list[bytes] = []
+        self.encoder = (-1, 0)
+        self.connect()
+
+    def connect(self) -> None:
+        self.server = ServerSession("s", [FIELD], self.now)
+        self.decoder = (0, 0)
+        self.delayed.clear()
+        self.agent.connected(self.now)
+        self.exchange()
+
+    def step(self, index: int) -> None:
+        """Capture a picture and let everything happen that can."""
+        self.now += 1.0
+        picture = PosedPicture(
+            str(index), Camera(INTRINSICS, Pose.identity()), lambda: np.zeros((16, 32, 3), np.uint8)
+        )
+        self.agent.offer(Capture(index, picture, self.now, index))
+        self.agent.handle_timer(self.now)
+        if self.agent.broken is not None:
+            self.agent.connection_lost(self.agent.broken, self.now)
+            self.connect()
+        while (job := self.agent.job_to_start()) is not None:
+            self.agent.encoded(self.encode(job), self.now)
+            self.exchange()
+        self.results += self.agent.take_results()
+
+    def encode(self, job: EncodeJob) -> EncodedFrame:
+        sequence = self.encoder[1] + 1 if self.encoder[0] == job.epoch else 0
+        self.encoder = (job.epoch, sequence)
+        payload = f"picture {job.capture.index}".encode()
+        digest = zlib.crc32(payload).to_bytes(16, "big")
+        packet = DeltaPacket(job.epoch, sequence, digest, b"c" * 64, digest, payload, 0)
+        return EncodedFrame(packet.sealed(), {})
+
+    def exchange(self) -> None:
+        for message in self.agent.messages_to_send(self.now):
+            data = client_message_to_bytes(message)
+            fault = next(self.plan, "deliver") if isinstance(message, Frame) else "deliver"
+            for arrived in self.through(data, fault):
+                self.serve(arrived)
+            answers = self.server.messages_to_send(self.now)
+            for answer in answers if fault != "answer lost" else []:
+                self.agent.receive(answer, self.now)
+
+    def through(self, data: bytes, fault: str) -> list[bytes]:
+        late, self.delayed = self.delayed, []
+        match fault:
+            case "lose":
+                return late
+            case "repeat":
+                return [data, data, *late]
+            case "delay":
+                self.delayed = [data]
+                return late
+            case "flip":
+                where = len(data) // 2
+                return [data[:where] + bytes([data[where] ^ 4]) + data[where + 1 :], *late]
+            case "cut":
+                return [data[: len(data) // 2], *late]
+        return [data, *late]
+
+    def serve(self, data: bytes) -> None:
+        try:
+            self.server.receive(client_message_from_bytes(data), self.now)
+        except InvalidInput as error:
+            self.server.refuse(error, self.now)
+        while jobs := self.server.jobs_to_start(self.now):
+            for job in jobs:
+                self.work(job)
+
+    def work(self, job: OpenJob | DecodeJob) -> None:
+        if isinstance(job, OpenJob):
+            self.server.opened(job, self.now)
+            return
+        packet = job.frame.packet
+        expected = self.decoder[1] if self.decoder[0] == packet.epoch else 0
+        reason = None
+        if packet.sequence < expected:
+            reason = RejectReason.STALE_SEQUENCE
+        elif packet.crc32 != packet.expected_crc32():
+            reason = RejectReason.CRC_MISMATCH
+        if reason is not None:
+            self.server.rejected(job, PacketRejected(reason, "as the codec would"), self.now)
+            return
+        self.decoder = (packet.epoch, packet.sequence + 1)
+        outcome = DecodeOutcome(
+            packet.sequence - expected, packet.reconstruction_digest, StageTimes()
+        )
+        self.server.decoded(job, outcome, self.now)
+
+
+@settings(max_examples=300)
+@given(st.lists(faults, max_size=25))
+def test_every_picture_ends_once_and_the_stream_recovers_from_anything(plan: list[str]) -> None:
+    world = World(plan)
+    trouble, calm = 2 * len(plan) + 2, 12
+    for index in range(trouble + calm):
+        world.step(index)
+    ended = [result.capture.index for result in world.results]
+    assert len(ended) == len(set(ended)), "no picture ends twice"
+    assert set(ended) | {trouble + calm - 1} == set(range(trouble + calm)), "and none is forgotten"
+    assert [r.outcome for r in world.results[-4:]] == [Outcome.ACKED] * 4
+    for result in world.results:
+        if result.outcome is Outcome.ACKED:
+            assert result.packet is not None
+            assert result.packet.payload == f"picture {result.capture.index}".encode()
+            assert result.server_digest == result.packet.reconstruction_digest
+
+
+def test_without_faults_every_picture_is_acknowledged_in_one_epoch() -> None:
+    world = World([])
+    for index in range(20):
+        world.step(index)
+    assert [result.outcome for result in world.results] == [Outcome.ACKED] * 20
+    assert {result.packet.epoch for result in world.results if result.packet} == {0}
+
+
+def test_a_damaged_frame_costs_one_picture() -> None:
+    world = World(["deliver", "deliver", "flip"])
+    for index in range(8):
+        world.step(index)
+    outcomes = [str(result.outcome) for result in world.results]
+    assert outcomes.count("nacked") == 1
+    assert outcomes.count("acked") == 7
