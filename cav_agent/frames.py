@@ -38,7 +38,7 @@ class EncodeJob:
 
 @dataclass(frozen=True)
 class EncodedFrame:
-    """What the pipeline made of a picture; ``stage_s`` has load, render, encode, closed_loop."""
+    """A coded picture; ``stage_s`` has read, convert, render, encode and closed_loop."""
 
     packet: DeltaPacket
     stage_s: Mapping[str, float]

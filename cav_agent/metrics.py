@@ -34,7 +34,7 @@ class AgentMetrics:
         )
         self.stages = Histogram(
             "rfedge_agent_stage_seconds",
-            "Time by stage: load, render, encode, closed_loop, link, end_to_end (capture to Ack)",
+            "Time by stage; end_to_end is from the picture in memory to its Ack",
             ["stage"],
             buckets=FRAME_BUDGET_BUCKETS_S,
             registry=registry,

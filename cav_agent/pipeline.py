@@ -1,4 +1,4 @@
-"""From a captured picture to a packet: load, render, encode. Runs on a worker thread.
+"""From a captured picture to a packet: read, convert, render, encode. Runs on a worker thread.
 
 The encoder's state is a value; it starts afresh whenever the session asks for another epoch.
 """
@@ -12,7 +12,7 @@ from cav_agent.frames import EncodedFrame, EncodeJob
 from rfcore.camera import Camera, Intrinsics
 from rfcore.codec import CodecConfig, DeltaEncoder, EncoderState, StreamHeader
 from rfcore.errors import InvalidInput
-from rfcore.image import I420
+from rfcore.image import Rgb
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
 from rfcore.views import PosedPicture, View
 
@@ -50,8 +50,10 @@ class Pipeline:
         another size, ``CodecError`` when x264 fails.
         """
         started_ns = self._clock_ns()
-        frame = self._load(job.capture.picture)
-        loaded_ns = self._clock_ns()
+        rgb = self._read(job.capture.picture)
+        read_ns = self._clock_ns()
+        frame = i420_from_rgb(rgb)
+        converted_ns = self._clock_ns()
         render = i420_from_colour(self._renderer.render(job.capture.picture.camera).colour)
         rendered_ns = self._clock_ns()
         state = self._state
@@ -62,14 +64,15 @@ class Pipeline:
         return EncodedFrame(
             encoded.packet,
             {
-                "load": (loaded_ns - started_ns) / 1e9,
-                "render": (rendered_ns - loaded_ns) / 1e9,
+                "read": (read_ns - started_ns) / 1e9,
+                "convert": (converted_ns - read_ns) / 1e9,
+                "render": (rendered_ns - converted_ns) / 1e9,
                 "encode": encoded.stage_ns["encode"] / 1e9,
                 "closed_loop": encoded.stage_ns["closed_loop"] / 1e9,
             },
         )
 
-    def _load(self, picture: PosedPicture) -> I420:
+    def _read(self, picture: PosedPicture) -> Rgb:
         k: Intrinsics = picture.camera.intrinsics
         if (k.width_px, k.height_px) != self._config.size_px:
             raise InvalidInput(
@@ -77,4 +80,4 @@ class Pipeline:
                 f"{k.width_px}x{k.height_px} px, the stream is coded at "
                 f"{self._config.width_px}x{self._config.height_px} px",
             )
-        return i420_from_rgb(picture.read())
+        return picture.read()

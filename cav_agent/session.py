@@ -217,7 +217,9 @@ class AgentSession:
 
     def _finish(self, address: FrameAddress, outcome: Outcome, reason: str, now: float) -> None:
         result = self._pending.pop(address).result
-        latency_s = now - result.capture.captured_s
+        # A camera hands its picture over; that ours comes from a file is the replay's cost.
+        reading_s = result.stage_s.get("read", 0.0)
+        latency_s = now - result.capture.captured_s - reading_s
         self._results.append(replace(result, outcome=outcome, reason=reason, latency_s=latency_s))
 
     # --- what goes out, and time

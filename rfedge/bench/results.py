@@ -10,7 +10,7 @@ from typing import Any, Literal
 from rfcore.errors import InvalidInput
 from rfedge.provenance import host, revision
 
-__all__ = ["CASES", "Rows", "print_rows", "run_case", "write_json"]
+__all__ = ["CASES", "Rows", "flattened", "print_rows", "run_case", "write_json"]
 
 CASES = ("raster", "train", "codec")
 
@@ -49,7 +49,7 @@ def print_rows(result: dict[str, Any]) -> None:
 
     where = result["host"]
     title = f"{result['case']} at {result['revision']} on {where['cpu']} ({where['isa']})"
-    rows = [_flattened(row) for row in result["rows"]]
+    rows = [flattened(row) for row in result["rows"]]
     table = Table(title=title)
     for name in rows[0]:
         table.add_column(name, justify="right", overflow="fold")
@@ -67,7 +67,8 @@ def write_json(result: dict[str, Any], path: str) -> None:
         Path(path).write_text(text)
 
 
-def _flattened(row: Row) -> Row:
+def flattened(row: Row) -> Row:
+    """Return a row whose nested values stand beside the others, as ``outer.inner``."""
     flat: Row = {}
     for name, value in row.items():
         if isinstance(value, dict):

@@ -19,6 +19,17 @@ __all__ = ["bytes_chart", "quality_chart", "stages_chart"]
 
 INK, MUTED, GRID = "#1c2733", "#6b7785", "#dfe4ea"
 PAYLOAD, HEADER, RECONSTRUCTION, RENDER = "#2563eb", "#93b4f5", "#2563eb", "#d97706"
+STAGES = {
+    "convert": "vehicle: camera to YUV",
+    "render": "vehicle: render",
+    "encode": "vehicle: encode",
+    "closed_loop": "vehicle: closed loop",
+    "link": "link, both ways",
+    "server_queue": "server: wait",
+    "server_render": "server: render",
+    "server_splice": "server: splice",
+    "server_decode": "server: decode",
+}
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "rfedge",
@@ -77,7 +88,8 @@ def quality_chart(frames: Sequence[Frame]) -> str:
 
 
 def stages_chart(stages_ms: Mapping[str, float]) -> str:
-    """Return one horizontal bar that splits a frame's milliseconds by stage (medians)."""
+    """Return the median milliseconds of each stage, in the order a frame goes through them."""
+    stages_ms = {label: stages_ms[stage] for stage, label in STAGES.items()}
     with mpl.rc_context({**STYLE, "axes.grid.axis": "x"}):
         figure, axes = plt.subplots(figsize=(7.2, 0.42 * len(stages_ms) + 0.6))
         names = list(stages_ms)

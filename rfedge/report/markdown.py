@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rfcore.errors import InvalidInput
+from rfedge.bench.results import flattened
 from rfedge.report.summary import METRIC, SUMMARY
 
 __all__ = ["results_page"]
@@ -65,7 +66,7 @@ def _demo(path: Path, result: Row) -> str:
 
 
 def _bench(path: Path, result: Row) -> str:
-    rows = [_flat(row) for row in result["rows"]]
+    rows = [flattened(row) for row in result["rows"]]
     columns = list(rows[0])
     cells = [[_cell(row[column]) for column in columns] for row in rows]
     return "\n\n".join([_heading(path, result), _table(columns, cells), ""])
@@ -78,16 +79,6 @@ def _heading(path: Path, result: Row) -> str:
         f"## {path.stem}\n\n`{command}` at `{result['revision']}`; {host['cpu']}, "
         f"{host['cores']} cores, {host['isa']}."
     )
-
-
-def _flat(row: Row) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in row.items():
-        if isinstance(value, Mapping):
-            flat.update({f"{key}.{name}": part for name, part in value.items()})
-        else:
-            flat[key] = value
-    return flat
 
 
 def _cell(value: Any) -> str:

@@ -52,7 +52,7 @@ SUMMARY: tuple[tuple[str, str, Callable[[Entry], str]], ...] = (
         "100·I/(I+P) of a two-frame clip",
         lambda entry: f"{entry['paper_savings_percent']:.1f} %",
     ),
-    ("Latency", "capture to acknowledged, p50 / p99", _latency),
+    ("Latency", "picture in memory to acknowledged, p50 / p99", _latency),
     (
         "Link timing error",
         "measured busy time against bytes / throughput",
