@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff
 
 __all__ = ["Link"]
 
@@ -27,6 +30,9 @@ class Link:
     ready_file: Path | None = None
     """Write HOST:PORT here once listening."""
 
+    allow_insecure: Annotated[bool, FlagCreatePairsOff] = False
+    """Forward plaintext to or from other machines."""
+
     def run(self) -> None:
         """Forward until SIGTERM or SIGINT."""
         from rfedge.link_proxy import ProxySettings, run_proxy
@@ -40,5 +46,6 @@ class Link:
                 delay_ms=self.delay_ms,
                 report=self.report,
                 ready_file=self.ready_file,
+                allow_insecure=self.allow_insecure,
             )
         )

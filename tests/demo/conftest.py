@@ -94,3 +94,9 @@ def tiny_sample(tmp_path: Path) -> Path:
     write_points(folder / "points.ply")
     write_manifest(folder)
     return folder
+
+
+@pytest.fixture
+def tiny_gaussians() -> Gaussians:
+    """Return the Gaussians the tiny street's pictures were rendered from."""
+    return tiny_street()

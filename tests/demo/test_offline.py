@@ -1,0 +1,49 @@
+"""The codec without a network: what is decoded is the vehicle's closed loop, or an error."""
+
+from pathlib import Path
+
+import pytest
+
+from rfcore.codec import CodecConfig, DeltaEncoder
+from rfcore.dataset import Dataset, read_transforms
+from rfcore.errors import InvalidData
+from rfcore.field import SplatField
+from rfcore.native.yuv import i420_from_rgb
+from rfcore.raster.gaussians import Gaussians
+from rfcore.wire.drive_file import read_drive, write_drive
+from rfedge.offline import CodingSettings, decode_drive, encode_drive, rendered
+
+SETTINGS = CodingSettings(preset="veryfast", crf=27.0)
+
+
+@pytest.fixture
+def drive(tiny_sample: Path) -> Dataset:
+    return read_transforms(tiny_sample / "transforms_drive_vehicles.json")
+
+
+@pytest.fixture
+def field(tiny_gaussians: Gaussians) -> SplatField:
+    return SplatField(tiny_gaussians)
+
+
+def test_a_decoded_file_is_the_senders_closed_loop(
+    drive: Dataset, field: SplatField, tmp_path: Path
+) -> None:
+    path = tmp_path / "drive.rfv"
+    write_drive(path, encode_drive(drive, field, SETTINGS))
+    encoder = DeltaEncoder(CodecConfig(96, 64, "veryfast", 27.0))
+    state = encoder.start(1)
+    decoded = list(decode_drive(read_drive(path), field))
+    assert [frame.sequence for frame in decoded] == [0, 1, 2, 3]
+    for picture, frame in zip(drive.pictures, decoded, strict=True):
+        own = encoder.encode(state, i420_from_rgb(picture.read()), rendered(field, picture.camera))
+        state = own.state
+        assert frame.frame.digest() == own.reconstruction.digest()
+
+
+def test_another_field_is_refused_with_both_ids_named(drive: Dataset, field: SplatField) -> None:
+    coded = encode_drive(drive, field, SETTINGS)
+    g = field.gaussians
+    other = SplatField(Gaussians(g.means + 1, g.quaternions, g.log_scales, g.opacity_logits, g.sh))
+    with pytest.raises(InvalidData, match=f"{field.field_id}, given {other.field_id}"):
+        next(decode_drive(coded, other))
