@@ -1,0 +1,69 @@
+"""Picture files: what is read is what was stored, and what cannot be read is said."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rfcore.errors import DatasetError, InvalidInput
+from rfcore.image import I420, Rgb, read_rgb, write_png
+
+
+def noise(height: int, width: int) -> Rgb:
+    return np.random.default_rng(5).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 13), (64, 48)])
+def test_a_png_comes_back_byte_for_byte(size: tuple[int, int], tmp_path: Path) -> None:
+    rgb = noise(*size)
+    write_png(tmp_path / "a.png", rgb)
+    assert np.array_equal(read_rgb(tmp_path / "a.png"), rgb)
+    assert np.array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], rgb), "another reader"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"], "no partial file is left"
+
+
+def test_a_lossless_webp_comes_back_byte_for_byte(tmp_path: Path) -> None:
+    rgb = noise(36, 64)
+    cv2.imwrite(str(tmp_path / "a.webp"), rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 101])
+    assert np.array_equal(read_rgb(tmp_path / "a.webp"), rgb)
+
+
+def test_a_jpeg_is_read_without_a_colour_cast(tmp_path: Path) -> None:
+    """OpenCV's reader (libjpeg-turbo) is the oracle; a fifth of a level is far below rounding."""
+    ramp = np.linspace(0, 255, 64 * 96 * 3).reshape(64, 96, 3).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "a.jpg"), ramp, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    other = cv2.imread(str(tmp_path / "a.jpg"))[..., ::-1].astype(float)
+    bias = (read_rgb(tmp_path / "a.jpg") - other).mean(axis=(0, 1))
+    assert np.abs(bias).max() < 0.2
+
+
+@pytest.mark.parametrize("content", [b"", b"no picture", b"\x89PNG\r\n\x1a\n"])
+def test_what_is_no_picture_is_refused_by_name(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "bad.png").write_bytes(content)
+    with pytest.raises(DatasetError, match=r"bad\.png: not a readable picture"):
+        read_rgb(tmp_path / "bad.png")
+
+
+def test_a_missing_picture_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"none\.png"):
+        read_rgb(tmp_path / "none.png")
+
+
+def test_planes_that_do_not_belong_together_are_refused() -> None:
+    half, full = np.zeros((2, 2), np.uint8), np.zeros((4, 4), np.uint8)
+    I420(full, half, half)
+    with pytest.raises(InvalidInput, match="chroma planes"):
+        I420(full, full, half)
+    with pytest.raises(InvalidInput, match="uint8"):
+        I420(full, half, half.astype(np.int16))  # type: ignore[arg-type]
+
+
+def test_a_digest_knows_pixels_planes_and_size() -> None:
+    y, c = np.zeros((4, 4), np.uint8), np.zeros((2, 2), np.uint8)
+    changed = c.copy()
+    changed[1, 1] = 1
+    wide = I420(np.zeros((2, 8), np.uint8), np.zeros((1, 4), np.uint8), np.zeros((1, 4), np.uint8))
+    pictures = [I420(y, c, c), I420(y, changed, c), I420(y, c, changed), wide]
+    assert len({picture.digest() for picture in pictures}) == 4
+    assert I420(y, c, c).digest() == I420(y.copy(), c.copy(), c.copy()).digest()
