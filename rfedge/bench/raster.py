@@ -2,6 +2,9 @@
 
 Before anything is timed, a small picture must follow the reference in float64: every pixel within
 1e-5, but for those where an alpha or a transmittance rounds across a threshold.
+
+Timed is the colour picture alone, what both ends of the codec predict from; depth and opacity on
+top of it take 7 % longer at 640x360 and 25 % at 1920x1080.
 """
 
 from __future__ import annotations
@@ -85,7 +88,7 @@ def _native_row(rasterizer: Rasterizer, size: tuple[int, int], count: int) -> di
         "blends_per_px": round(statistics.blends_per_px, 3),
         "threads": rasterizer.threads,
         "isa": rasterizer.isa,
-        "native_ms": median_ms(lambda: rasterizer.render(camera)),
+        "native_ms": median_ms(lambda: rasterizer.render_colour(camera)),
     }
 
 

@@ -14,7 +14,7 @@ from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import LearningRates, Rasterizer, TrainableRasterizer, available_isas
 
 VIEW_DIGEST = "c18bdbe3d11e00a26b05ca90804cd8b1"
-TRAINED_DIGEST = "deae0dfa91136055db34fe300c725424"
+TRAINED_DIGEST = "38d26a93fefa81eb52ea0cd7e89ad3bb"
 FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 

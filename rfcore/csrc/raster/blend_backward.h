@@ -24,38 +24,65 @@ struct Replay {
     alignas(64) float weight[(kChunk + kLanes) * 16];  // alpha T
 };
 
+// Up to 16 pixels of a row of the picture and of its gradient; zeros where it has ended.
+RF_INLINE void load_pixels(const BlendBackwardJob& job, size_t first, int columns, Lanes* colour,
+                           Lanes* d_colour) {
+    const size_t pixels = static_cast<size_t>(job.camera->width) * job.camera->height;
+    if (columns == kTileSide) {
+        load_interleaved(job.colour + 3 * first, colour);
+        for (int c = 0; c < 3; ++c) d_colour[c] = load_unaligned(job.d_colour + c * pixels + first);
+        return;
+    }
+    float row[3 * kTileSide] = {}, d_row[3][kTileSide] = {};
+    const size_t bytes = static_cast<size_t>(columns) * sizeof(float);
+    memcpy(row, job.colour + 3 * first, 3 * bytes);
+    load_interleaved(row, colour);
+    for (int c = 0; c < 3; ++c) {
+        memcpy(d_row[c], job.d_colour + c * pixels + first, bytes);
+        d_colour[c] = load_unaligned(d_row[c]);
+    }
+}
+
+RF_INLINE void store_blocks(const Lanes* rows, float (*plane)[16]) {
+    Lanes turned[4], blocks[4];
+    rows_from_blocks(rows, turned);
+    rows_from_blocks(turned, blocks);  // the inverse is the map applied twice
+    for (int j = 0; j < 4; ++j) store(plane[j], blocks[j]);
+}
+
+// Read the tile; return the blocks wholly outside the picture as a bit set.
 RF_INLINE uint32_t start_gradient(const BlendBackwardJob& job, int tile_x, int tile_y,
                                   TileGradient* g) {
     const int width = job.camera->width, height = job.camera->height;
-    const size_t pixels = static_cast<size_t>(width) * height;
-    uint32_t outside = 0;
-    for (int b = 0; b < kBlocksPerTile; ++b) {
-        const int left = tile_x * kTileSide + (b & 3) * kBlockSide;
-        const int top = tile_y * kTileSide + (b >> 2) * kBlockSide;
-        if (left >= width || top >= height) outside |= 1u << b;
-        alignas(64) float colour[3][16];
-        for (int lane = 0; lane < kLanes; ++lane) {
-            const int x = left + (lane >> 2), y = top + (lane & 3);
-            const bool inside = x < width && y < height;
-            const size_t at = inside ? static_cast<size_t>(y) * width + x : 0;
-            g->transmittance[b][lane] = inside ? 1.0f : 0.0f;
-            g->red[b][lane] = inside ? job.d_colour[at] : 0.0f;
-            g->green[b][lane] = inside ? job.d_colour[pixels + at] : 0.0f;
-            g->blue[b][lane] = inside ? job.d_colour[2 * pixels + at] : 0.0f;
-            for (int c = 0; c < 3; ++c) colour[c][lane] = inside ? job.colour[3 * at + c] : 0.0f;
+    const int left = tile_x * kTileSide;
+    const int columns = width - left < kTileSide ? width - left : kTileSide;
+    for (int block_row = 0; block_row < 4; ++block_row) {
+        Lanes red[4], green[4], blue[4], behind[4];
+        for (int s = 0; s < kBlockSide; ++s) {
+            const int y = tile_y * kTileSide + block_row * kBlockSide + s;
+            Lanes colour[3] = {zero(), zero(), zero()}, d[3] = {zero(), zero(), zero()};
+            if (y < height) {
+                load_pixels(job, static_cast<size_t>(y) * width + left, columns, colour, d);
+            }
+            red[s] = d[0];
+            green[s] = d[1];
+            blue[s] = d[2];
+            behind[s] = fma(d[0], colour[0], fma(d[1], colour[1], d[2] * colour[2]));
         }
-        const Lanes green_blue =
-            fma(load(g->green[b]), load(colour[1]), load(g->blue[b]) * load(colour[2]));
-        store(g->behind[b], fma(load(g->red[b]), load(colour[0]), green_blue));
+        store_blocks(red, g->red + 4 * block_row);
+        store_blocks(green, g->green + 4 * block_row);
+        store_blocks(blue, g->blue + 4 * block_row);
+        store_blocks(behind, g->behind + 4 * block_row);
     }
-    return outside;
+    return start_transmittance(*job.camera, tile_x, tile_y, g->transmittance);
 }
 
-// Replay `listed` splats over block `b`; return how many were replayed before the block was opaque
-// (a multiple of kUnroll unless the list ended).
+constexpr int kReplayUnroll = 4;
+
+// Replay `listed` splats, a multiple of kReplayUnroll, over block `b`; return how many were
+// replayed before the block was opaque.
 RF_INLINE int replay_block(const TileChunk& chunk, int b, int listed, TileGradient* g,
                            Replay* replay, bool* opaque) {
-    constexpr int kCheckEvery = 4;
     const Lanes x = load(kLaneX) + splat(static_cast<float>((b & 3) * kBlockSide));
     const Lanes one = splat(1.0f), max_alpha = splat(kMaxAlpha), min_power = splat(kMinPower);
     const Lanes min_t = splat(kMinTransmittance);
@@ -63,25 +90,31 @@ RF_INLINE int replay_block(const TileChunk& chunk, int b, int listed, TileGradie
     Lanes t = load(g->transmittance[b]), behind = load(g->behind[b]);
     int k = 0;
     while (k < listed) {
-        const TileEntry& e = chunk.at(k);
-        const Lanes p = power_at(e, x, b >> 2);
-        const Lanes unclamped = alpha_from_log2(p);
-        const Lanes alpha = keep_min(ge(p, min_power), unclamped, max_alpha);
-        const Lanes after = fnma(t, alpha, t);
-        const Mask lit = gt(after, min_t);
-        const Lanes weight = keep_mul(lit, alpha, t);
-        const Lanes own = fma(red, splat(e.splat.red),
-                              fma(green, splat(e.splat.green), blue * splat(e.splat.blue)));
-        behind = fnma(weight, own, behind);
-        const Lanes d_alpha = fma(t, own, negate(behind / (one - alpha)));
-        store(replay->s + 16 * k, keep_mul(both(lit, ge(max_alpha, unclamped)), alpha, d_alpha));
-        store(replay->weight + 16 * k, weight);
-        t = after;
-        ++k;
-        if (k % kCheckEvery == 0) {
-            t = keep(lit, t);
-            if (!any(lit)) break;
+        Lanes alpha[kReplayUnroll];
+        Mask free[kReplayUnroll];  // alpha was not clamped
+        for (int i = 0; i < kReplayUnroll; ++i) {
+            const Lanes p = power_at(chunk.at(k + i), x, b >> 2);
+            const Lanes unclamped = alpha_from_log2(p);
+            alpha[i] = keep_min(ge(p, min_power), unclamped, max_alpha);
+            free[i] = ge(max_alpha, unclamped);
         }
+        Mask lit;
+        for (int i = 0; i < kReplayUnroll; ++i) {
+            const Splat& s = chunk.at(k + i).splat;
+            const Lanes after = fnma(t, alpha[i], t);
+            lit = gt(after, min_t);
+            const Lanes weight = keep_mul(lit, alpha[i], t);
+            const Lanes own =
+                fma(red, splat(s.red), fma(green, splat(s.green), blue * splat(s.blue)));
+            behind = fnma(weight, own, behind);
+            const Lanes d_alpha = fnma(behind, reciprocal(one - alpha[i]), t * own);
+            store(replay->s + 16 * (k + i), keep_mul(both(lit, free[i]), alpha[i], d_alpha));
+            store(replay->weight + 16 * (k + i), weight);
+            t = after;
+        }
+        k += kReplayUnroll;
+        t = keep(lit, t);
+        if (!any(lit)) break;
     }
     store(g->transmittance[b], t);
     store(g->behind[b], behind);
@@ -195,7 +228,7 @@ static void blend_backward(const BlendBackwardJob& job, int tile) {
     alignas(64) TileChunk chunk;
     TileGradient gradient;
     Replay replay;
-    alignas(64) float sums[kChunk * 16];
+    alignas(64) float sums[(kChunk + 1) * 16];  // the last row takes what pads the lists
     uint32_t done = start_gradient(job, tile_x, tile_y, &gradient);
     const uint32_t end = job.tile_offsets[tile + 1];
     uint32_t e = job.tile_offsets[tile];
@@ -206,7 +239,7 @@ static void blend_backward(const BlendBackwardJob& job, int tile) {
         memset(sums, 0, sizeof sums);
         for (int b = 0; b < kBlocksPerTile; ++b) {
             if (done >> b & 1) continue;
-            const int listed = list_block(&chunk, b, count, 1);
+            const int listed = list_block(&chunk, b, count, kReplayUnroll);
             bool opaque;
             const int replayed = replay_block(chunk, b, listed, &gradient, &replay, &opaque);
             reduce_block(chunk, b, replayed, gradient, &replay, sums);

@@ -10,7 +10,7 @@
 namespace {
 
 #if defined(RF_ISA_AVX512)
-constexpr int kUnroll = 4;  // independent alphas in flight: 32 registers hold four
+constexpr int kUnroll = 8;  // independent alphas in flight; 4 take 3 % longer, 2 take 8 %
 #else
 constexpr int kUnroll = 2;
 #endif
@@ -24,29 +24,15 @@ struct TilePixels {
     alignas(64) float opacity[kBlocksPerTile][16];  // sum of w
 };
 
-// T = 1 inside the picture and 0 outside; return the blocks wholly outside as a bit set.
 RF_INLINE uint32_t start_tile(const Camera& camera, int tile_x, int tile_y, TilePixels* pixels) {
-    uint32_t done = 0;
     for (int b = 0; b < kBlocksPerTile; ++b) {
-        const int left = tile_x * kTileSide + (b & 3) * kBlockSide;
-        const int top = tile_y * kTileSide + (b >> 2) * kBlockSide;
         store(pixels->red[b], zero());
         store(pixels->green[b], zero());
         store(pixels->blue[b], zero());
         store(pixels->depth[b], zero());
         store(pixels->opacity[b], zero());
-        if (left + kBlockSide <= camera.width && top + kBlockSide <= camera.height) {
-            store(pixels->transmittance[b], splat(1.0f));
-            continue;
-        }
-        for (int lane = 0; lane < kLanes; ++lane) {
-            const bool inside =
-                left + (lane >> 2) < camera.width && top + (lane & 3) < camera.height;
-            pixels->transmittance[b][lane] = inside ? 1.0f : 0.0f;
-        }
-        if (left >= camera.width || top >= camera.height) done |= 1u << b;
     }
-    return done;
+    return start_transmittance(camera, tile_x, tile_y, pixels->transmittance);
 }
 
 // Blend the listed splats of `chunk` into block `b`; return true once no pixel lets light through.
@@ -98,29 +84,77 @@ RF_INLINE bool blend_block(const TileChunk& chunk, int b, int listed, TilePixels
     return !any(gt(t, min_t));
 }
 
+// Four rows of the tile as rows of 16 pixels.
+struct RowsOfBlocks {
+    Lanes red[4], green[4], blue[4], depth[4], opacity[4];
+};
+
+RF_INLINE void load_rows(const float (*plane)[16], int block_row, Lanes* rows) {
+    Lanes blocks[4];
+    for (int j = 0; j < 4; ++j) blocks[j] = load(plane[4 * block_row + j]);
+    rows_from_blocks(blocks, rows);
+}
+
+// Copy the first `columns` of 16 pixels.
+RF_INLINE void store_columns(float* out, Lanes row, int columns) {
+    if (columns == kTileSide) {
+        store_unaligned(out, row);
+        return;
+    }
+    alignas(64) float all[16];
+    store(all, row);
+    memcpy(out, all, static_cast<size_t>(columns) * sizeof(float));
+}
+
 // Write the pixels of the tile that are inside the picture.
 template <bool kView>
 RF_INLINE void write_tile(const BlendJob& job, int tile_x, int tile_y, const TilePixels& pixels) {
     const int width = job.camera->width, height = job.camera->height;
+    const int left = tile_x * kTileSide;
+    const int columns = width - left < kTileSide ? width - left : kTileSide;
+    for (int block_row = 0; block_row < 4; ++block_row) {
+        RowsOfBlocks r;
+        load_rows(pixels.red, block_row, r.red);
+        load_rows(pixels.green, block_row, r.green);
+        load_rows(pixels.blue, block_row, r.blue);
+        if (kView) {
+            load_rows(pixels.depth, block_row, r.depth);
+            load_rows(pixels.opacity, block_row, r.opacity);
+        }
+        for (int s = 0; s < kBlockSide; ++s) {
+            const int y = tile_y * kTileSide + block_row * kBlockSide + s;
+            if (y >= height) return;
+            const size_t first = static_cast<size_t>(y) * width + left;
+            if (columns == kTileSide) {
+                store_interleaved(job.colour + 3 * first, r.red[s], r.green[s], r.blue[s]);
+            } else {
+                alignas(64) float row[48];
+                store_interleaved(row, r.red[s], r.green[s], r.blue[s]);
+                memcpy(job.colour + 3 * first, row, 3 * sizeof(float) * static_cast<size_t>(columns));
+            }
+            if (kView) {
+                const Lanes mean = r.depth[s] / r.opacity[s];
+                store_columns(job.opacity + first, r.opacity[s], columns);
+                store_columns(job.depth + first, keep(gt(r.opacity[s], zero()), mean), columns);
+            }
+        }
+    }
+}
+
+// Fetch the lines write_tile will touch; by then they are there.
+template <bool kView>
+RF_INLINE void prefetch_output(const BlendJob& job, int tile_x, int tile_y) {
+    const int width = job.camera->width, height = job.camera->height;
     for (int row = 0; row < kTileSide; ++row) {
         const int y = tile_y * kTileSide + row;
-        if (y >= height) break;
-        const int columns =
-            width - tile_x * kTileSide < kTileSide ? width - tile_x * kTileSide : kTileSide;
+        if (y >= height) return;
         const size_t first = static_cast<size_t>(y) * width + tile_x * kTileSide;
-        for (int column = 0; column < columns; ++column) {
-            const int b = (row / kBlockSide) * 4 + column / kBlockSide;
-            const int lane = 4 * (column % kBlockSide) + row % kBlockSide;
-            float* colour = job.colour + 3 * (first + column);
-            colour[0] = pixels.red[b][lane];
-            colour[1] = pixels.green[b][lane];
-            colour[2] = pixels.blue[b][lane];
-            if (kView) {
-                const float opacity = pixels.opacity[b][lane];
-                job.opacity[first + column] = opacity;
-                job.depth[first + column] =
-                    opacity > 0.0f ? pixels.depth[b][lane] / opacity : 0.0f;
-            }
+        for (int part = 0; part < 3; ++part) {
+            __builtin_prefetch(job.colour + 3 * first + 16 * part, 1);
+        }
+        if (kView) {
+            __builtin_prefetch(job.depth + first, 1);
+            __builtin_prefetch(job.opacity + first, 1);
         }
     }
 }
@@ -134,6 +168,7 @@ static void blend(const BlendJob& job, int tile) {
     alignas(64) TileChunk chunk;
     TilePixels pixels;
     uint32_t done = start_tile(*job.camera, tile_x, tile_y, &pixels);
+    prefetch_output<kView>(job, tile_x, tile_y);
     const uint32_t end = job.tile_offsets[tile + 1];
     for (uint32_t e = job.tile_offsets[tile]; e < end && done != kAllDone; e += kChunk) {
         const int count = end - e < kChunk ? static_cast<int>(end - e) : kChunk;

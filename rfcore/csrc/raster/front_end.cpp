@@ -9,10 +9,15 @@ namespace rfcore::raster {
 namespace {
 
 constexpr int kBlocksPerTask = 128;
-constexpr int kItemsPerCall = 64;
+constexpr int kItemsPerCall = 1024;
 constexpr int kMinItemsPerPart = 2048;
 constexpr uint64_t kMaxEntries = 1ull << 30;
 constexpr int kReadableBehind = 64;  // the kernels prefetch past the end of a list
+
+// Tiles and one more per row of tiles, where the counts of the last tile end.
+size_t slots_of(const Camera& camera) {
+    return (static_cast<size_t>(camera.tiles_x()) + 1) * camera.tiles_y();
+}
 
 }  // namespace
 
@@ -25,10 +30,9 @@ void FrontEnd::run(const Kernels& kernels, ThreadPool& pool, ProjectJob job, int
 
     const Camera& camera = *job.camera;
     const int parts = std::clamp(visible_ / kMinItemsPerPart, 1, pool.threads());
-    const size_t tiles = static_cast<size_t>(camera.tiles_x()) * camera.tiles_y();
     spans_.resize(std::max(spans_.size(), static_cast<size_t>(parts)));
     part_entries_.assign(static_cast<size_t>(parts), 0);
-    tile_next_.reserve(tiles * static_cast<size_t>(parts));
+    tile_next_.reserve(slots_of(camera) * static_cast<size_t>(parts));
     pool.run(parts, [&](int part) { find_spans(kernels, camera, part, parts); });
     count_to_offsets(camera, parts);
     if (keep_positions) {
@@ -63,10 +67,10 @@ void FrontEnd::project(const Kernels& kernels, ThreadPool& pool, const ProjectJo
 }
 
 void FrontEnd::find_spans(const Kernels& kernels, const Camera& camera, int part, int parts) {
-    const size_t tiles = static_cast<size_t>(camera.tiles_x()) * camera.tiles_y();
+    const size_t slots = slots_of(camera);
     const SpanJob job{&camera, splats_.data(),
-                      tile_next_.data() + static_cast<size_t>(part) * tiles};
-    std::memset(job.tile_counts, 0, tiles * sizeof(uint32_t));
+                      tile_next_.data() + static_cast<size_t>(part) * slots};
+    std::memset(job.tile_steps, 0, slots * sizeof(uint32_t));
     std::vector<uint32_t>& words = spans_[static_cast<size_t>(part)];
     const size_t most = static_cast<size_t>(kItemsPerCall) * (1 + camera.tiles_y());
     size_t used = 0;
@@ -78,17 +82,26 @@ void FrontEnd::find_spans(const Kernels& kernels, const Camera& camera, int part
     }
 }
 
-// Turn counts per part and tile into the position of the first entry of each.
+// Turn the steps of each part into counts, and those into the position of its first entry.
 void FrontEnd::count_to_offsets(const Camera& camera, int parts) {
     const size_t tiles = static_cast<size_t>(camera.tiles_x()) * camera.tiles_y();
     tile_offsets_.reserve(tiles + 1);
+    const size_t slots = slots_of(camera);
+    const int tiles_x = camera.tiles_x();
+    std::vector<uint32_t> counts(static_cast<size_t>(parts));
     uint64_t next = 0;
-    for (size_t tile = 0; tile < tiles; ++tile) {
-        tile_offsets_[tile] = static_cast<uint32_t>(next);
-        for (int part = 0; part < parts; ++part) {
-            uint32_t& count = tile_next_[static_cast<size_t>(part) * tiles + tile];
-            part_entries_[static_cast<size_t>(part)] += count;
-            next += std::exchange(count, static_cast<uint32_t>(next));
+    for (int row = 0; row < camera.tiles_y(); ++row) {
+        std::fill(counts.begin(), counts.end(), 0);
+        for (int column = 0; column < tiles_x; ++column) {
+            const size_t slot = static_cast<size_t>(row) * (tiles_x + 1) + column;
+            tile_offsets_[static_cast<size_t>(row) * tiles_x + column] =
+                static_cast<uint32_t>(next);
+            for (size_t part = 0; part < counts.size(); ++part) {
+                uint32_t& step = tile_next_[part * slots + slot];
+                counts[part] += std::exchange(step, static_cast<uint32_t>(next));
+                part_entries_[part] += counts[part];
+                next += counts[part];
+            }
         }
         if (next > kMaxEntries) {
             throw std::length_error("more than " + std::to_string(kMaxEntries) +
@@ -103,8 +116,8 @@ void FrontEnd::count_to_offsets(const Camera& camera, int parts) {
 }
 
 void FrontEnd::scatter(const Camera& camera, int part, int parts, bool keep_positions) {
-    const size_t tiles_x = static_cast<size_t>(camera.tiles_x());
-    uint32_t* next = tile_next_.data() + static_cast<size_t>(part) * tiles_x * camera.tiles_y();
+    const size_t stride = static_cast<size_t>(camera.tiles_x()) + 1;
+    uint32_t* next = tile_next_.data() + static_cast<size_t>(part) * slots_of(camera);
     const uint32_t* word = spans_[static_cast<size_t>(part)].data();
     uint32_t position = 0;
     for (int p = 0; p < part; ++p) position += part_entries_[static_cast<size_t>(p)];
@@ -114,7 +127,7 @@ void FrontEnd::scatter(const Camera& camera, int part, int parts, bool keep_posi
         const uint32_t first_position = position;
         for (uint32_t left = *word++; left != 0; --left) {
             const uint32_t span = *word++;
-            uint32_t* row = next + span_row(span) * tiles_x;
+            uint32_t* row = next + span_row(span) * stride;
             for (uint32_t x = span_first(span); x <= span_last(span); ++x) {
                 const uint32_t at = row[x]++;
                 entries_[at] = id;

@@ -41,7 +41,7 @@ class FrontEnd {
     int visible_ = 0;
     std::vector<std::vector<uint32_t>> spans_;  // per part: the stream of find_spans
     std::vector<uint32_t> part_entries_;        // per part
-    AlignedBuffer<uint32_t> tile_next_;         // [parts][tiles]
+    AlignedBuffer<uint32_t> tile_next_;         // [parts][tile rows][tile columns + 1]
     AlignedBuffer<uint32_t> tile_offsets_, entries_, positions_;
     AlignedBuffer<EntryRange> ranges_;
     uint32_t entry_count_ = 0;

@@ -12,7 +12,7 @@ struct Kernels {
     // Project blocks begin..end, append the visible ones to `out`, return how many.
     // [training][degree]
     int (*project[2][kMaxDegree + 1])(const ProjectJob&, int begin, int end, SortItem* out);
-    // Append the spans of `count` items to `out` and count them per tile; return the words used.
+    // Append the spans of `count` items to `out` and note where counts change; return words used.
     // `out` must have room for count * (1 + tile rows) words.
     size_t (*find_spans)(const SpanJob&, const SortItem* items, int count, uint32_t* out);
     void (*blend_colour)(const BlendJob&, int tile);

@@ -20,6 +20,17 @@ RF_INLINE Lanes alpha_from_log2(Lanes p) {
     return times_exp2_floor(e, p);
 }
 
+// 1 / x for normal x > 0 to 2e-7: a guess from the bits of x within 12 %, then two steps of third
+// order. A division of 16 lanes keeps the divider busy for longer than all of this.
+RF_INLINE Lanes reciprocal(Lanes x) {
+    Lanes r = reciprocal_guess(x);
+    for (int step = 0; step < 2; ++step) {
+        const Lanes error = fnma(x, r, splat(1.0f));
+        r = fma(fma(error, error, error), r, r);
+    }
+    return r;
+}
+
 // 2^p to 1e-7, p clamped to +-120: for scales and opacities.
 RF_INLINE Lanes exp2_accurate(Lanes p) {
     p = clamp(p, splat(-120.0f), splat(120.0f));

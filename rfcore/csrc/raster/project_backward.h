@@ -15,9 +15,27 @@ struct SplatGradient {
     Lanes s, sx, sy, sxx, sxy, syy, colour[3];
 };
 
+// Fetch what gather_entries will read soon: the entries of the block after next, whose positions
+// were fetched two blocks ago. Both are scattered over megabytes.
+RF_INLINE void prefetch_entries(const ProjectBackwardJob& job, int block, int end) {
+    if (block + 4 < end) {
+        for (int i = 0; i < kLanes; ++i) {
+            const EntryRange range = job.ranges[(block + 4) * kLanes + i];
+            if (range.begin != kNotVisible) __builtin_prefetch(&job.positions[range.begin]);
+        }
+    }
+    if (block + 2 < end) {
+        for (int i = 0; i < kLanes; ++i) {
+            const EntryRange range = job.ranges[(block + 2) * kLanes + i];
+            for (uint32_t e = range.begin; e < range.end; ++e) {
+                __builtin_prefetch(&job.entry_gradients[job.positions[e]]);
+            }
+        }
+    }
+}
+
 // Add up entries in the order of the tiles; return the visible lanes.
 RF_INLINE uint32_t gather_entries(const ProjectBackwardJob& job, int block, SplatGradient* g) {
-    constexpr uint32_t kAhead = 8;
     alignas(64) float rows[256];
     uint32_t visible = 0;
     for (int i = 0; i < kLanes; ++i) {
@@ -26,7 +44,6 @@ RF_INLINE uint32_t gather_entries(const ProjectBackwardJob& job, int block, Spla
         if (range.begin != kNotVisible) {
             visible |= 1u << i;
             for (uint32_t e = range.begin; e < range.end; ++e) {
-                __builtin_prefetch(&job.entry_gradients[job.positions[e + kAhead]]);
                 sum = sum + load(reinterpret_cast<const float*>(
                                 &job.entry_gradients[job.positions[e]]));
             }
@@ -234,6 +251,7 @@ static void project_backward(const ProjectBackwardJob& job, int begin, int end) 
     const size_t stride = static_cast<size_t>(parameter_planes(job.stored_degree)) * kLanes;
     for (int b = begin; b < end; ++b) {
         SplatGradient g;
+        prefetch_entries(job, b, end);
         const uint32_t visible_bits = gather_entries(job, b, &g);
         if (visible_bits == 0) continue;
         const Mask visible = mask_from_bits(visible_bits);

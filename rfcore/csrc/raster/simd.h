@@ -45,4 +45,35 @@ RF_INLINE double sum_in_order(Lanes a) {
     return sum;
 }
 
+#if !defined(RF_ISA_AVX512)
+// rows[s] lane 4 j + c = blocks[j] lane 4 c + s: four 4x4 blocks side by side, columns first, as
+// four rows of 16. It turns the three indices round, so twice more brings the blocks back.
+RF_INLINE void rows_from_blocks(const Lanes* blocks, Lanes* rows) {
+    alignas(64) float in[4][16], out[4][16];
+    for (int j = 0; j < 4; ++j) store(in[j], blocks[j]);
+    for (int s = 0; s < 4; ++s) {
+        for (int i = 0; i < 16; ++i) out[s][i] = in[i >> 2][4 * (i & 3) + s];
+    }
+    for (int s = 0; s < 4; ++s) rows[s] = load(out[s]);
+}
+// Lane i of channel c = in[3 i + c].
+RF_INLINE void load_interleaved(const float* in, Lanes* channels) {
+    alignas(64) float lanes[3][16];
+    for (int i = 0; i < 16; ++i) {
+        for (int c = 0; c < 3; ++c) lanes[c][i] = in[3 * i + c];
+    }
+    for (int c = 0; c < 3; ++c) channels[c] = load(lanes[c]);
+}
+// out[3 i + c] = lane i of channel c.
+RF_INLINE void store_interleaved(float* out, Lanes red, Lanes green, Lanes blue) {
+    alignas(64) float channels[3][16];
+    store(channels[0], red);
+    store(channels[1], green);
+    store(channels[2], blue);
+    for (int i = 0; i < 16; ++i) {
+        for (int c = 0; c < 3; ++c) out[3 * i + c] = channels[c][i];
+    }
+}
+#endif
+
 }  // namespace

@@ -82,6 +82,13 @@ RF_INLINE Lanes above_floor(Lanes p) {
     return {_mm256_sub_ps(p.a, _mm256_floor_ps(p.a)), _mm256_sub_ps(p.b, _mm256_floor_ps(p.b))};
 }
 RF_INLINE Lanes above_floor_of_positive(Lanes p) { return above_floor(p); }
+RF_INLINE __m256 half_reciprocal_guess(__m256 x) {
+    const __m256i magic = _mm256_set1_epi32(0x7ef311c3);
+    return _mm256_castsi256_ps(_mm256_sub_epi32(magic, _mm256_castps_si256(x)));
+}
+RF_INLINE Lanes reciprocal_guess(Lanes x) {
+    return {half_reciprocal_guess(x.a), half_reciprocal_guess(x.b)};
+}
 RF_INLINE __m256 half_times_exp2_floor(__m256 x, __m256 p) {
     const __m256i exponent = _mm256_slli_epi32(_mm256_cvttps_epi32(_mm256_floor_ps(p)), 23);
     return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(x), exponent));

@@ -49,6 +49,11 @@ RF_INLINE Lanes above_floor(Lanes p) {
 RF_INLINE Lanes above_floor_of_positive(Lanes p) {
     return {_mm512_reduce_ps(p.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)};
 }
+// Within 12 % of 1 / x for normal x > 0.
+RF_INLINE Lanes reciprocal_guess(Lanes x) {
+    const __m512i magic = _mm512_set1_epi32(0x7ef311c3);
+    return {_mm512_castsi512_ps(_mm512_sub_epi32(magic, _mm512_castps_si512(x.v)))};
+}
 // a * 2^floor(p), exact while normal.
 RF_INLINE Lanes times_exp2_floor(Lanes a, Lanes p) { return {_mm512_scalef_ps(a.v, p.v)}; }
 // Split x > 0 (normal) into mantissa in [sqrt(1/2), sqrt(2)) and exponent.
@@ -68,6 +73,51 @@ RF_INLINE int append_offsets(uint16_t* out, uint32_t mask, int base, int step) {
     const __m512i packed = _mm512_maskz_compress_epi32(static_cast<Mask>(mask), offset);
     _mm256_storeu_si256(reinterpret_cast<__m256i*>(out), _mm512_cvtepi32_epi16(packed));
     return __builtin_popcount(mask);
+}
+
+// rows[s] lane 4 j + c = blocks[j] lane 4 c + s (see simd.h).
+RF_INLINE void rows_from_blocks(const Lanes* blocks, Lanes* rows) {
+    const __m512i turned = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+    __m512 b[4];
+    for (int j = 0; j < 4; ++j) b[j] = _mm512_permutexvar_ps(turned, blocks[j].v);
+    const __m512 low01 = _mm512_shuffle_f32x4(b[0], b[1], 0x44);
+    const __m512 high01 = _mm512_shuffle_f32x4(b[0], b[1], 0xee);
+    const __m512 low23 = _mm512_shuffle_f32x4(b[2], b[3], 0x44);
+    const __m512 high23 = _mm512_shuffle_f32x4(b[2], b[3], 0xee);
+    rows[0].v = _mm512_shuffle_f32x4(low01, low23, 0x88);
+    rows[1].v = _mm512_shuffle_f32x4(low01, low23, 0xdd);
+    rows[2].v = _mm512_shuffle_f32x4(high01, high23, 0x88);
+    rows[3].v = _mm512_shuffle_f32x4(high01, high23, 0xdd);
+}
+// Lane i of channel c = in[3 i + c]: lanes 0..10 or so from the first two vectors, the rest from
+// the third.
+RF_INLINE void load_interleaved(const float* in, Lanes* channels) {
+    const __m512i step = _mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 33, 36, 39, 42, 45);
+    const __m512 first = _mm512_loadu_ps(in), second = _mm512_loadu_ps(in + 16);
+    const __m512 third = _mm512_loadu_ps(in + 32);
+    for (int c = 0; c < 3; ++c) {
+        const __m512i from = _mm512_add_epi32(step, _mm512_set1_epi32(c));
+        const __mmask16 in_third = _mm512_cmpge_epi32_mask(from, _mm512_set1_epi32(32));
+        const __m512 two = _mm512_permutex2var_ps(first, from, second);
+        channels[c].v = _mm512_mask_permutexvar_ps(two, in_third, from, third);
+    }
+}
+// out[3 i + c] = lane i of channel c. Lane numbers from 16 on mean the second operand.
+RF_INLINE void store_interleaved(float* out, Lanes red, Lanes green, Lanes blue) {
+    const __m512i red_green[3] = {
+        _mm512_setr_epi32(0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5),
+        _mm512_setr_epi32(21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26),
+        _mm512_setr_epi32(0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0)};
+    const __m512i only_blue[3] = {
+        _mm512_setr_epi32(0, 0, 0, 0, 0, 1, 0, 0, 2, 0, 0, 3, 0, 0, 4, 0),
+        _mm512_setr_epi32(0, 5, 0, 0, 6, 0, 0, 7, 0, 0, 8, 0, 0, 9, 0, 0),
+        _mm512_setr_epi32(10, 0, 0, 11, 0, 0, 12, 0, 0, 13, 0, 0, 14, 0, 0, 15)};
+    const __mmask16 is_blue[3] = {0x4924, 0x2492, 0x9249};
+    for (int k = 0; k < 3; ++k) {
+        const __m512 two = _mm512_permutex2var_ps(red.v, red_green[k], green.v);
+        _mm512_storeu_ps(out + 16 * k,
+                         _mm512_mask_permutexvar_ps(two, is_blue[k], only_blue[k], blue.v));
+    }
 }
 
 // columns[j] lane i = rows[16 * i + j].

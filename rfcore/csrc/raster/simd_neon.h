@@ -96,6 +96,13 @@ RF_INLINE Lanes above_floor(Lanes p) {
     return p;
 }
 RF_INLINE Lanes above_floor_of_positive(Lanes p) { return above_floor(p); }
+RF_INLINE Lanes reciprocal_guess(Lanes x) {
+    const int32x4_t magic = vdupq_n_s32(0x7ef311c3);
+    RF_QUARTERS {
+        x.q[i] = vreinterpretq_f32_s32(vsubq_s32(magic, vreinterpretq_s32_f32(x.q[i])));
+    }
+    return x;
+}
 RF_INLINE Lanes times_exp2_floor(Lanes x, Lanes p) {
     RF_QUARTERS {
         const int32x4_t exponent = vshlq_n_s32(vcvtmq_s32_f32(p.q[i]), 23);

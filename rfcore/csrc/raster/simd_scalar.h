@@ -103,6 +103,15 @@ RF_INLINE Lanes above_floor(Lanes p) {
     return p;
 }
 RF_INLINE Lanes above_floor_of_positive(Lanes p) { return above_floor(p); }
+RF_INLINE Lanes reciprocal_guess(Lanes x) {
+    RF_EACH {
+        uint32_t bits_of_x;
+        memcpy(&bits_of_x, &x.f[i], sizeof bits_of_x);
+        bits_of_x = 0x7ef311c3u - bits_of_x;
+        memcpy(&x.f[i], &bits_of_x, sizeof bits_of_x);
+    }
+    return x;
+}
 RF_INLINE Lanes times_exp2_floor(Lanes x, Lanes p) {
     RF_EACH {
         uint32_t bits_of_x;

@@ -59,8 +59,8 @@ RF_INLINE bool is_small(const SortItem& item) {
 }
 
 static size_t find_spans(const SpanJob& job, const SortItem* items, int count, uint32_t* out) {
-    constexpr int kAhead = 12;  // items; hides the latency of a random read of splats
-    const int tiles_x = job.camera->tiles_x();
+    constexpr int kAhead = 16;  // items; hides the latency of a random read of splats
+    const size_t stride = static_cast<size_t>(job.camera->tiles_x()) + 1;
     size_t used = 0;
     for (int i = 0; i < count; ++i) {
         const SortItem& item = items[i];
@@ -79,8 +79,9 @@ static size_t find_spans(const SpanJob& job, const SortItem* items, int count, u
         *header = static_cast<uint32_t>(found);
         used += found;
         for (size_t k = 0; k < found; ++k) {
-            uint32_t* row = job.tile_counts + static_cast<size_t>(span_row(spans[k])) * tiles_x;
-            for (uint32_t x = span_first(spans[k]); x <= span_last(spans[k]); ++x) ++row[x];
+            uint32_t* row = job.tile_steps + span_row(spans[k]) * stride;
+            ++row[span_first(spans[k])];
+            --row[span_last(spans[k]) + 1];
         }
     }
     return used;

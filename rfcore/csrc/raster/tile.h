@@ -15,7 +15,7 @@ using namespace rfcore::raster;
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinPower = 0.00564656f;  // log2(256 / 255): the least that counts
 constexpr float kMinTransmittance = 1e-4f;
-constexpr int kChunk = 64;  // splats gathered at a time
+constexpr int kChunk = 128;  // splats gathered at a time
 constexpr int kGroups = kChunk / kLanes;
 
 alignas(64) const float kRowCentre[16] = {0.5f, 1.5f, 2.5f,  3.5f,  4.5f,  5.5f,  6.5f,  7.5f,
@@ -40,6 +40,27 @@ struct TileChunk {
                                                    offsets[k]);
     }
 };
+
+// T = 1 inside the picture and 0 outside; return the blocks wholly outside as a bit set.
+RF_INLINE uint32_t start_transmittance(const Camera& camera, int tile_x, int tile_y,
+                                       float (*transmittance)[16]) {
+    uint32_t outside = 0;
+    for (int b = 0; b < kBlocksPerTile; ++b) {
+        const int left = tile_x * kTileSide + (b & 3) * kBlockSide;
+        const int top = tile_y * kTileSide + (b >> 2) * kBlockSide;
+        if (left + kBlockSide <= camera.width && top + kBlockSide <= camera.height) {
+            store(transmittance[b], splat(1.0f));
+            continue;
+        }
+        for (int lane = 0; lane < kLanes; ++lane) {
+            const bool inside =
+                left + (lane >> 2) < camera.width && top + (lane & 3) < camera.height;
+            transmittance[b][lane] = inside ? 1.0f : 0.0f;
+        }
+        if (left >= camera.width || top >= camera.height) outside |= 1u << b;
+    }
+    return outside;
+}
 
 RF_INLINE void make_transparent(TileEntry* e) {
     store(reinterpret_cast<float*>(&e->splat), zero());

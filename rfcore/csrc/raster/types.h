@@ -83,7 +83,7 @@ constexpr uint32_t span_last(uint32_t span) { return span & 1023; }
 struct SpanJob {
     const Camera* camera;
     const Splat* splats;
-    uint32_t* tile_counts;  // [tiles], incremented
+    uint32_t* tile_steps;  // [tile rows][tile columns + 1]: where counts rise and fall, modulo 2^32
 };
 
 struct BlendCounts {
