@@ -8,13 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cav_agent.frames import EncodedFrame, EncodeJob
 from rfcore.camera import Camera, Intrinsics
 from rfcore.codec import CodecConfig, DeltaEncoder, EncoderState, StreamHeader
 from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
-from rfcore.views import PosedPicture, View
+from rfcore.views import PosedPicture
 
 __all__ = ["Pipeline", "Renderer"]
 
@@ -24,8 +27,8 @@ ClockNs = Callable[[], int]
 class Renderer(Protocol):
     """A radiance field, ready to be looked at."""
 
-    def render(self, camera: Camera) -> View:
-        """Return the view from ``camera``."""
+    def render_colour(self, camera: Camera) -> NDArray[np.float32]:
+        """Return the colour seen from ``camera``, float32 [H, W, 3]."""
 
 
 class Pipeline:
@@ -54,7 +57,7 @@ class Pipeline:
         read_ns = self._clock_ns()
         frame = i420_from_rgb(rgb)
         converted_ns = self._clock_ns()
-        render = i420_from_colour(self._renderer.render(job.capture.picture.camera).colour)
+        render = i420_from_colour(self._renderer.render_colour(job.capture.picture.camera))
         rendered_ns = self._clock_ns()
         state = self._state
         if state is None or state.epoch != job.epoch:

@@ -10,13 +10,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mec_server.jobs import DecodeJob, DecodeOutcome, OpenJob
 from rfcore.camera import Camera
 from rfcore.codec import DecoderState, DeltaDecoder
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_colour
-from rfcore.views import View
 from rfcore.wire.messages import CameraDescription, StageTimes
 
 __all__ = ["CameraDecoder", "FieldSource", "Reconstruction", "Renderer", "open_cameras"]
@@ -27,8 +29,8 @@ ClockNs = Callable[[], int]
 class Renderer(Protocol):
     """A radiance field, ready to be looked at."""
 
-    def render(self, camera: Camera) -> View:
-        """Return the view from ``camera``."""
+    def render_colour(self, camera: Camera) -> NDArray[np.float32]:
+        """Return the colour seen from ``camera``, float32 [H, W, 3]."""
 
 
 class FieldSource(Protocol):
@@ -84,7 +86,7 @@ class CameraDecoder:
     def _render(self, job: DecodeJob) -> I420:
         camera = job.frame.camera(self._camera.intrinsics)
         try:
-            return i420_from_colour(self._renderers[job.field_id].render(camera).colour)
+            return i420_from_colour(self._renderers[job.field_id].render_colour(camera))
         except InvalidInput as error:
             raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
 

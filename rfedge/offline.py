@@ -95,4 +95,4 @@ def decode_drive(drive: CodedDrive, field: SplatField) -> Iterator[DecodedFrame]
 
 def rendered(field: SplatField, camera: Camera) -> I420:
     """Return the field's render as both ends of the codec hold it."""
-    return i420_from_colour(field.render(camera).colour)
+    return i420_from_colour(field.render_colour(camera))

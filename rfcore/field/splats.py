@@ -10,6 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.field.archive import (
@@ -115,6 +118,10 @@ class SplatField:
     def rasterizer(self) -> Rasterizer:
         """The renderer of this field, made when it is first needed."""
         return Rasterizer(self.gaussians, threads=self._threads, isa=self._isa)
+
+    def render_colour(self, camera: Camera) -> NDArray[np.float32]:
+        """Render colour alone, float32 [H, W, 3]: the bytes of ``render``, sooner."""
+        return self.rasterizer.render_colour(camera)
 
     def render(self, camera: Camera) -> View:
         """Render colour, depth and opacity as ``camera`` sees them."""

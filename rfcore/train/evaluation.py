@@ -22,5 +22,5 @@ def mean_psnr_db(field: SplatField, pictures: Sequence[PosedPicture]) -> float:
 
 
 def _psnr_db(field: SplatField, picture: PosedPicture) -> float:
-    colour = np.clip(field.render(picture.camera).colour.astype(np.float64), 0.0, 1.0)
+    colour = np.clip(field.render_colour(picture.camera).astype(np.float64), 0.0, 1.0)
     return psnr(colour, picture.read() / 255.0, peak=1.0)

@@ -44,7 +44,7 @@ class Ends:
 
     def render(self) -> I420:
         """Render as both ends do: field, then the project's own YUV conversion."""
-        return i420_from_colour(self.rasterizer.render(self.camera).colour)
+        return i420_from_colour(self.rasterizer.render_colour(self.camera))
 
 
 def codec_rows(threads: int = 1) -> list[dict[str, Any]]:
@@ -58,7 +58,7 @@ def _ends(rasterizer: Rasterizer, width_px: int, height_px: int) -> Ends:
     camera = street_camera(width_px, height_px)
     encoder = DeltaEncoder(CodecConfig(width_px, height_px), clock_ns=perf_counter_ns)
     decoder = DeltaDecoder(encoder.header, clock_ns=perf_counter_ns)
-    frame = _camera_frame(rasterizer.render(camera).colour)
+    frame = _camera_frame(rasterizer.render_colour(camera))
     return Ends(rasterizer, camera, frame, encoder, decoder)
 
 

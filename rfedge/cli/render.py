@@ -40,7 +40,7 @@ class Render:
         field = load_field(self.field, threads=self.threads, isa=self.isa)
         self.out.mkdir(parents=True, exist_ok=True)
         for picture in read_transforms(self.drive).pictures:
-            colour = field.render(picture.camera).colour
+            colour = field.render_colour(picture.camera)
             rgb = np.floor(np.clip(colour, 0, 1) * 255 + 0.5).astype(np.uint8)
             path = self.out / f"{Path(picture.name).stem}.png"
             write_png(path, rgb)

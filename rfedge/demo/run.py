@@ -17,12 +17,13 @@ from rfcore.dataset import Dataset, read_transforms, verify_manifest
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import SplatField, load_field
 from rfcore.image import Rgb, read_rgb
-from rfcore.native.yuv import i420_from_colour, rgb_from_i420
+from rfcore.native.yuv import rgb_from_i420
 from rfcore.train import SplatTrainingConfig
 from rfedge.demo.field import cached_or_trained
 from rfedge.demo.measure import DriveOutcome, FrameAddress, Pictures, measure_drive
 from rfedge.demo.processes import command_of, run_to_end, service
 from rfedge.demo.video import write_video
+from rfedge.offline import rendered
 from rfedge.provenance import host, revision
 
 __all__ = ["DRIVES", "DemoRun", "DemoSettings", "run_demo"]
@@ -202,7 +203,7 @@ def _pictures(
 
 def _rendered(field: SplatField, camera: Camera) -> Rgb:
     """The render as the codec sees it: through YUV 4:2:0 and back."""
-    return rgb_from_i420(i420_from_colour(field.render(camera).colour))
+    return rgb_from_i420(rendered(field, camera))
 
 
 def _wrong_street(sample: Path, field: SplatField) -> Rgb:
