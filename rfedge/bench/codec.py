@@ -21,7 +21,7 @@ from rfcore.errors import CodecError
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
 from rfcore.raster.native import Rasterizer
-from rfcore.raster.street import street_camera, street_gaussians
+from rfedge.bench.street import street_camera, street_gaussians
 
 __all__ = ["codec_rows"]
 

@@ -19,8 +19,8 @@ from rfcore.camera import Camera
 from rfcore.errors import RfedgeError
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
-from rfcore.raster.street import street_camera, street_gaussians
-from rfedge.bench.results import Rows
+from rfedge.bench.rows import Rows
+from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.bench.timing import median_ms
 
 __all__ = ["check_against_reference", "raster_rows"]

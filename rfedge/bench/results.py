@@ -5,17 +5,15 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from rfcore.errors import InvalidInput
+from rfedge.bench.rows import Row, Rows, flattened
 from rfedge.provenance import host, revision
 
-__all__ = ["CASES", "Rows", "flattened", "print_rows", "run_case", "write_json"]
+__all__ = ["CASES", "print_rows", "run_case", "write_json"]
 
 CASES = ("raster", "train", "codec")
-
-Rows = Literal["all", "native"]
-Row = dict[str, Any]
 
 
 def run_case(case: str, *, rows: Rows = "all") -> dict[str, Any]:
@@ -65,17 +63,6 @@ def write_json(result: dict[str, Any], path: str) -> None:
         sys.stdout.write(text)
     else:
         Path(path).write_text(text)
-
-
-def flattened(row: Row) -> Row:
-    """Return a row whose nested values stand beside the others, as ``outer.inner``."""
-    flat: Row = {}
-    for name, value in row.items():
-        if isinstance(value, dict):
-            flat.update({f"{name}.{inner}": ms for inner, ms in value.items()})
-        else:
-            flat[name] = value
-    return flat
 
 
 def _cell(value: object) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from rfcore.errors import RfedgeError
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.native import LearningRates, TrainableRasterizer
-from rfcore.raster.street import street_camera, street_gaussians
+from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.bench.timing import median_ms
 
 __all__ = ["check_gradients", "train_rows"]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rfcore.errors import InvalidInput
-from rfedge.bench.results import flattened
+from rfedge.bench.rows import flattened
 from rfedge.report.summary import METRIC, SUMMARY
 
 __all__ = ["results_page"]

@@ -8,8 +8,8 @@ import pytest
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.native import Rasterizer
-from rfcore.raster.street import street_camera, street_gaussians
 from rfedge.bench import print_rows, raster, results, run_case, timing, train, write_json
+from rfedge.bench.street import street_camera, street_gaussians
 
 RASTER_KEYS = [
     *("width", "height", "gaussians", "visible", "blends_per_px", "threads", "isa"),
