@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from rfcore.dataset import read_transforms
+from rfcore.errors import FieldFormatError
 from rfcore.field import load_field, save_field
 from rfcore.train import SplatTrainingConfig
 from rfedge.training import TrainingJob, train_field
@@ -27,7 +28,10 @@ def cached_or_trained(
     """
     path = cache_path(sample, cache, config)
     if path.exists() and not anew:
-        field = load_field(path)
+        try:
+            field = load_field(path)
+        except FieldFormatError as error:
+            raise FieldFormatError(f"{error}; run again with --train to make it anew") from error
         console.print(f"[bold]Field[/] {field.field_id[:12]} from {path} (--train makes it anew)")
         return path
     job = TrainingJob(
