@@ -24,7 +24,7 @@ Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 def run(
     server: str,
     drive: Path,
-    fields: Path,
+    fields: Path = Path("~/.cache/rfedge/fields"),
     camera: str = "front",
     rate: float = 10.0,
     loop: Flag = False,
@@ -65,7 +65,7 @@ def run(
     return AgentConfig(
         server=server,
         drive=drive,
-        fields=fields,
+        fields=fields.expanduser(),
         camera=camera,
         rate=rate,
         loop=loop,

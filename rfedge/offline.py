@@ -29,7 +29,7 @@ FIELD_ID_PREFIX_BYTES = 8
 
 @dataclass(frozen=True)
 class CodingSettings:
-    """How the P pictures are coded: an x264 preset and a constant rate factor (0..51)."""
+    """How the P pictures are coded: an x264 preset and a constant rate factor (1..51)."""
 
     preset: str = "medium"
     crf: float = 23.0

@@ -33,7 +33,7 @@ class Demo:
     preset: str = "medium"
     """x264 preset of the P pictures."""
     crf: float = 23.0
-    """x264 constant rate factor, 0 (best) to 51."""
+    """x264 constant rate factor, 1 (best) to 51."""
     threads: int = 2
     """Threads of each renderer."""
 
