@@ -260,6 +260,13 @@ RF_INLINE void store_splats(const Projection& p, Lanes log2_alpha, Lanes headroo
     for (int i = 0; i < kLanes; ++i) store(reinterpret_cast<float*>(out + i), columns[i]);
 }
 
+// Fetch the first planes of a block. The hardware's own prefetching starts anew on every page, so
+// for almost every block of coefficients.
+template <int kPlanes>
+RF_INLINE void prefetch_planes(const float* block) {
+    for (int k = 0; k < kPlanes; ++k) __builtin_prefetch(plane(block, k));
+}
+
 template <int kDegree, bool kTraining>
 static int project(const ProjectJob& job, int begin, int end, SortItem* out) {
     const Camera& camera = *job.camera;
@@ -292,12 +299,14 @@ static int project(const ProjectJob& job, int begin, int end, SortItem* out) {
         const uint32_t visible =
             bits(find_visible(camera, p, headroom, half_x, half_y, &box));
         if (visible == 0) continue;
-        Lanes inverse_distance, basis[coefficients_of(kDegree)], colour[3];
-        const Vec3 d = view_direction(camera, mean, &inverse_distance);
-        sh_basis<kDegree>(d.x, d.y, d.z, basis);
         const float* harmonics =
             kTraining ? plane(block, kShPlane)
                       : job.harmonics + static_cast<size_t>(b) * sh_planes * kLanes;
+        prefetch_planes<3 * coefficients_of(kDegree)>(  // of the next block: likely visible too
+            harmonics + (kTraining ? kShPlane + sh_planes : sh_planes) * kLanes);
+        Lanes inverse_distance, basis[coefficients_of(kDegree)], colour[3];
+        const Vec3 d = view_direction(camera, mean, &inverse_distance);
+        sh_basis<kDegree>(d.x, d.y, d.z, basis);
         sh_colour<kDegree>(harmonics, basis, colour);
         store_splats(p, log2_alpha, headroom, half_x, half_y, colour, job.splats + b * kLanes);
         count += append_visible(visible, b * kLanes, p.in_camera.z, box, out + count);
