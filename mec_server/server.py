@@ -20,6 +20,7 @@ from mec_server.metrics import ServerMetrics
 from mec_server.recorder import Recorder
 from rfcore.errors import RfedgeError
 from rfcore.field import FieldStore
+from rfcore.files import write_whole
 from rfcore.wire.address import Address
 from rfcore.wire.conventions import SERVER_OPTIONS
 
@@ -73,7 +74,7 @@ class EdgeServer:
         self._serve_metrics()
         await self._set_health(health_pb2.HealthCheckResponse.SERVING)
         if self._config.ready_file is not None:
-            _write_whole(self._config.ready_file, f"{self.address}\n")
+            write_whole(self._config.ready_file, f"{self.address}\n")
         log.info("serving", address=str(self.address), fields=count)
         return self.address
 
@@ -107,9 +108,3 @@ class EdgeServer:
     async def _set_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
         for service in SERVICES:
             await self._health.set(service, status)
-
-
-def _write_whole(path: Path, text: str) -> None:
-    partial = path.with_suffix(path.suffix + ".part")
-    partial.write_text(text)
-    partial.replace(path)

@@ -19,6 +19,7 @@ from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 
 from rfcore.errors import DatasetError, InvalidInput
+from rfcore.files import write_whole
 
 __all__ = ["I420", "Rgb", "read_rgb", "write_png"]
 
@@ -89,6 +90,4 @@ def write_png(path: Path, rgb: Rgb) -> None:
     encoder.time_base = Fraction(1, 1)
     frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
     packets = [*encoder.encode(frame), *encoder.encode(None)]
-    partial = path.with_suffix(path.suffix + ".part")
-    partial.write_bytes(b"".join(bytes(packet) for packet in packets))
-    partial.replace(path)
+    write_whole(path, b"".join(bytes(packet) for packet in packets))

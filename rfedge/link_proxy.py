@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from rfcore.errors import RfedgeError
+from rfcore.files import write_whole
 from rfcore.link import LinkProfile
 from rfcore.wire.address import Address
 from rfedge.link_direction import Direction
@@ -191,7 +192,7 @@ class LinkProxy:
         for direction in (self._up, self._down):
             self._keep(asyncio.create_task(direction.pump()))
         if self._settings.ready_file is not None:
-            _write_whole(self._settings.ready_file, f"{self.address}\n")
+            write_whole(self._settings.ready_file, f"{self.address}\n")
         return self.address
 
     async def stop(self) -> None:
@@ -217,7 +218,7 @@ class LinkProxy:
     def write_report(self) -> None:
         """Write the report, whole, if one was asked for."""
         if self._settings.report is not None:
-            _write_whole(self._settings.report, json.dumps(self.report(), indent=1) + "\n")
+            write_whole(self._settings.report, json.dumps(self.report(), indent=1) + "\n")
 
     def _accept(self) -> Side:
         side = Side(self._up, self.write_report)
@@ -271,9 +272,3 @@ def _bound_receive_buffer(side: Side) -> None:
     if side.transport is not None:
         sock = side.transport.get_extra_info("socket")
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BUFFER_BYTES)
-
-
-def _write_whole(path: Path, text: str) -> None:
-    partial = path.with_suffix(path.suffix + ".part")
-    partial.write_text(text)
-    partial.replace(path)

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from rfcore.errors import FieldFormatError, InvalidInput
 
-__all__ = ["Archive", "decode_archive", "encode_archive", "read_file", "write_atomically"]
+__all__ = ["Archive", "decode_archive", "encode_archive", "read_file"]
 
 MAGIC = b"RFFIELD\0"
 VERSION = 1
@@ -90,13 +90,6 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise FieldFormatError(f"{path}: cannot be read ({error.strerror})") from error
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file that appears whole or not at all."""
-    partial = path.with_name(path.name + ".part")
-    partial.write_bytes(data)
-    partial.replace(path)
 
 
 class _Damage(Exception):

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import FieldFormatError
+from rfcore.files import whole_file
 
 __all__ = ["read_vertices", "write_vertices"]
 
@@ -59,11 +60,9 @@ def write_vertices(path: Path, table: Table) -> None:
     ]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     lines += [f"property {NAMES[dtype]} {name}" for name, dtype in columns]
-    partial = path.with_name(path.name + ".part")
-    with partial.open("wb") as file:
+    with whole_file(path) as file:
         file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
         table.tofile(file)
-    partial.replace(path)
 
 
 def _header_lines(path: Path, file: BinaryIO) -> list[str]:

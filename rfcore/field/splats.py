@@ -20,8 +20,8 @@ from rfcore.field.archive import (
     decode_archive,
     encode_archive,
     read_file,
-    write_atomically,
 )
+from rfcore.files import write_whole
 from rfcore.native.raster import check_backend
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
@@ -162,7 +162,7 @@ def load_field(path: Path, *, threads: int = 1, isa: str | None = None) -> Splat
 def save_field(splats: SplatField, path: Path) -> str:
     """Write a field's archive, whole or not at all, and return the field's id."""
     data = encode_field(splats)
-    write_atomically(path, data)
+    write_whole(path, data)
     return hashlib.sha256(data).hexdigest()
 
 

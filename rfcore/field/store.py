@@ -11,8 +11,9 @@ import re
 from pathlib import Path
 
 from rfcore.errors import FieldFormatError, UnknownField
-from rfcore.field.archive import read_file, write_atomically
+from rfcore.field.archive import read_file
 from rfcore.field.splats import SplatField, decode_field
+from rfcore.files import write_whole
 
 __all__ = ["FieldStore"]
 
@@ -58,7 +59,7 @@ class FieldStore:
         name = str(source) if isinstance(source, Path) else "field"
         found = _checked_id(data, field_id, name)
         decode_field(data, name)
-        write_atomically(self._directory / f"{found}{SUFFIX}", data)
+        write_whole(self._directory / f"{found}{SUFFIX}", data)
         return found
 
     def _files(self) -> dict[str, Path]:

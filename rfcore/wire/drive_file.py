@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from rfcore.errors import InvalidData, InvalidInput
+from rfcore.files import whole_file
 from rfcore.wire.conventions import MAX_MESSAGE_BYTES
 from rfcore.wire.convert import client_message_from_bytes, client_message_to_bytes
 from rfcore.wire.messages import ClientMessage, Frame, Hello
@@ -34,14 +35,9 @@ class CodedDrive:
 
 def write_drive(path: Path, drive: CodedDrive) -> None:
     """Write ``drive``; the file appears whole or not at all. Raises ``OSError``."""
-    partial = path.with_suffix(path.suffix + ".part")
-    try:
-        with partial.open("wb") as file:
-            file.write(MAGIC)
-            file.writelines(_records((drive.hello, *drive.frames)))
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with whole_file(path) as file:
+        file.write(MAGIC)
+        file.writelines(_records((drive.hello, *drive.frames)))
 
 
 def read_drive(path: Path) -> CodedDrive:

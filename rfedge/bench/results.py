@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rfcore.errors import InvalidInput
+from rfcore.files import write_whole
 from rfedge.bench.rows import Row, Rows, flattened
 from rfedge.provenance import host, revision
 
@@ -62,7 +63,7 @@ def write_json(result: dict[str, Any], path: str) -> None:
     if path == "-":
         sys.stdout.write(text)
     else:
-        Path(path).write_text(text)
+        write_whole(Path(path), text)
 
 
 def _cell(value: object) -> str:

@@ -16,6 +16,7 @@ from rfcore.camera import Camera
 from rfcore.dataset import Dataset, read_transforms, verify_manifest
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import SplatField, load_field
+from rfcore.files import write_whole
 from rfcore.image import Rgb, read_rgb
 from rfcore.native.yuv import rgb_from_i420
 from rfcore.train import SplatTrainingConfig
@@ -88,16 +89,17 @@ def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
     )
     _empty_folder(settings.out)
     field = load_field(field_path, threads=settings.threads)
+    wrong_street = _wrong_street(settings.sample, field)
     sequences: dict[str, Any] = {}
     pictures: dict[str, list[Pictures]] = {}
     for drive in DRIVES:
         console.print(f"[bold]Drive[/] {drive}: server, link and vehicle as processes")
-        outcome = _drive_outcome(settings, drive, field_path, field)
+        outcome = _drive_outcome(settings, drive, field_path, field, wrong_street)
         sequences[drive] = measure_drive(outcome)
         pictures[drive] = list(outcome.pictures)
     result = _result(settings, field, sequences)
     write_video(settings.out / "reconstructed.mp4", pictures, settings.rate_hz)
-    (settings.out / "result.json").write_text(json.dumps(result, indent=2) + "\n")
+    write_whole(settings.out / "result.json", json.dumps(result, indent=2) + "\n")
     return DemoRun(result, pictures)
 
 
@@ -116,7 +118,7 @@ def _empty_folder(folder: Path) -> None:
 
 
 def _drive_outcome(
-    settings: DemoSettings, drive: str, field_path: Path, field: SplatField
+    settings: DemoSettings, drive: str, field_path: Path, field: SplatField, wrong_street: Rgb
 ) -> DriveOutcome:
     work = settings.out / "work" / drive
     work.mkdir(parents=True)
@@ -138,7 +140,7 @@ def _drive_outcome(
             agent_rows,
             {address: saved / row["file"] for address, row in index.items()},
         ),
-        wrong_street=_wrong_street(settings.sample, field),
+        wrong_street=wrong_street,
         preset=settings.preset,
         crf=settings.crf,
     )

@@ -13,6 +13,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rfcore.errors import RfedgeError
+from rfcore.files import write_whole
 from rfcore.image import Rgb
 from rfedge.demo.measure import Pictures
 from rfedge.report.figures import bytes_chart, quality_chart, stages_chart
@@ -52,7 +53,7 @@ def write_report(
             indent=2,
         ),
     )
-    path.write_text(page, encoding="utf-8")
+    write_whole(path, page)
 
 
 def _headline(sequences: Mapping[str, Any]) -> str:
