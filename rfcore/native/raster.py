@@ -24,6 +24,7 @@ __all__ = [
     "NativeTrainable",
     "RasterStatistics",
     "available_isas",
+    "bands_to_use",
     "check_backend",
     "native_camera",
     "overlaps_limited",
@@ -84,6 +85,17 @@ def native_camera(camera: Camera) -> _native.RasterCamera:
     if not all(abs(number) <= FLOAT32_MAX for number in numbers):
         raise InvalidInput("camera", "a value is beyond the range of float32; move the tile origin")
     return _native.RasterCamera(numbers, k.width_px, k.height_px)
+
+
+def bands_to_use(sh_degree: int | None, stored: int) -> int:
+    """Return the SH degree to evaluate: ``sh_degree``, or all ``stored`` bands for None.
+
+    Raises ``InvalidInput`` for one outside 0..``stored``.
+    """
+    degree = stored if sh_degree is None else sh_degree
+    if not 0 <= degree <= stored:
+        raise InvalidInput("sh_degree", f"{degree} is outside 0..{stored}, what the field has")
+    return degree
 
 
 class overlaps_limited:  # noqa: N801 - reads as a condition in a with statement

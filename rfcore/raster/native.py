@@ -15,6 +15,7 @@ from rfcore.native.raster import (
     NativeRasterizer,
     RasterStatistics,
     available_isas,
+    bands_to_use,
     check_backend,
     native_camera,
     overlaps_limited,
@@ -36,34 +37,43 @@ class Rasterizer:
     """A copy of one set of Gaussians, ready to be rendered; may be shared between threads.
 
     ``isa`` forces one of ``available_isas()`` (default: the best); ``threads`` is 1..256. Neither
-    changes a byte of any picture. Raises ``BackendUnavailable`` or ``InvalidInput``. Rendering
-    raises ``InvalidInput`` when the Gaussians overlap more than 2^30 tiles of 16x16 pixels.
+    changes a byte of any picture. ``antialiased`` must be what the Gaussians were trained with.
+    Raises ``BackendUnavailable`` or ``InvalidInput``. Rendering raises ``InvalidInput`` when the
+    Gaussians overlap more than 2^30 tiles of 16x16 pixels, and for an ``sh_degree`` they lack.
     """
 
-    def __init__(self, gaussians: Gaussians, *, threads: int = 1, isa: str | None = None) -> None:
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        *,
+        threads: int = 1,
+        isa: str | None = None,
+        antialiased: bool = False,
+    ) -> None:
         self.isa = check_backend(threads, isa)
         self.threads = threads
+        self.antialiased = antialiased
+        self.sh_degree = gaussians.sh_degree
         g = gaussians
-        self._native = NativeRasterizer(
-            g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh, threads, self.isa
-        )
+        arrays = (g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh)
+        self._native = NativeRasterizer(*arrays, threads, self.isa, antialiased)
         self._lock = Lock()
 
-    def render(self, camera: Camera) -> View:
-        """Render colour, depth and opacity from ``camera``."""
+    def render(self, camera: Camera, *, sh_degree: int | None = None) -> View:
+        """Render colour, depth and opacity with the bands up to ``sh_degree`` (default: all)."""
         shape = (camera.intrinsics.height_px, camera.intrinsics.width_px)
         view = View(*(np.empty(s, np.float32) for s in ((*shape, 3), shape, shape)))
-        seen_from = native_camera(camera)
+        seen_from, degree = native_camera(camera), bands_to_use(sh_degree, self.sh_degree)
         with self._lock, overlaps_limited():
-            self._native.render(seen_from, view.colour, view.depth, view.opacity)
+            self._native.render(seen_from, degree, view.colour, view.depth, view.opacity)
         return view
 
-    def render_colour(self, camera: Camera) -> F32:
+    def render_colour(self, camera: Camera, *, sh_degree: int | None = None) -> F32:
         """Render colour [H, W, 3] alone: the same bytes as ``render``'s, a little sooner."""
         colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
-        seen_from = native_camera(camera)
+        seen_from, degree = native_camera(camera), bands_to_use(sh_degree, self.sh_degree)
         with self._lock, overlaps_limited():
-            self._native.render_colour(seen_from, colour)
+            self._native.render_colour(seen_from, degree, colour)
         return colour
 
     def statistics(self, camera: Camera) -> RasterStatistics:

@@ -35,6 +35,8 @@ MIN_ALPHA = 1.0 / 255.0
 MIN_TRANSMITTANCE = 1e-4
 MIN_QUATERNION_NORM = 1e-12
 """Shorter quaternions are not normalised; the zero quaternion comes out as no rotation."""
+MIN_DET_RATIO = 1e-6
+"""Of the antialiased mode. Under MIN_ALPHA^2, so nothing it clamps is ever drawn."""
 EXTENT_SIGMAS = 3.33
 """No alpha reaches 1/255 beyond sqrt(2 ln 255) = 3.3290 standard deviations."""
 TILE_PX = 16
@@ -72,14 +74,20 @@ def render(
     params: Mapping[str, Tensor],
     camera: Camera,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    antialiased: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Render colour [H, W, 3], depth [H, W] in metres and opacity [H, W].
 
     ``params`` has the fields of ``Gaussians`` as tensors of one floating dtype; finiteness is not
     checked. Colour is not clamped from above; depth is the mean z weighted by each Gaussian's
     share of the pixel, 0 where nothing was hit; opacity is 1 - final transmittance.
+
+    With ``antialiased`` a Gaussian that the dilation widens is made fainter by as much: its
+    opacity is multiplied by sqrt(det C / det (C + 0.3 I)), C its projected covariance
+    (Yu et al., "Mip-Splatting", CVPR 2024, eq. 9; ``antialiased`` in gsplat).
     """
-    splats = _project(params, camera)
+    splats = _project(params, camera, antialiased)
     k = camera.intrinsics
     rows = []
     for top in range(0, k.height_px, TILE_PX):
@@ -136,7 +144,7 @@ def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(basis[: (degree + 1) ** 2], dim=-1)
 
 
-def _project(params: Mapping[str, Tensor], camera: Camera) -> _Splats:
+def _project(params: Mapping[str, Tensor], camera: Camera, antialiased: bool) -> _Splats:
     """Project every Gaussian beyond the near plane and sort them front to back."""
     means = params["means"]
     pose = camera.cam_from_world()
@@ -148,13 +156,14 @@ def _project(params: Mapping[str, Tensor], camera: Camera) -> _Splats:
         order = kept[torch.argsort(depth[kept], stable=True)]
     root = rotation @ _covariance_root(params["quaternions"][order], params["log_scales"][order])
     root_px = _jacobian(in_camera[order], camera) @ root
-    conic, extent_px = _conic_and_extent(root_px)
+    conic, extent_px, det_ratio = _conic_and_extent(root_px)
+    opacity = torch.sigmoid(params["opacity_logits"][order])
     return _Splats(
         centre_px=_pinhole(in_camera[order], camera),
         conic=conic,
         extent_px=extent_px,
         colour=_colour(params["sh"][order], means[order], camera),
-        opacity=torch.sigmoid(params["opacity_logits"][order]),
+        opacity=opacity * det_ratio.clamp(min=MIN_DET_RATIO).sqrt() if antialiased else opacity,
         depth_m=in_camera[order, 2],
     )
 
@@ -206,20 +215,22 @@ def _clamped_slope(slope: Tensor, focal_px: float, centre_px: float, side_px: in
     return slope.clamp(-centre_px / focal_px - margin, (side_px - centre_px) / focal_px + margin)
 
 
-def _conic_and_extent(root_px: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the inverse of C = A A^T + 0.3 I as [V, 3], and the half box [V, 2], A = ``root_px``.
+def _conic_and_extent(root_px: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the inverse of C = A A^T + 0.3 I as [V, 3], the half box [V, 2] and det A A^T / det C.
 
-    det C is summed from the squared 2x2 minors of A (Cauchy-Binet), none negative, because
-    c_xx c_yy - c_xy^2 of a needle loses every digit.
+    A is ``root_px``. Determinants are summed from the squared 2x2 minors of A (Cauchy-Binet), none
+    negative, because c_xx c_yy - c_xy^2 of a needle loses every digit.
     """
     a, b = root_px.unbind(1)
     c_xx = (a * a).sum(-1) + DILATION_PX2
     c_yy = (b * b).sum(-1) + DILATION_PX2
     c_xy = (a * b).sum(-1)
     minors = torch.linalg.cross(a, b)
-    det = (minors * minors).sum(-1) + DILATION_PX2 * (c_xx + c_yy - DILATION_PX2)
+    sharp_det = (minors * minors).sum(-1)
+    det = sharp_det + DILATION_PX2 * (c_xx + c_yy - DILATION_PX2)
     extent_px = EXTENT_SIGMAS * torch.stack([c_xx, c_yy], dim=-1).detach().sqrt()
-    return torch.stack([c_yy / det, -c_xy / det, c_xx / det], dim=-1), extent_px
+    conic = torch.stack([c_yy / det, -c_xy / det, c_xx / det], dim=-1)
+    return conic, extent_px, sharp_det / det
 
 
 def _colour(sh: Tensor, means: Tensor, camera: Camera) -> Tensor:

@@ -15,7 +15,13 @@ import numpy as np
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
-from rfcore.native.raster import NativeTrainable, check_backend, native_camera, overlaps_limited
+from rfcore.native.raster import (
+    NativeTrainable,
+    bands_to_use,
+    check_backend,
+    native_camera,
+    overlaps_limited,
+)
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.views import View
 
@@ -61,19 +67,26 @@ class TrainableRasterizer:
 
     Adam is sparse: a step moves the Gaussians that were visible in the last ``forward``, and only
     their moments decay. Gradients that are not finite or beyond 1e15 count as zero. One thread at
-    a time drives it; a lock guards single calls, not the order of calls. ``isa`` and ``threads``
-    as in ``Rasterizer``.
+    a time drives it; a lock guards single calls, not the order of calls. ``isa``, ``threads`` and
+    ``antialiased`` as in ``Rasterizer``.
     """
 
-    def __init__(self, gaussians: Gaussians, *, threads: int = 1, isa: str | None = None) -> None:
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        *,
+        threads: int = 1,
+        isa: str | None = None,
+        antialiased: bool = False,
+    ) -> None:
         self.isa = check_backend(threads, isa)
         self.threads = threads
+        self.antialiased = antialiased
         self.sh_degree = gaussians.sh_degree
         self._count = len(gaussians)
         g = gaussians
-        self._native = NativeTrainable(
-            g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh, threads, self.isa
-        )
+        arrays = (g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh)
+        self._native = NativeTrainable(*arrays, threads, self.isa, antialiased)
         self._lock = Lock()
         self._colour: F32 | None = None
         self._has_colour_gradient = False
@@ -89,7 +102,7 @@ class TrainableRasterizer:
         """
         shape = (camera.intrinsics.height_px, camera.intrinsics.width_px)
         view = View(*(np.empty(s, np.float32) for s in ((*shape, 3), shape, shape)))
-        seen_from, degree = native_camera(camera), self._active_degree(sh_degree)
+        seen_from, degree = native_camera(camera), bands_to_use(sh_degree, self.sh_degree)
         with self._lock, overlaps_limited():
             self._forget()
             self._native.forward(seen_from, degree, view.colour, view.depth, view.opacity)
@@ -144,7 +157,7 @@ class TrainableRasterizer:
         """Run forward (colour only), loss, backward and one step of Adam; return the loss."""
         colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
         _check_picture("target", target, colour)
-        seen_from, degree = native_camera(camera), self._active_degree(sh_degree)
+        seen_from, degree = native_camera(camera), bands_to_use(sh_degree, self.sh_degree)
         with self._lock, overlaps_limited():
             self._forget()
             self._native.forward_colour(seen_from, degree, colour)
@@ -172,12 +185,6 @@ class TrainableRasterizer:
     def _check_gradients(self, caller: str) -> None:
         if not self._has_gradients:
             raise InvalidInput(caller, "no gradients: call backward() first")
-
-    def _active_degree(self, sh_degree: int | None) -> int:
-        degree = self.sh_degree if sh_degree is None else sh_degree
-        if not 0 <= degree <= self.sh_degree:
-            raise InvalidInput("sh_degree", f"{degree} is outside 0..{self.sh_degree}")
-        return degree
 
     def _empty_arrays(self) -> dict[str, F32]:
         n, coefficients = self._count, (self.sh_degree + 1) ** 2

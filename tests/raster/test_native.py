@@ -1,6 +1,7 @@
 """The native renderer: equal to the float64 definition, and to itself wherever it runs."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -41,10 +42,12 @@ def forward_camera(width_px: int = 33, height_px: int = 17) -> Camera:
 
 
 def test_every_instruction_set_and_thread_count_gives_the_same_bytes(
-    scene: SceneMaker, camera: CameraMaker, isa: str, threads: int
+    scene: SceneMaker, camera: CameraMaker, isa: str, threads: int, antialiased: bool
 ) -> None:
-    definition = Rasterizer(scene(700), isa="scalar").render(camera())
-    view = Rasterizer(scene(700), threads=threads, isa=isa).render(camera())
+    definition = Rasterizer(scene(700), isa="scalar", antialiased=antialiased).render(camera())
+    view = Rasterizer(scene(700), threads=threads, isa=isa, antialiased=antialiased).render(
+        camera()
+    )
     assert view_bytes(view) == view_bytes(definition)
     assert 0.2 < float(view.opacity.mean()) < 0.95
 
@@ -52,11 +55,17 @@ def test_every_instruction_set_and_thread_count_gives_the_same_bytes(
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("size_px", [(67, 45), (16, 16), (1, 1), (3, 50)])
 def test_colour_depth_and_opacity_follow_the_float64_definition(
-    scene: SceneMaker, camera: CameraMaker, degree: int, size_px: tuple[int, int]
+    scene: SceneMaker,
+    camera: CameraMaker,
+    degree: int,
+    size_px: tuple[int, int],
+    antialiased: bool,
 ) -> None:
     gaussians, view_from = scene(200, degree), camera(*size_px)
-    view = Rasterizer(gaussians).render(view_from)
-    colour, depth, opacity = reference.render(reference.parameters(gaussians), view_from)
+    view = Rasterizer(gaussians, antialiased=antialiased).render(view_from)
+    colour, depth, opacity = reference.render(
+        reference.parameters(gaussians), view_from, antialiased=antialiased
+    )
     error = np.abs(view.colour - colour.numpy()).max(axis=2)
     assert_close_but_for_flips(error, view.depth - depth.numpy(), view.opacity - opacity.numpy())
 
@@ -130,6 +139,39 @@ def test_colour_alone_is_the_colour_of_the_view(scene: SceneMaker, camera: Camer
     rasterizer = Rasterizer(scene(300))
     view = rasterizer.render(camera())
     assert rasterizer.render_colour(camera()).tobytes() == view.colour.tobytes()
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_fewer_bands_are_the_picture_of_a_field_that_has_no_more(
+    scene: SceneMaker, camera: CameraMaker, isa: str, degree: int
+) -> None:
+    full = scene(300, 3)
+    cut = replace(full, sh=np.ascontiguousarray(full.sh[:, : (degree + 1) ** 2]))
+    want = Rasterizer(cut, isa=isa).render(camera())
+    rasterizer = Rasterizer(full, isa=isa)
+    got = rasterizer.render(camera(), sh_degree=degree)
+    assert view_bytes(got) == view_bytes(want)
+    alone = rasterizer.render_colour(camera(), sh_degree=degree)
+    assert alone.tobytes() == want.colour.tobytes()
+    assert view_bytes(rasterizer.render(camera())) != view_bytes(want)
+
+
+@pytest.mark.parametrize("degree", [-1, 2, 7])
+def test_bands_a_field_lacks_are_refused(
+    scene: SceneMaker, camera: CameraMaker, degree: int
+) -> None:
+    with pytest.raises(InvalidInput, match=f"sh_degree: {degree} is outside 0..1"):
+        Rasterizer(scene(3, 1)).render(camera(), sh_degree=degree)
+
+
+def test_the_antialiased_mode_makes_gaussians_under_a_pixel_fainter() -> None:
+    small, camera = on_axis(scale_m=0.02), forward_camera()
+    sharp_px2 = (40.0 * 0.02 / 4.0) ** 2
+    plain = Rasterizer(small).render(camera).opacity
+    compensated = Rasterizer(small, antialiased=True).render(camera).opacity
+    assert compensated[8, 16] == pytest.approx(
+        plain[8, 16] * sharp_px2 / (sharp_px2 + 0.3), rel=1e-5
+    )
 
 
 def test_statistics_count_every_weight_of_a_picture() -> None:

@@ -57,10 +57,13 @@ POISONS: dict[str, tuple[str, object]] = {
 @pytest.mark.parametrize("kind", POISONS)
 @pytest.mark.parametrize("every", [1, 5])
 def test_a_degenerate_scene_renders_finite_and_equal_everywhere(
-    scene: SceneMaker, kind: str, every: int
+    scene: SceneMaker, kind: str, every: int, antialiased: bool
 ) -> None:
     gaussians = poisoned(scene(64), *POISONS[kind], every=every)
-    views = [Rasterizer(gaussians, isa=isa, threads=2).render(CAMERA) for isa in available_isas()]
+    views = [
+        Rasterizer(gaussians, isa=isa, threads=2, antialiased=antialiased).render(CAMERA)
+        for isa in available_isas()
+    ]
     for view in views:
         assert np.isfinite(view.colour).all()
         assert np.isfinite(view.depth).all()
@@ -71,13 +74,13 @@ def test_a_degenerate_scene_renders_finite_and_equal_everywhere(
 
 @pytest.mark.parametrize("kind", POISONS)
 def test_training_on_a_degenerate_scene_keeps_every_parameter_finite(
-    scene: SceneMaker, kind: str
+    scene: SceneMaker, kind: str, antialiased: bool
 ) -> None:
     gaussians = poisoned(scene(64), *POISONS[kind], every=3)
     target = np.random.default_rng(0).random((24, 40, 3), dtype=F32)
     results = []
     for isa in available_isas():
-        trainable = TrainableRasterizer(gaussians, isa=isa)
+        trainable = TrainableRasterizer(gaussians, isa=isa, antialiased=antialiased)
         for _ in range(3):
             trainable.iterate(CAMERA, target, LearningRates(means=1e-2))
         after = trainable.gaussians()  # Gaussians refuses what is not finite

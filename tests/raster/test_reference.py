@@ -182,6 +182,29 @@ def test_a_window_of_the_picture_is_the_picture_of_a_window() -> None:
         torch.testing.assert_close(part, whole[3:21, 5:25], rtol=1e-12, atol=1e-12)
 
 
+def test_the_antialiased_mode_keeps_the_light_of_a_gaussian_smaller_than_a_pixel() -> None:
+    """Summed over the plane, opacity * 2 pi sqrt(det C) of the sharp Gaussian is what is drawn."""
+    z, s, o = 4.0, 0.04, 0.6
+    drawn = render(splat((0.0, 0.0, z), s, o), AHEAD, antialiased=True)[2]
+    sharp_det = (30.0 * s / z) ** 2 * (28.0 * s / z) ** 2
+    det = ((30.0 * s / z) ** 2 + 0.3) * ((28.0 * s / z) ** 2 + 0.3)
+    dilated = render(splat((0.0, 0.0, z), s, o), AHEAD)[2]
+    peak = dilated.max().item() * math.sqrt(sharp_det / det)
+    assert drawn.max().item() == pytest.approx(peak, rel=1e-12)
+    kept = drawn > 0
+    np.testing.assert_allclose(drawn[kept], dilated[kept] * math.sqrt(sharp_det / det), rtol=1e-12)
+
+
+def test_the_antialiased_mode_leaves_a_wide_gaussian_alone() -> None:
+    plain, compensated = (render(splat(scale_m=20.0), AHEAD, antialiased=a) for a in (False, True))
+    np.testing.assert_allclose(compensated[0], plain[0], rtol=3e-5)
+
+
+def test_a_gaussian_without_area_is_not_drawn_in_the_antialiased_mode() -> None:
+    thin = {"log_scales": torch.tensor([[0.0, -40.0, -40.0]], dtype=torch.float64)}
+    assert not render(with_changed(splat(), **thin), AHEAD, antialiased=True)[2].any()
+
+
 def test_colour_below_zero_is_cut() -> None:
     assert render(splat(rgb=(-0.5, 0.5, 0.5)), AHEAD)[0][..., 0].max() == 0
 
@@ -205,13 +228,14 @@ def test_the_first_harmonics_point_along_minus_y_z_and_minus_x() -> None:
     np.testing.assert_allclose(axes, want, atol=1e-15)
 
 
-def test_gradients_of_every_parameter_agree_with_finite_differences() -> None:
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradients_of_every_parameter_agree_with_finite_differences(antialiased: bool) -> None:
     camera = Camera(Intrinsics(7, 6, 8.0, 8.0, 3.5, 3.0), Pose((0.1, 0.2, 0.0), (1, 0, 0, 0)))
     field = {name: value.requires_grad_() for name, value in cloud(4, seed=3).items()}
     names = list(field)
 
     def pictures(*values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return render(dict(zip(names, values, strict=True)), camera)
+        return render(dict(zip(names, values, strict=True)), camera, antialiased=antialiased)
 
     assert torch.autograd.gradcheck(pictures, tuple(field.values()), atol=1e-6)
 
@@ -233,13 +257,14 @@ POISON = {
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("poison", POISON.values(), ids=POISON.keys())
+@pytest.mark.parametrize("antialiased", [False, True])
 def test_a_poisonous_gaussian_leaves_picture_and_gradients_finite(
-    poison: dict[str, list[float]], dtype: torch.dtype
+    poison: dict[str, list[float]], dtype: torch.dtype, antialiased: bool
 ) -> None:
     bad = with_changed(splat(), **{k: torch.tensor(v).double() for k, v in poison.items()})
     field = scene(bad, splat((0.2, 0.1, 5.0)))
     field = {name: value.to(dtype).requires_grad_() for name, value in field.items()}
-    colour, depth, opacity = render(field, AHEAD)
+    colour, depth, opacity = render(field, AHEAD, antialiased=antialiased)
     (colour.sum() + depth.sum() + opacity.sum()).backward()
     for value in (colour, depth, opacity, *(p.grad for p in field.values())):
         assert value is not None

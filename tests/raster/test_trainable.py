@@ -41,14 +41,14 @@ def array_bytes(g: Gaussians) -> bytes:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gradients_of_a_random_cotangent_follow_the_float64_definition(
-    scene: SceneMaker, camera: CameraMaker, degree: int
+    scene: SceneMaker, camera: CameraMaker, degree: int, antialiased: bool
 ) -> None:
     gaussians, view_from = scene(120, degree), camera(61, 37)
     cotangent = np.random.default_rng(5).normal(size=(37, 61, 3)).astype(np.float32)
-    native = TrainableRasterizer(gaussians)
+    native = TrainableRasterizer(gaussians, antialiased=antialiased)
     view = native.forward(view_from)
     params = reference.parameters(gaussians, requires_grad=True)
-    colour, _, opacity = reference.render(params, view_from)
+    colour, _, opacity = reference.render(params, view_from, antialiased=antialiased)
     flipped = np.abs(opacity.detach().numpy() - view.opacity) > 1e-5
     assert flipped.mean() <= 0.002
     cotangent[flipped] = 0
@@ -81,7 +81,9 @@ def test_loss_and_its_gradient_follow_the_float64_definition(
             assert relative_error(through_loss[name], direct[name]) < GRADIENT_TOLERANCE, name
 
 
-def test_gradients_agree_with_finite_differences_on_a_smooth_scene(camera: CameraMaker) -> None:
+def test_gradients_agree_with_finite_differences_on_a_smooth_scene(
+    camera: CameraMaker, antialiased: bool
+) -> None:
     """Wide translucent blobs: no alpha is near 1/255 or 0.99, so the picture is smooth."""
     rng = np.random.default_rng(11)
     f32 = np.float32
@@ -94,7 +96,7 @@ def test_gradients_agree_with_finite_differences_on_a_smooth_scene(camera: Camer
     )
     view_from = camera(19, 13)
     cotangent = rng.normal(size=(13, 19, 3)).astype(f32)
-    native = TrainableRasterizer(gaussians)
+    native = TrainableRasterizer(gaussians, antialiased=antialiased)
     native.forward(view_from)
     native.backward(cotangent)
     gradients = native.gradients()
@@ -105,7 +107,8 @@ def test_gradients_agree_with_finite_differences_on_a_smooth_scene(camera: Camer
         values = []
         for sign in (1.0, -1.0):
             moved = {**params, name: params[name] + sign * step * direction}
-            values.append(float((reference.render(moved, view_from)[0].numpy() * cotangent).sum()))
+            picture = reference.render(moved, view_from, antialiased=antialiased)[0]
+            values.append(float((picture.numpy() * cotangent).sum()))
         difference = (values[0] - values[1]) / (2 * step)
         along = float((gradients[name] * direction.numpy()).sum())
         scale = float(np.linalg.norm(gradients[name]) * np.linalg.norm(direction.numpy()))
@@ -113,10 +116,10 @@ def test_gradients_agree_with_finite_differences_on_a_smooth_scene(camera: Camer
 
 
 def test_training_steps_are_byte_equal_everywhere(
-    scene: SceneMaker, camera: CameraMaker, isa: str, threads: int
+    scene: SceneMaker, camera: CameraMaker, isa: str, threads: int, antialiased: bool
 ) -> None:
     def three_steps(isa: str, threads: int) -> tuple[list[float], bytes]:
-        native = TrainableRasterizer(scene(200), threads=threads, isa=isa)
+        native = TrainableRasterizer(scene(200), threads=threads, isa=isa, antialiased=antialiased)
         view_from = camera(50, 140)
         losses = [native.iterate(view_from, random_picture(view_from), RATES) for _ in range(3)]
         return losses, array_bytes(native.gaussians())
@@ -133,10 +136,10 @@ def test_equal_pictures_have_a_loss_of_exactly_zero(scene: SceneMaker, camera: C
 
 
 def test_the_training_forward_is_the_rendering_forward(
-    scene: SceneMaker, camera: CameraMaker
+    scene: SceneMaker, camera: CameraMaker, antialiased: bool
 ) -> None:
-    for_training = TrainableRasterizer(scene(300)).forward(camera())
-    for_rendering = Rasterizer(scene(300)).render(camera())
+    for_training = TrainableRasterizer(scene(300), antialiased=antialiased).forward(camera())
+    for_rendering = Rasterizer(scene(300), antialiased=antialiased).render(camera())
     assert for_training.colour.tobytes() == for_rendering.colour.tobytes()
     assert for_training.depth.tobytes() == for_rendering.depth.tobytes()
 

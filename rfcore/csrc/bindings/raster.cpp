@@ -86,29 +86,29 @@ void bind_rasterizer(nb::module_& m) {
         .def("__init__",
              [](Rasterizer* self, const Floats& means, const Floats& quaternions,
                 const Floats& log_scales, const Floats& opacity_logits, const Floats& sh,
-                int threads, const std::string& isa) {
+                int threads, const std::string& isa, bool antialiased) {
                  const Kernels& kernels = kernels_or_best(isa);
                  const GaussianArrays arrays =
                      arrays_of(means, quaternions, log_scales, opacity_logits, sh);
                  const nb::gil_scoped_release release;
-                 new (self) Rasterizer(arrays, kernels, threads);
+                 new (self) Rasterizer(arrays, kernels, threads, antialiased);
              },
              "means"_a, "quaternions"_a, "log_scales"_a, "opacity_logits"_a, "sh"_a, "threads"_a,
-             "isa"_a)
+             "isa"_a, "antialiased"_a)
         .def_prop_ro("isa", [](const Rasterizer& self) { return self.kernels().isa; })
         .def("render",
-             [](Rasterizer& self, const Camera& camera, const FloatsOut& colour,
+             [](Rasterizer& self, const Camera& camera, int degree, const FloatsOut& colour,
                 const FloatsOut& depth, const FloatsOut& opacity) {
                  const nb::gil_scoped_release release;
-                 self.render(camera, colour.data(), depth.data(), opacity.data());
+                 self.render(camera, degree, colour.data(), depth.data(), opacity.data());
              },
-             "camera"_a, "colour"_a, "depth"_a, "opacity"_a)
+             "camera"_a, "degree"_a, "colour"_a, "depth"_a, "opacity"_a)
         .def("render_colour",
-             [](Rasterizer& self, const Camera& camera, const FloatsOut& colour) {
+             [](Rasterizer& self, const Camera& camera, int degree, const FloatsOut& colour) {
                  const nb::gil_scoped_release release;
-                 self.render(camera, colour.data(), nullptr, nullptr);
+                 self.render(camera, degree, colour.data(), nullptr, nullptr);
              },
-             "camera"_a, "colour"_a)
+             "camera"_a, "degree"_a, "colour"_a)
         .def("statistics",
              [](Rasterizer& self, const Camera& camera) {
                  Statistics s{};
@@ -136,15 +136,15 @@ void bind_trainable(nb::module_& m) {
         .def("__init__",
              [](TrainableRasterizer* self, const Floats& means, const Floats& quaternions,
                 const Floats& log_scales, const Floats& opacity_logits, const Floats& sh,
-                int threads, const std::string& isa) {
+                int threads, const std::string& isa, bool antialiased) {
                  const Kernels& kernels = kernels_or_best(isa);
                  const GaussianArrays arrays =
                      arrays_of(means, quaternions, log_scales, opacity_logits, sh);
                  const nb::gil_scoped_release release;
-                 new (self) TrainableRasterizer(arrays, kernels, threads);
+                 new (self) TrainableRasterizer(arrays, kernels, threads, antialiased);
              },
              "means"_a, "quaternions"_a, "log_scales"_a, "opacity_logits"_a, "sh"_a, "threads"_a,
-             "isa"_a)
+             "isa"_a, "antialiased"_a)
         .def("forward",
              [](TrainableRasterizer& self, const Camera& camera, int degree,
                 const FloatsOut& colour, const FloatsOut& depth, const FloatsOut& opacity) {

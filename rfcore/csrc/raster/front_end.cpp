@@ -22,10 +22,10 @@ size_t slots_of(const Camera& camera) {
 }  // namespace
 
 void FrontEnd::run(const Kernels& kernels, ThreadPool& pool, ProjectJob job, int blocks,
-                   int degree, bool keep_positions) {
+                   bool keep_positions) {
     splats_.reserve(static_cast<size_t>(blocks) * kLanes);
     job.splats = splats_.data();
-    project(kernels, pool, job, blocks, degree);
+    project(kernels, pool, job, blocks);
     sort_.sort(pool, items_, visible_);
 
     const Camera& camera = *job.camera;
@@ -45,11 +45,10 @@ void FrontEnd::run(const Kernels& kernels, ThreadPool& pool, ProjectJob job, int
     pool.run(parts, [&](int part) { scatter(camera, part, parts, keep_positions); });
 }
 
-void FrontEnd::project(const Kernels& kernels, ThreadPool& pool, const ProjectJob& job, int blocks,
-                       int degree) {
+void FrontEnd::project(const Kernels& kernels, ThreadPool& pool, const ProjectJob& job, int blocks) {
     projected_.reserve(static_cast<size_t>(blocks) * kLanes);
     items_.reserve(static_cast<size_t>(blocks) * kLanes);
-    const auto kernel = kernels.project[job.parameters != nullptr][degree];
+    const auto kernel = kernels.project[job.parameters != nullptr][job.antialiased][job.degree];
     const int tasks = (blocks + kBlocksPerTask - 1) / kBlocksPerTask;
     std::vector<int> counts(static_cast<size_t>(tasks));
     pool.run(tasks, [&](int task) {

@@ -16,7 +16,7 @@ class FrontEnd {
     // Project, sort and bin everything `job` holds; job.splats is filled in here. With
     // `keep_positions`, also record where each splat's entries are, for gathering gradients.
     // Throws std::length_error past 2^30 entries.
-    void run(const Kernels& kernels, ThreadPool& pool, ProjectJob job, int blocks, int degree,
+    void run(const Kernels& kernels, ThreadPool& pool, ProjectJob job, int blocks,
              bool keep_positions);
 
     int visible() const { return visible_; }
@@ -30,7 +30,7 @@ class FrontEnd {
     const uint32_t* positions() const { return positions_.data(); }
 
   private:
-    void project(const Kernels&, ThreadPool&, const ProjectJob&, int blocks, int degree);
+    void project(const Kernels&, ThreadPool&, const ProjectJob&, int blocks);
     void find_spans(const Kernels&, const Camera&, int part, int parts);
     void count_to_offsets(const Camera&, int parts);
     void scatter(const Camera&, int part, int parts, bool keep_positions);

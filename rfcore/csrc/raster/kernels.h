@@ -10,8 +10,8 @@ struct Kernels {
     // Fill `geometry` of blocks begin..end from their parameters.
     void (*prepare)(const float* parameters, int planes, float* geometry, int begin, int end);
     // Project blocks begin..end, append the visible ones to `out`, return how many.
-    // [training][degree]
-    int (*project[2][kMaxDegree + 1])(const ProjectJob&, int begin, int end, SortItem* out);
+    // [training][antialiased][degree]
+    int (*project[2][2][kMaxDegree + 1])(const ProjectJob&, int begin, int end, SortItem* out);
     // Append the spans of `count` items to `out` and note where counts change; return words used.
     // `out` must have room for count * (1 + tile rows) words.
     size_t (*find_spans)(const SpanJob&, const SortItem* items, int count, uint32_t* out);
@@ -19,8 +19,8 @@ struct Kernels {
     void (*blend_view)(const BlendJob&, int tile);
     void (*blend_counting)(const BlendJob&, int tile);
     void (*blend_backward)(const BlendBackwardJob&, int tile);
-    // [degree]; blocks begin..end
-    void (*project_backward[kMaxDegree + 1])(const ProjectBackwardJob&, int begin, int end);
+    // [antialiased][degree]; blocks begin..end
+    void (*project_backward[2][kMaxDegree + 1])(const ProjectBackwardJob&, int begin, int end);
     // Rows begin..end of a channel; `scratch` holds kLossRows * loss_stride(width) zeros before
     // the first call and is left ready for the next one of the same width.
     void (*loss_strip)(const LossJob&, int channel, int begin, int end, float* scratch);

@@ -10,18 +10,22 @@
 
 namespace rfcore::raster {
 
+// One kernel per SH degree: a field of few bands does not pay for those it lacks.
+#define RF_PER_DEGREE(kernel, ...) \
+    {kernel<0, __VA_ARGS__>, kernel<1, __VA_ARGS__>, kernel<2, __VA_ARGS__>, kernel<3, __VA_ARGS__>}
+
 extern const Kernels RF_KERNELS;
 const Kernels RF_KERNELS = {
     RF_ISA_NAME,
     prepare,
-    {{project<0, false>, project<1, false>, project<2, false>, project<3, false>},
-     {project<0, true>, project<1, true>, project<2, true>, project<3, true>}},
+    {{RF_PER_DEGREE(project, false, false), RF_PER_DEGREE(project, false, true)},
+     {RF_PER_DEGREE(project, true, false), RF_PER_DEGREE(project, true, true)}},
     find_spans,
     blend<false, false>,
     blend<true, false>,
     blend<true, true>,
     blend_backward,
-    {project_backward<0>, project_backward<1>, project_backward<2>, project_backward<3>},
+    {RF_PER_DEGREE(project_backward, false), RF_PER_DEGREE(project_backward, true)},
     loss_strip,
 };
 

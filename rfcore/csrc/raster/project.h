@@ -17,6 +17,7 @@ constexpr float kFar = 1e9f;            // m; nor those beyond this
 constexpr float kMaxVariance = 1e18f;   // px^2; wider splats would overflow and are not drawn
 constexpr float kMaxColour = 1e18f;     // keeps a picture finite whatever the coefficients
 constexpr float kDilation = 0.3f;       // px^2
+constexpr float kMinDetRatio = 1e-6f;   // under (1/255)^2: what it clamps is not drawn
 constexpr float kFrustumMargin = 0.3f;  // of the half field of view
 constexpr float kMinQuaternionNorm = 1e-12f;
 constexpr float kLog2Of255 = 7.99435344f;
@@ -105,6 +106,8 @@ struct Projection {
     Vec3 world_row0, world_row1;   // J W
     Vec3 m0, m1;                   // J W R S
     Lanes c_xx, c_xy, c_yy, det;   // dilated covariance
+    Vec3 minors;                   // 2x2 minors of M
+    Lanes sharp_det;               // det M M^T, before dilation
     Lanes centre_x, centre_y;
 };
 
@@ -152,13 +155,20 @@ RF_INLINE void project_covariance(const Camera& camera, const Lanes* root, Proje
     p->m0 = row_times(p->world_row0, root);
     p->m1 = row_times(p->world_row1, root);
     const Lanes xx = dot(p->m0, p->m0), yy = dot(p->m1, p->m1);
-    const Vec3 minors = cross(p->m0, p->m1);
+    p->minors = cross(p->m0, p->m1);
+    p->sharp_det = dot(p->minors, p->minors);
     p->c_xx = xx + splat(kDilation);
     p->c_yy = yy + splat(kDilation);
     p->c_xy = dot(p->m0, p->m1);
-    p->det = fma(splat(kDilation), xx + p->c_yy, dot(minors, minors));
+    p->det = fma(splat(kDilation), xx + p->c_yy, p->sharp_det);
     p->centre_x = fma(splat(camera.fx), x, splat(camera.cx));
     p->centre_y = fma(splat(camera.fy), y, splat(camera.cy));
+}
+
+// log2 of what keeps the light of a splat when dilation widens it: sqrt(det M M^T / det), 1e-3 at
+// least (Mip-Splatting, Yu et al. 2024, eq. 9, at a filter of 0.3 px^2).
+RF_INLINE Lanes log2_compensation(const Projection& p) {
+    return splat(0.5f) * log2_accurate(max(p.sharp_det / p.det, splat(kMinDetRatio)));
 }
 
 // Unit vector from the camera to the mean, and one over the distance.
@@ -267,7 +277,7 @@ RF_INLINE void prefetch_planes(const float* block) {
     for (int k = 0; k < kPlanes; ++k) __builtin_prefetch(plane(block, k));
 }
 
-template <int kDegree, bool kTraining>
+template <int kDegree, bool kTraining, bool kAntialiased>
 static int project(const ProjectJob& job, int begin, int end, SortItem* out) {
     const Camera& camera = *job.camera;
     const int sh_planes = 3 * coefficients_of(job.stored_degree);
@@ -292,6 +302,7 @@ static int project(const ProjectJob& job, int begin, int end, SortItem* out) {
             log2_alpha = load(plane(block, kLog2OpacityPlane));
             project_covariance(camera, root, &p);
         }
+        if (kAntialiased) log2_alpha = log2_alpha + log2_compensation(p);
         const Lanes headroom = log2_alpha + splat(kLog2Of255);
         const Lanes reach = splat(kTwoLn2 * kCutoffScale) * max(headroom, zero());
         const Lanes half_x = sqrt(reach * p.c_xx), half_y = sqrt(reach * p.c_yy);

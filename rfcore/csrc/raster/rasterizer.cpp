@@ -40,11 +40,13 @@ void pack_parameters(const GaussianArrays& from, float* blocks) {
     }
 }
 
-Rasterizer::Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads)
+Rasterizer::Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads,
+                       bool antialiased)
     : kernels_(kernels),
       pool_(threads),
       blocks_((gaussians.count + kLanes - 1) / kLanes),
-      degree_(gaussians.degree) {
+      degree_(gaussians.degree),
+      antialiased_(antialiased) {
     const int planes = parameter_planes(degree_);
     const size_t stride = static_cast<size_t>(planes) * kLanes;
     const size_t sh_size = static_cast<size_t>(planes - kShPlane) * kLanes;
@@ -64,20 +66,22 @@ Rasterizer::Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, 
     }
 }
 
-void Rasterizer::run_front_end(const Camera& camera) {
-    const ProjectJob job{&camera, geometry_.data(), harmonics_.data(), nullptr, degree_, nullptr};
-    front_end_.run(kernels_, pool_, job, blocks_, degree_, false);
+void Rasterizer::run_front_end(const Camera& camera, int degree) {
+    const ProjectJob job{&camera, geometry_.data(), harmonics_.data(), nullptr,
+                         degree_, degree,           antialiased_,      nullptr};
+    front_end_.run(kernels_, pool_, job, blocks_, false);
 }
 
-void Rasterizer::render(const Camera& camera, float* colour, float* depth, float* opacity) {
-    run_front_end(camera);
+void Rasterizer::render(const Camera& camera, int degree, float* colour, float* depth,
+                        float* opacity) {
+    run_front_end(camera, degree);
     const BlendJob job{&camera, front_end_.splats(),  front_end_.entries(),
                        front_end_.tile_offsets(), colour, depth, opacity, nullptr};
     blend_tiles(pool_, depth == nullptr ? kernels_.blend_colour : kernels_.blend_view, job);
 }
 
 Statistics Rasterizer::statistics(const Camera& camera) {
-    run_front_end(camera);
+    run_front_end(camera, degree_);
     const size_t pixels = static_cast<size_t>(camera.width) * camera.height;
     AlignedBuffer<float> picture;
     picture.reserve(5 * pixels);

@@ -30,21 +30,25 @@ void pack_parameters(const GaussianArrays& from, float* blocks);
 
 class Rasterizer {
   public:
-    Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads);
+    Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads,
+               bool antialiased);
 
-    // Render colour [H, W, 3]; with depth and opacity [H, W] both or neither.
-    void render(const Camera& camera, float* colour, float* depth, float* opacity);
+    // Render colour [H, W, 3] with the first `degree` bands; with depth and opacity [H, W] both
+    // or neither.
+    void render(const Camera& camera, int degree, float* colour, float* depth, float* opacity);
+    // All bands.
     Statistics statistics(const Camera& camera);
 
     const Kernels& kernels() const { return kernels_; }
     int threads() const { return pool_.threads(); }
 
   private:
-    void run_front_end(const Camera& camera);
+    void run_front_end(const Camera& camera, int degree);
 
     const Kernels& kernels_;
     ThreadPool pool_;
     int blocks_, degree_;
+    bool antialiased_;
     AlignedBuffer<float> geometry_, harmonics_;
     FrontEnd front_end_;
 };

@@ -34,12 +34,13 @@ void unpack_parameters(const float* blocks, const GaussianArrays& to) {
 }  // namespace
 
 TrainableRasterizer::TrainableRasterizer(const GaussianArrays& gaussians, const Kernels& kernels,
-                                         int threads)
+                                         int threads, bool antialiased)
     : kernels_(kernels),
       pool_(threads),
       count_(gaussians.count),
       blocks_((gaussians.count + kLanes - 1) / kLanes),
-      degree_(gaussians.degree) {
+      degree_(gaussians.degree),
+      antialiased_(antialiased) {
     const size_t size =
         static_cast<size_t>(blocks_) * static_cast<size_t>(parameter_planes(degree_)) * kLanes;
     for (AlignedBuffer<float>* buffer : {&parameters_, &first_moments_, &second_moments_}) {
@@ -53,8 +54,9 @@ void TrainableRasterizer::forward(const Camera& camera, int degree, float* colou
                                   float* opacity) {
     camera_ = camera;
     active_degree_ = degree;
-    const ProjectJob job{&camera_, nullptr, nullptr, parameters_.data(), degree_, nullptr};
-    front_end_.run(kernels_, pool_, job, blocks_, degree, true);
+    const ProjectJob job{&camera_, nullptr, nullptr,      parameters_.data(),
+                         degree_,  degree,  antialiased_, nullptr};
+    front_end_.run(kernels_, pool_, job, blocks_, true);
     const BlendJob blend{&camera_, front_end_.splats(),  front_end_.entries(),
                          front_end_.tile_offsets(), colour, depth, opacity, nullptr};
     blend_tiles(pool_, depth == nullptr ? kernels_.blend_colour : kernels_.blend_view, blend);
@@ -127,8 +129,8 @@ void TrainableRasterizer::project_backward(float* gradients, const AdamStep* ada
     const int tasks = (blocks_ + kBlocksPerTask - 1) / kBlocksPerTask;
     pool_.run(tasks, [&](int task) {
         const int begin = task * kBlocksPerTask;
-        kernels_.project_backward[active_degree_](job, begin,
-                                                  std::min(blocks_, begin + kBlocksPerTask));
+        kernels_.project_backward[antialiased_][active_degree_](
+            job, begin, std::min(blocks_, begin + kBlocksPerTask));
     });
 }
 

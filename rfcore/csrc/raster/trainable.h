@@ -14,7 +14,8 @@ struct LearningRates {
 
 class TrainableRasterizer {
   public:
-    TrainableRasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads);
+    TrainableRasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads,
+                        bool antialiased);
 
     // Render with the first `degree` bands; depth and opacity both or neither (null).
     void forward(const Camera& camera, int degree, float* colour, float* depth, float* opacity);
@@ -44,6 +45,7 @@ class TrainableRasterizer {
     const Kernels& kernels_;
     ThreadPool pool_;
     int count_, blocks_, degree_;
+    bool antialiased_;
     AlignedBuffer<float> parameters_, first_moments_, second_moments_;
     FrontEnd front_end_;
     Camera camera_{};

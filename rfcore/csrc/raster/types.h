@@ -69,6 +69,8 @@ struct ProjectJob {
     const float* harmonics;   // rendering: [blocks][3 K][16]
     const float* parameters;  // training: [blocks][11 + 3 K][16]; the two above are unused then
     int stored_degree;        // K = coefficients_of(stored_degree)
+    int degree;               // of the bands to use, at most stored_degree
+    bool antialiased;         // opacities make up for the dilation
     Splat* splats;            // [16 blocks]
 };
 
