@@ -24,7 +24,7 @@ from cav_agent.session import AgentSession
 from rfcore.codec import CodecConfig
 from rfcore.dataset import read_transforms
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.field import FieldStore, SplatField
+from rfcore.field import FieldStore, RadianceField
 from rfcore.views import PosedPicture
 from rfcore.wire.address import Address
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RENDERER_CONTRACT
@@ -80,7 +80,7 @@ class Vehicle:
             server, _ = start_http_server(port, self._config.metrics_host, self.registry)
             log.info("metrics", port=server.server_port)
 
-    async def _field(self, channel: grpc.aio.Channel) -> SplatField:
+    async def _field(self, channel: grpc.aio.Channel) -> RadianceField:
         """Load the field, fetched from the server if it is not here."""
         config = self._config
         store = FieldStore(config.fields)
@@ -95,7 +95,7 @@ class Vehicle:
             await fetch_field(channel, store, field_id, config.fields)
         return await asyncio.to_thread(store.load, field_id, threads=config.threads, isa=config.isa)
 
-    def _prepare(self, field: SplatField) -> Journey:
+    def _prepare(self, field: RadianceField) -> Journey:
         config = self._config
         pictures = read_transforms(config.drive, field.metadata.tile_origin).pictures
         intrinsics = pictures[0].camera.intrinsics
@@ -111,7 +111,8 @@ class Vehicle:
         camera = CameraDescription(config.camera, intrinsics, pipeline.header)
         contract = RendererContract(RENDERER_CONTRACT, exact=True)
         hello = Hello(config.vehicle, (camera,), (field.field_id,), contract)
-        log.info("ready", pictures=len(pictures), field=field.field_id, isa=field.rasterizer.isa)
+        field.prepare()
+        log.info("ready", pictures=len(pictures), field=field.field_id, isa=field.isa)
         return Journey(pictures, pipeline, hello)
 
     async def _drive(

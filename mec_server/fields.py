@@ -15,9 +15,9 @@ import structlog
 
 from mec_server.handlers import Renderer
 from rfcore.errors import InvalidInput
-from rfcore.field import FieldStore, SplatField
+from rfcore.field import FieldStore, RadianceField
 
-__all__ = ["CHUNK_BYTES", "FieldShelf", "Store", "read_chunks", "splat_loader"]
+__all__ = ["CHUNK_BYTES", "FieldShelf", "Store", "field_loader", "read_chunks"]
 
 log = structlog.get_logger()
 
@@ -64,18 +64,24 @@ class FieldShelf:
         return len(ids)
 
 
-def splat_loader(
+def field_loader(
     store: FieldStore, *, threads: int, isa: str | None
-) -> Callable[[str], SplatField]:
+) -> Callable[[str], RadianceField]:
     """Return how a shelf opens fields of ``store``: whole, checked, and with a renderer built.
 
     What it returns raises ``UnknownField``, ``FieldFormatError`` or ``BackendUnavailable``.
     """
 
-    def load(field_id: str) -> SplatField:
+    def load(field_id: str) -> RadianceField:
         field = store.load(field_id, threads=threads, isa=isa)
-        isa_used = field.rasterizer.isa
-        log.info("field opened", field=field_id, gaussians=len(field.gaussians), isa=isa_used)
+        field.prepare()
+        log.info(
+            "field opened",
+            field=field_id,
+            kind=field.metadata.kind,
+            primitives=field.primitives,
+            isa=field.isa,
+        )
         return field
 
     return load

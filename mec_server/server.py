@@ -15,7 +15,7 @@ from prometheus_client import CollectorRegistry, start_http_server
 from mec_server.config import ServerConfig
 from mec_server.edge_service import EdgeService, Surroundings
 from mec_server.field_service import FieldService
-from mec_server.fields import FieldShelf, splat_loader
+from mec_server.fields import FieldShelf, field_loader
 from mec_server.metrics import ServerMetrics
 from mec_server.recorder import Recorder
 from rfcore.errors import RfedgeError
@@ -39,7 +39,7 @@ class EdgeServer:
         self.address.require_private("listen", config.allow_insecure)
         self._config = config
         store = FieldStore(config.fields)
-        self._shelf = FieldShelf(store, splat_loader(store, threads=config.threads, isa=config.isa))
+        self._shelf = FieldShelf(store, field_loader(store, threads=config.threads, isa=config.isa))
         self._metrics = ServerMetrics(self.registry)
         self._executor = ThreadPoolExecutor(config.workers, "worker")
         self._recorder = self._open_recorder(config.save)

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera
+from rfcore.confidence import confidence
 from rfcore.errors import InvalidInput
 
 __all__ = ["PointCloud", "PosedPicture", "View"]
@@ -23,12 +25,18 @@ class View:
 
     ``colour`` float32 [H, W, 3], display-referred RGB, nominally 0..1 (not clamped);
     ``depth`` float32 [H, W], alpha-weighted mean z in metres, 0 where nothing was hit;
-    ``opacity`` float32 [H, W], 1 - final transmittance.
+    ``opacity`` float32 [H, W], 1 - final transmittance; ``confidence`` float32 [H, W], 0..1, how
+    far the renderer itself trusts a pixel (``rfcore.confidence``), computed when first asked for.
     """
 
     colour: NDArray[np.float32]
     depth: NDArray[np.float32]
     opacity: NDArray[np.float32]
+
+    @cached_property
+    def confidence(self) -> NDArray[np.float32]:
+        """Opacity, less where depth breaks."""
+        return confidence(self.depth, self.opacity)
 
 
 @dataclass(frozen=True)

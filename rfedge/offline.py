@@ -12,7 +12,7 @@ from rfcore.camera import Camera
 from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder
 from rfcore.dataset import Dataset
 from rfcore.errors import DatasetError, InvalidData
-from rfcore.field import SplatField
+from rfcore.field import RadianceField
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
 from rfcore.wire.conventions import RENDERER_CONTRACT
@@ -43,7 +43,7 @@ class DecodedFrame:
     frame: I420
 
 
-def encode_drive(dataset: Dataset, field: SplatField, settings: CodingSettings) -> CodedDrive:
+def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSettings) -> CodedDrive:
     """Code every picture of a drive against the field's render at its pose.
 
     Raises ``DatasetError`` if the pictures are not all of one camera.
@@ -73,7 +73,7 @@ def encode_drive(dataset: Dataset, field: SplatField, settings: CodingSettings) 
     return CodedDrive(Hello(OFFLINE_VEHICLE, (camera,), (field.field_id,), RENDERER), tuple(frames))
 
 
-def decode_drive(drive: CodedDrive, field: SplatField) -> Iterator[DecodedFrame]:
+def decode_drive(drive: CodedDrive, field: RadianceField) -> Iterator[DecodedFrame]:
     """Reconstruct every frame, in order.
 
     Raises ``InvalidData`` if the drive was coded against another field, ``PacketRejected`` at the
@@ -93,6 +93,6 @@ def decode_drive(drive: CodedDrive, field: SplatField) -> Iterator[DecodedFrame]
         yield DecodedFrame(frame.packet.sequence, decoded.frame)
 
 
-def rendered(field: SplatField, camera: Camera) -> I420:
+def rendered(field: RadianceField, camera: Camera) -> I420:
     """Return the field's render as both ends of the codec hold it."""
     return i420_from_colour(field.render_colour(camera))

@@ -1,12 +1,19 @@
 """Radiance fields as data: what they are made of, and the files that hold them."""
 
+from rfcore.field.interface import Bounds, FieldMetadata, RadianceField
+from rfcore.field.load import load_field, save_field
 from rfcore.field.ply import read_ply, write_ply
-from rfcore.field.splats import FieldMetadata, SplatField, load_field, save_field
+from rfcore.field.quality import FULL, Quality
+from rfcore.field.splats import SplatField
 from rfcore.field.store import FieldStore
 
 __all__ = [
+    "FULL",
+    "Bounds",
     "FieldMetadata",
     "FieldStore",
+    "Quality",
+    "RadianceField",
     "SplatField",
     "load_field",
     "read_ply",

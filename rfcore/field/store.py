@@ -12,7 +12,8 @@ from pathlib import Path
 
 from rfcore.errors import FieldFormatError, UnknownField
 from rfcore.field.archive import read_file
-from rfcore.field.splats import SplatField, decode_field
+from rfcore.field.interface import RadianceField
+from rfcore.field.load import decode_field
 from rfcore.files import write_whole
 
 __all__ = ["FieldStore"]
@@ -42,7 +43,7 @@ class FieldStore:
             raise UnknownField(f"field {field_id!r} is not in {self._directory}; it holds {here}")
         return files[field_id]
 
-    def load(self, field_id: str, *, threads: int = 1, isa: str | None = None) -> SplatField:
+    def load(self, field_id: str, *, threads: int = 1, isa: str | None = None) -> RadianceField:
         """Load a field; raise ``UnknownField``, or ``FieldFormatError`` if it is damaged."""
         path = self.path(field_id)
         data = read_file(path)

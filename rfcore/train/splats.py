@@ -15,7 +15,7 @@ import numpy as np
 
 from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput
-from rfcore.field.splats import FieldMetadata, SplatField
+from rfcore.field import FieldMetadata, SplatField
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
 from rfcore.raster.native import TrainableRasterizer
 from rfcore.train.initialise import gaussians_from_points

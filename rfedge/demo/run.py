@@ -15,7 +15,7 @@ from rich.console import Console
 from rfcore.camera import Camera
 from rfcore.dataset import Dataset, read_transforms, verify_manifest
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.field import SplatField, load_field
+from rfcore.field import RadianceField, load_field
 from rfcore.files import write_whole
 from rfcore.image import Rgb, read_rgb
 from rfcore.native.yuv import rgb_from_i420
@@ -118,7 +118,7 @@ def _empty_folder(folder: Path) -> None:
 
 
 def _drive_outcome(
-    settings: DemoSettings, drive: str, field_path: Path, field: SplatField, wrong_street: Rgb
+    settings: DemoSettings, drive: str, field_path: Path, field: RadianceField, wrong_street: Rgb
 ) -> DriveOutcome:
     work = settings.out / "work" / drive
     work.mkdir(parents=True)
@@ -185,7 +185,7 @@ def _json_lines(path: Path) -> list[dict[str, Any]]:
 
 def _pictures(
     dataset: Dataset,
-    field: SplatField,
+    field: RadianceField,
     agent_rows: list[dict[str, Any]],
     saved: Mapping[FrameAddress, Path],
 ) -> list[Pictures]:
@@ -203,12 +203,12 @@ def _pictures(
     ]
 
 
-def _rendered(field: SplatField, camera: Camera) -> Rgb:
+def _rendered(field: RadianceField, camera: Camera) -> Rgb:
     """The render as the codec sees it: through YUV 4:2:0 and back."""
     return rgb_from_i420(rendered(field, camera))
 
 
-def _wrong_street(sample: Path, field: SplatField) -> Rgb:
+def _wrong_street(sample: Path, field: RadianceField) -> Rgb:
     """A render of the same field from a training view far from the drive."""
     train = read_transforms(sample / "transforms_train.json")
     drive = read_transforms(sample / f"transforms_drive_{DRIVES[0]}.json")
@@ -224,7 +224,7 @@ def _wrong_street(sample: Path, field: SplatField) -> Rgb:
 
 
 def _result(
-    settings: DemoSettings, field: SplatField, sequences: Mapping[str, Any]
+    settings: DemoSettings, field: RadianceField, sequences: Mapping[str, Any]
 ) -> dict[str, Any]:
     return {
         "format": "rfedge-demo-1",
@@ -234,7 +234,8 @@ def _result(
         "settings": {k: str(v) if isinstance(v, Path) else v for k, v in asdict(settings).items()},
         "field": {
             "id": field.field_id,
-            "gaussians": len(field.gaussians),
+            "kind": field.metadata.kind,
+            "gaussians": field.primitives,
             "held_out_psnr_db": field.metadata.held_out_psnr_db,
         },
         "sequences": sequences,

@@ -9,11 +9,14 @@ from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.errors import BackendUnavailable, FieldFormatError, InvalidInput
 from rfcore.field import FieldMetadata, SplatField, load_field, save_field
 from rfcore.field.archive import Archive, encode_archive
-from rfcore.field.splats import Bounds, encode_field
+from rfcore.field.interface import Bounds
+from rfcore.field.load import encode_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 
-METADATA = FieldMetadata("street", TileOrigin(691_608.0, 5_334_760.0, 520.5), "ab" * 32, 26.25)
+METADATA = FieldMetadata(
+    "street", TileOrigin(691_608.0, 5_334_760.0, 520.5), "ab" * 32, 26.25, 0.875, antialiased=True
+)
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
@@ -50,7 +53,7 @@ def test_the_bounds_hold_every_mean(make_gaussians) -> None:
     assert (gaussians.means >= np.array(bounds.low_m)).all()
     assert (gaussians.means <= np.array(bounds.high_m)).all()
     assert (gaussians.means == np.array(bounds.low_m)).any(axis=0).all()
-    assert Bounds.around(make_gaussians(0)).low_m == (0, 0, 0)
+    assert Bounds.around(make_gaussians(0).means).low_m == (0, 0, 0)
 
 
 def test_a_field_shows_what_its_gaussians_show(make_gaussians, tmp_path: Path) -> None:
@@ -87,7 +90,7 @@ PLAIN = {
 @pytest.mark.parametrize(
     ("kind", "change", "metadata", "named"),
     [
-        ("ngp", {}, PLAIN, "kind 'ngp'"),
+        ("mesh", {}, PLAIN, "kind 'mesh', not splats"),
         ("splats", {"means": np.zeros((4, 3), np.float32)}, PLAIN, "gaussians.quaternions"),
         ("splats", {"sh": np.zeros((5, 5, 3), np.float32)}, PLAIN, "gaussians.sh"),
         ("splats", {"means": np.zeros((5, 3))}, PLAIN, "gaussians.means: must be contiguous float"),
@@ -96,6 +99,16 @@ PLAIN = {
         ("splats", {}, {}, "name"),
         ("splats", {}, {**PLAIN, "name": 3}, "field.name: 3 is not text"),
         ("splats", {}, {**PLAIN, "held_out_psnr_db": "good"}, "held_out_psnr_db"),
+        ("splats", {}, {**PLAIN, "held_out_ssim": 2}, "held_out_ssim: 2.0 is outside -1..1"),
+        ("splats", {}, {**PLAIN, "antialiased": 1}, "antialiased: 1 is neither"),
+        ("splats", {}, {**PLAIN, "bounds": {"low_m": [0, 0], "high_m": [1, 1, 1]}}, "unpack"),
+        ("splats", {}, {**PLAIN, "bounds": {"low_m": [0] * 3, "high_m": [1] * 3}}, "not those of"),
+        (
+            "splats",
+            {},
+            {**PLAIN, "bounds": {"low_m": [1] * 3, "high_m": [0] * 3}},
+            "not the low",
+        ),
         ("splats", {}, {**PLAIN, "tile_origin": {"east": 0}}, "east"),
         ("splats", {}, {**PLAIN, "tile_origin": 0}, "items"),
     ],

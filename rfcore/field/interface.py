@@ -1,0 +1,119 @@
+"""What every radiance field is to those who use one, whatever it is made of.
+
+A field is immutable, may be shared between threads, and is named by its id, the SHA-256 of its
+archive. The same field, camera and quality give the same bytes on every machine.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera, TileOrigin
+from rfcore.errors import InvalidInput
+from rfcore.field.archive import Archive
+from rfcore.field.quality import FULL, Quality
+from rfcore.views import View
+
+__all__ = ["KINDS", "NGP", "SPLATS", "Bounds", "FieldMetadata", "RadianceField"]
+
+SPLATS = "splats"
+"""3D Gaussian Splatting (Kerbl et al. 2023)."""
+NGP = "ngp"
+"""Multiresolution hash grid with a small network (Mueller et al. 2022)."""
+KINDS = (SPLATS, NGP)
+
+Vec3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """An axis-aligned box, lowest and highest corner in metres, relative to the tile's origin."""
+
+    low_m: Vec3
+    high_m: Vec3
+
+    def __post_init__(self) -> None:
+        corners = (self.low_m, self.high_m)
+        if any(len(c) != 3 or not all(map(math.isfinite, c)) for c in corners):
+            raise InvalidInput("bounds", f"{corners} must be two corners of three finite metres")
+        if any(low > high for low, high in zip(*corners, strict=True)):
+            raise InvalidInput("bounds", f"{corners}: the lowest corner is not the lowest")
+
+    @staticmethod
+    def around(points_m: NDArray[np.float32]) -> Bounds:
+        """Return the box of ``points_m`` [N, 3]; of none, the origin."""
+        if not len(points_m):
+            return Bounds((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        low, high = points_m.min(axis=0).tolist(), points_m.max(axis=0).tolist()
+        return Bounds((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+
+@dataclass(frozen=True)
+class FieldMetadata:
+    """What is known about a field besides its parameters.
+
+    ``training_digest`` is the digest of the pictures, points and settings it was trained with,
+    empty when it was imported. ``held_out_psnr_db`` and ``held_out_ssim`` are means over pictures
+    it was not trained on, ``None`` when nobody measured. ``antialiased`` says how splats are to be
+    drawn: with the opacity that makes up for the screen-space blur, because they were trained so.
+    """
+
+    name: str = ""
+    tile_origin: TileOrigin = field(default_factory=TileOrigin)
+    training_digest: str = ""
+    held_out_psnr_db: float | None = None
+    held_out_ssim: float | None = None
+    antialiased: bool = False
+    kind: str = SPLATS
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InvalidInput("field.kind", f"'{self.kind}' is none of {', '.join(KINDS)}")
+        if self.antialiased and self.kind != SPLATS:
+            raise InvalidInput("field.antialiased", f"is a property of {SPLATS}, not {self.kind}")
+        db, ssim = self.held_out_psnr_db, self.held_out_ssim
+        if db is not None and not math.isfinite(db):
+            raise InvalidInput("field.held_out_psnr_db", f"{db} must be finite or not given")
+        if ssim is not None and not -1 <= ssim <= 1:
+            raise InvalidInput("field.held_out_ssim", f"{ssim} is outside -1..1")
+
+
+class RadianceField(Protocol):
+    """A radiance field, ready to be looked at."""
+
+    @property
+    def metadata(self) -> FieldMetadata:
+        """What is known about the field."""
+
+    @property
+    def field_id(self) -> str:
+        """SHA-256 of the field's archive, in hex."""
+
+    @property
+    def bounds(self) -> Bounds:
+        """The box the field was made for; what is drawn may reach beyond it."""
+
+    @property
+    def primitives(self) -> int:
+        """How many Gaussians, or trained numbers of a hash grid, the field has."""
+
+    @property
+    def isa(self) -> str:
+        """The instruction set it renders with; it changes the time a picture takes, no byte."""
+
+    def prepare(self, quality: Quality = FULL) -> None:
+        """Make what rendering at ``quality`` needs, so that the first picture is not late."""
+
+    def render(self, camera: Camera, quality: Quality = FULL) -> View:
+        """Render colour, depth and opacity as ``camera`` sees them."""
+
+    def render_colour(self, camera: Camera, quality: Quality = FULL) -> NDArray[np.float32]:
+        """Render colour alone, float32 [H, W, 3]: the bytes of ``render``'s, sooner."""
+
+    def archive(self) -> Archive:
+        """Return what the field's file holds."""
