@@ -1,6 +1,15 @@
 """Readers of posed pictures on disk."""
 
+from rfcore.dataset.assemble import Dataset, Distortion, ReadOptions
 from rfcore.dataset.manifest import verify_manifest, write_manifest
-from rfcore.dataset.transforms import Dataset, read_transforms
+from rfcore.dataset.read import read_dataset, read_transforms
 
-__all__ = ["Dataset", "read_transforms", "verify_manifest", "write_manifest"]
+__all__ = [
+    "Dataset",
+    "Distortion",
+    "ReadOptions",
+    "read_dataset",
+    "read_transforms",
+    "verify_manifest",
+    "write_manifest",
+]

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from rfcore.camera import TileOrigin
 from rfcore.dataset.points import read_points
 from rfcore.errors import DatasetError
 
@@ -29,4 +28,4 @@ def test_damaged_points_are_refused(tmp_path: Path, header: str, rows: bytes, na
     file = tmp_path / "points.ply"
     file.write_bytes(header.encode() + rows)
     with pytest.raises(DatasetError, match=rf"points\.ply.*{named}"):
-        read_points(file, TileOrigin())
+        read_points(file)

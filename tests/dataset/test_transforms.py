@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from rfcore.camera import TileOrigin
-from rfcore.dataset import read_transforms
-from rfcore.errors import DatasetError
+from rfcore.dataset import read_dataset
+from rfcore.errors import DatasetError, InvalidInput
+from rfcore.field.ply_table import write_vertices
 from rfcore.image import write_png
 
 Content = dict[str, Any]
@@ -19,7 +20,7 @@ Write = Callable[..., Path]
 
 def test_a_known_point_lands_on_the_known_pixel(write: Write, content: Content) -> None:
     """OpenGL looks along -z with y up: (1, 1, -4) is right of and above the middle."""
-    first, second = read_transforms(write(content)).pictures
+    first, second = read_dataset(write(content)).pictures
     assert first.camera.project((1, 1, -4)) == pytest.approx((4 + 10 / 4, 3 - 12 / 4, 4))
     assert second.camera.project((3, 1, -4)) == pytest.approx((4 + 10 / 4, 3 - 12 / 4, 4))
 
@@ -34,7 +35,7 @@ def test_a_rotated_camera_keeps_its_place_and_turns_its_axes(
         [0, 1, 0, 7],
         [0, 0, 0, 1],
     ]
-    camera = read_transforms(write(content)).pictures[0].camera
+    camera = read_dataset(write(content)).pictures[0].camera
     assert camera.world_from_cam.translation_m == (5, 6, 7)
     assert camera.project((15, 6, 7)) == pytest.approx((4, 3, 10)), "straight ahead"
     assert camera.project((15, 5, 7)) == pytest.approx((5, 3, 10)), "world -y is to the right"
@@ -42,7 +43,7 @@ def test_a_rotated_camera_keeps_its_place_and_turns_its_axes(
 
 
 def test_pixels_times_rate_and_points_come_with_it(write: Write, content: Content) -> None:
-    dataset = read_transforms(write(content))
+    dataset = read_dataset(write(content))
     assert [picture.name for picture in dataset.pictures] == ["a.png", "b.png"]
     assert [picture.time_ns for picture in dataset.pictures] == [0, 100_000_000]
     assert dataset.rate_hz == pytest.approx(10.0)
@@ -53,21 +54,21 @@ def test_pixels_times_rate_and_points_come_with_it(write: Write, content: Conten
 
 
 def test_a_directory_stands_for_its_transforms_file(write: Write, content: Content) -> None:
-    assert len(read_transforms(write(content).parent).pictures) == 2
+    assert len(read_dataset(write(content).parent).pictures) == 2
     named = write(content, "transforms_drive.json")
-    assert len(read_transforms(named.parent).pictures) == 2, "transforms.json goes first"
+    assert len(read_dataset(named.parent).pictures) == 2, "transforms.json goes first"
 
 
 def test_a_directory_with_several_drives_asks_which(write: Write, content: Content) -> None:
     write(content, "transforms_one.json")
     directory = write(content, "transforms_two.json").parent
     with pytest.raises(DatasetError, match=r"transforms_one\.json, transforms_two\.json"):
-        read_transforms(directory)
+        read_dataset(directory)
 
 
 def test_a_frame_may_override_the_intrinsics(write: Write, content: Content) -> None:
     content["frames"][1] |= {"fl_x": 20.0, "cx": 1.5}
-    first, second = (p.camera.intrinsics for p in read_transforms(write(content)).pictures)
+    first, second = (p.camera.intrinsics for p in read_dataset(write(content)).pictures)
     assert (first.fx_px, first.cx_px) == (10.0, 4.0)
     assert (second.fx_px, second.cx_px, second.fy_px) == (20.0, 1.5, 12.0)
 
@@ -76,21 +77,21 @@ def test_a_field_of_view_stands_for_the_focal_length(write: Write, content: Cont
     for key in ("fl_x", "fl_y", "cx", "cy"):
         del content[key]
     content["camera_angle_x"] = math.pi / 2
-    k = read_transforms(write(content)).pictures[0].camera.intrinsics
+    k = read_dataset(write(content)).pictures[0].camera.intrinsics
     assert (k.fx_px, k.cx_px, k.cy_px) == (pytest.approx(4.0), 4.0, 3.0)
     assert k.fy_px == k.fx_px
 
 
 def test_pictures_without_times_have_no_rate(write: Write, content: Content) -> None:
     del content["frames"][0]["time"]
-    assert read_transforms(write(content)).rate_hz is None
+    assert read_dataset(write(content)).rate_hz is None
 
 
 def test_the_tile_origin_is_taken_off_poses_and_points(write: Write, content: Content) -> None:
     content["frames"][0]["transform_matrix"][0][3] = 691_608.125
     content["frames"][1]["transform_matrix"][0][3] = 691_609.125
     origin = TileOrigin(east_m=691_608.0)
-    dataset = read_transforms(write(content), origin)
+    dataset = read_dataset(write(content), tile_origin=origin)
     assert dataset.tile_origin == origin
     assert dataset.pictures[0].camera.world_from_cam.translation_m == (0.125, 0, 0)
     assert dataset.points is not None
@@ -131,8 +132,13 @@ FAR = [[1, 0, 0, 7e5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (top_change("w", 0), "intrinsics.width_px: 0 px"),
         (top_change("fl_x", "wide"), "'fl_x' is 'wide', not a number"),
         (top_change("cx", math.nan), "'cx' is nan"),
-        (top_change("camera_model", "OPENCV_FISHEYE"), "OPENCV_FISHEYE.*undistort"),
-        (top_change("k1", 0.01), "distortion k1 = 0.01 is not supported yet"),
+        (top_change("camera_model", "EQUIRECTANGULAR"), "EQUIRECTANGULAR.*PINHOLE"),
+        (top_change("k4", 0.01), "distortion k4 = 0.01 does not belong to camera_model OPENCV"),
+        (top_change("ftheta_p0", 0.01), "'ftheta_p0' names a lens that is not read"),
+        (top_change("k1", 0.01), "lens distortion BrownLens.*k1=0.01.*undistort"),
+        (top_change("is_fisheye", True), "lens distortion FisheyeLens.*undistort"),
+        (top_change("applied_scale", 0), "'applied_scale' is 0"),
+        (top_change("applied_transform", [[1]]), "'applied_transform' is missing or not 4x4"),
         (top_change("ply_file_path", "absent.ply"), "absent.ply"),
         (frame_change("file_path", 3), r"frames\[1\]: key 'file_path'"),
         (frame_change("file_path", "absent.png"), r"frames\[1\] \(absent.png\): picture .*missing"),
@@ -140,7 +146,10 @@ FAR = [[1, 0, 0, 7e5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (frame_change("transform_matrix", None), "'transform_matrix' is missing or not 4x4"),
         (frame_change("transform_matrix", BAD_MATRIX), r"transform_matrix\[0\]\[3\] is nan"),
         (frame_change("transform_matrix", MIRRORED), "left-handed"),
-        (frame_change("transform_matrix", FAR), "700000 m from the tile's origin.*tile_origin"),
+        (frame_change("transform_matrix", FAR), "350000 m from the tile's origin.*tile_origin"),
+        (frame_change("file_path", "../a.png"), r"'\.\./a.png' leaves the dataset"),
+        (frame_change("file_path", "/a.png"), "'/a.png' leaves the dataset"),
+        (top_change("ply_file_path", "../points.ply"), "points.ply' leaves the dataset"),
     ],
 )
 def test_what_is_wrong_is_named(
@@ -148,24 +157,21 @@ def test_what_is_wrong_is_named(
 ) -> None:
     change(content)
     with pytest.raises(DatasetError, match=named) as caught:
-        read_transforms(write(content))
+        read_dataset(write(content))
     assert "transforms.json" in str(caught.value) or "absent.ply" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_a_distortion_of_zero_is_no_distortion(write: Write, content: Content) -> None:
     content |= {"k1": 0.0, "k2": 0, "p1": 0.0}
-    assert len(read_transforms(write(content)).pictures) == 2
+    assert len(read_dataset(write(content)).pictures) == 2
 
 
-def test_a_picture_of_another_size_is_refused_when_it_is_read(
-    write: Write, content: Content
-) -> None:
+def test_a_picture_of_another_size_is_refused(write: Write, content: Content) -> None:
     file = write(content)
     write_png(file.parent / "b.png", np.zeros((7, 8, 3), np.uint8))
-    picture = read_transforms(file).pictures[1]
     with pytest.raises(DatasetError, match=r"b.png: picture is 8x7 px, its camera says 8x6"):
-        picture.read()
+        read_dataset(file)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "3"])
@@ -173,9 +179,85 @@ def test_a_file_that_is_no_transforms_file_is_refused(tmp_path: Path, text: str)
     file = tmp_path / "transforms.json"
     file.write_text(text)
     with pytest.raises(DatasetError, match=r"transforms.json"):
-        read_transforms(file)
+        read_dataset(file)
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="cannot be read"):
-        read_transforms(tmp_path / "transforms_x.json")
+        read_dataset(tmp_path / "transforms_x.json")
+
+
+def test_a_blurred_picture_that_was_sorted_out_is_left_out(write: Write, content: Content) -> None:
+    """instant-ngp's colmap2nerf writes ``sharpness`` so that blurred pictures can be deleted."""
+    content["frames"][0]["file_path"] = "gone.png"
+    file = write(content)
+    with pytest.raises(DatasetError, match=r"gone\.png is missing"):
+        read_dataset(file)
+    content["frames"][0]["sharpness"] = 3.5
+    dataset = read_dataset(write(content))
+    assert [picture.name for picture in dataset.pictures] == ["b.png"]
+    assert dataset.sorted_out == 1
+
+
+def test_what_was_applied_to_the_world_is_undone(write: Write, content: Content) -> None:
+    """nerfstudio turns COLMAP's world (x, y, z) to (x, z, -y); here it is also scaled by 2."""
+    plain = read_dataset(write(content))
+    turn = np.array([[1, 0, 0, 0.5], [0, 0, 1, -1], [0, -1, 0, 2], [0, 0, 0, 1]], float)
+    content |= {"applied_transform": turn[:3].tolist(), "applied_scale": 2.0}
+    for frame in content["frames"]:
+        matrix = turn @ np.array(frame["transform_matrix"])
+        matrix[:3, 3] *= 2.0
+        frame["transform_matrix"] = matrix.tolist()
+    file = write(content)
+    assert plain.points is not None
+    turned = plain.points.xyz_m @ turn[:3, :3].T.astype(np.float32) + turn[:3, 3]
+    write_points(file.parent / "points.ply", 2 * turned, plain.points.rgb)
+    undone = read_dataset(file)
+    for picture, expected in zip(undone.pictures, plain.pictures, strict=True):
+        assert picture.camera.project((1, 1, -4)) == pytest.approx(
+            expected.camera.project((1, 1, -4))
+        )
+    assert undone.points is not None
+    np.testing.assert_allclose(undone.points.xyz_m, plain.points.xyz_m, atol=1e-6)
+
+
+def write_points(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
+    columns = [(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
+    rows = [(*p, *c) for p, c in zip(xyz.tolist(), rgb.tolist(), strict=True)]
+    write_vertices(path, np.array(rows, columns))
+
+
+def test_a_far_world_gets_an_origin_of_whole_metres(write: Write, content: Content) -> None:
+    for frame in content["frames"]:
+        frame["transform_matrix"][0][3] += 691_607.75
+        frame["transform_matrix"][1][3] += 5_334_760.25
+    dataset = read_dataset(write(content))
+    assert dataset.tile_origin == TileOrigin(691_609.0, 5_334_760.0, 0.0)
+    assert dataset.pictures[0].camera.world_from_cam.translation_m == (-1.25, 0.25, 0.0)
+
+
+def test_time_that_goes_back_is_refused(write: Write, content: Content) -> None:
+    content["frames"][0]["time"] = 0.2
+    with pytest.raises(DatasetError, match=r"frames\[1\] \(b.png\): time 0.1 s comes after 0.2 s"):
+        read_dataset(write(content))
+
+
+def test_a_lens_is_taken_out_only_when_that_is_chosen(write: Write, content: Content) -> None:
+    content["frames"][1]["k1"] = 0.05
+    file = write(content)
+    with pytest.raises(DatasetError, match=r"frames\[1\].*undistorted"):
+        read_dataset(file)
+    dataset = read_dataset(file, distortion="undistort")
+    plain, lens = (picture.camera.intrinsics for picture in dataset.pictures)
+    assert dataset.undistorted == 1
+    assert plain.fx_px == 10.0
+    assert lens.fx_px > 10.0, "the corners reach outside the picture at the same focal length"
+    assert (dataset.pictures[1].read() == 20).all()
+
+
+def test_a_smaller_size_scales_pictures_and_cameras_alike(write: Write, content: Content) -> None:
+    picture = read_dataset(write(content), size_px=(4, 2)).pictures[0]
+    assert picture.read().shape == (2, 4, 3)
+    assert picture.camera.project((1, 1, -4)) == pytest.approx((3.25, 0, 4))
+    with pytest.raises(InvalidInput, match=r"8x6, the size of .*a\.png"):
+        read_dataset(write(content), size_px=(16, 12))

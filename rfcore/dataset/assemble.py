@@ -1,0 +1,168 @@
+"""From what a reader found to what trainers and vehicles take: pinhole pictures around an origin.
+
+The tile's origin is subtracted in float64. A lens is never dropped silently: either the caller
+chose ``Distortion.UNDISTORT``, and every read resamples the picture once, or it is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
+from rfcore.dataset.resize import area_averaged, check_reduction
+from rfcore.dataset.source import Source, SourcePicture, SourcePoints
+from rfcore.dataset.undistort import pinhole_of, undistorted
+from rfcore.errors import DatasetError, InvalidInput
+from rfcore.image import Rgb
+from rfcore.views import PointCloud, PosedPicture
+
+__all__ = ["Dataset", "Distortion", "ReadOptions", "assemble"]
+
+NEAR_M = 10_000.0
+"""float32 positions resolve 1 mm at this distance: nearer to zero, zero is the origin."""
+MAX_TILE_RADIUS_M = 100_000.0
+"""float32 positions resolve 8 mm at this distance from the tile's origin."""
+
+
+class Distortion(StrEnum):
+    """What becomes of pictures taken through a lens that distorts."""
+
+    REFUSE = "refuse"
+    UNDISTORT = "undistort"
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How a dataset is read.
+
+    ``tile_origin`` None: zero where the cameras are within 10 km of it, else the median camera
+    position rounded to whole metres. ``size_px`` (width, height): pictures reduced to that size.
+    """
+
+    tile_origin: TileOrigin | None = None
+    distortion: Distortion = Distortion.REFUSE
+    size_px: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Posed pictures on disk, in the order of the file.
+
+    ``rate_hz`` is the mean rate of the pictures' times, ``None`` unless every picture has one and
+    they increase. ``points`` is ``None`` when the dataset has none. ``undistorted`` counts the
+    pictures that are resampled to take a lens out, ``sorted_out`` those that are listed but were
+    deleted as blurred (``rfcore.dataset.transforms``).
+    """
+
+    pictures: tuple[PosedPicture, ...]
+    rate_hz: float | None
+    points: PointCloud | None
+    tile_origin: TileOrigin
+    undistorted: int = 0
+    sorted_out: int = 0
+
+
+def assemble(source: Source, options: ReadOptions) -> Dataset:
+    """Return the dataset; pixels are read on demand.
+
+    Raises ``DatasetError`` naming the file and the key for a lens that was not to be undistorted,
+    times out of order, and cameras too far from the origin; ``InvalidInput`` for ``size_px``.
+    """
+    if not source.pictures:
+        raise DatasetError(f"{source.file}: names no pictures")
+    _check_times(source.pictures)
+    origin = options.tile_origin or _chosen_origin(source.pictures)
+    times_ns = [picture.time_ns for picture in source.pictures if picture.time_ns is not None]
+    timed = len(times_ns) == len(source.pictures)
+    return Dataset(
+        pictures=tuple(_posed(picture, origin, options) for picture in source.pictures),
+        rate_hz=_rate_hz(times_ns) if timed else None,
+        points=_localised(source.points, origin) if source.points is not None else None,
+        tile_origin=origin,
+        undistorted=sum(picture.camera.lens is not None for picture in source.pictures),
+        sorted_out=source.sorted_out,
+    )
+
+
+def _posed(picture: SourcePicture, origin: TileOrigin, options: ReadOptions) -> PosedPicture:
+    intrinsics = _pinhole(picture, options.distortion)
+    read = partial(_read, picture)
+    if options.size_px is not None:
+        size_px = (intrinsics.width_px, intrinsics.height_px)
+        check_reduction(picture.where, size_px, options.size_px)
+        intrinsics = intrinsics.resized(*options.size_px)
+        read = partial(_read, picture, options.size_px)
+    camera = Camera(intrinsics, _near(picture, origin))
+    return PosedPicture(picture.name, camera, read, picture.time_ns or 0)
+
+
+def _read(picture: SourcePicture, size_px: tuple[int, int] | None = None) -> Rgb:
+    rgb = picture.read()
+    lens = picture.camera.lens
+    if lens is not None:
+        rgb = undistorted(rgb, picture.camera.intrinsics, lens)
+    return rgb if size_px is None else area_averaged(rgb, *size_px)
+
+
+def _pinhole(picture: SourcePicture, distortion: Distortion) -> Intrinsics:
+    lens = picture.camera.lens
+    if lens is None:
+        return picture.camera.intrinsics
+    if distortion is Distortion.REFUSE:
+        raise DatasetError(
+            f"{picture.where}: lens distortion {lens}; choose that pictures are undistorted, "
+            "or undistort them once with `rfedge scene convert`"
+        )
+    try:
+        return pinhole_of(picture.camera.intrinsics, lens)
+    except InvalidInput as error:
+        raise DatasetError(f"{picture.where}: {error}") from error
+
+
+def _near(picture: SourcePicture, origin: TileOrigin) -> Pose:
+    local = origin.localise(picture.world_from_cam)
+    distance_m = math.hypot(*local.translation_m)
+    if distance_m > MAX_TILE_RADIUS_M:
+        raise DatasetError(
+            f"{picture.where}: camera is {distance_m:.6g} m from the tile's origin, over "
+            f"{MAX_TILE_RADIUS_M:g} m; pass a tile_origin near the pictures"
+        )
+    return local
+
+
+def _chosen_origin(pictures: Sequence[SourcePicture]) -> TileOrigin:
+    axes = zip(*(picture.world_from_cam.translation_m for picture in pictures), strict=True)
+    middle = [statistics.median(axis) for axis in axes]
+    if math.hypot(*middle) <= NEAR_M:
+        return TileOrigin()
+    return TileOrigin(*(float(round(value)) for value in middle))
+
+
+def _localised(points: SourcePoints, origin: TileOrigin) -> PointCloud:
+    local_m = points.xyz_m - (origin.east_m, origin.north_m, origin.up_m)
+    return PointCloud(local_m.astype(np.float32), points.rgb)
+
+
+def _check_times(pictures: Sequence[SourcePicture]) -> None:
+    """Raise ``DatasetError`` where time goes back; equal times are several cameras' pictures."""
+    timed = [picture for picture in pictures if picture.time_ns is not None]
+    for before, after in pairwise(timed):
+        if (after.time_ns or 0) < (before.time_ns or 0):
+            raise DatasetError(
+                f"{after.where}: time {(after.time_ns or 0) / 1e9:.9g} s comes after "
+                f"{(before.time_ns or 0) / 1e9:.9g} s; put the pictures in order of time"
+            )
+
+
+def _rate_hz(times_ns: Sequence[int]) -> float | None:
+    if len(times_ns) < 2 or any(b <= a for a, b in pairwise(times_ns)):
+        return None
+    return (len(times_ns) - 1) * 1e9 / (times_ns[-1] - times_ns[0])

@@ -1,0 +1,97 @@
+"""Values of a JSON or TOML table, checked one by one.
+
+``where`` is the file and the place in it; every error starts with it and names the key.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rfcore.camera import Pose
+from rfcore.errors import DatasetError, InvalidInput
+
+__all__ = [
+    "Table",
+    "load_json",
+    "matrix_rows",
+    "number",
+    "pose_of_rows",
+    "read_file",
+    "side_px",
+    "text",
+]
+
+Table = Mapping[str, Any]
+
+
+def read_file(file: Path) -> bytes:
+    """Return a file's bytes; raise ``DatasetError`` naming it."""
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{file}: cannot be read ({error.strerror})") from error
+
+
+def load_json(file: Path) -> Any:
+    """Return the content of a JSON file; raise ``DatasetError`` naming it."""
+    try:
+        return json.loads(read_file(file))
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{file}: not JSON ({error})") from error
+
+
+def number(where: str, keys: Table, key: str, minimum: float = -math.inf) -> float:
+    """Return a finite number of at least ``minimum``."""
+    if key not in keys:
+        raise DatasetError(f"{where}: key '{key}' is missing")
+    value = keys[key]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise DatasetError(f"{where}: key '{key}' is {value!r}, not a number")
+    if not math.isfinite(value):
+        raise DatasetError(f"{where}: key '{key}' is {value}, must be finite")
+    if value < minimum:
+        raise DatasetError(f"{where}: key '{key}' is {value}, must be at least {minimum:g}")
+    return float(value)
+
+
+def side_px(where: str, keys: Table, key: str) -> int:
+    """Return a whole number of pixels."""
+    value = number(where, keys, key)
+    if value != int(value):
+        raise DatasetError(f"{where}: key '{key}' is {value}, not a whole number of pixels")
+    return int(value)
+
+
+def text(where: str, keys: Table, key: str) -> str:
+    """Return a string that is not empty."""
+    value = keys.get(key)
+    if not isinstance(value, str) or not value:
+        raise DatasetError(f"{where}: key '{key}' is missing or not a string")
+    return value
+
+
+def matrix_rows(where: str, keys: Table, key: str, columns: int = 4) -> list[Sequence[float]]:
+    """Return the rows of a matrix of 3 or 4 rows and ``columns`` finite numbers each."""
+    matrix = keys.get(key)
+    if not isinstance(matrix, list) or len(matrix) not in (3, columns):
+        raise DatasetError(f"{where}: key '{key}' is missing or not {columns}x{columns}")
+    if any(not isinstance(row, list) or len(row) != columns for row in matrix):
+        raise DatasetError(f"{where}: key '{key}' is missing or not {columns}x{columns}")
+    for i, row in enumerate(matrix):
+        for j, value in enumerate(row):
+            whole = isinstance(value, int | float) and not isinstance(value, bool)
+            if not whole or not math.isfinite(value):
+                raise DatasetError(f"{where}: {key}[{i}][{j}] is {value!r}, not a finite number")
+    return matrix
+
+
+def pose_of_rows(where: str, key: str, rows: Sequence[Sequence[float]]) -> Pose:
+    """Return the pose of a rigid 3x4 or 4x4 matrix."""
+    try:
+        return Pose.from_matrix(rows)
+    except InvalidInput as error:
+        raise DatasetError(f"{where}: {key}: {error}") from error

@@ -1,0 +1,73 @@
+"""What a reader finds on disk, before anything is changed.
+
+Poses are world_from_cam with OpenCV camera axes, float64, in the dataset's own world; pictures have
+the lens they were taken with. ``rfcore.dataset.assemble`` makes a ``Dataset`` of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Intrinsics, Pose
+from rfcore.errors import InvalidInput
+from rfcore.image import Rgb
+from rfcore.lens import Lens
+
+__all__ = ["Source", "SourceCamera", "SourcePicture", "SourcePoints"]
+
+
+@dataclass(frozen=True)
+class SourceCamera:
+    """Intrinsics and, where the pictures are distorted, the lens."""
+
+    intrinsics: Intrinsics
+    lens: Lens | None = None
+
+
+@dataclass(frozen=True)
+class SourcePicture:
+    """A picture as it was taken. ``where`` is the place in the file that names it, for errors."""
+
+    where: str
+    name: str
+    camera: SourceCamera
+    world_from_cam: Pose
+    read: Callable[[], Rgb]
+    time_ns: int | None = None
+
+
+@dataclass(frozen=True)
+class SourcePoints:
+    """Surface points in the dataset's world: ``xyz_m`` float64 [N, 3], ``rgb`` uint8 [N, 3]."""
+
+    xyz_m: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        n = len(self.xyz_m)
+        if self.xyz_m.shape != (n, 3) or self.rgb.shape != (n, 3):
+            raise InvalidInput(
+                "points", f"shapes {self.xyz_m.shape} and {self.rgb.shape} must both be [N, 3]"
+            )
+        if not np.isfinite(self.xyz_m).all():
+            bad = int((~np.isfinite(self.xyz_m)).any(axis=1).sum())
+            raise InvalidInput("points.xyz_m", f"{bad} of {n} points are not finite")
+
+
+@dataclass(frozen=True)
+class Source:
+    """Everything one reader found.
+
+    ``file`` says what there is; ``sorted_out`` counts pictures it lists that were deleted on
+    purpose, by the rules of its format.
+    """
+
+    file: Path
+    pictures: tuple[SourcePicture, ...]
+    points: SourcePoints | None = None
+    sorted_out: int = 0
