@@ -77,10 +77,10 @@ def check_backend(threads: int, isa: str | None) -> str:
 
 
 def native_camera(camera: Camera) -> _native.RasterCamera:
-    """Return the camera as the kernels take it: float32, rounded once from float64."""
-    k, pose = camera.intrinsics, camera.cam_from_world()
-    rotation = [value for row in pose.rotation_matrix() for value in row]
-    numbers = [*rotation, *pose.translation_m, *camera.world_from_cam.translation_m]
+    """Return the camera as the kernels take it: float32, rounded once; the position as two."""
+    k = camera.intrinsics
+    rotation = [value for row in camera.cam_from_world().rotation_matrix() for value in row]
+    numbers = [*rotation, *camera.world_from_cam.translation_m]
     numbers += [k.fx_px, k.fy_px, k.cx_px, k.cy_px]
     if not all(abs(number) <= FLOAT32_MAX for number in numbers):
         raise InvalidInput("camera", "a value is beyond the range of float32; move the tile origin")

@@ -21,7 +21,7 @@ MAX_MESSAGE_BYTES: Final = 1 << 20
 
 STREAM_METHOD: Final = "/rfcore.wire.v1.EdgeService/Stream"
 
-RENDERER_CONTRACT: Final = "splats-f32-1"
+RENDERER_CONTRACT: Final = "splats-f32-2"
 """Name of the bit-exact contract of ``rfcore.raster.native``; changes when its pixels change."""
 
 FRAME_BUDGET_BUCKETS_S: Final = (

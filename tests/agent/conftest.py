@@ -11,6 +11,7 @@ from cav_agent.session import AgentSession
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
 from rfcore.views import PosedPicture
+from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.messages import CameraDescription, Credit, Hello, RendererContract, Welcome
 
 INTRINSICS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)
@@ -20,7 +21,7 @@ INTRINSICS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)
 def hello() -> Hello:
     header = StreamHeader(CodecConfig(32, 16, "medium", 23.0), b"\x67" * 20, b"\x68" * 5)
     camera = CameraDescription("front", INTRINSICS, header)
-    return Hello("cav-1", (camera,), ("ab" * 32,), RendererContract("splats-f32-1", exact=True))
+    return Hello("cav-1", (camera,), ("ab" * 32,), RendererContract(RENDERER_CONTRACT, exact=True))
 
 
 @pytest.fixture

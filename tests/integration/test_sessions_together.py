@@ -19,6 +19,7 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.views import PosedPicture
+from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import client_message_from_bytes, client_message_to_bytes
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract, StageTimes
 
@@ -29,7 +30,7 @@ HELLO = Hello(
     "cav-1",
     (CameraDescription("front", INTRINSICS, HEADER),),
     (FIELD,),
-    RendererContract("splats-f32-1", exact=True),
+    RendererContract(RENDERER_CONTRACT, exact=True),
 )
 
 faults = st.sampled_from(["deliver", "lose", "repeat", "delay", "flip", "cut", "answer lost"])

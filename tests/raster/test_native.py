@@ -210,6 +210,24 @@ def _joined(*parts: Gaussians, degree: int = 0) -> Gaussians:
     return Gaussians(*(np.concatenate(column) for column in zip(*padded, strict=True)))
 
 
+def test_a_thousand_kilometres_from_its_origin_a_scene_is_drawn_as_at_home(
+    scene: SceneMaker, camera: CameraMaker
+) -> None:
+    """Means on the grid of 1/16 m that float32 has there, a camera turned and between grid points:
+    only the subtraction of its position is left to go wrong."""
+    gaussians, home = scene(300), camera()
+    gaussians.means[:] = np.round(gaussians.means * 16) / 16
+    away_m = (1e6, -1e6, 5e5)
+    moved = _arrays(gaussians)
+    moved = (moved[0] + np.float32(away_m), *moved[1:])
+    x, y, z = (a + b for a, b in zip(away_m, home.world_from_cam.translation_m, strict=True))
+    there = Camera(home.intrinsics, Pose((x, y, z), home.world_from_cam.rotation))
+    got = Rasterizer(Gaussians(*moved)).render(there)
+    want = Rasterizer(gaussians).render(home)
+    assert np.abs(got.colour - want.colour).max() < FORWARD_TOLERANCE
+    assert np.abs(got.opacity - want.opacity).max() < FORWARD_TOLERANCE
+
+
 def test_torch_runs_beside_the_threads_of_the_rasterizer(
     scene: SceneMaker, camera: CameraMaker
 ) -> None:

@@ -8,6 +8,7 @@ import pytest
 from mec_server.session import ServerSession
 from rfcore.camera import Intrinsics, Pose
 from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
+from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
 
 FIELD = "ab" * 32
@@ -18,7 +19,7 @@ def hello() -> Hello:
     header = StreamHeader(CodecConfig(32, 16, "medium", 23.0), b"\x67" * 20, b"\x68" * 5)
     intrinsics = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)
     cameras = tuple(CameraDescription(name, intrinsics, header) for name in ("front", "rear"))
-    return Hello("cav-1", cameras, (FIELD,), RendererContract("splats-f32-1", exact=True))
+    return Hello("cav-1", cameras, (FIELD,), RendererContract(RENDERER_CONTRACT, exact=True))
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from rfcore.errors import (
     RejectReason,
     UnknownField,
 )
+from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import FrameRefused
 from rfcore.wire.messages import (
     Ack,
@@ -117,8 +118,8 @@ def test_an_unknown_field_is_refused_with_both_ids_named(hello: Hello) -> None:
 @pytest.mark.parametrize(
     ("contract", "exact"),
     [
-        (RendererContract("splats-f32-1", exact=True), True),
-        (RendererContract("splats-f32-1", exact=False), False),
+        (RendererContract(RENDERER_CONTRACT, exact=True), True),
+        (RendererContract(RENDERER_CONTRACT, exact=False), False),
         (RendererContract("splats-cuda-9", exact=True), False),
     ],
 )

@@ -6,6 +6,7 @@ import pytest
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
+from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
 
 INTRINSICS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)
@@ -19,7 +20,7 @@ def hello() -> Hello:
         "cav-1",
         (CameraDescription("front", INTRINSICS, header),),
         ("ab" * 32,),
-        RendererContract("splats-f32-1", exact=True),
+        RendererContract(RENDERER_CONTRACT, exact=True),
     )
 
 

@@ -12,6 +12,7 @@
 #include <tuple>
 #include <vector>
 
+#include "raster/camera.h"
 #include "raster/rasterizer.h"
 #include "raster/trainable.h"
 
@@ -54,22 +55,11 @@ GaussianArrays arrays_of(const Floats& means, const Floats& quaternions, const F
             static_cast<int>(means.shape(0)), degree};
 }
 
-// `numbers`: rotation 9, translation 3, position 3, fx, fy, cx, cy.
-Camera make_camera(const std::vector<double>& numbers, int width, int height) {
-    if (numbers.size() != 19) throw std::invalid_argument("a camera is 19 numbers");
-    float values[19];
-    for (size_t i = 0; i < 19; ++i) values[i] = static_cast<float>(numbers[i]);
-    Camera c{};
-    for (int i = 0; i < 9; ++i) c.rotation[i] = values[i];
-    for (int i = 0; i < 3; ++i) c.translation[i] = values[9 + i];
-    for (int i = 0; i < 3; ++i) c.position[i] = values[12 + i];
-    c.fx = values[15];
-    c.fy = values[16];
-    c.cx = values[17];
-    c.cy = values[18];
-    c.width = width;
-    c.height = height;
-    return c;
+Camera camera_of(const std::vector<double>& numbers, int width, int height) {
+    if (numbers.size() != raster::kCameraNumbers) {
+        throw std::invalid_argument("a camera is 16 numbers");
+    }
+    return raster::make_camera(numbers.data(), width, height);
 }
 
 
@@ -79,7 +69,7 @@ void bind_rasterizer(nb::module_& m) {
 
     nb::class_<Camera>(m, "RasterCamera")
         .def("__init__", [](Camera* self, const std::vector<double>& numbers, int width,
-                            int height) { new (self) Camera(make_camera(numbers, width, height)); },
+                            int height) { new (self) Camera(camera_of(numbers, width, height)); },
              "numbers"_a, "width"_a, "height"_a);
 
     nb::class_<Rasterizer>(m, "Rasterizer")

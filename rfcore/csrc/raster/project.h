@@ -30,8 +30,8 @@ struct Vec3 {
     Lanes x, y, z;
 };
 RF_INLINE Lanes dot(Vec3 p, Vec3 q) { return fma(p.x, q.x, fma(p.y, q.y, p.z * q.z)); }
-RF_INLINE Lanes dot(const float* row, Vec3 q, float offset) {
-    return fma(splat(row[0]), q.x, fma(splat(row[1]), q.y, fma(splat(row[2]), q.z, splat(offset))));
+RF_INLINE Lanes dot(const float* row, Vec3 q) {
+    return fma(splat(row[0]), q.x, fma(splat(row[1]), q.y, splat(row[2]) * q.z));
 }
 RF_INLINE Vec3 cross(Vec3 p, Vec3 q) {
     return {fnma(p.z, q.y, p.y * q.z), fnma(p.x, q.z, p.z * q.x), fnma(p.y, q.x, p.x * q.y)};
@@ -111,10 +111,17 @@ struct Projection {
     Lanes centre_x, centre_y;
 };
 
-RF_INLINE Vec3 to_camera(const Camera& camera, Vec3 mean) {
+// From the camera's position to the mean, in world axes. Subtracting before anything is rotated,
+// from a position of twice the digits, keeps a scene sharp a thousand kilometres from its origin.
+RF_INLINE Vec3 offset_from(const Camera& camera, Vec3 mean) {
+    const float *high = camera.position, *rest = camera.position_rest;
+    return {mean.x - splat(high[0]) - splat(rest[0]), mean.y - splat(high[1]) - splat(rest[1]),
+            mean.z - splat(high[2]) - splat(rest[2])};
+}
+
+RF_INLINE Vec3 to_camera(const Camera& camera, Vec3 offset) {
     const float* r = camera.rotation;
-    const float* t = camera.translation;
-    return {dot(r, mean, t[0]), dot(r + 3, mean, t[1]), dot(r + 6, mean, t[2])};
+    return {dot(r, offset), dot(r + 3, offset), dot(r + 6, offset)};
 }
 
 RF_INLINE Lanes clamped_slope(Lanes slope, float focal, float centre, int side, Mask* is_free) {
@@ -171,10 +178,8 @@ RF_INLINE Lanes log2_compensation(const Projection& p) {
     return splat(0.5f) * log2_accurate(max(p.sharp_det / p.det, splat(kMinDetRatio)));
 }
 
-// Unit vector from the camera to the mean, and one over the distance.
-RF_INLINE Vec3 view_direction(const Camera& camera, Vec3 mean, Lanes* inverse_distance) {
-    const Vec3 d = {mean.x - splat(camera.position[0]), mean.y - splat(camera.position[1]),
-                    mean.z - splat(camera.position[2])};
+// Unit vector along `d`, and one over its length.
+RF_INLINE Vec3 direction_of(Vec3 d, Lanes* inverse_distance) {
     *inverse_distance = splat(1.0f) / sqrt(dot(d, d));
     return {d.x * *inverse_distance, d.y * *inverse_distance, d.z * *inverse_distance};
 }
@@ -286,9 +291,9 @@ static int project(const ProjectJob& job, int begin, int end, SortItem* out) {
         const float* block =
             kTraining ? job.parameters + static_cast<size_t>(b) * (kShPlane + sh_planes) * kLanes
                       : job.geometry + static_cast<size_t>(b) * kGeometryPlanes * kLanes;
-        const Vec3 mean = load_vec3(block, kMeanPlane);
+        const Vec3 offset = offset_from(camera, load_vec3(block, kMeanPlane));
         Projection p;
-        p.in_camera = to_camera(camera, mean);
+        p.in_camera = to_camera(camera, offset);
         if (!any(gt(p.in_camera.z, splat(kNear)))) continue;
         Lanes log2_alpha;
         if (kTraining) {
@@ -316,7 +321,7 @@ static int project(const ProjectJob& job, int begin, int end, SortItem* out) {
         prefetch_planes<3 * coefficients_of(kDegree)>(  // of the next block: likely visible too
             harmonics + (kTraining ? kShPlane + sh_planes : sh_planes) * kLanes);
         Lanes inverse_distance, basis[coefficients_of(kDegree)], colour[3];
-        const Vec3 d = view_direction(camera, mean, &inverse_distance);
+        const Vec3 d = direction_of(offset, &inverse_distance);
         sh_basis<kDegree>(d.x, d.y, d.z, basis);
         sh_colour<kDegree>(harmonics, basis, colour);
         store_splats(p, log2_alpha, headroom, half_x, half_y, colour, job.splats + b * kLanes);

@@ -89,8 +89,8 @@ RF_INLINE Vec3 matrix_times(const Lanes* m, Vec3 v) {
 RF_INLINE Vec3 d_in_camera(const Camera& camera, const Projection& p, Lanes d_centre_x,
                            Lanes d_centre_y, Vec3 d_row0, Vec3 d_row1) {
     const float* w = camera.rotation;
-    const Lanes d_j00 = dot(w, d_row0, 0.0f), d_j02 = dot(w + 6, d_row0, 0.0f);
-    const Lanes d_j11 = dot(w + 3, d_row1, 0.0f), d_j12 = dot(w + 6, d_row1, 0.0f);
+    const Lanes d_j00 = dot(w, d_row0), d_j02 = dot(w + 6, d_row0);
+    const Lanes d_j11 = dot(w + 3, d_row1), d_j12 = dot(w + 6, d_row1);
     const Lanes fx = splat(camera.fx), fy = splat(camera.fy), rz = p.inverse_z, rz2 = rz * rz;
     const Lanes shift_x = fx * rz2 * d_j02, shift_y = fy * rz2 * d_j12;
     const Lanes along_x = shift_x * p.slope_x, along_y = shift_y * p.slope_y;
@@ -161,12 +161,11 @@ RF_INLINE Vec3 d_sh_basis(Lanes x, Lanes y, Lanes z, const Lanes* f) {
 
 // Through the colour: gradients of the coefficients (written to `out`) and of the mean (returned).
 template <int kDegree>
-RF_INLINE Vec3 d_colour(const Camera& camera, const float* block, Vec3 mean, const Lanes* d_rgb,
-                        float* out) {
+RF_INLINE Vec3 d_colour(const float* block, Vec3 offset, const Lanes* d_rgb, float* out) {
     constexpr int kCoefficients = coefficients_of(kDegree);
     const float* harmonics = plane(block, kShPlane);
     Lanes inverse_distance, basis[kCoefficients], colour[3], along[kCoefficients];
-    const Vec3 v = view_direction(camera, mean, &inverse_distance);
+    const Vec3 v = direction_of(offset, &inverse_distance);
     sh_basis<kDegree>(v.x, v.y, v.z, basis);
     sh_colour<kDegree>(harmonics, basis, colour);
     Lanes d[3];
@@ -200,11 +199,11 @@ RF_INLINE void add_d_compensation(const Projection& p, Lanes s, Vec3* d_m0, Vec3
 template <int kDegree, bool kAntialiased>
 RF_INLINE void block_gradient(const Camera& camera, const float* block, const SplatGradient& g,
                               float* out) {
-    const Vec3 mean = load_vec3(block, kMeanPlane);
+    const Vec3 offset = offset_from(camera, load_vec3(block, kMeanPlane));
     CovarianceRoot c;
     covariance_root(block, &c);
     Projection p;
-    p.in_camera = to_camera(camera, mean);
+    p.in_camera = to_camera(camera, offset);
     project_covariance(camera, c.root, &p);
     const Lanes inverse_det = splat(1.0f) / p.det;
     const Symmetric conic = {p.c_yy * inverse_det, negate(p.c_xy * inverse_det),
@@ -230,12 +229,12 @@ RF_INLINE void block_gradient(const Camera& camera, const float* block, const Sp
     }
     d_covariance_root(c, d_root, out);
     store(plane(out, kLogitPlane), g.s * (splat(1.0f) - sigmoid(load(plane(block, kLogitPlane)))));
-    const Vec3 d_mean = d_colour<kDegree>(camera, block, mean, g.colour, out);
+    const Vec3 d_mean = d_colour<kDegree>(block, offset, g.colour, out);
     const float* w = camera.rotation;
     const Lanes by_view[3] = {d_mean.x, d_mean.y, d_mean.z};
     for (int j = 0; j < 3; ++j) {
         const float column[3] = {w[j], w[3 + j], w[6 + j]};
-        store(plane(out, kMeanPlane + j), dot(column, d_cam, 0.0f) + by_view[j]);
+        store(plane(out, kMeanPlane + j), dot(column, d_cam) + by_view[j]);
     }
 }
 

@@ -30,11 +30,11 @@ enum GeometryPlane { kRootPlane = 3, kLog2OpacityPlane = 12 };
 constexpr int kGeometryPlanes = 13;
 
 struct Camera {
-    float rotation[9];     // cam_from_world, row-major
-    float translation[3];  // cam_from_world, m
-    float position[3];     // of the camera in the world, m
-    float fx, fy, cx, cy;  // px
-    int width, height;     // px
+    float rotation[9];        // cam_from_world, row-major
+    float position[3];        // of the camera in the world, m
+    float position_rest[3];   // what rounding took off it, m
+    float fx, fy, cx, cy;     // px
+    int width, height;        // px
 
     int tiles_x() const { return (width + kTileSide - 1) / kTileSide; }
     int tiles_y() const { return (height + kTileSide - 1) / kTileSide; }
