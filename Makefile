@@ -9,7 +9,7 @@ TORCH_INDEX ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow check build bench proto figures
+.PHONY: help demo test test-slow cross check build bench proto figures
 
 help:  ## show the targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -20,8 +20,17 @@ demo: build  ## run the main job: two processes, one field, two drives; writes o
 test: build  ## run the test suite
 	$(BIN)/python -m pytest -m "not slow"
 
-test-slow: build  ## run the tests that take more than ten seconds each
+test-slow: build cross  ## run the tests that take more than ten seconds each
 	$(BIN)/python -m pytest -m slow --timeout 600
+
+# tests/native/test_aarch64.py fails without these two, and says so.
+CROSS := g++-aarch64-linux-gnu qemu-user
+cross:  ## install the AArch64 compiler and emulator that test-slow uses (root, Debian)
+	@if command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64 >/dev/null; then :; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		apt-get -qq update && \
+		DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends $(CROSS); \
+	else echo "the AArch64 test needs $(CROSS), which root can install: it will fail"; fi
 
 check: build  ## lint, types, layers, generated files
 	$(BIN)/ruff format --check .
