@@ -33,9 +33,11 @@ class FieldFile:
 
 
 def _splats(file: FieldFile) -> RadianceField:
+    gaussians, rungs = splats_of_archive(file.archive)
     field = SplatField(
-        splats_of_archive(file.archive),
+        gaussians,
         file.metadata,
+        rungs=rungs,
         threads=file.threads,
         isa=file.isa,
         field_id=file.field_id,

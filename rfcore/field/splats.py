@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive, encode_archive
-from rfcore.field.detail import rung
+from rfcore.field.detail import Rungs, check_rungs, splats_of_rung
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata
 from rfcore.field.quality import FULL, Quality
 from rfcore.field.splat_archive import splat_archive
@@ -31,9 +31,10 @@ __all__ = ["SplatField"]
 class SplatField:
     """Gaussians with metadata, ready to render.
 
-    ``field_id`` is that of the archive it came from; ``None``: that of the archive it would make.
-    ``threads`` and ``isa`` choose how it renders, never what: every choice gives the same bytes.
-    Raises ``BackendUnavailable`` if this machine lacks ``isa``. Safe to share between threads.
+    ``rungs`` is what the lower rungs have of their own (``rfcore.field.detail``). ``field_id`` is
+    that of the archive it came from; ``None``: of the archive it would make. ``threads`` and
+    ``isa`` choose how it renders, never what: every choice gives the same bytes. Raises
+    ``BackendUnavailable`` if this machine lacks ``isa``. Safe to share between threads.
     """
 
     def __init__(
@@ -41,6 +42,7 @@ class SplatField:
         gaussians: Gaussians,
         metadata: FieldMetadata | None = None,
         *,
+        rungs: Rungs | None = None,
         threads: int = 1,
         isa: str | None = None,
         field_id: str | None = None,
@@ -49,10 +51,12 @@ class SplatField:
         self.metadata = metadata if metadata is not None else FieldMetadata()
         if self.metadata.kind != SPLATS:
             raise InvalidInput("field.kind", f"'{self.metadata.kind}' is not '{SPLATS}'")
+        self.rungs = dict(rungs or {})
+        check_rungs(gaussians, self.rungs)
         self.isa = check_backend(threads, isa)
         self._threads = threads
         self._field_id = field_id
-        self._rasterizers: dict[tuple[float, int], Rasterizer] = {}
+        self._rasterizers: dict[float, Rasterizer] = {}
         self._lock = Lock()
 
     @cached_property
@@ -74,30 +78,33 @@ class SplatField:
 
     def archive(self) -> Archive:
         """Return what the field's file holds."""
-        return splat_archive(self.gaussians, self.metadata)
+        return splat_archive(self.gaussians, self.rungs, self.metadata)
 
     def prepare(self, quality: Quality = FULL) -> None:
         """Make the renderer of ``quality``; without this the first picture makes it."""
-        self.rasterizer(quality)
+        self.rasterizer(quality.detail)
 
-    def rasterizer(self, quality: Quality = FULL) -> Rasterizer:
-        """Return the renderer of ``quality``, made when it is first needed and kept."""
-        most = self.gaussians.sh_degree
-        degree = most if quality.sh_degree is None else min(quality.sh_degree, most)
-        key = (quality.detail, degree)
+    def rasterizer(self, detail: float = 1.0) -> Rasterizer:
+        """Return the renderer of a rung, made when it is first needed and kept."""
         with self._lock:
-            if key not in self._rasterizers:
-                self._rasterizers[key] = Rasterizer(
-                    rung(self.gaussians, quality.detail, degree),
+            if detail not in self._rasterizers:
+                self._rasterizers[detail] = Rasterizer(
+                    splats_of_rung(self.gaussians, self.rungs, detail),
                     threads=self._threads,
                     isa=self.isa,
+                    antialiased=self.metadata.antialiased,
                 )
-            return self._rasterizers[key]
+            return self._rasterizers[detail]
 
     def render(self, camera: Camera, quality: Quality = FULL) -> View:
         """Render colour, depth and opacity as ``camera`` sees them."""
-        return self.rasterizer(quality).render(camera)
+        return self.rasterizer(quality.detail).render(camera, sh_degree=self._degree(quality))
 
     def render_colour(self, camera: Camera, quality: Quality = FULL) -> NDArray[np.float32]:
         """Render colour alone, float32 [H, W, 3]: the bytes of ``render``, sooner."""
-        return self.rasterizer(quality).render_colour(camera)
+        rasterizer = self.rasterizer(quality.detail)
+        return rasterizer.render_colour(camera, sh_degree=self._degree(quality))
+
+    def _degree(self, quality: Quality) -> int:
+        most = self.gaussians.sh_degree
+        return most if quality.sh_degree is None else min(quality.sh_degree, most)

@@ -1,12 +1,14 @@
 """A quality is on the ladder or refused, and draws what its rung is defined to draw."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
-from rfcore.field import FULL, Quality, SplatField
-from rfcore.field.detail import kept_of, rung
+from rfcore.field import FULL, Quality, SplatField, load_field, save_field
+from rfcore.field.detail import Rung, kept_of, splats_of_rung
 from rfcore.field.quality import DETAILS
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
@@ -53,13 +55,43 @@ def test_a_field_draws_the_first_splats_with_the_first_bands(
 
 def test_everything_is_drawn_unless_less_is_asked_for(make_gaussians) -> None:
     field = SplatField(make_gaussians(20))
-    assert rung(field.gaussians, 1.0, 3) is field.gaussians, "the full rung copies nothing"
+    assert splats_of_rung(field.gaussians, {}, 1.0) is field.gaussians, "and nothing is copied"
     assert field.render_colour(CAMERA).tobytes() == field.render_colour(CAMERA, FULL).tobytes()
 
 
 def test_the_renderer_of_a_rung_is_made_once_and_only_when_asked_for(make_gaussians) -> None:
     field = SplatField(make_gaussians(20, 1))
-    half = field.rasterizer(Quality(0.5))
-    assert field.rasterizer(Quality(0.5, sh_degree=1)) is half, "the same rung by another name"
-    assert field.rasterizer(Quality(0.5, sh_degree=3)) is half
+    half = field.rasterizer(0.5)
+    assert field.rasterizer(0.5) is half
     assert field.rasterizer() is not half
+
+
+def test_a_rung_with_scales_and_opacities_of_its_own_is_drawn_with_them(
+    make_gaussians, tmp_path: Path
+) -> None:
+    g, other = make_gaussians(21, 1), make_gaussians(11, 1, seed=1)
+    own = Rung(other.log_scales, other.opacity_logits)
+    save_field(SplatField(g, rungs={0.5: own}), tmp_path / "a.rff")
+    field = load_field(tmp_path / "a.rff")
+    drawn = (g.means[:11], g.quaternions[:11], own.log_scales, own.opacity_logits, g.sh[:11])
+    want = Rasterizer(Gaussians(*drawn)).render_colour(CAMERA)
+    np.testing.assert_array_equal(field.render_colour(CAMERA, Quality(0.5)), want)
+    np.testing.assert_array_equal(field.render_colour(CAMERA), Rasterizer(g).render_colour(CAMERA))
+    plain = Rasterizer(splats_of_rung(g, {}, 0.25)).render_colour(CAMERA)
+    np.testing.assert_array_equal(field.render_colour(CAMERA, Quality(0.25)), plain)
+
+
+@pytest.mark.parametrize(
+    ("detail", "count", "value", "named"),
+    [
+        (0.5, 10, 0.0, r"detail 0\.5: .*log_scales: shape \(10, 3\), expected \(11, 3\)"),
+        (0.5, 11, np.nan, r"detail 0\.5: .*not finite"),
+        (1.0, 21, 0.0, r"1\.0 is none of \(0\.5, 0\.25, 0\.1\)"),
+    ],
+)
+def test_a_rung_that_does_not_fit_is_refused_by_name(
+    make_gaussians, detail: float, count: int, value: float, named: str
+) -> None:
+    own = Rung(np.full((count, 3), value, np.float32), np.full(count, value, np.float32))
+    with pytest.raises(InvalidInput, match=named):
+        SplatField(make_gaussians(21), rungs={detail: own})

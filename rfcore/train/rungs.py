@@ -1,0 +1,124 @@
+"""Fits the lower rungs of a splat field to its full rung, without training pictures.
+
+The splats are put in order of what they contribute to the cameras given. A rung is then the first
+of them, and to fill the gaps its scales and opacities are optimised against the full field's own
+renders; means, rotations and colours stay, so a rung costs four numbers a splat and no more.
+
+Measured on the held-out drive of the sample street (150k splats, 27.14 dB), half of the splats:
+prefix alone 24.22 dB; all wider by e^0.1, 25.48 dB; opacities and scales fitted for 360
+iterations, 26.51 dB; colours fitted as well, 26.56 dB; everything fitted, 26.70 dB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rfcore.camera import Camera
+from rfcore.errors import InvalidInput
+from rfcore.field.detail import Rung, Rungs, splats_of_rung
+from rfcore.field.importance import contributions, most_important_first, reordered
+from rfcore.field.quality import DETAILS
+from rfcore.field.splats import SplatField
+from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.native import LearningRates, Rasterizer, TrainableRasterizer
+from rfcore.train.schedule import view_order
+
+__all__ = ["RungConfig", "with_rungs"]
+
+Progress = Callable[[int, int], None]
+"""Told how many steps are done and how many there are."""
+
+
+@dataclass(frozen=True)
+class RungConfig:
+    """How to fit. ``threads`` changes how long it takes, nothing else."""
+
+    iterations: int = 360
+    """Per rung; 0 leaves every rung a plain prefix."""
+    log_scales_rate: float = 2e-2
+    opacity_rate: float = 5e-2
+    widening: float = 0.15
+    """Added to the log scales before the first iteration of each rung."""
+    final_factor: float = 0.02
+    """What is left of the rates at the end; they fall in the second half."""
+    seed: int = 0
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.iterations <= 1_000_000:
+            raise InvalidInput("rungs.iterations", f"{self.iterations} is outside 0..1000000")
+        for name in ("log_scales_rate", "opacity_rate", "widening", "final_factor"):
+            if not 0 < getattr(self, name) <= 1:
+                raise InvalidInput(f"rungs.{name}", f"{getattr(self, name)} is outside 0..1")
+
+    def rates(self, progress: float) -> LearningRates:
+        """Return Adam's rates at ``progress`` 0..1."""
+        factor = self.final_factor ** max(0.0, 2 * progress - 1)
+        return LearningRates(
+            means=0.0,
+            quaternions=0.0,
+            sh_dc=0.0,
+            sh_rest=0.0,
+            log_scales=self.log_scales_rate * factor,
+            opacity=self.opacity_rate * factor,
+        )
+
+
+def with_rungs(
+    field: SplatField,
+    cameras: Sequence[Camera],
+    config: RungConfig | None = None,
+    progress: Progress | None = None,
+) -> SplatField:
+    """Return the field with its splats in order of importance and its lower rungs fitted.
+
+    ``cameras`` are those the field is to be seen from, as the training views'. The full rung draws
+    the same splats as before. Raises ``InvalidInput`` when there is no camera.
+    """
+    settings = config if config is not None else RungConfig()
+    antialiased = field.metadata.antialiased
+    weights = contributions(
+        field.gaussians, cameras, threads=settings.threads, antialiased=antialiased
+    )
+    ordered = reordered(field.gaussians, most_important_first(weights))
+    rungs = _fitted(ordered, antialiased, cameras, settings, progress) if len(ordered) else {}
+    return SplatField(ordered, field.metadata, rungs=rungs, threads=settings.threads, isa=field.isa)
+
+
+def _fitted(
+    gaussians: Gaussians,
+    antialiased: bool,
+    cameras: Sequence[Camera],
+    config: RungConfig,
+    progress: Progress | None,
+) -> Rungs:
+    """Fit every rung, each starting from the one above it."""
+    full = Rasterizer(gaussians, threads=config.threads, antialiased=antialiased)
+    order = view_order(len(cameras), np.random.default_rng(config.seed))
+    total = config.iterations * len(DETAILS[1:])
+    above, done = gaussians, 0
+    rungs: dict[float, Rung] = {}
+    for detail in DETAILS[1:] if config.iterations else ():
+        start = _widened(reordered(above, np.arange(_count(gaussians, detail))), config.widening)
+        rasterizer = TrainableRasterizer(start, threads=config.threads, antialiased=antialiased)
+        for iteration in range(config.iterations):
+            camera = cameras[next(order)]
+            rates = config.rates(iteration / config.iterations)
+            rasterizer.iterate(camera, full.render_colour(camera), rates)
+            done += 1
+            if progress is not None:
+                progress(done, total)
+        above = rasterizer.gaussians()
+        rungs[detail] = Rung(above.log_scales, above.opacity_logits)
+    return rungs
+
+
+def _count(gaussians: Gaussians, detail: float) -> int:
+    return len(splats_of_rung(gaussians, {}, detail))
+
+
+def _widened(gaussians: Gaussians, widening: float) -> Gaussians:
+    return replace(gaussians, log_scales=gaussians.log_scales + np.float32(widening))
