@@ -1,0 +1,168 @@
+"""What a user would pick instead: x264, x265 and SVT-AV1 set for low delay, one thread.
+
+Each runs as a user would run it on a vehicle: every frame goes out before the next comes in (no
+reordering, no lookahead; checked, not hoped), rate by CRF, one key frame at the start unless the
+rival is about key frames. Options are the libraries' own names.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from time import process_time_ns
+from typing import Any, Literal, cast
+
+import av
+import numpy as np
+from av.error import FFmpegError
+from numpy.typing import NDArray
+
+from rfcore.errors import CodecError, InvalidInput
+from rfcore.image import I420
+from rfcore.metrics import ssim
+from rfedge.evaluate.clip import CodedClip, luma_mse
+
+__all__ = ["Rival", "svtav1_lowdelay", "x264_lowdelay", "x265_lowdelay"]
+
+X264_CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0)
+X265_CRFS = (19.0, 22.0, 25.0, 28.0, 31.0, 34.0, 37.0)
+SVT_CRFS = (20.0, 27.0, 34.0, 41.0, 48.0, 55.0)
+"""Spans the headline window of 32..35 dB on street pictures, with room on either side."""
+
+os.environ.setdefault("SVT_LOG", "1")  # read when the library opens: errors only
+
+
+@dataclass(frozen=True)
+class Rival:
+    """One encoder with its options; codes a clip by feeding frames one at a time."""
+
+    name: str
+    encoder: str
+    decoder: str
+    options: Mapping[str, str]
+    points: Sequence[float] = field(default=X264_CRFS)
+
+    def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
+        """Code and decode ``frames`` at CRF ``point``.
+
+        Raises ``InvalidInput`` without frames or for odd sizes, ``CodecError`` if a library fails
+        or holds a frame back.
+        """
+        if not frames or any(n % 2 for n in frames[0].size_px):
+            raise InvalidInput("frames", "a rival needs frames of one even size")
+        began_ns = process_time_ns()
+        packets = self._encoded(frames, rate_hz, point)
+        cpu_ms = (process_time_ns() - began_ns) / 1e6
+        decoded = self._decoded(packets)
+        pairs = list(zip(decoded, frames, strict=True))
+        return CodedClip(
+            point,
+            np.array([len(packet) for packet in packets]),
+            np.array([luma_mse(*pair) for pair in pairs]),
+            np.array([ssim(ours.y, theirs.y) for ours, theirs in pairs]),
+            cpu_ms,
+        )
+
+    def _encoded(self, frames: Sequence[I420], rate_hz: float, point: float) -> list[bytes]:
+        encoder = self._encoder(frames[0].size_px, rate_hz, point)
+        packets = []
+        try:
+            for index, frame in enumerate(frames):
+                made = encoder.encode(_video_frame(frame, index))
+                if len(made) != 1:
+                    raise CodecError(f"{self.name}: frame {index} came out as {len(made)} packets")
+                packets.append(bytes(made[0]))
+            if encoder.encode(None):
+                raise CodecError(f"{self.name}: kept a frame until the end")
+        except (FFmpegError, ValueError) as error:
+            raise CodecError(f"{self.name}: {error}") from error
+        return packets
+
+    def _encoder(
+        self, size_px: tuple[int, int], rate_hz: float, point: float
+    ) -> av.VideoCodecContext:
+        encoder = _opened(self.encoder, "w")
+        rate = Fraction(rate_hz).limit_denominator(1000)
+        encoder.width, encoder.height = size_px
+        encoder.pix_fmt = "yuv420p"
+        encoder.time_base, encoder.framerate = 1 / rate, rate
+        encoder.thread_count = 1
+        encoder.options = {**self.options, "crf": f"{point:g}"}
+        encoder.open()
+        return encoder
+
+    def _decoded(self, packets: Sequence[bytes]) -> list[I420]:
+        decoder = _opened(self.decoder, "r")
+        decoder.thread_count = 1
+        frames = [f for packet in packets for f in decoder.decode(av.Packet(packet))]
+        return [_picture(frame) for frame in (*frames, *decoder.decode(None))]
+
+
+def x264_lowdelay(preset: str, name: str | None = None, **params: str) -> Rival:
+    """Return x264 with ``tune=zerolatency``: IPPP, no scene cuts; ``params`` are added to it."""
+    options = {"keyint": "infinite", "scenecut": "0", "threads": "1", **params}
+    return Rival(
+        name or f"x264-lowdelay-{preset}",
+        "libx264",
+        "h264",
+        {"preset": preset, "tune": "zerolatency", "x264-params": _joined(options)},
+    )
+
+
+def x265_lowdelay(preset: str) -> Rival:
+    """Return x265 with ``tune=zerolatency``, one key frame."""
+    options = {
+        "keyint": "-1",
+        "scenecut": "0",
+        "log-level": "none",
+        "pools": "none",
+        "frame-threads": "1",
+    }
+    return Rival(
+        f"x265-lowdelay-{preset}",
+        "libx265",
+        "hevc",
+        {"preset": preset, "tune": "zerolatency", "x265-params": _joined(options)},
+        X265_CRFS,
+    )
+
+
+def svtav1_lowdelay(preset: int) -> Rival:
+    """Return SVT-AV1 with ``pred-struct=1`` (low delay), one key frame."""
+    options = {"pred-struct": "1", "keyint": "-1", "lp": "1", "rc": "0"}
+    return Rival(
+        f"svtav1-lowdelay-p{preset}",
+        "libsvtav1",
+        "libdav1d",
+        {"preset": str(preset), "svtav1-params": _joined(options)},
+        SVT_CRFS,
+    )
+
+
+def _opened(codec: str, mode: Literal["r", "w"]) -> av.VideoCodecContext:
+    """PyAV knows only some codec names to be of video."""
+    return cast(av.VideoCodecContext, av.CodecContext.create(codec, mode))
+
+
+def _joined(options: Mapping[str, str]) -> str:
+    return ":".join(f"{name}={value}" for name, value in options.items())
+
+
+def _video_frame(picture: I420, index: int) -> av.VideoFrame:
+    frame = av.VideoFrame(*picture.size_px, "yuv420p")
+    for plane, source in zip(frame.planes, picture.planes, strict=True):
+        _samples(plane)[:] = source
+    frame.pts = index
+    return frame
+
+
+def _picture(frame: av.VideoFrame) -> I420:
+    y, u, v = (_samples(plane).copy() for plane in frame.planes)
+    return I420(y, u, v)
+
+
+def _samples(plane: Any) -> NDArray[np.uint8]:
+    samples: NDArray[np.uint8] = np.frombuffer(memoryview(plane), np.uint8)
+    return samples.reshape(-1, plane.line_size)[: plane.height, : plane.width]
