@@ -9,7 +9,7 @@ TORCH_INDEX ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow cross check build bench proto figures
+.PHONY: help demo test test-slow test-prometheus test-system-packages check build bench proto figures
 
 help:  ## show the targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -20,17 +20,23 @@ demo: build  ## run the main job: two processes, one field, two drives; writes o
 test: build  ## run the test suite
 	$(BIN)/python -m pytest -m "not slow"
 
-test-slow: build cross  ## run the tests that take more than ten seconds each
+test-slow: build test-system-packages  ## run the tests that take more than ten seconds each
 	$(BIN)/python -m pytest -m slow --timeout 600
 
-# tests/native/test_aarch64.py fails without these two, and says so.
-CROSS := g++-aarch64-linux-gnu qemu-user
-cross:  ## install the AArch64 compiler and emulator that test-slow uses (root, Debian)
-	@if command -v aarch64-linux-gnu-g++ >/dev/null && command -v qemu-aarch64 >/dev/null; then :; \
+# Debian packages that slow tests use beside Python: cross compiler and emulator for
+# tests/native/test_aarch64.py, promtool and prometheus for tests/deploy, ip and tc for tests/link.
+# A test fails without its program, and says so.
+SYSTEM_PACKAGES := g++-aarch64-linux-gnu qemu-user prometheus iproute2
+SYSTEM_PROGRAMS := aarch64-linux-gnu-g++ qemu-aarch64 promtool prometheus ip tc
+test-system-packages:  ## install the programs that test-slow uses (root, Debian)
+	@if (for name in $(SYSTEM_PROGRAMS); do command -v $$name >/dev/null || exit 1; done); then :; \
 	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 		apt-get -qq update && \
-		DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends $(CROSS); \
-	else echo "the AArch64 test needs $(CROSS), which root can install: it will fail"; fi
+		DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends $(SYSTEM_PACKAGES); \
+	else echo "slow tests need $(SYSTEM_PACKAGES), which root can install: some will fail"; fi
+
+test-prometheus: build test-system-packages  ## test rules with promtool, and dashboards on a live run
+	$(BIN)/python -m pytest -m prometheus --timeout 600
 
 check: build  ## lint, types, layers, generated files
 	$(BIN)/ruff format --check .
@@ -45,9 +51,11 @@ bench: build  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench train
 	$(BIN)/rfedge bench codec
 
-figures: build  ## regenerate docs/results.md from results/*.json
+figures: build  ## regenerate docs/results.md and docs/metrics.md
 	$(BIN)/python -m rfedge.report.markdown results > docs/results.md.part
 	mv docs/results.md.part docs/results.md
+	$(BIN)/python -m rfedge.report.metrics_page > docs/metrics.md.part
+	mv docs/metrics.md.part docs/metrics.md
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -14,7 +14,7 @@ import tyro
 from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.vehicle import Vehicle
 from rfcore.errors import RfedgeError
-from rfcore.wire.logs import configure_logs
+from rfcore.wire.logs import LogForm, configure_logs
 
 __all__ = ["main"]
 
@@ -37,6 +37,8 @@ def run(
     isa: str | None = None,
     metrics_port: int | None = None,
     metrics_host: str = "127.0.0.1",
+    metrics_per_vehicle: Flag = False,
+    log: LogForm = LogForm.AUTO,
     report: Path | None = None,
     allow_insecure: Flag = False,
 ) -> AgentConfig:
@@ -59,6 +61,8 @@ def run(
         isa: Instruction set to force (avx512, avx2, scalar); the best of this machine without it.
         metrics_port: Port for Prometheus; none are served without it.
         metrics_host: Address the metrics are served on.
+        metrics_per_vehicle: Show the name of the vehicle in the metrics.
+        log: console lines, json lines, or auto: console on a terminal.
         report: File for one JSON line per picture.
         allow_insecure: Send plaintext to another machine.
     """
@@ -78,6 +82,8 @@ def run(
         isa=isa,
         metrics_port=metrics_port,
         metrics_host=metrics_host,
+        metrics_per_vehicle=metrics_per_vehicle,
+        log=log,
         report=report,
         allow_insecure=allow_insecure,
     )
@@ -85,9 +91,9 @@ def run(
 
 def main() -> None:
     """Parse the command line and drive; exit 2 with one line when it cannot be done."""
-    configure_logs(sys.stderr)
     try:
         config = tyro.cli(run, prog="cav-agent")
+        configure_logs(sys.stderr, config.log)
         asyncio.run(travel(config))
     except (RfedgeError, OSError) as error:
         print(f"cav-agent: {error}", file=sys.stderr)

@@ -9,6 +9,7 @@ from pathlib import Path
 from rfcore.codec.config import CRF_RANGE, PRESETS
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import check_field_id, check_name
+from rfcore.wire.logs import LogForm
 
 __all__ = ["AgentConfig", "AgentLimits", "PaceKind"]
 
@@ -70,7 +71,9 @@ class AgentConfig:
     isa: str | None = None
     metrics_port: int | None = None
     metrics_host: str = "127.0.0.1"
+    metrics_per_vehicle: bool = False
     report: Path | None = None
+    log: LogForm = LogForm.AUTO
     allow_insecure: bool = False
     limits: AgentLimits = AgentLimits()
 

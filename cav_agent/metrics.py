@@ -1,11 +1,15 @@
-"""What Prometheus sees of the agent. All names begin with ``rfedge_agent_``."""
+"""What Prometheus sees of the agent. All names of its own begin with ``rfedge_agent_``.
+
+An agent is one vehicle and one target of Prometheus, so ``instance`` tells vehicles apart. Their
+names appear only in ``rfedge_agent_info``, and only when asked for.
+"""
 
 from __future__ import annotations
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client import CollectorRegistry
 
 from cav_agent.frames import FrameResult
-from rfcore.wire.conventions import FRAME_BUDGET_BUCKETS_S
+from rfcore.wire.instruments import Instruments
 
 __all__ = ["AgentMetrics"]
 
@@ -14,30 +18,47 @@ class AgentMetrics:
     """Counters and histograms on a registry of their own."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
-        self._connected = Gauge(
-            "rfedge_agent_connected", "1 while the server has welcomed us", registry=registry
+        self.instruments = make = Instruments(registry)
+        make.process()
+        self._connected = make.gauge(
+            "rfedge_agent_connected", "1 while the server has welcomed this vehicle."
         )
-        self._lost = Counter(
-            "rfedge_agent_connections_lost", "Streams that ended too early", registry=registry
+        self._lost = make.counter(
+            "rfedge_agent_connections_lost", "Streams that ended before the drive did."
         )
-        self.frames = Counter(
+        self._frames = make.counter(
             "rfedge_agent_frames",
-            "Pictures by result (acked, nacked, dropped, lost) and reason",
-            ["result", "reason"],
-            registry=registry,
+            "Captured pictures by result (acked, nacked, dropped, lost) and reason.",
+            ("result", "reason"),
         )
-        self.bytes = Counter(
-            "rfedge_agent_sent_bytes",
-            "Bytes by kind: payload (P slice), packet (whole message)",
-            ["kind"],
-            registry=registry,
+        self._sent = make.counter(
+            "rfedge_agent_sent_bytes", "Bytes of coded frames sent: pose, header and payload."
         )
-        self.stages = Histogram(
+        self._payload = make.counter("rfedge_agent_payload_bytes", "Bytes of P slices sent.")
+        self._stages = make.seconds(
             "rfedge_agent_stage_seconds",
-            "Time by stage; end_to_end is from the picture in memory to its Ack",
-            ["stage"],
-            buckets=FRAME_BUDGET_BUCKETS_S,
-            registry=registry,
+            "Time of a frame by stage; link is from sending to Ack without the server's own time.",
+            ("stage",),
+        )
+        self._latency = make.seconds(
+            "rfedge_agent_capture_to_ack_seconds",
+            "From the picture in the camera to its Ack.",
+        )
+
+    def travelling(self, vehicle_id: str, camera_id: str) -> None:
+        """Tell who this is; for operators who want names."""
+        self.instruments.info(
+            "rfedge_agent_info",
+            "1; the vehicle and its camera. Only with --metrics-per-vehicle.",
+            {"vehicle": vehicle_id, "camera": camera_id},
+        )
+
+    def field(self, field_id: str, kind: str) -> None:
+        """Tell which field frames are coded against."""
+        self.instruments.info(
+            "rfedge_agent_field_info",
+            "1; the radiance field in use: the first 16 digits of its id, and its kind.",
+            {"field": field_id[:16], "kind": kind},
         )
 
     def connected(self, is_connected: bool) -> None:
@@ -49,12 +70,12 @@ class AgentMetrics:
     def ended(self, result: FrameResult) -> None:
         """Count a picture that came to its end."""
         reason = result.reason.partition(":")[0][:40]
-        self.frames.labels(str(result.outcome), reason).inc()
+        self._frames.labels(str(result.outcome), reason).inc()
         if result.packet is not None:
-            self.bytes.labels("payload").inc(len(result.packet.payload))
-            self.bytes.labels("packet").inc(result.packet_bytes)
+            self._payload.inc(len(result.packet.payload))
+            self._sent.inc(result.packet_bytes)
         for stage, spent_s in result.stage_s.items():
-            self.stages.labels(stage).observe(spent_s)
+            self._stages.labels(stage).observe(spent_s)
         if result.server is not None and result.link_s is not None and result.latency_s is not None:
-            self.stages.labels("link").observe(result.link_s)
-            self.stages.labels("end_to_end").observe(result.latency_s)
+            self._stages.labels("link").observe(result.link_s)
+            self._latency.observe(result.latency_s)

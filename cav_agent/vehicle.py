@@ -15,7 +15,7 @@ from prometheus_client import CollectorRegistry, start_http_server
 from cav_agent.client import Agent, Equipment
 from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.field_fetch import choose_field, fetch_field
-from cav_agent.frames import FrameResult
+from cav_agent.frames import FrameResult, Outcome
 from cav_agent.metrics import AgentMetrics
 from cav_agent.pace import Lockstep, Pace, Realtime
 from cav_agent.pipeline import Pipeline
@@ -61,7 +61,13 @@ class Vehicle:
 
     async def run(self) -> Counter[str]:
         """Drive; return how many pictures ended how. Raises ``RfedgeError``."""
+        if self._config.metrics_per_vehicle:
+            self._metrics.travelling(self._config.vehicle, self._config.camera)
         self._serve_metrics()
+        with structlog.contextvars.bound_contextvars(vehicle=self._config.vehicle):
+            return await self._travel()
+
+    async def _travel(self) -> Counter[str]:
         executor = ThreadPoolExecutor(1, "encoder")
         try:
             async with grpc.aio.insecure_channel(
@@ -112,6 +118,7 @@ class Vehicle:
         contract = RendererContract(RENDERER_CONTRACT, exact=True)
         hello = Hello(config.vehicle, (camera,), (field.field_id,), contract)
         field.prepare()
+        self._metrics.field(field.field_id, field.metadata.kind)
         log.info("ready", pictures=len(pictures), field=field.field_id, isa=field.isa)
         return Journey(pictures, pipeline, hello)
 
@@ -123,6 +130,7 @@ class Vehicle:
 
         def ended(result: FrameResult) -> None:
             self._metrics.ended(result)
+            _log_failure(session.session_id, result)
             if report is not None:
                 report.ended(result)
 
@@ -149,6 +157,19 @@ class Vehicle:
     async def _pass_on_stop(self, agent: Agent) -> None:
         await self._stopped.wait()
         agent.stop()
+
+
+def _log_failure(session_id: str, result: FrameResult) -> None:
+    """Say which frame was sent in vain; one dropped before it was encoded is only counted."""
+    if result.packet is None or result.outcome is Outcome.ACKED:
+        return
+    log.warning(
+        f"frame {result.outcome}",
+        session=session_id,
+        epoch=result.packet.epoch,
+        seq=result.packet.sequence,
+        reason=result.reason,
+    )
 
 
 def _pace(config: AgentConfig, pictures: int) -> Pace:

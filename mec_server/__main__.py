@@ -13,9 +13,11 @@ import tyro
 from mec_server.config import ServerConfig
 from mec_server.server import EdgeServer
 from rfcore.errors import RfedgeError
-from rfcore.wire.logs import configure_logs
+from rfcore.wire.logs import LogForm, configure_logs
 
 __all__ = ["main"]
+
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 
 def run(
@@ -24,11 +26,13 @@ def run(
     save: Path | None = None,
     metrics_port: int | None = None,
     metrics_host: str = "127.0.0.1",
+    metrics_per_vehicle: Flag = False,
+    log: LogForm = LogForm.AUTO,
     threads: int = 1,
     workers: int = 2,
     isa: str | None = None,
     ready_file: Path | None = None,
-    allow_insecure: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    allow_insecure: Flag = False,
 ) -> ServerConfig:
     """Reconstruct what vehicles see, against the radiance fields held here.
 
@@ -38,6 +42,8 @@ def run(
         save: Directory for reconstructed pictures (PNG) and their index; none without it.
         metrics_port: Port for Prometheus; 0 takes a free one, none are served without it.
         metrics_host: Address the metrics are served on.
+        metrics_per_vehicle: Tell vehicles apart in the metrics; each costs its own time series.
+        log: console lines, json lines, or auto: console on a terminal.
         threads: Threads per render; the pictures do not depend on it.
         workers: Frames reconstructed at once.
         isa: Instruction set to force (avx512, avx2, scalar); the best of this machine without it.
@@ -50,6 +56,8 @@ def run(
         save=save,
         metrics_port=metrics_port,
         metrics_host=metrics_host,
+        metrics_per_vehicle=metrics_per_vehicle,
+        log=log,
         threads=threads,
         workers=workers,
         isa=isa,
@@ -60,9 +68,9 @@ def run(
 
 def main() -> None:
     """Parse the command line and serve until SIGTERM or SIGINT; exit 2 on a user's mistake."""
-    configure_logs(sys.stderr)
     try:
         config = tyro.cli(run, prog="mec-server")
+        configure_logs(sys.stderr, config.log)
         asyncio.run(serve(config))
     except (RfedgeError, OSError) as error:
         print(f"mec-server: {error}", file=sys.stderr)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rfcore.errors import InvalidInput
+from rfcore.wire.logs import LogForm
 
 __all__ = ["ServerConfig", "SessionLimits"]
 
@@ -36,8 +37,9 @@ class ServerConfig:
 
     ``fields``: directory of field archives. ``save``: directory for reconstructed pictures, none
     are written without it. ``listen`` and ``metrics_port``: port 0 takes a free one; no metrics are
-    served without a port. ``threads`` per render, ``workers`` frames at once. ``isa`` forces an
-    instruction set. ``ready_file`` receives the address once connections are accepted.
+    served without a port, and ``metrics_per_vehicle`` tells vehicles apart in them. ``threads`` per
+    render, ``workers`` frames at once. ``isa`` forces an instruction set. ``ready_file`` receives
+    the address once connections are accepted.
     """
 
     fields: Path
@@ -45,10 +47,12 @@ class ServerConfig:
     save: Path | None = None
     metrics_port: int | None = None
     metrics_host: str = "127.0.0.1"
+    metrics_per_vehicle: bool = False
     threads: int = 1
     workers: int = 2
     isa: str | None = None
     ready_file: Path | None = None
+    log: LogForm = LogForm.AUTO
     allow_insecure: bool = False
     drain_s: float = 5.0
     limits: SessionLimits = SessionLimits()

@@ -34,6 +34,9 @@ __all__ = ["EdgeService", "Surroundings"]
 log = structlog.get_logger()
 Context = grpc.aio.ServicerContext[bytes, bytes]
 
+UNKNOWN_VEHICLE = ""
+"""Whom a stream counts for until its Hello was accepted."""
+
 
 @dataclass(frozen=True)
 class Surroundings:
@@ -78,6 +81,7 @@ class EdgeService:
         finally:
             self._streams.discard(stream)
             self._around.metrics.sessions.dec()
+            stream.metrics.forget()
         if end.error is not None:
             await context.abort(status_of(end.error), str(end.error))
 
@@ -90,6 +94,7 @@ class _Stream:
         self._context = context
         self._wake = asyncio.Event()
         self._decoders: dict[str, CameraDecoder] = {}
+        self.metrics = around.metrics.of(UNKNOWN_VEHICLE)
         session_id = uuid.uuid4().hex[:12]
         self._log = log.bind(session=session_id, peer=context.peer())
         self._session = ServerSession(
@@ -127,14 +132,14 @@ class _Stream:
                 self._session.refuse(error, now)
             else:
                 if isinstance(message, Frame):
-                    self._count(message, len(data))
+                    self.metrics.received(message, len(data))
                 self._session.receive(message, now)
             self._wake.set()
         self.drain()
 
     async def _write(self) -> None:
         messages = self._session.messages_to_send(time.monotonic())
-        self._around.metrics.answered(messages)
+        self.metrics.answered(messages)
         for message in messages:
             await self._context.write(server_message_to_bytes(message))
 
@@ -168,6 +173,8 @@ class _Stream:
             self._session.open_failed(error, time.monotonic())
             return
         self._log = self._log.bind(vehicle=job.hello.vehicle_id)
+        self.metrics.forget()
+        self.metrics = around.metrics.of(job.hello.vehicle_id)
         self._log.info("vehicle welcomed", fields=job.hello.field_ids, exact=job.exact)
         self._session.opened(job, time.monotonic())
 
@@ -175,13 +182,18 @@ class _Stream:
         try:
             outcome = (await self._reconstruct(job)).outcome
         except PacketRejected as error:
-            self._log.warning("frame rejected", reason=str(error.reason), problem=error.problem)
+            self._log.warning(
+                "frame rejected",
+                camera=job.frame.camera_id,
+                epoch=job.frame.packet.epoch,
+                seq=job.frame.packet.sequence,
+                reason=str(error.reason),
+                problem=error.problem,
+            )
             self._session.rejected(job, error, time.monotonic())
             return
         self._session.decoded(job, outcome, time.monotonic())
-        self._around.metrics.stages.labels("end_to_end").observe(
-            max(0.0, (time.time_ns() - job.frame.capture_time_ns) / 1e9)
-        )
+        self.metrics.reconstructed(max(0.0, (time.time_ns() - job.frame.capture_time_ns) / 1e9))
 
     async def _reconstruct(self, job: DecodeJob) -> Reconstruction:
         decoder = self._decoders[job.frame.camera_id]
@@ -192,7 +204,3 @@ class _Stream:
             kept = Recording(hello.vehicle_id, job.frame, done.picture)
             await loop.run_in_executor(executor, recorder.save, kept)
         return done
-
-    def _count(self, frame: Frame, packet_bytes: int) -> None:
-        self._around.metrics.bytes.labels("payload").inc(len(frame.packet.payload))
-        self._around.metrics.bytes.labels("packet").inc(packet_bytes)

@@ -65,9 +65,15 @@ class FieldShelf:
 
 
 def field_loader(
-    store: FieldStore, *, threads: int, isa: str | None
+    store: FieldStore,
+    *,
+    threads: int,
+    isa: str | None,
+    opened: Callable[[RadianceField], None],
 ) -> Callable[[str], RadianceField]:
     """Return how a shelf opens fields of ``store``: whole, checked, and with a renderer built.
+
+    ``opened`` is told of each.
 
     What it returns raises ``UnknownField``, ``FieldFormatError`` or ``BackendUnavailable``.
     """
@@ -82,6 +88,7 @@ def field_loader(
             primitives=field.primitives,
             isa=field.isa,
         )
+        opened(field)
         return field
 
     return load

@@ -1,53 +1,138 @@
-"""What Prometheus sees of the server. All names begin with ``rfedge_server_``."""
+"""What Prometheus sees of the server. Names begin with ``rfedge_server_`` or ``rfedge_twin_``.
+
+No metric tells vehicles apart unless ``per_vehicle`` is set: ids are unbounded, and every label
+value is a time series for ever. With it, a vehicle's series leave when its last stream ends.
+"""
 
 from __future__ import annotations
 
+from collections import Counter as Tally
 from collections.abc import Iterable
+from dataclasses import fields
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client import CollectorRegistry
 
-from rfcore.wire.conventions import FRAME_BUDGET_BUCKETS_S
-from rfcore.wire.messages import Ack, Nack, ServerMessage
+from rfcore.field import RadianceField
+from rfcore.wire.instruments import Instruments
+from rfcore.wire.messages import Ack, Frame, Nack, ServerMessage, StageTimes
 
-__all__ = ["ServerMetrics"]
+__all__ = ["ServerMetrics", "VehicleMetrics"]
+
+STAGES = tuple(f.name.removesuffix("_ns") for f in fields(StageTimes) if f.name != "total_ns")
 
 
 class ServerMetrics:
     """Counters and histograms on a registry of their own."""
 
-    def __init__(self, registry: CollectorRegistry) -> None:
-        self.sessions = Gauge("rfedge_server_sessions", "Streams that are open", registry=registry)
-        self.frames = Counter(
+    def __init__(self, registry: CollectorRegistry, *, per_vehicle: bool = False) -> None:
+        self.per_vehicle = per_vehicle
+        self.instruments = make = Instruments(registry)
+        make.process()
+        vehicle = ("vehicle",) if per_vehicle else ()
+        self.sessions = make.gauge("rfedge_server_sessions", "Streams that are open.")
+        self.workers = make.gauge("rfedge_server_workers", "Frames that may be in work at once.")
+        self.frames = make.counter(
             "rfedge_server_frames",
-            "Frames by result (acked, nacked) and reject reason",
-            ["result", "reason"],
-            registry=registry,
+            "Frames by result (acked, nacked) and reject reason.",
+            (*vehicle, "result", "reason"),
         )
-        self.bytes = Counter(
+        self.received = make.counter(
             "rfedge_server_received_bytes",
-            "Bytes by kind: payload (P slice), packet (whole message)",
-            ["kind"],
-            registry=registry,
+            "Bytes of coded frames received: pose, header and payload.",
+            vehicle,
         )
-        self.stages = Histogram(
+        self.payload = make.counter(
+            "rfedge_server_payload_bytes",
+            "Bytes of P slices received, by the reference pictures they predict from.",
+            (*vehicle, "references"),
+        )
+        self.coded = make.counter(
+            "rfedge_server_coded_frames",
+            "Frames received, by the reference pictures they predict from.",
+            (*vehicle, "references"),
+        )
+        self.stages = make.seconds(
             "rfedge_server_stage_seconds",
-            "Time by stage: queue, render, splice, decode, total, end_to_end (capture to picture)",
-            ["stage"],
-            buckets=FRAME_BUDGET_BUCKETS_S,
-            registry=registry,
+            "Time of a frame by stage: queue (waiting), render, splice, decode.",
+            ("stage",),
         )
-        self.recording = Gauge(
-            "rfedge_server_recording", "1 while pictures are recorded, 0 after the disk refused",
-            registry=registry,
-        )  # fmt: skip
+        self.answer = make.seconds(
+            "rfedge_server_frame_seconds", "From a frame's arrival to its Ack."
+        )
+        self.latency = make.seconds(
+            "rfedge_server_capture_to_picture_seconds",
+            "From the vehicle's capture to the reconstructed picture; needs synchronised clocks.",
+            vehicle,
+        )
+        self.recording = make.gauge(
+            "rfedge_server_recording",
+            "1 while pictures are recorded, 0 when none are asked for or the disk refused.",
+        )
+        self._fields = make.gauge(
+            "rfedge_server_field_info",
+            "1 for each open radiance field: the first 16 digits of its id, and its kind.",
+            ("field", "kind"),
+        )
+        self._streams: Tally[str] = Tally()
+
+    def field_opened(self, field: RadianceField) -> None:
+        """Tell which field was opened."""
+        self._fields.labels(field.field_id[:16], field.metadata.kind).set(1)
+
+    def of(self, vehicle_id: str) -> VehicleMetrics:
+        """Return what a stream of ``vehicle_id`` counts on; ``forget`` it when the stream ends."""
+        self._streams[vehicle_id] += 1
+        return VehicleMetrics(self, vehicle_id)
+
+    def forget(self, vehicle_id: str) -> None:
+        """Drop the series of a vehicle whose last stream ended."""
+        self._streams[vehicle_id] -= 1
+        if self._streams[vehicle_id] > 0:
+            return
+        del self._streams[vehicle_id]
+        if self.per_vehicle:
+            for metric in (self.frames, self.received, self.payload, self.coded, self.latency):
+                metric.remove_by_labels({"vehicle": vehicle_id})
+
+
+class VehicleMetrics:
+    """The server's metrics as one stream counts on them."""
+
+    def __init__(self, metrics: ServerMetrics, vehicle_id: str) -> None:
+        self._metrics = metrics
+        self._vehicle_id = vehicle_id
+        self._label = (vehicle_id,) if metrics.per_vehicle else ()
+
+    def received(self, frame: Frame, packet_bytes: int) -> None:
+        """Count a frame that could be parsed."""
+        metrics, label = self._metrics, self._label
+        references = str(frame.references)
+        received = metrics.received.labels(*label) if label else metrics.received
+        received.inc(packet_bytes)
+        metrics.payload.labels(*label, references).inc(len(frame.packet.payload))
+        metrics.coded.labels(*label, references).inc()
 
     def answered(self, messages: Iterable[ServerMessage]) -> None:
         """Count the frames that ``messages`` answer."""
+        metrics, label = self._metrics, self._label
         for message in messages:
             if isinstance(message, Ack):
-                self.frames.labels("acked", "").inc()
-                for stage in ("queue", "render", "splice", "decode", "total"):
-                    spent_s = getattr(message.times, f"{stage}_ns") / 1e9
-                    self.stages.labels(stage).observe(spent_s)
+                metrics.frames.labels(*label, "acked", "").inc()
+                for stage in STAGES:
+                    metrics.stages.labels(stage).observe(_seconds(message.times, stage))
+                metrics.answer.observe(_seconds(message.times, "total"))
             elif isinstance(message, Nack):
-                self.frames.labels("nacked", str(message.reason)).inc(message.count)
+                metrics.frames.labels(*label, "nacked", str(message.reason)).inc(message.count)
+
+    def reconstructed(self, latency_s: float) -> None:
+        """Note how old a picture was when it became one."""
+        latency = self._metrics.latency
+        (latency.labels(*self._label) if self._label else latency).observe(latency_s)
+
+    def forget(self) -> None:
+        """The stream is over."""
+        self._metrics.forget(self._vehicle_id)
+
+
+def _seconds(times: StageTimes, stage: str) -> float:
+    return float(getattr(times, f"{stage}_ns")) / 1e9

@@ -39,8 +39,12 @@ class EdgeServer:
         self.address.require_private("listen", config.allow_insecure)
         self._config = config
         store = FieldStore(config.fields)
-        self._shelf = FieldShelf(store, field_loader(store, threads=config.threads, isa=config.isa))
-        self._metrics = ServerMetrics(self.registry)
+        self._metrics = ServerMetrics(self.registry, per_vehicle=config.metrics_per_vehicle)
+        self._metrics.workers.set(config.workers)
+        load = field_loader(
+            store, threads=config.threads, isa=config.isa, opened=self._metrics.field_opened
+        )
+        self._shelf = FieldShelf(store, load)
         self._executor = ThreadPoolExecutor(config.workers, "worker")
         self._recorder = self._open_recorder(config.save)
         self._health = health_aio.HealthServicer()

@@ -118,15 +118,22 @@ async def test_in_realtime_what_the_link_cannot_take_is_dropped_before_it_is_enc
             assert (line["reason"], line["packet_bytes"]) == ("superseded", None)
 
 
-async def test_the_server_counts_frames_bytes_and_seconds(serve: Any, travel: Any) -> None:
+async def test_the_server_counts_frames_bytes_and_seconds(
+    street: Any, serve: Any, travel: Any
+) -> None:
     async with serve() as server:
         await travel(server.address)
         value = server.registry.get_sample_value
         acked = {"result": "acked", "reason": ""}
         assert value("rfedge_server_frames_total", acked) == 6
-        assert value("rfedge_server_received_bytes_total", {"kind": "payload"}) > 0
-        for stage in ("queue", "render", "splice", "decode", "total", "end_to_end"):
+        payload_bytes = value("rfedge_server_payload_bytes_total", {"references": "render"})
+        assert 0 < payload_bytes < value("rfedge_server_received_bytes_total")
+        for stage in ("queue", "render", "splice", "decode"):
             assert value("rfedge_server_stage_seconds_count", {"stage": stage}) == 6
+        for whole in ("frame", "capture_to_picture"):
+            assert value(f"rfedge_server_{whole}_seconds_count") == 6
+        prefix = street.field_id[:16]
+        assert value("rfedge_server_field_info", {"field": prefix, "kind": "splats"}) == 1
 
 
 async def test_a_server_that_forces_a_missing_instruction_set_does_not_start(serve: Any) -> None:

@@ -148,7 +148,7 @@ def _tool(name: str) -> str:
     found = shutil.which(name, path=folders)
     if found is None:
         pytest.fail(
-            f"{name} not found: run `make cross` as root, or "
+            f"{name} not found: run `make test-system-packages` as root, or "
             "`apt-get install g++-aarch64-linux-gnu qemu-user` (cmake and ninja: `make build`)"
         )
     return found
