@@ -40,8 +40,9 @@ def _splats(file: FieldFile) -> RadianceField:
         rungs=rungs,
         threads=file.threads,
         isa=file.isa,
-        field_id=file.field_id,
+        archive=file.archive,
     )
+    field.field_id = file.field_id
     stated = bounds_of_header(file.archive.metadata)
     if stated is not None and stated != field.bounds:
         raise InvalidInput("field.bounds", f"{stated} are not those of the means, {field.bounds}")
@@ -79,7 +80,10 @@ def load_field(path: Path, *, threads: int = 1, isa: str | None = None) -> Radia
 
 
 def save_field(field: RadianceField, path: Path) -> str:
-    """Write a field's archive, whole or not at all, and return the field's id."""
+    """Write a field's archive, whole or not at all, and return the field's id.
+
+    A field that was loaded is written as it was; ``SplatField.compressed`` makes the small form.
+    """
     data = encode_field(field)
     write_whole(path, data)
     return hashlib.sha256(data).hexdigest()

@@ -1,7 +1,8 @@
 """Splats as the content of an archive.
 
 Raw float32 arrays by the names of ``Gaussians``; what a lower rung has of its own follows as
-``detail_50.log_scales`` and ``detail_50.opacity_logits``, likewise for 25 and 10.
+``detail_50.log_scales`` and ``detail_50.opacity_logits``, likewise for 25 and 10. Where the header
+has an ``encoding``, ``rfcore.field.splat_codec`` says what the arrays are.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from rfcore.field.detail import Rung, Rungs
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata
 from rfcore.field.metadata import stored_metadata
 from rfcore.field.quality import DETAILS
+from rfcore.field.splat_codec import splats_of_compressed
 from rfcore.raster.gaussians import Gaussians
 
 __all__ = ["splat_archive", "splats_of_archive"]
@@ -33,7 +35,12 @@ def splat_archive(gaussians: Gaussians, rungs: Rungs, metadata: FieldMetadata) -
 
 
 def splats_of_archive(archive: Archive) -> tuple[Gaussians, Rungs]:
-    """Return the content of an archive; raise ``InvalidInput`` if it does not hold splats."""
+    """Return the content of an archive, raw or compressed.
+
+    Raises ``InvalidInput`` if it does not hold splats; see also ``splats_of_compressed``.
+    """
+    if "encoding" in archive.metadata:
+        return splats_of_compressed(archive)
     arrays = dict(archive.arrays)
     rungs = {
         detail: Rung(*(arrays.pop(_own(detail, name)) for name in RUNG_NAMES))

@@ -18,8 +18,10 @@ from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive, encode_archive
 from rfcore.field.detail import Rungs, check_rungs, splats_of_rung
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata
+from rfcore.field.metadata import stored_metadata
 from rfcore.field.quality import FULL, Quality
 from rfcore.field.splat_archive import splat_archive
+from rfcore.field.splat_codec import compressed_archive, splats_of_compressed
 from rfcore.native.raster import check_backend
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
@@ -31,10 +33,10 @@ __all__ = ["SplatField"]
 class SplatField:
     """Gaussians with metadata, ready to render.
 
-    ``rungs`` is what the lower rungs have of their own (``rfcore.field.detail``). ``field_id`` is
-    that of the archive it came from; ``None``: of the archive it would make. ``threads`` and
-    ``isa`` choose how it renders, never what: every choice gives the same bytes. Raises
-    ``BackendUnavailable`` if this machine lacks ``isa``. Safe to share between threads.
+    ``rungs`` is what the lower rungs have of their own (``rfcore.field.detail``). ``archive`` is
+    the one the field came from, ``None`` for one that was just made: saving it is up to it.
+    ``threads`` and ``isa`` choose how it renders, never what: every choice gives the same bytes.
+    Raises ``BackendUnavailable`` if this machine lacks ``isa``. Safe to share between threads.
     """
 
     def __init__(
@@ -45,7 +47,7 @@ class SplatField:
         rungs: Rungs | None = None,
         threads: int = 1,
         isa: str | None = None,
-        field_id: str | None = None,
+        archive: Archive | None = None,
     ) -> None:
         self.gaussians = gaussians
         self.metadata = metadata if metadata is not None else FieldMetadata()
@@ -55,15 +57,13 @@ class SplatField:
         check_rungs(gaussians, self.rungs)
         self.isa = check_backend(threads, isa)
         self._threads = threads
-        self._field_id = field_id
+        self._archive = archive
         self._rasterizers: dict[float, Rasterizer] = {}
         self._lock = Lock()
 
     @cached_property
     def field_id(self) -> str:
         """SHA-256 of the field's archive, in hex."""
-        if self._field_id is not None:
-            return self._field_id
         return hashlib.sha256(encode_archive(self.archive())).hexdigest()
 
     @cached_property
@@ -78,7 +78,28 @@ class SplatField:
 
     def archive(self) -> Archive:
         """Return what the field's file holds."""
+        if self._archive is not None:
+            return self._archive
         return splat_archive(self.gaussians, self.rungs, self.metadata)
+
+    def compressed(self) -> SplatField:
+        """Return the field that a compressed archive of this one holds; of such a one, itself.
+
+        It differs a little and is another field. Raises ``InvalidInput`` for values that a
+        compressed archive cannot hold.
+        """
+        if "encoding" in self.archive().metadata:
+            return self
+        archive = compressed_archive(self.gaussians, self.rungs, self.metadata)
+        gaussians, rungs = splats_of_compressed(archive)
+        return self._like(gaussians, self.metadata, rungs, archive)
+
+    def described(self, metadata: FieldMetadata) -> SplatField:
+        """Return the same splats with other metadata, another field."""
+        old = self.archive()
+        described = {**old.metadata, **stored_metadata(metadata, self.bounds)}
+        archive = Archive(SPLATS, described, old.arrays)
+        return self._like(self.gaussians, metadata, self.rungs, archive)
 
     def prepare(self, quality: Quality = FULL) -> None:
         """Make the renderer of ``quality``; without this the first picture makes it."""
@@ -104,6 +125,18 @@ class SplatField:
         """Render colour alone, float32 [H, W, 3]: the bytes of ``render``, sooner."""
         rasterizer = self.rasterizer(quality.detail)
         return rasterizer.render_colour(camera, sh_degree=self._degree(quality))
+
+    def _like(
+        self, gaussians: Gaussians, metadata: FieldMetadata, rungs: Rungs, archive: Archive
+    ) -> SplatField:
+        return SplatField(
+            gaussians,
+            metadata,
+            rungs=rungs,
+            threads=self._threads,
+            isa=self.isa,
+            archive=archive,
+        )
 
     def _degree(self, quality: Quality) -> int:
         most = self.gaussians.sh_degree

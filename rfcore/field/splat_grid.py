@@ -1,0 +1,211 @@
+"""Splats on a grid: the whole numbers a compressed archive stores, and the splats they stand for.
+
+Every step is a power of two and every number fits float32's 24 bits, so what is decoded is exact:
+the same bytes on every machine, without a rounding anywhere (the three small components of a
+rotation aside, a float32 division by 127 each).
+
+* means: blocks of 256 splats in file order; in a block, ``2^e`` times (base + q), with e chosen so
+  that the step is at most an eighth of the block's smaller widths;
+* log scales, opacity logits, SH: one step each (``Steps``);
+* rotations: the largest component becomes +1 and the others, divided by it, multiples of 1/127.
+  Renderers normalise; the sign of a quaternion means nothing;
+* colours, per SH coefficient: (r, g, b) as luma and two differences by the reversible transform
+  YCoCg-R (Malvar and Sullivan, 2003), which is exact in whole numbers;
+* a rung's own scales and opacities: their difference to the full rung's, in the same steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.errors import InvalidInput
+from rfcore.field.detail import Rung
+from rfcore.field.integers import LIMIT, Integers
+from rfcore.raster.gaussians import F32, Gaussians
+
+__all__ = [
+    "BLOCK",
+    "SplatNumbers",
+    "Steps",
+    "gaussians_of",
+    "numbers_of",
+    "rung_numbers_of",
+    "rung_of",
+]
+
+BLOCK = 256
+ROTATION_STEPS = 127
+EXPONENTS = (-60, 60)
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Quantiser steps as powers of two: a step is ``2^-bits``. 0..16 each."""
+
+    log_scales: int = 4
+    opacity_logits: int = 3
+    sh_dc: int = 5
+    sh_rest: int = 5
+
+    def __post_init__(self) -> None:
+        for name, bits in vars(self).items():
+            if type(bits) is not int or not 0 <= bits <= 16:
+                raise InvalidInput(f"steps.{name}", f"{bits!r} is not a whole number 0..16")
+
+
+@dataclass(frozen=True)
+class SplatNumbers:
+    """The whole numbers of N splats in B blocks, int32.
+
+    ``blocks`` [B, 4]: exponent and base; ``means`` [N, 3]; ``rotations`` [N, 4]: which component
+    is largest, then the others in order; ``log_scales`` [N, 3]; ``opacity_logits`` [N, 1];
+    ``sh`` [N, 3 K]: luma of every coefficient, then the two differences.
+    """
+
+    blocks: Integers
+    means: Integers
+    rotations: Integers
+    log_scales: Integers
+    opacity_logits: Integers
+    sh: Integers
+
+
+def numbers_of(gaussians: Gaussians, steps: Steps) -> SplatNumbers:
+    """Return the nearest splats on the grid."""
+    blocks, means = _means_numbers(gaussians)
+    return SplatNumbers(
+        blocks=blocks,
+        means=means,
+        rotations=_rotation_numbers(gaussians.quaternions),
+        log_scales=_rounded("log_scales", gaussians.log_scales, steps.log_scales),
+        opacity_logits=_rounded(
+            "opacity_logits", gaussians.opacity_logits[:, None], steps.opacity_logits
+        ),
+        sh=_sh_numbers(gaussians.sh, steps),
+    )
+
+
+def gaussians_of(numbers: SplatNumbers, steps: Steps) -> Gaussians:
+    """Return the splats of ``numbers``; raise ``InvalidInput`` for numbers that are none."""
+    return Gaussians(
+        means=_means_of(numbers),
+        quaternions=_quaternions_of(numbers.rotations),
+        log_scales=_scaled(numbers.log_scales, steps.log_scales),
+        opacity_logits=_scaled(numbers.opacity_logits, steps.opacity_logits)[:, 0].copy(),
+        sh=_sh_of(numbers.sh, steps),
+    )
+
+
+def rung_numbers_of(rung: Rung, numbers: SplatNumbers, steps: Steps) -> Integers:
+    """Return a rung's [K, 4]: log scales and opacity less those of the full rung."""
+    kept = len(rung.opacity_logits)
+    scales = _rounded("log_scales", rung.log_scales, steps.log_scales) - numbers.log_scales[:kept]
+    opacity = _rounded("opacity_logits", rung.opacity_logits[:, None], steps.opacity_logits)
+    return np.hstack([scales, opacity - numbers.opacity_logits[:kept]])
+
+
+def rung_of(own: Integers, numbers: SplatNumbers, steps: Steps) -> Rung:
+    """Return the rung of ``own`` [K, 4]."""
+    kept = len(own)
+    opacity = own[:, 3:] + numbers.opacity_logits[:kept]
+    return Rung(
+        log_scales=_scaled(own[:, :3] + numbers.log_scales[:kept], steps.log_scales),
+        opacity_logits=_scaled(opacity, steps.opacity_logits)[:, 0].copy(),
+    )
+
+
+def _rounded(name: str, values: F32, bits: int | NDArray[np.int64]) -> Integers:
+    """Return values in steps of 2^-bits; raise ``InvalidInput`` for one that is too large."""
+    scaled = np.rint(np.ldexp(values.astype(np.float64), bits))
+    if scaled.size and np.abs(scaled).max() >= LIMIT // 4:
+        raise InvalidInput(
+            f"gaussians.{name}",
+            f"{np.abs(values).max():g} is too large for a compressed archive; save it uncompressed",
+        )
+    return scaled.astype(np.int32)
+
+
+def _scaled(numbers: Integers, bits: int) -> F32:
+    return np.ascontiguousarray(np.ldexp(numbers.astype(np.float64), -bits), dtype=np.float32)
+
+
+def _means_numbers(gaussians: Gaussians) -> tuple[Integers, Integers]:
+    n = len(gaussians)
+    starts = np.arange(0, n, BLOCK)
+    exponents = np.array([_exponent(gaussians, start) for start in range(0, n, BLOCK)], np.int32)
+    steps = np.ldexp(1.0, np.repeat(exponents, BLOCK)[:n])
+    whole = np.rint(gaussians.means.astype(np.float64) / steps[:, None]).astype(np.int32)
+    bases = np.minimum.reduceat(whole, starts, axis=0) if n else np.zeros((0, 3), np.int32)
+    blocks = np.hstack([exponents[:, None], bases])
+    return blocks, whole - np.repeat(bases, BLOCK, axis=0)[:n]
+
+
+def _exponent(gaussians: Gaussians, start: int) -> int:
+    """Return e of a block: a fine enough step, no finer than float32 is where the block lies."""
+    part = slice(start, start + BLOCK)
+    widths = np.sort(gaussians.log_scales[part].astype(np.float64), axis=1)[:, 1]
+    wanted = float(np.quantile(widths, 0.1)) / np.log(2) - 3
+    furthest = float(np.abs(gaussians.means[part]).max())
+    finest = np.ceil(np.log2(max(furthest, 2.0**-36))) - 23
+    return int(np.clip(max(np.floor(wanted), finest), *EXPONENTS))
+
+
+def _means_of(numbers: SplatNumbers) -> F32:
+    n = len(numbers.means)
+    blocks = np.repeat(numbers.blocks, BLOCK, axis=0)[:n]
+    exponents = np.clip(blocks[:, :1], *EXPONENTS)
+    whole = (blocks[:, 1:] + numbers.means).astype(np.float64)
+    return np.ascontiguousarray(np.ldexp(whole, exponents), dtype=np.float32)
+
+
+def _rotation_numbers(quaternions: F32) -> Integers:
+    q = quaternions.astype(np.float64)
+    largest = np.abs(q).argmax(axis=1)
+    divisor = np.take_along_axis(q, largest[:, None], axis=1)
+    unit = np.where(divisor == 0, [[1.0, 0, 0, 0]], q / np.where(divisor == 0, 1, divisor))
+    others = np.take_along_axis(unit, _others(largest), axis=1)
+    return np.hstack([largest[:, None], np.rint(others * ROTATION_STEPS)]).astype(np.int32)
+
+
+def _quaternions_of(rotations: Integers) -> F32:
+    largest = rotations[:, 0]
+    if ((largest < 0) | (largest > 3)).any():
+        raise InvalidInput("rotations", "a largest component is none of 0..3")
+    q = np.empty((len(largest), 4), np.float32)
+    others = rotations[:, 1:].astype(np.float32) / np.float32(ROTATION_STEPS)
+    np.put_along_axis(q, largest[:, None], np.float32(1), axis=1)
+    np.put_along_axis(q, _others(largest), others, axis=1)
+    return q
+
+
+def _others(largest: Integers) -> Integers:
+    """Return the three components [N, 3] that are not ``largest`` [N], in order."""
+    rest = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+    return rest[largest]
+
+
+def _sh_numbers(sh: F32, steps: Steps) -> Integers:
+    bits = _bits_of_bands(sh.shape[1], steps)
+    q = _rounded("sh", sh, bits[:, None])
+    r, g, b = q[..., 0], q[..., 1], q[..., 2]
+    orange = r - b
+    middle = b + (orange >> 1)
+    green = g - middle
+    return np.hstack([middle + (green >> 1), orange, green])
+
+
+def _sh_of(numbers: Integers, steps: Steps) -> F32:
+    coefficients = numbers.shape[1] // 3
+    luma, orange, green = (numbers[:, i * coefficients :][:, :coefficients] for i in range(3))
+    middle = luma - (green >> 1)
+    b = middle - (orange >> 1)
+    q = np.stack([b + orange, green + middle, b], axis=2).astype(np.float64)
+    bits = _bits_of_bands(coefficients, steps)
+    return np.ascontiguousarray(np.ldexp(q, -bits[:, None]), dtype=np.float32)
+
+
+def _bits_of_bands(coefficients: int, steps: Steps) -> NDArray[np.int64]:
+    return np.array([steps.sh_dc] + [steps.sh_rest] * (coefficients - 1))

@@ -1,0 +1,205 @@
+"""A compressed archive holds nearly the same splats, the same for everybody, and no surprise."""
+
+import hashlib
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.errors import FieldFormatError, InvalidInput
+from rfcore.field import FieldMetadata, Quality, SplatField, load_field, save_field
+from rfcore.field.archive import Archive, decode_archive, encode_archive
+from rfcore.field.detail import Rung, kept_of
+from rfcore.field.load import decode_field, encode_field
+from rfcore.field.quality import DETAILS
+from rfcore.field.splat_codec import compressed_archive, splats_of_compressed
+from rfcore.field.splat_grid import BLOCK, Steps, gaussians_of, numbers_of
+from rfcore.raster.gaussians import Gaussians
+
+GOLDEN = Path(__file__).parent / "golden" / "grid-1.rff"
+GOLDEN_SPLATS = "3597093196fa52eeb631e76985d822af7bb577ea11ec70dd24045f1194120adf"
+CAMERA = Camera(Intrinsics(48, 36, 40.0, 40.0, 24.0, 18.0), Pose((0, 0, -5), (1, 0, 0, 0)))
+STEPS = Steps()
+
+
+def field_of(gaussians: Gaussians, *details: float) -> SplatField:
+    """A field with rungs a little wider than their prefix."""
+    rungs = {}
+    for detail in details:
+        kept = kept_of(len(gaussians), detail)
+        wider = gaussians.log_scales[:kept] + np.float32(1 / detail / 16)
+        rungs[detail] = Rung(wider, gaussians.opacity_logits[:kept] + np.float32(0.5))
+    return SplatField(gaussians, FieldMetadata("street", held_out_psnr_db=27.0), rungs=rungs)
+
+
+def digest_of(field: SplatField) -> str:
+    """SHA-256 over every array of the splats and rungs."""
+    digest = hashlib.sha256()
+    for f in fields(Gaussians):
+        digest.update(getattr(field.gaussians, f.name).tobytes())
+    for own in field.rungs.values():
+        digest.update(own.log_scales.tobytes() + own.opacity_logits.tobytes())
+    return digest.hexdigest()
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [0, 1, 700])
+def test_a_compressed_field_survives_its_file(
+    make_gaussians, tmp_path: Path, n: int, sh_degree: int
+) -> None:
+    field = field_of(make_gaussians(n, sh_degree), 0.5, 0.1).compressed()
+    field_id = save_field(field, tmp_path / "a.rff")
+    back = load_field(tmp_path / "a.rff")
+    assert isinstance(back, SplatField)
+    assert back.field_id == field.field_id == field_id
+    assert (back.metadata, back.bounds) == (field.metadata, field.bounds)
+    assert digest_of(back) == digest_of(field)
+    assert set(back.rungs) == {0.5, 0.1}
+    assert back.compressed() is back
+    assert save_field(back, tmp_path / "b.rff") == field_id, "what was loaded is saved as it was"
+
+
+def test_the_decoded_bytes_are_pinned() -> None:
+    """Both ends of a session decode for themselves; ``golden_field`` made the file."""
+    field = load_field(GOLDEN)
+    assert isinstance(field, SplatField)
+    assert digest_of(field) == GOLDEN_SPLATS
+    assert field.field_id == hashlib.sha256(GOLDEN.read_bytes()).hexdigest()
+
+
+def golden_field(gaussians: Gaussians) -> bytes:
+    """What the golden file was made of: ``make_gaussians(300, 1)``."""
+    return encode_field(field_of(gaussians, 0.5, 0.25).compressed())
+
+
+def test_the_golden_file_is_what_its_maker_makes(make_gaussians) -> None:
+    made = decode_field(golden_field(make_gaussians(300, 1)))
+    assert isinstance(made, SplatField)
+    assert digest_of(made) == GOLDEN_SPLATS
+
+
+def test_every_value_is_within_half_a_step(make_gaussians) -> None:
+    g = make_gaussians(600, 2)
+    back = gaussians_of(numbers_of(g, STEPS), STEPS)
+    assert np.abs(back.log_scales - g.log_scales).max() <= 2.0**-STEPS.log_scales / 2
+    assert np.abs(back.opacity_logits - g.opacity_logits).max() <= 2.0**-STEPS.opacity_logits / 2
+    assert np.abs(back.sh[:, 0] - g.sh[:, 0]).max() <= 2.0**-STEPS.sh_dc / 2
+    assert np.abs(back.sh[:, 1:] - g.sh[:, 1:]).max() <= 2.0**-STEPS.sh_rest / 2
+    for start in range(0, 600, BLOCK):
+        part = slice(start, start + BLOCK)
+        narrow = np.exp(np.quantile(np.sort(g.log_scales[part], axis=1)[:, 1], 0.1))
+        assert np.abs(back.means[part] - g.means[part]).max() <= narrow / 8 / 2 * 1.01
+
+
+def test_a_rotation_turns_by_less_than_a_degree(make_gaussians) -> None:
+    """Each of three components is off by at most 1/254 of the largest: |dq| <= sqrt(3)/254,
+    and a rotation's angle is at most 2 asin of that, 0.8 degrees."""
+    g = make_gaussians(600, 0)
+    back = gaussians_of(numbers_of(g, STEPS), STEPS)
+    a = g.quaternions / np.linalg.norm(g.quaternions, axis=1, keepdims=True)
+    b = back.quaternions / np.linalg.norm(back.quaternions, axis=1, keepdims=True)
+    angles = 2 * np.arccos(np.clip(np.abs((a * b).sum(axis=1)), 0, 1))
+    assert np.degrees(angles).max() < 0.8
+    still = replace(g, quaternions=np.zeros_like(g.quaternions))
+    want = [[1, 0, 0, 0]] * 600
+    np.testing.assert_array_equal(gaussians_of(numbers_of(still, STEPS), STEPS).quaternions, want)
+
+
+def test_splats_far_from_the_origin_keep_what_float32_keeps(make_gaussians) -> None:
+    g = make_gaussians(300, 0)
+    distant = replace(g, means=g.means + np.float32(1e6), log_scales=g.log_scales - 9)
+    back = gaussians_of(numbers_of(distant, STEPS), STEPS)
+    assert np.abs(back.means - distant.means).max() <= 2.0 ** (20 - 23) / 2
+
+
+def test_every_rung_keeps_its_splats(make_gaussians) -> None:
+    """Neighbours are brought together within a band only; opacity tells which splat is which."""
+    g = make_gaussians(1000, 0)
+    marked = replace(g, opacity_logits=np.arange(1000, dtype=np.float32))
+    back, _ = splats_of_compressed(compressed_archive(marked, {}, FieldMetadata()))
+    for detail in DETAILS:
+        kept = kept_of(1000, detail)
+        assert sorted(back.opacity_logits[:kept]) == list(range(kept))
+    distance = np.linalg.norm(np.diff(back.means[500:], axis=0), axis=1).mean()
+    assert distance < 0.5 * np.linalg.norm(np.diff(g.means[500:], axis=0), axis=1).mean()
+
+
+def test_pictures_of_every_rung_stay_close(make_gaussians) -> None:
+    field = field_of(make_gaussians(700, 1), 0.5, 0.25)
+    small = field.compressed()
+    for detail in DETAILS:
+        quality = Quality(detail)
+        difference = small.render_colour(CAMERA, quality) - field.render_colour(CAMERA, quality)
+        assert np.sqrt(np.mean(np.square(difference))) < 0.04
+
+
+def test_other_metadata_make_another_field_of_the_same_splats(make_gaussians) -> None:
+    field = field_of(make_gaussians(50), 0.5).compressed()
+    measured = field.described(replace(field.metadata, held_out_ssim=0.5))
+    assert measured.field_id != field.field_id
+    back = decode_field(encode_field(measured))
+    assert back.field_id == measured.field_id
+    assert back.metadata.held_out_ssim == 0.5
+    assert digest_of(measured) == digest_of(field)
+
+
+def test_every_changed_byte_is_refused(make_gaussians) -> None:
+    data = bytearray(encode_field(field_of(make_gaussians(3, 0), 0.5).compressed()))
+    for position in range(len(data)):
+        data[position] ^= 1 << position % 8
+        with pytest.raises(FieldFormatError):
+            decode_field(bytes(data))
+        data[position] ^= 1 << position % 8
+
+
+def with_encoding(field: SplatField, change: dict[str, Any]) -> bytes:
+    """The field's archive with another encoding in its header, its digests right."""
+    archive = decode_archive(encode_field(field))
+    encoding = {**archive.metadata["encoding"], **change}
+    metadata = {**archive.metadata, "encoding": encoding}
+    return encode_archive(Archive(archive.kind, metadata, archive.arrays))
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"name": "grid-2"}, "'grid-2' is not 'grid-1'"),
+        ({"count": 2_000_000_000}, "count: 2000000000 is not a whole number"),
+        ({"count": 50_000_000}, "a bomb"),
+        ({"count": 21}, "does not hold"),
+        ({"count": -1}, "count: -1"),
+        ({"count": True}, "count: True"),
+        ({"sh_degree": 4}, "sh_degree: 4"),
+        ({"sh_degree": 0}, "not a list of 3"),
+        ({"steps": {"log_scales": 99}}, r"steps\.log_scales: 99"),
+        ({"steps": {"colour": 1}}, "colour"),
+        ({"streams": {}}, "blocks"),
+        ({"streams": None}, "subscriptable"),
+    ],
+)
+def test_an_encoding_that_lies_is_refused_by_name(
+    make_gaussians, change: dict[str, Any], named: str
+) -> None:
+    field = field_of(make_gaussians(20, 1)).compressed()
+    with pytest.raises(FieldFormatError, match=named):
+        decode_field(with_encoding(field, change))
+
+
+def test_streams_that_do_not_belong_are_refused(make_gaussians) -> None:
+    archive = field_of(make_gaussians(20, 1)).compressed().archive()
+    arrays = {**archive.arrays, "more": np.zeros(3, np.uint8)}
+    data = encode_archive(Archive(archive.kind, archive.metadata, arrays))
+    with pytest.raises(FieldFormatError, match="are not its streams"):
+        decode_field(data)
+
+
+@pytest.mark.parametrize("name", ["log_scales", "opacity_logits", "sh"])
+def test_values_no_grid_holds_are_refused_by_name(make_gaussians, name: str) -> None:
+    g = make_gaussians(5)
+    huge = getattr(g, name).copy()
+    huge.flat[-1] = 1e30
+    with pytest.raises(InvalidInput, match=f"gaussians.{name}: 1e\\+30 is too large"):
+        SplatField(replace(g, **{name: huge})).compressed()
