@@ -1,4 +1,4 @@
-"""Values of a JSON or TOML table, checked one by one.
+"""Values of a JSON or TOML table or of a line of text, checked one by one.
 
 ``where`` is the file and the place in it; every error starts with it and names the key.
 """
@@ -16,14 +16,20 @@ from rfcore.errors import DatasetError, InvalidInput
 
 __all__ = [
     "Table",
+    "finite_numbers",
     "load_json",
     "matrix_rows",
     "number",
+    "pose_of_quaternion",
     "pose_of_rows",
     "read_file",
     "side_px",
     "text",
+    "text_lines",
 ]
+
+FILE_NORM_TOLERANCE = 1e-3
+"""Trajectories are printed with as few as four decimals."""
 
 Table = Mapping[str, Any]
 
@@ -95,3 +101,36 @@ def pose_of_rows(where: str, key: str, rows: Sequence[Sequence[float]]) -> Pose:
         return Pose.from_matrix(rows)
     except InvalidInput as error:
         raise DatasetError(f"{where}: {key}: {error}") from error
+
+
+def pose_of_quaternion(where: str, translation: Sequence[float], wxyz: Sequence[float]) -> Pose:
+    """Return a pose from numbers as files print them: a norm within 1e-3 of 1 is normalised."""
+    norm = math.hypot(*wxyz)
+    if not abs(norm - 1.0) < FILE_NORM_TOLERANCE:
+        raise DatasetError(f"{where}: quaternion {tuple(wxyz)} has norm {norm:.6g}, must be 1")
+    x, y, z = translation
+    w, i, j, k = (value / norm for value in wxyz)
+    try:
+        return Pose((x, y, z), (w, i, j, k))
+    except InvalidInput as error:
+        raise DatasetError(f"{where}: {error}") from error
+
+
+def finite_numbers(where: str, words: Sequence[str]) -> list[float]:
+    """Return the numbers of a line's words."""
+    try:
+        values = [float(word) for word in words]
+    except ValueError as error:
+        raise DatasetError(f"{where}: {error}") from error
+    for value in values:
+        if not math.isfinite(value):
+            raise DatasetError(f"{where}: {value} is not a finite number")
+    return values
+
+
+def text_lines(file: Path) -> list[str]:
+    """Return a text file's lines; raise ``DatasetError`` for bytes that are no UTF-8."""
+    try:
+        return read_file(file).decode().splitlines()
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{file}: not a text file ({error.reason})") from error

@@ -25,8 +25,10 @@ __all__ = [
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG", ".WEBP")
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-JPEG_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-JPEG_BARE_MARKERS = frozenset(range(0xD0, 0xD9)) | {0x01}
+JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+JPEG_BARE = frozenset(range(0xD0, 0xD9)) | {0x01}
+JPEG_SCAN = frozenset({0xDA})
+JPEG_END = b"\xff\xd9"
 
 
 def inside(where: str, folder: Path, name: str) -> Path:
@@ -61,6 +63,7 @@ def picture_file(where: str, folder: Path, name: str) -> Path | None:
 def read_picture(path: Path, intrinsics: Intrinsics) -> Rgb:
     """Read a picture; raise ``DatasetError`` when its size is not the camera's."""
     check_size(path, intrinsics)
+    _require_whole_jpeg(path)
     rgb = read_rgb(path)
     _require_size(path, (rgb.shape[1], rgb.shape[0]), intrinsics)
     return rgb
@@ -102,18 +105,35 @@ def _require_size(path: Path, size_px: tuple[int, int], intrinsics: Intrinsics) 
 
 
 def _jpeg_size_px(file: BinaryIO) -> tuple[int, int] | None:
-    """Walk the marker segments to the frame header."""
+    if not _at_marker(file, JPEG_FRAMES):
+        return None
+    header = file.read(7)
+    return int.from_bytes(header[5:7]), int.from_bytes(header[3:5])
+
+
+def _require_whole_jpeg(path: Path) -> None:
+    """FFmpeg fills what is missing of a JPEG with grey and reports nothing.
+
+    In a scan 0xFF is followed by 0 or a restart marker only, so that an end marker is one.
+    """
+    with path.open("rb") as file:
+        if file.read(2) == b"\xff\xd8" and not (
+            _at_marker(file, JPEG_SCAN) and JPEG_END in file.read()
+        ):
+            raise DatasetError(f"{path}: truncated, the JPEG has no end marker")
+
+
+def _at_marker(file: BinaryIO, wanted: frozenset[int]) -> bool:
+    """Walk the marker segments from the start; stop behind the first wanted marker."""
     file.seek(2)
     while len(marker := file.read(2)) == 2 and marker[0] == 0xFF:
+        if marker[1] in wanted:
+            return True
         if marker[1] == 0xFF:
             file.seek(-1, 1)
-        elif marker[1] in JPEG_FRAME_MARKERS:
-            header = file.read(7)
-            return int.from_bytes(header[5:7]), int.from_bytes(header[3:5])
-        elif marker[1] not in JPEG_BARE_MARKERS:
-            length = int.from_bytes(file.read(2))
-            file.seek(max(length - 2, 0), 1)
-    return None
+        elif marker[1] not in JPEG_BARE:
+            file.seek(max(int.from_bytes(file.read(2)) - 2, 0), 1)
+    return False
 
 
 def _webp_size_px(start: bytes) -> tuple[int, int] | None:

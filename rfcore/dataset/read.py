@@ -1,4 +1,9 @@
-"""A dataset of any format, recognised by the files that are there."""
+"""A dataset of any format, recognised by the files that are there.
+
+``transforms.json`` (nerfstudio, instant-ngp), a COLMAP model, a KITTI odometry sequence, INRIA's
+``cameras.json``, or ``camera.toml`` for a recording of one's own. A folder with more than one of
+them is ambiguous: the file itself is to be named.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +11,19 @@ from pathlib import Path
 
 from rfcore.camera import TileOrigin
 from rfcore.dataset.assemble import Dataset, Distortion, ReadOptions, assemble
+from rfcore.dataset.colmap import colmap_model_folder, read_colmap_source
+from rfcore.dataset.inria import read_inria_source
+from rfcore.dataset.kitti import read_kitti_source
+from rfcore.dataset.recording import read_recording_source
 from rfcore.dataset.source import Source
 from rfcore.dataset.transforms import read_transforms_source, transforms_file
 from rfcore.errors import DatasetError
 
 __all__ = ["read_dataset", "read_source", "read_transforms"]
+
+EXPECTED = (
+    "transforms.json, sparse/0 of COLMAP, calib.txt of KITTI, cameras.json of INRIA, camera.toml"
+)
 
 
 def read_dataset(
@@ -30,12 +43,40 @@ def read_dataset(
 
 def read_source(path: Path) -> Source:
     """Read what is there, with its lenses and its own world."""
-    if not path.is_dir():
-        return read_transforms_source(path)
-    file = transforms_file(path)
-    if file is None:
-        raise DatasetError(f"{path}: no dataset is recognised there (no transforms.json)")
-    return read_transforms_source(file)
+    if path.is_dir():
+        return _read_folder(path)
+    if not path.exists():
+        raise DatasetError(f"{path}: cannot be read (it does not exist)")
+    if path.suffix == ".toml":
+        return read_recording_source(path)
+    if path.name == "calib.txt":
+        return read_kitti_source(path.parent)
+    if path.suffix in (".bin", ".txt"):
+        return read_colmap_source(path.parent)
+    return read_inria_source(path) if path.name == "cameras.json" else read_transforms_source(path)
+
+
+def _read_folder(folder: Path) -> Source:
+    """Read the one dataset a folder holds; several are a ``DatasetError`` that asks which."""
+    found = _candidates(folder)
+    if not found:
+        raise DatasetError(f"{folder}: no dataset is recognised there (none of {EXPECTED})")
+    if len(found) > 1:
+        names = ", ".join(str(file) for file in found)
+        raise DatasetError(f"{folder}: holds several datasets, name one of them: {names}")
+    return read_source(found[0])
+
+
+def _candidates(folder: Path) -> list[Path]:
+    named = [folder / name for name in ("camera.toml", "cameras.json", "calib.txt")]
+    found = [file for file in named if file.is_file()]
+    transforms = transforms_file(folder)
+    model = colmap_model_folder(folder)
+    if transforms is not None:
+        found.append(transforms)
+    if model is not None:
+        found.append(next(f for f in (model / "images.bin", model / "images.txt") if f.is_file()))
+    return found
 
 
 def read_transforms(path: Path, tile_origin: TileOrigin | None = None) -> Dataset:

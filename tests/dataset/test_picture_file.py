@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Intrinsics
-from rfcore.dataset.picture_file import check_size, find_picture, inside, picture_size_px
+from rfcore.dataset.picture_file import (
+    check_size,
+    find_picture,
+    inside,
+    picture_size_px,
+    read_picture,
+)
 from rfcore.errors import DatasetError
 
 RGB = np.random.default_rng(2).integers(0, 256, (31, 77, 3), dtype=np.uint8)
@@ -55,3 +61,16 @@ def test_a_name_without_suffix_finds_its_picture(tmp_path: Path) -> None:
 def test_no_name_leaves_the_folder(name: str, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="leaves the dataset's folder"):
         inside("x", tmp_path, name)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp"])
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.97])
+def test_a_truncated_picture_is_refused(name: str, share: float, tmp_path: Path) -> None:
+    path = tmp_path / name
+    assert cv2.imwrite(str(path), RGB)
+    camera = Intrinsics(77, 31, 50.0, 50.0, 38.0, 15.0)
+    assert read_picture(path, camera).shape == (31, 77, 3)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(DatasetError, match=rf"{path.name}: (truncated|not a readable)"):
+        read_picture(path, camera)

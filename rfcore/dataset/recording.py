@@ -1,0 +1,216 @@
+"""One's own recording: a video or a folder of pictures, a trajectory, and ``camera.toml``.
+
+::
+
+    [camera]
+    model = "OPENCV"                # as COLMAP names them; PINHOLE is the default
+    width_px = 1920
+    height_px = 1080
+    fx_px = 1050.0
+    fy_px = 1050.0                  # default: fx_px
+    cx_px = 960.0                   # default: the middle
+    cy_px = 540.0
+    k1 = -0.1                       # the lens: k1 k2 p1 p2 k3, or k1..k4 of OPENCV_FISHEYE
+
+    [pictures]
+    video = "drive.mp4"             # or folder = "frames", in the order of the names, with
+    rate_hz = 10.0                  #   rate_hz, or times = "times.txt", a time in seconds a line
+    every = 1                       # take each n-th picture
+
+    [trajectory]
+    file = "trajectory.txt"         # TUM, or CSV if named .csv
+    time_offset_s = 0.0             # time in the trajectory = time of the picture + offset
+    max_gap_s = 1.0                 # no interpolation between poses further apart
+    outside = "refuse"              # or "drop": leave out pictures the trajectory does not cover
+    body_from_cam = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]   # default: it is the camera's
+
+The camera has OpenCV axes. A video's time starts at 0 with its first frame, a folder's with the
+first picture (``rate_hz``) or where ``times`` says.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rfcore.camera import Intrinsics, Pose
+from rfcore.dataset.keys import (
+    matrix_rows,
+    number,
+    pose_of_rows,
+    read_file,
+    side_px,
+    text,
+    text_lines,
+)
+from rfcore.dataset.lens_keys import lens_of
+from rfcore.dataset.picture_file import SUFFIXES, check_size, inside, read_picture
+from rfcore.dataset.source import Source, SourceCamera, SourcePicture
+from rfcore.dataset.trajectory import NS_PER_S, Trajectory, read_trajectory, time_ns
+from rfcore.dataset.video import Video
+from rfcore.errors import DatasetError, InvalidInput
+from rfcore.image import Rgb
+
+__all__ = ["read_recording_source"]
+
+SECTIONS = {
+    "camera": "model width_px height_px fx_px fy_px cx_px cy_px k1 k2 k3 k4 p1 p2",
+    "pictures": "video folder rate_hz times every",
+    "trajectory": "file time_offset_s max_gap_s outside body_from_cam",
+}
+
+Table = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture before its pose is known; ``time_ns`` on the pictures' own clock."""
+
+    name: str
+    time_ns: int
+    read: Callable[[], Rgb]
+
+
+def read_recording_source(file: Path) -> Source:
+    """Read a ``camera.toml`` and what it names. Raises ``DatasetError`` naming the file and key."""
+    content = _load(file)
+    where = f"{file}: [camera]"
+    camera = _camera(where, content["camera"])
+    shots = _shots(file, content["pictures"], camera.intrinsics)
+    poses = _Poses.of(file, content["trajectory"])
+    pictures = tuple(
+        SourcePicture(
+            where=f"{file}: {shot.name}",
+            name=shot.name,
+            camera=camera,
+            world_from_cam=poses.at(f"{file}: {shot.name}", poses.time_ns(shot)),
+            read=shot.read,
+            time_ns=poses.time_ns(shot),
+        )
+        for shot in shots
+        if poses.wanted(shot)
+    )
+    return Source(file, pictures, sorted_out=len(shots) - len(pictures))
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """Where the camera is at a picture's time."""
+
+    trajectory: Trajectory
+    offset_ns: int
+    max_gap_ns: int
+    drop_outside: bool
+    body_from_cam: Pose
+
+    @staticmethod
+    def of(file: Path, keys: Table) -> _Poses:
+        where = f"{file}: [trajectory]"
+        outside = keys.get("outside", "refuse")
+        if outside not in ("refuse", "drop"):
+            raise DatasetError(f'{where}: key \'outside\' is {outside!r}, not "refuse" or "drop"')
+        body_from_cam = Pose.identity()
+        if "body_from_cam" in keys:
+            rows = matrix_rows(where, keys, "body_from_cam")
+            body_from_cam = pose_of_rows(where, "body_from_cam", rows)
+        offset_s = number(where, {"time_offset_s": 0.0, **keys}, "time_offset_s")
+        max_gap_s = number(where, {"max_gap_s": 1.0, **keys}, "max_gap_s", minimum=0.0)
+        return _Poses(
+            trajectory=read_trajectory(inside(where, file.parent, text(where, keys, "file"))),
+            offset_ns=round(offset_s * NS_PER_S),
+            max_gap_ns=round(max_gap_s * NS_PER_S),
+            drop_outside=outside == "drop",
+            body_from_cam=body_from_cam,
+        )
+
+    def time_ns(self, shot: Shot) -> int:
+        return shot.time_ns + self.offset_ns
+
+    def wanted(self, shot: Shot) -> bool:
+        return not self.drop_outside or self.trajectory.covers(self.time_ns(shot))
+
+    def at(self, where: str, time: int) -> Pose:
+        world_from_body = self.trajectory.pose_at(where, time, self.max_gap_ns)
+        return world_from_body.compose(self.body_from_cam)
+
+
+def _load(file: Path) -> dict[str, Table]:
+    try:
+        content = tomllib.loads(read_file(file).decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{file}: not TOML ({error})") from error
+    for section in content:
+        if section not in SECTIONS:
+            raise DatasetError(f"{file}: section [{section}] is none of {', '.join(SECTIONS)}")
+    for section, known in SECTIONS.items():
+        if not isinstance(content.get(section), dict):
+            raise DatasetError(f"{file}: section [{section}] is missing")
+        for key in content[section]:
+            if key not in known.split():
+                raise DatasetError(f"{file}: [{section}]: key '{key}' is none of {known}")
+    return content
+
+
+def _camera(where: str, keys: Table) -> SourceCamera:
+    width_px, height_px = side_px(where, keys, "width_px"), side_px(where, keys, "height_px")
+    fx_px = number(where, keys, "fx_px")
+    defaults = {"fy_px": fx_px, "cx_px": width_px / 2, "cy_px": height_px / 2}
+    given = {key: number(where, {**defaults, **keys}, key) for key in defaults}
+    try:
+        intrinsics = Intrinsics(width_px, height_px, fx_px, **given)
+    except InvalidInput as error:
+        raise DatasetError(f"{where}: {error}") from error
+    return SourceCamera(intrinsics, lens_of(where, keys.get("model", "PINHOLE"), keys))
+
+
+def _shots(file: Path, keys: Table, intrinsics: Intrinsics) -> Sequence[Shot]:
+    where = f"{file}: [pictures]"
+    if ("video" in keys) == ("folder" in keys):
+        raise DatasetError(f"{where}: name either a 'video' or a 'folder'")
+    every = number(where, {"every": 1, **keys}, "every", minimum=1)
+    if every != int(every):
+        raise DatasetError(f"{where}: key 'every' is {every}, not a whole number")
+    shots = _video_shots if "video" in keys else _folder_shots
+    return shots(where, file.parent, keys, intrinsics)[:: int(every)]
+
+
+def _video_shots(where: str, folder: Path, keys: Table, intrinsics: Intrinsics) -> list[Shot]:
+    video = Video(inside(where, folder, text(where, keys, "video")), intrinsics)
+    stem = video.file.stem
+    return [
+        Shot(f"{stem}_{i:06d}", time, partial(video.read, i))
+        for i, time in enumerate(video.times_ns)
+    ]
+
+
+def _folder_shots(where: str, folder: Path, keys: Table, intrinsics: Intrinsics) -> list[Shot]:
+    pictures = inside(where, folder, text(where, keys, "folder"))
+    paths = sorted(path for path in pictures.glob("*") if path.suffix in SUFFIXES)
+    if not paths:
+        raise DatasetError(f"{where}: folder {pictures} holds no pictures ({', '.join(SUFFIXES)})")
+    times_ns = _folder_times_ns(where, folder, keys, len(paths))
+    for path in paths:
+        check_size(path, intrinsics)
+    return [
+        Shot(path.name, time, partial(read_picture, path, intrinsics))
+        for path, time in zip(paths, times_ns, strict=True)
+    ]
+
+
+def _folder_times_ns(where: str, folder: Path, keys: Table, count: int) -> list[int]:
+    if ("rate_hz" in keys) == ("times" in keys):
+        raise DatasetError(f"{where}: a folder needs either 'rate_hz' or 'times'")
+    if "rate_hz" in keys:
+        rate_hz = number(where, keys, "rate_hz")
+        if rate_hz <= 0:
+            raise DatasetError(f"{where}: key 'rate_hz' is {rate_hz}, must be above 0")
+        return [round(i * NS_PER_S / rate_hz) for i in range(count)]
+    file = inside(where, folder, text(where, keys, "times"))
+    rows = [(i, line) for i, line in enumerate(text_lines(file), start=1) if line.strip()]
+    if len(rows) != count:
+        raise DatasetError(f"{file}: holds {len(rows)} times for {count} pictures")
+    return [time_ns(f"{file}: line {i}", line) for i, line in rows]

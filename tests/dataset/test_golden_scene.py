@@ -1,0 +1,106 @@
+"""One scene in every format: the known point lands on the known pixel, forth and back."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera, TileOrigin
+from rfcore.dataset import read_dataset
+from rfcore.errors import DatasetError
+
+FORMATS = ("transforms", "colmap_text", "colmap_binary", "kitti", "inria", "folder", "video")
+TIMED = ("transforms", "kitti", "folder", "video")
+
+
+@pytest.fixture(params=FORMATS)
+def format_name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def test_every_format_is_tested(golden: Any) -> None:
+    assert golden.FORMATS == FORMATS
+
+
+def test_the_point_lands_on_its_pixel(golden: Any, format_name: str, tmp_path: Path) -> None:
+    dataset = read_dataset(golden.write(format_name, tmp_path / "d"))
+    assert dataset.tile_origin == TileOrigin()
+    for picture, expected in zip(dataset.pictures, golden.pixels(), strict=True):
+        u_px, v_px, _ = picture.camera.project(golden.point)
+        assert (u_px, v_px) == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_pixel_and_its_depth_lead_back(golden: Any, format_name: str, tmp_path: Path) -> None:
+    for picture in read_dataset(golden.write(format_name, tmp_path / "d")).pictures:
+        u_px, v_px, depth_m = picture.camera.project(golden.point)
+        assert unprojected(picture.camera, u_px, v_px, depth_m) == pytest.approx(golden.point)
+
+
+def unprojected(camera: Camera, u: float, v: float, depth_m: float) -> tuple[float, float, float]:
+    k = camera.intrinsics
+    x, y = (u - k.cx_px) / k.fx_px * depth_m, (v - k.cy_px) / k.fy_px * depth_m
+    return camera.world_from_cam.apply((x, y, depth_m))
+
+
+def test_the_pixel_of_the_point_is_white(golden: Any, format_name: str, tmp_path: Path) -> None:
+    """The file of a picture belongs to its pose, and nothing is flipped or shifted."""
+    for picture in read_dataset(golden.write(format_name, tmp_path / "d")).pictures:
+        u_px, v_px, _ = picture.camera.project(golden.point)
+        rgb = picture.read()
+        assert (rgb[int(v_px), int(u_px)] > 250).all()
+        assert np.median(rgb) == pytest.approx(90, abs=1)
+
+
+def test_a_scene_at_utm_magnitudes_keeps_its_pixels(
+    golden_utm: Any,
+    format_name: str,
+    tmp_path: Path,
+) -> None:
+    """float64 resolves 1e-9 m there; cam_from_world of COLMAP multiplies that by its turn."""
+    dataset = read_dataset(golden_utm.write(format_name, tmp_path / "d"))
+    origin = dataset.tile_origin
+    assert dataclasses.astuple(origin) == pytest.approx((691_609.0, 5_334_760.0, 520.5), abs=0.6)
+    assert all(value == round(value) for value in dataclasses.astuple(origin))
+    near = np.subtract(golden_utm.point, (origin.east_m, origin.north_m, origin.up_m))
+    for picture, expected in zip(dataset.pictures, golden_utm.pixels(), strict=True):
+        u_px, v_px, _ = picture.camera.project(near.tolist())
+        assert (u_px, v_px) == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("timed", TIMED)
+def test_times_give_the_rate(golden: Any, timed: str, tmp_path: Path) -> None:
+    dataset = read_dataset(golden.write(timed, tmp_path / "d"))
+    times_ns = [picture.time_ns for picture in dataset.pictures]
+    assert times_ns == [100_000_000_000, 100_100_000_000, 100_200_000_000]
+    assert dataset.rate_hz == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("colmap", ["colmap_text", "colmap_binary"])
+def test_a_model_brings_its_points(golden: Any, colmap: str, tmp_path: Path) -> None:
+    points = read_dataset(golden.write(colmap, tmp_path / "d")).points
+    assert points is not None
+    np.testing.assert_array_equal(points.xyz_m, [golden.point])
+    np.testing.assert_array_equal(points.rgb, [[255, 128, 0]])
+
+
+def test_a_video_is_read_in_any_order(golden: Any, tmp_path: Path) -> None:
+    pictures = read_dataset(golden.write("video", tmp_path / "d")).pictures
+    ahead = [picture.read() for picture in pictures]
+    for i in (2, 0, 1, 1):
+        np.testing.assert_array_equal(pictures[i].read(), ahead[i])
+
+
+def test_a_folder_with_two_datasets_asks_which(golden: Any, tmp_path: Path) -> None:
+    folder = golden.write("colmap_text", tmp_path)
+    golden.write("inria", tmp_path)
+    with pytest.raises(DatasetError, match=r"several datasets.*cameras\.json.*images\.txt"):
+        read_dataset(folder)
+    assert len(read_dataset(folder / "cameras.json").pictures) == 3
+    assert len(read_dataset(folder / "sparse" / "0").pictures) == 3
+
+
+def test_a_folder_without_a_dataset_says_what_is_expected(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"transforms\.json, .*camera\.toml"):
+        read_dataset(tmp_path)
