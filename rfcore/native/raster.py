@@ -5,7 +5,7 @@ camera give the same bytes on every instruction set and for every number of thre
 
 What float32 cannot express is not drawn: Gaussians nearer than 0.01 m or beyond 1e9 m along the
 optical axis, or wider than 1e9 px in the picture. Colours are limited to 0..1e18. A quaternion
-shorter than 1e-12 is not normalised; zero means no rotation.
+shorter than 1e-12 counts as no rotation.
 """
 
 from __future__ import annotations

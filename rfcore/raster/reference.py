@@ -34,7 +34,7 @@ MAX_ALPHA = 0.99
 MIN_ALPHA = 1.0 / 255.0
 MIN_TRANSMITTANCE = 1e-4
 MIN_QUATERNION_NORM = 1e-12
-"""Shorter quaternions are not normalised; the zero quaternion comes out as no rotation."""
+"""A shorter quaternion counts as no rotation."""
 MIN_DET_RATIO = 1e-6
 """Of the antialiased mode. Under MIN_ALPHA^2, so nothing it clamps is ever drawn."""
 EXTENT_SIGMAS = 3.33
@@ -173,9 +173,12 @@ def _like(tensor: Tensor, values: object) -> Tensor:
 
 
 def _rotation_matrices(quaternions: Tensor) -> Tensor:
-    """Return [V, 3, 3] from quaternions [V, 4] w, x, y, z of any norm; zero gives the identity."""
+    """Return [V, 3, 3] from quaternions [V, 4] w, x, y, z; one too short gives the identity."""
     norm = torch.linalg.vector_norm(quaternions, dim=-1, keepdim=True)
-    w, x, y, z = (quaternions / norm.clamp(min=MIN_QUATERNION_NORM)).unbind(-1)
+    identity = _like(quaternions, (1.0, 0.0, 0.0, 0.0))
+    is_rotation = norm > MIN_QUATERNION_NORM
+    unit = quaternions / torch.where(is_rotation, norm, 1.0)
+    w, x, y, z = torch.where(is_rotation, unit, identity).unbind(-1)
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),

@@ -18,8 +18,8 @@ VIEW_DIGESTS = {
     True: "166cd618d89adb962c1438894c17769a",
 }
 TRAINED_DIGESTS = {
-    False: "5dfd61bf6a1faafe08d8029677cf6667",
-    True: "4d543c580dcd3310e1c91d314396597a",
+    False: "939f45cf1ccd0c9d97f3774915e25b66",
+    True: "0c3bf9129bb323d319e3c3666be49954",
 }
 FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 

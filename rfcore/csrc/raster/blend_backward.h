@@ -193,25 +193,33 @@ RF_INLINE void reduce_block(const TileChunk& chunk, int b, int replayed, const T
     }
 }
 
-// Move the moments of a chunk from the tile's origin to each splat's centre and write them out.
+// Turn the moments of a chunk, of pixels about the tile's origin, into those of each splat's own
+// coordinates (u, v) and write them out.
 RF_INLINE void flush_sums(const TileChunk& chunk, const float* sums, int count, float left,
                           float top, EntryGradient* out) {
     for (int first = 0; first < count; first += kLanes) {
-        alignas(64) float centre_x[16], centre_y[16];
+        alignas(64) float centre_x[16], centre_y[16], factor_a[16], factor_b[16], factor_c[16];
         for (int i = 0; i < kLanes; ++i) {
             centre_x[i] = chunk.entries[first + i].splat.centre_x - left;
             centre_y[i] = chunk.entries[first + i].splat.centre_y - top;
+            factor_a[i] = chunk.entries[first + i].splat.a;
+            factor_b[i] = chunk.entries[first + i].splat.b;
+            factor_c[i] = chunk.entries[first + i].splat.c;
         }
-        const Lanes x = load(centre_x), y = load(centre_y);
+        const Lanes a = load(factor_a), b = load(factor_b), c = load(factor_c);
+        const Lanes y = load(centre_y);
+        const Lanes u = negate(fma(a, load(centre_x), b * y)), v = negate(c * y);  // of the origin
         Lanes sum[16], rows[16];
         transpose(sums + 16 * first, sum);
+        const Lanes along_u = fma(a, sum[1], b * sum[2]), along_v = c * sum[2];
+        const Lanes mixed = fma(a, sum[4], b * sum[5]);
         Moments m;
         m.one = sum[0];
-        m.x = fnma(x, m.one, sum[1]);
-        m.y = fnma(y, m.one, sum[2]);
-        m.xx = fnma(x, sum[1] + m.x, sum[3]);
-        m.yy = fnma(y, sum[2] + m.y, sum[5]);
-        m.xy = fnma(x, m.y, fnma(y, sum[1], sum[4]));
+        m.x = fma(u, m.one, along_u);
+        m.y = fma(v, m.one, along_v);
+        m.xx = fma(a, fma(a, sum[3], b * sum[4]), fma(b, mixed, u * (along_u + m.x)));
+        m.yy = fma(c * c, sum[5], v * (along_v + m.y));
+        m.xy = fma(c, mixed, fma(u, along_v, v * m.x));
         planes_to_rows(m, sum[6], sum[7], sum[8], rows);
         const int last = count - first < kLanes ? count - first : kLanes;
         for (int i = 0; i < last; ++i) {

@@ -20,6 +20,8 @@ constexpr float kDilation = 0.3f;       // px^2
 constexpr float kMinDetRatio = 1e-6f;   // under (1/255)^2: what it clamps is not drawn
 constexpr float kFrustumMargin = 0.3f;  // of the half field of view
 constexpr float kMinQuaternionNorm = 1e-12f;
+constexpr float kLongQuaternion = 1e15f;
+constexpr float kQuaternionShrink = 0x1p-66f;
 constexpr float kLog2Of255 = 7.99435344f;
 constexpr float kHalfLog2ERoot = 0.849321800288f;  // sqrt(log2(e) / 2)
 constexpr float kTwoLn2 = 1.386294361f;
@@ -49,7 +51,7 @@ struct CovarianceRoot {
     Lanes scale[3];
     Lanes quaternion[4];   // normalised
     Lanes inverse_norm;
-    Mask norm_is_free;     // the norm was not clamped
+    Mask is_rotation;      // the quaternion was long enough to say which way
     Lanes root[9];
 };
 
@@ -67,16 +69,29 @@ RF_INLINE void rotation_from(const Lanes* q, Lanes* r) {
     r[8] = one - two * (x * x + y * y);
 }
 
+// Normalise the quaternion; one shorter than 1e-12 says nothing and counts as no rotation. The
+// square of a long one would overflow.
+RF_INLINE void normalise(const float* block, CovarianceRoot* c) {
+    Lanes q[4];
+    for (int k = 0; k < 4; ++k) q[k] = load(plane(block, kQuaternionPlane + k));
+    const Lanes longest = max(max(absolute(q[0]), absolute(q[1])),
+                              max(absolute(q[2]), absolute(q[3])));
+    const Lanes shrink =
+        select(gt(longest, splat(kLongQuaternion)), splat(kQuaternionShrink), splat(1.0f));
+    for (int k = 0; k < 4; ++k) q[k] = q[k] * shrink;
+    const Lanes norm = sqrt(fma(q[0], q[0], fma(q[1], q[1], fma(q[2], q[2], q[3] * q[3]))));
+    c->is_rotation = gt(norm, splat(kMinQuaternionNorm));
+    const Lanes inverse = splat(1.0f) / max(norm, splat(kMinQuaternionNorm));
+    c->inverse_norm = inverse * shrink;
+    for (int k = 0; k < 4; ++k) c->quaternion[k] = keep(c->is_rotation, q[k] * inverse);
+    c->quaternion[0] = select(c->is_rotation, c->quaternion[0], splat(1.0f));
+}
+
 RF_INLINE void covariance_root(const float* block, CovarianceRoot* c) {
     for (int k = 0; k < 3; ++k) {
         c->scale[k] = exp2_accurate(load(plane(block, kScalePlane + k)) * splat(kLog2E));
     }
-    Lanes q[4];
-    for (int k = 0; k < 4; ++k) q[k] = load(plane(block, kQuaternionPlane + k));
-    const Lanes norm = sqrt(fma(q[0], q[0], fma(q[1], q[1], fma(q[2], q[2], q[3] * q[3]))));
-    c->norm_is_free = gt(norm, splat(kMinQuaternionNorm));
-    c->inverse_norm = splat(1.0f) / max(norm, splat(kMinQuaternionNorm));
-    for (int k = 0; k < 4; ++k) c->quaternion[k] = q[k] * c->inverse_norm;
+    normalise(block, c);
     rotation_from(c->quaternion, c->rotation);
     for (int i = 0; i < 9; ++i) c->root[i] = c->rotation[i] * c->scale[i % 3];
 }

@@ -1,6 +1,6 @@
 // From gradients of splats to gradients of parameters, and the Adam step, 16 Gaussians at a time.
 //
-// Notation: X is the conic, M = J W R S as in project.h, and d_q stands for dL/dq. Only Gaussians
+// Notation: M = J W R S as in project.h, and d_q stands for dL/dq. Only Gaussians
 // that were visible move (sparse Adam); a gradient that is not a number or beyond 1e15 counts as 0.
 #pragma once
 
@@ -12,7 +12,7 @@ constexpr float kMaxGradient = 1e15f;  // its square stays finite
 
 // Sums over the entries of 16 Gaussians, and the quantities the backward pass starts from.
 struct SplatGradient {
-    Lanes s, sx, sy, sxx, sxy, syy, colour[3];
+    Lanes s, su, sv, suu, suv, svv, colour[3];
 };
 
 // Fetch what gather_entries will read soon: the entries of the block after next, whose positions
@@ -53,26 +53,13 @@ RF_INLINE uint32_t gather_entries(const ProjectBackwardJob& job, int block, Spla
     Lanes field[16];
     transpose(rows, field);
     g->s = field[0];
-    g->sx = field[1];
-    g->sy = field[2];
-    g->sxx = field[3];
-    g->sxy = field[4];
-    g->syy = field[5];
+    g->su = field[1];
+    g->sv = field[2];
+    g->suu = field[3];
+    g->suv = field[4];
+    g->svv = field[5];
     for (int c = 0; c < 3; ++c) g->colour[c] = field[6 + c];
     return visible;
-}
-
-// A symmetric 2x2 matrix.
-struct Symmetric {
-    Lanes xx, xy, yy;
-};
-
-// -X G X for symmetric X and G: how a gradient of a matrix becomes one of its inverse.
-RF_INLINE Symmetric minus_sandwich(const Symmetric& x, const Symmetric& g) {
-    const Lanes e0 = fma(x.xx, g.xx, x.xy * g.xy), e1 = fma(x.xx, g.xy, x.xy * g.yy);
-    const Lanes f0 = fma(x.xy, g.xx, x.yy * g.xy), f1 = fma(x.xy, g.xy, x.yy * g.yy);
-    return {negate(fma(e0, x.xx, e1 * x.xy)), negate(fma(e0, x.xy, e1 * x.yy)),
-            negate(fma(f0, x.xy, f1 * x.yy))};
 }
 
 RF_INLINE Vec3 combine(Lanes p, Vec3 a, Lanes q, Vec3 b) {
@@ -104,30 +91,71 @@ RF_INLINE Vec3 d_in_camera(const Camera& camera, const Projection& p, Lanes d_ce
     return d;
 }
 
-// Through R S: gradients of log scales and quaternion from that of the root, row-major.
-RF_INLINE void d_covariance_root(const CovarianceRoot& c, const Lanes* d_root, float* out) {
-    Lanes r[9];  // gradient of the rotation
-    for (int k = 0; k < 3; ++k) {
-        const Lanes d_scale = fma(d_root[k], c.rotation[k],
-                                  fma(d_root[3 + k], c.rotation[3 + k],
-                                      d_root[6 + k] * c.rotation[6 + k]));
-        store(plane(out, kScalePlane + k), c.scale[k] * d_scale);
-        for (int i = 0; i < 3; ++i) r[3 * i + k] = d_root[3 * i + k] * c.scale[k];
-    }
-    const Lanes two = splat(2.0f), minus_two = splat(-2.0f);
+// The columns of J W R in the splat's own coordinates, z_k = L u_k, where (u, v) = L d.
+struct Whitened {
+    Lanes a, b, c;  // L = (a b; 0 c)
+    Vec3 u, v;      // of the three columns
+    Vec3 scale;
+};
+
+// L u_k = (a (u0 + u1 b / a), c u1) cancels for a needle; with the minors of J W R nothing does.
+RF_INLINE Whitened whiten(const CovarianceRoot& r, const Projection& p) {
+    Whitened w;
+    const Lanes root = splat(kHalfLog2ERoot);
+    w.a = root * sqrt(p.c_yy / p.det);
+    w.b = negate(w.a * (p.c_xy / p.c_yy));
+    w.c = root / sqrt(p.c_yy);
+    w.scale = {r.scale[0], r.scale[1], r.scale[2]};
+    const Vec3 u0 = row_times(p.world_row0, r.rotation), u1 = row_times(p.world_row1, r.rotation);
+    const Vec3 spread = {r.scale[0] * r.scale[0] * u1.x, r.scale[1] * r.scale[1] * u1.y,
+                         r.scale[2] * r.scale[2] * u1.z};
+    const Vec3 across = cross(spread, cross(u0, u1));
+    const Lanes a_over_yy = w.a / p.c_yy, dilation = splat(kDilation);
+    w.u = {a_over_yy * fma(dilation, u0.x, across.x), a_over_yy * fma(dilation, u0.y, across.y),
+           a_over_yy * fma(dilation, u0.z, across.z)};
+    w.v = {w.c * u1.x, w.c * u1.y, w.c * u1.z};
+    return w;
+}
+
+// Gradients of M, of the logarithms of the scales, and of a rotation about the splat's own axes.
+struct RootGradient {
+    Vec3 m0, m1, log_scale, turn;
+};
+
+RF_INLINE Vec3 times(Vec3 p, Vec3 q) { return {p.x * q.x, p.y * q.y, p.z * q.z}; }
+RF_INLINE Vec3 plus(Vec3 p, Vec3 q) { return {p.x + q.x, p.y + q.y, p.z + q.z}; }
+RF_INLINE Vec3 scaled(Lanes f, Vec3 p) { return {f * p.x, f * p.y, f * p.z}; }
+RF_INLINE Vec3 rotated(Vec3 p) { return {p.y, p.z, p.x}; }
+
+// From P, the second moments in (u, v), with tau = 2 ln 2: dL/dM = tau^2 L^T P z S,
+// dL/d(ln s_k) = tau^2 s_k^2 z_k P z_k and dL/d(turn about axis k) = tau^2 (s_i^2 - s_j^2) z_i P z_j,
+// i and j the axes after k.
+RF_INLINE RootGradient d_root_of(const Whitened& w, const SplatGradient& g) {
+    const Lanes tau2 = splat(kTwoLn2 * kTwoLn2);
+    const Vec3 pu = scaled(tau2, combine(g.suu, w.u, g.suv, w.v));
+    const Vec3 pv = scaled(tau2, combine(g.suv, w.u, g.svv, w.v));
+    RootGradient d;
+    d.m0 = times(w.scale, scaled(w.a, pu));
+    d.m1 = times(w.scale, combine(w.b, pu, w.c, pv));
+    d.log_scale = times(times(w.scale, w.scale), plus(times(w.u, pu), times(w.v, pv)));
+    const Vec3 s1 = rotated(w.scale), s2 = rotated(s1);
+    const Vec3 difference = {(s1.x - s2.x) * (s1.x + s2.x), (s1.y - s2.y) * (s1.y + s2.y),
+                             (s1.z - s2.z) * (s1.z + s2.z)};
+    const Vec3 u1 = rotated(w.u), v1 = rotated(w.v);
+    d.turn = times(difference, plus(times(u1, rotated(rotated(pu))), times(v1, rotated(rotated(pv)))));
+    return d;
+}
+
+// Quaternion q moves along q (0, turn) / 2; one that is no rotation does not move.
+RF_INLINE void store_d_quaternion(const CovarianceRoot& c, Vec3 turn, float* out) {
     const Lanes *q = c.quaternion, w = q[0], x = q[1], y = q[2], z = q[3];
-    const Lanes sum01 = r[1] + r[3], sum02 = r[2] + r[6], sum12 = r[5] + r[7];
-    const Lanes dif21 = r[7] - r[5], dif02 = r[2] - r[6], dif10 = r[3] - r[1];
-    Lanes d[4];
-    d[0] = two * fma(x, dif21, fma(y, dif02, z * dif10));
-    d[1] = two * fma(minus_two * x, r[4] + r[8], fma(y, sum01, fma(z, sum02, w * dif21)));
-    d[2] = two * fma(x, sum01, fma(minus_two * y, r[0] + r[8], fma(z, sum12, w * dif02)));
-    d[3] = two * fma(x, sum02, fma(y, sum12, fma(minus_two * z, r[0] + r[4], w * dif10)));
-    // Normalisation takes away the part along q, unless the norm was clamped.
-    const Lanes along = fma(w, d[0], fma(x, d[1], fma(y, d[2], z * d[3])));
-    const Lanes removed = keep(c.norm_is_free, along);
+    const Lanes d[4] = {negate(fma(x, turn.x, fma(y, turn.y, z * turn.z))),
+                        fma(w, turn.x, fnma(z, turn.y, y * turn.z)),
+                        fma(z, turn.x, fma(w, turn.y, negate(x * turn.z))),
+                        fma(x, turn.y, fnma(y, turn.x, w * turn.z))};
+    const Lanes factor = splat(2.0f) * c.inverse_norm;
     for (int k = 0; k < 4; ++k) {
-        store(plane(out, kQuaternionPlane + k), c.inverse_norm * fnma(q[k], removed, d[k]));
+        store(plane(out, kQuaternionPlane + k), keep(c.is_rotation, factor * d[k]));
     }
 }
 
@@ -183,16 +211,22 @@ RF_INLINE Vec3 d_colour(const float* block, Vec3 offset, const Lanes* d_rgb, flo
             inverse_distance * fnma(v.z, radial, u.z)};
 }
 
-// Gradient of s ln sqrt(det0 / det) by the rows of M, added to d_m0 and d_m1: det0 = |minors|^2
-// moves along m1 x minors, and 1 / det0 - 1 / det = 0.3 trace / (det0 det) has nothing to cancel.
-RF_INLINE void add_d_compensation(const Projection& p, Lanes s, Vec3* d_m0, Vec3* d_m1) {
+// Gradient of s ln sqrt(det0 / det) by the rows of M, added to `d`: det0 = |minors|^2 moves along
+// m1 x minors, and 1 / det0 - 1 / det = 0.3 trace / (det0 det) has nothing to cancel.
+RF_INLINE void add_d_compensation(const CovarianceRoot& c, const Projection& p, Lanes s,
+                                  RootGradient* d) {
     const Lanes inverse = splat(kDilation) / p.det;
     const Lanes trace = p.c_xx + p.c_yy - splat(kDilation);
     const Lanes along = s * (inverse * trace / p.sharp_det), back = negate(s * inverse);
     const Vec3 by_m0 = combine(along, cross(p.m1, p.minors), back, p.m0);
     const Vec3 by_m1 = combine(along, cross(p.minors, p.m0), back, p.m1);
-    *d_m0 = {d_m0->x + by_m0.x, d_m0->y + by_m0.y, d_m0->z + by_m0.z};
-    *d_m1 = {d_m1->x + by_m1.x, d_m1->y + by_m1.y, d_m1->z + by_m1.z};
+    d->m0 = plus(d->m0, by_m0);
+    d->m1 = plus(d->m1, by_m1);
+    d->log_scale = plus(d->log_scale, plus(times(p.m0, by_m0), times(p.m1, by_m1)));
+    const Vec3 u0 = row_times(p.world_row0, c.rotation), u1 = row_times(p.world_row1, c.rotation);
+    const Vec3 scale = {c.scale[0], c.scale[1], c.scale[2]};
+    const Vec3 r0 = times(scale, by_m0), r1 = times(scale, by_m1);
+    d->turn = plus(d->turn, plus(cross(r0, u0), cross(r1, u1)));
 }
 
 // Gradients of the parameters of one block into `out`, [planes][16].
@@ -205,35 +239,24 @@ RF_INLINE void block_gradient(const Camera& camera, const float* block, const Sp
     Projection p;
     p.in_camera = to_camera(camera, offset);
     project_covariance(camera, c.root, &p);
-    const Lanes inverse_det = splat(1.0f) / p.det;
-    const Symmetric conic = {p.c_yy * inverse_det, negate(p.c_xy * inverse_det),
-                             p.c_xx * inverse_det};
-    const Lanes minus_half = splat(-0.5f), two = splat(2.0f);
-    const Symmetric d_conic = {minus_half * g.sxx, minus_half * g.sxy, minus_half * g.syy};
-    const Symmetric h = minus_sandwich(conic, d_conic);
-    const Lanes d_centre_x = fma(conic.xx, g.sx, conic.xy * g.sy);
-    const Lanes d_centre_y = fma(conic.xy, g.sx, conic.yy * g.sy);
-    Vec3 d_m0 = combine(two * h.xx, p.m0, two * h.xy, p.m1);
-    Vec3 d_m1 = combine(two * h.xy, p.m0, two * h.yy, p.m1);
-    if (kAntialiased) add_d_compensation(p, g.s, &d_m0, &d_m1);
-    const Vec3 d_row0 = matrix_times(c.root, d_m0), d_row1 = matrix_times(c.root, d_m1);
+    const Whitened w = whiten(c, p);
+    const Lanes tau = splat(kTwoLn2);
+    const Lanes d_centre_x = tau * (w.a * g.su), d_centre_y = tau * fma(w.b, g.su, w.c * g.sv);
+    RootGradient d = d_root_of(w, g);
+    if (kAntialiased) add_d_compensation(c, p, g.s, &d);
+    const Vec3 d_row0 = matrix_times(c.root, d.m0), d_row1 = matrix_times(c.root, d.m1);
     const Vec3 d_cam = d_in_camera(camera, p, d_centre_x, d_centre_y, d_row0, d_row1);
-    const Vec3 &a = p.world_row0, &b = p.world_row1;
-    const Vec3 rows[3] = {combine(a.x, d_m0, b.x, d_m1), combine(a.y, d_m0, b.y, d_m1),
-                          combine(a.z, d_m0, b.z, d_m1)};
-    Lanes d_root[9];
-    for (int i = 0; i < 3; ++i) {
-        d_root[3 * i] = rows[i].x;
-        d_root[3 * i + 1] = rows[i].y;
-        d_root[3 * i + 2] = rows[i].z;
-    }
-    d_covariance_root(c, d_root, out);
-    store(plane(out, kLogitPlane), g.s * (splat(1.0f) - sigmoid(load(plane(block, kLogitPlane)))));
+    store(plane(out, kScalePlane), d.log_scale.x);
+    store(plane(out, kScalePlane + 1), d.log_scale.y);
+    store(plane(out, kScalePlane + 2), d.log_scale.z);
+    store_d_quaternion(c, d.turn, out);
+    const Lanes logit = load(plane(block, kLogitPlane));
+    store(plane(out, kLogitPlane), g.s * sigmoid(negate(logit)));  // 1 - sigmoid would cancel
     const Vec3 d_mean = d_colour<kDegree>(block, offset, g.colour, out);
-    const float* w = camera.rotation;
+    const float* r = camera.rotation;
     const Lanes by_view[3] = {d_mean.x, d_mean.y, d_mean.z};
     for (int j = 0; j < 3; ++j) {
-        const float column[3] = {w[j], w[3 + j], w[6 + j]};
+        const float column[3] = {r[j], r[3 + j], r[6 + j]};
         store(plane(out, kMeanPlane + j), dot(column, d_cam) + by_view[j]);
     }
 }

@@ -106,9 +106,10 @@ struct BlendJob {
 };
 
 // Gradients of one (tile, splat) entry, or their sum over the entries of a splat. s is dL/d(ln
-// alpha) of a pixel, (dx, dy) the pixel minus the centre of the splat.
+// alpha) of a pixel, (u, v) its place in the splat as in Splat: never beyond 4 where it counts,
+// while pixels along a needle are hundreds from its centre and their squares would cancel.
 struct alignas(64) EntryGradient {
-    float s, sx, sy, sxx, sxy, syy;  // sums of s, s dx, s dy, s dx^2, s dx dy, s dy^2
+    float s, su, sv, suu, suv, svv;  // sums of s, s u, s v, s u^2, s u v, s v^2
     float red, green, blue;          // sums of dL/dcolour times the weight of the splat
     float unused[7];
 };
