@@ -97,7 +97,7 @@ def bd_rate_interval(
     rng: np.random.Generator,
     *,
     first: int = 1,
-    repetitions: int = 1000,
+    repetitions: int = 400,
 ) -> tuple[float, float]:
     """Return the 95 % interval of the BD-rate from resampled frames (percentile bootstrap).
 

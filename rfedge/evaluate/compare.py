@@ -1,0 +1,163 @@
+"""One method against rivals on one clip: BD-rates, savings and processor time, as result rows.
+
+Two questions are answered. Against x264 of the same preset: what does the field buy? Against the
+best of all rivals whose sender takes no more processor time than the method's: is it worth having?
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rfcore.errors import InvalidInput
+from rfcore.image import I420
+from rfedge.evaluate.cells import CellStore
+from rfedge.evaluate.clip import ClipCoder, CodedClip
+from rfedge.evaluate.rate_curve import (
+    RateCurve,
+    Window,
+    bd_rate_interval,
+    bd_rate_percent,
+    rate_curve,
+)
+
+__all__ = ["BEST", "WINDOWS_DB", "Contest", "Performance", "compare_rows", "perform"]
+
+WINDOWS_DB: tuple[Window, ...] = ((32.0, 35.0), (30.0, 35.0))
+"""The headline window first."""
+SAVING_AT_DB = (31.0, 33.0, 35.0)
+BEST = "best-comparable"
+STEADY = slice(1, None)
+"""Every frame but the first, which a stream sends once and a clip of 24 frames counts too much."""
+BOOTSTRAP_SEED = 2026
+
+
+@dataclass(frozen=True)
+class Contest:
+    """A clip with its rate, its name, the digest of its frames, and the field's own quality."""
+
+    scene: str
+    rate_hz: float
+    frames: Sequence[I420]
+    frames_digest: str
+    field_psnr_db: float | None
+
+
+@dataclass(frozen=True)
+class Performance:
+    """A method's clips at all its operating points."""
+
+    name: str
+    clips: tuple[CodedClip, ...]
+
+    @property
+    def steady(self) -> RateCurve:
+        """The curve without the first frame."""
+        return rate_curve(self.clips, STEADY)
+
+    @property
+    def cpu_ms_per_frame(self) -> float:
+        """Processor time a frame, the mean over the operating points."""
+        return float(np.mean([clip.cpu_ms / len(clip.frame_bytes) for clip in self.clips]))
+
+
+def perform(contest: Contest, coder: ClipCoder, revision: str, store: CellStore) -> Performance:
+    """Code the contest's clip at every point of ``coder``, taking from ``store`` what is there."""
+    clips = []
+    for point in coder.points:
+        key: dict[str, str | float | int | None] = {
+            "scene": contest.scene,
+            "hz": contest.rate_hz,
+            "frames": contest.frames_digest,
+            "method": coder.name,
+            "point": point,
+            "revision": revision,
+        }
+
+        def make(point: float = point) -> CodedClip:
+            return coder.code(contest.frames, contest.rate_hz, point)
+
+        clips.append(store.clip(key, make))
+    return Performance(coder.name, tuple(clips))
+
+
+def compare_rows(
+    contest: Contest, method: Performance, families: Mapping[str, Sequence[Performance]]
+) -> list[dict[str, Any]]:
+    """Return a row per window and family of rivals, and one against the best comparable rival.
+
+    A family is one codec at several settings; the strongest that takes no more processor time than
+    the method stands for it, or its quickest if none is that quick. Raises ``InvalidInput`` when a
+    curve does not span a window.
+    """
+    rows = []
+    for window in WINDOWS_DB:
+        chosen = {name: _champion(method, rivals, window) for name, rivals in families.items()}
+        able = [rival for rival in chosen.values() if _comparable(method, rival)]
+        if able:
+            chosen[BEST] = min(able, key=lambda rival: rival.steady.mean_log_bytes(window))
+        rows += [_row(contest, method, name, rival, window) for name, rival in chosen.items()]
+    return rows
+
+
+def _champion(method: Performance, rivals: Sequence[Performance], window: Window) -> Performance:
+    if not rivals:
+        raise InvalidInput("rivals", "a family needs at least one setting")
+    able = [rival for rival in rivals if _comparable(method, rival)]
+    if not able:
+        return min(rivals, key=lambda rival: rival.cpu_ms_per_frame)
+    return min(able, key=lambda rival: rival.steady.mean_log_bytes(window))
+
+
+def _comparable(method: Performance, rival: Performance) -> bool:
+    return rival.cpu_ms_per_frame <= method.cpu_ms_per_frame
+
+
+def _row(
+    contest: Contest, method: Performance, family: str, rival: Performance, window: Window
+) -> dict[str, Any]:
+    ours, theirs = method.steady, rival.steady
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    return {
+        "scene": contest.scene,
+        "hz": contest.rate_hz,
+        "method": method.name,
+        "rival": family,
+        "rival_setting": rival.name,
+        "window_db": list(window),
+        "bd_rate_percent": bd_rate_percent(theirs, ours, window),
+        "ci95": list(bd_rate_interval(rival.clips, method.clips, window, rng)),
+        "points": len(method.clips),
+        "saving_percent_at_db": {
+            f"{db:g}": 100 * (1 - ours.bytes_at(db) / theirs.bytes_at(db)) for db in SAVING_AT_DB
+        },
+        "first_frame_bytes": _first_frame_bytes(method, window),
+        "rival_first_frame_bytes": _first_frame_bytes(rival, window),
+        "ssim": _middle(method, window).ssim.mean(),
+        "psnr_deviation_db": _deviation_db(_middle(method, window)),
+        "rival_psnr_deviation_db": _deviation_db(_middle(rival, window)),
+        "cpu_ms": method.cpu_ms_per_frame,
+        "rival_cpu_ms": rival.cpu_ms_per_frame,
+        "field_psnr_db": contest.field_psnr_db,
+    }
+
+
+def _middle(performance: Performance, window: Window) -> CodedClip:
+    """Return the clip whose quality is nearest the middle of the window."""
+    middle_db = sum(window) / 2
+    return min(performance.clips, key=lambda clip: abs(_psnr_db(clip.luma_mse.mean()) - middle_db))
+
+
+def _first_frame_bytes(performance: Performance, window: Window) -> int:
+    return int(_middle(performance, window).frame_bytes[0])
+
+
+def _deviation_db(clip: CodedClip) -> float:
+    return float(np.std([_psnr_db(mse) for mse in clip.luma_mse]))
+
+
+def _psnr_db(mse: float) -> float:
+    return float(10 * np.log10(255.0**2 / mse))

@@ -1,0 +1,90 @@
+"""A comparison of coders whose curves are known by algebra."""
+
+import numpy as np
+import pytest
+
+from rfedge.evaluate.cells import CellStore
+from rfedge.evaluate.clip import CodedClip
+from rfedge.evaluate.compare import BEST, Contest, Performance, compare_rows, perform
+
+CONTEST = Contest("street", 10.0, (), "digest", 27.5)
+
+
+def performance(name, rate_factor, cpu_ms, frames=10):
+    """Seven points, 28..40 dB, each of ``rate_factor`` times a common exponential rate."""
+    clips = []
+    for point in range(7):
+        db = 40 - 2 * point
+        rate = round(1000 * rate_factor * np.exp(0.25 * (db - 28)))
+        mse = np.full(frames, 255.0**2 / 10 ** (db / 10))
+        sizes = np.full(frames, rate)
+        sizes[0] *= 5
+        clips.append(CodedClip(point, sizes, mse, np.full(frames, 0.9), cpu_ms * frames))
+    return Performance(name, tuple(clips))
+
+
+OURS = performance("ours", 0.5, cpu_ms=50)
+FAMILIES = {
+    "x264-lowdelay": [performance("x264", 1.0, cpu_ms=10)],
+    "svtav1-lowdelay": [
+        performance("p10", 0.9, cpu_ms=20),
+        performance("p8", 0.8, cpu_ms=49),
+        performance("p4", 0.4, cpu_ms=51),
+    ],
+    "x265-lowdelay": [performance("slow", 0.3, 99), performance("fast", 0.7, 60)],
+}
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return {
+        row["rival"]: row
+        for row in compare_rows(CONTEST, OURS, FAMILIES)
+        if row["window_db"] == [32.0, 35.0]
+    }
+
+
+def test_the_figure_is_the_ratio_of_rates(rows):
+    assert rows["x264-lowdelay"]["bd_rate_percent"] == pytest.approx(-50, abs=0.1)
+
+
+def test_a_family_is_represented_by_its_strongest_of_no_more_processor_time(rows):
+    assert rows["svtav1-lowdelay"]["rival_setting"] == "p8"
+
+
+def test_a_family_that_is_always_slower_is_represented_by_its_quickest(rows):
+    assert rows["x265-lowdelay"]["rival_setting"] == "fast"
+
+
+def test_the_best_comparable_rival_never_took_more_processor_time(rows):
+    best = rows[BEST]
+    assert best["rival_setting"] == "p8"
+    assert best["bd_rate_percent"] == pytest.approx(100 * (0.5 / 0.8 - 1), abs=0.1)
+    assert best["rival_cpu_ms"] <= best["cpu_ms"]
+
+
+def test_the_first_frame_is_told_apart_from_the_steady_state(rows):
+    row = rows["x264-lowdelay"]
+    assert row["rival_first_frame_bytes"] == 2 * row["first_frame_bytes"]
+    assert row["saving_percent_at_db"]["33"] == pytest.approx(50, abs=0.1)
+
+
+class Counting:
+    """A coder that counts how often it is asked."""
+
+    name = "counting"
+    points = (1.0, 2.0)
+
+    def __init__(self):
+        self.calls = 0
+
+    def code(self, _frames, _rate_hz, point):
+        self.calls += 1
+        return CodedClip(point, np.array([9]), np.array([point]), np.ones(1), 1.0)
+
+
+def test_what_was_coded_once_is_not_coded_again(tmp_path):
+    coder, store = Counting(), CellStore(tmp_path)
+    for revision in ("a", "a", "b"):
+        perform(CONTEST, coder, revision, store)
+    assert coder.calls == 4
