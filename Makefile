@@ -9,7 +9,7 @@ TORCH_INDEX ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-prometheus test-system-packages check build bench proto figures
+.PHONY: help demo sample-field test test-slow test-prometheus test-system-packages check build bench proto figures
 
 help:  ## show the targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -45,6 +45,9 @@ check: build  ## lint, types, layers, generated files
 	$(BIN)/lint-imports
 	@if npx --yes @bufbuild/buf --version >/dev/null 2>&1; then npx --yes @bufbuild/buf lint proto; \
 		else echo "buf lint was not run: it needs node and its registry"; fi
+
+sample-field: build  ## train the field that ships in samples/fields (some minutes)
+	$(BIN)/python -m rfedge.demo.sample_field samples/street
 
 bench: build  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench raster

@@ -10,7 +10,7 @@ __all__ = ["Demo"]
 
 @dataclass(frozen=True)
 class Demo:
-    """Train the sample's field, run server, link and vehicle on two drives, and report."""
+    """Take or train a field, run server, link and vehicle on two drives, and report."""
 
     sample: Path = Path("samples/street")
     """Dataset folder: training views, points, and the drives `empty` and `vehicles`."""
@@ -19,7 +19,8 @@ class Demo:
     cache: Path = Path("out/cache")
     """Folder that keeps the trained field between runs."""
     train: bool = False
-    """Train the field anew even if a trained one is cached."""
+    """Train the field anew; without this, and without settings of your own, the field that ships
+    with the sample is used."""
     gaussians: int | None = None
     """At most how many Gaussians to train; default: the trainer's own."""
     iterations: int | None = None

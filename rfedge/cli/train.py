@@ -39,6 +39,8 @@ class Train:
         from rfcore.dataset import read_transforms
         from rfcore.errors import InvalidInput
         from rfcore.field import save_field
+        from rfcore.train.rungs import RungConfig
+        from rfedge.finishing import finish_field
         from rfedge.training import TrainingJob, train_field, training_config
 
         if self.out.suffix != ".rff":
@@ -51,7 +53,10 @@ class Train:
             config=training_config(self.gaussians, self.iterations, self.threads),
             seed=self.seed,
         )
+        held_out = job.held_out.pictures if job.held_out else ()
+        rungs = RungConfig(threads=self.threads)
         field = train_field(job, console)
+        field = finish_field(field, job.dataset.pictures, held_out, rungs, console)
         self.out.parent.mkdir(parents=True, exist_ok=True)
         field_id = save_field(field, self.out)
         console.print(f"{self.out}: field {field_id}, {len(field.gaussians):,} Gaussians")

@@ -20,7 +20,7 @@ from rfcore.files import write_whole
 from rfcore.image import Rgb, read_rgb
 from rfcore.native.yuv import rgb_from_i420
 from rfcore.train import SplatTrainingConfig
-from rfedge.demo.field import cached_or_trained
+from rfedge.demo.field import FieldChoice, choose_field
 from rfedge.demo.measure import DriveOutcome, FrameAddress, Pictures, measure_drive
 from rfedge.demo.processes import command_of, run_to_end, service
 from rfedge.demo.video import write_video
@@ -84,9 +84,8 @@ def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
     console.print(f"[bold]Sample[/] {settings.sample}: verifying")
     verify_manifest(settings.sample)
     _refuse_foreign_folder(settings.out)
-    field_path = cached_or_trained(
-        settings.sample, settings.cache, settings.training, settings.train_anew, console
-    )
+    choice = FieldChoice(settings.sample, settings.cache, settings.training, settings.train_anew)
+    field_path = choose_field(choice, console)
     _empty_folder(settings.out)
     field = load_field(field_path, threads=settings.threads)
     wrong_street = _wrong_street(settings.sample, field)

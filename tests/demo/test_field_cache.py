@@ -1,23 +1,46 @@
-"""The demo's field is trained once, found again, and never used when it is damaged."""
+"""The demo starts from the field that ships, or trains one once; never from a damaged one."""
 
+import json
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from rfcore.errors import FieldFormatError
+from rfcore.dataset import write_manifest
+from rfcore.errors import DatasetError, FieldFormatError, InvalidData
+from rfcore.field import SplatField, load_field
+from rfcore.raster.gaussians import Gaussians
 from rfcore.train import SplatTrainingConfig
-from rfedge.demo.field import cache_path, cached_or_trained
+from rfedge.demo import sample_field
+from rfedge.demo.field import FieldChoice, cache_path, choose_field
+from rfedge.demo.sample_field import sample_field_path, write_sample_field
 
 CONFIG = SplatTrainingConfig(gaussians=100, iterations=3)
 SILENT = Console(quiet=True)
 
 
+def chosen(
+    sample: Path, cache: Path, config: SplatTrainingConfig = CONFIG, anew: bool = False
+) -> Path:
+    return choose_field(FieldChoice(sample, cache, config, anew), SILENT)
+
+
 def test_a_trained_field_is_found_again(tiny_sample: Path, tmp_path: Path) -> None:
-    path = cached_or_trained(tiny_sample, tmp_path / "c", CONFIG, anew=False, console=SILENT)
+    path = chosen(tiny_sample, tmp_path / "c")
     written_ns = path.stat().st_mtime_ns
-    again = cached_or_trained(tiny_sample, tmp_path / "c", CONFIG, anew=False, console=SILENT)
+    again = chosen(tiny_sample, tmp_path / "c")
     assert (again, again.stat().st_mtime_ns) == (path, written_ns)
+
+
+def test_a_trained_field_is_small_has_rungs_and_says_how_good_it_is(
+    tiny_sample: Path, tmp_path: Path
+) -> None:
+    field = load_field(chosen(tiny_sample, tmp_path / "c"))
+    assert isinstance(field, SplatField)
+    assert "encoding" in field.archive().metadata
+    assert set(field.rungs) == {0.5, 0.25, 0.1}
+    assert field.metadata.held_out_psnr_db is not None
+    assert field.metadata.held_out_ssim is not None
 
 
 def test_other_settings_or_another_sample_are_another_field(
@@ -34,10 +57,76 @@ def test_other_settings_or_another_sample_are_another_field(
 
 
 def test_a_damaged_field_says_how_to_make_it_anew(tiny_sample: Path, tmp_path: Path) -> None:
-    path = cached_or_trained(tiny_sample, tmp_path, CONFIG, anew=False, console=SILENT)
+    path = chosen(tiny_sample, tmp_path)
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
     path.write_bytes(data)
     with pytest.raises(FieldFormatError, match=r"field\.rff.*--train"):
-        cached_or_trained(tiny_sample, tmp_path, CONFIG, anew=False, console=SILENT)
-    assert cached_or_trained(tiny_sample, tmp_path, CONFIG, anew=True, console=SILENT) == path
+        chosen(tiny_sample, tmp_path)
+    assert chosen(tiny_sample, tmp_path, anew=True) == path
+
+
+@pytest.fixture
+def shipped(tiny_sample: Path, tiny_gaussians: Gaussians) -> Path:
+    """The field of the tiny sample, put where a shipped one lies."""
+    write_sample_field(tiny_sample, SplatField(tiny_gaussians).compressed(), 0)
+    return sample_field_path(tiny_sample)
+
+
+def test_the_shipped_field_is_used_at_once_unless_the_user_asks_for_another(
+    shipped: Path, tiny_sample: Path, tmp_path: Path
+) -> None:
+    assert chosen(tiny_sample, tmp_path / "c", SplatTrainingConfig(threads=2)) == shipped
+    assert not (tmp_path / "c").exists()
+    assert chosen(tiny_sample, tmp_path / "c", CONFIG) == cache_path(
+        tiny_sample, tmp_path / "c", CONFIG
+    )
+
+
+def test_the_record_says_what_made_the_field_from_what(shipped: Path) -> None:
+    record = json.loads(shipped.with_suffix(".json").read_text())
+    assert record["field"] == f"splats {load_field(shipped).field_id}"
+    assert record["bytes"] == shipped.stat().st_size
+    assert {"command", "revision", "host", "held_out", "primitives", "seconds"} < set(record)
+
+
+@pytest.mark.parametrize("victim", ["tiny.rff", "tiny.json"])
+def test_a_damaged_shipped_field_is_named_with_the_way_out(
+    shipped: Path, tiny_sample: Path, tmp_path: Path, victim: str
+) -> None:
+    path = shipped.parent / victim
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    with pytest.raises(DatasetError, match=f"{victim}.*--train"):
+        chosen(tiny_sample, tmp_path, SplatTrainingConfig())
+
+
+def test_a_shipped_field_of_another_sample_is_refused(
+    shipped: Path, tiny_sample: Path, tmp_path: Path
+) -> None:
+    (tiny_sample / "more.txt").write_text("new")
+    write_manifest(tiny_sample)
+    with pytest.raises(DatasetError, match=r"made from another .* make sample-field"):
+        chosen(tiny_sample, tmp_path, SplatTrainingConfig())
+    shipped.with_suffix(".json").write_text("{}")
+    write_manifest(shipped.parent)
+    with pytest.raises(DatasetError, match="no readable record"):
+        chosen(tiny_sample, tmp_path, SplatTrainingConfig())
+
+
+def test_a_field_too_large_to_ship_is_not_left_there(
+    tiny_sample: Path, tiny_gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sample_field, "MAX_BYTES", 1000)
+    with pytest.raises(InvalidData, match="over the 1000"):
+        write_sample_field(tiny_sample, SplatField(tiny_gaussians), 0)
+    assert not sample_field_path(tiny_sample).exists()
+
+
+def test_making_the_sample_field_writes_what_the_demo_takes(
+    tiny_sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sample_field, "SplatTrainingConfig", lambda threads: CONFIG)  # noqa: ARG005
+    monkeypatch.setattr("sys.argv", ["sample-field", str(tiny_sample)])
+    assert sample_field.main() == 0
+    path = chosen(tiny_sample, tmp_path / "c", SplatTrainingConfig())
+    assert path == sample_field_path(tiny_sample)
