@@ -8,9 +8,10 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
-from rfcore.link import Link, LinkProfile
+from rfcore.link import DirectionPlan, Link
 from rfcore.link.meter import BusyMeter
 
 __all__ = ["Direction", "Sender"]
@@ -34,50 +35,84 @@ class Sender(Protocol):
         """Push nothing any more."""
 
 
+@dataclass(frozen=True)
+class Packet:
+    """What is in the link: what to do at the end, and since when."""
+
+    release: Callable[[], None]
+    pushed_s: float
+
+
+def _ignore(transit_s: float) -> None:
+    """Nobody wants to know."""
+
+
 class Direction:
     """One direction of the link: senders push, the pump releases to receivers on time."""
 
-    def __init__(self, profile: LinkProfile) -> None:
-        self.meter = BusyMeter(profile)
+    def __init__(self, plan: DirectionPlan, transit: Callable[[float], None] = _ignore) -> None:
+        self.meter = BusyMeter()
         self.senders: set[Sender] = set()
-        self._link: Link[Callable[[], None]] = Link(profile)
+        self.profile = plan.profile
+        self._transit = transit
+        self._link: Link[Packet] = plan.link(time.perf_counter())
         self._arrived = asyncio.Event()
+        self._holding = False
 
     @property
     def room_bytes(self) -> int:
         """How much may still be pushed."""
-        return self._link.profile.held_limit_bytes - self._link.held_bytes
+        return self._link.room_bytes(time.perf_counter())
+
+    @property
+    def held_bytes(self) -> int:
+        """How much is in the link."""
+        return self._link.held_bytes
 
     def push(self, release: Callable[[], None], size_bytes: int) -> None:
         """Let ``release`` be called when ``size_bytes`` have been through the link."""
-        self._link.push(release, size_bytes, time.perf_counter())
+        now = time.perf_counter()
+        self._link.push(Packet(release, now), size_bytes, now)
         self._arrived.set()
-        if self._link.is_full:
+        if self._link.is_full(now):
+            self._holding = True
             for sender in self.senders:
                 sender.hold("link")
 
     async def pump(self) -> None:
         """Release packets when they are due, for ever."""
         while True:
-            due_s = self._link.next_event_at()
-            if due_s is None:
+            next_s = self._next_event_at()
+            if next_s is None:
                 self._arrived.clear()
                 await self._arrived.wait()
                 continue
-            await _sleep_until(due_s)
-            for delivery in self._link.pop_due(time.perf_counter()):
-                delivery.item()
-                self.meter.released(delivery, time.perf_counter())
-            if not self._link.is_full:
+            await _sleep_until(next_s)
+            self._release(time.perf_counter())
+            if self._holding and not self._link.is_full(time.perf_counter()):
+                self._holding = False
                 for sender in self.senders:
                     sender.go_on("link")
 
+    def _next_event_at(self) -> float | None:
+        """When a packet is due, or senders that are held may go on."""
+        events = [self._link.next_event_at(), self._link.room_at() if self._holding else None]
+        return min((event for event in events if event is not None), default=None)
+
+    def _release(self, now: float) -> None:
+        for delivery in self._link.pop_due(now):
+            delivery.item.release()
+            released_s = time.perf_counter()
+            self.meter.released(delivery, released_s)
+            if delivery.size_bytes:
+                self._transit(released_s - delivery.item.pushed_s)
+
     def report(self) -> dict[str, float | int | None]:
         """Return what was measured."""
-        meter, profile = self.meter, self._link.profile
+        meter = self.meter
         return {
-            "rate_bps": profile.rate_bps,
-            "delay_s": profile.delay_s,
+            "rate_bps": self.profile.rate_bps,
+            "delay_s": self.profile.delay_s,
             "bytes": meter.wire_bytes,
             "busy_s": meter.busy_s,
             "expected_s": meter.expected_s,

@@ -17,42 +17,49 @@ import json
 import os
 import selectors
 import signal
-import socket
-from collections.abc import Callable
+import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rfcore.errors import RfedgeError
+from prometheus_client import CollectorRegistry, start_http_server
+
+from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.files import write_whole
-from rfcore.link import LinkProfile
+from rfcore.link import DirectionPlan, LinkPlan, LinkProfile
+from rfcore.link.profile_file import read_link
 from rfcore.wire.address import Address
 from rfedge.link_direction import Direction
+from rfedge.link_metrics import LinkMetrics
+from rfedge.link_side import Side
 
 __all__ = ["LinkProxy", "ProxySettings", "run_proxy"]
 
-SEGMENT_BYTES = 4096
-"""Bytes released at once: 8 ms at 4 Mbit/s, so that a long message does not arrive in one lump."""
+DEFAULT_BPS = 4e6
+DEFAULT_DELAY_MS = 20.0
 
 SCHEDULERS = {os.SCHED_OTHER: "other", os.SCHED_FIFO: "fifo", os.SCHED_RR: "rr"}
-READ_BYTES = 16 * 1024
-SOCKET_BUFFER_BYTES = 64 * 1024
 
 
 @dataclass(frozen=True)
 class ProxySettings:
     """Where the link begins (``listen``) and ends (``to``), HOST:PORT, and what it is like.
 
-    ``delay_ms`` is one-way, in either direction. ``report`` receives JSON after each connection and
-    at the end; ``ready_file`` receives HOST:PORT once connections are accepted.
+    ``profile`` is a link profile in a file; without it a constant rate and ``delay_ms`` one way, in
+    either direction. ``report`` receives JSON after each connection and at the end; ``ready_file``
+    receives HOST:PORT once connections are accepted. ``metrics_port``: port 0 takes a free one;
+    no metrics are served without it.
     """
 
     to: str
     listen: str = "127.0.0.1:0"
-    uplink_bps: float = 4e6
-    downlink_bps: float = 4e6
-    delay_ms: float = 20.0
+    uplink_bps: float | None = None
+    downlink_bps: float | None = None
+    delay_ms: float | None = None
+    profile: Path | None = None
+    metrics_port: int | None = None
+    metrics_host: str = "127.0.0.1"
     report: Path | None = None
     ready_file: Path | None = None
     allow_insecure: bool = False
@@ -61,108 +68,24 @@ class ProxySettings:
         for field in ("listen", "to"):
             address = Address.parse(field, getattr(self, field))
             address.require_private(field, self.allow_insecure)
-        for rate_bps in (self.uplink_bps, self.downlink_bps):
-            self._profile(rate_bps)
+        if self.metrics_port is not None and not 0 <= self.metrics_port <= 65535:
+            raise InvalidInput("metrics_port", f"{self.metrics_port} is outside 0..65535")
+        if self.profile is None:
+            self.plan()
+        for name in ("uplink_bps", "downlink_bps", "delay_ms"):
+            if self.profile is not None and getattr(self, name) is not None:
+                raise InvalidInput(name, f"is given beside the profile {self.profile}; give one")
 
-    @property
-    def uplink(self) -> LinkProfile:
-        """The link from the accepting side to ``to``."""
-        return self._profile(self.uplink_bps)
+    def plan(self) -> LinkPlan:
+        """Return what the link is made of; raise what reading ``profile`` raises."""
+        if self.profile is not None:
+            return read_link(self.profile)
+        return LinkPlan(self._constant(self.uplink_bps), self._constant(self.downlink_bps))
 
-    @property
-    def downlink(self) -> LinkProfile:
-        """The link back."""
-        return self._profile(self.downlink_bps)
-
-    def _profile(self, rate_bps: float) -> LinkProfile:
-        return LinkProfile(rate_bps, self.delay_ms / 1e3)
-
-
-class Side(asyncio.BufferedProtocol):
-    """One end of one connection: what it sends goes into ``outward``, to ``peer``."""
-
-    def __init__(self, outward: Direction, ended: Callable[[], None]) -> None:
-        self.peer: Side | None = None
-        self.transport: asyncio.Transport | None = None
-        self._outward = outward
-        self._ended = ended
-        self._buffer = bytearray(READ_BYTES)
-        self._held: set[str] = set()
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Wait for the other end before reading anything; asyncio has set TCP_NODELAY."""
-        assert isinstance(transport, asyncio.Transport)
-        self.transport = transport
-        transport.set_write_buffer_limits(SOCKET_BUFFER_BYTES)
-        self._outward.senders.add(self)
-        self.hold("peer")
-
-    def join(self, peer: Side) -> None:
-        """Send what comes in here to ``peer``."""
-        self.peer = peer
-        self.go_on("peer")
-
-    def hold(self, reason: str) -> None:
-        """Stop reading until ``reason`` is gone."""
-        if not self._held and self.transport is not None:
-            self.transport.pause_reading()
-        self._held.add(reason)
-
-    def go_on(self, reason: str) -> None:
-        """Read again if ``reason`` was the last one against it."""
-        if self._held == {reason} and self.transport is not None:
-            self.transport.resume_reading()
-        self._held.discard(reason)
-
-    def abort(self) -> None:
-        """Close at once."""
-        if self.transport is not None:
-            self.transport.abort()
-
-    def get_buffer(self, sizehint: int) -> memoryview:  # noqa: ARG002
-        """Offer no more than the link has room for."""
-        return memoryview(self._buffer)[: max(1, min(READ_BYTES, self._outward.room_bytes))]
-
-    def buffer_updated(self, nbytes: int) -> None:
-        """Push what came in, in segments."""
-        data = bytes(self._buffer[:nbytes])
-        for start in range(0, nbytes, SEGMENT_BYTES):
-            segment = data[start : start + SEGMENT_BYTES]
-            self._outward.push(lambda part=segment: self._deliver(part), len(segment))  # type: ignore[misc]
-
-    def eof_received(self) -> bool:
-        """Pass the end on behind the data; keep our own direction open."""
-        self._outward.push(self._deliver_end, 0)
-        return True
-
-    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
-        """Take the other end down too, after what is under way."""
-        self._outward.senders.discard(self)
-        self._outward.push(self._close_peer, 0)
-        self._ended()
-
-    def pause_writing(self) -> None:
-        """Our socket does not take more: the other end shall not send more."""
-        if self.peer is not None:
-            self.peer.hold("receiver")
-
-    def resume_writing(self) -> None:
-        """Our socket takes data again."""
-        if self.peer is not None:
-            self.peer.go_on("receiver")
-
-    def _deliver(self, data: bytes) -> None:
-        if self.peer is not None and self.peer.transport is not None:
-            self.peer.transport.write(data)
-
-    def _deliver_end(self) -> None:
-        transport = self.peer.transport if self.peer is not None else None
-        if transport is not None and transport.can_write_eof() and not transport.is_closing():
-            transport.write_eof()
-
-    def _close_peer(self) -> None:
-        if self.peer is not None and self.peer.transport is not None:
-            self.peer.transport.close()
+    def _constant(self, rate_bps: float | None) -> DirectionPlan:
+        rate_bps = DEFAULT_BPS if rate_bps is None else rate_bps
+        delay_ms = DEFAULT_DELAY_MS if self.delay_ms is None else self.delay_ms
+        return DirectionPlan(LinkProfile(rate_bps, delay_ms / 1e3))
 
 
 class LinkProxy:
@@ -172,9 +95,15 @@ class LinkProxy:
         self.address = Address.parse("listen", settings.listen)
         self._server_address = Address.parse("to", settings.to)
         self._settings = settings
-        self._up = Direction(settings.uplink)
-        self._down = Direction(settings.downlink)
+        plan = settings.plan()
+        self._lives = plan.connection_lives()
+        self.registry = CollectorRegistry()
+        self._metrics = LinkMetrics(self.registry)
+        self._up = Direction(plan.uplink, self._metrics.transit("up"))
+        self._down = Direction(plan.downlink, self._metrics.transit("down"))
+        self._metrics.observe({"up": self._up, "down": self._down})
         self._connections = 0
+        self._connections_cut = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._listener: asyncio.Server | None = None
 
@@ -191,6 +120,7 @@ class LinkProxy:
         self.address = Address(self.address.host, sock.getsockname()[1])
         for direction in (self._up, self._down):
             self._keep(asyncio.create_task(direction.pump()))
+        self._serve_metrics()
         if self._settings.ready_file is not None:
             write_whole(self._settings.ready_file, f"{self.address}\n")
         return self.address
@@ -211,6 +141,7 @@ class LinkProxy:
         return {
             "scheduler": SCHEDULERS.get(os.sched_getscheduler(0), "unknown"),
             "connections": self._connections,
+            "connections_cut": self._connections_cut,
             "uplink": self._up.report(),
             "downlink": self._down.report(),
         }
@@ -220,27 +151,49 @@ class LinkProxy:
         if self._settings.report is not None:
             write_whole(self._settings.report, json.dumps(self.report(), indent=1) + "\n")
 
+    def _serve_metrics(self) -> None:
+        port = self._settings.metrics_port
+        if port is not None:
+            server, _ = start_http_server(port, self._settings.metrics_host, self.registry)
+            print(f"rfedge link: metrics on port {server.server_port}", file=sys.stderr)
+
     def _accept(self) -> Side:
-        side = Side(self._up, self.write_report)
+        side = Side(self._up, self._ended)
         self._keep(asyncio.create_task(self._connect(side)))
         return side
 
     async def _connect(self, near: Side) -> None:
         """Open the far half of a new connection, or refuse the near one."""
         self._connections += 1
+        self._metrics.connections.inc()
         loop = asyncio.get_running_loop()
         address = self._server_address
         try:
             _, far = await loop.create_connection(
-                lambda: Side(self._down, self.write_report), address.host, address.port
+                lambda: Side(self._down, _ignore), address.host, address.port
             )
         except OSError:
             near.abort()
             return
         for side in (near, far):
-            _bound_receive_buffer(side)
+            side.bound_receive_buffer()
         near.join(far)
         far.join(near)
+        if self._lives is not None:
+            await asyncio.sleep(self._lives.lifetime_s())
+            self._cut(near, far)
+
+    def _cut(self, *sides: Side) -> None:
+        """Lose a connection, unless it is over by itself."""
+        if all(side.is_open for side in sides):
+            self._connections_cut += 1
+            self._metrics.cut.inc()
+            for side in sides:
+                side.abort()
+
+    def _ended(self) -> None:
+        self._metrics.connections.dec()
+        self.write_report()
 
     def _keep(self, task: asyncio.Task[None]) -> None:
         self._tasks.add(task)
@@ -267,8 +220,5 @@ async def _run(settings: ProxySettings) -> None:
     await proxy.stop()
 
 
-def _bound_receive_buffer(side: Side) -> None:
-    """Keep the kernel from hiding seconds of data behind the link's own queue."""
-    if side.transport is not None:
-        sock = side.transport.get_extra_info("socket")
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BUFFER_BYTES)
+def _ignore() -> None:
+    """The near side reports for both."""

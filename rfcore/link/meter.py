@@ -1,29 +1,32 @@
 """How long a link was really busy, from the moments at which packets were really released.
 
 The union of the intervals from the start of a busy period to the release of its last packet, less
-the link's delay. Against ``expected_s``, bytes over rate, it says how true the driver was: a late
-release shows up as too much.
+what the packet spent in propagation. Against ``expected_s``, the time the link's machine gave those
+bytes (bytes over rate where the rate is constant), it says how true the driver was: a late release
+shows up as too much.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from rfcore.link.profile import LinkProfile
 from rfcore.link.shaper import Delivery
 
 __all__ = ["BusyMeter"]
 
 
 class BusyMeter:
-    """Measures one link; tell it of every release, in order."""
+    """Measures one link; tell it of every release, in order.
 
-    def __init__(self, profile: LinkProfile) -> None:
-        self._profile = profile
+    ``expected_s`` is how long the machine said the link would be busy.
+    """
+
+    def __init__(self) -> None:
         self._period_start_s = 0.0
         self._scheduled_end_s = float("-inf")
         self._measured_end_s = float("-inf")
         self._closed_s = 0.0
+        self.expected_s = 0.0
         self.wire_bytes = 0
         self.periods = 0
         self.largest_lateness_s = 0.0
@@ -34,8 +37,10 @@ class BusyMeter:
             self.periods += 1
             self._closed_s = self.busy_s
             self._period_start_s = max(delivery.start_s, self._measured_end_s)
+        in_propagation_s = delivery.due_s - delivery.end_s
         self._scheduled_end_s = delivery.end_s
-        self._measured_end_s = max(at_s - self._profile.delay_s, self._period_start_s)
+        self._measured_end_s = max(at_s - in_propagation_s, self._period_start_s)
+        self.expected_s += delivery.end_s - delivery.start_s
         self.wire_bytes += delivery.size_bytes
         self.largest_lateness_s = max(self.largest_lateness_s, at_s - delivery.due_s)
 
@@ -47,13 +52,8 @@ class BusyMeter:
         return self._closed_s + self._measured_end_s - self._period_start_s
 
     @property
-    def expected_s(self) -> float:
-        """Seconds the bytes should have taken."""
-        return self._profile.transmission_s(self.wire_bytes)
-
-    @property
     def tau_error_percent(self) -> float | None:
         """How much longer (+) or shorter (-) than it should; None before the first byte."""
-        if not self.wire_bytes:
+        if not self.expected_s:
             return None
         return 100.0 * (self.busy_s / self.expected_s - 1.0)

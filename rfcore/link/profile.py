@@ -47,8 +47,3 @@ class LinkProfile:
     def transmission_s(self, size_bytes: int) -> float:
         """Return tau, the seconds that ``size_bytes`` occupy the link."""
         return size_bytes * 8 / self.rate_bps
-
-    @property
-    def held_limit_bytes(self) -> int:
-        """How much the link may hold in all: its queue and what is in propagation."""
-        return self.queue_limit_bytes + math.ceil(self.rate_bps * self.delay_s / 8)

@@ -5,19 +5,24 @@ finds the link busy is transmitted from the moment the previous one is *due* to 
 moment somebody looks: late drivers cause no drift. Within a busy period every end is computed from
 the period's start and an integer number of bits, so nothing accumulates but one rounding.
 
-Times are seconds on any clock of the caller's that does not run backwards.
+How long transmission takes and what delays a packet beyond the profile's constant are parts that
+can be exchanged (``rfcore.link.plan``); whatever they do, packets keep their order.
+
+Times are seconds on any clock of the caller's that does not run backwards; parts see the seconds
+since the link's origin.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from rfcore.errors import InvalidInput
 from rfcore.link.profile import LinkProfile
 
-__all__ = ["Delivery", "Link"]
+__all__ = ["ConstantRate", "Delay", "Delivery", "Link", "Transmission"]
 
 Item = TypeVar("Item")
 
@@ -33,55 +38,115 @@ class Delivery(Generic[Item]):
     due_s: float
 
 
-class Link(Generic[Item]):
-    """A first-in first-out link of constant rate and delay; loses and reorders nothing."""
+class Transmission(Protocol):
+    """Who decides when bytes get through, first come first served; times are since the origin."""
 
-    def __init__(self, profile: LinkProfile) -> None:
-        self.profile = profile
-        self._queue: deque[Delivery[Item]] = deque()
-        self._held_bytes = 0
+    def schedule(self, size_bytes: int, at_s: float) -> tuple[float, float]:
+        """Take ``size_bytes`` that arrive at ``at_s``; return when they start and end."""
+
+
+class Delay(Protocol):
+    """What adds to the time in propagation."""
+
+    def delay_s(self, at_s: float) -> float:
+        """Return how much longer a packet takes that was transmitted until ``at_s``."""
+
+
+class ConstantRate:
+    """``rate_bps`` bits per second, for ever.
+
+    Within a busy period every end is computed from the period's start and an integer number of
+    bytes.
+    """
+
+    def __init__(self, rate_bps: float) -> None:
+        self._rate_bps = rate_bps
         self._period_start_s = float("-inf")
         self._period_bytes = 0
         self._busy_until_s = float("-inf")
 
-    @property
-    def held_bytes(self) -> int:
-        """Bytes pushed and not yet popped."""
-        return self._held_bytes
+    def schedule(self, size_bytes: int, at_s: float) -> tuple[float, float]:
+        """Return start and end of transmission."""
+        if at_s >= self._busy_until_s:
+            self._period_start_s, self._period_bytes, self._busy_until_s = at_s, 0, at_s
+        start_s = self._busy_until_s
+        self._period_bytes += size_bytes
+        self._busy_until_s = self._period_start_s + self._period_bytes * 8 / self._rate_bps
+        return start_s, self._busy_until_s
+
+
+class Link(Generic[Item]):
+    """A first-in first-out link; loses and reorders nothing. Constant rate and delay by default."""
+
+    def __init__(
+        self,
+        profile: LinkProfile,
+        transmission: Transmission | None = None,
+        delays: Sequence[Delay] = (),
+        origin_s: float = 0.0,
+    ) -> None:
+        self.profile = profile
+        self._transmission = transmission or ConstantRate(profile.rate_bps)
+        self._delays = tuple(delays)
+        self._origin_s = origin_s
+        self._queue: deque[Delivery[Item]] = deque()
+        self._sending: deque[Delivery[Item]] = deque()
+        self._held_bytes = 0
+        self._waiting_bytes = 0
+        self._last_due_s = float("-inf")
 
     @property
-    def is_full(self) -> bool:
-        """Whether the caller should stop pushing until something was popped."""
-        return self._held_bytes >= self.profile.held_limit_bytes
+    def held_bytes(self) -> int:
+        """Bytes pushed and not yet popped: waiting, or in propagation."""
+        return self._held_bytes
+
+    def room_bytes(self, now: float) -> int:
+        """Return how much may be pushed; what is in propagation takes no room."""
+        self._forget_sent(now)
+        return max(0, self.profile.queue_limit_bytes - self._waiting_bytes)
+
+    def is_full(self, now: float) -> bool:
+        """Return whether the caller should stop pushing until ``room_at``."""
+        return self.room_bytes(now) == 0
+
+    def room_at(self) -> float | None:
+        """Return when the packet in front leaves the queue, or None when none waits."""
+        return self._sending[0].end_s if self._sending else None
 
     def push(self, item: Item, size_bytes: int, now: float) -> Delivery[Item]:
         """Accept ``item`` at ``now`` and return when it will be transmitted and delivered.
 
-        Raises ``InvalidInput`` for a negative size, and when the link is full: a plain link drops
+        Raises ``InvalidInput`` for a negative size, and when the link is full: a link drops
         nothing, so its driver has to hold the sender back (see ``is_full``). An empty packet, which
         takes no room, is always accepted.
         """
         if size_bytes < 0:
             raise InvalidInput("link.size_bytes", f"{size_bytes} must not be negative")
-        if size_bytes and self.is_full:
+        if size_bytes and self.is_full(now):
             raise InvalidInput(
                 "link.queue",
-                f"{self._held_bytes} bytes are held, the limit is "
-                f"{self.profile.held_limit_bytes}; pop before pushing more",
+                f"{self._waiting_bytes} bytes are waiting, the limit is "
+                f"{self.profile.queue_limit_bytes}; push again at room_at()",
             )
         delivery = self._schedule(item, size_bytes, now)
         self._queue.append(delivery)
         self._held_bytes += size_bytes
+        if size_bytes:
+            self._sending.append(delivery)
+            self._waiting_bytes += size_bytes
         return delivery
 
     def _schedule(self, item: Item, size_bytes: int, now: float) -> Delivery[Item]:
-        if now >= self._busy_until_s:
-            self._period_start_s, self._period_bytes, self._busy_until_s = now, 0, now
-        start_s = self._busy_until_s
-        self._period_bytes += size_bytes
-        end_s = self._period_start_s + self.profile.transmission_s(self._period_bytes)
-        self._busy_until_s = end_s
-        return Delivery(item, size_bytes, start_s, end_s, end_s + self.profile.delay_s)
+        start, end = self._transmission.schedule(size_bytes, now - self._origin_s)
+        more_s = sum(delay.delay_s(end) for delay in self._delays)
+        start_s, end_s = self._origin_s + start, self._origin_s + end
+        due_s = max(end_s + self.profile.delay_s + more_s, self._last_due_s)
+        self._last_due_s = due_s
+        return Delivery(item, size_bytes, start_s, end_s, due_s)
+
+    def _forget_sent(self, now: float) -> None:
+        while self._sending and self._sending[0].end_s <= now:
+            self._waiting_bytes -= self._sending.popleft().size_bytes
 
     def pop_due(self, now: float) -> list[Delivery[Item]]:
         """Return, in order, every packet whose delivery is due at or before ``now``."""

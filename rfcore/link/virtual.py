@@ -7,11 +7,11 @@ the proxy on real sockets counts wire bytes instead.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from rfcore.errors import InvalidInput
+from rfcore.link.plan import DirectionPlan
 from rfcore.link.profile import LinkProfile
-from rfcore.link.shaper import Link
 
 __all__ = ["Arrival", "delivery_times"]
 
@@ -24,13 +24,14 @@ class Arrival:
     size_bytes: int
 
 
-def delivery_times(profile: LinkProfile, schedule: Iterable[Arrival]) -> list[float]:
-    """Return the second at which each packet of ``schedule`` is delivered.
+def delivery_times(link: LinkProfile | DirectionPlan, schedule: Iterable[Arrival]) -> list[float]:
+    """Return the second at which each packet of ``schedule`` is delivered; traces begin at 0 s.
 
     The queue is unbounded here: a schedule is a given, there is no sender to hold back. Raises
     ``InvalidInput`` when the schedule is not in time order.
     """
-    link: Link[int] = Link(replace(profile, queue_limit_bytes=2**62))
+    plan = DirectionPlan(link) if isinstance(link, LinkProfile) else link
+    machine = plan.unbounded().link()
     times: list[float] = []
     previous_s = float("-inf")
     for index, arrival in enumerate(schedule):
@@ -39,6 +40,6 @@ def delivery_times(profile: LinkProfile, schedule: Iterable[Arrival]) -> list[fl
                 f"schedule[{index}].at_s", f"{arrival.at_s} s is before {previous_s} s; sort it"
             )
         previous_s = arrival.at_s
-        times.append(link.push(index, arrival.size_bytes, arrival.at_s).due_s)
-        link.pop_due(arrival.at_s)
+        times.append(machine.push(index, arrival.size_bytes, arrival.at_s).due_s)
+        machine.pop_due(arrival.at_s)
     return times

@@ -19,12 +19,18 @@ class Link:
     """Where to connect for each accepted connection, HOST:PORT."""
     listen: str = "127.0.0.1:0"
     """Where to accept connections, HOST:PORT; port 0 takes a free one."""
-    uplink_bps: float = 4e6
-    """Throughput from the accepting side to `--to`, bit/s."""
-    downlink_bps: float = 4e6
-    """Throughput of the way back, bit/s."""
-    delay_ms: float = 20.0
-    """One-way delay in either direction, ms."""
+    profile: Path | None = None
+    """Link profile (TOML, see samples/links): traces, jitter, outages, lost connections."""
+    uplink_bps: float | None = None
+    """Throughput from the accepting side to `--to`, bit/s; 4e6 without a profile."""
+    downlink_bps: float | None = None
+    """Throughput of the way back, bit/s; 4e6 without a profile."""
+    delay_ms: float | None = None
+    """One-way delay in either direction, ms; 20 without a profile."""
+    metrics_port: int | None = None
+    """Port for Prometheus; 0 takes a free one, none are served without it."""
+    metrics_host: str = "127.0.0.1"
+    """Address the metrics are served on."""
     report: Path | None = None
     """Write bytes, busy time and timing error here as JSON."""
     ready_file: Path | None = None
@@ -44,6 +50,9 @@ class Link:
                 uplink_bps=self.uplink_bps,
                 downlink_bps=self.downlink_bps,
                 delay_ms=self.delay_ms,
+                profile=self.profile,
+                metrics_port=self.metrics_port,
+                metrics_host=self.metrics_host,
                 report=self.report,
                 ready_file=self.ready_file,
                 allow_insecure=self.allow_insecure,

@@ -12,6 +12,7 @@ from prometheus_client import CollectorRegistry
 from cav_agent.metrics import AgentMetrics
 from mec_server.metrics import ServerMetrics
 from rfcore.wire.instruments import Family
+from rfedge.link_metrics import LinkMetrics
 
 __all__ = ["families", "metrics_page"]
 
@@ -37,6 +38,7 @@ def families() -> Mapping[str, Sequence[Family]]:
     return {
         "mec-server": ServerMetrics(CollectorRegistry(), per_vehicle=True).instruments.families,
         "cav-agent": agent.instruments.families,
+        "rfedge link": LinkMetrics(CollectorRegistry()).instruments.families,
     }
 
 

@@ -11,7 +11,7 @@ from rfcore.link.meter import BusyMeter
 def measure(profile: LinkProfile, pushes: list[tuple[float, int]], late_s: float) -> BusyMeter:
     """Push everything, then release each packet ``late_s`` after it is due."""
     link: Link[int] = Link(LinkProfile(profile.rate_bps, profile.delay_s, 2**40))
-    meter = BusyMeter(profile)
+    meter = BusyMeter()
     for at_s, size_bytes in pushes:
         link.push(0, size_bytes, at_s)
     for delivery in link.pop_due(1e9):
@@ -50,5 +50,5 @@ def test_an_interval_is_not_counted_twice_when_late_periods_overlap() -> None:
 
 
 def test_an_unused_link_has_no_error_to_report() -> None:
-    meter = BusyMeter(LinkProfile(4e6))
+    meter = BusyMeter()
     assert (meter.busy_s, meter.expected_s, meter.tau_error_percent) == (0.0, 0.0, None)

@@ -3,7 +3,7 @@
 import asyncio
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +82,7 @@ async def test_a_full_link_holds_the_sender_back() -> None:
         with pytest.raises(TimeoutError):
             async with asyncio.timeout(0.3):
                 await writer.drain()
-        assert proxy._up._link.held_bytes <= 65_536
+        assert proxy._up.held_bytes <= 65_536
         writer.transport.abort()
 
 
@@ -140,3 +140,58 @@ def test_addresses_are_checked_by_name(listen: str, to: str, named: str) -> None
 
 def test_another_machine_is_reached_when_plaintext_is_allowed() -> None:
     ProxySettings("example.org:1", "0.0.0.0:1", allow_insecure=True)
+
+
+async def test_a_profile_s_outage_holds_what_comes_during_it(profile: Callable[..., Path]) -> None:
+    """The link is out from the beginning on, so that no test has to hit a moment."""
+    path = profile("rate_mbps = 100.0\n[uplink.outage]\nat_s = [[0.0, 0.4]]")
+    clock = asyncio.get_running_loop().time
+    started_s = clock()
+    server = await asyncio.start_server(echo, "127.0.0.1", 0)
+    proxy = LinkProxy(
+        ProxySettings(f"127.0.0.1:{server.sockets[0].getsockname()[1]}", profile=path)
+    )
+    await proxy.start()
+    assert await exchange(proxy, b"through") == b"through"
+    assert clock() - started_s >= 0.4
+    await proxy.stop()
+    server.close()
+
+
+async def test_connections_are_lost_as_the_profile_says_and_counted(
+    profile: Callable[..., Path],
+) -> None:
+    path = profile(end="[connection_loss]\nmean_life_s = 0.05")
+    server = await asyncio.start_server(echo, "127.0.0.1", 0)
+    proxy = LinkProxy(
+        ProxySettings(f"127.0.0.1:{server.sockets[0].getsockname()[1]}", profile=path)
+    )
+    await proxy.start()
+    reader, writer = await asyncio.open_connection(proxy.address.host, proxy.address.port)
+    with suppress(ConnectionResetError):
+        assert await reader.read() == b"", "nothing was sent; the end comes when it is cut"
+    writer.close()
+    await proxy.stop()
+    server.close()
+    assert proxy.report()["connections_cut"] == 1
+    assert proxy.registry.get_sample_value("rfedge_link_connections_cut_total") == 1
+
+
+async def test_the_metrics_of_the_link_are_what_its_report_says() -> None:
+    async with linked(echo) as proxy:
+        await exchange(proxy, bytes(50_000))
+        value = proxy.registry.get_sample_value
+        for direction, reported in (("up", "uplink"), ("down", "downlink")):
+            label = {"direction": direction}
+            report = proxy.report()[reported]
+            assert value("rfedge_link_bytes_total", label) == report["bytes"] == 50_000
+            assert value("rfedge_link_busy_seconds_total", label) == report["busy_s"]
+            assert value("rfedge_link_rate_bytes_per_second", label) == 1e9 / 8
+            assert value("rfedge_link_held_bytes", label) == 0
+            assert value("rfedge_link_transit_seconds_count", label) >= 50_000 / 4096
+    assert value("rfedge_link_connections") == 0
+
+
+def test_a_rate_beside_a_profile_is_refused(profile: Callable[..., Path]) -> None:
+    with pytest.raises(InvalidInput, match="uplink_bps: is given beside the profile"):
+        ProxySettings("127.0.0.1:1", uplink_bps=1e6, profile=profile())

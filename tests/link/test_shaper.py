@@ -97,20 +97,24 @@ def test_an_idle_link_starts_at_the_arrival() -> None:
     assert link.push("b", 1000, now=7.0).start_s == 7.0
 
 
-def test_a_full_link_refuses_more_and_takes_it_after_a_pop() -> None:
+def test_a_full_link_refuses_more_and_takes_it_when_the_first_was_sent() -> None:
     link: Link[str] = Link(LinkProfile(rate_bps=8000.0, queue_limit_bytes=1000))
     link.push("a", 1000, now=0.0)
-    assert link.is_full
-    with pytest.raises(InvalidInput, match="1000 bytes are held"):
+    assert link.is_full(0.999)
+    with pytest.raises(InvalidInput, match="1000 bytes are waiting"):
         link.push("b", 1, now=0.0)
     link.push("end", 0, now=0.0)
-    link.pop_due(1.0)
+    assert link.room_at() == 1.0
     link.push("b", 1, now=1.0)
 
 
 def test_what_is_in_propagation_does_not_count_against_the_queue() -> None:
-    profile = LinkProfile(rate_bps=8e6, delay_s=0.1, queue_limit_bytes=1000)
-    assert profile.held_limit_bytes == 1000 + 100_000
+    link: Link[str] = Link(LinkProfile(rate_bps=8e6, delay_s=0.1, queue_limit_bytes=1000))
+    link.push("a", 1000, now=0.0)
+    assert link.room_bytes(0.0005) == 0
+    assert link.room_bytes(0.001) == 1000
+    assert link.held_bytes == 1000
+    assert link.room_at() is None
 
 
 @pytest.mark.parametrize(
@@ -151,6 +155,7 @@ def test_a_plain_link_imports_no_other_stage() -> None:
     assert done.stdout.split() == [
         "rfcore.errors",
         "rfcore.link",
+        "rfcore.link.plan",
         "rfcore.link.profile",
         "rfcore.link.shaper",
         "rfcore.link.virtual",

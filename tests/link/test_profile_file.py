@@ -1,0 +1,96 @@
+"""A profile says what it means: stages it names are loaded, no others, and no key is ignored."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rfcore.errors import InvalidData, InvalidInput
+from rfcore.link import LinkPlan
+from rfcore.link.profile_file import read_link
+
+SAMPLES = Path(__file__).parents[2] / "samples" / "links"
+STAGES = ("connection_loss", "delay_trace", "jitter", "outage", "trace")
+
+Read = Callable[..., LinkPlan]
+
+
+def test_a_constant_rate_is_what_it_says(read: Read) -> None:
+    plan = read("rate_mbps = 4.5\ndelay_ms = 20\nqueue_kib = 2", "rate_mbps = 10", "seed = 3")
+    assert plan.uplink.profile.rate_bps == 4.5e6
+    assert plan.uplink.profile.delay_s == 0.02
+    assert plan.uplink.profile.queue_limit_bytes == 2048
+    assert plan.downlink.profile.delay_s == 0.0
+    assert plan.connection_lives() is None
+    assert plan.stage_names == []
+
+
+@pytest.mark.parametrize("path", sorted(SAMPLES.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_sample_profile_is_read(path: Path) -> None:
+    assert read_link(path).description
+
+
+def test_the_sample_traces_are_what_their_generator_makes(tmp_path: Path) -> None:
+    subprocess.run([sys.executable, SAMPLES / "generate.py", tmp_path], check=True)
+    for name in ("drive.up", "drive.delay.txt"):
+        assert (tmp_path / name).read_bytes() == (SAMPLES / name).read_bytes(), name
+
+
+@pytest.mark.parametrize(
+    ("profile", "named"),
+    [
+        ("steady", []),
+        ("drive", ["delay_trace", "jitter", "trace"]),
+        ("tunnel", ["outage"]),
+        ("flaky", ["connection_loss", "jitter", "outage"]),
+    ],
+)
+def test_only_the_stages_a_profile_names_are_imported(profile: str, named: list[str]) -> None:
+    code = (
+        "import sys; from pathlib import Path; from rfcore.link.profile_file import read_link;"
+        f"read_link(Path({str(SAMPLES / (profile + '.toml'))!r}));"
+        f"print(*[s for s in {STAGES!r} if 'rfcore.link.' + s in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == named
+
+
+@pytest.mark.parametrize(
+    ("uplink", "end", "problem"),
+    [
+        ("", "", "uplink.rate_mbps: is missing"),
+        ("rate_mbps = 0", "", "uplink.rate_mbps: 0 must be a number in"),
+        ("rate_mbps = nan", "", "uplink.rate_mbps: nan must be a number in"),
+        ("rate_mbps = inf", "", "uplink.rate_mbps: inf must be"),
+        ("rate_mbps = '4'", "", "uplink.rate_mbps: '4' must be a number"),
+        ("rate_mbps = true", "", "uplink.rate_mbps: True must be a number"),
+        ("rate_mbps = 4\nrate = 5", "", "uplink.rate: is not known here; known are delay_ms"),
+        ("rate_mbps = 4\ndelay_ms = 90000", "", "uplink.delay_ms: 90000 must be .* 0..60000"),
+        ("rate_mbps = 4\noutage = 3", "", "uplink.outage: 3 must be a section"),
+        ("rate_mbps = 4\n[uplink.trace]\nfile = 'x'", "", "is given beside a trace"),
+        ("[uplink.trace]\nfil = 'x'", "", "uplink.trace.file: is missing"),
+        ("rate_mbps = 4\n[uplink.jitter]\nspread_ms = -1", "", "uplink.jitter.spread_ms: -1"),
+        (
+            "rate_mbps = 4\n[uplink.jitter]\nspread_ms = 1\ndistribution = 'normal'",
+            "",
+            "uplink.jitter.distribution: 'normal' is none of uniform, exponential",
+        ),
+        ("rate_mbps = 4\n[uplink.outage]\nat_s = [[1]]", "", r"outage.at_s: \[1\] must be"),
+        ("rate_mbps = 4\n[uplink.outage]\nmean_up_s = 1", "", "outage.mean_down_s: is missing"),
+        ("rate_mbps = 4", "[connection_loss]\nmean_life_s = 0", "connection_loss.mean_life_s: 0"),
+        ("rate_mbps = 4", "[uplinks]\n", "uplinks: is not known here; known are connection_loss"),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_limit(
+    read: Read, uplink: str, end: str, problem: str
+) -> None:
+    with pytest.raises(InvalidInput, match=problem):
+        read(uplink, end=end)
+
+
+def test_a_file_that_is_no_toml_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.toml").write_text("rate = = 3")
+    with pytest.raises(InvalidData, match=r"x\.toml: not a link profile"):
+        read_link(tmp_path / "x.toml")
