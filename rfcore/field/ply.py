@@ -3,7 +3,12 @@
 Vertex properties by name, in any order: ``x y z``, ``f_dc_0..2``, ``f_rest_0..``, ``opacity``
 (logit), ``scale_0..2`` (log), ``rot_0..3`` (w, x, y, z). ``f_rest`` is channel-major: all
 coefficients of red, then green, then blue. Normals and other properties are ignored when read;
-normals are written as zeros because viewers ask for them.
+normals are written as zeros because viewers ask for them. So write INRIA's trainer, gsplat,
+nerfstudio, OpenSplat, Brush, Postshot and SuperSplat, each in an order of its own.
+
+Two properties that change what the others mean are refused by name rather than ignored:
+``filter_3D`` of Mip-Splatting (its own ``create_fused_ply.py`` fuses it in), and two scales
+instead of three (2D Gaussian Splatting's discs).
 """
 
 from __future__ import annotations
@@ -29,6 +34,9 @@ ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 REST_COUNTS = (0, 9, 24, 45)
 """3 ((D + 1)^2 - 1) coefficients beyond the first band for SH degree D = 0..3."""
 
+OTHER_FORMATS = (".splat", ".ksplat", ".spz", ".sog", ".sogs", ".gltf", ".glb")
+"""Formats of splats that lose precision or order; every tool that writes them also writes .ply."""
+
 F32 = NDArray[np.float32]
 
 
@@ -37,7 +45,12 @@ def read_ply(path: Path, tile_origin: TileOrigin | None = None) -> Gaussians:
 
     Raises ``FieldFormatError`` naming the file and the property or Gaussian at fault.
     """
+    _check_suffix(path)
     table = read_vertices(path, (*XYZ, *DC, "opacity", *SCALES, *ROTATION))
+    if "filter_3D" in (table.dtype.names or ()):
+        raise FieldFormatError(
+            f"{path}: has filter_3D of Mip-Splatting; fuse it with its create_fused_ply.py first"
+        )
     rest = _rest_names(path, table)
     origin = tile_origin if tile_origin is not None else TileOrigin()
     offset_m = np.array([origin.east_m, origin.north_m, origin.up_m])
@@ -69,6 +82,11 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
     ]
     rows = np.concatenate(parts, axis=1).astype("<f4")
     write_vertices(path, rows.view([(name, "<f4") for name in names])[:, 0])
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix.lower() in OTHER_FORMATS:
+        raise FieldFormatError(f"{path}: {path.suffix} is another format; export it as .ply")
 
 
 def _rest_names(path: Path, table: Table) -> tuple[str, ...]:

@@ -86,8 +86,11 @@ def edited(path: Path, old: str, new: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
-        ("binary_little_endian", "binary_big_endian", "'format binary_big_endian 1.0' where"),
-        ("binary_little_endian", "ascii", "convert"),
+        ("binary_little_endian", "binary_middle_endian", "'format binary_middle_endian 1.0' where"),
+        ("format binary_little_endian 1.0\n", "", "'element vertex 4' where 'format'"),
+        ("binary_little_endian 1.0", "binary_little_endian 2.0", "1.0 is needed"),
+        ("element vertex 4", "element chunk 1", "compressed .ply of PlayCanvas"),
+        ("property float nx", "property float filter_3D", "create_fused_ply"),
         ("ply\n", "plx\n", "does not start with 'ply'"),
         ("end_header", "end_of_it", "no 'end_header'|not a scalar"),
         ("element vertex 4", "element vertex many", "does not state a count"),
@@ -150,3 +153,72 @@ def test_values_that_are_not_finite_are_refused(make_gaussians, tmp_path: Path, 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FieldFormatError, match=r"none\.ply: cannot be read"):
         read_ply(tmp_path / "none.ply")
+
+
+def as_text(path: Path, out: Path, digits: int = 9) -> None:
+    """Rewrite a binary file as text, with nine digits as float32 needs."""
+    table = read_vertices(path, ())
+    header, _, _ = path.read_bytes().partition(b"end_header\n")
+    lines = [" ".join(f"{value:.{digits}g}" for value in row.tolist()) for row in table]
+    text = header.replace(b"binary_little_endian", b"ascii") + b"end_header\n"
+    out.write_bytes(text + "\n".join(lines).encode())
+
+
+@pytest.mark.parametrize("n", [0, 1, 5000])
+def test_text_gives_back_the_values_it_was_written_from(
+    make_gaussians, tmp_path: Path, n: int
+) -> None:
+    gaussians = make_gaussians(n, 0)
+    write_ply(tmp_path / "a.ply", gaussians)
+    as_text(tmp_path / "a.ply", tmp_path / "b.ply")
+    assert_equal(read_ply(tmp_path / "b.ply"), gaussians)
+
+
+def test_big_endian_rows_give_the_same_values(make_gaussians, tmp_path: Path) -> None:
+    gaussians = make_gaussians(6, 1)
+    write_ply(tmp_path / "a.ply", gaussians)
+    table = read_vertices(tmp_path / "a.ply", ())
+    header, _, _ = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    big = table.astype([(name, ">f4") for name in table.dtype.names or ()])
+    header = header.replace(b"little", b"big") + b"end_header\n"
+    (tmp_path / "b.ply").write_bytes(header + big.tobytes())
+    assert_equal(read_ply(tmp_path / "b.ply"), gaussians)
+
+
+def test_every_truncated_text_is_refused(make_gaussians, tmp_path: Path) -> None:
+    """But for the last digits of the last number, which nobody can miss."""
+    write_ply(tmp_path / "a.ply", make_gaussians(2, 0))
+    as_text(tmp_path / "a.ply", tmp_path / "b.ply")
+    data = (tmp_path / "b.ply").read_bytes()
+    for length in range(len(data) - len(data.split()[-1])):
+        (tmp_path / "b.ply").write_bytes(data[:length])
+        with pytest.raises(FieldFormatError):
+            read_ply(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        (b"element vertex 3", b"element vertex 4", "3 rows, the header claims 4"),
+        (b"element vertex 3", b"element vertex 2000000000", "claims 68000000000 bytes"),
+        (b"\n0.125730", b"\nnan 0.125730", "row 0 has 18 numbers, not 17"),
+        (b"\n0.125730", b"\nzero.125730", "could not convert"),
+        (b"\n0.125730217", b"\nnan", "means: 1 of 3 .* number 0"),
+    ],
+)
+def test_text_that_is_not_rows_of_numbers_is_refused_by_name(
+    make_gaussians, tmp_path: Path, old: bytes, new: bytes, named: str
+) -> None:
+    write_ply(tmp_path / "a.ply", make_gaussians(3, 0))
+    as_text(tmp_path / "a.ply", tmp_path / "b.ply")
+    data = (tmp_path / "b.ply").read_bytes()
+    assert old in data
+    (tmp_path / "b.ply").write_bytes(data.replace(old, new, 1))
+    with pytest.raises(FieldFormatError, match=named):
+        read_ply(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize("suffix", ["splat", "ksplat", "spz", "sog"])
+def test_other_formats_of_splats_are_refused_by_their_name(tmp_path: Path, suffix: str) -> None:
+    with pytest.raises(FieldFormatError, match=f"{suffix} is another format; export it as .ply"):
+        read_ply(tmp_path / f"a.{suffix}")

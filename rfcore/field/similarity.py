@@ -1,0 +1,121 @@
+"""Moving a field to another frame: turned, scaled, shifted.
+
+``p_dst = scale * rotation @ p_src + translation_m``. Everything of a Gaussian follows: its mean,
+its widths, its rotation, and its colour, because spherical harmonics are functions of the
+direction in the field's frame. Done once, when a field is imported, in float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Pose
+from rfcore.errors import InvalidInput
+from rfcore.raster.gaussians import F32, Gaussians
+
+__all__ = ["Similarity", "moved", "spherical_harmonics"]
+
+F64 = NDArray[np.float64]
+DIRECTIONS = 64
+"""Sample directions for the rotation of SH; 7 unknowns a row at most."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """``dst_from_src``; ``pose`` holds rotation and translation (in metres of dst)."""
+
+    pose: Pose
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 1e-9 <= self.scale <= 1e9:
+            raise InvalidInput("transform.scale", f"{self.scale} is outside 1e-9..1e9")
+
+    @property
+    def rotation(self) -> F64:
+        """The rotation as a matrix [3, 3]."""
+        return np.array(self.pose.rotation_matrix())
+
+    def inverse(self) -> Similarity:
+        """Return ``src_from_dst``."""
+        back = self.pose.inverse()
+        x, y, z = (value / self.scale for value in back.translation_m)
+        return Similarity(Pose((x, y, z), back.rotation), 1 / self.scale)
+
+    def compose(self, other: Similarity) -> Similarity:
+        """Return ``self`` after ``other``."""
+        x, y, z = (value * self.scale for value in other.pose.translation_m)
+        inner = Pose((x, y, z), other.pose.rotation)
+        return Similarity(self.pose.compose(inner), self.scale * other.scale)
+
+    def apply(self, points: F64) -> F64:
+        """Map points [N, 3] from src to dst."""
+        turned = points @ self.rotation.T
+        return np.asarray(self.scale * turned + np.array(self.pose.translation_m))
+
+
+def moved(gaussians: Gaussians, dst_from_src: Similarity) -> Gaussians:
+    """Return the Gaussians in the frame dst: from there they look as they did from src."""
+    means = dst_from_src.apply(gaussians.means.astype(np.float64))
+    widening = np.log(dst_from_src.scale)
+    return replace(
+        gaussians,
+        means=np.ascontiguousarray(means, np.float32),
+        quaternions=_turned(gaussians.quaternions, dst_from_src.pose.rotation),
+        log_scales=(gaussians.log_scales.astype(np.float64) + widening).astype(np.float32),
+        sh=_turned_sh(gaussians.sh, dst_from_src.rotation),
+    )
+
+
+def spherical_harmonics(directions: F64) -> F64:
+    """Return the 16 real basis functions [M, 16] of unit directions [M, 3], as splats use them.
+
+    Same order and signs as ``rfcore.raster.reference`` (Kerbl et al. 2023; Sloan 2013).
+    """
+    x, y, z = directions.T
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [
+        0.28209479177387814 * np.ones_like(x),
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * zz - xx - yy),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (xx - yy),
+        -0.5900435899266435 * y * (3 * xx - yy),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * zz - xx - yy),
+        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+        -0.4570457994644658 * x * (4 * zz - xx - yy),
+        1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3 * yy),
+    ]
+    return np.stack(basis, axis=1)
+
+
+def _turned(quaternions: F32, by: tuple[float, float, float, float]) -> F32:
+    """Return ``by`` times each quaternion [N, 4] (w, x, y, z); norms stay."""
+    w, x, y, z = by
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return np.ascontiguousarray(quaternions.astype(np.float64) @ left.T, np.float32)
+
+
+def _turned_sh(sh: F32, rotation: F64) -> F32:
+    """Return coefficients [N, K, 3] of the colours turned with the field.
+
+    Each band is closed under rotation; its matrix is solved for from its values at directions.
+    """
+    turned = sh.astype(np.float64)
+    directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    here, there = spherical_harmonics(directions), spherical_harmonics(directions @ rotation)
+    for degree in range(1, round(sh.shape[1] ** 0.5)):
+        band = slice(degree**2, (degree + 1) ** 2)
+        matrix = np.linalg.lstsq(here[:, band], there[:, band], rcond=None)[0]
+        turned[:, band] = np.einsum("ij,njc->nic", matrix, sh[:, band].astype(np.float64))
+    return np.ascontiguousarray(turned, np.float32)
