@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from rfcore.errors import CodecError
 from rfcore.image import I420
 
-__all__ = ["EncoderOptions", "H264Decoder", "PictureKind", "encode_pictures"]
+__all__ = ["EncoderOptions", "H264Decoder", "PictureKind", "decode_clip", "encode_pictures"]
 
 SIGNAL = MappingProxyType(
     {
@@ -106,6 +106,15 @@ class H264Decoder:
             raise CodecError(f"H.264 decoder returned {len(frames)} pictures for one access unit")
         return self._picture_of(frames[0])
 
+    def decode_all(self, access_units: Sequence[bytes]) -> list[I420]:
+        """Decode a stream to its end, pictures that were held back included."""
+        try:
+            frames = [f for unit in access_units for f in self._context.decode(av.Packet(unit))]
+            frames += self._context.decode(None)
+        except (FFmpegError, ValueError, MemoryError) as error:
+            raise CodecError(f"H.264 decoder: {error}") from error
+        return [self._picture_of(frame) for frame in frames]
+
     def _picture_of(self, frame: av.VideoFrame) -> I420:
         if frame.is_corrupt:
             raise CodecError("H.264 decoder marks the picture as corrupt")
@@ -123,6 +132,18 @@ class H264Decoder:
         max_pixels = (width_px + 63) // 64 * 64 * ((height_px + 15) // 16 * 16)
         context.options = {"max_pixels": str(max_pixels), "err_detect": "explode"}
         return context
+
+
+def decode_clip(size_px: tuple[int, int], access_units: Sequence[bytes]) -> list[I420]:
+    """Decode a whole clip that may reorder pictures; return them in the order they are shown.
+
+    Raises ``CodecError`` on damage, or unless there is one picture for each access unit.
+    """
+    decoder = H264Decoder(size_px)
+    pictures = decoder.decode_all(access_units)
+    if len(pictures) != len(access_units):
+        raise CodecError(f"{len(access_units)} access units decoded to {len(pictures)} pictures")
+    return pictures
 
 
 def _open_encoder(options: EncoderOptions) -> av.VideoCodecContext:

@@ -20,7 +20,15 @@ from rfcore.codec.parameter_sets import NAL_IDR, NAL_P, nal_type, parse_slice_st
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 
-__all__ = ["PaperSavings", "paper_savings", "paper_savings_percent", "slice_nals"]
+__all__ = [
+    "PaperSavings",
+    "intra_alone",
+    "paper_savings",
+    "paper_savings_percent",
+    "published_clip",
+    "savings_of_clip",
+    "slice_nals",
+]
 
 _TYPES = ("P", "B", "I")
 
@@ -43,21 +51,36 @@ class PaperSavings:
         return 100.0 * self.i_bytes / (self.i_bytes + self.p_bytes)
 
 
-def paper_savings(camera: I420, render: I420, preset: str, crf: float) -> PaperSavings:
-    """Code the published two-frame clip and return its sizes.
+def published_clip(camera: I420, render: I420, preset: str, crf: float) -> tuple[bytes, bytes]:
+    """Code the published two-frame clip; return the access units of render and camera.
 
     Raises ``InvalidInput`` for pictures of different sizes, a size, preset or CRF outside
     ``CodecConfig``, ``CodecError`` if x264 fails.
     """
     if camera.size_px != render.size_px:
         raise InvalidInput("camera", f"{camera.size_px} px where the render has {render.size_px}")
-    config = CodecConfig(*camera.size_px, preset=preset, crf=crf)
-    options = EncoderOptions(
-        config.coded_size_px, preset, crf, params={"threads": "1"}, tune=None, rate_hz=1
-    )
+    options = _published_options(camera.size_px, preset, crf)
     clip = [(render, PictureKind.CHOSEN), (camera, PictureKind.CHOSEN)]
-    first, second = (slice_nals(unit) for unit in encode_pictures(options, clip))
+    first, second = encode_pictures(options, clip)
+    return first, second
+
+
+def intra_alone(camera: I420, preset: str, crf: float) -> bytes:
+    """Code the camera frame alone with the published options; return its access unit."""
+    options = _published_options(camera.size_px, preset, crf)
+    (unit,) = encode_pictures(options, [(camera, PictureKind.CHOSEN)])
+    return unit
+
+
+def savings_of_clip(clip: tuple[bytes, bytes]) -> PaperSavings:
+    """Return the sizes of a published clip's slices."""
+    first, second = map(slice_nals, clip)
     return PaperSavings(sum(map(len, first)), sum(map(len, second)), _type_of(second[0]))
+
+
+def paper_savings(camera: I420, render: I420, preset: str, crf: float) -> PaperSavings:
+    """Code the published two-frame clip and return its sizes; raises as ``published_clip``."""
+    return savings_of_clip(published_clip(camera, render, preset, crf))
 
 
 def paper_savings_percent(camera: I420, render: I420, preset: str, crf: float) -> float:
@@ -71,6 +94,13 @@ def slice_nals(access_unit: bytes) -> list[bytes]:
     if not nals:
         raise CodecError(f"access unit of {len(access_unit)} bytes holds no slice")
     return nals
+
+
+def _published_options(size_px: tuple[int, int], preset: str, crf: float) -> EncoderOptions:
+    config = CodecConfig(*size_px, preset=preset, crf=crf)
+    return EncoderOptions(
+        config.coded_size_px, preset, crf, params={"threads": "1"}, tune=None, rate_hz=1
+    )
 
 
 def _type_of(nal: bytes) -> str:

@@ -1,0 +1,117 @@
+"""The published experiment, frame by frame: rows of sizes and qualities as its tables need them.
+
+Each camera frame and the render at its pose are coded as the two-frame clip of
+``rfcore.codec.paper`` (one frame a second, x264's default tune, the same CRF for both), at every
+size, preset and CRF; the camera alone, coded so, says what an I picture of it costs. Nothing here
+is our own coding. Qualities are PSNRs of RGB, and SSIM of RGB, on the true size.
+
+``downscaled`` renders and frames are made at the drive's size and reduced together, as published;
+``native`` renders are made at the small size, which is what a vehicle would do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from rfcore.codec.config import CodecConfig
+from rfcore.codec.h264 import decode_clip
+from rfcore.codec.paper import intra_alone, published_clip, savings_of_clip, slice_nals
+from rfcore.errors import InvalidInput
+from rfcore.image import I420, Rgb
+from rfcore.metrics import psnr, ssim
+from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
+
+__all__ = [
+    "PUBLISHED_CRFS",
+    "PUBLISHED_PRESETS",
+    "PublishedFrame",
+    "Setting",
+    "published_rows",
+    "reduced",
+]
+
+PUBLISHED_PRESETS = ("veryslow", "medium", "veryfast")
+PUBLISHED_CRFS = (18.0, 23.0, 28.0)
+Size = tuple[int, int]
+Making = Literal["downscaled", "native"]
+
+
+@dataclass(frozen=True)
+class PublishedFrame:
+    """A camera frame, and how its render is made for a size: uint8 RGB [H, W, 3]."""
+
+    name: str
+    camera: Rgb
+    render: Callable[[Size, Making], Rgb]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One combination of what the published averages run over."""
+
+    size_px: Size
+    making: Making
+    preset: str
+    crf: float
+
+
+def published_rows(frame: PublishedFrame, settings: Sequence[Setting]) -> Iterator[dict[str, Any]]:
+    """Yield a row per setting. Raises ``InvalidInput`` for a size larger than the frame."""
+    for setting in settings:
+        camera = reduced(frame.camera, setting.size_px)
+        render = frame.render(setting.size_px, setting.making)
+        yield {
+            "width": setting.size_px[0],
+            "height": setting.size_px[1],
+            "render": setting.making,
+            "preset": setting.preset,
+            "crf": setting.crf,
+            "frame": frame.name,
+            **_coded(camera, render, setting),
+            "rf_psnr_db": psnr(render, camera),
+            "rf_ssim": ssim(render, camera),
+        }
+
+
+def reduced(picture: Rgb, size_px: Size) -> Rgb:
+    """Return the picture at a smaller size, each pixel the mean of the area it covers."""
+    height, width = picture.shape[:2]
+    if size_px == (width, height):
+        return picture
+    if size_px[0] > width or size_px[1] > height:
+        raise InvalidInput("size", f"{size_px} px is larger than the frame's {(width, height)} px")
+    smaller: Rgb = cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    return smaller
+
+
+def _coded(camera: Rgb, render: Rgb, setting: Setting) -> dict[str, Any]:
+    frame, reference = i420_from_rgb(camera), i420_from_rgb(render)
+    clip = published_clip(frame, reference, setting.preset, setting.crf)
+    alone = intra_alone(frame, setting.preset, setting.crf)
+    sizes = savings_of_clip(clip)
+    first, second = (rgb_from_i420(picture) for picture in _decoded(clip, setting))
+    camera_alone = rgb_from_i420(_decoded((alone,), setting)[0])
+    return {
+        "i_bytes": sizes.i_bytes,
+        "p_bytes": sizes.p_bytes,
+        "second_type": sizes.second_type,
+        "header_bytes": sum(map(len, clip)) - sizes.i_bytes - sizes.p_bytes,
+        "camera_i_bytes": sum(map(len, slice_nals(alone))),
+        "savings_percent": sizes.percent,
+        "i_psnr_db": psnr(first, render),
+        "psnr_db": psnr(second, camera),
+        "camera_i_psnr_db": psnr(camera_alone, camera),
+        "ssim": ssim(second, camera),
+    }
+
+
+def _decoded(clip: Sequence[bytes], setting: Setting) -> list[I420]:
+    config = CodecConfig(*setting.size_px, preset=setting.preset, crf=setting.crf)
+    width, height = setting.size_px
+    pictures = decode_clip(config.coded_size_px, clip)
+    return [I420(p.y[:height, :width], p.u, p.v) for p in pictures]
