@@ -12,7 +12,8 @@
     ├── PacketRejected          a delta packet that must not be shown; carries a RejectReason
     ├── ProtocolError           the peer broke the session's rules
     ├── BackendUnavailable      an instruction set or device this machine does not have
-    └── CodecError              encoder or decoder did not do what its configuration promises
+    ├── CodecError              encoder or decoder did not do what its configuration promises
+    └── TrainingDiverged        a training run no longer gets anywhere
 
 A message names the offending value, the limit it broke and what to do about it. Commands print
 it as one line and exit with status 2; services map it to one gRPC status (``rfcore.wire``).
@@ -32,6 +33,7 @@ __all__ = [
     "ProtocolError",
     "RejectReason",
     "RfedgeError",
+    "TrainingDiverged",
     "UnknownField",
 ]
 
@@ -106,3 +108,15 @@ class BackendUnavailable(RfedgeError):
 
 class CodecError(RfedgeError):
     """The encoder or decoder did not do what its configuration promises."""
+
+
+class TrainingDiverged(RfedgeError):
+    """A training run left the ground: what it learned last is worth nothing.
+
+    ``group`` is the group of parameters that moved furthest, or is not finite.
+    """
+
+    def __init__(self, iteration: int, group: str, problem: str) -> None:
+        super().__init__(f"training diverged at iteration {iteration}, {group}: {problem}")
+        self.iteration = iteration
+        self.group = group

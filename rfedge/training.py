@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rfcore.dataset import Dataset
 from rfcore.errors import DatasetError
 from rfcore.field import SplatField
-from rfcore.train import SplatTrainer, SplatTrainingConfig, mean_psnr_db
+from rfcore.train import SplatTrainer, SplatTrainingConfig, held_out_quality
 
 __all__ = ["TrainingJob", "train_field", "training_config"]
 
@@ -58,9 +58,9 @@ def train_field(job: TrainingJob, console: Console) -> SplatField:
     if job.held_out is None:
         console.print(f"  {training_s:.0f} s of training")
         return field
-    held_out_psnr_db = mean_psnr_db(field, job.held_out.pictures)
-    console.print(f"  {training_s:.0f} s of training, held-out PSNR {held_out_psnr_db:.2f} dB")
-    return trainer.field(job.name, job.dataset.tile_origin, held_out_psnr_db)
+    quality = held_out_quality(field, job.held_out.pictures)
+    console.print(f"  {training_s:.0f} s of training, held-out PSNR {quality.psnr_db:.2f} dB")
+    return trainer.field(job.name, job.dataset.tile_origin, quality)
 
 
 def _run_with_bar(trainer: SplatTrainer, console: Console) -> None:

@@ -21,14 +21,23 @@ from rfcore.native.raster import (
     overlaps_limited,
 )
 from rfcore.raster.gaussians import F32, Gaussians
-from rfcore.raster.trainable import LearningRates, TrainableRasterizer
+from rfcore.raster.trainable import (
+    DensityStep,
+    Exposure,
+    LearningRates,
+    TrainableRasterizer,
+    TrainingState,
+)
 from rfcore.views import View
 
 __all__ = [
+    "DensityStep",
+    "Exposure",
     "LearningRates",
     "RasterStatistics",
     "Rasterizer",
     "TrainableRasterizer",
+    "TrainingState",
     "available_isas",
 ]
 

@@ -12,6 +12,7 @@ from dataclasses import astuple, dataclass, fields
 from threading import Lock
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
@@ -22,11 +23,20 @@ from rfcore.native.raster import (
     native_camera,
     overlaps_limited,
 )
-from rfcore.raster.gaussians import F32, Gaussians
+from rfcore.raster.gaussians import F32, MAX_GAUSSIANS, Gaussians
 from rfcore.views import View
 
-__all__ = ["LearningRates", "TrainableRasterizer"]
+__all__ = [
+    "DEAD_LOGIT",
+    "DensityStep",
+    "Exposure",
+    "LearningRates",
+    "TrainableRasterizer",
+    "TrainingState",
+]
 
+DEAD_LOGIT = -5.293305
+"""An opacity of 0.005: less is not told from nothing on an 8-bit display."""
 DSSIM_WEIGHT = 0.2
 """Share of D-SSIM in the loss (Kerbl et al. 2023, eq. 7)."""
 
@@ -49,6 +59,10 @@ class LearningRates:
     beta1: float = 0.9
     beta2: float = 0.999
     epsilon: float = 1e-15
+    opacity_pull: float = 0.0
+    """Regularisation: what the opacity of a visible Gaussian adds to the loss, times this."""
+    scale_pull: float = 0.0
+    """The same for each of its three scales in metres."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -60,6 +74,68 @@ class LearningRates:
                 raise InvalidInput(f"rates.{name}", f"{getattr(self, name)} must be below 1")
         if self.epsilon < 1e-30:
             raise InvalidInput("rates.epsilon", f"{self.epsilon} must be at least 1e-30")
+
+
+@dataclass(frozen=True)
+class DensityStep:
+    """One round of density control: the dead are replaced, ``added`` more join at the end.
+
+    Every new Gaussian is split off one that is alive, drawn by its opacity (Kheradmand et al.
+    2024, "MCMC") or, with ``by_gradient``, by the mean gradient of its centre in the picture since
+    the last round (Kerbl et al. 2023, section 5.2). ``in_place`` leaves the parts where the
+    original was, equal to it together (MCMC, eq. 9); otherwise they are halves, side by side
+    along its longest axis. Moments of all that took part start anew.
+    """
+
+    added: int
+    seed: int
+    by_gradient: bool = False
+    in_place: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.added <= MAX_GAUSSIANS:
+            raise InvalidInput("density.added", f"{self.added} is outside 0..{MAX_GAUSSIANS}")
+        if not 0 <= self.seed < 1 << 64:
+            raise InvalidInput("density.seed", f"{self.seed} is outside 0..2^64")
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """An affine map of colours, float32 [3, 4], and the gradient of the loss by it, float64."""
+
+    affine: F32
+    gradient: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("affine", np.float32), ("gradient", np.float64)):
+            array = getattr(self, name)
+            if array.shape != (3, 4) or array.dtype != dtype or not array.flags.c_contiguous:
+                raise InvalidInput(
+                    f"exposure.{name}", f"must be contiguous {dtype.__name__} [3, 4]"
+                )
+
+
+@dataclass(frozen=True)
+class TrainingState:
+    """Everything a run goes on from: parameters, Adam's moments and powers, density scores.
+
+    ``scores`` float32 [N, 2]: sum of the gradients of the centre, number of views.
+    """
+
+    gaussians: Gaussians
+    first_moments: Gaussians
+    second_moments: Gaussians
+    scores: F32
+    beta_powers: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        n = len(self.gaussians)
+        if not n == len(self.first_moments) == len(self.second_moments):
+            raise InvalidInput("training state", "moments and parameters differ in number")
+        if self.scores.shape != (n, 2) or self.scores.dtype != np.float32:
+            raise InvalidInput("training state", f"scores {self.scores.shape} must be [{n}, 2]")
+        if not all(0.0 <= power <= 1.0 for power in self.beta_powers):
+            raise InvalidInput("training state", f"powers {self.beta_powers} are not in 0..1")
 
 
 class TrainableRasterizer:
@@ -83,7 +159,6 @@ class TrainableRasterizer:
         self.threads = threads
         self.antialiased = antialiased
         self.sh_degree = gaussians.sh_degree
-        self._count = len(gaussians)
         g = gaussians
         arrays = (g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh)
         self._native = NativeTrainable(*arrays, threads, self.isa, antialiased)
@@ -93,7 +168,7 @@ class TrainableRasterizer:
         self._has_gradients = False
 
     def __len__(self) -> int:
-        return self._count
+        return self._native.count
 
     def forward(self, camera: Camera, *, sh_degree: int | None = None) -> View:
         """Render ``camera`` with the bands up to ``sh_degree`` (default: all of them).
@@ -152,16 +227,30 @@ class TrainableRasterizer:
             self._forget()
 
     def iterate(
-        self, camera: Camera, target: F32, rates: LearningRates, *, sh_degree: int | None = None
+        self,
+        camera: Camera,
+        target: F32,
+        rates: LearningRates,
+        *,
+        sh_degree: int | None = None,
+        exposure: Exposure | None = None,
     ) -> float:
-        """Run forward (colour only), loss, backward and one step of Adam; return the loss."""
+        """Run forward (colour only), loss, backward and one step of Adam; return the loss.
+
+        With ``exposure`` the loss is that of the mapped picture, and its gradient is filled in.
+        """
         colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
         _check_picture("target", target, colour)
         seen_from, degree = native_camera(camera), bands_to_use(sh_degree, self.sh_degree)
         with self._lock, overlaps_limited():
             self._forget()
             self._native.forward_colour(seen_from, degree, colour)
-            value = self._native.loss(colour, target, DSSIM_WEIGHT)
+            if exposure is None:
+                value = self._native.loss(colour, target, DSSIM_WEIGHT)
+            else:
+                value = self._native.exposed_loss(
+                    colour, target, DSSIM_WEIGHT, exposure.affine, exposure.gradient
+                )
             self._native.backward(colour)
             self._native.adam_step(astuple(rates))
         return value
@@ -172,6 +261,61 @@ class TrainableRasterizer:
         with self._lock:
             self._native.parameters(*arrays.values())
         return Gaussians(**arrays)
+
+    def keep_scores(self, keep: bool) -> None:
+        """Say whether steps note what ``DensityStep.by_gradient`` needs."""
+        self._native.keep_scores(keep)
+
+    def control_density(self, step: DensityStep) -> int:
+        """Replace the dead and add Gaussians; return how many were dead."""
+        with self._lock:
+            self._forget()
+            return self._native.control_density(
+                DEAD_LOGIT, step.added, step.by_gradient, step.in_place, step.seed
+            )
+
+    def perturb(self, strength: float, seed: int) -> None:
+        """Move faint Gaussians at random, by up to ``strength`` of their deviations (MCMC, eq. 8).
+
+        Opaque ones stay: the noise falls from a half at an opacity of 0.005 to 0.01 at 0.05.
+        """
+        if not 0 <= strength <= 100:
+            raise InvalidInput("perturb.strength", f"{strength} is outside 0..100")
+        with self._lock:
+            self._native.perturb(strength, seed)
+
+    def remove_dead(self) -> None:
+        """Leave out the Gaussians that show nothing; the others keep their order."""
+        with self._lock:
+            self._forget()
+            self._native.remove_dead(DEAD_LOGIT)
+
+    def state(self) -> TrainingState:
+        """Return a copy of everything a run goes on from."""
+        first, second = self._empty_arrays(), self._empty_arrays()
+        powers, scores = np.empty(2), np.empty((len(self), 2), np.float32)
+        with self._lock:
+            self._native.moments([*first.values()], [*second.values()], powers)
+            self._native.scores(scores)
+        moments = Gaussians(**first), Gaussians(**second)
+        return TrainingState(
+            self.gaussians(), *moments, scores, (float(powers[0]), float(powers[1]))
+        )
+
+    def set_optimiser(self, state: TrainingState) -> None:
+        """Go on from ``state``, made of as many Gaussians; its parameters are not looked at."""
+        if len(state.gaussians) != len(self):
+            raise InvalidInput(
+                "training state", f"of {len(state.gaussians)} Gaussians, these are {len(self)}"
+            )
+        first, second = (
+            [getattr(moments, f.name) for f in fields(Gaussians)]
+            for moments in (state.first_moments, state.second_moments)
+        )
+        with self._lock:
+            self._forget()
+            self._native.set_moments(first, second, state.beta_powers)
+            self._native.set_scores(state.scores)
 
     def _forget(self) -> None:
         self._colour = None
@@ -187,7 +331,7 @@ class TrainableRasterizer:
             raise InvalidInput(caller, "no gradients: call backward() first")
 
     def _empty_arrays(self) -> dict[str, F32]:
-        n, coefficients = self._count, (self.sh_degree + 1) ** 2
+        n, coefficients = len(self), (self.sh_degree + 1) ** 2
         shapes = {
             "means": (n, 3),
             "quaternions": (n, 4),

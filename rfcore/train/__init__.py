@@ -1,13 +1,25 @@
 """Training of radiance fields from posed pictures."""
 
-from rfcore.train.evaluation import mean_psnr_db
-from rfcore.train.schedule import RateSchedule
-from rfcore.train.splats import SplatTrainer, SplatTrainingConfig, TrainingProgress
+from rfcore.train.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from rfcore.train.density import DensityControl
+from rfcore.train.evaluation import held_out_quality, mean_psnr_db
+from rfcore.train.protocol import FieldTrainer, HeldOut, TrainingProgress
+from rfcore.train.schedule import Bands, RateSchedule, Regularisation
+from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
 
 __all__ = [
+    "Bands",
+    "Checkpoint",
+    "DensityControl",
+    "FieldTrainer",
+    "HeldOut",
     "RateSchedule",
+    "Regularisation",
     "SplatTrainer",
     "SplatTrainingConfig",
     "TrainingProgress",
+    "held_out_quality",
     "mean_psnr_db",
+    "read_checkpoint",
+    "write_checkpoint",
 ]

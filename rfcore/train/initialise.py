@@ -24,7 +24,6 @@ MIN_SPACING_M = 1e-3
 MAX_SPACING_M = 20.0
 """A stray point far from all others would cover the picture."""
 SH_DC = math.sqrt(1 / (4 * math.pi))
-SH_COEFFICIENTS = 16
 FLANN_KDTREE_SINGLE = 4
 """One exact tree: unlike FLANN's forests it does not depend on a random state."""
 
@@ -32,9 +31,14 @@ F32 = NDArray[np.float32]
 
 
 def gaussians_from_points(
-    points: PointCloud, count: int, scale: float, rng: np.random.Generator
+    points: PointCloud,
+    count: int,
+    scale: float,
+    rng: np.random.Generator,
+    *,
+    sh_degree: int = 3,
 ) -> Gaussians:
-    """Return Gaussians of SH degree 3 on ``count`` points drawn from ``points``, or on all.
+    """Return Gaussians on ``count`` points drawn from ``points``, or on all.
 
     ``scale`` is a Gaussian's standard deviation in units of the distance to its neighbours.
     Raises ``InvalidInput`` for fewer than four points.
@@ -45,7 +49,7 @@ def gaussians_from_points(
     means = np.ascontiguousarray(points.xyz_m[chosen], dtype=np.float32)
     n = len(means)
     log_scales = np.log(np.clip(spacing_m(means), MIN_SPACING_M, MAX_SPACING_M) * scale)
-    sh = np.zeros((n, SH_COEFFICIENTS, 3), np.float32)
+    sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (points.rgb[chosen] / 255.0 - 0.5) / SH_DC
     return Gaussians(
         means=means,

@@ -6,14 +6,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rfcore.errors import InvalidInput
 from rfcore.raster.native import LearningRates
 
-__all__ = ["RateSchedule", "view_order"]
+__all__ = ["Bands", "RateSchedule", "Regularisation", "view_order"]
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,14 @@ class RateSchedule:
             if not 0 < getattr(self, name) <= 1:
                 raise InvalidInput(f"rates.{name}", f"{getattr(self, name)} is outside 0..1")
 
+    def factor(self, progress: float) -> float:
+        """Return what is left of the rates at ``progress``, 1 to begin with."""
+        fall = max(0.0, (progress - self.held_share) / (1.0 - self.held_share))
+        return float(self.final_factor**fall)
+
     def at(self, progress: float, unit_m: float) -> LearningRates:
         """Return the rates at ``progress``; ``unit_m`` is the median initial deviation."""
-        fall = max(0.0, (progress - self.held_share) / (1.0 - self.held_share))
-        factor = self.final_factor**fall
+        factor = self.factor(progress)
         return LearningRates(
             means=self.means * unit_m * factor * self.means_fall**progress,
             log_scales=self.log_scales * factor,
@@ -60,6 +64,52 @@ class RateSchedule:
             sh_dc=self.sh_dc * factor,
             sh_rest=self.sh_rest * factor,
         )
+
+
+@dataclass(frozen=True)
+class Regularisation:
+    """What is added to the loss: so much times the mean opacity and the mean scale in metres.
+
+    MCMC (Kheradmand et al. 2024, eq. 10) takes 0.01 for both: it makes Gaussians that do not pay
+    for themselves fade, and with that frees them for density control.
+    """
+
+    opacity: float = 0.0
+    scale: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("opacity", "scale"):
+            if not 0 <= getattr(self, name) <= 10:
+                raise InvalidInput(f"regularisation.{name}", f"{getattr(self, name)} not in 0..10")
+
+    def added_to(self, rates: LearningRates, count: int) -> LearningRates:
+        """Return ``rates`` with the pulls on each of ``count`` Gaussians."""
+        per_gaussian = 1.0 / max(count, 1)
+        return replace(
+            rates,
+            opacity_pull=self.opacity * per_gaussian,
+            scale_pull=self.scale * per_gaussian / 3.0,
+        )
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Which bands of the spherical harmonics are learned, and from when."""
+
+    degree: int = 3
+    """The field's, 0..3."""
+    rise: float = 0.0
+    """Share of the run after which one more band joins, beginning with none; 0 has all at once."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.degree <= 3:
+            raise InvalidInput("bands.degree", f"{self.degree} is outside 0..3")
+        if not 0 <= self.rise <= 0.3:
+            raise InvalidInput("bands.rise", f"{self.rise} is outside 0..0.3")
+
+    def at(self, progress: float) -> int:
+        """Return the degree in use at ``progress``."""
+        return self.degree if self.rise == 0 else min(self.degree, int(progress / self.rise))
 
 
 def view_order(views: int, rng: np.random.Generator) -> Iterator[int]:

@@ -1,8 +1,11 @@
-"""Training of 3D Gaussians from posed pictures and points (3DGS, sections 5.1 and 7.1).
+"""Training of 3D Gaussians from posed pictures (3DGS, sections 5 and 7.1).
 
-Stochastic descent on L1 and D-SSIM, one view an iteration, with Adam. No density control: the
-number of Gaussians is that of the start. The same pictures, points, settings and seed give the
-same field to the last bit, whatever the instruction set and the number of threads.
+Stochastic descent on L1 and D-SSIM, one view an iteration, with Adam and density control. The same
+pictures, start, settings and seed give the same field to the last bit, whatever the instruction
+set and the number of threads, and whether or not the run was interrupted.
+
+How far a run is, ``progress``, goes from 0 to 1: by default it is the share of the iterations done;
+a run limited by time passes its own, and then repeats itself only as well as its clock does.
 """
 
 from __future__ import annotations
@@ -10,20 +13,31 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields
+from itertools import islice
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rfcore.camera import TileOrigin
-from rfcore.errors import InvalidInput
+from rfcore.errors import InvalidInput, TrainingDiverged
 from rfcore.field import FieldMetadata, SplatField
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
-from rfcore.raster.native import TrainableRasterizer
+from rfcore.raster.native import TrainableRasterizer, TrainingState
+from rfcore.train.checkpoint import Checkpoint
+from rfcore.train.density import DensityControl, control_density
+from rfcore.train.divergence import DivergenceWatch
+from rfcore.train.exposure import ExposureModel
 from rfcore.train.initialise import gaussians_from_points
-from rfcore.train.schedule import RateSchedule, view_order
+from rfcore.train.protocol import HeldOut, TrainingProgress
+from rfcore.train.schedule import Bands, RateSchedule, Regularisation, view_order
 from rfcore.train.targets import load_targets
 from rfcore.views import PointCloud, PosedPicture
 
-__all__ = ["SplatTrainer", "SplatTrainingConfig", "TrainingProgress"]
+__all__ = ["SplatTrainer", "SplatTrainingConfig"]
+
+STATE_PARTS = ("gaussians", "first_moments", "second_moments")
+"""Of ``TrainingState``: each of them shaped as Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +50,13 @@ class SplatTrainingConfig:
     initial_scale: float = 0.6
     """Standard deviation at the start, in units of the distance to the three nearest points."""
     rates: RateSchedule = field(default_factory=RateSchedule)
+    density: DensityControl = field(default_factory=DensityControl)
+    regularisation: Regularisation = field(default_factory=Regularisation)
+    bands: Bands = field(default_factory=Bands)
+    antialiased: bool = False
+    """Train for the antialiased mode; the field says so."""
+    exposure: bool = False
+    """Learn an affine map of colours per picture; the field is that of the mean picture."""
     threads: int = 1
     isa: str | None = None
 
@@ -48,15 +69,6 @@ class SplatTrainingConfig:
             raise InvalidInput("training.initial_scale", f"{self.initial_scale} not in 0.01..10")
 
 
-@dataclass(frozen=True)
-class TrainingProgress:
-    """What one iteration did: ``iteration`` counts from 1 to ``total``."""
-
-    iteration: int
-    total: int
-    loss: float
-
-
 class SplatTrainer:
     """One training run.
 
@@ -64,6 +76,8 @@ class SplatTrainer:
     memory at once. Raises ``InvalidInput`` on settings, too few points or no pictures, and
     ``DatasetError`` on pictures that cannot be read.
     """
+
+    kind = "splats"
 
     def __init__(
         self,
@@ -74,16 +88,16 @@ class SplatTrainer:
         seed: int = 0,
     ) -> None:
         self.config = config if config is not None else SplatTrainingConfig()
+        self._seed = seed
         self._targets, pictures_digest = load_targets(pictures)
-        rng = np.random.default_rng(seed)
-        initial = self._initial(start, rng)
-        self._order = view_order(len(self._targets), rng)
+        initial = self._initial(start, np.random.default_rng(seed))
+        self._order = view_order(len(self._targets), self._order_rng())
         self._unit_m = float(np.median(np.exp(initial.log_scales.astype(np.float64))))
         self._digest = self._training_digest(pictures_digest, initial, seed)
         self._done = 0
-        self._rasterizer = TrainableRasterizer(
-            initial, threads=self.config.threads, isa=self.config.isa
-        )
+        self._watch = DivergenceWatch()
+        self._exposure = ExposureModel(len(self._targets)) if self.config.exposure else None
+        self._rasterizer = self._rasterizer_of(initial)
 
     @property
     def training_digest(self) -> str:
@@ -91,19 +105,39 @@ class SplatTrainer:
         return self._digest
 
     @property
+    def iteration(self) -> int:
+        """How many iterations have been done."""
+        return self._done
+
+    @property
+    def total(self) -> int:
+        """How many iterations the settings ask for."""
+        return self.config.iterations
+
+    @property
+    def primitives(self) -> int:
+        """How many Gaussians there are now."""
+        return len(self._rasterizer)
+
+    @property
     def finished(self) -> bool:
         """Whether every iteration has been done."""
         return self._done >= self.config.iterations
 
-    def step(self) -> TrainingProgress:
-        """Do one iteration; raise ``InvalidInput`` when the run is finished."""
+    def step(self, progress: float | None = None) -> TrainingProgress:
+        """Do one iteration.
+
+        Raises ``InvalidInput`` when the run is finished, ``TrainingDiverged`` when it no longer
+        gets anywhere.
+        """
         if self.finished:
             raise InvalidInput("training", f"all {self.config.iterations} iterations are done")
-        progress = self._done / self.config.iterations
-        target = self._targets[next(self._order)]
-        rates = self.config.rates.at(progress, self._unit_m)
-        loss = self._rasterizer.iterate(target.camera, target.colour(), rates)
+        if progress is None:
+            progress = self._done / self.config.iterations
+        loss = self._descend(next(self._order), progress)
         self._done += 1
+        self._watch.see(self._done, loss, self.gaussians)
+        control_density(self._rasterizer, self.config.density, self._done, progress, self._seed)
         return TrainingProgress(self._done, self.config.iterations, loss)
 
     def steps(self) -> Iterator[TrainingProgress]:
@@ -119,20 +153,96 @@ class SplatTrainer:
         self,
         name: str = "",
         tile_origin: TileOrigin | None = None,
-        held_out_psnr_db: float | None = None,
+        held_out: HeldOut | None = None,
     ) -> SplatField:
         """Return what has been learnt so far as a field."""
-        origin = tile_origin if tile_origin is not None else TileOrigin()
-        metadata = FieldMetadata(name, origin, self._digest, held_out_psnr_db)
-        return SplatField(
-            self.gaussians(), metadata, threads=self.config.threads, isa=self.config.isa
+        config = self.config
+        metadata = FieldMetadata(
+            name=name,
+            tile_origin=tile_origin if tile_origin is not None else TileOrigin(),
+            training_digest=self._digest,
+            held_out_psnr_db=held_out.psnr_db if held_out is not None else None,
+            held_out_ssim=held_out.ssim if held_out is not None else None,
+            antialiased=config.antialiased,
         )
+        return SplatField(self.gaussians(), metadata, threads=config.threads, isa=config.isa)
+
+    def checkpoint(self) -> Checkpoint:
+        """Return what ``restore`` of a trainer made of the same things goes on from.
+
+        Raises ``TrainingDiverged`` when a parameter is no longer finite.
+        """
+        try:
+            state = self._rasterizer.state()
+        except InvalidInput as error:
+            raise TrainingDiverged(self._done, error.field.split(".")[-1], str(error)) from error
+        arrays: dict[str, NDArray[Any]] = {"scores": state.scores}
+        for part in STATE_PARTS:
+            values = getattr(state, part)
+            arrays |= {f"{part}.{f.name}": getattr(values, f.name) for f in fields(values)}
+        values = {"beta_powers": list(state.beta_powers), "watch": self._watch.values()}
+        if self._exposure is not None:
+            arrays |= self._exposure.arrays()
+        return Checkpoint(self.kind, self._digest, self._done, values, arrays)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on after ``checkpoint``. Raises ``InvalidInput`` when it is of another run."""
+        checkpoint.check(self.kind, self._digest)
+        arrays = checkpoint.arrays
+        parts = {
+            part: Gaussians(**{f.name: arrays[f"{part}.{f.name}"] for f in fields(Gaussians)})
+            for part in STATE_PARTS
+        }
+        first_power, second_power = checkpoint.values["beta_powers"]
+        state = TrainingState(
+            **parts, scores=arrays["scores"], beta_powers=(first_power, second_power)
+        )
+        self._rasterizer = self._rasterizer_of(state.gaussians)
+        self._rasterizer.set_optimiser(state)
+        if self._exposure is not None:
+            self._exposure.restore(arrays)
+        self._watch.restore(checkpoint.values["watch"])
+        self._order = view_order(len(self._targets), self._order_rng())
+        for _ in islice(self._order, checkpoint.iteration):
+            pass
+        self._done = checkpoint.iteration
+
+    def _order_rng(self) -> np.random.Generator:
+        return np.random.default_rng([self._seed, 1])
+
+    def _descend(self, view: int, progress: float) -> float:
+        """Do one step of Adam on a view; return the loss."""
+        config, target = self.config, self._targets[view]
+        rates = config.regularisation.added_to(
+            config.rates.at(progress, self._unit_m), len(self._rasterizer)
+        )
+        exposure = self._exposure.of_view(view) if self._exposure is not None else None
+        loss = self._rasterizer.iterate(
+            target.camera,
+            target.colour(),
+            rates,
+            sh_degree=config.bands.at(progress),
+            exposure=exposure,
+        )
+        if self._exposure is not None and exposure is not None:
+            self._exposure.step(view, exposure.gradient, config.rates.factor(progress))
+        return loss
 
     def _initial(self, start: PointCloud | Gaussians, rng: np.random.Generator) -> Gaussians:
         if isinstance(start, Gaussians):
             return start
         config = self.config
-        return gaussians_from_points(start, config.gaussians, config.initial_scale, rng)
+        return gaussians_from_points(
+            start, config.gaussians, config.initial_scale, rng, sh_degree=config.bands.degree
+        )
+
+    def _rasterizer_of(self, gaussians: Gaussians) -> TrainableRasterizer:
+        config = self.config
+        rasterizer = TrainableRasterizer(
+            gaussians, threads=config.threads, isa=config.isa, antialiased=config.antialiased
+        )
+        rasterizer.keep_scores(config.density.limit > 0 and config.density.drawn_by == "gradient")
+        return rasterizer
 
     def _training_digest(self, pictures: str, initial: Gaussians, seed: int) -> str:
         """Leave out what does not change the result: threads and instruction set."""

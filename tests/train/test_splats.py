@@ -9,7 +9,7 @@ from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.raster.gaussians import Gaussians
-from rfcore.train import SplatTrainer, SplatTrainingConfig, mean_psnr_db
+from rfcore.train import HeldOut, SplatTrainer, SplatTrainingConfig, mean_psnr_db
 from rfcore.views import PointCloud
 
 SHORT = SplatTrainingConfig(gaussians=300, iterations=60)
@@ -75,11 +75,11 @@ def test_another_seed_gives_another_field(posed, points) -> None:
 
 def test_the_field_says_where_it_comes_from(posed, points) -> None:
     trainer = SplatTrainer(posed(checked), points, SHORT)
-    field = trainer.field("wall", TileOrigin(1.0, 2.0, 3.0), held_out_psnr_db=20.0)
+    field = trainer.field("wall", TileOrigin(1.0, 2.0, 3.0), held_out=HeldOut(20.0, 0.5))
     assert field.metadata.name == "wall"
     assert field.metadata.tile_origin == TileOrigin(1.0, 2.0, 3.0)
     assert field.metadata.training_digest == trainer.training_digest
-    assert field.metadata.held_out_psnr_db == 20.0
+    assert (field.metadata.held_out_psnr_db, field.metadata.held_out_ssim) == (20.0, 0.5)
 
 
 def test_gaussians_may_be_trained_further(posed, points) -> None:

@@ -29,6 +29,7 @@ using raster::Rasterizer;
 using raster::Statistics;
 using raster::TrainableRasterizer;
 using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using DoublesOut = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
 using FloatsOut = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 
 const Kernels& kernels_or_best(const std::string& isa) {
@@ -120,9 +121,76 @@ GaussianArrays writable_arrays_of(const TrainableRasterizer& self, const FloatsO
             self.count(), self.degree()};
 }
 
+GaussianArrays writable_arrays_of(const TrainableRasterizer& self,
+                                  const std::vector<FloatsOut>& arrays) {
+    if (arrays.size() != 5) throw std::invalid_argument("five arrays");
+    return writable_arrays_of(self, arrays[0], arrays[1], arrays[2], arrays[3], arrays[4]);
+}
+
+GaussianArrays arrays_of(const std::vector<Floats>& arrays) {
+    if (arrays.size() != 5) throw std::invalid_argument("five arrays");
+    return arrays_of(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4]);
+}
+
+using Trainable = nb::class_<TrainableRasterizer>;
+
+// Density control, and what a checkpoint keeps.
+void bind_density(Trainable& trainable) {
+    using nb::literals::operator""_a;
+    trainable.def_prop_ro("count", &TrainableRasterizer::count)
+        .def("keep_scores", &TrainableRasterizer::keep_scores, "keep"_a)
+        .def("control_density",
+             [](TrainableRasterizer& self, float dead_logit, int added, bool by_gradient,
+                bool in_place, uint64_t seed) {
+                 const raster::DensityPlan plan{
+                     dead_logit, added,
+                     by_gradient ? raster::SourceRule::kGradient : raster::SourceRule::kOpacity,
+                     in_place ? raster::SplitRule::kInPlace : raster::SplitRule::kLongAxis, seed};
+                 const nb::gil_scoped_release release;
+                 return self.control_density(plan);
+             },
+             "dead_logit"_a, "added"_a, "by_gradient"_a, "in_place"_a, "seed"_a)
+        .def("perturb", &TrainableRasterizer::perturb, "strength"_a, "seed"_a,
+             nb::call_guard<nb::gil_scoped_release>())
+        .def("remove_dead", &TrainableRasterizer::remove_dead, "dead_logit"_a,
+             nb::call_guard<nb::gil_scoped_release>())
+        .def("moments",
+             [](const TrainableRasterizer& self, const std::vector<FloatsOut>& first,
+                const std::vector<FloatsOut>& second, const DoublesOut& beta_powers) {
+                 const GaussianArrays a = writable_arrays_of(self, first), b =
+                     writable_arrays_of(self, second);
+                 const nb::gil_scoped_release release;
+                 self.moments(a, b, beta_powers.data());
+             },
+             "first"_a, "second"_a, "beta_powers"_a)
+        .def("set_moments",
+             [](TrainableRasterizer& self, const std::vector<Floats>& first,
+                const std::vector<Floats>& second, const std::vector<double>& beta_powers) {
+                 if (beta_powers.size() != 2) throw std::invalid_argument("two powers of beta");
+                 const GaussianArrays a = arrays_of(first), b = arrays_of(second);
+                 const nb::gil_scoped_release release;
+                 self.set_moments(a, b, beta_powers.data());
+             },
+             "first"_a, "second"_a, "beta_powers"_a)
+        .def("scores",
+             [](const TrainableRasterizer& self, const FloatsOut& out) {
+                 const nb::gil_scoped_release release;
+                 self.scores(out.data());
+             },
+             "out"_a)
+        .def("set_scores",
+             [](TrainableRasterizer& self, const Floats& scores) {
+                 const nb::gil_scoped_release release;
+                 self.set_scores(scores.data());
+             },
+             "scores"_a);
+}
+
 void bind_trainable(nb::module_& m) {
     using nb::literals::operator""_a;
-    nb::class_<TrainableRasterizer>(m, "TrainableRasterizer")
+    Trainable trainable(m, "TrainableRasterizer");
+    bind_density(trainable);
+    trainable
         .def("__init__",
              [](TrainableRasterizer* self, const Floats& means, const Floats& quaternions,
                 const Floats& log_scales, const Floats& opacity_logits, const Floats& sh,
@@ -156,6 +224,14 @@ void bind_trainable(nb::module_& m) {
                  return self.loss(colour.data(), target.data(), dssim_weight);
              },
              "colour"_a, "target"_a, "dssim_weight"_a)
+        .def("exposed_loss",
+             [](TrainableRasterizer& self, const Floats& colour, const Floats& target,
+                float dssim_weight, const Floats& affine, const DoublesOut& d_affine) {
+                 const nb::gil_scoped_release release;
+                 return self.exposed_loss(colour.data(), target.data(), dssim_weight,
+                                          affine.data(), d_affine.data());
+             },
+             "colour"_a, "target"_a, "dssim_weight"_a, "affine"_a, "d_affine"_a)
         .def("set_colour_gradient",
              [](TrainableRasterizer& self, const Floats& d_colour) {
                  const nb::gil_scoped_release release;
@@ -170,9 +246,9 @@ void bind_trainable(nb::module_& m) {
              "colour"_a)
         .def("adam_step",
              [](TrainableRasterizer& self, const std::vector<float>& rates) {
-                 if (rates.size() != 9) throw std::invalid_argument("rates are 9 numbers");
-                 const LearningRates r{rates[0], rates[1], rates[2], rates[3], rates[4],
-                                       rates[5], rates[6], rates[7], rates[8]};
+                 if (rates.size() != 11) throw std::invalid_argument("rates are 11 numbers");
+                 const LearningRates r{rates[0], rates[1], rates[2], rates[3], rates[4], rates[5],
+                                       rates[6], rates[7], rates[8], rates[9], rates[10]};
                  const nb::gil_scoped_release release;
                  self.adam_step(r);
              },

@@ -229,10 +229,10 @@ RF_INLINE void add_d_compensation(const CovarianceRoot& c, const Projection& p, 
     d->turn = plus(d->turn, plus(cross(r0, u0), cross(r1, u1)));
 }
 
-// Gradients of the parameters of one block into `out`, [planes][16].
+// Gradients of the parameters of one block into `out`, [planes][16]; return that of the centre.
 template <int kDegree, bool kAntialiased>
-RF_INLINE void block_gradient(const Camera& camera, const float* block, const SplatGradient& g,
-                              float* out) {
+RF_INLINE Lanes block_gradient(const Camera& camera, const float* block, const SplatGradient& g,
+                               float* out) {
     const Vec3 offset = offset_from(camera, load_vec3(block, kMeanPlane));
     CovarianceRoot c;
     covariance_root(block, &c);
@@ -259,11 +259,29 @@ RF_INLINE void block_gradient(const Camera& camera, const float* block, const Sp
         const float column[3] = {r[j], r[3 + j], r[6 + j]};
         store(plane(out, kMeanPlane + j), dot(column, d_cam) + by_view[j]);
     }
+    return sqrt(fma(d_centre_x, d_centre_x, d_centre_y * d_centre_y));
 }
 
 // A usable gradient: 0 where the Gaussian is not visible, or the value is not.
 RF_INLINE Lanes usable(Mask visible, Lanes gradient) {
     return keep(both(visible, ge(splat(kMaxGradient), absolute(gradient))), gradient);
+}
+
+// Gradients of what AdamStep adds to the loss, onto those of the picture.
+RF_INLINE void add_regularisation(const AdamStep& step, const float* block, float* gradient) {
+    const Lanes opacity = sigmoid(load(plane(block, kLogitPlane)));
+    float* logit = plane(gradient, kLogitPlane);
+    store(logit, fma(splat(step.opacity_pull) * opacity, splat(1.0f) - opacity, load(logit)));
+    for (int k = kScalePlane; k < kScalePlane + 3; ++k) {
+        const Lanes scale = exp2_accurate(load(plane(block, k)) * splat(kLog2E));
+        store(plane(gradient, k), fma(splat(step.scale_pull), scale, load(plane(gradient, k))));
+    }
+}
+
+RF_INLINE void add_score(Mask visible, Lanes centre_gradient, float* scores) {
+    float *gradient = plane(scores, kGradientPlane), *visits = plane(scores, kVisitsPlane);
+    store(gradient, load(gradient) + usable(visible, centre_gradient));
+    store(visits, load(visits) + keep(visible, splat(1.0f)));
 }
 
 RF_INLINE void adam_plane(const AdamStep& step, int index, Mask visible, Lanes gradient,
@@ -292,7 +310,14 @@ static void project_backward(const ProjectBackwardJob& job, int begin, int end) 
         const Mask visible = mask_from_bits(visible_bits);
         const size_t offset = static_cast<size_t>(b) * stride;
         alignas(64) float gradient[kPlanes * kLanes];
-        block_gradient<kDegree, kAntialiased>(*job.camera, job.parameters + offset, g, gradient);
+        const Lanes centre = block_gradient<kDegree, kAntialiased>(
+            *job.camera, job.parameters + offset, g, gradient);
+        if (job.scores != nullptr) {
+            add_score(visible, centre, job.scores + static_cast<size_t>(b) * kScorePlanes * kLanes);
+        }
+        if (job.adam != nullptr && job.adam->opacity_pull + job.adam->scale_pull > 0.0f) {
+            add_regularisation(*job.adam, job.parameters + offset, gradient);
+        }
         for (int k = 0; k < kPlanes; ++k) {
             const Lanes value = usable(visible, load(plane(gradient, k)));
             const size_t at = offset + static_cast<size_t>(k) * kLanes;

@@ -6,7 +6,6 @@
 namespace rfcore::raster {
 namespace {
 
-constexpr float kTransparentLogit = -100.0f;
 constexpr int kTilesPerBatch = 4;
 
 void pack_gaussian(const GaussianArrays& from, size_t n, float* lane) {

@@ -24,6 +24,8 @@ struct Statistics {
     uint64_t evaluated_blends;
 };
 
+constexpr float kTransparentLogit = -100.0f;  // of lanes without a Gaussian
+
 // Copy `from` into blocks of 16, [blocks][parameter_planes(degree)][16]; the lanes behind the last
 // Gaussian are transparent.
 void pack_parameters(const GaussianArrays& from, float* blocks);

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cstring>
 
+#include "raster/exposure.h"
+
 namespace rfcore::raster {
 namespace {
 
@@ -41,12 +43,7 @@ TrainableRasterizer::TrainableRasterizer(const GaussianArrays& gaussians, const 
       blocks_((gaussians.count + kLanes - 1) / kLanes),
       degree_(gaussians.degree),
       antialiased_(antialiased) {
-    const size_t size =
-        static_cast<size_t>(blocks_) * static_cast<size_t>(parameter_planes(degree_)) * kLanes;
-    for (AlignedBuffer<float>* buffer : {&parameters_, &first_moments_, &second_moments_}) {
-        buffer->reserve(size);
-        std::memset(buffer->data(), 0, size * sizeof(float));
-    }
+    make_room(count_);
     pack_parameters(gaussians, parameters_.data());
 }
 
@@ -95,6 +92,17 @@ double TrainableRasterizer::loss(const float* colour, const float* target, float
     return ((1.0 - weight) * l1_sum + weight * dssim_sum) / (3.0 * static_cast<double>(pixels));
 }
 
+double TrainableRasterizer::exposed_loss(const float* colour, const float* target,
+                                         float dssim_weight, const float* affine,
+                                         double* d_affine) {
+    const size_t pixels = static_cast<size_t>(camera_.width) * camera_.height;
+    exposed_.reserve(3 * pixels);
+    apply_affine(affine, colour, pixels, exposed_.data());
+    const double value = loss(exposed_.data(), target, dssim_weight);
+    apply_affine_backward(affine, colour, pixels, d_colour_.data(), d_affine);
+    return value;
+}
+
 void TrainableRasterizer::set_colour_gradient(const float* d_colour) {
     const size_t pixels = static_cast<size_t>(camera_.width) * camera_.height;
     d_colour_.reserve(3 * pixels);
@@ -117,7 +125,7 @@ void TrainableRasterizer::backward(const float* colour) {
         [&](int tile) { kernels_.blend_backward(job, tile); }, kTilesPerBatch);
 }
 
-void TrainableRasterizer::project_backward(float* gradients, const AdamStep* adam) {
+void TrainableRasterizer::project_backward(float* gradients, const AdamStep* adam, float* scores) {
     const ProjectBackwardJob job{&camera_,
                                  parameters_.data(),
                                  degree_,
@@ -125,7 +133,8 @@ void TrainableRasterizer::project_backward(float* gradients, const AdamStep* ada
                                  front_end_.positions(),
                                  entry_gradients_.data(),
                                  gradients,
-                                 adam};
+                                 adam,
+                                 scores};
     const int tasks = (blocks_ + kBlocksPerTask - 1) / kBlocksPerTask;
     pool_.run(tasks, [&](int task) {
         const int begin = task * kBlocksPerTask;
@@ -140,7 +149,7 @@ void TrainableRasterizer::gradients(const GaussianArrays& out_as_floats) {
     AlignedBuffer<float> blocks;
     blocks.reserve(size);
     std::memset(blocks.data(), 0, size * sizeof(float));
-    project_backward(blocks.data(), nullptr);
+    project_backward(blocks.data(), nullptr, nullptr);
     unpack_parameters(blocks.data(), out_as_floats);
 }
 
@@ -153,6 +162,8 @@ AdamStep TrainableRasterizer::next_step(const LearningRates& rates) {
     step.beta1 = rates.beta1;
     step.beta2 = rates.beta2;
     step.epsilon = rates.epsilon;
+    step.opacity_pull = rates.opacity_pull;
+    step.scale_pull = rates.scale_pull;
     step.second_correction = static_cast<float>(1.0 / (1.0 - beta2_power_));
     step.first_moments = first_moments_.data();
     step.second_moments = second_moments_.data();
@@ -170,11 +181,99 @@ AdamStep TrainableRasterizer::next_step(const LearningRates& rates) {
 
 void TrainableRasterizer::adam_step(const LearningRates& rates) {
     const AdamStep step = next_step(rates);
-    project_backward(nullptr, &step);
+    project_backward(nullptr, &step, keep_scores_ ? scores_.data() : nullptr);
 }
 
 void TrainableRasterizer::parameters(const GaussianArrays& out_as_floats) const {
     unpack_parameters(parameters_.data(), out_as_floats);
+}
+
+void TrainableRasterizer::moments(const GaussianArrays& first_as_floats,
+                                  const GaussianArrays& second_as_floats,
+                                  double* beta_powers) const {
+    unpack_parameters(first_moments_.data(), first_as_floats);
+    unpack_parameters(second_moments_.data(), second_as_floats);
+    beta_powers[0] = beta1_power_;
+    beta_powers[1] = beta2_power_;
+}
+
+void TrainableRasterizer::set_moments(const GaussianArrays& first, const GaussianArrays& second,
+                                      const double* beta_powers) {
+    pack_parameters(first, first_moments_.data());
+    pack_parameters(second, second_moments_.data());
+    beta1_power_ = beta_powers[0];
+    beta2_power_ = beta_powers[1];
+}
+
+void TrainableRasterizer::scores(float* out) const {
+    for (int n = 0; n < count_; ++n) {
+        const float* lane = scores_.data() + n / kLanes * kScorePlanes * kLanes + n % kLanes;
+        for (int k = 0; k < kScorePlanes; ++k) out[n * kScorePlanes + k] = lane[k * kLanes];
+    }
+}
+
+void TrainableRasterizer::set_scores(const float* scores) {
+    for (int n = 0; n < count_; ++n) {
+        float* lane = scores_.data() + n / kLanes * kScorePlanes * kLanes + n % kLanes;
+        for (int k = 0; k < kScorePlanes; ++k) lane[k * kLanes] = scores[n * kScorePlanes + k];
+    }
+}
+
+TrainableBlocks TrainableRasterizer::blocks() {
+    return {parameters_.data(), first_moments_.data(), second_moments_.data(),
+            scores_.data(),     count_,                degree_};
+}
+
+// Room for `count` Gaussians, transparent behind those that are there; moments and scores zero.
+void TrainableRasterizer::make_room(int count) {
+    const int wanted = (count + kLanes - 1) / kLanes;
+    if (wanted <= room_) return;
+    const auto grow = [&](AlignedBuffer<float>& buffer, int planes) {
+        const size_t kept = static_cast<size_t>(room_) * static_cast<size_t>(planes) * kLanes;
+        const size_t size = static_cast<size_t>(wanted) * static_cast<size_t>(planes) * kLanes;
+        AlignedBuffer<float> larger;
+        larger.reserve(size);
+        if (kept > 0) std::memcpy(larger.data(), buffer.data(), kept * sizeof(float));
+        std::memset(larger.data() + kept, 0, (size - kept) * sizeof(float));
+        swap(buffer, larger);
+    };
+    const int planes = parameter_planes(degree_);
+    grow(parameters_, planes);
+    grow(first_moments_, planes);
+    grow(second_moments_, planes);
+    grow(scores_, kScorePlanes);
+    room_ = wanted;
+    hide_lanes_from(count_);
+}
+
+// Lanes behind the last Gaussian are transparent.
+void TrainableRasterizer::hide_lanes_from(int first) {
+    const size_t stride = static_cast<size_t>(parameter_planes(degree_)) * kLanes;
+    for (int n = first; n < room_ * kLanes; ++n) {
+        float* lane = parameters_.data() + static_cast<size_t>(n / kLanes) * stride + n % kLanes;
+        lane[kLogitPlane * kLanes] = kTransparentLogit;
+    }
+}
+
+void TrainableRasterizer::set_count(int count) {
+    count_ = count;
+    blocks_ = (count + kLanes - 1) / kLanes;
+}
+
+int TrainableRasterizer::control_density(const DensityPlan& plan) {
+    make_room(count_ + plan.added);
+    const int replaced = rfcore::raster::control_density(blocks(), plan);
+    if (replaced >= 0) set_count(count_ + plan.added);
+    return std::max(replaced, 0);
+}
+
+void TrainableRasterizer::perturb(float strength, uint64_t seed) {
+    rfcore::raster::perturb(blocks(), strength, seed);
+}
+
+void TrainableRasterizer::remove_dead(float dead_logit) {
+    set_count(rfcore::raster::remove_dead(blocks(), dead_logit));
+    hide_lanes_from(count_);
 }
 
 }  // namespace rfcore::raster

@@ -138,7 +138,14 @@ struct AdamStep {
     float second_correction;
     float* first_moments;   // as the parameters
     float* second_moments;
+    // Regularisation: added to the loss, opacity_pull times the opacity and scale_pull times each
+    // scale of every visible Gaussian.
+    float opacity_pull, scale_pull;
 };
+
+// What density control knows about a Gaussian, summed over the views since the last time.
+enum ScorePlane { kGradientPlane = 0, kVisitsPlane = 1 };  // |dL/dcentre|, 1/px; views
+constexpr int kScorePlanes = 2;
 
 struct ProjectBackwardJob {
     const Camera* camera;
@@ -149,6 +156,7 @@ struct ProjectBackwardJob {
     const EntryGradient* entry_gradients;
     float* gradients;      // as the parameters, or null
     const AdamStep* adam;  // or null
+    float* scores;         // [blocks][kScorePlanes][16], or null
 };
 
 // One strip of rows of one channel of the training loss.
