@@ -85,6 +85,72 @@ class TrainableRasterizer:
     def scores(self, out: _F32) -> None: ...
     def set_scores(self, scores: _F32) -> None: ...
 
+# --- ngp --------------------------------------------------------------------
+
+_U32 = NDArray[np.uint32]
+_I32 = NDArray[np.int32]
+
+class NgpCamera:
+    def __init__(self, numbers: Sequence[float], width: int, height: int) -> None: ...
+
+def ngp_table_entries(level_cells: _I32, hashed_entries: int) -> int: ...
+
+class NgpRenderer:
+    def __init__(
+        self,
+        box: Sequence[float],
+        grid: Sequence[int],
+        level_cells: _I32,
+        occupancy: _U32,
+        edges: _F32,
+        table: _F32,
+        matrices: _F32,
+        threads: int,
+        isa: str,
+    ) -> None: ...
+    @property
+    def isa(self) -> str: ...
+    def render(
+        self, camera: NgpCamera, samples_per_ray: int, colour: _F32, depth: _F32, opacity: _F32
+    ) -> int: ...
+    def render_colour(self, camera: NgpCamera, samples_per_ray: int, colour: _F32) -> int: ...
+
+class NgpTrainer:
+    def __init__(
+        self,
+        box: Sequence[float],
+        grid: Sequence[int],
+        level_cells: _I32,
+        occupancy: _U32,
+        edges: _F32,
+        table: _F32,
+        matrices: _F32,
+        peaks: _F32,
+        threads: int,
+        isa: str,
+    ) -> None: ...
+    def accumulate(
+        self,
+        origins: _F32,
+        directions: _F32,
+        jitter: _F32,
+        targets: _F32,
+        rays_per_block: int,
+        samples_per_ray: int,
+    ) -> float: ...
+    def update(self, rates: Sequence[float], peak_decay: float) -> None: ...
+    def gradients(self, table: _F32, matrices: _F32) -> None: ...
+    def rebuild_occupancy(self, threshold: float) -> int: ...
+    @property
+    def samples(self) -> int: ...
+    @property
+    def steps(self) -> int: ...
+    def set_steps(self, steps: int) -> None: ...
+    def read(self, which: int, out: _F32) -> None: ...
+    def write(self, which: int, values: _F32) -> None: ...
+    def read_occupancy(self, out: _U32) -> None: ...
+    def write_occupancy(self, words: _U32) -> None: ...
+
 # --- yuv --------------------------------------------------------------------
 
 def i420_from_colour(

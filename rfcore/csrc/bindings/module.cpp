@@ -4,12 +4,14 @@
 namespace nb = nanobind;
 
 namespace rfcore {
+void bind_ngp(nb::module_& m);
 void bind_raster(nb::module_& m);
 void bind_yuv(nb::module_& m);
 }
 
 NB_MODULE(_native, m) {
     m.doc() = "Bit-exact kernels of rfcore; use the wrappers in rfcore.native.";
+    rfcore::bind_ngp(m);
     rfcore::bind_raster(m);
     rfcore::bind_yuv(m);
 }

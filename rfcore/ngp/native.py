@@ -1,0 +1,74 @@
+"""The native hash grid renderer: what everything but tests renders with.
+
+The same function as ``rfcore.ngp.reference``, whose docstrings define it.
+"""
+
+from __future__ import annotations
+
+from threading import Lock
+
+import numpy as np
+
+from rfcore.camera import Camera
+from rfcore.native.ngp import NativeNgpRenderer, ngp_camera
+from rfcore.native.raster import check_backend
+from rfcore.ngp.parameters import F32, NgpParameters
+from rfcore.ngp.shape import NgpShape
+from rfcore.views import View
+
+__all__ = ["NgpRenderer", "native_shape"]
+
+
+class NgpRenderer:
+    """A copy of one hash grid field, ready to be rendered; may be shared between threads.
+
+    ``isa`` and ``threads`` as in ``rfcore.raster.native.Rasterizer``: neither changes a byte.
+    """
+
+    def __init__(
+        self, parameters: NgpParameters, *, threads: int = 1, isa: str | None = None
+    ) -> None:
+        self.isa = check_backend(threads, isa)
+        self.threads = threads
+        p, shape = parameters, parameters.shape
+        box, grid = native_shape(shape)
+        self._native = NativeNgpRenderer(
+            box,
+            grid,
+            shape.grid.array,
+            p.occupancy,
+            shape.marching.edges_m,
+            p.table,
+            p.matrices,
+            threads,
+            self.isa,
+        )
+        self._lock = Lock()
+        self.samples = 0
+        """Evaluated for the last picture."""
+
+    def render(self, camera: Camera, samples_per_ray: int | None = None) -> View:
+        """Render colour, depth and opacity; see ``reference.render`` for ``samples_per_ray``."""
+        shape = (camera.intrinsics.height_px, camera.intrinsics.width_px)
+        view = View(*(np.empty(s, np.float32) for s in ((*shape, 3), shape, shape)))
+        seen_from = ngp_camera(camera)
+        with self._lock:
+            self.samples = self._native.render(
+                seen_from, samples_per_ray or 0, view.colour, view.depth, view.opacity
+            )
+        return view
+
+    def render_colour(self, camera: Camera, samples_per_ray: int | None = None) -> F32:
+        """Render colour [H, W, 3] alone: the same bytes as ``render``'s."""
+        colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
+        seen_from = ngp_camera(camera)
+        with self._lock:
+            self.samples = self._native.render_colour(seen_from, samples_per_ray or 0, colour)
+        return colour
+
+
+def native_shape(shape: NgpShape) -> tuple[list[float], list[int]]:
+    """Return a shape as the kernels take it: box and grid numbers."""
+    space = shape.space
+    box = [*space.centre_m, *space.half_m, float(space.unbounded)]
+    return box, [shape.hidden, shape.grid.T, *shape.occupancy_cells]

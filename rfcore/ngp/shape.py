@@ -1,0 +1,179 @@
+"""The shape of a hash grid field: levels, networks, the space it covers, the steps along a ray.
+
+Names as in Mueller et al., "Instant Neural Graphics Primitives with a Multiresolution Hash
+Encoding", ACM TOG 41(4), 2022 (below: NGP): L levels of at most T entries of F features, N_l cells
+on level l. Positions are metres relative to the tile's origin until ``Space`` maps them to 0..1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.errors import InvalidInput
+
+__all__ = ["FEATURES", "MAX_LEVELS", "HashGrid", "Marching", "NgpShape", "Space", "grid_levels"]
+
+FEATURES = 2
+"""F: features an entry; the kernels are written for the two of NGP, section 4."""
+MAX_LEVELS = 16
+MAX_CELLS = 1 << 19
+MAX_LOG2_T = 24
+MAX_OCCUPANCY_CELLS = 1 << 28
+HIDDEN = (16, 32, 48, 64)
+MAX_STEPS = 8192
+
+Vec3 = tuple[float, float, float]
+Cells = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class HashGrid:
+    """``level_cells``: cells along x, y, z of every level, coarse to fine; ``log2_T``.
+
+    The cells are data and not a formula, so that no logarithm of some machine decides a byte.
+    """
+
+    level_cells: tuple[Cells, ...]
+    log2_T: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.level_cells) <= MAX_LEVELS:
+            raise InvalidInput("ngp.L", f"{len(self.level_cells)} is outside 1..{MAX_LEVELS}")
+        if not 4 <= self.log2_T <= MAX_LOG2_T:
+            raise InvalidInput("ngp.log2_T", f"{self.log2_T} is outside 4..{MAX_LOG2_T}")
+        for cells in self.level_cells:
+            if len(cells) != 3 or not all(1 <= n <= MAX_CELLS for n in cells):
+                raise InvalidInput("ngp.level_cells", f"{cells} must be 3 of 1..{MAX_CELLS}")
+
+    @property
+    def L(self) -> int:
+        """Number of levels."""
+        return len(self.level_cells)
+
+    @property
+    def T(self) -> int:
+        """Most entries of a level."""
+        return 1 << self.log2_T
+
+    @cached_property
+    def array(self) -> NDArray[np.int32]:
+        """``level_cells`` as [L, 3]."""
+        return np.array(self.level_cells, dtype=np.int32)
+
+
+def grid_levels(L: int, N_min: int, N_max: int, aspect: Vec3) -> tuple[Cells, ...]:
+    """Return the cells of L levels: N_l = floor(N_min b^l), b as in NGP, eq. 3.
+
+    N_l is along the longest side; ``aspect`` is every side's share of it, in 0..1, so that cells
+    are as long as wide in metres.
+    """
+    if not 1 <= N_min <= N_max <= MAX_CELLS:
+        raise InvalidInput("ngp.N_min", f"{N_min}, N_max {N_max}: must be 1 <= N_min <= N_max")
+    growth = (math.log(N_max) - math.log(N_min)) / max(L - 1, 1)
+    sizes = [math.floor(N_min * math.exp(growth * level) + 1e-6) for level in range(L)]
+    return tuple(_along_sides(size, aspect) for size in sizes)
+
+
+def _along_sides(size: int, aspect: Vec3) -> Cells:
+    x, y, z = (max(1, math.ceil(size * share - 1e-9)) for share in aspect)
+    return (x, y, z)
+
+
+@dataclass(frozen=True)
+class Space:
+    """The box the field is made for, and whether there is anything outside.
+
+    An unbounded field contracts what is outside as Mip-NeRF 360 (Barron et al. 2022, eq. 10), with
+    the largest coordinate for the norm: x' = (2 - 1/|x|) x / |x| for |x| > 1, where x runs from -1
+    to 1 in the box. A bounded field is empty and black outside, and does not pay for the rest.
+    """
+
+    centre_m: Vec3
+    half_m: Vec3
+    unbounded: bool
+
+    def __post_init__(self) -> None:
+        values = (*self.centre_m, *self.half_m)
+        if len(values) != 6 or not all(math.isfinite(v) and abs(v) <= 1e6 for v in values):
+            raise InvalidInput("ngp.space", f"{values} must be 6 numbers of at most 1e6 m")
+        if not all(half >= 1e-6 for half in self.half_m):
+            raise InvalidInput("ngp.space.half_m", f"{self.half_m} must be at least 1e-6 m")
+
+    @property
+    def aspect(self) -> Vec3:
+        """Every side's share of the longest."""
+        longest = max(self.half_m)
+        x, y, z = (half / longest for half in self.half_m)
+        return (x, y, z)
+
+
+@dataclass(frozen=True)
+class Marching:
+    """Steps along a ray: step k reaches from near growth^k to near growth^(k+1) metres."""
+
+    near_m: float
+    growth: float
+    steps: int
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.near_m) and 1e-6 <= self.near_m <= 1e6):
+            raise InvalidInput("ngp.near_m", f"{self.near_m} is outside 1e-6..1e6")
+        if not 1.0 < self.growth <= 2.0:
+            raise InvalidInput("ngp.growth", f"{self.growth} is outside 1..2, 1 excluded")
+        if not 1 <= self.steps <= MAX_STEPS:
+            raise InvalidInput("ngp.steps", f"{self.steps} is outside 1..{MAX_STEPS}")
+        if not self.edges_m[-1] <= 1e9:
+            raise InvalidInput("ngp.steps", f"the last ends at {self.edges_m[-1]:g} m, over 1e9")
+
+    @staticmethod
+    def between(near_m: float, far_m: float, per_doubling: int) -> Marching:
+        """Return steps from ``near_m`` to at least ``far_m``, so many per doubling of distance."""
+        if not 0 < near_m < far_m or per_doubling < 1:
+            raise InvalidInput("ngp.near_m", f"{near_m} and {far_m} m, {per_doubling} per doubling")
+        growth = 2.0 ** (1.0 / per_doubling)
+        return Marching(near_m, growth, math.ceil(math.log2(far_m / near_m) * per_doubling))
+
+    @cached_property
+    def edges_m(self) -> NDArray[np.float32]:
+        """The steps' edges [steps + 1], by repeated multiplication in float64."""
+        edges = [self.near_m]
+        for _ in range(self.steps):
+            edges.append(edges[-1] * self.growth)
+        return np.array(edges, dtype=np.float64).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class NgpShape:
+    """Everything about a field but its numbers.
+
+    ``hidden``: width of the hidden layers, 16, 32, 48 or 64; ``occupancy_cells`` along x, y, z.
+    """
+
+    grid: HashGrid
+    space: Space
+    marching: Marching
+    hidden: int
+    occupancy_cells: Cells
+
+    def __post_init__(self) -> None:
+        if self.hidden not in HIDDEN:
+            raise InvalidInput("ngp.hidden", f"{self.hidden} is none of {HIDDEN}")
+        cells = self.occupancy_cells
+        count = math.prod(cells)
+        if len(cells) != 3 or min(cells) < 1 or count > MAX_OCCUPANCY_CELLS:
+            raise InvalidInput("ngp.occupancy_cells", f"{cells}: at most {MAX_OCCUPANCY_CELLS}")
+
+    @property
+    def encoded(self) -> int:
+        """Inputs of the density network: F L, filled up with zeros to a multiple of 16."""
+        return -(-FEATURES * self.grid.L // 16) * 16
+
+    @property
+    def occupancy_words(self) -> int:
+        """Length of the occupancy's bits in uint32."""
+        return -(-math.prod(self.occupancy_cells) // 32)
