@@ -40,10 +40,11 @@ def _ssim_of_plane(x: F64, y: F64, peak: float) -> float:
     """Return the mean SSIM of one channel [H, W]."""
     c1, c2 = (K1 * peak) ** 2, (K2 * peak) ** 2
     mean_x, mean_y = _windowed(x), _windowed(y)
-    variances = _windowed(x * x + y * y) - mean_x * mean_x - mean_y * mean_y
     covariance = _windowed(x * y) - mean_x * mean_y
+    # var_x + var_y - 2 cov, from differences: of identical pictures exactly 0, so their SSIM is 1.
+    spread = np.maximum(_windowed((x - y) ** 2) - (mean_x - mean_y) ** 2, 0.0)
     luminance = (2 * mean_x * mean_y + c1) / (mean_x * mean_x + mean_y * mean_y + c1)
-    structure = (2 * covariance + c2) / (np.maximum(variances, 0.0) + c2)
+    structure = 1.0 - spread / (np.maximum(2 * covariance + spread, 0.0) + c2)
     return float(np.mean(luminance * structure))
 
 

@@ -18,6 +18,7 @@ from rfedge.cli.bench import Bench
 from rfedge.cli.decode import Decode
 from rfedge.cli.demo import Demo
 from rfedge.cli.encode import Encode
+from rfedge.cli.eval import Eval
 from rfedge.cli.link import Link
 from rfedge.cli.render import Render
 from rfedge.cli.train import Train
@@ -32,6 +33,7 @@ Verb = (
     | Annotated[Decode, subcommand("decode")]
     | Annotated[Link, subcommand("link")]
     | Annotated[Bench, subcommand("bench")]
+    | Annotated[Eval, subcommand("eval")]
 )
 
 DESCRIPTION = """Distributed radiance fields for edge video: H.264 deltas against a shared render,

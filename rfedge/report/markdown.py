@@ -40,6 +40,8 @@ def _section(path: Path) -> str:
     result = json.loads(path.read_text())
     if result.get("format") == "rfedge-demo-1":
         return _demo(path, result)
+    if result.get("format") == "rfedge-stability-1":
+        return f"{_heading(path, result)}\n\n{len(result['cases'])} cases: `docs/stability.md`.\n"
     if "case" in result:
         return _bench(path, result)
     raise InvalidInput("results", f"{path} is neither a demo nor a bench result")

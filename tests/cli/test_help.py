@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-VERBS = ("demo", "train", "render", "encode", "decode", "link", "bench")
+VERBS = ("demo", "train", "render", "encode", "decode", "link", "bench", "eval")
 HEAVY = ("torch", "cv2", "matplotlib", "av", "grpc")
 
 

@@ -1,0 +1,1 @@
+"""Experiments: one package an experiment, results as immutable JSON."""

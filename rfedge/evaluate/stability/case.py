@@ -1,0 +1,59 @@
+"""What a hard case is: what must come out, and what came out.
+
+The same cases are run by the tests (``tests/hard``) and by ``rfedge eval stability``, which writes
+the page, so that the two cannot differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from rfcore.errors import RfedgeError
+
+__all__ = ["Case", "Finding", "refusal", "statement", "within"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one case came to.
+
+    ``error`` is the largest difference from what is right and ``limit`` what it may be; both are
+    None where the answer is yes or no.
+    """
+
+    got: str
+    holds: bool
+    error: float | None = None
+    limit: float | None = None
+
+
+@dataclass(frozen=True)
+class Case:
+    """One hard case: ``expected`` says what is right and by which rule it is judged."""
+
+    group: str
+    name: str
+    expected: str
+    measure: Callable[[], Finding]
+
+
+def within(error: float, limit: float, got: str = "") -> Finding:
+    """Return the finding that ``error`` is at most ``limit``; NaN never is."""
+    return Finding(got or "as expected", error <= limit, float(error), float(limit))
+
+
+def statement(holds: bool, got: str, otherwise: str) -> Finding:
+    """Return the finding of a yes or no."""
+    return Finding(got if holds else otherwise, bool(holds))
+
+
+def refusal(call: Callable[[], object], error: type[RfedgeError], *said: str) -> Finding:
+    """Return the finding that ``call`` raises ``error`` with a message that has every word said."""
+    try:
+        call()
+    except error as refused:
+        missing = [word for word in said if word not in str(refused)]
+        got = f"{type(refused).__name__}: {refused}"
+        return Finding(got if not missing else f"{got} (without {missing})", not missing)
+    return Finding("accepted", False)

@@ -1,0 +1,18 @@
+"""Every hard case, in the order of the page."""
+
+from __future__ import annotations
+
+from rfedge.evaluate.stability import delta, files, pictures, poses, splats, training
+from rfedge.evaluate.stability.case import Case
+
+__all__ = ["CASES"]
+
+CASES: tuple[Case, ...] = (
+    *splats.CASES,
+    *training.CASES,
+    *poses.CASES,
+    *pictures.CASES,
+    *delta.CASES,
+    *files.CASES,
+)
+"""Names are unique within a group."""

@@ -1,0 +1,68 @@
+"""Every hard case holds, and the committed page is what came of them."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rfcore.errors import InvalidInput
+from rfedge.evaluate.stability import CASES, Case
+from rfedge.evaluate.stability.case import refusal, statement, within
+from rfedge.evaluate.stability.results import run_cases, stability_page
+
+pytestmark = pytest.mark.hard
+
+ROOT = Path(__file__).parents[2]
+RESULT = ROOT / "results" / "stability.json"
+PAGE = ROOT / "docs" / "stability.md"
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.group}-{case.name}")
+def test_the_case_holds(case: Case) -> None:
+    finding = case.measure()
+    assert finding.holds, f"expected {case.expected}, got {finding}"
+
+
+def test_there_are_enough_cases_of_every_kind_and_no_two_alike() -> None:
+    names = [(case.group, case.name) for case in CASES]
+    assert len(set(names)) == len(names) >= 60
+    groups = {group for group, _ in names}
+    assert groups >= {"Gaussians", "Training", "Poses", "Pictures and metrics", "Delta codec"}
+
+
+def test_the_page_is_generated_from_the_result_file() -> None:
+    result = json.loads(RESULT.read_text())
+    assert PAGE.read_text().rstrip() == stability_page(result).rstrip(), (
+        "run `rfedge eval stability`"
+    )
+
+
+def test_the_result_file_has_exactly_these_cases_and_all_hold() -> None:
+    rows = json.loads(RESULT.read_text())["cases"]
+    listed = [(row["group"], row["name"], row["expected"]) for row in rows]
+    assert listed == [(c.group, c.name, c.expected) for c in CASES], "run `rfedge eval stability`"
+    assert [row["name"] for row in rows if not row["holds"]] == []
+
+
+def test_a_case_that_breaks_is_named_on_the_page() -> None:
+    broken = Case("Poses", "a lie", "truth", lambda: within(2.0, 1.0))
+    page = stability_page(run_cases([broken]))
+    assert "Broken: Poses: a lie." in page
+    assert "| a lie | truth | as expected | 2.0e+00 | 1.0e+00 |" in page
+
+
+def test_nothing_is_within_a_limit_that_is_not_a_number() -> None:
+    assert not within(float("nan"), 1.0).holds
+    assert within(1.0, 1.0).holds
+    assert not statement(False, "yes", "no").holds
+
+
+def test_a_refusal_must_be_of_the_kind_and_say_the_words() -> None:
+    def refuse() -> None:
+        raise InvalidInput("pose", "is NaN")
+
+    assert refusal(refuse, InvalidInput, "pose", "NaN").holds
+    assert not refusal(refuse, InvalidInput, "infinite").holds
+    assert not refusal(lambda: None, InvalidInput).holds
+    with pytest.raises(InvalidInput):
+        refusal(refuse, type("Other", (InvalidInput,), {}))
