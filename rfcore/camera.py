@@ -178,6 +178,13 @@ class TileOrigin:
             world_from_cam, translation_m=(x - self.east_m, y - self.north_m, z - self.up_m)
         )
 
+    def globalise(self, world_from_cam: Pose) -> Pose:
+        """Return a pose relative to this origin as a global one; the inverse of ``localise``."""
+        x, y, z = world_from_cam.translation_m
+        return replace(
+            world_from_cam, translation_m=(x + self.east_m, y + self.north_m, z + self.up_m)
+        )
+
 
 @dataclass(frozen=True)
 class Camera:

@@ -24,7 +24,7 @@ from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import Rgb
 from rfcore.views import PointCloud, PosedPicture
 
-__all__ = ["Dataset", "Distortion", "ReadOptions", "assemble"]
+__all__ = ["Dataset", "Distortion", "ReadOptions", "assemble", "chosen_origin"]
 
 NEAR_M = 10_000.0
 """float32 positions resolve 1 mm at this distance: nearer to zero, zero is the origin."""
@@ -79,7 +79,7 @@ def assemble(source: Source, options: ReadOptions) -> Dataset:
     if not source.pictures:
         raise DatasetError(f"{source.file}: names no pictures")
     _check_times(source.pictures)
-    origin = options.tile_origin or _chosen_origin(source.pictures)
+    origin = options.tile_origin or chosen_origin(source.pictures)
     times_ns = [picture.time_ns for picture in source.pictures if picture.time_ns is not None]
     timed = len(times_ns) == len(source.pictures)
     return Dataset(
@@ -138,7 +138,8 @@ def _near(picture: SourcePicture, origin: TileOrigin) -> Pose:
     return local
 
 
-def _chosen_origin(pictures: Sequence[SourcePicture]) -> TileOrigin:
+def chosen_origin(pictures: Sequence[SourcePicture]) -> TileOrigin:
+    """Return zero where the cameras are near it, else their median position in whole metres."""
     axes = zip(*(picture.world_from_cam.translation_m for picture in pictures), strict=True)
     middle = [statistics.median(axis) for axis in axes]
     if math.hypot(*middle) <= NEAR_M:

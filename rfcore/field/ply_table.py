@@ -21,7 +21,7 @@ from rfcore.files import whole_file
 
 __all__ = ["Table", "read_vertices", "write_vertices"]
 
-NAMES = {np.dtype("<f4"): "float", np.dtype("u1"): "uchar"}
+NAMES = {np.dtype("<f4"): "float", np.dtype("<f8"): "double", np.dtype("u1"): "uchar"}
 ROWS_AT_ONCE = 4096
 SHORTEST_VALUE_BYTES = 2
 """A digit and what separates it from the next."""

@@ -21,6 +21,7 @@ from rfedge.cli.encode import Encode
 from rfedge.cli.eval import Eval
 from rfedge.cli.link import Link
 from rfedge.cli.render import Render
+from rfedge.cli.scene import Scene
 from rfedge.cli.train import Train
 
 __all__ = ["main"]
@@ -32,6 +33,7 @@ Verb = (
     | Annotated[Encode, subcommand("encode")]
     | Annotated[Decode, subcommand("decode")]
     | Annotated[Link, subcommand("link")]
+    | Annotated[Scene, subcommand("scene")]
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Eval, subcommand("eval")]
 )

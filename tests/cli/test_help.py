@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 VERBS = ("demo", "train", "render", "encode", "decode", "link", "bench", "eval")
+SCENE_VERBS = ("scene convert", "scene poses", "scene record-carla")
 HEAVY = ("torch", "cv2", "matplotlib", "av", "grpc")
 
 
@@ -17,9 +18,9 @@ def rfedge(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", VERBS + SCENE_VERBS)
 def test_every_verb_has_help_with_defaults(verb: str) -> None:
-    done = rfedge(verb, "--help")
+    done = rfedge(*verb.split(), "--help")
     assert done.returncode == 0, done.stderr
     assert "default" in done.stdout
 
@@ -43,6 +44,11 @@ def test_the_help_loads_nothing_heavy() -> None:
         (("demo", "--link-bps", "0"), "above 0 bit/s"),
         (("decode", "missing.rfv", "--field", "f.rff", "--out", "o"), "missing.rfv"),
         (("link", "--to", "nonsense"), "nonsense"),
+        (("scene", "convert", "nowhere", "--out", "o"), "nowhere"),
+        (("scene", "convert", "nowhere", "--out", "o", "--size", "big"), "'big' is not WIDTHx"),
+        (("scene", "poses", "nowhere", "--out", "o"), "nowhere: holds 0 pictures"),
+        (("scene", "record-carla", "--out", "o", "--cameras", "top"), "'top' is none of"),
+        (("scene", "record-carla", "--out", "o", "--port", "1", "--timeout-s", "1"), "127.0.0.1:1"),
     ],
 )
 def test_a_users_mistake_is_one_line_and_exit_status_2(

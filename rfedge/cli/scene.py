@@ -1,0 +1,29 @@
+"""``rfedge scene``: datasets made from what users own, one module a verb."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import subcommand
+
+from rfedge.cli.scene_convert import SceneConvert
+from rfedge.cli.scene_poses import ScenePoses
+from rfedge.cli.scene_record_carla import SceneRecordCarla
+
+__all__ = ["Scene"]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Make datasets: convert recordings, find poses, record a simulator."""
+
+    verb: (
+        Annotated[SceneConvert, subcommand("convert")]
+        | Annotated[ScenePoses, subcommand("poses")]
+        | Annotated[SceneRecordCarla, subcommand("record-carla")]
+    )
+
+    def run(self) -> None:
+        """Run the verb."""
+        self.verb.run()

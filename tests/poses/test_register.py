@@ -1,0 +1,92 @@
+"""New pictures are placed in a dataset's own world, which stays as it is."""
+
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Pose
+from rfcore.dataset import read_dataset
+from rfcore.dataset.read import read_source
+from rfcore.dataset.source import SourcePicture
+from rfcore.dataset.write import WrittenPicture, write_transforms
+from rfcore.errors import DatasetError
+from rfcore.image import write_png
+from rfedge.poses import PoseSettings, pose_dataset
+
+SAMPLE = Path(__file__).parents[2] / "samples" / "street"
+SETTINGS = PoseSettings(max_side_px=640, features=1024, threads=1)
+
+
+@pytest.fixture
+def drive() -> tuple[SourcePicture, ...]:
+    """Eight pictures of the sample's empty drive."""
+    return read_source(SAMPLE / "transforms_drive_empty.json").pictures[:8]
+
+
+def half_of(drive: tuple[SourcePicture, ...], folder: Path) -> Path:
+    """A dataset of every second picture."""
+    (folder / "images").mkdir(parents=True)
+    pictures = []
+    for i, picture in enumerate(drive[::2]):
+        write_png(folder / "images" / f"{i}.png", picture.read())
+        pictures.append(WrittenPicture(f"images/{i}.png", picture.camera, picture.world_from_cam))
+    write_transforms(folder, pictures, None)
+    return folder
+
+
+def others_of(drive: tuple[SourcePicture, ...], folder: Path) -> Path:
+    folder.mkdir()
+    for i, picture in enumerate(drive[1::2]):
+        write_png(folder / f"{i}.png", picture.read())
+    return folder
+
+
+def turn_deg(a: Pose, b: Pose) -> float:
+    cosine = abs(sum(p * q for p, q in zip(a.rotation, b.rotation, strict=True)))
+    return math.degrees(2 * math.acos(min(cosine, 1.0)))
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_half_of_a_drive_is_placed_among_the_other_half(
+    drive: tuple[SourcePicture, ...], tmp_path: Path
+) -> None:
+    """A pixel is 0.18 degrees here; the true poses are those the street was rendered with."""
+    known, new = half_of(drive, tmp_path / "known"), others_of(drive, tmp_path / "new")
+    line = pose_dataset(new, tmp_path / "out", known, SETTINGS)
+    assert line.startswith(f"{tmp_path / 'out'}: 4 pictures placed")
+    placed = read_dataset(tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "images",
+        "points.ply",
+        "transforms.json",
+    ]
+    turns, shifts = [], []
+    for found, true in zip(placed.pictures, drive[1::2], strict=True):
+        pose = found.camera.world_from_cam
+        turns.append(turn_deg(pose, true.world_from_cam))
+        shifts.append(math.dist(pose.translation_m, true.world_from_cam.translation_m))
+    assert np.median(turns) < 0.05
+    assert np.median(shifts) < 0.05
+    assert placed.points is not None
+    assert len(placed.points.xyz_m) > 100
+
+
+def test_too_few_pictures_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="holds 0 pictures"):
+        pose_dataset(tmp_path, tmp_path / "out", None, SETTINGS)
+
+
+def test_pictures_that_share_nothing_leave_nothing_behind(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for i in range(3):
+        rgb = np.random.default_rng(i).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+        write_png(images / f"{i}.png", rgb)
+    with pytest.raises(DatasetError, match="no two pictures share enough"):
+        pose_dataset(images, tmp_path / "out", None, SETTINGS)
+    shutil.rmtree(images)
+    assert list(tmp_path.iterdir()) == []
