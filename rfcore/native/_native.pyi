@@ -150,6 +150,25 @@ class NgpTrainer:
     def write(self, which: int, values: _F32) -> None: ...
     def read_occupancy(self, out: _U32) -> None: ...
     def write_occupancy(self, words: _U32) -> None: ...
+# --- warp -------------------------------------------------------------------
+
+_U8 = NDArray[np.uint8]
+
+def block_costs(frame: _U8, reference: _U8, satd: _I32, ssd: _I32) -> None: ...
+def warp_i420(
+    previous_y: _U8,
+    previous_u: _U8,
+    previous_v: _U8,
+    previous_depth: _F32,
+    depth: _F32,
+    render_y: _U8,
+    render_u: _U8,
+    render_v: _U8,
+    numbers: Sequence[float],
+    y: _U8,
+    u: _U8,
+    v: _U8,
+) -> int: ...
 
 # --- yuv --------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ namespace nb = nanobind;
 namespace rfcore {
 void bind_ngp(nb::module_& m);
 void bind_raster(nb::module_& m);
+void bind_warp(nb::module_& m);
 void bind_yuv(nb::module_& m);
 }
 
@@ -13,5 +14,6 @@ NB_MODULE(_native, m) {
     m.doc() = "Bit-exact kernels of rfcore; use the wrappers in rfcore.native.";
     rfcore::bind_ngp(m);
     rfcore::bind_raster(m);
+    rfcore::bind_warp(m);
     rfcore::bind_yuv(m);
 }

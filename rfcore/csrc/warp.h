@@ -1,0 +1,36 @@
+// The previous picture carried to another pose by depth; and what predicting a block would cost.
+//
+// The definition (geometry, filters, rounding, siting) is in rfcore/native/warp.py.
+#pragma once
+
+#include <cstdint>
+
+#include "yuv.h"
+
+namespace rfcore {
+
+// Both poses belong to one pinhole camera. `rotation` (row-major) and `translation` map points of
+// the present camera into the previous one's axes.
+struct WarpGeometry {
+    float rotation[9];
+    float translation[3];
+    float fx, fy, cx, cy;
+};
+
+struct WarpInputs {
+    ConstI420Planes previous;
+    const float* previous_depth;
+    const float* depth;
+    ConstI420Planes render;
+};
+
+// Returns how many luma samples came from the previous picture; the others are the render's.
+std::int64_t warp_i420(const WarpInputs& in, const WarpGeometry& geometry, PictureSize size,
+                       I420Planes out);
+
+// For every whole 8x8 block: the sums of absolute Hadamard coefficients (DC included, divided by
+// 8) and of squared differences between frame and reference.
+void block_costs(const std::uint8_t* frame, const std::uint8_t* reference, PictureSize size,
+                 std::int32_t* satd, std::int32_t* ssd);
+
+}  // namespace rfcore

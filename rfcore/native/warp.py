@@ -1,0 +1,132 @@
+"""The previous decoded picture carried to the present pose by depth, and block costs.
+
+Both ends make the warp from what both have, so every sample is defined here, in float32 without
+fused operations and in integers; ``csrc/warp.cpp`` computes exactly this on every machine.
+
+Where: pixel (x, y) of the present camera, depth z = ``depth[y, x]``, has the ray
+((x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy, 1). With R, t mapping points of the present camera into
+the previous camera's axes (float64, rounded once), row terms first::
+
+    P = z * (R[:, 0] * ray_x + (R[:, 1] * ray_y + R[:, 2])) + t
+    (u, v) = (fx * (Px / Pz) + cx - 0.5, fy * (Py / Pz) + cy - 0.5)
+
+The sample is *known* when z > 0, Pz > 0.1, (u, v) lies inside the previous picture's outer
+sample centres, and the previous depth at the nearest sample d satisfies
+|d - Pz| < 0.08 Pz + 0.1: otherwise another surface was in front. Unknown samples are the render's.
+
+What: (u, v) is rounded half up to 1/64 sample, and the previous picture is interpolated with
+Lanczos-3, six taps a side at 6 bits, products summed without rounding, then
+``(sum + 2**11) >> 12`` clamped to 1..255 (0 could not be spliced). The edge is repeated.
+
+Chroma sits in the middle of its 2x2 luma samples (``rfcore.native.yuv``): it is known when all
+four are, and its position is ((u1 + u2 + u3 + u4) / 4 - 0.5) / 2, rounded half up to 1/64. A last
+odd row or column counts twice.
+
+Lanczos-3 was chosen over a bicubic filter because a picture is resampled again and again along a
+drive, and every pass of a softer filter takes away detail that has to be sent again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera
+from rfcore.errors import InvalidInput
+from rfcore.image import I420
+from rfcore.native import _native
+
+__all__ = ["BLOCK_PX", "BlockCosts", "PosedDepth", "block_costs", "warp_i420", "warp_numbers"]
+
+BLOCK_PX = 8
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+
+
+@dataclass(frozen=True)
+class PosedDepth:
+    """A camera and what it sees: ``depth`` float32 [H, W], z in metres, 0 where nothing is.
+
+    Raises ``InvalidInput`` when the depth is not of the camera's size, not float32 or not finite.
+    """
+
+    camera: Camera
+    depth: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        k = self.camera.intrinsics
+        if self.depth.shape != (k.height_px, k.width_px) or self.depth.dtype != np.float32:
+            raise InvalidInput(
+                "depth",
+                f"{self.depth.dtype} {self.depth.shape} must be float32 {k.height_px, k.width_px}",
+            )
+        if not np.isfinite(self.depth).all():
+            bad = int((~np.isfinite(self.depth)).sum())
+            raise InvalidInput("depth", f"{bad} of {self.depth.size} values are NaN or infinite")
+
+
+@dataclass(frozen=True)
+class BlockCosts:
+    """Costs of predicting each whole 8x8 luma block: int32 [H // 8, W // 8].
+
+    ``satd``: sum of absolute Hadamard coefficients / 8; ``ssd``: sum of squared differences.
+    """
+
+    satd: NDArray[np.int32]
+    ssd: NDArray[np.int32]
+
+
+def warp_i420(previous: I420, seen_before: PosedDepth, seen: PosedDepth, render: I420) -> I420:
+    """Return ``previous`` as it would look from ``seen.camera``, holes filled from ``render``.
+
+    Raises ``InvalidInput`` for pictures of another size or cameras of different intrinsics.
+    """
+    if seen_before.camera.intrinsics != seen.camera.intrinsics:
+        raise InvalidInput("warp", "the two cameras have different intrinsics")
+    k = seen.camera.intrinsics
+    for name, picture in (("previous", previous), ("render", render)):
+        if picture.size_px != (k.width_px, k.height_px):
+            raise InvalidInput(
+                f"warp.{name}",
+                f"{picture.size_px} px where the camera has {k.width_px, k.height_px}",
+            )
+    out = I420(*(np.empty(plane.shape, np.uint8) for plane in render.planes))
+    previous_y, previous_u, previous_v = map(np.ascontiguousarray, previous.planes)
+    render_y, render_u, render_v = map(np.ascontiguousarray, render.planes)
+    _native.warp_i420(
+        previous_y,
+        previous_u,
+        previous_v,
+        np.ascontiguousarray(seen_before.depth),
+        np.ascontiguousarray(seen.depth),
+        render_y,
+        render_u,
+        render_v,
+        warp_numbers(seen_before.camera, seen.camera),
+        *out.planes,
+    )
+    return out
+
+
+def warp_numbers(before: Camera, now: Camera) -> list[float]:
+    """Return R (9, row-major), t (3), fx, fy, cx, cy of the warp from ``now`` into ``before``."""
+    motion = before.cam_from_world().compose(now.world_from_cam)
+    k = now.intrinsics
+    numbers = [value for row in motion.rotation_matrix() for value in row]
+    numbers += [*motion.translation_m, k.fx_px, k.fy_px, k.cx_px, k.cy_px]
+    if not all(abs(number) <= FLOAT32_MAX for number in numbers):
+        raise InvalidInput("camera", "a value is beyond the range of float32; move the tile origin")
+    return numbers
+
+
+def block_costs(frame: NDArray[np.uint8], reference: NDArray[np.uint8]) -> BlockCosts:
+    """Return what predicting the luma plane ``frame`` from ``reference`` leaves, block by block."""
+    if frame.shape != reference.shape:
+        raise InvalidInput("reference", f"shape {reference.shape} of a frame {frame.shape}")
+    shape = (frame.shape[0] // BLOCK_PX, frame.shape[1] // BLOCK_PX)
+    costs = BlockCosts(np.zeros(shape, np.int32), np.zeros(shape, np.int32))
+    _native.block_costs(
+        np.ascontiguousarray(frame), np.ascontiguousarray(reference), costs.satd, costs.ssd
+    )
+    return costs

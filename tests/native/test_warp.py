@@ -1,0 +1,215 @@
+"""The warp against its definition in numpy, bit by bit; its geometry against plane homographies."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.errors import InvalidInput
+from rfcore.image import I420
+from rfcore.native.warp import PosedDepth, block_costs, warp_i420, warp_numbers
+
+F32 = NDArray[np.float32]
+SIZES = [(1, 1), (2, 2), (3, 5), (17, 9), (64, 48), (101, 67)]
+
+
+def filter_table() -> NDArray[np.int64]:
+    """Lanczos-3 at n / 64 in 1/64, the largest tap taking what rounding left over."""
+    distance = np.arange(64)[:, None] / 64 - np.arange(-2, 4)[None]
+    taps = np.sinc(distance) * np.sinc(distance / 3)
+    taps /= taps.sum(axis=1, keepdims=True)
+    table = np.rint(taps * 64).astype(np.int64)
+    table[np.arange(64), taps.argmax(axis=1)] += 64 - table.sum(axis=1)
+    return table
+
+
+def locate(seen: PosedDepth, before: PosedDepth) -> tuple[F32, F32, NDArray[np.bool_]]:
+    """Positions in 1/64 sample and what is known, each step in float32 as the docstring has it."""
+    one = np.float32
+    numbers = [one(n) for n in warp_numbers(before.camera, seen.camera)]
+    r, t, (fx, fy, cx, cy) = numbers[:9], numbers[9:12], numbers[12:]
+    height, width = seen.depth.shape
+    ray_x = ((np.arange(width, dtype=one) + one(0.5) - cx) / fx)[None]
+    ray_y = ((np.arange(height, dtype=one) + one(0.5) - cy) / fy)[:, None]
+    z = seen.depth
+    px, py, pz = (
+        z * (r[3 * i] * ray_x + (r[3 * i + 1] * ray_y + r[3 * i + 2])) + t[i] for i in range(3)
+    )
+    with np.errstate(all="ignore"):
+        u = fx * (px / pz) + cx - one(0.5)
+        v = fy * (py / pz) + cy - one(0.5)
+        known = (z > 0) & (pz > one(0.1))
+        known &= (u >= 0) & (u <= one(width - 1)) & (v >= 0) & (v <= one(height - 1))
+        u64, v64 = ((np.where(known, p, 0) * one(64) + one(0.5)).astype(np.int64) for p in (u, v))
+        seen_there = before.depth[(v64 + 32) // 64, (u64 + 32) // 64]
+        known &= np.abs(seen_there - pz) < one(0.08) * pz + one(0.1)
+    return u64, v64, known
+
+
+def interpolate(
+    plane: NDArray[np.uint8], u: NDArray[np.int64], v: NDArray[np.int64]
+) -> NDArray[np.uint8]:
+    table = filter_table()
+    padded = np.pad(plane.astype(np.int64), 3, mode="edge")
+    total = np.zeros(u.shape, np.int64)
+    for j in range(6):
+        for i in range(6):
+            sample = padded[(v >> 6) + j + 1, (u >> 6) + i + 1]
+            total += table[v & 63, j] * table[u & 63, i] * sample
+    return np.clip((total + (1 << 11)) >> 12, 1, 255).astype(np.uint8)
+
+
+def definition(previous: I420, before: PosedDepth, seen: PosedDepth, render: I420) -> I420:
+    u, v, known = locate(seen, before)
+    y = np.where(known, interpolate(previous.y, u, v), np.maximum(render.y, 1))
+    height, width = known.shape
+    pad = ((0, height % 2), (0, width % 2))
+    quads = [
+        np.pad(a, pad, mode="edge").reshape(-(-height // 2), 2, -(-width // 2), 2)
+        for a in (u, v, known)
+    ]
+    u_c, v_c = ((q.sum(axis=(1, 3)) - 128 + 4) >> 3 for q in quads[:2])
+    known_c = quads[2].all(axis=(1, 3))
+    u_c, v_c = np.where(known_c, u_c, 0), np.where(known_c, v_c, 0)
+    chroma = [
+        np.where(known_c, interpolate(a, u_c, v_c), np.maximum(b, 1))
+        for a, b in ((previous.u, render.u), (previous.v, render.v))
+    ]
+    return I420(y, *chroma)
+
+
+def noise(size_px: tuple[int, int], seed: int) -> I420:
+    rng = np.random.default_rng(seed)
+    width, height = size_px
+    half = ((height + 1) // 2, (width + 1) // 2)
+    return I420(*(rng.integers(0, 256, s, dtype=np.uint8) for s in ((height, width), half, half)))
+
+
+def posed(size_px: tuple[int, int], depth: F32, pose: Pose) -> PosedDepth:
+    width, height = size_px
+    k = Intrinsics(width, height, 0.8 * width, 0.9 * width, width / 2, height / 2)
+    return PosedDepth(Camera(k, pose), depth)
+
+
+def scene(size_px: tuple[int, int], seed: int) -> tuple[I420, PosedDepth, PosedDepth, I420]:
+    """A rough surface, holes of zero depth, a turn and a step."""
+    rng = np.random.default_rng(seed)
+    width, height = size_px
+    depths = []
+    for _ in range(2):
+        depth = rng.uniform(4, 6, (height, width)).astype(np.float32)
+        depth[rng.random((height, width)) < 0.05] = 0
+        depths.append(depth)
+    axis = rng.normal(size=3) * 0.03
+    turn = np.array([1.0, *axis])
+    turn /= np.linalg.norm(turn)
+    w, x, y, z = turn.tolist()
+    step = Pose((0.2, -0.1, 0.5), (w, x, y, z))
+    before = posed(size_px, depths[0], Pose.identity())
+    return noise(size_px, seed), before, posed(size_px, depths[1], step), noise(size_px, seed + 1)
+
+
+def equal(a: I420, b: I420) -> bool:
+    return all(np.array_equal(p, q) for p, q in zip(a.planes, b.planes, strict=True))
+
+
+@pytest.mark.parametrize("size_px", SIZES)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_kernel_is_its_definition_bit_by_bit(size_px: tuple[int, int], seed: int) -> None:
+    given = scene(size_px, seed)
+    assert equal(warp_i420(*given), definition(*given))
+
+
+def test_a_golden_digest_pins_the_bytes() -> None:
+    assert warp_i420(*scene((64, 48), 7)).digest().hex() == "2ee3f6ae0a6fb2fd569311b8eea77a8b"
+
+
+def test_without_motion_the_picture_stays_as_it_is() -> None:
+    picture, render = noise((40, 30), 1), noise((40, 30), 2)
+    seen = posed((40, 30), np.full((30, 40), 5, np.float32), Pose.identity())
+    kept = warp_i420(picture, seen, seen, render)
+    assert all(
+        np.array_equal(a, np.maximum(b, 1))
+        for a, b in zip(kept.planes, picture.planes, strict=True)
+    )
+
+
+def test_a_step_sideways_shifts_a_wall_by_focal_length_over_distance() -> None:
+    """fx = 32 px, 5 m away, 0.625 m to the right: 4 px. The right is the render's."""
+    size = (40, 30)
+    wall = np.full((30, 40), 5, np.float32)
+    previous, render = noise(size, 1), noise(size, 2)
+    moved = warp_i420(
+        previous, posed(size, wall, Pose.identity()),
+        posed(size, wall, Pose((0.625, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))), render,
+    )  # fmt: skip
+    assert np.array_equal(moved.y[:, :36], np.maximum(previous.y[:, 4:], 1))
+    assert np.array_equal(moved.y[:, 36:], np.maximum(render.y[:, 36:], 1))
+    assert np.array_equal(moved.u[:, :18], np.maximum(previous.u[:, 2:], 1))
+
+
+def test_what_another_surface_hid_comes_from_the_render() -> None:
+    size = (40, 30)
+    far, near = np.full((30, 40), 9, np.float32), np.full((30, 40), 5, np.float32)
+    render = noise(size, 2)
+    for before, now in ((near, far), (far, near), (np.zeros_like(far), far)):
+        pose = Pose.identity()
+        warped = warp_i420(
+            noise(size, 1), posed(size, before, pose), posed(size, now, pose), render
+        )
+        assert np.array_equal(warped.y, np.maximum(render.y, 1))
+
+
+@pytest.mark.parametrize("pose", [
+    Pose((0.0, 0.0, 50.0), (1.0, 0.0, 0.0, 0.0)), Pose((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
+    Pose((9e5, 9e5, 9e5), (1.0, 0.0, 0.0, 0.0)),
+])  # fmt: skip
+def test_a_pose_that_saw_nothing_of_this_leaves_the_render(pose: Pose) -> None:
+    size = (24, 18)
+    depth = np.full((18, 24), 5, np.float32)
+    render = noise(size, 2)
+    warped = warp_i420(
+        noise(size, 1), posed(size, depth, pose), posed(size, depth, Pose.identity()), render
+    )
+    assert np.array_equal(warped.y, np.maximum(render.y, 1))
+
+
+def test_extreme_depths_are_computed_as_defined() -> None:
+    previous, before, seen, render = scene((64, 48), 3)
+    rng = np.random.default_rng(4)
+    depth = (10.0 ** rng.uniform(-30, 30, (48, 64))).astype(np.float32)
+    depth[0] = -1
+    given = (previous, before, PosedDepth(seen.camera, depth), render)
+    with np.errstate(over="ignore"):
+        assert equal(warp_i420(*given), definition(*given))
+
+
+def test_values_that_cannot_be_are_refused_by_name() -> None:
+    previous, before, seen, render = scene((16, 16), 1)
+    bad: list[tuple[str, Callable[[], object]]] = [
+        ("NaN or infinite", lambda: PosedDepth(seen.camera, np.full((16, 16), np.nan, np.float32))),
+        ("must be float32", lambda: PosedDepth(seen.camera, np.ones((16, 15), np.float32))),
+        ("warp.previous", lambda: warp_i420(noise((8, 8), 1), before, seen, render)),
+        ("different intrinsics", lambda: warp_i420(previous, scene((8, 8), 1)[1], seen, render)),
+        ("reference", lambda: block_costs(render.y, render.y[:8])),
+    ]  # fmt: skip
+    for words, call in bad:
+        with pytest.raises(InvalidInput, match=words):
+            call()
+
+
+def test_block_costs_are_hadamard_sums_and_squares() -> None:
+    a, b = noise((43, 29), 1).y, noise((43, 29), 2).y
+    costs = block_costs(a, b)
+    h = np.array([[1]])
+    for _ in range(3):
+        h = np.block([[h, h], [h, -h]])
+    assert costs.satd.shape == (3, 5)
+    for j in range(3):
+        for i in range(5):
+            block = np.s_[8 * j : 8 * j + 8, 8 * i : 8 * i + 8]
+            d = a[block].astype(int) - b[block]
+            assert costs.satd[j, i] == (np.abs(h @ d @ h).sum() + 4) // 8
+            assert costs.ssd[j, i] == (d * d).sum()
