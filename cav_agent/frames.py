@@ -12,7 +12,7 @@ from enum import StrEnum
 
 from rfcore.codec import DeltaPacket
 from rfcore.views import PosedPicture
-from rfcore.wire.messages import StageTimes
+from rfcore.wire.messages import FrameAddress, StageTimes
 
 __all__ = ["Capture", "EncodeJob", "EncodedFrame", "FrameResult", "Outcome"]
 
@@ -29,16 +29,21 @@ class Capture:
 
 @dataclass(frozen=True)
 class EncodeJob:
-    """Code ``capture`` in ``epoch``; a new epoch starts the encoder's state afresh."""
+    """Code ``capture`` in ``epoch``; a new epoch numbers its packets afresh.
+
+    ``base`` is the frame it may be predicted from; ``None``: nothing but the render.
+    """
 
     capture: Capture
     epoch: int
     connection: int
+    base: FrameAddress | None = None
 
 
 @dataclass(frozen=True)
 class EncodedFrame:
-    """A coded picture; ``stage_s`` has read, convert, render, encode and closed_loop."""
+    """A coded picture; ``stage_s`` has read, convert, render, references, encode and
+    closed_loop."""
 
     packet: DeltaPacket
     stage_s: Mapping[str, float]

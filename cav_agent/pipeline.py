@@ -1,23 +1,31 @@
 """From a captured picture to a packet: read, convert, render, encode. Runs on a worker thread.
 
-The encoder's state is a value; it starts afresh whenever the session asks for another epoch.
+The encoder's state is a value. Its numbering starts afresh whenever the session asks for another
+epoch; the frames it made last are kept, so that the session can say from which one to go on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from cav_agent.frames import EncodedFrame, EncodeJob
 from rfcore.camera import Camera, Intrinsics
-from rfcore.codec import CodecConfig, DeltaEncoder, EncoderState, StreamHeader
+from rfcore.codec import (
+    KEPT_FRAMES,
+    CodecConfig,
+    DeltaEncoder,
+    Encoded,
+    EncoderState,
+    Past,
+    StreamHeader,
+)
 from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
+from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
-from rfcore.views import PosedPicture
+from rfcore.views import PosedPicture, View
 
 __all__ = ["Pipeline", "Renderer"]
 
@@ -27,8 +35,8 @@ ClockNs = Callable[[], int]
 class Renderer(Protocol):
     """A radiance field, ready to be looked at."""
 
-    def render_colour(self, camera: Camera) -> NDArray[np.float32]:
-        """Return the colour seen from ``camera``, float32 [H, W, 3]."""
+    def render(self, camera: Camera) -> View:
+        """Return colour and depth seen from ``camera``."""
 
 
 class Pipeline:
@@ -40,6 +48,7 @@ class Pipeline:
         self._clock_ns = clock_ns
         self._encoder = DeltaEncoder(config, clock_ns)
         self._state: EncoderState | None = None
+        self._pasts: dict[tuple[int, int] | None, Past] = {}
 
     @property
     def header(self) -> StreamHeader:
@@ -57,23 +66,38 @@ class Pipeline:
         read_ns = self._clock_ns()
         frame = i420_from_rgb(rgb)
         converted_ns = self._clock_ns()
-        render = i420_from_colour(self._renderer.render_colour(job.capture.picture.camera))
+        camera = job.capture.picture.camera
+        view = self._renderer.render(camera)
+        render = i420_from_colour(view.colour)
         rendered_ns = self._clock_ns()
-        state = self._state
-        if state is None or state.epoch != job.epoch:
-            state = self._encoder.start(job.epoch)
-        encoded = self._encoder.encode(state, frame, render)
-        self._state = encoded.state
+        seen = PosedDepth(camera, view.depth)
+        encoded = self._encoder.encode(self._state_for(job), frame, render, seen)
+        self._remember(encoded)
         return EncodedFrame(
             encoded.packet,
             {
                 "read": (read_ns - started_ns) / 1e9,
                 "convert": (converted_ns - read_ns) / 1e9,
                 "render": (rendered_ns - converted_ns) / 1e9,
-                "encode": encoded.stage_ns["encode"] / 1e9,
-                "closed_loop": encoded.stage_ns["closed_loop"] / 1e9,
+                **{stage: ns / 1e9 for stage, ns in encoded.stage_ns.items()},
             },
         )
+
+    def _state_for(self, job: EncodeJob) -> EncoderState:
+        """Return the state to encode in; a base that is no longer kept counts as none."""
+        state = self._state
+        if state is None or state.epoch != job.epoch:
+            state = self._encoder.start(job.epoch)
+        base = None if job.base is None else (job.base.epoch, job.base.sequence)
+        return replace(state, past=self._pasts.get(base))
+
+    def _remember(self, encoded: Encoded) -> None:
+        self._state = encoded.state
+        made = encoded.state.past
+        if made is not None:
+            self._pasts[encoded.packet.epoch, encoded.packet.sequence] = made
+        while len(self._pasts) > KEPT_FRAMES:
+            del self._pasts[next(iter(self._pasts))]
 
     def _read(self, picture: PosedPicture) -> Rgb:
         k: Intrinsics = picture.camera.intrinsics

@@ -5,8 +5,11 @@ for encoding when the server's credit allows; ``encoded`` brings the packet back
 ``messages_to_send`` has what goes up, ``receive`` takes what came down, ``get_timer`` says when
 ``handle_timer`` wants to be called, and ``take_results`` tells how each picture ended.
 
-Pictures are dropped only before they are encoded. After a Nack, a lost connection or an answer
-that does not come, a new epoch begins, whose first packet needs nothing that went before.
+Pictures are dropped only before they are encoded. A frame is predicted from the one sent before it,
+as if that had arrived. After a Nack a new epoch begins, and its first frame goes back to the last
+one that the server is known to have decoded; after a lost connection, or when the server does not
+have that one either, it needs nothing that went before. Between renderers that are not exact no
+frame is ever predicted from another.
 """
 
 from __future__ import annotations
@@ -46,10 +49,11 @@ class LinkState(StrEnum):
 
 @dataclass(frozen=True)
 class Pending:
-    """An encoded frame that has not been answered."""
+    """An encoded frame that has not been answered; ``base`` is the frame it was predicted from."""
 
     result: FrameResult
     encoded_s: float
+    base: FrameAddress | None
     sent_s: float | None = None
 
 
@@ -76,6 +80,8 @@ class AgentSession:
         self._outbox: deque[ClientMessage] = deque()
         self._results: deque[FrameResult] = deque()
         self._greeting_until_s = 0.0
+        self._sent: FrameAddress | None = None
+        self._decoded: FrameAddress | None = None
 
     @property
     def is_idle(self) -> bool:
@@ -99,6 +105,7 @@ class AgentSession:
         self._outbox.clear()
         for address in list(self._pending):
             self._finish(address, Outcome.LOST, reason, now)
+        self._decoded = None
         self._start_epoch()
 
     def receive(self, message: ServerMessage, now: float) -> None:
@@ -129,6 +136,9 @@ class AgentSession:
             link_s=link_s,
         )
         self._pending[ack.address] = replace(pending, result=answered)
+        packet = pending.result.packet
+        if packet is not None and packet.reconstruction_digest == ack.reconstruction_digest:
+            self._decoded = ack.address
         self._finish(ack.address, Outcome.ACKED, "", now)
 
     def _nacked(self, nack: Nack, now: float) -> None:
@@ -137,16 +147,23 @@ class AgentSession:
             return
         overloaded = nack.reason is RejectReason.OVERLOADED  # never looked at: may be sent again
         outcome = Outcome.LOST if overloaded else Outcome.NACKED
-        for address in list(self._pending):
+        for address, pending in list(self._pending.items()):
             if _covers(nack, address):
+                if nack.reason is RejectReason.UNKNOWN_STATE and pending.base == self._decoded:
+                    self._decoded = None
                 self._finish(address, outcome, f"{nack.reason}: {nack.problem}", now)
+        is_over = nack.address.camera_id != "" and nack.address.epoch < self._epoch
+        if is_over and nack.current_epoch <= self._epoch:
+            return  # it follows from a loss that a new epoch has answered already
         self._start_epoch(nack.current_epoch)
 
     def _start_epoch(self, above: int = -1) -> None:
-        """Begin a new epoch, unless the present one has no packet yet and is new enough."""
+        """Begin a new epoch, unless the present one has no packet yet and is new enough; go back
+        to the last frame known to have been decoded."""
         if self._epoch_used or self._epoch <= above:
             self._epoch = max(self._epoch, above) + 1
             self._epoch_used = False
+        self._sent = self._decoded
 
     # --- pictures
 
@@ -168,7 +185,8 @@ class AgentSession:
         ready = self.state is LinkState.STREAMING and self._job is None
         if not ready or not self._slot or self._used >= self._granted:
             return None
-        self._job = EncodeJob(self._slot.popleft(), self._epoch, self._connection)
+        base = self._sent if self.exact else None
+        self._job = EncodeJob(self._slot.popleft(), self._epoch, self._connection, base)
         self._epoch_used = True
         return self._job
 
@@ -183,15 +201,18 @@ class AgentSession:
             packet_bytes=len(client_message_to_bytes(frame)),
             stage_s=encoded.stage_s,
         )
-        self._pending[frame.address] = Pending(result, now)
+        self._pending[frame.address] = Pending(result, now, job.base)
         if len(encoded.packet.payload) > MAX_PAYLOAD_BYTES:
             problem = f"{len(encoded.packet.payload)} bytes of payload exceed {MAX_PAYLOAD_BYTES}"
             self._finish(frame.address, Outcome.DROPPED, f"oversize: {problem}", now)
             self._start_epoch()
         elif job.connection != self._connection or self.state is not LinkState.STREAMING:
             self._finish(frame.address, Outcome.LOST, "the stream ended before it was sent", now)
+        elif job.epoch != self._epoch and job.base is not None:
+            self._finish(frame.address, Outcome.LOST, "the frame it needs was not decoded", now)
         else:
             self._used += 1
+            self._sent = frame.address
             self._outbox.append(frame)
 
     def encoding_failed(self, error: RfedgeError) -> None:

@@ -194,6 +194,8 @@ class _Stream:
             return
         self._session.decoded(job, outcome, time.monotonic())
         self.metrics.reconstructed(max(0.0, (time.time_ns() - job.frame.capture_time_ns) / 1e9))
+        if not outcome.exact:
+            self._around.metrics.inexact.inc()
 
     async def _reconstruct(self, job: DecodeJob) -> Reconstruction:
         decoder = self._decoders[job.frame.camera_id]

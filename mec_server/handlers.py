@@ -10,15 +10,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mec_server.jobs import DecodeJob, DecodeOutcome, OpenJob
 from rfcore.camera import Camera
 from rfcore.codec import DecoderState, DeltaDecoder
-from rfcore.errors import InvalidInput, PacketRejected, RejectReason
+from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour
+from rfcore.views import View
 from rfcore.wire.messages import CameraDescription, StageTimes
 
 __all__ = ["CameraDecoder", "FieldSource", "Reconstruction", "Renderer", "open_cameras"]
@@ -29,8 +28,8 @@ ClockNs = Callable[[], int]
 class Renderer(Protocol):
     """A radiance field, ready to be looked at."""
 
-    def render_colour(self, camera: Camera) -> NDArray[np.float32]:
-        """Return the colour seen from ``camera``, float32 [H, W, 3]."""
+    def render(self, camera: Camera) -> View:
+        """Return colour and depth seen from ``camera``."""
 
 
 class FieldSource(Protocol):
@@ -66,27 +65,35 @@ class CameraDecoder:
 
     def reconstruct(self, job: DecodeJob) -> Reconstruction:
         """Return the frame of ``job``; raise ``PacketRejected`` and stay good for the next."""
+        try:
+            return self._reconstruct(job)
+        except CodecError as error:  # costs this frame, not the stream
+            raise PacketRejected(RejectReason.DECODER_FAILED, str(error)) from error
+
+    def _reconstruct(self, job: DecodeJob) -> Reconstruction:
         started_ns = self._clock_ns()
-        render = self._render(job)
+        render, seen = self._render(job)
         rendered_ns = self._clock_ns()
         packet = job.frame.packet
         state = self._state
         if state is None or state.epoch != packet.epoch:
-            state = self._decoder.start(packet.epoch)
-        decoded = self._decoder.decode(state, packet, render)
+            state = self._decoder.start(packet.epoch, after=state)
+        decoded = self._decoder.decode(state, packet, render, seen)
         self._state = decoded.state
         times = StageTimes(
             render_ns=rendered_ns - started_ns,
             splice_ns=decoded.stage_ns.get("splice", 0),
             decode_ns=decoded.stage_ns.get("decode", 0),
         )
-        outcome = DecodeOutcome(decoded.lost, decoded.frame.digest(), times)
+        digest = decoded.state.kept[0].digest
+        outcome = DecodeOutcome(decoded.lost, digest, times, decoded.exact)
         return Reconstruction(decoded.frame, outcome)
 
-    def _render(self, job: DecodeJob) -> I420:
+    def _render(self, job: DecodeJob) -> tuple[I420, PosedDepth]:
         camera = job.frame.camera(self._camera.intrinsics)
         try:
-            return i420_from_colour(self._renderers[job.field_id].render_colour(camera))
+            view = self._renderers[job.field_id].render(camera)
+            return i420_from_colour(view.colour), PosedDepth(camera, view.depth)
         except InvalidInput as error:
             raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
 

@@ -30,11 +30,15 @@ class DecodeJob:
 
 @dataclass(frozen=True)
 class DecodeOutcome:
-    """A reconstructed frame: how many before it are missing, its digest, the time it took."""
+    """A reconstructed frame: how many before it are missing, its digest, the time it took.
+
+    ``exact`` is false when the renders differed by rounding, and with them the pictures.
+    """
 
     lost: int
     reconstruction_digest: bytes
     times: StageTimes
+    exact: bool = True
 
 
 @dataclass(frozen=True)

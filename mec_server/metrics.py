@@ -12,6 +12,7 @@ from dataclasses import fields
 
 from prometheus_client import CollectorRegistry
 
+from rfcore.codec import references_name
 from rfcore.field import RadianceField
 from rfcore.wire.instruments import Instruments
 from rfcore.wire.messages import Ack, Frame, Nack, ServerMessage, StageTimes
@@ -64,6 +65,10 @@ class ServerMetrics:
             "From the vehicle's capture to the reconstructed picture; needs synchronised clocks.",
             vehicle,
         )
+        self.inexact = make.counter(
+            "rfedge_server_inexact_frames",
+            "Frames decoded against a render that differs from the vehicle's by rounding.",
+        )
         self.recording = make.gauge(
             "rfedge_server_recording",
             "1 while pictures are recorded, 0 when none are asked for or the disk refused.",
@@ -106,7 +111,7 @@ class VehicleMetrics:
     def received(self, frame: Frame, packet_bytes: int) -> None:
         """Count a frame that could be parsed."""
         metrics, label = self._metrics, self._label
-        references = str(frame.references)
+        references = references_name(frame.packet.references)
         received = metrics.received.labels(*label) if label else metrics.received
         received.inc(packet_bytes)
         metrics.payload.labels(*label, references).inc(len(frame.packet.payload))

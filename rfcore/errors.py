@@ -87,6 +87,7 @@ class RejectReason(StrEnum):
     RECONSTRUCTION_MISMATCH = "reconstruction_mismatch"
     INVALID_ARGUMENT = "invalid_argument"
     OVERLOADED = "overloaded"
+    UNKNOWN_STATE = "unknown_state"
 
 
 class PacketRejected(RfedgeError):

@@ -14,6 +14,7 @@ from rfcore.dataset import Dataset
 from rfcore.errors import DatasetError, InvalidData
 from rfcore.field import RadianceField
 from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.drive_file import CodedDrive
@@ -56,9 +57,8 @@ def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSetting
     for picture in dataset.pictures:
         if picture.camera.intrinsics != intrinsics:
             raise DatasetError(f"{picture.name}: its camera differs from the first picture's")
-        encoded = encoder.encode(
-            state, i420_from_rgb(picture.read()), rendered(field, picture.camera)
-        )
+        frame = i420_from_rgb(picture.read())
+        encoded = encoder.encode(state, frame, *rendered(field, picture.camera))
         state = encoded.state
         frames.append(
             Frame(
@@ -87,12 +87,13 @@ def decode_drive(drive: CodedDrive, field: RadianceField) -> Iterator[DecodedFra
     decoder = DeltaDecoder(camera.codec)
     state = decoder.start(drive.frames[0].packet.epoch) if drive.frames else decoder.start(1)
     for frame in drive.frames:
-        render = rendered(field, frame.camera(camera.intrinsics))
-        decoded = decoder.decode(state, frame.packet, render)
+        seen = rendered(field, frame.camera(camera.intrinsics))
+        decoded = decoder.decode(state, frame.packet, *seen)
         state = decoded.state
         yield DecodedFrame(frame.packet.sequence, decoded.frame)
 
 
-def rendered(field: RadianceField, camera: Camera) -> I420:
-    """Return the field's render as both ends of the codec hold it."""
-    return i420_from_colour(field.render_colour(camera))
+def rendered(field: RadianceField, camera: Camera) -> tuple[I420, PosedDepth]:
+    """Return the field's picture and depth as both ends of the codec hold them."""
+    view = field.render(camera)
+    return i420_from_colour(view.colour), PosedDepth(camera, view.depth)

@@ -1,12 +1,17 @@
 """The delta codec: camera frames as H.264 P slices against a render that is never sent."""
 
 from rfcore.codec.config import CodecConfig
-from rfcore.codec.delta import Decoded, DeltaDecoder, DeltaEncoder, Encoded
+from rfcore.codec.decoder import Decoded, DeltaDecoder
+from rfcore.codec.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
-from rfcore.codec.state import DecoderState, EncoderState
+from rfcore.codec.references import INTRA, RENDER_ONLY, Reference, References, references_name
+from rfcore.codec.state import KEPT_FRAMES, DecoderState, EncoderState, Past
 
 __all__ = [
+    "INTRA",
+    "KEPT_FRAMES",
+    "RENDER_ONLY",
     "CodecConfig",
     "Decoded",
     "DecoderState",
@@ -15,5 +20,10 @@ __all__ = [
     "DeltaPacket",
     "Encoded",
     "EncoderState",
+    "FrameChoice",
+    "Past",
+    "Reference",
+    "References",
     "StreamHeader",
+    "references_name",
 ]

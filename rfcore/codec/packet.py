@@ -1,4 +1,4 @@
-"""The delta packet: one P slice with everything a receiver needs to trust or refuse it."""
+"""The delta packet: one slice with everything a receiver needs to trust or refuse it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import zlib
 from dataclasses import dataclass, replace
 
 from rfcore.codec.coarse import COARSE_BYTES
+from rfcore.codec.photometric import Photometric, check_photometric
+from rfcore.codec.references import RENDER_ONLY, References, check_references, is_temporal
 from rfcore.errors import InvalidInput
 
 __all__ = ["DIGEST_BYTES", "DeltaPacket"]
@@ -19,10 +21,13 @@ class DeltaPacket:
     """One coded frame. Raises ``InvalidInput`` for digests of a wrong length and for numbers
     outside uint64 (``epoch``, ``sequence``) or uint32 (``crc32``); nothing else is checked here.
 
-    ``payload`` is one NAL unit without start code. ``reference_digest`` and
-    ``reference_coarse`` are of the sender's render, ``reconstruction_digest`` is of what the
-    receiver must get (``I420.digest``). ``crc32`` covers all other fields (``expected_crc32``): a
-    damaged sequence number would otherwise make every later packet look stale.
+    ``payload`` is one NAL unit without start code; empty, the frame is its only reference as it is.
+    ``reference_digest`` and ``reference_coarse`` are of the sender's render (whatever the frame is
+    predicted from: they say that pose and field are the same), ``reconstruction_digest`` is of what
+    the receiver must get (``I420.digest``). ``needed_digest`` names the earlier frame that
+    ``references`` call for, and is empty when they call for none; ``photometric`` changes the
+    render before it is used. ``crc32`` covers all other fields (``expected_crc32``): a damaged
+    sequence number would otherwise make every later packet look stale.
     """
 
     epoch: int
@@ -32,6 +37,9 @@ class DeltaPacket:
     reconstruction_digest: bytes
     payload: bytes
     crc32: int
+    references: References = RENDER_ONLY
+    needed_digest: bytes = b""
+    photometric: Photometric = ()
 
     def __post_init__(self) -> None:
         for name, limit in (("epoch", _UINT64), ("sequence", _UINT64), ("crc32", _UINT32)):
@@ -46,16 +54,28 @@ class DeltaPacket:
             got = len(getattr(self, name))
             if got != length:
                 raise InvalidInput(f"packet.{name}", f"{got} bytes where {length} are expected")
+        check_references(self.references)
+        check_photometric(self.photometric)
+        needed = DIGEST_BYTES if is_temporal(self.references) else 0
+        if len(self.needed_digest) != needed:
+            raise InvalidInput(
+                "packet.needed_digest",
+                f"{len(self.needed_digest)} bytes where {needed} are expected",
+            )
 
     def expected_crc32(self) -> int:
         """Return zlib.crc32 of epoch and sequence (8 bytes each, big-endian), the digests in the
-        order of the fields, and the payload."""
+        order of the fields, the payload, a byte for each reference, the needed digest, and the
+        photometric numbers (2 bytes each)."""
         crc = zlib.crc32(self.epoch.to_bytes(8, "big") + self.sequence.to_bytes(8, "big"))
         for part in (
             self.reference_digest,
             self.reference_coarse,
             self.reconstruction_digest,
             self.payload,
+            bytes(self.references),
+            self.needed_digest,
+            b"".join(number.to_bytes(2, "big", signed=True) for number in self.photometric),
         ):
             crc = zlib.crc32(part, crc)
         return crc

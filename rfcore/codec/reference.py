@@ -2,9 +2,10 @@
 
 The receiver never gets the picture its P slice predicts from; it makes one from its own render. An
 I_PCM macroblock holds its 384 samples as they are (ITU-T H.264, 7.3.5 and 7.4.5), so every
-standard decoder reproduces them bit for bit. The picture is one IDR slice under a picture
-parameter set of its own (id 1: CAVLC, so that macroblocks need no arithmetic coder, and deblocking
-off), beside x264's (id 0), which the P slice names.
+standard decoder reproduces them bit for bit. The picture is one slice under a picture parameter set
+of its own (id 1: CAVLC, so that macroblocks need no arithmetic coder, and deblocking off), beside
+x264's (id 0), which the P slice names. The first of several pictures is an IDR picture, those
+after it are not: an IDR picture would drop the ones before.
 
 In CAVLC each macroblock after the first begins byte-aligned with mb_type ue(25), nine bits, and
 seven zero bits: 0x0D 0x00. So the picture is one array of rows of 386 bytes. Samples are clamped to
@@ -13,14 +14,16 @@ at least 1; then no two zero bytes meet and no emulation prevention is needed (7
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.codec.bitstream import BitWriter, nal_of_rbsp
-from rfcore.codec.parameter_sets import NAL_IDR, NAL_PPS
+from rfcore.codec.parameter_sets import NAL_IDR, NAL_P, NAL_PPS
 from rfcore.image import I420
 
-__all__ = ["PCM_PPS_ID", "pcm_picture", "pcm_pps", "without_zeros"]
+__all__ = ["PCM_PPS_ID", "PcmPlace", "pcm_picture", "pcm_pps", "without_zeros"]
 
 PCM_PPS_ID = 1
 _NAL_REF_IDC = 3 << 5
@@ -44,15 +47,23 @@ def pcm_pps() -> bytes:
     return nal_of_rbsp(_NAL_REF_IDC | NAL_PPS, w.stop().to_bytes())
 
 
-def pcm_picture(picture: I420, log2_max_frame_num: int, idr_pic_id: int) -> bytes:
-    """Return the NAL unit of an IDR picture that decodes to ``picture``, samples raised to >= 1.
+@dataclass(frozen=True)
+class PcmPlace:
+    """Where an I_PCM picture stands: ``frame_num`` 0 is an IDR picture, and then ``idr_pic_id``
+    must differ from that of an IDR picture right before it (7.4.3)."""
+
+    log2_max_frame_num: int
+    frame_num: int = 0
+    idr_pic_id: int = 0
+
+
+def pcm_picture(picture: I420, place: PcmPlace) -> bytes:
+    """Return the NAL unit of a picture that decodes to ``picture``, samples raised to >= 1.
 
     The coded area is the size rounded up to whole macroblocks by repeating the last row and column.
-    ``idr_pic_id`` must differ between IDR pictures that follow each other (7.4.3). The sequence
-    must use picture order count type 2.
+    The sequence must use picture order count type 2.
     """
-    header = _slice_header(log2_max_frame_num, idr_pic_id)
-    return header + _macroblocks(picture).tobytes()[len(_MB_HEADER) :] + b"\x80"
+    return _slice_header(place) + _macroblocks(picture).tobytes()[len(_MB_HEADER) :] + b"\x80"
 
 
 def without_zeros(picture: I420) -> I420:
@@ -61,19 +72,24 @@ def without_zeros(picture: I420) -> I420:
     return I420(y, u, v)
 
 
-def _slice_header(log2_max_frame_num: int, idr_pic_id: int) -> bytes:
+def _slice_header(place: PcmPlace) -> bytes:
     """Return the NAL unit up to the first macroblock's samples (7.3.3, 7.3.5)."""
     w = BitWriter()
     w.ue(0).ue(_I_SLICE_ONLY).ue(PCM_PPS_ID)
-    w.u(log2_max_frame_num, 0)  # frame_num of an IDR picture
-    w.ue(idr_pic_id)
-    w.u(1, 0).u(1, 0)  # no_output_of_prior_pics_flag, long_term_reference_flag
+    w.u(place.log2_max_frame_num, place.frame_num)
+    is_idr = place.frame_num == 0
+    if is_idr:
+        w.ue(place.idr_pic_id)
+        w.u(1, 0).u(1, 0)  # no_output_of_prior_pics_flag, long_term_reference_flag
+    else:
+        w.u(1, 0)  # adaptive_ref_pic_marking_mode_flag: the oldest picture leaves first
     w.se(0)  # slice_qp_delta
     w.ue(1)  # disable_deblocking_filter_idc
     w.ue(_MB_TYPE_I_PCM).align()
     # The sample that follows is >= 1 and the last byte is not zero unless the bits were: a final
     # one bit stands in for what follows while emulation prevention is applied.
-    return nal_of_rbsp(_NAL_REF_IDC | NAL_IDR, w.to_bytes() + b"\x01")[:-1]
+    nal_unit_type = NAL_IDR if is_idr else NAL_P
+    return nal_of_rbsp(_NAL_REF_IDC | nal_unit_type, w.to_bytes() + b"\x01")[:-1]
 
 
 def _macroblocks(picture: I420) -> NDArray[np.uint8]:

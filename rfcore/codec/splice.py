@@ -1,27 +1,35 @@
-"""The splice: a decoder whose reference picture is put there by us.
+"""The splice: a decoder whose reference pictures are put there by us.
 
-Sender and receiver run the same code: an I_PCM picture of the render, then the received P slice.
-The P slice predicts from exactly the render's samples, and whatever it carries, the next frame
-begins with an IDR picture again, so nothing outlives a frame.
+Sender and receiver run the same code: an I_PCM picture for each reference, then the received slice.
+The P slice predicts from exactly those samples, and whatever it carries, the next frame begins with
+an IDR picture again, so nothing outlives a frame.
+
+A frame without references is an IDR picture of its own. A grey I_PCM picture goes before it, so
+that its ``idr_pic_id``, which is always 0, never follows another 0 (7.4.3).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from rfcore.codec.bitstream import join_nals
+from rfcore.codec.config import CodecConfig
 from rfcore.codec.h264 import H264Decoder
 from rfcore.codec.header import StreamHeader, check_header
-from rfcore.codec.parameter_sets import NAL_P, nal_type, parse_slice_start
-from rfcore.codec.reference import pcm_picture, pcm_pps
+from rfcore.codec.parameter_sets import NAL_IDR, NAL_P, nal_type, parse_slice_start
+from rfcore.codec.reference import PcmPlace, pcm_picture, pcm_pps
 from rfcore.errors import BitstreamError, CodecError
 from rfcore.image import I420
 
-__all__ = ["SpliceDecoder"]
+__all__ = ["SpliceDecoder", "grey"]
 
-_P_SLICE = 0
+_P_SLICE, _I_SLICE = 0, 2
 
 
 class SpliceDecoder:
-    """Decodes P slices against renders. One caller at a time.
+    """Decodes slices against references. One caller at a time.
 
     Raises ``InvalidInput`` for a header that our encoder would not make.
     """
@@ -32,34 +40,39 @@ class SpliceDecoder:
         self._parameter_sets = join_nals([header.sps, header.pps, pcm_pps()])
         self._decoder = H264Decoder(header.config.coded_size_px)
         self._knows_parameter_sets = False
-        self._idr_pic_id = 0
+        self._idr_pic_id = 1
 
-    def check_payload(self, payload: bytes) -> None:
+    def check_payload(self, payload: bytes, references: int = 1) -> None:
         """Raise ``BitstreamError`` unless ``payload`` is one NAL unit holding the first slice of a
-        P picture under x264's PPS, the first after the IDR picture."""
-        if nal_type(payload) != NAL_P:
-            raise BitstreamError(f"NAL unit type {nal_type(payload)} is not a P picture's slice")
+        picture under x264's PPS: the P picture after so many references, or an IDR picture."""
+        expected_nal = NAL_P if references else NAL_IDR
+        if nal_type(payload) != expected_nal:
+            kind = "a P picture's slice" if references else "an IDR picture's slice"
+            raise BitstreamError(f"NAL unit type {nal_type(payload)} is not {kind}")
         start = parse_slice_start(payload, self._log2_max_frame_num)
         fields = (start.first_mb, start.slice_type, start.pps_id, start.frame_num)
-        if fields != (0, _P_SLICE, 0, 1):
+        expected = (0, _P_SLICE if references else _I_SLICE, 0, references)
+        if fields != expected:
             raise BitstreamError(
                 f"slice with first macroblock, type, PPS, frame number {fields} "
-                f"where (0, {_P_SLICE}, 0, 1) is expected"
+                f"where {expected} is expected"
             )
 
-    def predict_from(self, render: I420) -> None:
-        """Make ``render`` the reference picture; raise ``CodecError`` if the decoder fails.
-
-        The caller checks the render's size.
+    def predict_from(self, *pictures: I420) -> None:
+        """Make ``pictures`` the references, the last one reference 0; none prepares for an IDR
+        picture. Raises ``CodecError`` if the decoder fails. The caller checks sizes and number.
         """
-        self._idr_pic_id ^= 1
-        picture = join_nals([pcm_picture(render, self._log2_max_frame_num, self._idr_pic_id)])
-        known = self._knows_parameter_sets
-        self._decode(picture if known else self._parameter_sets + picture)
-        self._knows_parameter_sets = True
+        fed: Sequence[I420] = pictures or [grey(self._config)]
+        self._idr_pic_id ^= 3  # 1 and 2 by turns
+        for frame_num, picture in enumerate(fed):
+            place = PcmPlace(self._log2_max_frame_num, frame_num, self._idr_pic_id)
+            unit = join_nals([pcm_picture(picture, place)])
+            known = self._knows_parameter_sets
+            self._decode(unit if known else self._parameter_sets + unit)
+            self._knows_parameter_sets = True
 
     def decode(self, payload: bytes) -> I420:
-        """Return the picture that ``payload`` makes of the reference picture, cropped to size.
+        """Return the picture that ``payload`` makes of the references, cropped to size.
 
         Raises ``CodecError`` when the decoder notices damage; it does not notice all of it.
         """
@@ -83,3 +96,10 @@ class SpliceDecoder:
         except CodecError:
             self.reset()
             raise
+
+
+def grey(config: CodecConfig) -> I420:
+    """Return a grey picture of the configured size."""
+    width_px, height_px = config.size_px
+    half = ((height_px + 1) // 2, (width_px + 1) // 2)
+    return I420(*(np.full(s, 128, np.uint8) for s in ((height_px, width_px), half, half)))

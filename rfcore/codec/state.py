@@ -1,24 +1,53 @@
-"""What each end remembers between frames: nothing but numbers.
+"""What each end remembers between frames: sequence numbers, and frames to predict from.
 
-The reference of every packet is the render at its own pose, so a state holds no picture, any
-packet can be decoded on its own, and losing one costs one frame.
+A frame's state is named by the digest of its picture. A packet that predicts from an earlier frame
+says which (``DeltaPacket.needed_digest``), and its own ``reconstruction_digest`` names the state it
+makes. The sender predicts from one frame at a time, and which one is the caller's choice: the last
+sent, or, after a loss, the last that is known to have been decoded. The receiver keeps the last
+few, so that rolling back needs no new start.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 from rfcore.errors import InvalidInput
+from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
 
-__all__ = ["DecoderState", "EncoderState"]
+__all__ = ["KEPT_FRAMES", "DecoderState", "EncoderState", "Past"]
+
+KEPT_FRAMES = 4
+"""Decoded frames a receiver keeps: two on their way, the one they follow, and one to spare."""
+
+
+@dataclass(frozen=True, eq=False)
+class Past:
+    """A decoded frame that later ones may predict from.
+
+    ``seen`` is the field's depth at its pose, ``render`` its picture there; without them nothing
+    can be carried to another pose.
+    """
+
+    picture: I420
+    seen: PosedDepth | None = None
+    render: I420 | None = None
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Name the state: the digest of the picture."""
+        return self.picture.digest()
 
 
 @dataclass(frozen=True)
 class EncoderState:
-    """The sender's state: the ``sequence`` its next packet gets within ``epoch``."""
+    """The sender's state: the ``sequence`` its next packet gets within ``epoch``, and the frame
+    that packet may be predicted from, if any."""
 
     epoch: int
     next_sequence: int = 0
+    past: Past | None = None
 
     def __post_init__(self) -> None:
         _require_counts(self.epoch, self.next_sequence)
@@ -26,13 +55,24 @@ class EncoderState:
 
 @dataclass(frozen=True)
 class DecoderState:
-    """The receiver's state: the lowest ``sequence`` of ``epoch`` it still accepts."""
+    """The receiver's state: the lowest ``sequence`` of ``epoch`` it still accepts, and the frames
+    it keeps, newest first."""
 
     epoch: int
     next_sequence: int = 0
+    kept: tuple[Past, ...] = ()
 
     def __post_init__(self) -> None:
         _require_counts(self.epoch, self.next_sequence)
+
+    def past(self, digest: bytes) -> Past | None:
+        """Return the kept frame of that digest, if there is one."""
+        return next((past for past in self.kept if past.digest == digest), None)
+
+    def after(self, sequence: int, past: Past) -> DecoderState:
+        """Return the state once the packet ``sequence`` has become ``past``."""
+        kept = (past, *self.kept)[:KEPT_FRAMES]
+        return replace(self, next_sequence=sequence + 1, kept=kept)
 
 
 def _require_counts(epoch: int, next_sequence: int) -> None:

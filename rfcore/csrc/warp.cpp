@@ -80,38 +80,44 @@ void drop_hidden(const float* previous_depth, int width_px, Row& row) {
 // so that a column's sum fits: no row of the filter has absolute values of more than 100 in all.
 using Lanes = std::int16_t __attribute__((vector_size(2 * kLanes)));
 
-// A plane with its edge repeated, as 16-bit numbers: GCC 12 widens eight bytes one by one.
+// A plane, or the difference of two, with its edge repeated, as 16-bit numbers (GCC 12 widens eight
+// bytes one by one).
 class Plane {
 public:
-    Plane(const std::uint8_t* samples, int width, int height)
-        : pitch_(width + kBefore + kAfter), samples_(pitch_ * (height + kBefore + kAfter)) {
+    Plane(const std::uint8_t* samples, const std::uint8_t* minus, int width, int height)
+        : is_difference_(minus != nullptr), pitch_(width + kBefore + kAfter),
+          samples_(pitch_ * (height + kBefore + kAfter)) {
         for (int y = -kBefore; y < height + kAfter; ++y) {
-            const std::uint8_t* from =
-                samples + static_cast<std::size_t>(std::clamp(y, 0, height - 1)) * width;
-            std::int16_t* to = samples_.data() + (y + kBefore) * pitch_;
-            std::fill_n(to, kBefore, from[0]);
-            std::copy_n(from, width, to + kBefore);
-            std::fill_n(to + kBefore + width, kAfter, from[width - 1]);
+            const std::size_t from = static_cast<std::size_t>(std::clamp(y, 0, height - 1)) * width;
+            std::int16_t* to = samples_.data() + (y + kBefore) * pitch_ + kBefore;
+            std::copy_n(samples + from, width, to);
+            for (int x = 0; minus != nullptr && x < width; ++x) to[x] -= minus[from + x];
+            std::fill_n(to - kBefore, kBefore, to[0]);
+            std::fill_n(to + width, kAfter, to[width - 1]);
         }
     }
     std::size_t pitch() const { return pitch_; }
+    bool is_difference() const { return is_difference_; }
     // The first sample under the filter for positions from (x, y) to (x + 1, y + 1); x, y >= -1.
     const std::int16_t* under(int x, int y) const { return samples_.data() + (y + 1) * pitch_ + x + 1; }
 
 private:
     static constexpr int kBefore = 3, kAfter = 6;
+    bool is_difference_;
     std::size_t pitch_;
     std::vector<std::int16_t> samples_;
 };
 
-// Writes the plane's value at each known (u, v), in 1/64 sample, and `otherwise` elsewhere. Eight
-// columns are summed although six have taps, so that a row of them is one vector.
+// Writes `gain` 64ths of the plane's value at each known (u, v), in 1/64 sample (on top of
+// the render if the plane is a difference), and the render elsewhere. Eight columns are summed although six have taps, so that a row is one vector.
 RFCORE_PER_ISA
-void interpolate_row(const Plane& plane, const std::int32_t* u, const std::int32_t* v, int count,
-                     const std::uint8_t* otherwise, std::uint8_t* out) {
+void interpolate_row(const Plane& plane, const Row& at, int count, std::int32_t gain,
+                     const std::uint8_t* render, std::uint8_t* out) {
+    const std::int32_t *u = at.u.data(), *v = at.v.data();
+    const std::int32_t with_render = plane.is_difference() ? 1 : 0;
     for (int n = 0; n < count; ++n) {
         if (u[n] == kNowhere) {
-            out[n] = std::max<std::uint8_t>(otherwise[n], 1);
+            out[n] = std::max<std::uint8_t>(render[n], 1);
             continue;
         }
         const std::int16_t* line = plane.under(u[n] >> 6, v[n] >> 6);
@@ -122,9 +128,10 @@ void interpolate_row(const Plane& plane, const std::int32_t* u, const std::int32
             std::memcpy(&row, line, sizeof row);
             columns += row * down[j];
         }
-        std::int32_t sum = 1 << 11;
+        std::int32_t sum = 0;
         for (int i = 0; i < kTaps; ++i) sum += columns[i] * across[i];
-        out[n] = static_cast<std::uint8_t>(std::min(std::max(sum >> 12, 1), 255));
+        const std::int32_t value = ((sum * gain + (1 << 17)) >> 18) + with_render * render[n];
+        out[n] = static_cast<std::uint8_t>(std::min(std::max(value, 1), 255));
     }
 }
 
@@ -132,9 +139,9 @@ class Warp {
 public:
     Warp(const WarpInputs& in, const WarpGeometry& geometry, PictureSize size, I420Planes out)
         : in_(in), geometry_(geometry), size_(size), out_(out), half_width_((size.width_px + 1) / 2),
-          y_(in.previous.y, size.width_px, size.height_px),
-          u_(in.previous.u, half_width_, (size.height_px + 1) / 2),
-          v_(in.previous.v, half_width_, (size.height_px + 1) / 2),
+          y_(in.previous.y, in.previous_render.y, size.width_px, size.height_px),
+          u_(in.previous.u, in.previous_render.u, half_width_, (size.height_px + 1) / 2),
+          v_(in.previous.v, in.previous_render.v, half_width_, (size.height_px + 1) / 2),
           rows_{Row(size.width_px), Row(size.width_px)}, middle_(half_width_) {}
 
     std::int64_t run() {
@@ -153,8 +160,7 @@ private:
         locate_row(in_.depth + start, geometry_, size_, y, row.u.data(), row.v.data(),
                    row.z.data());
         drop_hidden(in_.previous_depth, size_.width_px, row);
-        interpolate_row(y_, row.u.data(), row.v.data(), size_.width_px, in_.render.y + start,
-                        out_.y + start);
+        interpolate_row(y_, row, size_.width_px, in_.gain, in_.render.y + start, out_.y + start);
         return size_.width_px - std::count(row.u.begin(), row.u.end(), kNowhere);
     }
 
@@ -167,10 +173,8 @@ private:
             middle_.v[c] = all ? centre(top.v[a] + top.v[b] + bottom.v[a] + bottom.v[b]) : 0;
         }
         const std::size_t start = static_cast<std::size_t>(line) * half_width_;
-        interpolate_row(u_, middle_.u.data(), middle_.v.data(), half_width_, in_.render.u + start,
-                        out_.u + start);
-        interpolate_row(v_, middle_.u.data(), middle_.v.data(), half_width_, in_.render.v + start,
-                        out_.v + start);
+        interpolate_row(u_, middle_, half_width_, in_.gain, in_.render.u + start, out_.u + start);
+        interpolate_row(v_, middle_, half_width_, in_.gain, in_.render.v + start, out_.v + start);
     }
 
     // Four luma positions to the chroma sample in their middle: (mean - 1/2) / 2.

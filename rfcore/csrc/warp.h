@@ -1,4 +1,4 @@
-// The previous picture carried to another pose by depth; and what predicting a block would cost.
+// The previous picture, or its error, carried to another pose by depth; and what predicting a block would cost.
 //
 // The definition (geometry, filters, rounding, siting) is in rfcore/native/warp.py.
 #pragma once
@@ -22,6 +22,10 @@ struct WarpInputs {
     const float* previous_depth;
     const float* depth;
     ConstI420Planes render;
+    // What the previous picture was predicted to be, or null. With it, not the picture is carried
+    // but what it differs by, `gain` 64ths of which are added to the render.
+    ConstI420Planes previous_render;
+    std::int32_t gain;
 };
 
 // Returns how many luma samples came from the previous picture; the others are the render's.

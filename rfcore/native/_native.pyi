@@ -156,14 +156,12 @@ _U8 = NDArray[np.uint8]
 
 def block_costs(frame: _U8, reference: _U8, satd: _I32, ssd: _I32) -> None: ...
 def warp_i420(
-    previous_y: _U8,
-    previous_u: _U8,
-    previous_v: _U8,
+    previous: tuple[_U8, _U8, _U8],
     previous_depth: _F32,
     depth: _F32,
-    render_y: _U8,
-    render_u: _U8,
-    render_v: _U8,
+    render: tuple[_U8, _U8, _U8],
+    previous_render: tuple[_U8, _U8, _U8] | None,
+    gain: int,
     numbers: Sequence[float],
     y: _U8,
     u: _U8,

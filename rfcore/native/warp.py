@@ -22,6 +22,11 @@ Chroma sits in the middle of its 2x2 luma samples (``rfcore.native.yuv``): it is
 four are, and its position is ((u1 + u2 + u3 + u4) / 4 - 0.5) / 2, rounded half up to 1/64. A last
 odd row or column counts twice.
 
+The *correction* carries, instead of the picture, its signed difference from the field's render at
+its own pose, and adds 3/4 of it to the present render: ``render + ((48 * sum + 2**17) >> 18)``,
+clamped as above. What the field shows wrongly from one pose it shows wrongly from the next, while
+detail that resampling would soften comes from the render.
+
 Lanczos-3 was chosen over a bicubic filter because a picture is resampled again and again along a
 drive, and every pass of a softer filter takes away detail that has to be sent again.
 """
@@ -38,9 +43,24 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native import _native
 
-__all__ = ["BLOCK_PX", "BlockCosts", "PosedDepth", "block_costs", "warp_i420", "warp_numbers"]
+__all__ = [
+    "BLOCK_PX",
+    "BlockCosts",
+    "PosedDepth",
+    "Seen",
+    "block_costs",
+    "correct_i420",
+    "warp_i420",
+    "warp_numbers",
+]
 
 BLOCK_PX = 8
+WHOLE = 64
+CORRECTION_GAIN = 48
+"""Of 64. On a drive at 10 Hz with a field of 28.7 dB, the squared error of the luma prediction is
+86 for the render, 91 for the warp, and 69, 67, 68, 70 for gains of 1/2, 0.7, 0.85 and 1."""
+
+Plane = NDArray[np.uint8]
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
@@ -77,36 +97,56 @@ class BlockCosts:
     ssd: NDArray[np.int32]
 
 
+@dataclass(frozen=True)
+class Seen:
+    """A picture of a posed view: ``picture`` at ``at``, which the field rendered as ``render``."""
+
+    picture: I420
+    at: PosedDepth
+    render: I420
+
+
 def warp_i420(previous: I420, seen_before: PosedDepth, seen: PosedDepth, render: I420) -> I420:
     """Return ``previous`` as it would look from ``seen.camera``, holes filled from ``render``.
 
     Raises ``InvalidInput`` for pictures of another size or cameras of different intrinsics.
     """
-    if seen_before.camera.intrinsics != seen.camera.intrinsics:
+    return _carried(Seen(previous, seen_before, render), None, seen, render)
+
+
+def correct_i420(before: Seen, seen: PosedDepth, render: I420) -> I420:
+    """Return ``render`` plus 3/4 of the carried difference of ``before`` from its own render.
+
+    Raises ``InvalidInput`` for pictures of another size or cameras of different intrinsics.
+    """
+    return _carried(before, before.render, seen, render)
+
+
+def _carried(before: Seen, minus: I420 | None, seen: PosedDepth, render: I420) -> I420:
+    if before.at.camera.intrinsics != seen.camera.intrinsics:
         raise InvalidInput("warp", "the two cameras have different intrinsics")
     k = seen.camera.intrinsics
-    for name, picture in (("previous", previous), ("render", render)):
-        if picture.size_px != (k.width_px, k.height_px):
-            raise InvalidInput(
-                f"warp.{name}",
-                f"{picture.size_px} px where the camera has {k.width_px, k.height_px}",
-            )
+    size_px = (k.width_px, k.height_px)
+    for name, picture in (("previous", before.picture), ("render", render), ("minus", minus)):
+        if picture is not None and picture.size_px != size_px:
+            raise InvalidInput(f"warp.{name}", f"{picture.size_px} px of a camera of {size_px} px")
     out = I420(*(np.empty(plane.shape, np.uint8) for plane in render.planes))
-    previous_y, previous_u, previous_v = map(np.ascontiguousarray, previous.planes)
-    render_y, render_u, render_v = map(np.ascontiguousarray, render.planes)
     _native.warp_i420(
-        previous_y,
-        previous_u,
-        previous_v,
-        np.ascontiguousarray(seen_before.depth),
+        _dense(before.picture),
+        np.ascontiguousarray(before.at.depth),
         np.ascontiguousarray(seen.depth),
-        render_y,
-        render_u,
-        render_v,
-        warp_numbers(seen_before.camera, seen.camera),
+        _dense(render),
+        None if minus is None else _dense(minus),
+        WHOLE if minus is None else CORRECTION_GAIN,
+        warp_numbers(before.at.camera, seen.camera),
         *out.planes,
     )
     return out
+
+
+def _dense(picture: I420) -> tuple[Plane, Plane, Plane]:
+    y, u, v = map(np.ascontiguousarray, picture.planes)
+    return y, u, v
 
 
 def warp_numbers(before: Camera, now: Camera) -> list[float]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from google.protobuf.message import DecodeError
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
+from rfcore.codec import CodecConfig, DeltaPacket, Reference, References, StreamHeader
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import (
     FIELD_ID_PREFIX_BYTES,
@@ -154,10 +154,6 @@ def _frame_or_refusal(frame: pb.Frame) -> Frame:
 
 
 def _frame_from_wire(frame: pb.Frame) -> Frame:
-    if frame.references != pb.REFERENCES_RENDER:
-        raise InvalidInput(
-            "frame.references", f"{frame.references} is not REFERENCES_RENDER (the only one here)"
-        )
     check_range("frame.capture_time_ns", frame.capture_time_ns, 0, 2**63 - 1)
     prefix = check_bytes(
         "frame.field_id_prefix",
@@ -195,9 +191,19 @@ def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
         reconstruction_digest=check_bytes(
             "frame.reconstruction_digest", frame.reconstruction_digest, 16, 16
         ),
-        payload=check_bytes("frame.payload", frame.payload, 1, MAX_PAYLOAD_BYTES),
+        payload=check_bytes("frame.payload", frame.payload, 0, MAX_PAYLOAD_BYTES),
         crc32=frame.crc32,
+        references=_references_from_wire(frame),
+        needed_digest=frame.needed_digest,
+        photometric=tuple(frame.photometric),
     )
+
+
+def _references_from_wire(frame: pb.Frame) -> References:
+    try:
+        return tuple(Reference(number) for number in frame.references)
+    except ValueError as error:
+        raise InvalidInput("frame.references", f"{error}; update this end") from error
 
 
 def _frame_to_wire(frame: Frame) -> pb.Frame:
@@ -213,10 +219,12 @@ def _frame_to_wire(frame: Frame) -> pb.Frame:
             x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
         ),
         field_id_prefix=frame.field_id_prefix,
-        references=pb.References.Value(f"REFERENCES_{frame.references.name}"),
+        references=[pb.Reference.Value(f"REFERENCE_{r.name}") for r in packet.references],
         reference_digest=packet.reference_digest,
         reference_coarse=packet.reference_coarse,
         reconstruction_digest=packet.reconstruction_digest,
         payload=packet.payload,
         crc32=packet.crc32,
+        needed_digest=packet.needed_digest,
+        photometric=packet.photometric,
     )

@@ -7,7 +7,6 @@ that knows both forms. A value of these types that came through ``convert`` has 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec import DeltaPacket, StreamHeader
@@ -23,18 +22,11 @@ __all__ = [
     "FrameAddress",
     "Hello",
     "Nack",
-    "References",
     "RendererContract",
     "ServerMessage",
     "StageTimes",
     "Welcome",
 ]
-
-
-class References(StrEnum):
-    """Which pictures a P slice predicts from."""
-
-    RENDER = "render"
 
 
 @dataclass(frozen=True)
@@ -82,7 +74,6 @@ class Frame:
     pose: Pose
     field_id_prefix: bytes
     packet: DeltaPacket
-    references: References = References.RENDER
 
     @property
     def address(self) -> FrameAddress:

@@ -19,6 +19,7 @@ from rfcore.camera import Camera
 from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder
 from rfcore.errors import CodecError
 from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
 from rfcore.raster.native import Rasterizer
 from rfedge.bench.street import street_camera, street_gaussians
@@ -42,9 +43,10 @@ class Ends:
     encoder: DeltaEncoder
     decoder: DeltaDecoder
 
-    def render(self) -> I420:
+    def render(self) -> tuple[I420, PosedDepth]:
         """Render as both ends do: field, then the project's own YUV conversion."""
-        return i420_from_colour(self.rasterizer.render_colour(self.camera))
+        view = self.rasterizer.render(self.camera)
+        return i420_from_colour(view.colour), PosedDepth(self.camera, view.depth)
 
 
 def codec_rows(threads: int = 1) -> list[dict[str, Any]]:
@@ -79,9 +81,9 @@ def _row(ends: Ends) -> dict[str, Any]:
     send_state, receive_state = ends.encoder.start(1), ends.decoder.start(1)
     for repetition in range(WARM_UP + REPETITIONS):
         render_ms, render = _timed(ends.render)
-        total_ms, encoded = _timed(lambda: ends.encoder.encode(send_state, ends.frame, render))  # noqa: B023
+        total_ms, encoded = _timed(lambda: ends.encoder.encode(send_state, ends.frame, *render))  # noqa: B023
         decode_ms, decoded = _timed(
-            lambda: ends.decoder.decode(receive_state, encoded.packet, render)  # noqa: B023
+            lambda: ends.decoder.decode(receive_state, encoded.packet, *render)  # noqa: B023
         )
         if decoded.frame.digest() != encoded.reconstruction.digest():
             raise CodecError("the receiver's picture differs from the sender's closed loop")

@@ -204,7 +204,7 @@ def _pictures(
 
 def _rendered(field: RadianceField, camera: Camera) -> Rgb:
     """The render as the codec sees it: through YUV 4:2:0 and back."""
-    return rgb_from_i420(rendered(field, camera))
+    return rgb_from_i420(rendered(field, camera)[0])
 
 
 def _wrong_street(sample: Path, field: RadianceField) -> Rgb:

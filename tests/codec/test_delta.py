@@ -49,7 +49,7 @@ def psnr_y_db(a: I420, b: I420) -> float:
         ({"crc32": 0}, RejectReason.CRC_MISMATCH),
         ({"reference_digest": bytes(16), "crc32": 0}, RejectReason.CRC_MISMATCH),
         ({"reference_digest": bytes(16), "payload": b""}, RejectReason.REFERENCE_MISMATCH),
-        ({"payload": b""}, RejectReason.MALFORMED_PAYLOAD),
+        ({"payload": b""}, RejectReason.RECONSTRUCTION_MISMATCH),
         ({"payload": b"\x41"}, RejectReason.MALFORMED_PAYLOAD),
         ({"payload": b"\x41\x9a\x22"}, RejectReason.DECODER_FAILED),
         ({"reconstruction_digest": bytes(16)}, RejectReason.RECONSTRUCTION_MISMATCH),

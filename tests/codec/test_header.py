@@ -9,9 +9,9 @@ from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, StreamHeader
 from rfcore.codec.bitstream import BitWriter, nal_of_rbsp
 from rfcore.codec.config import PRESETS
 from rfcore.codec.header import check_header
-from rfcore.codec.pair import encode_pair
 from rfcore.codec.parameter_sets import parse_pps, parse_sps
 from rfcore.codec.reference import pcm_pps
+from rfcore.codec.slices import encode_slice
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 
@@ -23,28 +23,31 @@ def header() -> StreamHeader:
     return DeltaEncoder(CodecConfig(300, 168)).header
 
 
-def test_every_preset_and_crf_writes_the_same_parameter_sets(
-    header: StreamHeader, pair: PairMaker
+@pytest.mark.parametrize("references", [0, 1, 2, 3])
+def test_every_preset_crf_and_number_of_references_writes_the_same_parameter_sets(
+    header: StreamHeader, pair: PairMaker, references: int
 ) -> None:
     frame, render = pair(300, 168)
     for preset in PRESETS:
         for crf in (1, 17.5, 23, 28, 51):
             config = CodecConfig(300, 168, preset, crf)
-            made, payload = encode_pair(config, render, frame)
+            coded = encode_slice(config, [render] * references, frame)
+            made = coded.header
             assert (made.sps, made.pps) == (header.sps, header.pps), (preset, crf)
-            assert payload
+            assert coded.payload
 
 
 def test_a_better_preset_or_crf_changes_the_slice(pair: PairMaker) -> None:
     """The zone's analysis settings reach the P picture, and CRF its quantiser."""
     frame, render = pair(300, 168)
     sizes = [
-        len(encode_pair(CodecConfig(300, 168, preset, crf), render, frame)[1])
+        len(encode_slice(CodecConfig(300, 168, preset, crf), [render], frame).payload)
         for preset, crf in (("medium", 18), ("medium", 23), ("medium", 28))
     ]
     assert sizes == sorted(sizes, reverse=True)
     slices = {
-        encode_pair(CodecConfig(300, 168, preset, 23), render, frame)[1] for preset in PRESETS
+        encode_slice(CodecConfig(300, 168, preset, 23), [render], frame).payload
+        for preset in PRESETS
     }
     assert len(slices) >= len(PRESETS) - 1
 

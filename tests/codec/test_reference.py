@@ -8,8 +8,8 @@ import pytest
 from rfcore.codec import CodecConfig, DeltaEncoder
 from rfcore.codec.bitstream import join_nals, rbsp_of_nal
 from rfcore.codec.h264 import H264Decoder
-from rfcore.codec.parameter_sets import NAL_IDR, parse_pps, parse_slice_start
-from rfcore.codec.reference import PCM_PPS_ID, pcm_picture, pcm_pps, without_zeros
+from rfcore.codec.parameter_sets import NAL_IDR, NAL_P, parse_pps, parse_slice_start
+from rfcore.codec.reference import PCM_PPS_ID, PcmPlace, pcm_picture, pcm_pps, without_zeros
 from rfcore.errors import CodecError
 from rfcore.image import I420
 
@@ -25,23 +25,35 @@ def test_any_samples_above_zero_come_back_bit_for_bit(
     sets = [header.sps, header.pps, pcm_pps()]
     for index in range(3):
         source = noise(*size_px, index)
-        nal = pcm_picture(source, log2_max_frame_num=4, idr_pic_id=index % 2)
+        nal = pcm_picture(source, PcmPlace(4, idr_pic_id=index % 2))
         decoded = decoder.decode(join_nals([*(sets if index == 0 else []), nal]))
         assert decoded.digest() == without_zeros(source).digest()
 
 
 def test_the_picture_is_one_idr_slice_without_emulation_bytes(noise: PictureMaker) -> None:
-    nal = pcm_picture(noise(40, 24, 0), log2_max_frame_num=4, idr_pic_id=1)
+    nal = pcm_picture(noise(40, 24, 0), PcmPlace(4, idr_pic_id=1))
     assert nal[0] & 0x1F == NAL_IDR
     assert len(rbsp_of_nal(nal)) == len(nal) - 1
     start = parse_slice_start(nal, log2_max_frame_num=4)
     assert (start.first_mb, start.slice_type, start.pps_id, start.frame_num) == (0, 2, 1, 0)
 
 
-def test_each_macroblock_takes_its_samples_and_two_bytes(flat: PictureMaker) -> None:
-    small, large = (
-        len(pcm_picture(flat(16 * n, 16, 9), log2_max_frame_num=4, idr_pic_id=0)) for n in (1, 5)
+def test_later_pictures_are_not_idr_and_come_back_bit_for_bit(noise: PictureMaker) -> None:
+    header = DeltaEncoder(CodecConfig(50, 34)).header
+    decoder = H264Decoder((50, 34))
+    decoder.decode(
+        join_nals([header.sps, header.pps, pcm_pps(), pcm_picture(noise(50, 34, 0), PcmPlace(4))])
     )
+    for frame_num in (1, 2):
+        nal = pcm_picture(noise(50, 34, frame_num), PcmPlace(4, frame_num))
+        assert nal[0] & 0x1F == NAL_P
+        assert parse_slice_start(nal, log2_max_frame_num=4).frame_num == frame_num
+        shown = decoder.decode(join_nals([nal]))
+        assert shown.digest() == without_zeros(noise(50, 34, frame_num)).digest()
+
+
+def test_each_macroblock_takes_its_samples_and_two_bytes(flat: PictureMaker) -> None:
+    small, large = (len(pcm_picture(flat(16 * n, 16, 9), PcmPlace(4))) for n in (1, 5))
     assert large - small == 4 * 386
 
 
@@ -67,7 +79,9 @@ def test_a_picture_larger_than_announced_is_refused_before_it_is_decoded(
 ) -> None:
     header = DeltaEncoder(CodecConfig(320, 256)).header
     decoder = H264Decoder((64, 64))
-    unit = join_nals([header.sps, header.pps, pcm_pps(), pcm_picture(noise(320, 256, 0), 4, 0)])
+    unit = join_nals(
+        [header.sps, header.pps, pcm_pps(), pcm_picture(noise(320, 256, 0), PcmPlace(4))]
+    )
     with pytest.raises(CodecError, match="decoder"):
         decoder.decode(unit)
 
@@ -75,7 +89,7 @@ def test_a_picture_larger_than_announced_is_refused_before_it_is_decoded(
 def test_after_a_reset_the_decoder_starts_over(noise: PictureMaker) -> None:
     header = DeltaEncoder(CodecConfig(32, 32)).header
     decoder = H264Decoder((32, 32))
-    picture = pcm_picture(noise(32, 32, 0), 4, 0)
+    picture = pcm_picture(noise(32, 32, 0), PcmPlace(4))
     with pytest.raises(CodecError):
         decoder.decode(join_nals([picture]))
     decoder.reset()

@@ -9,7 +9,7 @@ import pytest
 from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder
 from rfcore.codec.bitstream import join_nals
 from rfcore.codec.h264 import H264Decoder, PictureKind, encode_pictures
-from rfcore.codec.pair import pair_options
+from rfcore.codec.slices import slice_options
 from rfcore.image import I420
 
 PictureMaker = Callable[..., I420]
@@ -95,7 +95,9 @@ def test_the_splice_loses_less_than_a_tenth_of_a_decibel_to_what_x264_meant(
     config = CodecConfig(320, 192, preset=preset, crf=crf)
     encoder = DeltaEncoder(config)
     encoded = encoder.encode(encoder.start(0), frame, render)
-    units = encode_pictures(pair_options(config), [(render, PictureKind.I), (frame, PictureKind.P)])
+    units = encode_pictures(
+        slice_options(config), [(render, PictureKind.I), (frame, PictureKind.P)]
+    )
     assert join_nals([encoded.packet.payload]) == units[1]
     decoder = H264Decoder(config.coded_size_px)
     decoder.decode(units[0])
@@ -131,5 +133,5 @@ def test_stage_times_come_from_the_clock_given(pair: PairMaker) -> None:
     encoded = encoder.encode(encoder.start(0), frame, render)
     decoder = DeltaDecoder(encoder.header, clock_ns=lambda: next(ticks))
     decoded = decoder.decode(decoder.start(0), encoded.packet, render)
-    assert encoded.stage_ns == {"encode": 10, "closed_loop": 10}
+    assert encoded.stage_ns == {"references": 10, "encode": 10, "closed_loop": 10}
     assert decoded.stage_ns == {"splice": 10, "decode": 10}

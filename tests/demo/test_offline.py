@@ -36,7 +36,7 @@ def test_a_decoded_file_is_the_senders_closed_loop(
     decoded = list(decode_drive(read_drive(path), field))
     assert [frame.sequence for frame in decoded] == [0, 1, 2, 3]
     for picture, frame in zip(drive.pictures, decoded, strict=True):
-        own = encoder.encode(state, i420_from_rgb(picture.read()), rendered(field, picture.camera))
+        own = encoder.encode(state, i420_from_rgb(picture.read()), *rendered(field, picture.camera))
         state = own.state
         assert frame.frame.digest() == own.reconstruction.digest()
 

@@ -83,7 +83,7 @@ async def test_the_report_keeps_the_sizes_apart_and_says_where_the_time_went(
         assert 0 < line["payload_bytes"] < line["packet_bytes"] < line["payload_bytes"] + 260
         assert line["server_digest"] == line["reconstruction_digest"]
         assert len(bytes.fromhex(line["reference_digest"])) == 16
-        own = {"read", "convert", "render", "encode", "closed_loop", "link"}
+        own = {"read", "convert", "render", "references", "encode", "closed_loop", "link"}
         server_s = {f"server_{s}" for s in ("queue", "render", "splice", "decode", "total")}
         assert set(line["stage_ms"]) == own | server_s
         assert all(spent_ms >= 0 for spent_ms in line["stage_ms"].values())

@@ -1,6 +1,7 @@
 """The warp against its definition in numpy, bit by bit; its geometry against plane homographies."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,14 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth, block_costs, warp_i420, warp_numbers
+from rfcore.native.warp import (
+    PosedDepth,
+    Seen,
+    block_costs,
+    correct_i420,
+    warp_i420,
+    warp_numbers,
+)
 
 F32 = NDArray[np.float32]
 SIZES = [(1, 1), (2, 2), (3, 5), (17, 9), (64, 48), (101, 67)]
@@ -48,9 +56,10 @@ def locate(seen: PosedDepth, before: PosedDepth) -> tuple[F32, F32, NDArray[np.b
     return u64, v64, known
 
 
-def interpolate(
-    plane: NDArray[np.uint8], u: NDArray[np.int64], v: NDArray[np.int64]
-) -> NDArray[np.uint8]:
+def carried(
+    plane: NDArray[np.integer[Any]], u: NDArray[np.int64], v: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The plane at (u, v), in 1/4096 level."""
     table = filter_table()
     padded = np.pad(plane.astype(np.int64), 3, mode="edge")
     total = np.zeros(u.shape, np.int64)
@@ -58,12 +67,13 @@ def interpolate(
         for i in range(6):
             sample = padded[(v >> 6) + j + 1, (u >> 6) + i + 1]
             total += table[v & 63, j] * table[u & 63, i] * sample
-    return np.clip((total + (1 << 11)) >> 12, 1, 255).astype(np.uint8)
+    return total
 
 
-def definition(previous: I420, before: PosedDepth, seen: PosedDepth, render: I420) -> I420:
+def definition(
+    previous: I420, before: PosedDepth, seen: PosedDepth, render: I420, minus: I420 | None = None
+) -> I420:
     u, v, known = locate(seen, before)
-    y = np.where(known, interpolate(previous.y, u, v), np.maximum(render.y, 1))
     height, width = known.shape
     pad = ((0, height % 2), (0, width % 2))
     quads = [
@@ -72,12 +82,17 @@ def definition(previous: I420, before: PosedDepth, seen: PosedDepth, render: I42
     ]
     u_c, v_c = ((q.sum(axis=(1, 3)) - 128 + 4) >> 3 for q in quads[:2])
     known_c = quads[2].all(axis=(1, 3))
-    u_c, v_c = np.where(known_c, u_c, 0), np.where(known_c, v_c, 0)
-    chroma = [
-        np.where(known_c, interpolate(a, u_c, v_c), np.maximum(b, 1))
-        for a, b in ((previous.u, render.u), (previous.v, render.v))
-    ]
-    return I420(y, *chroma)
+    places = [(u, v, known), *[(np.where(known_c, u_c, 0), np.where(known_c, v_c, 0), known_c)] * 2]
+    planes = []
+    for n, (u_n, v_n, known_n) in enumerate(places):
+        base = render.planes[n].astype(np.int64)
+        if minus is None:
+            value = (carried(previous.planes[n], u_n, v_n) + (1 << 11)) >> 12
+        else:
+            error = previous.planes[n].astype(np.int64) - minus.planes[n]
+            value = base + ((48 * carried(error, u_n, v_n) + (1 << 17)) >> 18)
+        planes.append(np.clip(np.where(known_n, value, base), 1, 255).astype(np.uint8))
+    return I420(*planes)
 
 
 def noise(size_px: tuple[int, int], seed: int) -> I420:
@@ -122,7 +137,24 @@ def test_the_kernel_is_its_definition_bit_by_bit(size_px: tuple[int, int], seed:
     assert equal(warp_i420(*given), definition(*given))
 
 
-def test_a_golden_digest_pins_the_bytes() -> None:
+@pytest.mark.parametrize("size_px", SIZES)
+def test_the_correction_is_its_definition_bit_by_bit(size_px: tuple[int, int]) -> None:
+    previous, before, seen, render = scene(size_px, 5)
+    was = noise(size_px, 9)
+    corrected = correct_i420(Seen(previous, before, was), seen, render)
+    assert equal(corrected, definition(previous, before, seen, render, minus=was))
+
+
+def test_a_render_that_was_right_is_not_corrected() -> None:
+    previous, before, seen, render = scene((64, 48), 5)
+    corrected = correct_i420(Seen(previous, before, previous), seen, render)
+    assert equal(corrected, I420(*(np.maximum(plane, 1) for plane in render.planes)))
+
+
+def test_golden_digests_pin_the_bytes() -> None:
+    previous, before, seen, render = scene((64, 48), 7)
+    corrected = correct_i420(Seen(previous, before, render), seen, render)
+    assert corrected.digest().hex() == "78a9dc3781f4e7931130ccf7f4427d5a"
     assert warp_i420(*scene((64, 48), 7)).digest().hex() == "2ee3f6ae0a6fb2fd569311b8eea77a8b"
 
 

@@ -2,7 +2,12 @@
 // refuse anything else that nanobind can see.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
+
+#include <optional>
+#include <tuple>
 
 #include "warp.h"
 
@@ -14,6 +19,7 @@ namespace {
 using InPlane = nb::ndarray<const std::uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using OutPlane = nb::ndarray<std::uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using InDepth = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Picture = std::tuple<InPlane, InPlane, InPlane>;
 using OutCosts = nb::ndarray<std::int32_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 template <typename Plane>
@@ -29,6 +35,16 @@ void require_i420(PictureSize size, const Plane& y, const Plane& u, const Plane&
     require_shape(y, size.height_px, size.width_px);
     require_shape(u, (size.height_px + 1) / 2, (size.width_px + 1) / 2);
     require_shape(v, (size.height_px + 1) / 2, (size.width_px + 1) / 2);
+}
+
+void require_picture(PictureSize size, const Picture& picture) {
+    const auto& [y, u, v] = picture;
+    require_i420(size, y, u, v);
+}
+
+ConstI420Planes planes_of(const Picture& picture) {
+    const auto& [y, u, v] = picture;
+    return {y.data(), u.data(), v.data()};
 }
 
 // `numbers`: rotation 9, translation 3, fx, fy, cx, cy.
@@ -54,26 +70,29 @@ PictureSize size_of(const Plane& plane) {
 void bind_warp(nb::module_& m) {
     m.def(
         "warp_i420",
-        [](InPlane previous_y, InPlane previous_u, InPlane previous_v, InDepth previous_depth,
-           InDepth depth, InPlane render_y, InPlane render_u, InPlane render_v,
-           const std::vector<double>& numbers, OutPlane y, OutPlane u, OutPlane v) {
+        [](const Picture& previous, InDepth previous_depth, InDepth depth, const Picture& render,
+           const std::optional<Picture>& previous_render, std::int32_t gain, const std::vector<double>& numbers,
+           OutPlane y, OutPlane u, OutPlane v) {
             const PictureSize size = size_of(y);
-            require_i420(size, previous_y, previous_u, previous_v);
-            require_i420(size, render_y, render_u, render_v);
             require_i420(size, y, u, v);
+            require_picture(size, previous);
+            require_picture(size, render);
+            if (previous_render) require_picture(size, *previous_render);
             require_shape(previous_depth, size.height_px, size.width_px);
             require_shape(depth, size.height_px, size.width_px);
             const WarpGeometry geometry = geometry_of(numbers);
-            const WarpInputs in{{previous_y.data(), previous_u.data(), previous_v.data()},
+            const WarpInputs in{planes_of(previous),
                                 previous_depth.data(),
                                 depth.data(),
-                                {render_y.data(), render_u.data(), render_v.data()}};
+                                planes_of(render),
+                                previous_render ? planes_of(*previous_render) : ConstI420Planes{},
+                                gain};
             const nb::gil_scoped_release released;
             return warp_i420(in, geometry, size, {y.data(), u.data(), v.data()});
         },
-        nb::arg("previous_y"), nb::arg("previous_u"), nb::arg("previous_v"),
-        nb::arg("previous_depth"), nb::arg("depth"), nb::arg("render_y"), nb::arg("render_u"),
-        nb::arg("render_v"), nb::arg("numbers"), nb::arg("y"), nb::arg("u"), nb::arg("v"));
+        nb::arg("previous"), nb::arg("previous_depth"), nb::arg("depth"), nb::arg("render"),
+        nb::arg("previous_render").none(), nb::arg("gain"), nb::arg("numbers"), nb::arg("y"),
+        nb::arg("u"), nb::arg("v"));
     m.def(
         "block_costs",
         [](InPlane frame, InPlane reference, OutCosts satd, OutCosts ssd) {

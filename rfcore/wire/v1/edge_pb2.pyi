@@ -27,23 +27,35 @@ else:
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
-class _References:
+class _Reference:
     ValueType = _typing.NewType("ValueType", _builtins.int)
     V: _TypeAlias = ValueType  # noqa: Y015
 
-class _ReferencesEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_References.ValueType], _builtins.type):
+class _ReferenceEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Reference.ValueType], _builtins.type):
     DESCRIPTOR: _descriptor.EnumDescriptor
-    REFERENCES_UNSPECIFIED: _References.ValueType  # 0
-    REFERENCES_RENDER: _References.ValueType  # 1
-    """The field rendered at the frame's pose, nothing else."""
+    REFERENCE_UNSPECIFIED: _Reference.ValueType  # 0
+    REFERENCE_RENDER: _Reference.ValueType  # 1
+    """The field rendered at the frame's pose."""
+    REFERENCE_PREVIOUS: _Reference.ValueType  # 2
+    """The earlier frame that needed_digest names, as it was decoded."""
+    REFERENCE_WARP: _Reference.ValueType  # 3
+    """That frame carried to this frame's pose by the field's depth, holes from the render."""
+    REFERENCE_CORRECTION: _Reference.ValueType  # 4
+    """The render, with most of that frame's difference from its own render, carried likewise."""
 
-class References(_References, metaclass=_ReferencesEnumTypeWrapper):
-    """Which pictures the P slice predicts from."""
+class Reference(_Reference, metaclass=_ReferenceEnumTypeWrapper):
+    """A picture that both ends make by themselves, for a slice to predict from."""
 
-REFERENCES_UNSPECIFIED: References.ValueType  # 0
-REFERENCES_RENDER: References.ValueType  # 1
-"""The field rendered at the frame's pose, nothing else."""
-Global___References: _TypeAlias = References  # noqa: Y015
+REFERENCE_UNSPECIFIED: Reference.ValueType  # 0
+REFERENCE_RENDER: Reference.ValueType  # 1
+"""The field rendered at the frame's pose."""
+REFERENCE_PREVIOUS: Reference.ValueType  # 2
+"""The earlier frame that needed_digest names, as it was decoded."""
+REFERENCE_WARP: Reference.ValueType  # 3
+"""That frame carried to this frame's pose by the field's depth, holes from the render."""
+REFERENCE_CORRECTION: Reference.ValueType  # 4
+"""The render, with most of that frame's difference from its own render, carried likewise."""
+Global___Reference: _TypeAlias = Reference  # noqa: Y015
 
 class _RejectReason:
     ValueType = _typing.NewType("ValueType", _builtins.int)
@@ -62,6 +74,7 @@ class _RejectReasonEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_RejectRe
     REJECT_REASON_RECONSTRUCTION_MISMATCH: _RejectReason.ValueType  # 8
     REJECT_REASON_INVALID_ARGUMENT: _RejectReason.ValueType  # 9
     REJECT_REASON_OVERLOADED: _RejectReason.ValueType  # 10
+    REJECT_REASON_UNKNOWN_STATE: _RejectReason.ValueType  # 11
 
 class RejectReason(_RejectReason, metaclass=_RejectReasonEnumTypeWrapper): ...
 
@@ -76,6 +89,7 @@ REJECT_REASON_DECODER_FAILED: RejectReason.ValueType  # 7
 REJECT_REASON_RECONSTRUCTION_MISMATCH: RejectReason.ValueType  # 8
 REJECT_REASON_INVALID_ARGUMENT: RejectReason.ValueType  # 9
 REJECT_REASON_OVERLOADED: RejectReason.ValueType  # 10
+REJECT_REASON_UNKNOWN_STATE: RejectReason.ValueType  # 11
 Global___RejectReason: _TypeAlias = RejectReason  # noqa: Y015
 
 @_typing.final
@@ -342,7 +356,7 @@ Global___Pose: _TypeAlias = Pose  # noqa: Y015
 
 @_typing.final
 class Frame(_message.Message):
-    """One picture: its pose and the P slice that turns the render into it."""
+    """One picture: its pose and the slice that turns the references into it."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -358,6 +372,8 @@ class Frame(_message.Message):
     RECONSTRUCTION_DIGEST_FIELD_NUMBER: _builtins.int
     PAYLOAD_FIELD_NUMBER: _builtins.int
     CRC32_FIELD_NUMBER: _builtins.int
+    NEEDED_DIGEST_FIELD_NUMBER: _builtins.int
+    PHOTOMETRIC_FIELD_NUMBER: _builtins.int
     camera_id: _builtins.str
     epoch: _builtins.int
     """A new epoch starts the state of both ends afresh; sequences count from 0 in it."""
@@ -365,17 +381,30 @@ class Frame(_message.Message):
     capture_time_ns: _builtins.int
     field_id_prefix: _builtins.bytes
     """First 8 bytes of the sha256 of the field; the whole id is in Hello."""
-    references: Global___References.ValueType
     reference_digest: _builtins.bytes
-    """BLAKE2b-128 of the reference the packet was coded against, and its 8x8 block means."""
+    """BLAKE2b-128 of the render at the frame's pose, and its 8x8 block means."""
     reference_coarse: _builtins.bytes
     reconstruction_digest: _builtins.bytes
     """BLAKE2b-128 of the picture that the receiver must end up with."""
     payload: _builtins.bytes
     crc32: _builtins.int
     """CRC-32 (zlib) of everything above that the codec relies on; see rfcore.codec.packet."""
+    needed_digest: _builtins.bytes
+    """The reconstruction_digest of the earlier frame that the references call for; else empty."""
     @_builtins.property
     def pose(self) -> Global___Pose: ...
+    @_builtins.property
+    def references(self) -> _containers.RepeatedScalarFieldContainer[Global___Reference.ValueType]:
+        """In the order they are fed to the decoder: the last one is reference 0. Without any, the slice is
+        an I slice; with one and without a payload, that reference is the picture.
+        """
+
+    @_builtins.property
+    def photometric(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """What the render's colours are changed by before it is a reference: nothing, or the 12 numbers
+        of a matrix from Y, Cb, Cr, 1 to Y, Cb, Cr (rfcore.codec.photometric).
+        """
+
     def __init__(
         self,
         *,
@@ -385,16 +414,18 @@ class Frame(_message.Message):
         capture_time_ns: _builtins.int = ...,
         pose: Global___Pose | None = ...,
         field_id_prefix: _builtins.bytes = ...,
-        references: Global___References.ValueType = ...,
+        references: _abc.Iterable[Global___Reference.ValueType] | None = ...,
         reference_digest: _builtins.bytes = ...,
         reference_coarse: _builtins.bytes = ...,
         reconstruction_digest: _builtins.bytes = ...,
         payload: _builtins.bytes = ...,
         crc32: _builtins.int = ...,
+        needed_digest: _builtins.bytes = ...,
+        photometric: _abc.Iterable[_builtins.int] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["pose", b"pose"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "payload", b"payload", "pose", b"pose", "reconstruction_digest", b"reconstruction_digest", "reference_coarse", b"reference_coarse", "reference_digest", b"reference_digest", "references", b"references", "sequence", b"sequence"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "needed_digest", b"needed_digest", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "reconstruction_digest", b"reconstruction_digest", "reference_coarse", b"reference_coarse", "reference_digest", b"reference_digest", "references", b"references", "sequence", b"sequence"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -1,0 +1,195 @@
+"""The receiver: slices back into frames, against pictures it makes itself.
+
+Why a packet carries what it does: losing a P slice, or one flipped bit in it, can go unnoticed in a
+standard decoder (ITU-T H.264 says nothing about damaged streams). So the receiver compares, in this
+order, epoch, sequence, CRC, the digest of its render, the earlier frame that is needed, the shape
+of the payload, and at last the digest of what it decoded.
+
+With inexact renderers an error would be handed on from frame to frame, so only references made at
+the frame's own pose are taken then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from rfcore.codec.coarse import COARSE_TOLERANCE, coarse_difference, coarse_digest
+from rfcore.codec.header import StreamHeader
+from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.photometric import adapt
+from rfcore.codec.prediction import Prediction
+from rfcore.codec.reference import without_zeros
+from rfcore.codec.references import is_temporal
+from rfcore.codec.splice import SpliceDecoder
+from rfcore.codec.state import DecoderState, Past
+from rfcore.errors import BitstreamError, CodecError, InvalidInput, PacketRejected, RejectReason
+from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
+
+__all__ = ["Decoded", "DeltaDecoder"]
+
+Clock = Callable[[], int]
+
+
+def _stopped_clock() -> int:
+    return 0
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """A frame and the receiver's next state; ``lost`` packets are missing right before this one.
+
+    ``exact``: the frame is the sender's to the bit; otherwise the render differed by rounding.
+    ``stage_ns`` has "splice" (checks, the references as pictures) and "decode" (the slice, the
+    digest).
+    """
+
+    frame: I420
+    state: DecoderState
+    lost: int
+    exact: bool
+    stage_ns: Mapping[str, int]
+
+
+class DeltaDecoder:
+    """The receiver. Raises ``InvalidInput`` for a header our encoder would not make.
+
+    With ``exact=False`` the sender's renderer may differ by rounding: a reference that fails the
+    exact digest but passes the coarse one is accepted, and its reconstruction cannot be checked.
+    """
+
+    def __init__(
+        self, header: StreamHeader, exact: bool = True, clock_ns: Clock = _stopped_clock
+    ) -> None:
+        self._config = header.config
+        self._splice = SpliceDecoder(header)
+        self._exact = exact
+        self._clock_ns = clock_ns
+
+    def start(self, epoch: int, after: DecoderState | None = None) -> DecoderState:
+        """Return the state before the first packet of a (re)started stream.
+
+        The frames kept in ``after`` can still be predicted from: a new epoch numbers afresh.
+        """
+        return DecoderState(epoch, kept=() if after is None else after.kept)
+
+    def decode(
+        self,
+        state: DecoderState,
+        packet: DeltaPacket,
+        render: I420,
+        seen: PosedDepth | None = None,
+    ) -> Decoded:
+        """Decode one packet against our own ``render`` at its pose, and ``seen``, the depth there.
+
+        Raises ``PacketRejected`` with the reason; ``state`` stays good for the next packet.
+        Raises ``InvalidInput`` if the render is not of the stream's size.
+        """
+        if render.size_px != self._config.size_px:
+            raise InvalidInput(
+                "render",
+                f"{render.size_px} px where the stream has {self._config.size_px} px",
+            )
+        started_ns = self._clock_ns()
+        _check_order(state, packet)
+        _check_crc(packet)
+        same_render = self._check_render(packet, render)
+        past = self._past(state, packet)
+        self._check_payload(packet)
+        prediction = Prediction(adapt(render, packet.photometric), seen, past)
+        spliced_ns, frame = self._reconstruct(packet, prediction)
+        made = Past(frame, seen, prediction.render)
+        if same_render and made.digest != packet.reconstruction_digest:
+            self._splice.reset()
+            raise PacketRejected(
+                RejectReason.RECONSTRUCTION_MISMATCH,
+                f"packet {packet.sequence} decodes to another picture than the sender's",
+            )
+        stage_ns = {
+            "splice": spliced_ns - started_ns,
+            "decode": self._clock_ns() - spliced_ns,
+        }
+        lost = packet.sequence - state.next_sequence
+        return Decoded(frame, state.after(packet.sequence, made), lost, same_render, stage_ns)
+
+    def _check_render(self, packet: DeltaPacket, render: I420) -> bool:
+        """Tell whether the renders are identical; raise if they may not be used together."""
+        if render.digest() == packet.reference_digest:
+            return True
+        difference = coarse_difference(coarse_digest(render), packet.reference_coarse)
+        rounding_sized = difference <= COARSE_TOLERANCE
+        if rounding_sized and not self._exact:
+            return False
+        kind = (
+            "rounding-sized: the renderers are not bit-exact to each other"
+            if rounding_sized
+            else "another pose, field or camera"
+        )
+        raise PacketRejected(
+            RejectReason.REFERENCE_MISMATCH,
+            f"our render is not the sender's; block means differ by up to {difference} "
+            f"levels (tolerance {COARSE_TOLERANCE}): {kind}",
+        )
+
+    def _past(self, state: DecoderState, packet: DeltaPacket) -> Past | None:
+        """Return the earlier frame the packet predicts from, if it does."""
+        if not is_temporal(packet.references):
+            return None
+        if not self._exact:
+            raise PacketRejected(
+                RejectReason.INVALID_ARGUMENT,
+                "between renderers that are not exact only the render may be predicted from",
+            )
+        past = state.past(packet.needed_digest)
+        if past is None:
+            raise PacketRejected(
+                RejectReason.UNKNOWN_STATE,
+                f"frame {packet.needed_digest.hex()} is none of the {len(state.kept)} kept here",
+            )
+        return past
+
+    def _check_payload(self, packet: DeltaPacket) -> None:
+        count = len(packet.references)
+        try:
+            if packet.payload:
+                self._splice.check_payload(packet.payload, count)
+            elif count != 1:
+                raise BitstreamError(f"no slice, and {count} references where 1 is the picture")
+        except BitstreamError as error:
+            raise PacketRejected(RejectReason.MALFORMED_PAYLOAD, str(error)) from error
+
+    def _reconstruct(self, packet: DeltaPacket, prediction: Prediction) -> tuple[int, I420]:
+        """Return the time at which the references stood, and the decoded frame."""
+        try:
+            pictures = prediction.pictures(packet.references)
+        except InvalidInput as error:
+            raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
+        if not packet.payload:
+            return self._clock_ns(), without_zeros(pictures[0])
+        try:
+            self._splice.predict_from(*pictures)
+            spliced_ns = self._clock_ns()
+            return spliced_ns, self._splice.decode(packet.payload)
+        except CodecError as error:
+            raise PacketRejected(RejectReason.DECODER_FAILED, str(error)) from error
+
+
+def _check_order(state: DecoderState, packet: DeltaPacket) -> None:
+    if packet.epoch != state.epoch:
+        raise PacketRejected(
+            RejectReason.STALE_EPOCH, f"epoch {packet.epoch} where {state.epoch} is current"
+        )
+    if packet.sequence < state.next_sequence:
+        raise PacketRejected(
+            RejectReason.STALE_SEQUENCE,
+            f"sequence {packet.sequence} where {state.next_sequence} or later is expected",
+        )
+
+
+def _check_crc(packet: DeltaPacket) -> None:
+    expected = packet.expected_crc32()
+    if packet.crc32 != expected:
+        raise PacketRejected(
+            RejectReason.CRC_MISMATCH, f"CRC {packet.crc32:08x} of contents with {expected:08x}"
+        )

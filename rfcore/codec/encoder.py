@@ -1,0 +1,166 @@
+"""The sender: frames as slices against pictures that both ends make themselves.
+
+States are values: ``encode`` takes one and returns the next, and an error leaves the caller with
+the one it had. The object holds only the configuration and a decoder whose content does not
+outlive a frame. One caller at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from rfcore.codec.choice import choose_photometric, choose_references
+from rfcore.codec.coarse import coarse_digest
+from rfcore.codec.config import CRF_RANGE, CodecConfig
+from rfcore.codec.header import StreamHeader
+from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.photometric import Photometric, adapt
+from rfcore.codec.prediction import Prediction
+from rfcore.codec.reference import without_zeros
+from rfcore.codec.references import References, check_references, is_temporal
+from rfcore.codec.slices import encode_slice
+from rfcore.codec.splice import SpliceDecoder, grey
+from rfcore.codec.state import EncoderState, Past
+from rfcore.errors import CodecError, InvalidInput
+from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
+
+__all__ = ["DeltaEncoder", "Encoded", "FrameChoice"]
+
+Clock = Callable[[], int]
+
+
+def _stopped_clock() -> int:
+    return 0
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """How one frame is to be coded.
+
+    ``references``: the pictures to predict from; ``None`` leaves it to the encoder. ``crf``
+    replaces the configured one. ``photometric``: see there; ``None`` leaves it to the encoder.
+    ``pose_only``: send no slice; the frame is its only reference.
+    """
+
+    references: References | None = None
+    crf: float | None = None
+    photometric: Photometric | None = None
+    pose_only: bool = False
+
+    def __post_init__(self) -> None:
+        if self.references is not None:
+            check_references(self.references)
+        if self.crf is not None and not CRF_RANGE[0] <= self.crf <= CRF_RANGE[1]:
+            raise InvalidInput("crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}")
+        if self.pose_only and (self.references is None or len(self.references) != 1):
+            raise InvalidInput("references", "a pose-only packet names exactly one reference")
+
+
+LEFT_TO_THE_ENCODER = FrameChoice()
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A packet, what the receiver will see, and the sender's next state.
+
+    ``stage_ns`` has "references" (warp, choice), "encode" (x264) and "closed_loop" (decoding as the
+    receiver does, digests).
+    """
+
+    packet: DeltaPacket
+    reconstruction: I420
+    state: EncoderState
+    stage_ns: Mapping[str, int]
+
+
+class DeltaEncoder:
+    """The sender. Raises ``CodecError`` if x264 does not make the stream the config promises."""
+
+    def __init__(self, config: CodecConfig, clock_ns: Clock = _stopped_clock) -> None:
+        self._config = config
+        self._clock_ns = clock_ns
+        self._header = encode_slice(config, [grey(config)], grey(config)).header
+        try:
+            self._splice = SpliceDecoder(self._header)
+        except InvalidInput as error:
+            raise CodecError(f"x264 did not do as told: {error}") from error
+
+    @property
+    def header(self) -> StreamHeader:
+        """What a receiver needs before the first packet."""
+        return self._header
+
+    def start(self, epoch: int) -> EncoderState:
+        """Return the state before the first packet of a (re)started stream."""
+        return EncoderState(epoch)
+
+    def encode(
+        self,
+        state: EncoderState,
+        frame: I420,
+        render: I420,
+        seen: PosedDepth | None = None,
+        choice: FrameChoice = LEFT_TO_THE_ENCODER,
+    ) -> Encoded:
+        """Code ``frame`` against ``render`` (both of the configured size) and ``state.past``.
+
+        ``seen`` is the field's depth at the frame's pose; without it there is no warp, now or for
+        the next frame. Raises ``InvalidInput`` for another size, or references that cannot be made;
+        ``CodecError`` if x264 fails.
+        """
+        for name, picture in (("frame", frame), ("render", render)):
+            _require_size(name, picture, self._config)
+        started_ns = self._clock_ns()
+        photometric = choice.photometric
+        if photometric is None:
+            photometric = choose_photometric(frame, render)
+        prediction = Prediction(adapt(render, photometric), seen, state.past)
+        crf = self._config.crf if choice.crf is None else choice.crf
+        references = choice.references
+        if references is None:
+            references = choose_references(frame, prediction, crf)
+        pictures = prediction.pictures(references)
+        chosen_ns = self._clock_ns()
+        payload = b"" if choice.pose_only else self._slice(pictures, frame, crf)
+        encoded_ns = self._clock_ns()
+        reconstruction = self._reconstruct(pictures, payload)
+        past = state.past
+        packet = DeltaPacket(
+            epoch=state.epoch,
+            sequence=state.next_sequence,
+            reference_digest=render.digest(),
+            reference_coarse=coarse_digest(render),
+            reconstruction_digest=reconstruction.digest(),
+            payload=payload,
+            crc32=0,
+            references=references,
+            needed_digest=past.digest if past is not None and is_temporal(references) else b"",
+            photometric=photometric,
+        ).sealed()
+        stage_ns = {
+            "references": chosen_ns - started_ns,
+            "encode": encoded_ns - chosen_ns,
+            "closed_loop": self._clock_ns() - encoded_ns,
+        }
+        made = Past(reconstruction, seen, prediction.render)
+        following = EncoderState(state.epoch, state.next_sequence + 1, made)
+        return Encoded(packet, reconstruction, following, stage_ns)
+
+    def _slice(self, pictures: tuple[I420, ...], frame: I420, crf: float) -> bytes:
+        coded = encode_slice(self._config, pictures, frame, crf)
+        if coded.header != self._header:
+            raise CodecError("x264 changed its parameter sets within a stream")
+        return coded.payload
+
+    def _reconstruct(self, pictures: tuple[I420, ...], payload: bytes) -> I420:
+        if not payload:
+            return without_zeros(pictures[0])
+        self._splice.predict_from(*pictures)
+        return self._splice.decode(payload)
+
+
+def _require_size(name: str, picture: I420, config: CodecConfig) -> None:
+    if picture.size_px != config.size_px:
+        raise InvalidInput(name, f"{picture.size_px} px where the stream has {config.size_px} px")

@@ -1,0 +1,54 @@
+"""Which pictures a frame is predicted from, and in which order.
+
+All of them both ends can make: the field's *render* at the frame's pose; the *previous* frame as
+decoded; the *warp*, the previous frame carried to the present pose by the field's depth; and the
+*correction*, the render plus what the previous frame's render was found to lack, carried the same
+way (``rfcore.native.warp``). None of them is a frame of its own account (intra).
+
+The order is that of feeding the decoder: the picture fed last is reference 0, which skipped blocks
+copy and whose index costs least.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from rfcore.codec.config import REFERENCE_FRAMES
+from rfcore.errors import InvalidInput
+
+__all__ = ["INTRA", "RENDER_ONLY", "Reference", "References", "check_references", "is_temporal", "references_name"]
+
+
+class Reference(IntEnum):
+    """A picture that both ends have. The numbers are those of the wire."""
+
+    RENDER = 1
+    PREVIOUS = 2
+    WARP = 3
+    CORRECTION = 4
+
+
+References = tuple[Reference, ...]
+
+INTRA: References = ()
+RENDER_ONLY: References = (Reference.RENDER,)
+
+
+def is_temporal(references: References) -> bool:
+    """Tell whether the receiver must hold an earlier frame."""
+    return any(reference is not Reference.RENDER for reference in references)
+
+
+def check_references(references: References) -> References:
+    """Return ``references``; raise ``InvalidInput`` for more than 3 or repeated ones."""
+    if len(set(references)) != len(references) or len(references) > REFERENCE_FRAMES:
+        names = ", ".join(reference.name for reference in references)
+        raise InvalidInput(
+            "references", f"{names}: a frame has at most {REFERENCE_FRAMES} different references"
+        )
+    return references
+
+
+def references_name(references: References) -> str:
+    """Return the references in words, in their order: ``previous+render``, or ``intra``."""
+    return "+".join(reference.name.lower() for reference in references) or "intra"

@@ -1,0 +1,232 @@
+"""References in every mode and order; states that are named, kept, lost and returned to."""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.codec import (
+    INTRA,
+    KEPT_FRAMES,
+    RENDER_ONLY,
+    CodecConfig,
+    DecoderState,
+    DeltaDecoder,
+    DeltaEncoder,
+    Encoded,
+    EncoderState,
+    FrameChoice,
+    Reference,
+)
+from rfcore.errors import InvalidInput, PacketRejected, RejectReason
+from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
+
+PictureMaker = Callable[..., I420]
+PairMaker = Callable[..., tuple[I420, I420]]
+SIZE_PX = (160, 96)
+WALL_M = 10.0
+TEMPORAL = [
+    order
+    for count in (1, 2, 3)
+    for order in itertools.permutations(Reference, count)
+    if order != RENDER_ONLY
+]
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One frame of a drive along a wall: what the camera sees, and the field at its pose."""
+
+    frame: I420
+    render: I420
+    seen: PosedDepth
+
+
+def moment(pair: PairMaker, index: int, size_px: tuple[int, int] = SIZE_PX) -> Moment:
+    """The camera moves so that the picture shifts by 2 px a frame: f x / z of a wall."""
+    width, height = size_px
+    frame, render = pair(width, height, 2.0 * index)
+    k = Intrinsics(width, height, width, width, width / 2, height / 2)
+    pose = Pose((2.0 * index * WALL_M / width, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    depth = np.full((height, width), WALL_M, np.float32)
+    return Moment(frame, render, PosedDepth(Camera(k, pose), depth))
+
+
+def send(
+    encoder: DeltaEncoder, state: EncoderState, now: Moment, choice: FrameChoice | None = None
+) -> Encoded:
+    return encoder.encode(state, now.frame, now.render, now.seen, choice or FrameChoice())
+
+
+@pytest.fixture(scope="module")
+def encoder() -> DeltaEncoder:
+    return DeltaEncoder(CodecConfig(*SIZE_PX))
+
+
+@pytest.fixture
+def moments(pair: PairMaker) -> list[Moment]:
+    return [moment(pair, index) for index in range(8)]
+
+
+@pytest.mark.parametrize("references", [INTRA, RENDER_ONLY, *TEMPORAL])
+def test_every_mode_and_order_reconstructs_exactly(
+    encoder: DeltaEncoder, moments: list[Moment], references: tuple[Reference, ...]
+) -> None:
+    first = send(encoder, encoder.start(0), moments[0])
+    second = send(encoder, first.state, moments[1], FrameChoice(references))
+    assert second.packet.references == references
+    decoder = DeltaDecoder(encoder.header)
+    state = decoder.start(0)
+    for now, sent in zip(moments, (first, second), strict=False):
+        decoded = decoder.decode(state, sent.packet, now.render, now.seen)
+        assert decoded.frame.digest() == sent.reconstruction.digest()
+        state = decoded.state
+
+
+@pytest.mark.parametrize(
+    "size_px", [(2, 2), (3, 5), (16, 16), (18, 34), (101, 67), (300, 168), (641, 359)]
+)
+def test_three_references_work_at_any_size(pair: PairMaker, size_px: tuple[int, int]) -> None:
+    encoder = DeltaEncoder(CodecConfig(*size_px, preset="ultrafast"))
+    decoder = DeltaDecoder(encoder.header)
+    sending, receiving = encoder.start(0), decoder.start(0)
+    three = FrameChoice((Reference.WARP, Reference.PREVIOUS, Reference.RENDER))
+    for index in range(3):
+        now = moment(pair, index, size_px)
+        sent = send(encoder, sending, now, three if index else None)
+        got = decoder.decode(receiving, sent.packet, now.render, now.seen)
+        assert got.frame.digest() == sent.reconstruction.digest()
+        assert got.frame.size_px == size_px
+        sending, receiving = sent.state, got.state
+
+
+@pytest.mark.slow
+def test_three_references_work_at_the_largest_size(pair: PairMaker) -> None:
+    test_three_references_work_at_any_size(pair, (4096, 2304))
+
+
+@pytest.mark.parametrize("reference", list(Reference))
+def test_a_pose_only_packet_shows_the_reference_as_it_is(
+    encoder: DeltaEncoder, moments: list[Moment], reference: Reference
+) -> None:
+    first = send(encoder, encoder.start(0), moments[0])
+    bare = send(encoder, first.state, moments[1], FrameChoice((reference,), pose_only=True))
+    assert bare.packet.payload == b""
+    decoder = DeltaDecoder(encoder.header)
+    state = decoder.decode(decoder.start(0), first.packet, moments[0].render, moments[0].seen).state
+    shown = decoder.decode(state, bare.packet, moments[1].render, moments[1].seen)
+    assert shown.frame.digest() == bare.reconstruction.digest()
+    if reference is Reference.RENDER:
+        assert np.array_equal(shown.frame.y, moments[1].render.y)
+
+
+def test_the_states_of_a_stream_form_a_chain(encoder: DeltaEncoder, moments: list[Moment]) -> None:
+    state, made = encoder.start(0), b""
+    for now in moments[:4]:
+        sent = send(encoder, state, now)
+        assert sent.packet.needed_digest == made
+        made, state = sent.packet.reconstruction_digest, sent.state
+
+
+def test_earlier_frames_save_bytes_where_the_field_knows_nothing(
+    encoder: DeltaEncoder, moments: list[Moment]
+) -> None:
+    """The cars are not in the render, but they were in the frame before."""
+    first = send(encoder, encoder.start(0), moments[0])
+    alone = send(encoder, first.state, moments[1], FrameChoice(RENDER_ONLY))
+    both = send(encoder, first.state, moments[1], FrameChoice((Reference.WARP, Reference.RENDER)))
+    assert len(both.packet.payload) < 0.8 * len(alone.packet.payload)
+
+
+def test_a_frame_whose_base_was_lost_is_refused_and_rolling_back_heals_it(
+    encoder: DeltaEncoder, moments: list[Moment]
+) -> None:
+    decoder = DeltaDecoder(encoder.header)
+    first = send(encoder, encoder.start(0), moments[0])
+    lost = send(encoder, first.state, moments[1])
+    late = send(encoder, lost.state, moments[2])
+    got = decoder.decode(decoder.start(0), first.packet, moments[0].render, moments[0].seen)
+    with pytest.raises(PacketRejected, match="none of the 1 kept here") as caught:
+        decoder.decode(got.state, late.packet, moments[2].render, moments[2].seen)
+    assert caught.value.reason == RejectReason.UNKNOWN_STATE
+    back = replace(encoder.start(1), past=first.state.past)
+    again = send(encoder, back, moments[3])
+    assert again.packet.needed_digest == first.packet.reconstruction_digest
+    state = decoder.start(1, after=got.state)
+    healed = decoder.decode(state, again.packet, moments[3].render, moments[3].seen)
+    assert healed.frame.digest() == again.reconstruction.digest()
+
+
+def test_the_receiver_keeps_a_bounded_number_of_frames(
+    encoder: DeltaEncoder, moments: list[Moment]
+) -> None:
+    decoder = DeltaDecoder(encoder.header)
+    sending, receiving = encoder.start(0), decoder.start(0)
+    first = None
+    for now in moments[: KEPT_FRAMES + 1]:
+        sent = send(encoder, sending, now)
+        first = first or sent
+        got = decoder.decode(receiving, sent.packet, now.render, now.seen)
+        sending, receiving = sent.state, got.state
+    assert len(receiving.kept) == KEPT_FRAMES
+    assert first is not None
+    assert receiving.past(first.packet.reconstruction_digest) is None
+    assert receiving.past(sent.packet.reconstruction_digest) is receiving.kept[0]
+
+
+def test_between_inexact_renderers_only_the_render_is_taken(
+    encoder: DeltaEncoder, moments: list[Moment]
+) -> None:
+    decoder = DeltaDecoder(encoder.header, exact=False)
+    first = send(encoder, encoder.start(0), moments[0])
+    got = decoder.decode(decoder.start(0), first.packet, moments[0].render, moments[0].seen)
+    second = send(encoder, first.state, moments[1])
+    with pytest.raises(PacketRejected, match="only the render") as caught:
+        decoder.decode(got.state, second.packet, moments[1].render, moments[1].seen)
+    assert caught.value.reason == RejectReason.INVALID_ARGUMENT
+
+
+def test_without_depth_there_is_no_warp(encoder: DeltaEncoder, moments: list[Moment]) -> None:
+    first = encoder.encode(encoder.start(0), moments[0].frame, moments[0].render)
+    for reference in (Reference.WARP, Reference.CORRECTION):
+        with pytest.raises(InvalidInput, match="depth at both poses"):
+            send(encoder, first.state, moments[1], FrameChoice((reference,)))
+    with pytest.raises(InvalidInput, match="no earlier frame"):
+        send(encoder, encoder.start(0), moments[1], FrameChoice((Reference.PREVIOUS,)))
+    sent = send(encoder, send(encoder, encoder.start(0), moments[0]).state, moments[1])
+    decoder = DeltaDecoder(encoder.header)
+    if Reference.WARP in sent.packet.references or Reference.CORRECTION in sent.packet.references:
+        base = send(encoder, encoder.start(0), moments[0])
+        got = decoder.decode(DecoderState(0), base.packet, moments[0].render)
+        with pytest.raises(PacketRejected, match="depth at both poses"):
+            decoder.decode(got.state, sent.packet, moments[1].render, moments[1].seen)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"references": (Reference.RENDER, Reference.RENDER)}, "at most 3 different"),
+        ({"references": tuple(Reference)}, "at most 3 different"),
+        ({"pose_only": True}, "exactly one"),
+        ({"pose_only": True, "references": INTRA}, "exactly one"),
+        ({"crf": 60.0}, "crf: 60"),
+    ],
+)
+def test_choices_that_cannot_be_are_refused(change: dict[str, object], named: str) -> None:
+    with pytest.raises(InvalidInput, match=named):
+        FrameChoice(**change)  # type: ignore[arg-type]
+
+
+def test_the_quality_of_a_frame_is_the_callers(
+    encoder: DeltaEncoder, moments: list[Moment]
+) -> None:
+    sizes = [
+        len(send(encoder, encoder.start(0), moments[0], FrameChoice(crf=crf)).packet.payload)
+        for crf in (18, 23, 30, 40)
+    ]
+    assert sizes == sorted(sizes, reverse=True)
+    assert len(set(sizes)) == 4
