@@ -16,7 +16,15 @@ from enum import IntEnum
 from rfcore.codec.config import REFERENCE_FRAMES
 from rfcore.errors import InvalidInput
 
-__all__ = ["INTRA", "RENDER_ONLY", "Reference", "References", "check_references", "is_temporal", "references_name"]
+__all__ = [
+    "INTRA",
+    "RENDER_ONLY",
+    "Reference",
+    "References",
+    "check_references",
+    "is_temporal",
+    "references_name",
+]
 
 
 class Reference(IntEnum):
