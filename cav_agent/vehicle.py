@@ -22,7 +22,7 @@ from cav_agent.pipeline import Pipeline
 from cav_agent.report import Report
 from cav_agent.session import AgentSession
 from rfcore.codec import CodecConfig
-from rfcore.dataset import read_transforms
+from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import FieldStore, RadianceField
 from rfcore.views import PosedPicture
@@ -103,7 +103,7 @@ class Vehicle:
 
     def _prepare(self, field: RadianceField) -> Journey:
         config = self._config
-        pictures = read_transforms(config.drive, field.metadata.tile_origin).pictures
+        pictures = read_dataset(config.drive, tile_origin=field.metadata.tile_origin).pictures
         intrinsics = pictures[0].camera.intrinsics
         for picture in pictures:
             if picture.camera.intrinsics != intrinsics:

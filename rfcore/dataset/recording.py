@@ -24,6 +24,9 @@
     outside = "refuse"              # or "drop": leave out pictures the trajectory does not cover
     body_from_cam = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]   # default: it is the camera's
 
+    [points]                        # may be left out
+    file = "lidar.ply"              # coloured surface points in the trajectory's world
+
 The camera has OpenCV axes. A video's time starts at 0 with its first frame, a folder's with the
 first picture (``rate_hz``) or where ``times`` says.
 """
@@ -49,7 +52,8 @@ from rfcore.dataset.keys import (
 )
 from rfcore.dataset.lens_keys import lens_of
 from rfcore.dataset.picture_file import SUFFIXES, check_size, inside, read_picture
-from rfcore.dataset.source import Source, SourceCamera, SourcePicture
+from rfcore.dataset.points import read_points
+from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
 from rfcore.dataset.trajectory import NS_PER_S, Trajectory, read_trajectory, time_ns
 from rfcore.dataset.video import Video
 from rfcore.errors import DatasetError, InvalidInput
@@ -61,7 +65,9 @@ SECTIONS = {
     "camera": "model width_px height_px fx_px fy_px cx_px cy_px k1 k2 k3 k4 p1 p2",
     "pictures": "video folder rate_hz times every",
     "trajectory": "file time_offset_s max_gap_s outside body_from_cam",
+    "points": "file",
 }
+OPTIONAL = ("points",)
 
 Table = Mapping[str, Any]
 
@@ -94,7 +100,7 @@ def read_recording_source(file: Path) -> Source:
         for shot in shots
         if poses.wanted(shot)
     )
-    return Source(file, pictures, sorted_out=len(shots) - len(pictures))
+    return Source(file, pictures, _points(file, content), len(shots) - len(pictures))
 
 
 @dataclass(frozen=True)
@@ -147,12 +153,21 @@ def _load(file: Path) -> dict[str, Table]:
         if section not in SECTIONS:
             raise DatasetError(f"{file}: section [{section}] is none of {', '.join(SECTIONS)}")
     for section, known in SECTIONS.items():
+        if section in OPTIONAL and section not in content:
+            continue
         if not isinstance(content.get(section), dict):
             raise DatasetError(f"{file}: section [{section}] is missing")
         for key in content[section]:
             if key not in known.split():
                 raise DatasetError(f"{file}: [{section}]: key '{key}' is none of {known}")
     return content
+
+
+def _points(file: Path, content: Mapping[str, Table]) -> SourcePoints | None:
+    if "points" not in content:
+        return None
+    where = f"{file}: [points]"
+    return read_points(inside(where, file.parent, text(where, content["points"], "file")))
 
 
 def _camera(where: str, keys: Table) -> SourceCamera:

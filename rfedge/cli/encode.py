@@ -16,7 +16,7 @@ class Encode:
     """Code a drive against a field's renders; write the vehicle's messages as a .rfv file."""
 
     drive: Annotated[Path, Positional]
-    """A transforms.json with posed pictures in time order."""
+    """Posed pictures in time order, a dataset of any format (docs/data.md)."""
     field: Path
     """The field archive (.rff)."""
     out: Path
@@ -30,13 +30,13 @@ class Encode:
 
     def run(self) -> None:
         """Code the drive and print its size."""
-        from rfcore.dataset import read_transforms
+        from rfcore.dataset import read_dataset
         from rfcore.field import load_field
         from rfcore.wire.drive_file import write_drive
         from rfedge.offline import CodingSettings, encode_drive
 
-        dataset = read_transforms(self.drive)
         field = load_field(self.field, threads=self.threads)
+        dataset = read_dataset(self.drive, tile_origin=field.metadata.tile_origin)
         coded = encode_drive(dataset, field, CodingSettings(self.preset, self.crf))
         write_drive(self.out, coded)
         payload_bytes = sum(len(frame.packet.payload) for frame in coded.frames)

@@ -32,14 +32,15 @@ class Render:
         """Render the drive."""
         import numpy as np
 
-        from rfcore.dataset import read_transforms
+        from rfcore.dataset import read_dataset
         from rfcore.field import load_field
         from rfcore.image import write_png
         from rfcore.metrics import psnr
 
         field = load_field(self.field, threads=self.threads, isa=self.isa)
         self.out.mkdir(parents=True, exist_ok=True)
-        for picture in read_transforms(self.drive).pictures:
+        drive = read_dataset(self.drive, tile_origin=field.metadata.tile_origin)
+        for picture in drive.pictures:
             colour = field.render_colour(picture.camera)
             rgb = np.floor(np.clip(colour, 0, 1) * 255 + 0.5).astype(np.uint8)
             path = self.out / f"{Path(picture.name).stem}.png"

@@ -252,6 +252,8 @@ FAULTS: dict[str, list[tuple[str, Fault, str]]] = {
             edit_text("camera.toml", "[pictures]", "[photos]"),
             r"section \[photos\] is none",
         ),
+        ("video", edit_text("camera.toml", "[pic", "[points]\n[pic"), r"\[points\]: key 'file' is"),
+        ("video", edit_text("camera.toml", "[camera]", "camera = 3\n[x]"), r"\[x\] is none of"),
         ("video", edit_text("camera.toml", "fx_px", "focal"), r"\[camera\]: key 'focal' is none"),
         ("video", edit_text("camera.toml", "fx_px", "k1 = 0.0\n#"), r"\[camera\]: key 'fx_px' is"),
         ("folder", edit_text("camera.toml", "rate_hz", "#"), r"\[pictures\]: .*either 'rate_hz'"),
