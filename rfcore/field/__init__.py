@@ -2,6 +2,7 @@
 
 from rfcore.field.interface import Bounds, FieldMetadata, RadianceField
 from rfcore.field.load import load_field, save_field
+from rfcore.field.ngp import NgpField
 from rfcore.field.ply import read_ply, write_ply
 from rfcore.field.quality import FULL, Quality
 from rfcore.field.splats import SplatField
@@ -12,6 +13,7 @@ __all__ = [
     "Bounds",
     "FieldMetadata",
     "FieldStore",
+    "NgpField",
     "Quality",
     "RadianceField",
     "SplatField",

@@ -12,8 +12,10 @@ from pathlib import Path
 
 from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.field.archive import Archive, decode_archive, encode_archive, read_file
-from rfcore.field.interface import SPLATS, FieldMetadata, RadianceField
+from rfcore.field.interface import NGP, SPLATS, FieldMetadata, RadianceField
 from rfcore.field.metadata import bounds_of_header, metadata_of_header
+from rfcore.field.ngp import NgpField
+from rfcore.field.ngp_archive import ngp_of_archive
 from rfcore.field.splat_archive import splats_of_archive
 from rfcore.field.splats import SplatField
 from rfcore.files import write_whole
@@ -49,7 +51,17 @@ def _splats(file: FieldFile) -> RadianceField:
     return field
 
 
-READERS: Mapping[str, Callable[[FieldFile], RadianceField]] = {SPLATS: _splats}
+def _ngp(file: FieldFile) -> RadianceField:
+    numbers = ngp_of_archive(file.archive)
+    field = NgpField(numbers, file.metadata, threads=file.threads, isa=file.isa)
+    field.field_id = file.field_id
+    stated = bounds_of_header(file.archive.metadata)
+    if stated != field.bounds:
+        raise InvalidInput("field.bounds", f"{stated} are not those of the grid, {field.bounds}")
+    return field
+
+
+READERS: Mapping[str, Callable[[FieldFile], RadianceField]] = {SPLATS: _splats, NGP: _ngp}
 """Makes the field of a file, by its archive's kind."""
 
 

@@ -26,6 +26,7 @@ MAX_LOG2_T = 24
 MAX_OCCUPANCY_CELLS = 1 << 28
 HIDDEN = (16, 32, 48, 64)
 MAX_STEPS = 8192
+MAX_FAR_M = 1e9
 
 Vec3 = tuple[float, float, float]
 Cells = tuple[int, int, int]
@@ -127,8 +128,9 @@ class Marching:
             raise InvalidInput("ngp.growth", f"{self.growth} is outside 1..2, 1 excluded")
         if not 1 <= self.steps <= MAX_STEPS:
             raise InvalidInput("ngp.steps", f"{self.steps} is outside 1..{MAX_STEPS}")
-        if not self.edges_m[-1] <= 1e9:
-            raise InvalidInput("ngp.steps", f"the last ends at {self.edges_m[-1]:g} m, over 1e9")
+        log_far = math.log(self.near_m) + self.steps * math.log(self.growth)
+        if not log_far <= math.log(MAX_FAR_M):
+            raise InvalidInput("ngp.steps", f"{self.steps} reach e^{log_far:.1f} m, over 1e9 m")
 
     @staticmethod
     def between(near_m: float, far_m: float, per_doubling: int) -> Marching:

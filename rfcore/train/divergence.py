@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from rfcore.errors import TrainingDiverged
-from rfcore.raster.gaussians import Gaussians
 
 __all__ = ["WINDOW", "DivergenceWatch"]
 
@@ -32,7 +31,7 @@ class DivergenceWatch:
         self._lowest = math.inf
         self._sizes: dict[str, float] = {}
 
-    def see(self, iteration: int, loss: float, parameters: Callable[[], Gaussians]) -> None:
+    def see(self, iteration: int, loss: float, parameters: Callable[[], Any]) -> None:
         """Take the loss of one iteration; raise ``TrainingDiverged`` if the run is lost."""
         if not math.isfinite(loss):
             raise TrainingDiverged(iteration, self._grown(parameters()), f"the loss is {loss}")
@@ -61,7 +60,7 @@ class DivergenceWatch:
         self._lowest = math.inf if values["lowest"] is None else values["lowest"]
         self._sizes = values["sizes"]
 
-    def _grown(self, parameters: Gaussians) -> str:
+    def _grown(self, parameters: Any) -> str:
         growth = {
             name: size / max(self._sizes.get(name, size), 1e-9)
             for name, size in _sizes(parameters).items()
@@ -69,8 +68,8 @@ class DivergenceWatch:
         return max(growth, key=lambda name: growth[name])
 
 
-def _sizes(parameters: Gaussians) -> dict[str, float]:
-    """Return the root of the mean square of every group."""
+def _sizes(parameters: Any) -> dict[str, float]:
+    """Return the root of the mean square of every group, the arrays of a dataclass."""
     arrays = {f.name: getattr(parameters, f.name) for f in fields(parameters)}
     return {
         name: float(np.sqrt(np.mean(np.square(array, dtype=np.float64)))) if array.size else 0.0

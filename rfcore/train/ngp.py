@@ -1,0 +1,284 @@
+"""Training of a hash grid field from posed pictures (Mueller et al. 2022).
+
+Stochastic descent on the squared error of random pixels, with Adam. A batch has about as many
+samples, not rays, in every iteration. The same pictures, points, settings and seed give the same
+field to the last bit, whatever the instruction set and the number of threads, and whether or not
+the run was interrupted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera, TileOrigin
+from rfcore.errors import InvalidInput
+from rfcore.field import FieldMetadata, NgpField
+from rfcore.field.interface import NGP
+from rfcore.ngp.parameters import NgpParameters, initial_parameters
+from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space, grid_levels
+from rfcore.ngp.trainable import MAX_BLOCK_RAYS, NgpRates, TrainableNgp
+from rfcore.train.checkpoint import Checkpoint
+from rfcore.train.divergence import DivergenceWatch
+from rfcore.train.ngp_space import cells_near, occupancy_cells, space_around
+from rfcore.train.protocol import HeldOut, TrainingProgress
+from rfcore.train.ray_sampler import RaySampler
+from rfcore.train.targets import load_targets
+from rfcore.views import PointCloud, PosedPicture
+
+__all__ = ["NgpModel", "NgpSchedule", "NgpTrainer", "NgpTrainingConfig"]
+
+BLOCKS = 16
+"""Tasks of a batch; part of the definition, since sums are made block by block."""
+MAX_SAMPLES = 8192
+"""Of a block: memory for twice what it has on average."""
+REBUILD_EVERY = 64
+"""Iterations after which the occupied cells are found anew."""
+FIRST_SAMPLES_PER_RAY = 64.0
+FIRST_PEAK = 2.0
+"""Of a cell, times the threshold: kept until a dozen visits have found it empty."""
+
+
+@dataclass(frozen=True)
+class NgpModel:
+    """How large a field is: L, T, N_min and N_max as in the paper."""
+
+    L: int = 16
+    log2_T: int = 18
+    N_min: int = 16
+    N_max: int = 2048
+    """Cells along the longest side, of all space: the box is half of that."""
+    hidden: int = 32
+    occupancy: int = 8_000_000
+    """Cells of the occupancy grid, about."""
+    steps_per_doubling: int = 48
+    """Steps along a ray until its distance has doubled: 48 are a step of 1.4 % of it."""
+    near_share: float = 0.008
+    """Where rays begin, in longest half sides of the box."""
+    far_share: float = 8.0
+    """Where they end."""
+
+
+@dataclass(frozen=True)
+class NgpSchedule:
+    """Adam's rate: constant for a while, then falling exponentially."""
+
+    rate: float = 1e-2
+    held_share: float = 0.4
+    final_factor: float = 0.03
+    threshold: float = 0.01
+    """Optical thickness of a sample above which its cell is occupied."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rate <= 1:
+            raise InvalidInput("training.rate", f"{self.rate} is outside 0..1")
+        if not 0 <= self.held_share < 1:
+            raise InvalidInput("training.held_share", f"{self.held_share} is outside 0..1")
+        if not 0 < self.final_factor <= 1:
+            raise InvalidInput("training.final_factor", f"{self.final_factor} is outside 0..1")
+        if not 0 < self.threshold <= 1:
+            raise InvalidInput("training.threshold", f"{self.threshold} is outside 0..1")
+
+    def at(self, progress: float) -> NgpRates:
+        """Return the rates at ``progress``, 0..1."""
+        fall = max(0.0, (progress - self.held_share) / (1.0 - self.held_share))
+        rate = self.rate * self.final_factor**fall
+        return NgpRates(table=rate, matrices=rate)
+
+
+@dataclass(frozen=True)
+class NgpTrainingConfig:
+    """How to train. ``threads`` and ``isa`` change how long it takes, nothing else."""
+
+    iterations: int = 10_000
+    batch_samples: int = 65_536
+    """Samples of an iteration, about."""
+    model: NgpModel = field(default_factory=NgpModel)
+    schedule: NgpSchedule = field(default_factory=NgpSchedule)
+    threads: int = 1
+    isa: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.iterations <= 1_000_000:
+            raise InvalidInput("training.iterations", f"{self.iterations} is outside 1..1000000")
+        most = BLOCKS * MAX_SAMPLES // 2
+        if not BLOCKS <= self.batch_samples <= most:
+            raise InvalidInput(
+                "training.batch_samples", f"{self.batch_samples} is outside {BLOCKS}..{most}"
+            )
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """What can diverge."""
+
+    table: NDArray[np.float32]
+    matrices: NDArray[np.float32]
+
+
+class NgpTrainer:
+    """One training run.
+
+    ``points``, where there are any, say which cells can be occupied. Every picture is read into
+    memory at once. Raises ``InvalidInput`` on settings or no pictures, and ``DatasetError`` on
+    pictures that cannot be read.
+    """
+
+    kind = NGP
+
+    def __init__(
+        self,
+        pictures: Sequence[PosedPicture],
+        points: PointCloud | None = None,
+        config: NgpTrainingConfig | None = None,
+        *,
+        seed: int = 0,
+    ) -> None:
+        self.config = config if config is not None else NgpTrainingConfig()
+        targets, pictures_digest = load_targets(pictures)
+        self._sampler = RaySampler(targets, seed)
+        shape = _shape(self.config.model, [target.camera for target in targets], points)
+        initial, peaks = _start(shape, points, self.config.schedule.threshold, seed)
+        self._digest = self._training_digest(pictures_digest, points, seed)
+        self._done = 0
+        self._samples_per_ray = FIRST_SAMPLES_PER_RAY
+        self._watch = DivergenceWatch()
+        self._trainable = TrainableNgp(
+            initial, peaks, threads=self.config.threads, isa=self.config.isa
+        )
+        self._numbers = initial.table.size + initial.matrices.size
+        self._trainable.rebuild_occupancy(self.config.schedule.threshold)
+
+    @property
+    def training_digest(self) -> str:
+        """SHA-256 of pictures, points, settings and seed, in hex; known before the first step."""
+        return self._digest
+
+    @property
+    def iteration(self) -> int:
+        """How many iterations have been done."""
+        return self._done
+
+    @property
+    def total(self) -> int:
+        """How many iterations the settings ask for."""
+        return self.config.iterations
+
+    @property
+    def primitives(self) -> int:
+        """How many numbers are being learned."""
+        return self._numbers
+
+    @property
+    def finished(self) -> bool:
+        """Whether every iteration has been done."""
+        return self._done >= self.config.iterations
+
+    def step(self, progress: float | None = None) -> TrainingProgress:
+        """Do one iteration.
+
+        Raises ``InvalidInput`` when the run is finished, ``TrainingDiverged`` when it no longer
+        gets anywhere.
+        """
+        if self.finished:
+            raise InvalidInput("training", f"all {self.config.iterations} iterations are done")
+        if progress is None:
+            progress = self._done / self.config.iterations
+        loss = self._descend(progress)
+        self._done += 1
+        if self._done % REBUILD_EVERY == 0:
+            self._trainable.rebuild_occupancy(self.config.schedule.threshold)
+        self._watch.see(self._done, loss, self._groups)
+        return TrainingProgress(self._done, self.config.iterations, loss)
+
+    def steps(self) -> Iterator[TrainingProgress]:
+        """Do the iterations that are left, one at a time."""
+        while not self.finished:
+            yield self.step()
+
+    def field(
+        self,
+        name: str = "",
+        tile_origin: TileOrigin | None = None,
+        held_out: HeldOut | None = None,
+    ) -> NgpField:
+        """Return what has been learnt so far as a field."""
+        metadata = FieldMetadata(
+            name=name,
+            tile_origin=tile_origin if tile_origin is not None else TileOrigin(),
+            training_digest=self._digest,
+            held_out_psnr_db=held_out.psnr_db if held_out is not None else None,
+            held_out_ssim=held_out.ssim if held_out is not None else None,
+            kind=NGP,
+        )
+        numbers, config = self._trainable.parameters(), self.config
+        return NgpField(numbers, metadata, threads=config.threads, isa=config.isa)
+
+    def checkpoint(self) -> Checkpoint:
+        """Return what ``restore`` of a trainer made of the same things goes on from."""
+        values = {"samples_per_ray": self._samples_per_ray, "watch": self._watch.values()}
+        return Checkpoint(self.kind, self._digest, self._done, values, self._trainable.state())
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on after ``checkpoint``. Raises ``InvalidInput`` when it is of another run."""
+        checkpoint.check(self.kind, self._digest)
+        self._trainable.restore(checkpoint.arrays)
+        self._samples_per_ray = float(checkpoint.values["samples_per_ray"])
+        self._watch.restore(checkpoint.values["watch"])
+        self._done = checkpoint.iteration
+
+    def _descend(self, progress: float) -> float:
+        """Do one step of Adam on a batch of about ``batch_samples``; return its loss."""
+        wanted = int(self.config.batch_samples / BLOCKS / self._samples_per_ray)
+        rays = min(max(wanted, 1), MAX_BLOCK_RAYS)
+        batch = self._sampler.batch(self._done, rays, BLOCKS, MAX_SAMPLES // rays)
+        loss = self._trainable.accumulate(batch)
+        self._trainable.update(self.config.schedule.at(progress))
+        seen = max(self._trainable.samples / (rays * BLOCKS), 1.0)
+        self._samples_per_ray += 0.1 * (seen - self._samples_per_ray)
+        return loss
+
+    def _groups(self) -> _Groups:
+        numbers = self._trainable.parameters()
+        return _Groups(numbers.table, numbers.matrices)
+
+    def _training_digest(self, pictures: str, points: PointCloud | None, seed: int) -> str:
+        """Leave out what does not change the result: threads and instruction set."""
+        kept = [f for f in fields(self.config) if f.name not in ("threads", "isa")]
+        settings = [(f.name, getattr(self.config, f.name)) for f in kept]
+        digest = hashlib.sha256(repr((NGP, pictures, settings, seed)).encode())
+        if points is not None:
+            digest.update(points.xyz_m.tobytes())
+        return digest.hexdigest()
+
+
+def _shape(model: NgpModel, cameras: Sequence[Camera], points: PointCloud | None) -> NgpShape:
+    space = space_around(cameras, points)
+    grid = HashGrid(grid_levels(model.L, model.N_min, model.N_max, space.aspect), model.log2_T)
+    return NgpShape(
+        grid, space, _marching(model, space), model.hidden, occupancy_cells(space, model.occupancy)
+    )
+
+
+def _marching(model: NgpModel, space: Space) -> Marching:
+    longest = max(space.half_m)
+    return Marching.between(
+        model.near_share * longest, model.far_share * longest, model.steps_per_doubling
+    )
+
+
+def _start(
+    shape: NgpShape, points: PointCloud | None, threshold: float, seed: int
+) -> tuple[NgpParameters, NDArray[np.float32]]:
+    """Return the first numbers and peaks."""
+    cells = math.prod(shape.occupancy_cells)
+    peaks = np.full(cells, FIRST_PEAK * threshold, np.float32)
+    if points is not None:
+        peaks[~cells_near(shape.space, shape.occupancy_cells, points)] = 0
+    nothing = np.zeros(shape.occupancy_words, np.uint32)
+    return initial_parameters(shape, nothing, np.random.default_rng(seed)), peaks
