@@ -5,7 +5,7 @@ Instant-NGP as in Mueller et al. 2022 (NGP in ``rfcore.ngp.shape``), volume rend
 compute the same function and are tested against this file in float64.
 
 ``R`` rays, ``K`` steps along each, ``M`` samples at most, ``S`` points. Which steps are occupied is
-not differentiated. Every tensor has the dtype of ``params["table"]``.
+not differentiated. Every tensor has the dtype and device of ``params["table"]``.
 """
 
 from __future__ import annotations
@@ -53,12 +53,16 @@ class Rays:
 
 
 def parameters(
-    numbers: NgpParameters, dtype: torch.dtype = torch.float64, *, requires_grad: bool = False
+    numbers: NgpParameters,
+    dtype: torch.dtype = torch.float64,
+    *,
+    requires_grad: bool = False,
+    device: str = "cpu",
 ) -> dict[str, Tensor]:
     """Return the table and the five matrices as leaf tensors, keyed as ``render`` takes them."""
     arrays = {"table": numbers.table, **dict(zip(MATRICES, numbers.split_matrices(), strict=True))}
     return {
-        name: torch.tensor(array, dtype=dtype).requires_grad_(requires_grad)
+        name: torch.tensor(array, dtype=dtype, device=device).requires_grad_(requires_grad)
         for name, array in arrays.items()
     }
 
@@ -98,13 +102,13 @@ def _entries(cells: tuple[int, int, int], T: int, dense: bool) -> int:
 def _encode_level(
     cells: tuple[int, int, int], T: int, dense: bool, table: Tensor, positions: Tensor
 ) -> Tensor:
-    size = torch.tensor(cells)
+    size = torch.tensor(cells, device=positions.device)
     scaled = positions * size
     low = torch.minimum(scaled.detach().floor().long(), size - 1)
     above = scaled - low
     total = torch.zeros_like(positions[:, :2])
     for corner in range(8):
-        step = torch.tensor([corner >> axis & 1 for axis in range(3)])
+        step = torch.tensor([corner >> axis & 1 for axis in range(3)], device=size.device)
         weight = torch.where(step == 1, above, 1 - above).prod(dim=1)
         index = _dense_index(low + step, cells) if dense else _hash(low + step) % T
         total = total + weight[:, None] * table[index]
@@ -182,7 +186,8 @@ def render_rays(
     *edges, valid = _samples(shape, occupied, limit, samples_per_ray)
     low, high = (torch.as_tensor(edge).to(rays.origins) for edge in edges)
     distance = low + rays.jitter[:, None] * (high - low)
-    density, colour = _evaluate(params, shape, rays, distance, torch.as_tensor(valid))
+    there = torch.as_tensor(valid, device=distance.device)
+    density, colour = _evaluate(params, shape, rays, distance, there)
     survival = torch.exp(-density * (high - low))
     before = torch.cumprod(torch.cat([torch.ones_like(survival[:, :1]), survival], dim=1), dim=1)
     counts = before[:, :-1] >= MIN_TRANSMITTANCE
@@ -191,7 +196,7 @@ def render_rays(
     opacity = weight.sum(dim=1)
     mean = (weight * distance).sum(dim=1) / opacity.clamp(min=1e-300)
     if shape.space.unbounded:
-        room = torch.as_tensor(valid.sum(axis=1) < limit)
+        room = there.sum(dim=1) < limit
         left = torch.where(room & (1 - opacity >= MIN_TRANSMITTANCE), 1 - opacity, 0.0)
         position = at_infinity(shape.space, rays.directions)
         _, far = radiance(params, shape.grid, position, rays.directions)
@@ -206,11 +211,11 @@ def _occupied_steps(numbers: NgpParameters, rays: Rays) -> np.ndarray:
     distance = edges[:-1] + rays.jitter[:, None] * (edges[1:] - edges[:-1])
     points = rays.origins[:, None] + distance[..., None] * rays.directions[:, None]
     u, inside = contract(shape.space, points)
-    cells = torch.tensor(shape.occupancy_cells)
+    cells = torch.tensor(shape.occupancy_cells, device=u.device)
     x, y, z = torch.minimum((u * cells).long(), cells - 1).unbind(dim=-1)
     bits = np.unpackbits(numbers.occupancy.view(np.uint8), bitorder="little")
     index = x + cells[0] * (y + cells[1] * z)
-    occupied: np.ndarray = inside.numpy() & (bits[index.numpy()] == 1)
+    occupied: np.ndarray = inside.cpu().numpy() & (bits[index.cpu().numpy()] == 1)
     return occupied
 
 
@@ -259,21 +264,24 @@ def _evaluate(
     )
 
 
-def camera_rays(camera: Camera, dtype: torch.dtype = torch.float64) -> tuple[Rays, Tensor]:
+def camera_rays(
+    camera: Camera, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
+) -> tuple[Rays, Tensor]:
     """Return the rays through the pixel centres, row by row, and the depth z of one metre [R]."""
     k, pose = camera.intrinsics, camera.world_from_cam
     y, x = torch.meshgrid(
-        torch.arange(k.height_px, dtype=dtype) + 0.5,
-        torch.arange(k.width_px, dtype=dtype) + 0.5,
+        torch.arange(k.height_px, dtype=dtype, device=device) + 0.5,
+        torch.arange(k.width_px, dtype=dtype, device=device) + 0.5,
         indexing="ij",
     )
     seen = torch.stack(
         [(x - k.cx_px) / k.fx_px, (y - k.cy_px) / k.fy_px, torch.ones_like(x)], dim=-1
     ).reshape(-1, 3)
     length = seen.norm(dim=1, keepdim=True)
-    directions = (seen / length) @ torch.tensor(pose.rotation_matrix(), dtype=dtype).T
-    origins = torch.tensor(pose.translation_m, dtype=dtype).expand_as(directions)
-    return Rays(origins, directions, torch.full((len(seen),), 0.5, dtype=dtype)), 1 / length[:, 0]
+    rotation = torch.tensor(pose.rotation_matrix(), dtype=dtype, device=device)
+    directions = (seen / length) @ rotation.T
+    origins = torch.tensor(pose.translation_m, dtype=dtype, device=device).expand_as(directions)
+    return Rays(origins, directions, torch.full_like(length[:, 0], 0.5)), 1 / length[:, 0]
 
 
 def render(
@@ -283,7 +291,7 @@ def render(
     samples_per_ray: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Render colour [H, W, 3], depth [H, W] in metres (mean z, 0: nothing hit), opacity [H, W]."""
-    rays, z_of_metre = camera_rays(camera, params["table"].dtype)
+    rays, z_of_metre = camera_rays(camera, params["table"].dtype, params["table"].device)
     colour, distance, opacity = render_rays(params, numbers, rays, samples_per_ray=samples_per_ray)
     size = (camera.intrinsics.height_px, camera.intrinsics.width_px)
     depth = (distance * z_of_metre).reshape(size)

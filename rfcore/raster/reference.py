@@ -59,14 +59,17 @@ class _Splats:
 
 
 def parameters(
-    gaussians: Gaussians, dtype: torch.dtype = torch.float64, *, requires_grad: bool = False
+    gaussians: Gaussians,
+    dtype: torch.dtype = torch.float64,
+    *,
+    requires_grad: bool = False,
+    device: str = "cpu",
 ) -> dict[str, Tensor]:
     """Return the arrays of ``gaussians`` as leaf tensors, keyed as ``render`` takes them."""
+    arrays = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
     return {
-        field.name: torch.tensor(getattr(gaussians, field.name), dtype=dtype).requires_grad_(
-            requires_grad
-        )
-        for field in fields(gaussians)
+        name: torch.tensor(array, dtype=dtype, device=device).requires_grad_(requires_grad)
+        for name, array in arrays.items()
     }
 
 
@@ -169,7 +172,7 @@ def _project(params: Mapping[str, Tensor], camera: Camera, antialiased: bool) ->
 
 
 def _like(tensor: Tensor, values: object) -> Tensor:
-    return torch.tensor(values, dtype=tensor.dtype)
+    return torch.tensor(values, dtype=tensor.dtype, device=tensor.device)
 
 
 def _rotation_matrices(quaternions: Tensor) -> Tensor:
@@ -252,8 +255,8 @@ def _touching(splats: _Splats, axis: int, start: int, length: int) -> Tensor:
 
 def _pixel_centres(left: int, top: int, width: int, height: int, like: Tensor) -> Tensor:
     """Return [width * height, 2], row by row."""
-    y = torch.arange(top, top + height, dtype=like.dtype) + 0.5
-    x = torch.arange(left, left + width, dtype=like.dtype) + 0.5
+    y = torch.arange(top, top + height, dtype=like.dtype, device=like.device) + 0.5
+    x = torch.arange(left, left + width, dtype=like.dtype, device=like.device) + 0.5
     return torch.cartesian_prod(y, x).flip(-1)
 
 
@@ -296,7 +299,7 @@ def _ssim_map(a: Tensor, b: Tensor) -> Tensor:
 def _blur(stack: Tensor) -> Iterator[Tensor]:
     """Filter [5, 3, H, W] with the 11-tap Gaussian of sigma 1.5 along both axes."""
     taps = np.exp(-(np.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
-    kernel = torch.tensor(taps / taps.sum(), dtype=stack.dtype)
+    kernel = _like(stack, taps / taps.sum())
     planes = stack.flatten(0, 1)[:, None]
     planes = functional.conv2d(planes, kernel[None, None, None, :], padding=(0, 5))
     planes = functional.conv2d(planes, kernel[None, None, :, None], padding=(5, 0))

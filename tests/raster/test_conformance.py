@@ -1,0 +1,150 @@
+"""One body, every implementation of the splats: held to the float64 definition on the CPU.
+
+The torch definition in float32, the native kernels on every instruction set, and where there is a
+CUDA device the definition on it and gsplat. Alphas stay below every implementation's ceiling.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from rfcore.camera import Camera
+from rfcore.errors import BackendUnavailable
+from rfcore.raster import cuda, reference
+from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.native import Rasterizer, TrainableRasterizer, available_isas
+from rfcore.views import View
+
+SceneMaker = Callable[..., Gaussians]
+CameraMaker = Callable[..., Camera]
+Params = dict[str, Tensor]
+F32 = np.float32
+
+ON_DEVICE = ("definition-cuda", "gsplat")
+PICTURE_TOLERANCE, GRADIENT_TOLERANCE = 2e-5, 2e-4
+"""float32 throughout; gsplat's exponential and its order of sums are the device's own."""
+MAX_FLIPPED = 0.005
+"""Share of pixels where an alpha or a transmittance falls on the other side of a threshold."""
+
+
+@dataclass(frozen=True)
+class Implementation:
+    """How to draw a set of Gaussians, and how to take the gradient of a weighted sum of colours."""
+
+    draw: Callable[[Gaussians, Camera, bool], View]
+    gradients: Callable[[Gaussians, Camera, np.ndarray, bool], dict[str, np.ndarray]]
+
+
+def native(isa: str) -> Implementation:
+    def draw(gaussians: Gaussians, camera: Camera, antialiased: bool) -> View:
+        return Rasterizer(gaussians, isa=isa, antialiased=antialiased).render(camera)
+
+    def gradients(
+        gaussians: Gaussians, camera: Camera, weights: np.ndarray, antialiased: bool
+    ) -> dict[str, np.ndarray]:
+        trainable = TrainableRasterizer(gaussians, isa=isa, antialiased=antialiased)
+        trainable.forward(camera)
+        trainable.backward(weights)
+        return trainable.gradients()
+
+    return Implementation(draw, gradients)
+
+
+def torch_based(
+    render: Callable[..., tuple[Tensor, Tensor, Tensor]],
+    dtype: torch.dtype = torch.float32,
+    device: str = "cpu",
+) -> Implementation:
+    def draw(gaussians: Gaussians, camera: Camera, antialiased: bool) -> View:
+        params = reference.parameters(gaussians, dtype, device=device)
+        pictures = render(params, camera, antialiased=antialiased)
+        return View(*(picture.cpu().numpy() for picture in pictures))
+
+    def gradients(
+        gaussians: Gaussians, camera: Camera, weights: np.ndarray, antialiased: bool
+    ) -> dict[str, np.ndarray]:
+        params = reference.parameters(gaussians, dtype, requires_grad=True, device=device)
+        colour, _, _ = render(params, camera, antialiased=antialiased)
+        (colour * torch.tensor(weights, dtype=dtype, device=device)).sum().backward()
+        return {name: value.grad.cpu().numpy() for name, value in params.items()}
+
+    return Implementation(draw, gradients)
+
+
+def implementations() -> Iterator[str]:
+    yield "definition-float32"
+    yield from (f"native-{isa}" for isa in available_isas())
+    yield from ON_DEVICE
+
+
+@pytest.fixture(params=list(implementations()))
+def implementation(request: pytest.FixtureRequest) -> Implementation:
+    name = str(request.param)
+    if name in ON_DEVICE and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    if name.startswith("native-"):
+        return native(name.removeprefix("native-"))
+    if name == "gsplat":
+        return torch_based(cuda.render, device="cuda")
+    return torch_based(reference.render, device="cuda" if name in ON_DEVICE else "cpu")
+
+
+@pytest.fixture
+def gaussians(scene: SceneMaker) -> Gaussians:
+    """Opacities below 0.95: no alpha comes near a ceiling."""
+    made = scene(150, 2)
+    return replace(made, opacity_logits=np.minimum(made.opacity_logits, F32(2.9)))
+
+
+DEFINITION = torch_based(reference.render, torch.float64)
+
+
+def test_it_draws_the_definition(
+    implementation: Implementation, gaussians: Gaussians, camera: CameraMaker, antialiased: bool
+) -> None:
+    got = implementation.draw(gaussians, camera(), antialiased)
+    want = DEFINITION.draw(gaussians, camera(), antialiased)
+    flipped = np.abs(got.opacity - want.opacity) > PICTURE_TOLERANCE
+    assert flipped.mean() <= MAX_FLIPPED
+    assert np.abs(got.colour - want.colour)[~flipped].max() < PICTURE_TOLERANCE
+    assert np.abs(got.depth - want.depth)[~flipped].max() < 7.0 * PICTURE_TOLERANCE
+
+
+def test_its_gradients_are_those_of_the_definition(
+    implementation: Implementation, gaussians: Gaussians, camera: CameraMaker, antialiased: bool
+) -> None:
+    view_from = camera(61, 37)
+    weights = np.random.default_rng(5).normal(size=(37, 61, 3)).astype(F32)
+    got = implementation.draw(gaussians, view_from, antialiased)
+    want = DEFINITION.draw(gaussians, view_from, antialiased)
+    weights[np.abs(got.opacity - want.opacity) > PICTURE_TOLERANCE] = 0
+    gradients = implementation.gradients(gaussians, view_from, weights, antialiased)
+    for name, wanted in DEFINITION.gradients(gaussians, view_from, weights, antialiased).items():
+        error = np.linalg.norm(gradients[name] - wanted) / np.linalg.norm(wanted)
+        assert error < GRADIENT_TOLERANCE, name
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is here")
+def test_without_a_device_cuda_says_so_and_names_the_way_out(gaussians: Gaussians) -> None:
+    with pytest.raises(BackendUnavailable, match=r"no CUDA device.*native"):
+        cuda.CudaRasterizer(gaussians)
+
+
+def test_the_definition_never_leaves_the_device_of_its_parameters(
+    gaussians: Gaussians, camera: CameraMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The meta device computes shapes alone and refuses tensors of another device, like CUDA."""
+
+    def all_of_them(mask: Tensor) -> Tensor:
+        return torch.arange(len(mask), device=mask.device)[:, None]
+
+    monkeypatch.setattr(torch, "nonzero", all_of_them)
+    params = reference.parameters(gaussians, torch.float32, device="meta")
+    colour, depth, opacity = reference.render(params, camera(), antialiased=True)
+    loss = reference.loss_l1_dssim(colour, colour)
+    assert {value.device.type for value in (colour, depth, opacity, loss)} == {"meta"}
+    assert colour.shape == (45, 67, 3)
