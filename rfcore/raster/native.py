@@ -48,7 +48,7 @@ class Rasterizer:
     ``isa`` forces one of ``available_isas()`` (default: the best); ``threads`` is 1..256. Neither
     changes a byte of any picture. ``antialiased`` must be what the Gaussians were trained with.
     Raises ``BackendUnavailable`` or ``InvalidInput``. Rendering raises ``InvalidInput`` when the
-    Gaussians overlap more than 2^30 tiles of 16x16 pixels, and for an ``sh_degree`` they lack.
+    Gaussians overlap more than 2^28 regions of 64x64 pixels, and for an ``sh_degree`` they lack.
     """
 
     def __init__(

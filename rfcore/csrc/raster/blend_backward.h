@@ -194,9 +194,9 @@ RF_INLINE void reduce_block(const TileChunk& chunk, int b, int replayed, const T
 }
 
 // Turn the moments of a chunk, of pixels about the tile's origin, into those of each splat's own
-// coordinates (u, v) and write them out.
+// coordinates (u, v) and add them to those of the group.
 RF_INLINE void flush_sums(const TileChunk& chunk, const float* sums, int count, float left,
-                          float top, EntryGradient* out) {
+                          float top, const uint32_t* positions, EntryGradient* gradients) {
     for (int first = 0; first < count; first += kLanes) {
         alignas(64) float centre_x[16], centre_y[16], factor_a[16], factor_b[16], factor_c[16];
         for (int i = 0; i < kLanes; ++i) {
@@ -223,26 +223,25 @@ RF_INLINE void flush_sums(const TileChunk& chunk, const float* sums, int count, 
         planes_to_rows(m, sum[6], sum[7], sum[8], rows);
         const int last = count - first < kLanes ? count - first : kLanes;
         for (int i = 0; i < last; ++i) {
-            store(reinterpret_cast<float*>(out + first + i), rows[i]);
+            float* sum = reinterpret_cast<float*>(gradients + positions[first + i]);
+            store(sum, load(sum) + rows[i]);
         }
     }
 }
 
-static void blend_backward(const BlendBackwardJob& job, int tile) {
-    const int tile_x = tile % job.camera->tiles_x(), tile_y = tile / job.camera->tiles_x();
-    const float left = static_cast<float>(tile_x * kTileSide);
-    const float top = static_cast<float>(tile_y * kTileSide);
+static void tile_backward(const BlendBackwardJob& job, const TilePlace& place) {
+    const float left = place.left(), top = place.top();
     constexpr uint32_t kAllDone = (1u << kBlocksPerTile) - 1;
     alignas(64) TileChunk chunk;
     TileGradient gradient;
     Replay replay;
     alignas(64) float sums[(kChunk + 1) * 16];  // the last row takes what pads the lists
-    uint32_t done = start_gradient(job, tile_x, tile_y, &gradient);
-    const uint32_t end = job.tile_offsets[tile + 1];
-    uint32_t e = job.tile_offsets[tile];
-    for (; e < end && done != kAllDone; e += kChunk) {
-        const int count = end - e < kChunk ? static_cast<int>(end - e) : kChunk;
-        gather(job.splats, job.entries + e, count, left, top, &chunk);
+    TileList list(job.lists, place);
+    uint32_t done = start_gradient(job, place.column, place.row, &gradient);
+    while (done != kAllDone) {
+        const int count = list.find_chunk();
+        if (count == 0) break;
+        gather(job.splats, list, count, left, top, &chunk);
         find_touching(count, left, top, &chunk);
         memset(sums, 0, sizeof sums);
         for (int b = 0; b < kBlocksPerTile; ++b) {
@@ -253,9 +252,17 @@ static void blend_backward(const BlendBackwardJob& job, int tile) {
             reduce_block(chunk, b, replayed, gradient, &replay, sums);
             if (opaque) done |= 1u << b;
         }
-        flush_sums(chunk, sums, count, left, top, job.entry_gradients + e);
+        flush_sums(chunk, sums, count, left, top, list.positions, job.entry_gradients);
     }
-    if (e < end) memset(job.entry_gradients + e, 0, (end - e) * sizeof(EntryGradient));
+}
+
+static void blend_backward(const BlendBackwardJob& job, int group) {
+    const uint32_t begin = job.lists.offsets[group], end = job.lists.offsets[group + 1];
+    memset(job.entry_gradients + begin, 0, (end - begin) * sizeof(EntryGradient));
+    for (int i = 0; i < kTilesPerGroup; ++i) {
+        const TilePlace place(*job.camera, group * kTilesPerGroup + i);
+        if (place.is_inside(*job.camera)) tile_backward(job, place);
+    }
 }
 
 }  // namespace

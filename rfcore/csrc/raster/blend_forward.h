@@ -11,8 +11,10 @@ namespace {
 
 #if defined(RF_ISA_AVX512)
 constexpr int kUnroll = 8;  // independent alphas in flight; 4 take 3 % longer, 2 take 8 %
+constexpr int kTailUnroll = 4;
 #else
 constexpr int kUnroll = 2;
+constexpr int kTailUnroll = 2;
 #endif
 
 struct TilePixels {
@@ -24,15 +26,61 @@ struct TilePixels {
     alignas(64) float opacity[kBlocksPerTile][16];  // sum of w
 };
 
+template <bool kView>
 RF_INLINE uint32_t start_tile(const Camera& camera, int tile_x, int tile_y, TilePixels* pixels) {
     for (int b = 0; b < kBlocksPerTile; ++b) {
         store(pixels->red[b], zero());
         store(pixels->green[b], zero());
         store(pixels->blue[b], zero());
-        store(pixels->depth[b], zero());
-        store(pixels->opacity[b], zero());
+        if (kView) {
+            store(pixels->depth[b], zero());
+            store(pixels->opacity[b], zero());
+        }
     }
     return start_transmittance(camera, tile_x, tile_y, pixels->transmittance);
+}
+
+// The pixels of a block while splats are blended into it.
+struct BlockPixels {
+    Lanes t, red, green, blue, depth, opacity;
+};
+
+template <bool kView>
+RF_INLINE void add_splat(const Splat& s, Lanes weight, BlockPixels* p) {
+    p->red = fma(weight, splat(s.red), p->red);
+    p->green = fma(weight, splat(s.green), p->green);
+    p->blue = fma(weight, splat(s.blue), p->blue);
+    if (kView) {
+        p->depth = fma(weight, splat(s.depth), p->depth);
+        p->opacity = p->opacity + weight;
+    }
+}
+
+// Blend kSplats of `chunk` from `k` on; return whether a pixel still lets light through.
+template <bool kView, bool kCount, int kSplats>
+RF_INLINE bool blend_splats(const TileChunk& chunk, int k, Lanes x, int block_row, BlockPixels* p,
+                            BlendCounts* counts) {
+    const Lanes min_power = splat(kMinPower), max_alpha = splat(kMaxAlpha);
+    const Lanes min_t = splat(kMinTransmittance);
+    Lanes alpha[kSplats];
+    for (int i = 0; i < kSplats; ++i) {
+        const Lanes power = power_at(chunk.at(k + i), x, block_row);
+        alpha[i] = keep_min(ge(power, min_power), alpha_from_log2(power), max_alpha);
+    }
+    Mask lit;
+    for (int i = 0; i < kSplats; ++i) {
+        const Lanes after = fnma(p->t, alpha[i], p->t);
+        lit = gt(after, min_t);
+        const Lanes weight = keep_mul(lit, alpha[i], p->t);
+        add_splat<kView>(chunk.at(k + i).splat, weight, p);
+        if (kCount) {
+            counts->evaluated += kLanes;
+            counts->useful += __builtin_popcount(bits(gt(weight, zero())));
+        }
+        p->t = after;
+    }
+    p->t = keep(lit, p->t);  // before it becomes subnormal, which is slow
+    return any(lit);
 }
 
 // Blend the listed splats of `chunk` into block `b`; return true once no pixel lets light through.
@@ -40,48 +88,32 @@ template <bool kView, bool kCount>
 RF_INLINE bool blend_block(const TileChunk& chunk, int b, int listed, TilePixels* pixels,
                            BlendCounts* counts) {
     const Lanes x = load(kLaneX) + splat(static_cast<float>((b & 3) * kBlockSide));
-    const Lanes min_power = splat(kMinPower), max_alpha = splat(kMaxAlpha);
-    const Lanes min_t = splat(kMinTransmittance);
-    Lanes t = load(pixels->transmittance[b]);
-    Lanes red = load(pixels->red[b]), green = load(pixels->green[b]), blue = load(pixels->blue[b]);
-    Lanes depth = load(pixels->depth[b]), opacity = load(pixels->opacity[b]);
-    for (int k = 0; k < listed; k += kUnroll) {
-        Lanes alpha[kUnroll];
-        for (int i = 0; i < kUnroll; ++i) {
-            const Lanes p = power_at(chunk.at(k + i), x, b >> 2);
-            alpha[i] = keep_min(ge(p, min_power), alpha_from_log2(p), max_alpha);
-        }
-        Mask lit;
-        for (int i = 0; i < kUnroll; ++i) {
-            const Splat& s = chunk.at(k + i).splat;
-            const Lanes after = fnma(t, alpha[i], t);
-            lit = gt(after, min_t);
-            const Lanes weight = keep_mul(lit, alpha[i], t);
-            red = fma(weight, splat(s.red), red);
-            green = fma(weight, splat(s.green), green);
-            blue = fma(weight, splat(s.blue), blue);
-            if (kView) {
-                depth = fma(weight, splat(s.depth), depth);
-                opacity = opacity + weight;
-            }
-            if (kCount) {
-                counts->evaluated += kLanes;
-                counts->useful += __builtin_popcount(bits(gt(weight, zero())));
-            }
-            t = after;
-        }
-        t = keep(lit, t);  // before it becomes subnormal, which is slow
-        if (!any(lit)) break;
-    }
-    store(pixels->transmittance[b], t);
-    store(pixels->red[b], red);
-    store(pixels->green[b], green);
-    store(pixels->blue[b], blue);
+    BlockPixels p;
+    p.t = load(pixels->transmittance[b]);
+    p.red = load(pixels->red[b]);
+    p.green = load(pixels->green[b]);
+    p.blue = load(pixels->blue[b]);
     if (kView) {
-        store(pixels->depth[b], depth);
-        store(pixels->opacity[b], opacity);
+        p.depth = load(pixels->depth[b]);
+        p.opacity = load(pixels->opacity[b]);
     }
-    return !any(gt(t, min_t));
+    int k = 0;
+    bool lit = true;
+    for (; lit && k + kUnroll <= listed; k += kUnroll) {
+        lit = blend_splats<kView, kCount, kUnroll>(chunk, k, x, b >> 2, &p, counts);
+    }
+    for (; lit && k < listed; k += kTailUnroll) {
+        lit = blend_splats<kView, kCount, kTailUnroll>(chunk, k, x, b >> 2, &p, counts);
+    }
+    store(pixels->transmittance[b], p.t);
+    store(pixels->red[b], p.red);
+    store(pixels->green[b], p.green);
+    store(pixels->blue[b], p.blue);
+    if (kView) {
+        store(pixels->depth[b], p.depth);
+        store(pixels->opacity[b], p.opacity);
+    }
+    return !lit;
 }
 
 // Four rows of the tile as rows of 16 pixels.
@@ -161,27 +193,28 @@ RF_INLINE void prefetch_output(const BlendJob& job, int tile_x, int tile_y) {
 
 template <bool kView, bool kCount>
 static void blend(const BlendJob& job, int tile) {
-    const int tile_x = tile % job.camera->tiles_x(), tile_y = tile / job.camera->tiles_x();
-    const float left = static_cast<float>(tile_x * kTileSide);
-    const float top = static_cast<float>(tile_y * kTileSide);
+    const TilePlace place(*job.camera, tile);
+    if (!place.is_inside(*job.camera)) return;
+    const float left = place.left(), top = place.top();
     constexpr uint32_t kAllDone = (1u << kBlocksPerTile) - 1;
     alignas(64) TileChunk chunk;
     TilePixels pixels;
-    uint32_t done = start_tile(*job.camera, tile_x, tile_y, &pixels);
-    prefetch_output<kView>(job, tile_x, tile_y);
-    const uint32_t end = job.tile_offsets[tile + 1];
-    for (uint32_t e = job.tile_offsets[tile]; e < end && done != kAllDone; e += kChunk) {
-        const int count = end - e < kChunk ? static_cast<int>(end - e) : kChunk;
-        gather(job.splats, job.entries + e, count, left, top, &chunk);
+    TileList list(job.lists, place);
+    uint32_t done = start_tile<kView>(*job.camera, place.column, place.row, &pixels);
+    prefetch_output<kView>(job, place.column, place.row);
+    while (done != kAllDone) {
+        const int count = list.find_chunk();
+        if (count == 0) break;
+        gather(job.splats, list, count, left, top, &chunk);
         find_touching(count, left, top, &chunk);
         if (kCount) job.counts->tile_entries += count;
         for (int b = 0; b < kBlocksPerTile; ++b) {
             if (done >> b & 1) continue;
-            const int listed = list_block(&chunk, b, count, kUnroll);
+            const int listed = list_block(&chunk, b, count, kTailUnroll);
             if (blend_block<kView, kCount>(chunk, b, listed, &pixels, job.counts)) done |= 1u << b;
         }
     }
-    write_tile<kView>(job, tile_x, tile_y, pixels);
+    write_tile<kView>(job, place.column, place.row, pixels);
 }
 
 }  // namespace

@@ -1,6 +1,7 @@
 #include "raster/depth_sort.h"
 
 #include <algorithm>
+#include <cstring>
 
 namespace rfcore::raster {
 namespace {
@@ -31,12 +32,13 @@ void counts_to_starts(std::vector<uint32_t>& counts, int parts, uint32_t digits)
 
 }  // namespace
 
-void DepthSort::sort(ThreadPool& pool, AlignedBuffer<SortItem>& items, int count) {
+void DepthSort::sort(ThreadPool& pool, AlignedBuffer<SortItem>& items, const Projected& all) {
+    const int count = all.count;
     if (count < 2) return;
-    const auto [least, most] = std::minmax_element(
-        items.data(), items.data() + count,
-        [](const SortItem& a, const SortItem& b) { return a.depth_bits < b.depth_bits; });
-    const uint32_t lowest = least->depth_bits, range = most->depth_bits - lowest;
+    uint32_t lowest, highest;
+    std::memcpy(&lowest, &all.nearest, sizeof lowest);
+    std::memcpy(&highest, &all.farthest, sizeof highest);
+    const uint32_t range = highest - lowest;
     const int bits = range == 0 ? 1 : 32 - __builtin_clz(range);
     const int digit_bits = std::max(kMinDigitBits, (bits + kPasses - 1) / kPasses);
     const uint32_t digits = 1u << digit_bits;

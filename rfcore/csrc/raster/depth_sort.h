@@ -11,8 +11,8 @@ namespace rfcore::raster {
 
 class DepthSort {
   public:
-    // Sort items[0..count); positive floats order as their bits do.
-    void sort(ThreadPool& pool, AlignedBuffer<SortItem>& items, int count);
+    // Sort the items `all` describes; positive floats order as their bits do.
+    void sort(ThreadPool& pool, AlignedBuffer<SortItem>& items, const Projected& all);
 
   private:
     AlignedBuffer<SortItem> other_;

@@ -9,16 +9,16 @@ struct Kernels {
     const char* isa;
     // Fill `geometry` of blocks begin..end from their parameters.
     void (*prepare)(const float* parameters, int planes, float* geometry, int begin, int end);
-    // Project blocks begin..end, append the visible ones to `out`, return how many.
-    // [training][antialiased][degree]
-    int (*project[2][2][kMaxDegree + 1])(const ProjectJob&, int begin, int end, SortItem* out);
-    // Append the spans of `count` items to `out` and note where counts change; return words used.
-    // `out` must have room for count * (1 + tile rows) words.
-    size_t (*find_spans)(const SpanJob&, const SortItem* items, int count, uint32_t* out);
+    // Project blocks begin..end. [training][antialiased][degree]
+    Projected (*project[2][2][kMaxDegree + 1])(const ProjectJob&, int begin, int end);
+    // Append the entries of one splat, of any size, to `out`; return how many. There must be room
+    // for every group of the picture.
+    int (*place_large)(const Camera&, const Splat* splats, uint32_t id, GroupEntry* out);
+    // Tiles are numbered group by group, those of a group row by row.
     void (*blend_colour)(const BlendJob&, int tile);
     void (*blend_view)(const BlendJob&, int tile);
     void (*blend_counting)(const BlendJob&, int tile);
-    void (*blend_backward)(const BlendBackwardJob&, int tile);
+    void (*blend_backward)(const BlendBackwardJob&, int group);
     // [antialiased][degree]; blocks begin..end
     void (*project_backward[2][kMaxDegree + 1])(const ProjectBackwardJob&, int begin, int end);
     // Rows begin..end of a channel; `scratch` holds kLossRows * loss_stride(width) zeros before

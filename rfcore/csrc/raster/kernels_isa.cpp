@@ -6,7 +6,6 @@
 #include "raster/loss.h"
 #include "raster/project.h"
 #include "raster/project_backward.h"
-#include "raster/spans.h"
 
 namespace rfcore::raster {
 
@@ -20,7 +19,7 @@ const Kernels RF_KERNELS = {
     prepare,
     {{RF_PER_DEGREE(project, false, false), RF_PER_DEGREE(project, false, true)},
      {RF_PER_DEGREE(project, true, false), RF_PER_DEGREE(project, true, true)}},
-    find_spans,
+    place_large,
     blend<false, false>,
     blend<true, false>,
     blend<true, true>,

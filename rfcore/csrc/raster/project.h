@@ -5,6 +5,7 @@
 // needle has no correct digit in float32.
 #pragma once
 
+#include "raster/footprint.h"
 #include "raster/math.h"
 #include "raster/types.h"
 
@@ -211,60 +212,34 @@ RF_INLINE void sh_colour(const float* harmonics, const Lanes* basis, Lanes* colo
 }
 
 struct Box {
-    Lanes x0, x1, y0, y1;  // first and last pixel of a splat, clipped to the picture, px
+    Lanes x0, x1, y0, y1;  // first and last pixel of a splat, whole numbers within the picture
 };
+
+RF_INLINE Lanes round_down(Lanes a) { return a - above_floor(a); }
+RF_INLINE Lanes round_up(Lanes a) { return a + above_floor(negate(a)); }
 
 // Which lanes can colour a pixel; every comparison is false for a value that is not a number.
 RF_INLINE Mask find_visible(const Camera& camera, const Projection& p, Lanes headroom, Lanes half_x,
                             Lanes half_y, Box* box) {
     const Lanes half = splat(0.5f);
-    box->x0 = p.centre_x - half_x - half;
-    box->x1 = p.centre_x + half_x - half;
-    box->y0 = p.centre_y - half_y - half;
-    box->y1 = p.centre_y + half_y - half;
+    const Lanes x0 = p.centre_x - half_x - half, x1 = p.centre_x + half_x - half;
+    const Lanes y0 = p.centre_y - half_y - half, y1 = p.centre_y + half_y - half;
     const Lanes last_x = splat(static_cast<float>(camera.width - 1));
     const Lanes last_y = splat(static_cast<float>(camera.height - 1));
+    box->x0 = round_up(max(x0, zero()));
+    box->y0 = round_up(max(y0, zero()));
+    box->x1 = round_down(min(x1, last_x));
+    box->y1 = round_down(min(y1, last_y));
     Mask m = both(gt(p.in_camera.z, splat(kNear)), ge(splat(kFar), p.in_camera.z));
     m = both(m, gt(headroom, zero()));
     m = both(m, both(ge(splat(kMaxVariance), p.c_xx), ge(splat(kMaxVariance), p.c_yy)));
-    m = both(m, both(ge(box->x1, zero()), ge(last_x, box->x0)));
-    m = both(m, both(ge(box->y1, zero()), ge(last_y, box->y0)));
-    box->x0 = max(box->x0, zero());
-    box->y0 = max(box->y0, zero());
-    box->x1 = min(box->x1, last_x);
-    box->y1 = min(box->y1, last_y);
-    return m;
+    m = both(m, both(ge(x1, zero()), ge(last_x, x0)));
+    m = both(m, both(ge(y1, zero()), ge(last_y, y0)));
+    return both(m, both(ge(box->x1, box->x0), ge(box->y1, box->y0)));
 }
 
-// Append the visible lanes whose box holds a pixel centre; return how many.
-RF_INLINE int append_visible(uint32_t visible, int first_id, Lanes depth, const Box& box,
-                             SortItem* out) {
-    alignas(64) float z[16], x0[16], x1[16], y0[16], y1[16];
-    store(z, depth);
-    // ceil(x) = x + above_floor(-x); the largest integers here are below 2^14.
-    store(x0, box.x0 + above_floor(negate(box.x0)));
-    store(y0, box.y0 + above_floor(negate(box.y0)));
-    store(x1, box.x1);
-    store(y1, box.y1);
-    int count = 0;
-    for (; visible != 0; visible &= visible - 1) {
-        const int i = __builtin_ctz(visible);
-        const int px0 = static_cast<int>(x0[i]), px1 = static_cast<int>(x1[i]);
-        const int py0 = static_cast<int>(y0[i]), py1 = static_cast<int>(y1[i]);
-        SortItem* item = out + count;
-        memcpy(&item->depth_bits, &z[i], sizeof item->depth_bits);
-        item->id = static_cast<uint32_t>(first_id + i);
-        item->tile_x0 = static_cast<uint16_t>(px0 / kTileSide);
-        item->tile_x1 = static_cast<uint16_t>(px1 / kTileSide);
-        item->tile_y0 = static_cast<uint16_t>(py0 / kTileSide);
-        item->tile_y1 = static_cast<uint16_t>(py1 / kTileSide);
-        count += (px0 <= px1) & (py0 <= py1);
-    }
-    return count;
-}
-
-RF_INLINE void store_splats(const Projection& p, Lanes log2_alpha, Lanes headroom, Lanes half_x,
-                            Lanes half_y, const Lanes* colour, Splat* out) {
+RF_INLINE void make_splats(const Projection& p, Lanes log2_alpha, Lanes headroom, Lanes half_x,
+                           Lanes half_y, const Lanes* colour, Lanes* splats) {
     const Lanes a = splat(kHalfLog2ERoot) * sqrt(p.c_yy / p.det);
     const Lanes b_over_a = negate(p.c_xy / p.c_yy);
     const Lanes b = a * b_over_a;
@@ -285,9 +260,73 @@ RF_INLINE void store_splats(const Projection& p, Lanes log2_alpha, Lanes headroo
     store(rows + 208, negate(a * b) / fma(b, b, c * c));
     store(rows + 224, negate(b_over_a));
     store(rows + 240, zero());
-    Lanes columns[16];
-    transpose(rows, columns);
-    for (int i = 0; i < kLanes; ++i) store(reinterpret_cast<float*>(out + i), columns[i]);
+    transpose(rows, splats);
+}
+
+// Where 16 boxes lie among the groups of tiles; whole numbers.
+struct BoxTiles {
+    alignas(64) float column[16], row[16];       // of the upper left group
+    alignas(64) float columns[16];               // of tiles, a bit each
+    alignas(64) float first_row[16], rows[16];   // of tiles, the first relative to the group
+    uint32_t is_large;                           // it does not fit in 2x2 groups
+    uint32_t is_exact;                           // at most 2x2 tiles, or one row or column
+};
+
+RF_INLINE void find_tiles(const Box& box, BoxTiles* t) {
+    const Lanes one = splat(1.0f), four = splat(4.0f), per_tile = splat(1.0f / kTileSide);
+    const Lanes x0 = round_down(box.x0 * per_tile), x1 = round_down(box.x1 * per_tile);
+    const Lanes y0 = round_down(box.y0 * per_tile), y1 = round_down(box.y1 * per_tile);
+    const Lanes column = round_down(x0 * splat(0.25f)), row = round_down(y0 * splat(0.25f));
+    const Lanes left = fnma(four, column, x0), right = fnma(four, column, x1);
+    const Lanes top = fnma(four, row, y0), bottom = fnma(four, row, y1);
+    const Lanes across = x1 - x0, down = y1 - y0;
+    store(t->column, column);
+    store(t->row, row);
+    store(t->columns, times_exp2_floor(one, right + one) - times_exp2_floor(one, left));
+    store(t->first_row, top);
+    store(t->rows, down + one);
+    t->is_large = 0xffffu & ~bits(both(ge(splat(7.0f), right), ge(splat(7.0f), bottom)));
+    t->is_exact = bits(both(ge(one, across), ge(one, down))) | bits(ge(zero(), across)) |
+                  bits(ge(zero(), down));
+}
+
+RF_INLINE Footprint footprint_of(const Camera& camera, const BoxTiles& t, int lane,
+                                 const Splat& splat) {
+    const uint16_t column = static_cast<uint16_t>(static_cast<int>(t.column[lane]));
+    const uint16_t row = static_cast<uint16_t>(static_cast<int>(t.row[lane]));
+    if (t.is_large >> lane & 1) return {kLargeFootprint, row, 0, 0};
+    const int first = static_cast<int>(t.first_row[lane]), rows = static_cast<int>(t.rows[lane]);
+    uint64_t in_rows = ~uint64_t{0} >> (64 - 8 * rows) << (8 * first);
+    if (t.is_exact >> lane & 1) {
+        const uint64_t columns = static_cast<uint64_t>(static_cast<int>(t.columns[lane]));
+        in_rows &= columns * 0x0101010101010101u;
+    } else {
+        in_rows &= ellipse_tiles(camera, splat, column * kGroupSide, row * kGroupSide);
+    }
+    return {column, row, static_cast<uint32_t>(in_rows), static_cast<uint32_t>(in_rows >> 32)};
+}
+
+// Append the visible of 16 splats to the results of `job` at `first`; return how many.
+RF_INLINE int append_visible(const ProjectJob& job, uint32_t visible, uint32_t first,
+                             const Lanes* splats, Lanes depth, const Box& box) {
+    alignas(64) float z[16];
+    BoxTiles tiles;
+    store(z, depth);
+    find_tiles(box, &tiles);
+    uint32_t next = first;
+    for (int i = 0; i < kLanes; ++i) {  // an invisible one is overwritten
+        store(reinterpret_cast<float*>(job.splats + next), splats[i]);
+        next += visible >> i & 1;
+    }
+    next = first;
+    for (uint32_t left = visible; left != 0; left &= left - 1) {
+        const int i = __builtin_ctz(left);
+        memcpy(&job.items[next].depth_bits, &z[i], sizeof z[i]);
+        job.items[next].splat = next;
+        job.footprints[next] = footprint_of(*job.camera, tiles, i, job.splats[next]);
+        ++next;
+    }
+    return static_cast<int>(next - first);
 }
 
 // Fetch the first planes of a block. The hardware's own prefetching starts anew on every page, so
@@ -298,11 +337,13 @@ RF_INLINE void prefetch_planes(const float* block) {
 }
 
 template <int kDegree, bool kTraining, bool kAntialiased>
-static int project(const ProjectJob& job, int begin, int end, SortItem* out) {
+static Projected project(const ProjectJob& job, int begin, int end) {
     const Camera& camera = *job.camera;
     const int sh_planes = 3 * coefficients_of(job.stored_degree);
-    int count = 0;
+    uint32_t next = static_cast<uint32_t>(begin * kLanes);
+    Lanes nearest = splat(kFar), farthest = splat(kNear);
     for (int b = begin; b < end; ++b) {
+        if (kTraining) job.block_splats[b] = {next, 0};
         const float* block =
             kTraining ? job.parameters + static_cast<size_t>(b) * (kShPlane + sh_planes) * kLanes
                       : job.geometry + static_cast<size_t>(b) * kGeometryPlanes * kLanes;
@@ -327,22 +368,32 @@ static int project(const ProjectJob& job, int begin, int end, SortItem* out) {
         const Lanes reach = splat(kTwoLn2 * kCutoffScale) * max(headroom, zero());
         const Lanes half_x = sqrt(reach * p.c_xx), half_y = sqrt(reach * p.c_yy);
         Box box;
-        const uint32_t visible =
-            bits(find_visible(camera, p, headroom, half_x, half_y, &box));
+        const Mask is_visible = find_visible(camera, p, headroom, half_x, half_y, &box);
+        const uint32_t visible = bits(is_visible);
         if (visible == 0) continue;
+        nearest = min(nearest, select(is_visible, p.in_camera.z, nearest));
+        farthest = max(farthest, select(is_visible, p.in_camera.z, farthest));
         const float* harmonics =
             kTraining ? plane(block, kShPlane)
                       : job.harmonics + static_cast<size_t>(b) * sh_planes * kLanes;
         prefetch_planes<3 * coefficients_of(kDegree)>(  // of the next block: likely visible too
             harmonics + (kTraining ? kShPlane + sh_planes : sh_planes) * kLanes);
-        Lanes inverse_distance, basis[coefficients_of(kDegree)], colour[3];
+        Lanes inverse_distance, basis[coefficients_of(kDegree)], colour[3], splats[kLanes];
         const Vec3 d = direction_of(offset, &inverse_distance);
         sh_basis<kDegree>(d.x, d.y, d.z, basis);
         sh_colour<kDegree>(harmonics, basis, colour);
-        store_splats(p, log2_alpha, headroom, half_x, half_y, colour, job.splats + b * kLanes);
-        count += append_visible(visible, b * kLanes, p.in_camera.z, box, out + count);
+        make_splats(p, log2_alpha, headroom, half_x, half_y, colour, splats);
+        if (kTraining) job.block_splats[b].lanes = visible;
+        next += append_visible(job, visible, next, splats, p.in_camera.z, box);
     }
-    return count;
+    alignas(64) float least[16], most[16];
+    store(least, nearest);
+    store(most, farthest);
+    for (int i = 1; i < kLanes; ++i) {
+        least[0] = least[i] < least[0] ? least[i] : least[0];
+        most[0] = most[i] > most[0] ? most[i] : most[0];
+    }
+    return {static_cast<int>(next) - begin * kLanes, least[0], most[0]};
 }
 
 }  // namespace

@@ -18,15 +18,17 @@ struct SplatGradient {
 // Fetch what gather_entries will read soon: the entries of the block after next, whose positions
 // were fetched two blocks ago. Both are scattered over megabytes.
 RF_INLINE void prefetch_entries(const ProjectBackwardJob& job, int block, int end) {
-    if (block + 4 < end) {
-        for (int i = 0; i < kLanes; ++i) {
-            const EntryRange range = job.ranges[(block + 4) * kLanes + i];
-            if (range.begin != kNotVisible) __builtin_prefetch(&job.positions[range.begin]);
+    if (block + 4 < end) __builtin_prefetch(&job.ranges[job.block_splats[block + 4].first]);
+    if (block + 3 < end) {
+        const BlockSplats splats = job.block_splats[block + 3];
+        for (uint32_t i = 0; i < static_cast<uint32_t>(__builtin_popcount(splats.lanes)); ++i) {
+            __builtin_prefetch(&job.positions[job.ranges[splats.first + i].begin]);
         }
     }
     if (block + 2 < end) {
-        for (int i = 0; i < kLanes; ++i) {
-            const EntryRange range = job.ranges[(block + 2) * kLanes + i];
+        const BlockSplats splats = job.block_splats[block + 2];
+        for (uint32_t i = 0; i < static_cast<uint32_t>(__builtin_popcount(splats.lanes)); ++i) {
+            const EntryRange range = job.ranges[splats.first + i];
             for (uint32_t e = range.begin; e < range.end; ++e) {
                 __builtin_prefetch(&job.entry_gradients[job.positions[e]]);
             }
@@ -34,19 +36,19 @@ RF_INLINE void prefetch_entries(const ProjectBackwardJob& job, int block, int en
     }
 }
 
-// Add up entries in the order of the tiles; return the visible lanes.
-RF_INLINE uint32_t gather_entries(const ProjectBackwardJob& job, int block, SplatGradient* g) {
+// Add up entries in the order of the groups.
+RF_INLINE void gather_entries(const ProjectBackwardJob& job, const BlockSplats& splats,
+                              SplatGradient* g) {
     alignas(64) float rows[256];
-    uint32_t visible = 0;
+    const EntryRange* range = job.ranges + splats.first;
     for (int i = 0; i < kLanes; ++i) {
-        const EntryRange range = job.ranges[block * kLanes + i];
         Lanes sum = zero();
-        if (range.begin != kNotVisible) {
-            visible |= 1u << i;
-            for (uint32_t e = range.begin; e < range.end; ++e) {
+        if (splats.lanes >> i & 1) {
+            for (uint32_t e = range->begin; e < range->end; ++e) {
                 sum = sum + load(reinterpret_cast<const float*>(
                                 &job.entry_gradients[job.positions[e]]));
             }
+            ++range;
         }
         store(rows + 16 * i, sum);
     }
@@ -59,7 +61,6 @@ RF_INLINE uint32_t gather_entries(const ProjectBackwardJob& job, int block, Spla
     g->suv = field[4];
     g->svv = field[5];
     for (int c = 0; c < 3; ++c) g->colour[c] = field[6 + c];
-    return visible;
 }
 
 RF_INLINE Vec3 combine(Lanes p, Vec3 a, Lanes q, Vec3 b) {
@@ -305,9 +306,9 @@ static void project_backward(const ProjectBackwardJob& job, int begin, int end) 
     for (int b = begin; b < end; ++b) {
         SplatGradient g;
         prefetch_entries(job, b, end);
-        const uint32_t visible_bits = gather_entries(job, b, &g);
-        if (visible_bits == 0) continue;
-        const Mask visible = mask_from_bits(visible_bits);
+        if (job.block_splats[b].lanes == 0) continue;
+        gather_entries(job, job.block_splats[b], &g);
+        const Mask visible = mask_from_bits(job.block_splats[b].lanes);
         const size_t offset = static_cast<size_t>(b) * stride;
         alignas(64) float gradient[kPlanes * kLanes];
         const Lanes centre = block_gradient<kDegree, kAntialiased>(

@@ -66,16 +66,21 @@ Rasterizer::Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, 
 }
 
 void Rasterizer::run_front_end(const Camera& camera, int degree) {
-    const ProjectJob job{&camera, geometry_.data(), harmonics_.data(), nullptr,
-                         degree_, degree,           antialiased_,      nullptr};
+    ProjectJob job{};
+    job.camera = &camera;
+    job.geometry = geometry_.data();
+    job.harmonics = harmonics_.data();
+    job.stored_degree = degree_;
+    job.degree = degree;
+    job.antialiased = antialiased_;
     front_end_.run(kernels_, pool_, job, blocks_, false);
 }
 
 void Rasterizer::render(const Camera& camera, int degree, float* colour, float* depth,
                         float* opacity) {
     run_front_end(camera, degree);
-    const BlendJob job{&camera, front_end_.splats(),  front_end_.entries(),
-                       front_end_.tile_offsets(), colour, depth, opacity, nullptr};
+    const BlendJob job{&camera, front_end_.splats(), front_end_.lists(), colour,
+                       depth,   opacity,             nullptr};
     blend_tiles(pool_, depth == nullptr ? kernels_.blend_colour : kernels_.blend_view, job);
 }
 
@@ -87,20 +92,19 @@ Statistics Rasterizer::statistics(const Camera& camera) {
     BlendCounts counts{};
     const BlendJob job{&camera,
                        front_end_.splats(),
-                       front_end_.entries(),
-                       front_end_.tile_offsets(),
+                       front_end_.lists(),
                        picture.data(),
                        picture.data() + 3 * pixels,
                        picture.data() + 4 * pixels,
                        &counts};
-    const int tiles = camera.tiles_x() * camera.tiles_y();
+    const int tiles = camera.groups() * kTilesPerGroup;
     for (int tile = 0; tile < tiles; ++tile) kernels_.blend_counting(job, tile);
-    return {front_end_.visible(), front_end_.entry_count(), counts.tile_entries, counts.useful,
+    return {front_end_.visible(), front_end_.tile_entry_count(), counts.tile_entries, counts.useful,
             counts.evaluated};
 }
 
 void blend_tiles(ThreadPool& pool, void (*kernel)(const BlendJob&, int), const BlendJob& job) {
-    const int tiles = job.camera->tiles_x() * job.camera->tiles_y();
+    const int tiles = job.camera->groups() * kTilesPerGroup;
     pool.run(tiles, [&](int tile) { kernel(job, tile); }, kTilesPerBatch);
 }
 

@@ -46,6 +46,30 @@ RF_INLINE double sum_in_order(Lanes a) {
 }
 
 #if !defined(RF_ISA_AVX512)
+// Append to `out` first + lane for every lane < count whose set holds `bit`; may write 16 entries;
+// return how many. 16 sets must be readable.
+RF_INLINE int append_matching(uint32_t* out, const uint32_t* sets, uint32_t bit, uint32_t first,
+                              uint32_t count) {
+    int found = 0;
+    for (uint32_t lane = 0; lane < (count < 16 ? count : 16); ++lane) {
+        out[found] = first + lane;
+        found += (sets[lane] & bit) != 0;
+    }
+    return found;
+}
+// Byte i of the result: bits pixel[i] / 16 to pixel[8 + i] / 16, both in -1..127; none of them
+// where the second is less.
+RF_INLINE uint64_t tiles_of_rows(Lanes pixel) {
+    alignas(64) float p[16];
+    store(p, pixel);
+    uint64_t tiles = 0;
+    for (int i = 0; i < 8; ++i) {
+        const int first = static_cast<int>(p[i]) / 16, last = static_cast<int>(p[8 + i]) / 16;
+        const uint64_t columns = (uint64_t{2} << last) - (uint64_t{1} << first);
+        tiles |= (p[8 + i] < p[i] ? 0 : columns) << (8 * i);
+    }
+    return tiles;
+}
 // rows[s] lane 4 j + c = blocks[j] lane 4 c + s: four 4x4 blocks side by side, columns first, as
 // four rows of 16. It turns the three indices round, so twice more brings the blocks back.
 RF_INLINE void rows_from_blocks(const Lanes* blocks, Lanes* rows) {

@@ -75,6 +75,32 @@ RF_INLINE int append_offsets(uint16_t* out, uint32_t mask, int base, int step) {
     return __builtin_popcount(mask);
 }
 
+// Append to `out` first + lane for every lane < count whose set holds `bit`; may write 16 entries;
+// return how many. 16 sets must be readable.
+RF_INLINE int append_matching(uint32_t* out, const uint32_t* sets, uint32_t bit, uint32_t first,
+                              uint32_t count) {
+    const __m512i lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    const __mmask16 listed = static_cast<__mmask16>(count < 16 ? (1u << count) - 1 : 0xffffu);
+    const __m512i bits = _mm512_set1_epi32(static_cast<int>(bit));
+    const __mmask16 found = _mm512_mask_test_epi32_mask(listed, _mm512_loadu_si512(sets), bits);
+    const __m512i number = _mm512_add_epi32(_mm512_set1_epi32(static_cast<int>(first)), lane);
+    _mm512_storeu_si512(out, _mm512_maskz_compress_epi32(found, number));
+    return __builtin_popcount(found);
+}
+// Byte i of the result: bits pixel[i] / 16 to pixel[8 + i] / 16, both in -1..127; none of them
+// where the second is less.
+RF_INLINE uint64_t tiles_of_rows(Lanes pixel) {
+    const __m512i column = _mm512_srai_epi32(_mm512_cvttps_epi32(pixel.v), 4);
+    const __m256i first = _mm512_castsi512_si256(column);
+    const __m256i last = _mm512_extracti32x8_epi32(column, 1);
+    const __mmask8 some = _mm256_cmp_ps_mask(_mm512_extractf32x8_ps(pixel.v, 1),
+                                             _mm512_castps512_ps256(pixel.v), _CMP_GE_OQ);
+    const __m256i columns =
+        _mm256_maskz_sub_epi32(some, _mm256_sllv_epi32(_mm256_set1_epi32(2), last),
+                               _mm256_sllv_epi32(_mm256_set1_epi32(1), first));
+    return static_cast<uint64_t>(_mm_cvtsi128_si64(_mm256_cvtepi32_epi8(columns)));
+}
+
 // rows[s] lane 4 j + c = blocks[j] lane 4 c + s (see simd.h).
 RF_INLINE void rows_from_blocks(const Lanes* blocks, Lanes* rows) {
     const __m512i turned = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);

@@ -41,6 +41,53 @@ struct TileChunk {
     }
 };
 
+// Position of a tile in the picture; tiles are numbered group by group.
+struct TilePlace {
+    int group, column, row;  // column and row in tiles, of the picture
+    uint32_t bit;            // of the tile in its group
+
+    TilePlace(const Camera& camera, int tile) : group(tile / kTilesPerGroup) {
+        const int inside = tile % kTilesPerGroup, per_side = kTilesPerGroupSide;
+        column = group % camera.groups_x() * per_side + inside % per_side;
+        row = group / camera.groups_x() * per_side + inside / per_side;
+        bit = tile_bit(inside % per_side, inside / per_side);
+    }
+    bool is_inside(const Camera& camera) const {
+        return column * kTileSide < camera.width && row * kTileSide < camera.height;
+    }
+    float left() const { return static_cast<float>(column * kTileSide); }
+    float top() const { return static_cast<float>(row * kTileSide); }
+};
+
+// The entries of a group that touch one tile, front to back, a chunk at a time.
+struct TileList {
+    const GroupLists& lists;
+    uint32_t bit, next, end;
+    int found = 0;                           // how many of `positions` are filled
+    int taken = 0;                           // and belong to chunks before
+    uint32_t positions[kChunk + 2 * kLanes];  // in the lists
+
+    TileList(const GroupLists& all, const TilePlace& tile)
+        : lists(all), bit(tile.bit), next(all.offsets[tile.group]),
+          end(all.offsets[tile.group + 1]) {}
+
+    // Find up to kChunk more; return how many.
+    int find_chunk() {
+        const uint32_t* const tiles = lists.tiles;
+        const uint32_t wanted = bit, last = end;
+        int count = found - taken;
+        for (int i = 0; i < count; ++i) positions[i] = positions[taken + i];
+        uint32_t at = next;
+        for (; count < kChunk && at < last; at += kLanes) {
+            count += append_matching(positions + count, tiles + at, wanted, at, last - at);
+        }
+        next = at < last ? at : last;
+        found = count;
+        taken = count < kChunk ? count : kChunk;
+        return taken;
+    }
+};
+
 // T = 1 inside the picture and 0 outside; return the blocks wholly outside as a bit set.
 RF_INLINE uint32_t start_transmittance(const Camera& camera, int tile_x, int tile_y,
                                        float (*transmittance)[16]) {
@@ -69,10 +116,13 @@ RF_INLINE void make_transparent(TileEntry* e) {
 }
 
 // Gather `count` splats; what lies behind them up to the next 16 can touch nothing.
-RF_INLINE void gather(const Splat* splats, const uint32_t* ids, int count, float left, float top,
+RF_INLINE void gather(const Splat* splats, const TileList& list, int count, float left, float top,
                       TileChunk* chunk) {
-    constexpr int kAhead = 24;  // the list of ids is readable that far behind its end
+    constexpr int kAhead = 24;
     const Lanes row_centre = load(kRowCentre) + splat(top);
+    uint32_t ids[kChunk + kAhead];
+    for (int i = 0; i < count; ++i) ids[i] = list.lists.splats[list.positions[i]];
+    for (int i = 0; i < kAhead; ++i) ids[count + i] = ids[count - 1];
     for (int i = 0; i < count; ++i) {
         __builtin_prefetch(&splats[ids[i + kAhead]]);
         const Splat& s = splats[ids[i]];

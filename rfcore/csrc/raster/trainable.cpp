@@ -8,7 +8,6 @@
 namespace rfcore::raster {
 namespace {
 
-constexpr int kTilesPerBatch = 4;
 constexpr int kBlocksPerTask = 64;
 constexpr int kMinRowsPerStrip = 64;  // a strip computes 20 rows twice
 
@@ -51,11 +50,15 @@ void TrainableRasterizer::forward(const Camera& camera, int degree, float* colou
                                   float* opacity) {
     camera_ = camera;
     active_degree_ = degree;
-    const ProjectJob job{&camera_, nullptr, nullptr,      parameters_.data(),
-                         degree_,  degree,  antialiased_, nullptr};
+    ProjectJob job{};
+    job.camera = &camera_;
+    job.parameters = parameters_.data();
+    job.stored_degree = degree_;
+    job.degree = degree;
+    job.antialiased = antialiased_;
     front_end_.run(kernels_, pool_, job, blocks_, true);
-    const BlendJob blend{&camera_, front_end_.splats(),  front_end_.entries(),
-                         front_end_.tile_offsets(), colour, depth, opacity, nullptr};
+    const BlendJob blend{&camera_, front_end_.splats(), front_end_.lists(), colour,
+                         depth,    opacity,             nullptr};
     blend_tiles(pool_, depth == nullptr ? kernels_.blend_colour : kernels_.blend_view, blend);
 }
 
@@ -115,20 +118,18 @@ void TrainableRasterizer::backward(const float* colour) {
     entry_gradients_.reserve(front_end_.entry_count() + 1);
     const BlendBackwardJob job{&camera_,
                                front_end_.splats(),
-                               front_end_.entries(),
-                               front_end_.tile_offsets(),
+                               front_end_.lists(),
                                colour,
                                d_colour_.data(),
                                entry_gradients_.data()};
-    pool_.run(
-        camera_.tiles_x() * camera_.tiles_y(),
-        [&](int tile) { kernels_.blend_backward(job, tile); }, kTilesPerBatch);
+    pool_.run(camera_.groups(), [&](int group) { kernels_.blend_backward(job, group); });
 }
 
 void TrainableRasterizer::project_backward(float* gradients, const AdamStep* adam, float* scores) {
     const ProjectBackwardJob job{&camera_,
                                  parameters_.data(),
                                  degree_,
+                                 front_end_.block_splats(),
                                  front_end_.ranges(),
                                  front_end_.positions(),
                                  entry_gradients_.data(),

@@ -14,6 +14,9 @@ constexpr int kLanes = 16;
 constexpr int kTileSide = 16;
 constexpr int kBlockSide = 4;
 constexpr int kBlocksPerTile = 16;
+constexpr int kTilesPerGroupSide = 4;
+constexpr int kTilesPerGroup = 16;
+constexpr int kGroupSide = kTilesPerGroupSide * kTileSide;
 constexpr int kMaxDegree = 3;
 
 constexpr int coefficients_of(int degree) { return (degree + 1) * (degree + 1); }
@@ -36,8 +39,9 @@ struct Camera {
     float fx, fy, cx, cy;     // px
     int width, height;        // px
 
-    int tiles_x() const { return (width + kTileSide - 1) / kTileSide; }
-    int tiles_y() const { return (height + kTileSide - 1) / kTileSide; }
+    int groups_x() const { return (width + kGroupSide - 1) / kGroupSide; }
+    int groups_y() const { return (height + kGroupSide - 1) / kGroupSide; }
+    int groups() const { return groups_x() * groups_y(); }
 };
 
 // One projected Gaussian. With d = pixel - centre, u = a dx + b dy and v = c dy, its alpha is
@@ -56,11 +60,38 @@ struct alignas(64) Splat {
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 
-// A visible splat on its way through the depth sort, with the tiles its box covers (inclusive).
+// A visible splat on its way through the depth sort.
 struct SortItem {
     uint32_t depth_bits;
-    uint32_t id;
-    uint16_t tile_x0, tile_x1, tile_y0, tile_y1;
+    uint32_t splat;
+};
+
+// Tiles are binned in groups of 4x4. A set of tiles of a group is 4 bytes, one per row of tiles,
+// whose low 4 bits are the columns.
+constexpr uint32_t kLeftTiles = 0x0f0f0f0fu;
+constexpr uint32_t tile_bit(int column, int row) { return 1u << (8 * row + column); }
+
+// The tiles of a splat that fits in 2x2 groups of tiles: a byte per row, a bit per column.
+struct alignas(16) Footprint {
+    uint16_t column, row;  // of the upper left group; column kLargeFootprint where it does not fit
+    uint32_t upper, lower;  // rows of tiles 0..3 and 4..7
+};
+constexpr uint16_t kLargeFootprint = 0xffff;
+
+// A splat in one group of tiles.
+struct GroupEntry {
+    uint32_t group, splat, tiles;
+};
+
+// Visible splats of one block: neighbours in the order of their lanes.
+struct BlockSplats {
+    uint32_t first;
+    uint32_t lanes;  // as a bit set
+};
+
+struct Projected {
+    int count;
+    float nearest, farthest;  // of the visible splats, m; anything when there are none
 };
 
 struct ProjectJob {
@@ -71,21 +102,18 @@ struct ProjectJob {
     int stored_degree;        // K = coefficients_of(stored_degree)
     int degree;               // of the bands to use, at most stored_degree
     bool antialiased;         // opacities make up for the dilation
-    Splat* splats;            // [16 blocks]
+    // Results: the visible of blocks begin..end lie one after the other from 16 begin on.
+    Splat* splats;              // [16 blocks]
+    Footprint* footprints;      // [16 blocks]
+    SortItem* items;            // [16 blocks]
+    BlockSplats* block_splats;  // [blocks], null when not wanted
 };
 
-// Tiles of one splat, row by row, as a stream of words: the number of spans, then the spans.
-constexpr uint32_t pack_span(uint32_t row, uint32_t first, uint32_t last) {
-    return row << 20 | first << 10 | last;
-}
-constexpr uint32_t span_row(uint32_t span) { return span >> 20; }
-constexpr uint32_t span_first(uint32_t span) { return span >> 10 & 1023; }
-constexpr uint32_t span_last(uint32_t span) { return span & 1023; }
-
-struct SpanJob {
-    const Camera* camera;
-    const Splat* splats;
-    uint32_t* tile_steps;  // [tile rows][tile columns + 1]: where counts rise and fall, modulo 2^32
+// The depth-ordered splats of every group of tiles.
+struct GroupLists {
+    const uint32_t* splats;
+    const uint32_t* tiles;    // which tiles of the group each of them touches; readable 16 behind
+    const uint32_t* offsets;  // [groups + 1]
 };
 
 struct BlendCounts {
@@ -97,15 +125,14 @@ struct BlendCounts {
 struct BlendJob {
     const Camera* camera;
     const Splat* splats;
-    const uint32_t* entries;       // splat ids, tile by tile, front to back
-    const uint32_t* tile_offsets;  // [tiles + 1]
-    float* colour;                 // [H, W, 3]
-    float* depth;                  // [H, W], null when not wanted
-    float* opacity;                // [H, W], null when not wanted
-    BlendCounts* counts;           // null when not wanted
+    GroupLists lists;
+    float* colour;        // [H, W, 3]
+    float* depth;         // [H, W], null when not wanted
+    float* opacity;       // [H, W], null when not wanted
+    BlendCounts* counts;  // null when not wanted
 };
 
-// Gradients of one (tile, splat) entry, or their sum over the entries of a splat. s is dL/d(ln
+// Gradients of one (group, splat) entry, or their sum over the entries of a splat. s is dL/d(ln
 // alpha) of a pixel, (u, v) its place in the splat as in Splat: never beyond 4 where it counts,
 // while pixels along a needle are hundreds from its centre and their squares would cancel.
 struct alignas(64) EntryGradient {
@@ -118,18 +145,16 @@ static_assert(sizeof(EntryGradient) == 64, "one cache line");
 struct BlendBackwardJob {
     const Camera* camera;
     const Splat* splats;
-    const uint32_t* entries;
-    const uint32_t* tile_offsets;
-    const float* colour;            // [H, W, 3], as blended
-    const float* d_colour;          // [3, H, W]
+    GroupLists lists;
+    const float* colour;             // [H, W, 3], as blended
+    const float* d_colour;           // [3, H, W]
     EntryGradient* entry_gradients;  // [entries], all of them written
 };
 
-// Where the entries of one Gaussian are in the list of positions; empty when it is not visible.
+// Where the entries of one splat are in the list of positions.
 struct EntryRange {
     uint32_t begin, end;
 };
-constexpr uint32_t kNotVisible = 0xffffffffu;
 
 // Adam (Kingma and Ba 2015): one rate per plane, bias corrections 1 / (1 - beta^t) included.
 struct AdamStep {
@@ -151,8 +176,9 @@ struct ProjectBackwardJob {
     const Camera* camera;
     float* parameters;  // [blocks][planes][16]
     int stored_degree;
-    const EntryRange* ranges;   // [16 blocks]
-    const uint32_t* positions;  // into entry_gradients
+    const BlockSplats* block_splats;  // [blocks]
+    const EntryRange* ranges;         // of the splats
+    const uint32_t* positions;        // into entry_gradients
     const EntryGradient* entry_gradients;
     float* gradients;      // as the parameters, or null
     const AdamStep* adam;  // or null
