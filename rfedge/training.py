@@ -1,19 +1,45 @@
-"""Train a field with a progress bar and measure it on pictures it never saw."""
+"""Train a field with progress on the console, and measure it on pictures it never saw."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from time import monotonic
 
+import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from rfcore.dataset import Dataset
-from rfcore.errors import DatasetError
-from rfcore.field import SplatField
-from rfcore.train import SplatTrainer, SplatTrainingConfig, held_out_quality
+from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.field import RadianceField, SplatField
+from rfcore.image import Rgb
+from rfcore.metrics import psnr
+from rfcore.train import (
+    FieldTrainer,
+    HeldOut,
+    SplatTrainer,
+    SplatTrainingConfig,
+    held_out_quality,
+)
+from rfcore.train.start import random_points
+from rfcore.views import PointCloud, PosedPicture
+from rfedge.training_loop import LoopLimits, LoopStatus, TrainingLoop
+from rfedge.training_memory import available_bytes, check_memory, splat_training_bytes
 
-__all__ = ["TrainingJob", "train_field", "training_config"]
+__all__ = [
+    "UNLIMITED_ITERATIONS",
+    "Trained",
+    "TrainingJob",
+    "train",
+    "train_field",
+    "training_config",
+]
+
+UNLIMITED_ITERATIONS = 1_000_000
+"""Of a run that ends by the clock."""
+STEPS = 1000
+"""Of the bar: progress is a share, of time or of iterations."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +51,21 @@ class TrainingJob:
     held_out: Dataset | None
     config: SplatTrainingConfig
     seed: int
+    limits: LoopLimits = field(default_factory=LoopLimits)
+    resume: bool = False
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A field as it came out of training, and what that took."""
+
+    field: RadianceField
+    quality: HeldOut | None
+    seconds: float
+    iterations: int
+    primitives: int
+    curve: tuple[tuple[float, float], ...]
+    """Seconds of training and held-out PSNR in dB."""
 
 
 def training_config(
@@ -40,37 +81,126 @@ def training_config(
 
 
 def train_field(job: TrainingJob, console: Console) -> SplatField:
-    """Train to the end, showing progress and time left; return the field with its held-out PSNR.
+    """Train splats as ``train`` does; return them alone."""
+    trained = train(job, console).field
+    if not isinstance(trained, SplatField):
+        raise InvalidInput("kind", f"{trained.metadata.kind} is not a field of splats")
+    return trained
 
-    Raises ``DatasetError`` when the dataset has no points to start from.
+
+def train(job: TrainingJob, console: Console) -> Trained:
+    """Train to the end, showing progress, held-out PSNR and time left.
+
+    Says what memory it takes before it starts. Raises ``InvalidInput`` when that is not there, and
+    ``TrainingDiverged`` when the run is lost; the last good checkpoint stays.
     """
-    if job.dataset.points is None:
-        raise DatasetError("the dataset names no points (ply_file_path) to start Gaussians from")
-    console.print(
-        f"[bold]Training[/] {job.config.gaussians:,} Gaussians at most on "
-        f"{len(job.dataset.pictures)} pictures, {job.config.iterations} iterations"
+    _announce(job, console)
+    trainer = _trainer(job)
+    measure = _psnr_meter(job.held_out.pictures) if job.held_out is not None else None
+    loop = TrainingLoop(trainer, job.limits, measure, monotonic)
+    if job.resume:
+        loop.resume()
+        console.print(f"  going on after iteration {trainer.iteration:,}, {loop.seconds:.0f} s")
+    _run_with_bar(loop, console)
+    seconds = loop.seconds
+    quality = _quality(trainer, job)
+    _announce_end(seconds, quality, console)
+    return Trained(
+        field=trainer.field(job.name, job.dataset.tile_origin, quality),
+        quality=quality,
+        seconds=seconds,
+        iterations=trainer.iteration,
+        primitives=trainer.primitives,
+        curve=tuple(loop.curve),
     )
-    trainer = SplatTrainer(job.dataset.pictures, job.dataset.points, job.config, seed=job.seed)
-    started_s = monotonic()
-    _run_with_bar(trainer, console)
-    training_s = monotonic() - started_s
-    field = trainer.field(job.name, job.dataset.tile_origin)
+
+
+def _trainer(job: TrainingJob) -> FieldTrainer:
+    return SplatTrainer(job.dataset.pictures, _start(job), job.config, seed=job.seed)
+
+
+def _start(job: TrainingJob) -> PointCloud:
+    """Return the dataset's points, or random ones in the volume its cameras see."""
+    if job.dataset.points is not None:
+        return job.dataset.points
+    rng = np.random.default_rng([job.seed, 2])
+    return random_points(job.dataset.pictures, job.config.gaussians, rng)
+
+
+def _announce(job: TrainingJob, console: Console) -> None:
+    config, pictures = job.config, job.dataset.pictures
+    sizes = [(k.width_px, k.height_px) for k in (p.camera.intrinsics for p in pictures)]
+    most = max(config.gaussians, config.density.limit)
+    needed = splat_training_bytes(most, config.bands.degree, sizes)
+    length = f"{config.iterations:,} iterations"
+    if job.limits.minutes is not None:
+        length = f"{job.limits.minutes:g} minutes"
+    points = "" if job.dataset.points is not None else ", from random points"
+    console.print(
+        f"[bold]Training[/] {most:,} Gaussians at most on {len(pictures)} pictures, {length}"
+        f"{points}; about {needed / 2**30:.1f} GiB of memory"
+    )
+    check_memory(needed, available_bytes())
+
+
+def _announce_end(seconds: float, quality: HeldOut | None, console: Console) -> None:
+    measured = ""
+    if quality is not None:
+        measured = f", held-out PSNR {quality.psnr_db:.2f} dB, SSIM {quality.ssim:.3f}"
+    console.print(f"  {seconds:.0f} s of training{measured}")
+
+
+def _quality(trainer: FieldTrainer, job: TrainingJob) -> HeldOut | None:
     if job.held_out is None:
-        console.print(f"  {training_s:.0f} s of training")
-        return field
-    quality = held_out_quality(field, job.held_out.pictures)
-    console.print(f"  {training_s:.0f} s of training, held-out PSNR {quality.psnr_db:.2f} dB")
-    return trainer.field(job.name, job.dataset.tile_origin, quality)
+        return None
+    return held_out_quality(trainer.field(), job.held_out.pictures)
 
 
-def _run_with_bar(trainer: SplatTrainer, console: Console) -> None:
+class _psnr_meter:  # noqa: N801 - a function that remembers the pictures it has read
+    """Measures the mean PSNR of fields on the same pictures, read once."""
+
+    def __init__(self, pictures: Sequence[PosedPicture]) -> None:
+        if not pictures:
+            raise InvalidInput("held_out", "holds no pictures to measure on")
+        self._pictures = pictures
+        self._pixels: list[Rgb] = []
+
+    def __call__(self, field: RadianceField) -> float:
+        """Return the mean over pictures of the RGB PSNR."""
+        if not self._pixels:
+            self._pixels = [picture.read() for picture in self._pictures]
+        pairs = zip(self._pictures, self._pixels, strict=True)
+        return float(np.mean([_psnr_db(field, picture, rgb) for picture, rgb in pairs]))
+
+
+def _psnr_db(field: RadianceField, picture: PosedPicture, rgb: Rgb) -> float:
+    colour = np.clip(field.render_colour(picture.camera).astype(np.float64), 0.0, 1.0)
+    return psnr(colour, rgb / 255.0, peak=1.0)
+
+
+def _run_with_bar(loop: TrainingLoop, console: Console) -> None:
     columns = (
         BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("loss {task.fields[loss]:.4f}"),
+        TextColumn("{task.fields[state]}"),
+        TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("train", total=trainer.config.iterations, loss=float("nan"))
-        for progress in trainer.steps():
-            bar.update(task, completed=progress.iteration, loss=progress.loss)
+        task = bar.add_task("train", total=STEPS, state="")
+
+        def tell(status: LoopStatus) -> None:
+            bar.update(task, completed=STEPS * status.progress, state=_state(status))
+
+        try:
+            loop.run(tell)
+        except RfedgeError:
+            bar.stop()
+            raise
+
+
+def _state(status: LoopStatus) -> str:
+    quality = f", held out {status.psnr_db:.2f} dB" if status.psnr_db is not None else ""
+    return (
+        f"{status.iteration:,} iterations, {status.primitives:,} splats, "
+        f"loss {status.loss:.4f}{quality}"
+    )

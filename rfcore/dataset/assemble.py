@@ -24,7 +24,14 @@ from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import Rgb
 from rfcore.views import PointCloud, PosedPicture
 
-__all__ = ["Dataset", "Distortion", "ReadOptions", "assemble", "chosen_origin"]
+__all__ = [
+    "Dataset",
+    "Distortion",
+    "ReadOptions",
+    "assemble",
+    "chosen_origin",
+    "localised",
+]
 
 NEAR_M = 10_000.0
 """float32 positions resolve 1 mm at this distance: nearer to zero, zero is the origin."""
@@ -59,7 +66,8 @@ class Dataset:
     ``rate_hz`` is the mean rate of the pictures' times, ``None`` unless every picture has one and
     they increase. ``points`` is ``None`` when the dataset has none. ``undistorted`` counts the
     pictures that are resampled to take a lens out, ``sorted_out`` those that are listed but were
-    deleted as blurred (``rfcore.dataset.transforms``).
+    deleted as blurred (``rfcore.dataset.transforms``). ``exposure_varies`` where the dataset says
+    that every picture has an exposure of its own.
     """
 
     pictures: tuple[PosedPicture, ...]
@@ -68,6 +76,7 @@ class Dataset:
     tile_origin: TileOrigin
     undistorted: int = 0
     sorted_out: int = 0
+    exposure_varies: bool = False
 
 
 def assemble(source: Source, options: ReadOptions) -> Dataset:
@@ -85,10 +94,11 @@ def assemble(source: Source, options: ReadOptions) -> Dataset:
     return Dataset(
         pictures=tuple(_posed(picture, origin, options) for picture in source.pictures),
         rate_hz=_rate_hz(times_ns) if timed else None,
-        points=_localised(source.points, origin) if source.points is not None else None,
+        points=localised(source.points, origin) if source.points is not None else None,
         tile_origin=origin,
         undistorted=sum(picture.camera.lens is not None for picture in source.pictures),
         sorted_out=source.sorted_out,
+        exposure_varies=source.exposure_varies,
     )
 
 
@@ -147,7 +157,8 @@ def chosen_origin(pictures: Sequence[SourcePicture]) -> TileOrigin:
     return TileOrigin(*(float(round(value)) for value in middle))
 
 
-def _localised(points: SourcePoints, origin: TileOrigin) -> PointCloud:
+def localised(points: SourcePoints, origin: TileOrigin) -> PointCloud:
+    """Return points relative to the tile's origin, subtracted in float64."""
     local_m = points.xyz_m - (origin.east_m, origin.north_m, origin.up_m)
     return PointCloud(local_m.astype(np.float32), points.rgb)
 

@@ -64,10 +64,12 @@ class Source:
     """Everything one reader found.
 
     ``file`` says what there is; ``sorted_out`` counts pictures it lists that were deleted on
-    purpose, by the rules of its format.
+    purpose, by the rules of its format; ``exposure_varies`` where it says that the camera chose
+    exposure or white balance anew for each picture.
     """
 
     file: Path
     pictures: tuple[SourcePicture, ...]
     points: SourcePoints | None = None
     sorted_out: int = 0
+    exposure_varies: bool = False

@@ -71,7 +71,7 @@ def read_transforms_source(file: Path) -> Source:
     if applied is not None:
         pictures = tuple(_moved(picture, applied) for picture in pictures)
         points = applied.undo_points(points) if points is not None else None
-    return Source(file, pictures, points, len(frames) - len(kept))
+    return Source(file, pictures, points, len(frames) - len(kept), _exposure_varies(file, content))
 
 
 def transforms_file(folder: Path) -> Path | None:
@@ -166,6 +166,13 @@ def _applied(where: str, content: Table) -> Applied | None:
 
 def _moved(picture: SourcePicture, applied: Applied) -> SourcePicture:
     return replace(picture, world_from_cam=applied.undo(picture.world_from_cam))
+
+
+def _exposure_varies(file: Path, content: Table) -> bool:
+    value = content.get("exposure", "fixed")
+    if value not in ("auto", "fixed"):
+        raise DatasetError(f"{file}: key 'exposure' is {value!r}, neither 'auto' nor 'fixed'")
+    return bool(value == "auto")
 
 
 def _points(file: Path, content: Table) -> SourcePoints | None:

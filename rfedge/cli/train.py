@@ -4,59 +4,152 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rfcore.dataset import Dataset
+    from rfcore.field import RadianceField
+    from rfcore.train import SplatTrainingConfig
+    from rfedge.training import TrainingJob
 
 __all__ = ["Train"]
 
 
 @dataclass(frozen=True)
 class Train:
-    """Train a 3D Gaussian Splatting field from posed pictures and surface points."""
+    """Train a radiance field from posed pictures.
+
+    Gaussians start at the dataset's points, at those of --points, or at random ones in the volume
+    the cameras see. A run limited by iterations gives the same bytes every time, interrupted or
+    not; one limited by --minutes depends on the machine.
+    """
 
     dataset: Annotated[Path, Positional]
-    """A transforms.json (nerfstudio / instant-ngp), or the folder that holds it."""
+    """A dataset's folder, or the file that describes it (transforms.json, COLMAP, KITTI, ...)."""
     out: Path
     """The field archive to write (.rff)."""
     held_out: Path | None = None
-    """A transforms.json of pictures to measure on, never trained on."""
-    gaussians: int | None = None
-    """At most how many Gaussians, drawn from the points at random; default: the trainer's own."""
+    """Another dataset of the same place to measure on, never trained on."""
+    holdout: int | None = None
+    """Measure on every Nth picture of the dataset, and do not train on those."""
+    views_percent: float = 100.0
+    """Train on this share of the pictures, evenly spread."""
+    points: Path | None = None
+    """A .ply of coloured surface points, when the dataset does not name one."""
+    size: str | None = None
+    """Reduce pictures to WIDTHxHEIGHT, in pixels."""
+    undistort: bool = False
+    """Take a lens's distortion out of the pictures; without this such pictures are refused."""
+    minutes: float | None = None
+    """Train for so long instead of a number of iterations."""
     iterations: int | None = None
     """Training iterations, one picture each; default: the trainer's own."""
+    gaussians: int | None = None
+    """At most how many Gaussians to start with, drawn from the points at random."""
+    limit: int | None = None
+    """Density control: let the set grow to so many Gaussians, replacing those that show nothing."""
+    antialiased: bool = False
+    """Splats made fainter where they are smaller than a pixel; for pictures of several sizes."""
     seed: int = 1
-    """Seed of every random choice: the same seed gives the same bytes."""
+    """Seed of every random choice."""
     threads: int = 2
     """Threads of the rasterizer."""
     name: str = "field"
     """A name kept in the archive's header."""
+    plain: bool = False
+    """Write parameters as they were trained: no lower rungs, no compression."""
+    checkpoint_every: int = 0
+    """Write OUT.ckpt every so many iterations; 0: never."""
+    resume: bool = False
+    """Go on after OUT.ckpt."""
+    json: str | None = None
+    """Write the result as JSON to this file, or to standard output for "-"."""
+    report: Path | None = None
+    """Write a page with held-out pictures and the curve of quality over time (.html)."""
+    kind: Literal["splats"] = "splats"
+    """What to train."""
 
     def run(self) -> None:
-        """Train, write the archive, print its id and quality."""
+        """Train, write the archive and what was asked for beside it."""
         from rich.console import Console
 
-        from rfcore.dataset import read_transforms
         from rfcore.errors import InvalidInput
         from rfcore.field import save_field
-        from rfcore.train.rungs import RungConfig
-        from rfedge.finishing import finish_field
-        from rfedge.training import TrainingJob, train_field, training_config
+        from rfedge.bench.results import write_json
+        from rfedge.training import train
+        from rfedge.training_result import training_result
 
         if self.out.suffix != ".rff":
             raise InvalidInput("out", f"{self.out} must end in .rff")
-        console = Console()
-        job = TrainingJob(
-            name=self.name,
-            dataset=read_transforms(self.dataset),
-            held_out=read_transforms(self.held_out) if self.held_out else None,
-            config=training_config(self.gaussians, self.iterations, self.threads),
-            seed=self.seed,
-        )
-        held_out = job.held_out.pictures if job.held_out else ()
-        rungs = RungConfig(threads=self.threads)
-        field = train_field(job, console)
-        field = finish_field(field, job.dataset.pictures, held_out, rungs, console)
+        console = Console(stderr=self.json == "-")
+        job = self._job()
+        trained = train(job, console)
+        field = self._finished(job, trained.field, console)
         self.out.parent.mkdir(parents=True, exist_ok=True)
         field_id = save_field(field, self.out)
-        console.print(f"{self.out}: field {field_id}, {len(field.gaussians):,} Gaussians")
+        console.print(f"{self.out}: field {field_id}, {trained.primitives:,} Gaussians")
+        result = training_result(job, trained, field, self.out)
+        if self.json is not None:
+            write_json(result, self.json)
+        if self.report is not None:
+            from rfedge.report.training_page import write_training_report
+
+            write_training_report(self.report, result, field, job.held_out)
+            console.print(f"{self.report}: held-out pictures and the curve over time")
+
+    def _job(self) -> TrainingJob:
+        from rfedge.training import TrainingJob
+        from rfedge.training_loop import LoopLimits
+
+        dataset, held_out = self._views()
+        writes_checkpoints = self.resume or self.checkpoint_every > 0
+        limits = LoopLimits(
+            minutes=self.minutes,
+            checkpoint=self.out.with_suffix(".ckpt") if writes_checkpoints else None,
+            checkpoint_every=self.checkpoint_every or 1000,
+        )
+        config = self._config(dataset.exposure_varies)
+        return TrainingJob(self.name, dataset, held_out, config, self.seed, limits, self.resume)
+
+    def _views(self) -> tuple[Dataset, Dataset | None]:
+        from rfedge.training_views import ViewChoice, read_views, size_px_from
+
+        choice = ViewChoice(
+            dataset=self.dataset,
+            held_out=self.held_out,
+            holdout=self.holdout,
+            percent=self.views_percent,
+            points=self.points,
+            size_px=size_px_from(self.size) if self.size is not None else None,
+            undistort=self.undistort,
+        )
+        return read_views(choice)
+
+    def _config(self, exposure_varies: bool) -> SplatTrainingConfig:
+        from dataclasses import replace
+
+        from rfcore.train import DensityControl
+        from rfedge.training import UNLIMITED_ITERATIONS, training_config
+
+        iterations = UNLIMITED_ITERATIONS if self.minutes is not None else self.iterations
+        config = training_config(self.gaussians, iterations, self.threads)
+        if self.limit is not None:
+            config = replace(config, density=DensityControl(limit=self.limit))
+        return replace(config, antialiased=self.antialiased, exposure=exposure_varies)
+
+    def _finished(
+        self, job: TrainingJob, trained: RadianceField, console: Console
+    ) -> RadianceField:
+        from rfcore.field import SplatField
+        from rfcore.train.rungs import RungConfig
+        from rfedge.finishing import finish_field
+
+        if self.plain or not isinstance(trained, SplatField):
+            return trained
+        held_out = job.held_out.pictures if job.held_out is not None else ()
+        rungs = RungConfig(threads=self.threads)
+        return finish_field(trained, job.dataset.pictures, held_out, rungs, console)

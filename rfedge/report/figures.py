@@ -15,7 +15,7 @@ mpl.use("svg")
 
 from matplotlib import pyplot as plt
 
-__all__ = ["bytes_chart", "quality_chart", "stages_chart"]
+__all__ = ["bytes_chart", "curve_chart", "quality_chart", "stages_chart"]
 
 INK, MUTED, GRID = "#1c2733", "#6b7785", "#dfe4ea"
 PAYLOAD, HEADER, RECONSTRUCTION, RENDER = "#2563eb", "#93b4f5", "#2563eb", "#d97706"
@@ -84,6 +84,26 @@ def quality_chart(frames: Sequence[Frame]) -> str:
             )
         axes.set(xlabel="frame", ylabel="PSNR against the camera, dB")
         axes.margins(x=0.02)
+        return _svg(figure)
+
+
+def curve_chart(curve: Sequence[Sequence[float]]) -> str:
+    """Return PSNR in dB over seconds of training, from points of (seconds, dB)."""
+    with mpl.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(7.2, 2.8))
+        seconds, quality_db = zip(*curve, strict=True)
+        axes.plot(seconds, quality_db, color=PAYLOAD, linewidth=2, marker="o", markersize=4)
+        axes.annotate(
+            f"{quality_db[-1]:.2f} dB",
+            (seconds[-1], quality_db[-1]),
+            xytext=(0, 8),
+            textcoords="offset points",
+            ha="right",
+            color=PAYLOAD,
+        )
+        axes.set(xlabel="seconds of training", ylabel="held-out PSNR, dB")
+        axes.set_xlim(left=0)
+        axes.margins(y=0.15)
         return _svg(figure)
 
 

@@ -1,0 +1,146 @@
+"""Points to start from when a dataset brings none: from depth maps, or from nothing.
+
+Both give a ``PointCloud``, which ``rfcore.train.initialise`` turns into Gaussians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera
+from rfcore.errors import InvalidInput
+from rfcore.image import Rgb
+from rfcore.views import PointCloud, PosedPicture
+
+__all__ = ["RandomStart", "points_from_depth", "random_points"]
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RandomStart:
+    """Where random points are put, along random pixels' rays.
+
+    Distances are log-uniform between ``nearest`` and ``farthest`` times the distance at which the
+    cameras look, or, where their axes do not meet, the distance between cameras. A point counts
+    when ``seen_by`` cameras have it in view. ``sky`` is the share put at ``farthest``: it shows
+    what lies beyond everything.
+    """
+
+    nearest: float = 0.2
+    farthest: float = 8.0
+    seen_by: int = 2
+    sky: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not 0 < self.nearest < self.farthest <= 1e4:
+            raise InvalidInput("start.nearest", f"{self.nearest}..{self.farthest} is not a range")
+        if self.seen_by < 1:
+            raise InvalidInput("start.seen_by", f"{self.seen_by} must be at least 1")
+        if not 0 <= self.sky <= 1:
+            raise InvalidInput("start.sky", f"{self.sky} is outside 0..1")
+
+
+def random_points(
+    pictures: Sequence[PosedPicture],
+    count: int,
+    rng: np.random.Generator,
+    start: RandomStart | None = None,
+) -> PointCloud:
+    """Return ``count`` points in the volume the cameras see, of the colour of their pixel.
+
+    Raises ``InvalidInput`` without pictures or when too few points are seen by enough cameras.
+    """
+    if not pictures:
+        raise InvalidInput("pictures", "at least one is needed to start from")
+    start = start if start is not None else RandomStart()
+    cameras = [picture.camera for picture in pictures]
+    unit_m = looking_distance_m(cameras)
+    share = 4 * count // len(pictures) + 1  # about one in four is thrown away, at worst
+    drawn = [_along_rays(picture, share, unit_m, start, rng) for picture in pictures]
+    xyz_m, rgb = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+    seen = _views_of(xyz_m, cameras) >= min(start.seen_by, len(cameras))
+    kept = rng.permutation(np.flatnonzero(seen))[:count]
+    if len(kept) < min(count, 100):
+        raise InvalidInput("start", f"only {len(kept)} of {len(xyz_m)} points are in common view")
+    return PointCloud(xyz_m[kept].astype(np.float32), rgb[kept])
+
+
+def points_from_depth(camera: Camera, rgb: Rgb, depth_m: F32, step_px: int) -> PointCloud:
+    """Return a point for every ``step_px``-th pixel with a depth.
+
+    ``depth_m`` float32 [H, W] is z in the camera, as ``View.depth``; 0 or not finite: unknown.
+    """
+    k = camera.intrinsics
+    shape = (k.height_px, k.width_px)
+    if depth_m.shape != shape or rgb.shape[:2] != shape:
+        raise InvalidInput("depth", f"{depth_m.shape} and {rgb.shape[:2]} must both be {shape}")
+    if step_px < 1:
+        raise InvalidInput("step_px", f"{step_px} must be at least 1")
+    rows, columns = (np.arange(step_px // 2, side, step_px) for side in shape)
+    v, u = (grid.ravel() for grid in np.meshgrid(rows, columns, indexing="ij"))
+    z = depth_m[v, u].astype(np.float64)
+    known = np.isfinite(z) & (z > 0)
+    u, v, z = u[known], v[known], z[known]
+    xyz_m = _in_world(camera, np.float64(0.5) + u, np.float64(0.5) + v, z)
+    return PointCloud(xyz_m.astype(np.float32), np.ascontiguousarray(rgb[v, u]))
+
+
+def looking_distance_m(cameras: Sequence[Camera]) -> float:
+    """Return the distance from the cameras to the point nearest to all their axes.
+
+    Where that point is behind most of them, or they are one: the cameras' extent, at least 1 m.
+    """
+    centres = np.array([camera.world_from_cam.translation_m for camera in cameras])
+    axes = np.array([camera.world_from_cam.rotation_matrix() for camera in cameras])[:, :, 2]
+    extent_m = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(axis=0)
+    if np.linalg.cond(normal) > 1e6:
+        return max(2 * extent_m, 1.0)
+    point = np.linalg.solve(normal, (across @ centres[:, :, None]).sum(axis=0))[:, 0]
+    ahead = ((point - centres) * axes).sum(axis=1)
+    if np.median(ahead) <= 0.1 * extent_m:
+        return max(2 * extent_m, 1.0)
+    return float(np.median(ahead))
+
+
+def _along_rays(
+    picture: PosedPicture,
+    count: int,
+    unit_m: float,
+    start: RandomStart,
+    rng: np.random.Generator,
+) -> tuple[F64, NDArray[np.uint8]]:
+    k = picture.camera.intrinsics
+    u, v = rng.integers(0, k.width_px, count), rng.integers(0, k.height_px, count)
+    log_z = rng.uniform(np.log(start.nearest), np.log(start.farthest), count)
+    log_z[rng.uniform(size=count) < start.sky] = np.log(start.farthest)
+    xyz_m = _in_world(
+        picture.camera, np.float64(0.5) + u, np.float64(0.5) + v, np.exp(log_z) * unit_m
+    )
+    return xyz_m, picture.read()[v, u]
+
+
+def _in_world(camera: Camera, u_px: F64, v_px: F64, z_m: F64) -> F64:
+    k, pose = camera.intrinsics, camera.world_from_cam
+    x, y = (u_px - k.cx_px) / k.fx_px * z_m, (v_px - k.cy_px) / k.fy_px * z_m
+    turned = np.column_stack([x, y, z_m]) @ np.array(pose.rotation_matrix()).T
+    return np.asarray(turned + np.array(pose.translation_m))
+
+
+def _views_of(xyz_m: F64, cameras: Sequence[Camera]) -> NDArray[np.int64]:
+    """Return how many cameras have each point in view."""
+    views = np.zeros(len(xyz_m), np.int64)
+    for camera in cameras:
+        k, pose = camera.intrinsics, camera.cam_from_world()
+        x, y, z = (xyz_m @ np.array(pose.rotation_matrix()).T + pose.translation_m).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = k.fx_px * x / z + k.cx_px, k.fy_px * y / z + k.cy_px
+            views += (z > 0) & (u > 0) & (u < k.width_px) & (v > 0) & (v < k.height_px)
+    return views

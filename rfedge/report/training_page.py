@@ -1,0 +1,99 @@
+"""The page of one training run: held-out pictures beside their renders, quality over time."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from rfcore.dataset import Dataset
+from rfcore.errors import RfedgeError
+from rfcore.field import RadianceField
+from rfcore.files import write_whole
+from rfcore.image import Rgb
+from rfcore.metrics import psnr
+from rfcore.views import PosedPicture
+from rfedge.report.figures import curve_chart
+
+__all__ = ["write_training_report"]
+
+JPEG_QUALITY = 88
+DIFFERENCE_GAIN = 4
+
+
+def write_training_report(
+    path: Path, result: Mapping[str, Any], field: RadianceField, held_out: Dataset | None
+) -> None:
+    """Write the page of one run.
+
+    ``result`` is the content of its JSON; ``held_out`` the pictures it was measured on, of which
+    the best, the median and the worst are shown.
+    """
+    environment = Environment(
+        loader=PackageLoader("rfedge.report", "."), autoescape=True, undefined=StrictUndefined
+    )
+    page = environment.get_template("training.html.j2").render(
+        headline=_headline(result),
+        result=result,
+        curve_svg=curve_chart(result["curve"]) if result["curve"] else None,
+        strips=_strips(field, held_out) if held_out is not None else [],
+        provenance=json.dumps({key: result[key] for key in PROVENANCE}, indent=2),
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, page)
+
+
+PROVENANCE = ("command", "revision", "host", "seed", "settings", "training_digest", "field")
+
+
+def _headline(result: Mapping[str, Any]) -> str:
+    took = f"{result['seconds'] / 60:.1f} minutes of training"
+    db = result["held_out"]["psnr_db"]
+    return took if db is None else f"{db:.2f} dB on pictures never seen, after {took}"
+
+
+def _strips(field: RadianceField, held_out: Dataset) -> list[dict[str, Any]]:
+    """Return the best, the median and the worst held-out picture."""
+    renders = [_render(field, picture) for picture in held_out.pictures]
+    quality_db = [
+        psnr(render, picture.read())
+        for render, picture in zip(renders, held_out.pictures, strict=True)
+    ]
+    order = np.argsort(quality_db)[::-1].tolist()
+    shown = {"best": order[0], "median": order[len(order) // 2], "worst": order[-1]}
+    return [
+        _strip(which, held_out.pictures[i], renders[i], quality_db[i]) for which, i in shown.items()
+    ]
+
+
+def _render(field: RadianceField, picture: PosedPicture) -> Rgb:
+    colour = np.clip(field.render_colour(picture.camera), 0.0, 1.0)
+    return np.asarray(np.floor(colour * 255 + 0.5), dtype=np.uint8)
+
+
+def _strip(which: str, picture: PosedPicture, render: Rgb, quality_db: float) -> dict[str, Any]:
+    camera = picture.read()
+    difference = np.abs(render.astype(np.int16) - camera)
+    amplified = np.minimum(difference * DIFFERENCE_GAIN, 255).astype(np.uint8)
+    captions = (
+        (f"camera, {picture.name}", camera),
+        (f"render, {quality_db:.1f} dB", render),
+        (f"difference × {DIFFERENCE_GAIN}", amplified),
+    )
+    return {
+        "which": which,
+        "pictures": [{"caption": caption, "data": _jpeg(rgb)} for caption, rgb in captions],
+    }
+
+
+def _jpeg(rgb: Rgb) -> str:
+    done, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        raise RfedgeError(f"a report picture of shape {rgb.shape} could not be coded as JPEG")
+    return base64.b64encode(data.tobytes()).decode()

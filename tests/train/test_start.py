@@ -1,0 +1,99 @@
+"""Points made from depth lie on the surface; random points lie where several cameras look."""
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.errors import InvalidInput
+from rfcore.train.start import (
+    RandomStart,
+    looking_distance_m,
+    points_from_depth,
+    random_points,
+)
+
+K = Intrinsics(40, 24, 30.0, 30.0, 20.0, 12.0)
+
+
+def paint(level: int) -> np.ndarray:
+    return np.full((24, 40, 3), level, np.uint8)
+
+
+def looking_inwards(count: int, radius_m: float) -> list[Camera]:
+    """Cameras on a circle in the plane z = 0, looking at its centre."""
+    cameras = []
+    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        half = angle / 2  # a turn about y, from looking along +z
+        at = (-radius_m * np.sin(angle), 0.0, -radius_m * np.cos(angle))
+        cameras.append(Camera(K, Pose(at, (np.cos(half), 0.0, np.sin(half), 0.0))))
+    return cameras
+
+
+def test_a_depth_map_of_a_wall_gives_points_on_the_wall() -> None:
+    half = np.pi / 8
+    camera = Camera(K, Pose((1.0, -2.0, 0.5), (np.cos(half), 0.0, np.sin(half), 0.0)))
+    cloud = points_from_depth(camera, paint(80), np.full((24, 40), 3.0, np.float32), 4)
+    pose = camera.cam_from_world()
+    in_camera = cloud.xyz_m @ np.array(pose.rotation_matrix()).T + pose.translation_m
+    np.testing.assert_allclose(in_camera[:, 2], 3.0, rtol=1e-5)
+    u = 30.0 * in_camera[:, 0] / 3.0 + 20.0
+    np.testing.assert_allclose(np.unique(np.round(u, 3)), np.arange(2, 40, 4) + 0.5)
+    assert len(cloud.rgb) == 6 * 10
+    assert (cloud.rgb == 80).all()
+
+
+def test_pixels_without_depth_give_no_points() -> None:
+    depth = np.zeros((24, 40), np.float32)
+    depth[3, 5], depth[4, 6] = 2.0, np.nan
+    camera = Camera(K, Pose((0, 0, 0), (1.0, 0, 0, 0)))
+    assert len(points_from_depth(camera, paint(1), depth, 1).xyz_m) == 1
+    with pytest.raises(InvalidInput, match="depth"):
+        points_from_depth(camera, paint(1), depth[:5], 1)
+
+
+@pytest.mark.parametrize("radius_m", [0.5, 40.0])
+def test_cameras_in_a_circle_look_at_its_centre(radius_m: float) -> None:
+    assert looking_distance_m(looking_inwards(7, radius_m)) == pytest.approx(radius_m)
+
+
+def test_cameras_side_by_side_have_a_distance_of_their_own(cameras) -> None:
+    assert looking_distance_m(cameras) == 1.0
+
+
+def test_random_points_are_in_view_of_enough_cameras_and_coloured(posed) -> None:
+    pictures = posed(lambda i: paint(10 * i))
+    cloud = random_points(pictures, 300, np.random.default_rng(0), RandomStart(seen_by=3))
+    assert len(cloud.xyz_m) == 300
+    assert set(np.unique(cloud.rgb)) <= {0, 10, 20, 30}
+    views = np.zeros(300)
+    for picture in pictures:
+        pose = picture.camera.cam_from_world()
+        x, y, z = (cloud.xyz_m @ np.array(pose.rotation_matrix()).T + pose.translation_m).T
+        u, v = 30 * x / z + 20, 30 * y / z + 12
+        # Half a pixel of room: the points were rounded to float32.
+        views += (z > 0) & (abs(u - 20) < 20.01) & (abs(v - 12) < 12.01)
+    assert views.min() >= 3
+
+
+def test_the_same_generator_gives_the_same_points(posed) -> None:
+    pictures = posed(lambda i: paint(10 * i))
+    first, again = (random_points(pictures, 50, np.random.default_rng(2)) for _ in range(2))
+    np.testing.assert_array_equal(first.xyz_m, again.xyz_m)
+
+
+def test_cameras_with_nothing_in_common_are_refused(posed) -> None:
+    from dataclasses import replace
+
+    pictures = posed(lambda _: paint(0))
+    back = Camera(K, Pose((0, 0, -50.0), (0.0, 0, 1.0, 0)))
+    apart = (pictures[0], replace(pictures[1], camera=back))
+    with pytest.raises(InvalidInput, match="common view"):
+        random_points(apart, 100, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    "change", [{"nearest": 0.0}, {"farthest": 0.1}, {"seen_by": 0}, {"sky": 1.5}]
+)
+def test_settings_that_make_no_sense_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(InvalidInput, match="start"):
+        RandomStart(**change)

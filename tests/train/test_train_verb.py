@@ -1,0 +1,119 @@
+"""``rfedge train`` writes a field, a result, a page; interrupted, it ends with the same bytes."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rfcore.errors import InvalidInput
+from rfcore.field import load_field
+from rfedge.cli.train import Train
+from rfedge.training_views import share_of_views, size_px_from
+
+VIEWS = 8
+
+
+@pytest.fixture(scope="session")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A transforms.json of eight pictures of a painted wall, without points."""
+    folder = tmp_path_factory.mktemp("wall")
+    frames = []
+    for i in range(VIEWS):
+        x = -0.7 + 0.2 * i
+        u = (np.arange(48) + 0.5 - 24) / 40 * 4 + x
+        v = (np.arange(32) + 0.5 - 16) / 40 * 4
+        level = 128 + 60 * np.sin(3 * u)[None] * np.cos(2 * v)[:, None]
+        cv2.imwrite(str(folder / f"{i}.png"), np.repeat(level[..., None], 3, axis=2).astype("u1"))
+        # OpenGL axes: looking along -z at the wall 4 m ahead
+        matrix = np.eye(4)
+        matrix[0, 3] = x
+        frames.append({"file_path": f"{i}.png", "transform_matrix": matrix.tolist()})
+    k = {"fl_x": 40.0, "fl_y": 40.0, "cx": 24.0, "cy": 16.0, "w": 48, "h": 32}
+    (folder / "transforms.json").write_text(json.dumps({**k, "frames": frames}))
+    return folder
+
+
+def verb(wall: Path, out: Path, **changes: object) -> Train:
+    settings = {"iterations": 200, "gaussians": 300, "holdout": 4, "threads": 1, "plain": True}
+    return Train(dataset=wall, out=out, **{**settings, **changes})
+
+
+def test_it_writes_a_field_a_result_and_a_page(wall: Path, tmp_path: Path) -> None:
+    out, result, page = (tmp_path / name for name in ("a.rff", "a.json", "a.html"))
+    verb(wall, out, json=str(result), report=page, limit=400).run()
+    field, said = load_field(out), json.loads(result.read_text())
+    assert said["field"] == f"splats {field.field_id}"
+    assert (said["views"], said["held_out"]["views"]) == (6, 2)
+    assert said["held_out"]["psnr_db"] == field.metadata.held_out_psnr_db > 15
+    assert said["bytes"] == out.stat().st_size
+    assert said["iterations"] == 200
+    assert said["primitives"] == 315, "one round of 5 % in 200 iterations"
+    assert len(said["curve"]) == 12
+    assert said["curve"][-1][1] == pytest.approx(said["as_trained"]["psnr_db"], abs=1e-6)
+    text = page.read_text()
+    assert text.count("data:image/jpeg;base64,") == 9
+    assert "<svg" in text
+    assert "dB on pictures never seen" in text
+
+
+def test_without_held_out_pictures_there_is_a_page_and_no_quality(wall, tmp_path) -> None:
+    out, result, page = (tmp_path / name for name in ("a.rff", "a.json", "a.html"))
+    verb(wall, out, json=str(result), report=page, holdout=None, iterations=5).run()
+    assert json.loads(result.read_text())["held_out"] == {"psnr_db": None, "ssim": None, "views": 0}
+    assert "<svg" not in page.read_text()
+
+
+def test_an_interrupted_run_ends_with_the_same_bytes(wall: Path, tmp_path: Path) -> None:
+    whole, broken = tmp_path / "whole.rff", tmp_path / "broken.rff"
+    settings = {"iterations": 40, "limit": 350, "checkpoint_every": 15}
+    verb(wall, whole, **settings).run()
+    (tmp_path / "broken.ckpt").write_bytes((tmp_path / "whole.ckpt").read_bytes())
+    verb(wall, broken, **settings, resume=True).run()
+    assert broken.read_bytes() == whole.read_bytes()
+
+
+def test_a_run_may_be_limited_by_time(wall: Path, tmp_path: Path) -> None:
+    verb(wall, tmp_path / "a.rff", minutes=0.02).run()
+    assert load_field(tmp_path / "a.rff").metadata.held_out_psnr_db is not None
+
+
+def test_declared_exposure_is_learned_and_nothing_else_is(wall: Path, tmp_path: Path) -> None:
+    content = json.loads((wall / "transforms.json").read_text())
+    results = {}
+    for exposure in ("auto", "fixed"):
+        file = wall / f"{exposure}.json"
+        file.write_text(json.dumps({**content, "exposure": exposure}))
+        result = tmp_path / f"{exposure}.json"
+        verb(file, tmp_path / f"{exposure}.rff", iterations=5, json=str(result)).run()
+        results[exposure] = json.loads(result.read_text())["settings"]["exposure"]
+    assert results == {"auto": True, "fixed": False}
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"out": Path("a.ply")}, "out"),
+        ({"holdout": 1}, "holdout"),
+        ({"holdout": 4, "held_out": Path("x")}, "holdout"),
+        ({"views_percent": 0.0}, "views_percent"),
+        ({"size": "24"}, "size"),
+        ({"size": "24x0"}, "size"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_name(wall, tmp_path, change, named) -> None:
+    with pytest.raises(InvalidInput, match=named):
+        verb(wall, **{"out": tmp_path / "a.rff", **change}).run()
+
+
+def test_a_share_of_the_views_is_spread_evenly() -> None:
+    views = tuple(range(120))
+    assert share_of_views(views, 25) == tuple(range(0, 120, 4))
+    assert share_of_views(views, 50) == tuple(range(0, 120, 2))
+    assert share_of_views(views, 100) == views
+    assert share_of_views(views, 0.1) == (0,)
+
+
+def test_sizes_are_width_times_height() -> None:
+    assert size_px_from("640x360") == (640, 360)
