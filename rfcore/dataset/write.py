@@ -20,7 +20,7 @@ from rfcore.field.ply_table import write_vertices
 from rfcore.files import write_whole
 from rfcore.lens import FisheyeLens
 
-__all__ = ["WrittenPicture", "write_transforms"]
+__all__ = ["WrittenPicture", "write_points", "write_transforms"]
 
 POINTS_NAME = "points.ply"
 COLUMNS = [(n, "<f8") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
@@ -44,7 +44,7 @@ def write_transforms(
     shared = _camera_keys(pictures[0].camera) if len(cameras) == 1 else {}
     content: dict[str, Any] = dict(shared)
     if points is not None:
-        _write_points(folder / POINTS_NAME, points)
+        write_points(folder / POINTS_NAME, points)
         content["ply_file_path"] = POINTS_NAME
     content["frames"] = [_frame(picture, not shared) for picture in pictures]
     write_whole(folder / "transforms.json", json.dumps(content, indent=1) + "\n")
@@ -81,7 +81,8 @@ def _intrinsics_keys(k: Intrinsics) -> dict[str, float]:
     }
 
 
-def _write_points(file: Path, points: SourcePoints) -> None:
+def write_points(file: Path, points: SourcePoints) -> None:
+    """Write coloured points as PLY, positions as float64."""
     table = np.empty(len(points.xyz_m), COLUMNS)
     for i, axis in enumerate("xyz"):
         table[axis] = points.xyz_m[:, i]
