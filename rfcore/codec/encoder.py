@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from rfcore.codec.choice import choose_photometric, choose_references
 from rfcore.codec.coarse import coarse_digest
-from rfcore.codec.config import CRF_RANGE, CodecConfig
+from rfcore.codec.config import CRF_RANGE, REFERENCE_FRAMES, CodecConfig
 from rfcore.codec.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.photometric import Photometric, adapt
@@ -39,7 +39,8 @@ def _stopped_clock() -> int:
 class FrameChoice:
     """How one frame is to be coded.
 
-    ``references``: the pictures to predict from; ``None`` leaves it to the encoder. ``crf``
+    ``references``: the pictures to predict from; ``None`` leaves it to the encoder, which takes at
+    most ``most``: each costs as much time as coding a frame. ``crf``
     replaces the configured one. ``photometric``: see there; ``None`` leaves it to the encoder.
     ``pose_only``: send no slice; the frame is its only reference.
     """
@@ -48,12 +49,15 @@ class FrameChoice:
     crf: float | None = None
     photometric: Photometric | None = None
     pose_only: bool = False
+    most: int = REFERENCE_FRAMES
 
     def __post_init__(self) -> None:
         if self.references is not None:
             check_references(self.references)
         if self.crf is not None and not CRF_RANGE[0] <= self.crf <= CRF_RANGE[1]:
             raise InvalidInput("crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}")
+        if not 1 <= self.most <= REFERENCE_FRAMES:
+            raise InvalidInput("most", f"{self.most} references are outside 1..{REFERENCE_FRAMES}")
         if self.pose_only and (self.references is None or len(self.references) != 1):
             raise InvalidInput("references", "a pose-only packet names exactly one reference")
 
@@ -113,14 +117,14 @@ class DeltaEncoder:
         for name, picture in (("frame", frame), ("render", render)):
             _require_size(name, picture, self._config)
         started_ns = self._clock_ns()
+        crf = self._config.crf if choice.crf is None else choice.crf
         photometric = choice.photometric
         if photometric is None:
-            photometric = choose_photometric(frame, render)
+            photometric = choose_photometric(frame, render, crf)
         prediction = Prediction(adapt(render, photometric), seen, state.past)
-        crf = self._config.crf if choice.crf is None else choice.crf
         references = choice.references
         if references is None:
-            references = choose_references(frame, prediction, crf)
+            references = choose_references(frame, prediction, crf, choice.most)
         pictures = prediction.pictures(references)
         chosen_ns = self._clock_ns()
         payload = b"" if choice.pose_only else self._slice(pictures, frame, crf)

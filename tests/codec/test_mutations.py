@@ -10,7 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, DeltaPacket, StreamHeader
+from rfcore.codec import (
+    RENDER_ONLY,
+    CodecConfig,
+    DeltaDecoder,
+    DeltaEncoder,
+    DeltaPacket,
+    FrameChoice,
+    StreamHeader,
+)
 from rfcore.errors import PacketRejected, RejectReason
 from rfcore.image import I420
 
@@ -37,7 +45,7 @@ def stream(pair: PairMaker) -> Stream:
     pictures = [pair(*SIZE_PX, 5.0 * index) for index in range(FRAMES)]
     packets, digests = [], []
     for frame, render in pictures:
-        encoded = encoder.encode(state, frame, render)
+        encoded = encoder.encode(state, frame, render, choice=FrameChoice(RENDER_ONLY))
         state = encoded.state
         packets.append(encoded.packet)
         digests.append(encoded.reconstruction.digest())

@@ -1,0 +1,265 @@
+"""Damage packets at random and hand them to the receiver: python -m rfedge.bench.fuzz --packets N
+
+What must hold for every damaged packet: the decoder refuses it with a reason, or shows exactly the
+picture whose digest the packet carries; no other exception, no crash, and at most 50 ms of
+processor time. Half of the packets get a fresh CRC, so that the later checks have to do the work;
+now and then a whole packet must decode as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.codec import (
+    INTRA,
+    CodecConfig,
+    DecoderState,
+    DeltaDecoder,
+    DeltaEncoder,
+    DeltaPacket,
+    FrameChoice,
+    Reference,
+    StreamHeader,
+)
+from rfcore.errors import CodecError, PacketRejected
+from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
+from rfcore.native.yuv import i420_from_colour
+
+__all__ = ["MUTATIONS", "FuzzStream", "fuzz", "make_stream"]
+
+MAX_CPU_MS = 50.0
+WHOLE_EVERY = 50
+SIZE_PX = (64, 48)
+WALL_M = 10.0
+SHIFT_PX = 3.0
+"""By which the picture moves between frames; the camera moves along a wall."""
+
+LIGHT = (4096, 0, 0, 32, 0, 4096, 0, 0, 0, 0, 4096, 0)
+"""Two levels brighter."""
+
+CHOICES = (
+    FrameChoice(INTRA),
+    FrameChoice((Reference.RENDER,)),
+    FrameChoice((Reference.PREVIOUS,)),
+    FrameChoice((Reference.WARP, Reference.PREVIOUS, Reference.RENDER)),
+    FrameChoice((Reference.PREVIOUS, Reference.RENDER, Reference.CORRECTION)),
+    FrameChoice((Reference.RENDER, Reference.WARP), photometric=LIGHT),
+    FrameChoice((Reference.CORRECTION,), pose_only=True),
+)
+
+Rng = np.random.Generator
+Mutation = Callable[[DeltaPacket, Rng], DeltaPacket]
+
+
+@dataclass(frozen=True)
+class SentFrame:
+    """A packet with what its receiver holds: the render, the depth, and the state before it."""
+
+    packet: DeltaPacket
+    render: I420
+    seen: PosedDepth
+    before: DecoderState
+
+
+@dataclass(frozen=True)
+class FuzzStream:
+    """A short stream with a frame of every kind."""
+
+    header: StreamHeader
+    frames: tuple[SentFrame, ...]
+
+
+def make_stream(size_px: tuple[int, int] = SIZE_PX) -> FuzzStream:
+    """Code one frame of every kind."""
+    encoder = DeltaEncoder(CodecConfig(*size_px))
+    decoder = DeltaDecoder(encoder.header)
+    sending, receiving = encoder.start(1), decoder.start(1)
+    frames = []
+    for index, choice in enumerate(CHOICES):
+        frame, render, seen = _moment(index, size_px)
+        sent = encoder.encode(sending, frame, render, seen, choice)
+        frames.append(SentFrame(sent.packet, render, seen, receiving))
+        sending = sent.state
+        receiving = decoder.decode(receiving, sent.packet, render, seen).state
+    return FuzzStream(encoder.header, tuple(frames))
+
+
+def fuzz(stream: FuzzStream, packets: int, seed: int = 0) -> Counter[str]:
+    """Decode ``packets`` damaged packets; return how often each outcome came.
+
+    Raises ``CodecError`` for a wrong picture, a packet that took too long, or a whole packet that
+    was refused; other exceptions of the decoder come through.
+    """
+    rng = np.random.default_rng(seed)
+    decoder = DeltaDecoder(stream.header)
+    outcomes: Counter[str] = Counter()
+    for number in range(packets):
+        frame = stream.frames[rng.integers(len(stream.frames))]
+        name = MUTATION_NAMES[rng.integers(len(MUTATION_NAMES))]
+        damaged = MUTATIONS[name](frame.packet, rng)
+        repaired = damaged.sealed() if number % 2 else damaged
+        outcomes[_try(decoder, frame, repaired)] += 1
+        if number % WHOLE_EVERY == 0 and _try(decoder, frame, frame.packet) != "shown":
+            raise CodecError(f"a whole packet was refused after damaged packet {number}")
+    return outcomes
+
+
+def _try(decoder: DeltaDecoder, frame: SentFrame, packet: DeltaPacket) -> str:
+    started_s = time.process_time()
+    try:
+        shown = decoder.decode(frame.before, packet, frame.render, frame.seen).frame
+    except PacketRejected as rejection:
+        outcome = str(rejection.reason)
+    else:
+        outcome = "shown"
+        if shown.digest() != frame.packet.reconstruction_digest:
+            raise CodecError(f"a damaged packet was shown as another picture: {packet}")
+    spent_ms = (time.process_time() - started_s) * 1e3
+    if spent_ms > MAX_CPU_MS:
+        raise CodecError(f"a damaged packet took {spent_ms:.0f} ms: {packet}")
+    return outcome
+
+
+# --- damage
+
+
+def flip_bits(data: bytes, rng: Rng) -> bytes:
+    """Flip one to four bits."""
+    damaged = bytearray(data)
+    for _ in range(int(rng.integers(1, 5)) if damaged else 0):
+        damaged[rng.integers(len(damaged))] ^= 1 << int(rng.integers(8))
+    return bytes(damaged)
+
+
+def flip_payload(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Flip bits anywhere in the payload."""
+    return replace(packet, payload=flip_bits(packet.payload, rng))
+
+
+def flip_slice_header(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Flip bits in the first bytes of the payload."""
+    start = flip_bits(packet.payload[:8], rng)
+    return replace(packet, payload=start + packet.payload[8:])
+
+
+def truncate(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Cut the payload short."""
+    return replace(packet, payload=packet.payload[: rng.integers(len(packet.payload) + 1)])
+
+
+def extend(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Add noise to the payload."""
+    return replace(packet, payload=packet.payload + rng.bytes(int(rng.integers(1, 40))))
+
+
+def overwrite(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Replace the end of the payload by noise."""
+    start = int(rng.integers(len(packet.payload) + 1))
+    return replace(packet, payload=packet.payload[:start] + rng.bytes(int(rng.integers(1, 200))))
+
+
+def insert_nal(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Put a NAL unit of any type before, or after a start code behind, the payload."""
+    unit = bytes([0x60 | int(rng.integers(32))]) + rng.bytes(int(rng.integers(1, 40)))
+    joined = unit if rng.integers(2) else packet.payload + b"\x00\x00\x01" + unit
+    return replace(packet, payload=joined)
+
+
+def flip_digests(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Flip bits in one of the digests."""
+    names = ["reference_digest", "reference_coarse", "reconstruction_digest", "needed_digest"]
+    name = names[rng.integers(len(names))]
+    changed: dict[str, Any] = {name: flip_bits(getattr(packet, name), rng)}
+    return replace(packet, **changed)
+
+
+def renumber(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Change epoch or sequence by one bit."""
+    name = ("epoch", "sequence")[rng.integers(2)]
+    changed: dict[str, Any] = {name: getattr(packet, name) ^ (1 << int(rng.integers(63)))}
+    return replace(packet, **changed)
+
+
+def exchange_references(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Name other references, in another order."""
+    count = int(rng.integers(4))
+    order = [Reference(int(n)) for n in rng.permutation(4)[:count] + 1]
+    needs = any(reference is not Reference.RENDER for reference in order)
+    needed = (packet.needed_digest or rng.bytes(16)) if needs else b""
+    return replace(packet, references=tuple(order), needed_digest=needed)
+
+
+def relight(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Send another matrix, as large as it may be."""
+    matrix = tuple(int(n) for n in rng.integers(-(1 << 15), 1 << 15, 12))
+    return replace(packet, photometric=matrix if rng.integers(4) else ())
+
+
+MUTATIONS: dict[str, Mutation] = {
+    mutation.__name__: mutation
+    for mutation in (
+        flip_payload,
+        flip_slice_header,
+        truncate,
+        extend,
+        overwrite,
+        insert_nal,
+        flip_digests,
+        renumber,
+        exchange_references,
+        relight,
+    )
+}
+MUTATION_NAMES = tuple(MUTATIONS)
+
+
+# --- the stream
+
+
+def _moment(index: int, size_px: tuple[int, int]) -> tuple[I420, I420, PosedDepth]:
+    """Return frame, render and depth of a camera that moves along a painted wall."""
+    width, height = size_px
+    k = Intrinsics(width, height, width, width, width / 2, height / 2)
+    step_m = SHIFT_PX * WALL_M / width
+    pose = Pose((index * step_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    depth = np.full((height, width), WALL_M, np.float32)
+    x, y = np.meshgrid(np.arange(width) + SHIFT_PX * index, np.arange(height))
+    luma = 0.5 + 0.2 * np.sin(x / 5) * np.cos(y / 4) + 0.1 * (np.sin(x / 2) > math.sin(1))
+    wall = np.stack([luma, luma * 0.9, 1 - luma], axis=-1)
+    rng = np.random.default_rng(index)
+    noisy = wall + rng.normal(0, 0.02, wall.shape)
+    noisy[height // 2 :, :: 1 + index] *= 0.7
+    frame, render = (i420_from_colour(c.astype(np.float32)) for c in (noisy, wall))
+    return frame, render, PosedDepth(Camera(k, pose), depth)
+
+
+def _report(outcomes: Counter[str], seconds: float) -> Iterator[str]:
+    total = sum(outcomes.values())
+    yield f"{total} packets in {seconds:.0f} s"
+    for outcome, count in outcomes.most_common():
+        yield f"  {outcome:24} {count:8}  {100 * count / total:5.1f} %"
+
+
+def main() -> None:
+    """Fuzz and print the outcomes."""
+    parser = argparse.ArgumentParser(description=__doc__, prog="python -m rfedge.bench.fuzz")
+    parser.add_argument("--packets", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    started_s = time.monotonic()
+    outcomes = fuzz(make_stream(), given.packets, given.seed)
+    print("\n".join(_report(outcomes, time.monotonic() - started_s)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""Damaged packets of every kind of frame are refused, or show exactly the right picture.
+
+A million of them: ``python -m rfedge.bench.fuzz --packets 1000000``.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rfcore.codec import Reference
+from rfcore.errors import CodecError, RejectReason
+from rfedge.bench.fuzz import MUTATIONS, FuzzStream, fuzz, make_stream
+
+
+@pytest.fixture(scope="module")
+def stream() -> FuzzStream:
+    return make_stream()
+
+
+def test_damaged_packets_never_show_a_wrong_picture(stream: FuzzStream) -> None:
+    outcomes = fuzz(stream, 2_000, seed=1)
+    caught = {
+        RejectReason.CRC_MISMATCH,
+        RejectReason.MALFORMED_PAYLOAD,
+        RejectReason.DECODER_FAILED,
+        RejectReason.RECONSTRUCTION_MISMATCH,
+        RejectReason.REFERENCE_MISMATCH,
+        RejectReason.UNKNOWN_STATE,
+    }
+    assert {str(reason) for reason in caught} <= set(outcomes)
+
+
+@pytest.mark.slow
+def test_ten_thousand_damaged_packets_never_show_a_wrong_picture(stream: FuzzStream) -> None:
+    fuzz(stream, 10_000, seed=2)
+
+
+def test_the_stream_has_every_kind_of_frame(stream: FuzzStream) -> None:
+    packets = [frame.packet for frame in stream.frames]
+    used = {reference for packet in packets for reference in packet.references}
+    assert used == set(Reference)
+    assert any(not packet.references for packet in packets)
+    assert any(not packet.payload for packet in packets)
+    assert any(packet.photometric for packet in packets)
+
+
+def test_every_kind_of_damage_changes_something(stream: FuzzStream) -> None:
+    rng = np.random.default_rng(0)
+    packet = stream.frames[3].packet
+    for name, mutation in MUTATIONS.items():
+        assert any(mutation(packet, rng) != packet for _ in range(5)), name
+
+
+def test_a_picture_that_is_not_the_senders_is_noticed(stream: FuzzStream) -> None:
+    """The harness itself: what it compares with is the digest that was sent."""
+    first = stream.frames[1]
+    other = replace(first.packet, reconstruction_digest=bytes(16))
+    poisoned = replace(stream, frames=(replace(first, packet=other),))
+    with pytest.raises(CodecError, match="whole packet was refused"):
+        fuzz(poisoned, 1)
