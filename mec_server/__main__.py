@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from mec_server.config import ServerConfig
+from mec_server.config import ConsumerLimits, ServerConfig
 from mec_server.server import EdgeServer
 from rfcore.errors import RfedgeError
 from rfcore.wire.logs import LogForm, configure_logs
@@ -27,6 +27,7 @@ def run(
     metrics_port: int | None = None,
     metrics_host: str = "127.0.0.1",
     metrics_per_vehicle: Flag = False,
+    max_consumers: int = 8,
     log: LogForm = LogForm.AUTO,
     threads: int = 1,
     workers: int = 2,
@@ -43,6 +44,7 @@ def run(
         metrics_port: Port for Prometheus; 0 takes a free one, none are served without it.
         metrics_host: Address the metrics are served on.
         metrics_per_vehicle: Tell vehicles apart in the metrics; each costs its own time series.
+        max_consumers: How many may watch the twin at once (`rfedge watch`).
         log: console lines, json lines, or auto: console on a terminal.
         threads: Threads per render; the pictures do not depend on it.
         workers: Frames reconstructed at once.
@@ -57,6 +59,7 @@ def run(
         metrics_port=metrics_port,
         metrics_host=metrics_host,
         metrics_per_vehicle=metrics_per_vehicle,
+        consumers=ConsumerLimits(max_consumers),
         log=log,
         threads=threads,
         workers=workers,

@@ -8,7 +8,7 @@ from pathlib import Path
 from rfcore.errors import InvalidInput
 from rfcore.wire.logs import LogForm
 
-__all__ = ["ServerConfig", "SessionLimits"]
+__all__ = ["ConsumerLimits", "ServerConfig", "SessionLimits"]
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,20 @@ class SessionLimits:
                 raise InvalidInput(f"limits.{name}", f"{getattr(self, name)} must be above 0 s")
         if not 1 <= self.window_frames <= 64:
             raise InvalidInput("limits.window_frames", f"{self.window_frames} is outside 1..64")
+
+
+@dataclass(frozen=True)
+class ConsumerLimits:
+    """``consumers`` may watch at once; one that takes nothing for ``patience_s`` is let go."""
+
+    consumers: int = 8
+    patience_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.consumers <= 1000:
+            raise InvalidInput("consumers", f"{self.consumers} is outside 0..1000")
+        if not self.patience_s > 0:
+            raise InvalidInput("patience_s", f"{self.patience_s} must be above 0 s")
 
 
 @dataclass(frozen=True)
@@ -53,6 +67,7 @@ class ServerConfig:
     isa: str | None = None
     ready_file: Path | None = None
     log: LogForm = LogForm.AUTO
+    consumers: ConsumerLimits = ConsumerLimits()
     allow_insecure: bool = False
     drain_s: float = 5.0
     limits: SessionLimits = SessionLimits()

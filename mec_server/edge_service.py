@@ -22,6 +22,7 @@ from mec_server.jobs import DecodeJob, End, OpenJob
 from mec_server.metrics import ServerMetrics
 from mec_server.recorder import Recorder, Recording
 from mec_server.session import ServerSession
+from mec_server.twin import Twin, TwinView
 from rfcore.errors import InvalidInput, PacketRejected, RfedgeError
 from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_from_bytes
@@ -47,6 +48,7 @@ class Surroundings:
     executor: Executor
     metrics: ServerMetrics
     limits: SessionLimits
+    twin: Twin
     recorder: Recorder | None = None
 
 
@@ -81,7 +83,7 @@ class EdgeService:
         finally:
             self._streams.discard(stream)
             self._around.metrics.sessions.dec()
-            stream.metrics.forget()
+            stream.leave()
         if end.error is not None:
             await context.abort(status_of(end.error), str(end.error))
 
@@ -94,7 +96,7 @@ class _Stream:
         self._context = context
         self._wake = asyncio.Event()
         self._decoders: dict[str, CameraDecoder] = {}
-        self.metrics = around.metrics.of(UNKNOWN_VEHICLE)
+        self._metrics = around.metrics.of(UNKNOWN_VEHICLE)
         session_id = uuid.uuid4().hex[:12]
         self._log = log.bind(session=session_id, peer=context.peer())
         self._session = ServerSession(
@@ -105,6 +107,11 @@ class _Stream:
         """Take no more frames and end when those taken are answered."""
         self._session.drain()
         self._wake.set()
+
+    def leave(self) -> None:
+        """Let nothing remain of this stream, in the twin or in the metrics."""
+        self._around.twin.leave(self._session.session_id)
+        self._metrics.forget()
 
     async def run(self, requests: AsyncIterator[bytes]) -> End:
         """Serve until the session is closed; return how it ended."""
@@ -132,14 +139,14 @@ class _Stream:
                 self._session.refuse(error, now)
             else:
                 if isinstance(message, Frame):
-                    self.metrics.received(message, len(data))
+                    self._metrics.received(message, len(data))
                 self._session.receive(message, now)
             self._wake.set()
         self.drain()
 
     async def _write(self) -> None:
         messages = self._session.messages_to_send(time.monotonic())
-        self.metrics.answered(messages)
+        self._metrics.answered(messages)
         for message in messages:
             await self._context.write(server_message_to_bytes(message))
 
@@ -173,14 +180,14 @@ class _Stream:
             self._session.open_failed(error, time.monotonic())
             return
         self._log = self._log.bind(vehicle=job.hello.vehicle_id)
-        self.metrics.forget()
-        self.metrics = around.metrics.of(job.hello.vehicle_id)
+        self._metrics.forget()
+        self._metrics = around.metrics.of(job.hello.vehicle_id)
         self._log.info("vehicle welcomed", fields=job.hello.field_ids, exact=job.exact)
         self._session.opened(job, time.monotonic())
 
     async def _decode(self, job: DecodeJob) -> None:
         try:
-            outcome = (await self._reconstruct(job)).outcome
+            done = await self._reconstruct(job)
         except PacketRejected as error:
             self._log.warning(
                 "frame rejected",
@@ -192,10 +199,33 @@ class _Stream:
             )
             self._session.rejected(job, error, time.monotonic())
             return
-        self._session.decoded(job, outcome, time.monotonic())
-        self.metrics.reconstructed(max(0.0, (time.time_ns() - job.frame.capture_time_ns) / 1e9))
-        if not outcome.exact:
+        now = time.monotonic()
+        self._session.decoded(job, done.outcome, now)
+        latency_s = max(0.0, (time.time_ns() - job.frame.capture_time_ns) / 1e9)
+        self._metrics.reconstructed(latency_s)
+        if not done.outcome.exact:
             self._around.metrics.inexact.inc()
+        self._show(job, done, now, latency_s)
+
+    def _show(self, job: DecodeJob, done: Reconstruction, now: float, latency_s: float) -> None:
+        hello, session = self._session.hello, self._session
+        if hello is None or session.closed is not None:
+            return
+        camera_id = job.frame.camera_id
+        camera = next(camera for camera in hello.cameras if camera.camera_id == camera_id)
+        self._around.twin.show(
+            TwinView(
+                vehicle_id=hello.vehicle_id,
+                session_id=session.session_id,
+                frame=job.frame,
+                intrinsics=camera.intrinsics,
+                field_id=job.field_id,
+                picture=done.picture,
+                digest=done.outcome.reconstruction_digest,
+                reconstructed_s=now,
+                latency_s=latency_s,
+            )
+        )
 
     async def _reconstruct(self, job: DecodeJob) -> Reconstruction:
         decoder = self._decoders[job.frame.camera_id]

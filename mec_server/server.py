@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from mec_server.field_service import FieldService
 from mec_server.fields import FieldShelf, field_loader
 from mec_server.metrics import ServerMetrics
 from mec_server.recorder import Recorder
+from mec_server.twin import Twin
+from mec_server.twin_metrics import TwinMetrics
+from mec_server.twin_service import TwinService
 from rfcore.errors import RfedgeError
 from rfcore.field import FieldStore
 from rfcore.files import write_whole
@@ -27,7 +31,7 @@ from rfcore.wire.conventions import SERVER_OPTIONS
 __all__ = ["EdgeServer"]
 
 log = structlog.get_logger()
-SERVICES = ("", "rfcore.wire.v1.EdgeService", "rfcore.wire.v1.FieldService")
+SERVICES = ("", *(f"rfcore.wire.v1.{name}Service" for name in ("Edge", "Field", "Twin")))
 
 
 class EdgeServer:
@@ -45,6 +49,14 @@ class EdgeServer:
             store, threads=config.threads, isa=config.isa, opened=self._metrics.field_opened
         )
         self._shelf = FieldShelf(store, load)
+        self._twin = Twin()
+        watched = TwinMetrics(
+            self._metrics.instruments,
+            lambda: self._twin.ages_s(time.monotonic()),
+            lambda: self._twin.missed,
+            per_vehicle=config.metrics_per_vehicle,
+        )
+        self._twin_service = TwinService(self._twin, watched, config.consumers)
         self._executor = ThreadPoolExecutor(config.workers, "worker")
         self._recorder = self._open_recorder(config.save)
         self._health = health_aio.HealthServicer()
@@ -55,12 +67,14 @@ class EdgeServer:
                 self._executor,
                 self._metrics,
                 config.limits,
+                self._twin,
                 self._recorder,
             )
         )
         self._server = grpc.aio.server(options=SERVER_OPTIONS)
         self._edge.register(self._server)
         FieldService(store).register(self._server)
+        self._twin_service.register(self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
 
     async def start(self) -> Address:
@@ -87,8 +101,10 @@ class EdgeServer:
         log.info("draining", within_s=self._config.drain_s)
         await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
         self._edge.drain()
+        self._twin_service.drain()
         await self._server.stop(self._config.drain_s)
         await asyncio.to_thread(self._executor.shutdown)
+        self._twin_service.close()
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
         log.info("stopped")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rfcore.errors import DatasetError, InvalidInput
-from rfcore.image import I420, Rgb, read_rgb, write_png
+from rfcore.image import I420, Rgb, jpeg_bytes, read_rgb, write_png
 
 
 def noise(height: int, width: int) -> Rgb:
@@ -27,6 +27,32 @@ def test_a_lossless_webp_comes_back_byte_for_byte(tmp_path: Path) -> None:
     rgb = noise(36, 64)
     cv2.imwrite(str(tmp_path / "a.webp"), rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 101])
     assert np.array_equal(read_rgb(tmp_path / "a.webp"), rgb)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 13), (64, 48)])
+@pytest.mark.parametrize("colour", [(0, 0, 0), (255, 255, 255), (255, 153, 51), (10, 20, 200)])
+def test_a_jpeg_shows_the_colours_of_the_picture(
+    size: tuple[int, int], colour: tuple[int, int, int]
+) -> None:
+    """OpenCV's reader is the oracle; two roundings to 8 bits and a quantised mean are 3 levels."""
+    rgb = np.full((*size, 3), colour, np.uint8)
+    seen = cv2.imdecode(np.frombuffer(jpeg_bytes(rgb), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert seen.shape == rgb.shape
+    assert np.abs(seen.astype(int) - rgb).max() <= 3
+
+
+@pytest.mark.parametrize("size_px", [(1, 1), (7, 13), (64, 48)])
+def test_planes_are_packed_and_unpacked(size_px: tuple[int, int]) -> None:
+    width, height = size_px
+    half = ((height + 1) // 2, (width + 1) // 2)
+    rng = np.random.default_rng(3)
+    picture = I420(
+        *(rng.integers(0, 256, s, dtype=np.uint8) for s in ((height, width), half, half))
+    )
+    packed = picture.packed()
+    assert I420.unpacked(size_px, packed).digest() == picture.digest()
+    with pytest.raises(InvalidInput, match="bytes for"):
+        I420.unpacked(size_px, packed + b"x")
 
 
 def test_a_jpeg_is_read_without_a_colour_cast(tmp_path: Path) -> None:

@@ -66,6 +66,9 @@ SERVER_OPTIONS: Final[Options] = (
     ("grpc.http2.min_ping_interval_without_data_ms", 1_000),
     ("grpc.http2.max_ping_strikes", 0),
     ("grpc.keepalive_permit_without_calls", 1),
+    # A consumer of the twin only listens: if its machine vanishes, nobody but this would notice.
+    ("grpc.keepalive_time_ms", 10_000),
+    ("grpc.keepalive_timeout_ms", 5_000),
     # Two servers on one port would share the vehicles between them at random.
     ("grpc.so_reuseport", 0),
     ("grpc.max_concurrent_streams", 256),

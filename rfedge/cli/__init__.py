@@ -23,6 +23,7 @@ from rfedge.cli.link import Link
 from rfedge.cli.render import Render
 from rfedge.cli.scene import Scene
 from rfedge.cli.train import Train
+from rfedge.cli.watch import Watch
 
 __all__ = ["main"]
 
@@ -34,6 +35,7 @@ Verb = (
     | Annotated[Decode, subcommand("decode")]
     | Annotated[Link, subcommand("link")]
     | Annotated[Scene, subcommand("scene")]
+    | Annotated[Watch, subcommand("watch")]
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Eval, subcommand("eval")]
 )

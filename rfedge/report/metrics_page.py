@@ -11,6 +11,7 @@ from prometheus_client import CollectorRegistry
 
 from cav_agent.metrics import AgentMetrics
 from mec_server.metrics import ServerMetrics
+from mec_server.twin_metrics import TwinMetrics
 from rfcore.wire.instruments import Family
 from rfedge.link_metrics import LinkMetrics
 
@@ -35,8 +36,10 @@ def families() -> Mapping[str, Sequence[Family]]:
     agent = AgentMetrics(CollectorRegistry())
     agent.travelling("cav-1", "front")
     agent.field("0" * 16, "splats")
+    server = ServerMetrics(CollectorRegistry(), per_vehicle=True)
+    TwinMetrics(server.instruments, dict, int, per_vehicle=True)
     return {
-        "mec-server": ServerMetrics(CollectorRegistry(), per_vehicle=True).instruments.families,
+        "mec-server": server.instruments.families,
         "cav-agent": agent.instruments.families,
         "rfedge link": LinkMetrics(CollectorRegistry()).instruments.families,
     }

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-VERBS = ("demo", "train", "render", "encode", "decode", "link", "bench", "eval")
+VERBS = ("demo", "train", "render", "encode", "decode", "link", "watch", "bench", "eval")
 SCENE_VERBS = ("scene convert", "scene poses", "scene record-carla")
 HEAVY = ("torch", "cv2", "matplotlib", "av", "grpc")
 
@@ -44,6 +44,8 @@ def test_the_help_loads_nothing_heavy() -> None:
         (("demo", "--link-bps", "0"), "above 0 bit/s"),
         (("decode", "missing.rfv", "--field", "f.rff", "--out", "o"), "missing.rfv"),
         (("link", "--to", "nonsense"), "nonsense"),
+        (("link", "--to", "127.0.0.1:1", "--profile", "missing.toml"), "missing.toml"),
+        (("watch", "nonsense"), "nonsense"),
         (("scene", "convert", "nowhere", "--out", "o"), "nowhere"),
         (("scene", "convert", "nowhere", "--out", "o", "--size", "big"), "'big' is not WIDTHx"),
         (("scene", "poses", "nowhere", "--out", "o"), "nowhere: holds 0 pictures"),

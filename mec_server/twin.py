@@ -1,0 +1,130 @@
+"""The twin: the newest picture of every camera, and a mailbox for each who watches.
+
+Without asyncio or clock. ``show`` costs the same whether anybody reads or not: a mailbox holds at
+most one entry a camera, the newest, so whoever reads slowly misses pictures and delays nobody. One
+vehicle is one entry whatever number of streams it has: the newest capture wins.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from rfcore.camera import Intrinsics
+from rfcore.image import I420
+from rfcore.wire.messages import Frame
+from rfcore.wire.twin import Departure, Wish
+
+__all__ = ["CameraKey", "Mailbox", "Twin", "TwinView"]
+
+CameraKey = tuple[str, str]
+"""(vehicle id, camera id)"""
+
+
+@dataclass(frozen=True, eq=False)
+class TwinView:
+    """One reconstructed picture, and how old it was at ``reconstructed_s`` (monotonic)."""
+
+    vehicle_id: str
+    session_id: str
+    frame: Frame
+    intrinsics: Intrinsics
+    field_id: str
+    picture: I420
+    digest: bytes
+    reconstructed_s: float
+    latency_s: float
+
+    @property
+    def key(self) -> CameraKey:
+        """Which camera it is of."""
+        return (self.vehicle_id, self.frame.camera_id)
+
+    def age_s(self, now: float) -> float:
+        """Return the seconds since capture; a clock that is set back makes it no younger."""
+        return self.latency_s + max(0.0, now - self.reconstructed_s)
+
+
+class Mailbox:
+    """What one consumer has not taken yet; ``arrived`` is called when there is something."""
+
+    def __init__(self, wish: Wish, arrived: Callable[[], None]) -> None:
+        self.wish = wish
+        self.skipped: Counter[CameraKey] = Counter()
+        self._arrived = arrived
+        self._entries: OrderedDict[CameraKey, TwinView | Departure] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def put(self, key: CameraKey, entry: TwinView | Departure) -> bool:
+        """Keep ``entry`` in place of an older one of its camera; return whether one was missed."""
+        if not self.wish.includes(key[0]):
+            return False
+        missed = isinstance(self._entries.get(key), TwinView)
+        if missed:
+            self.skipped[key] += 1
+        self._entries[key] = entry
+        self._arrived()
+        return missed
+
+    def take(self) -> TwinView | Departure | None:
+        """Return what waits longest, or None."""
+        if not self._entries:
+            return None
+        key, entry = self._entries.popitem(last=False)
+        if isinstance(entry, Departure):
+            self.skipped.pop(key, None)
+        return entry
+
+
+class Twin:
+    """The state of the street, as pictures."""
+
+    def __init__(self) -> None:
+        self._views: dict[CameraKey, TwinView] = {}
+        self._mailboxes: list[Mailbox] = []
+        self.missed = 0
+
+    def show(self, view: TwinView) -> None:
+        """Take in a picture, unless another stream of its vehicle has brought a newer one."""
+        seen = self._views.get(view.key)
+        if (
+            seen is not None
+            and seen.session_id != view.session_id
+            and seen.frame.capture_time_ns > view.frame.capture_time_ns
+        ):
+            return
+        self._views[view.key] = view
+        self._tell(view.key, view)
+
+    def leave(self, session_id: str) -> None:
+        """A stream ended: cameras that no other stream took over are no longer seen."""
+        for key, view in tuple(self._views.items()):
+            if view.session_id == session_id:
+                del self._views[key]
+                self._tell(key, Departure(*key))
+
+    def watch(self, wish: Wish, arrived: Callable[[], None]) -> Mailbox:
+        """Return a new consumer's mailbox, with what is to be seen now in it."""
+        mailbox = Mailbox(wish, arrived)
+        for key, view in self._views.items():
+            mailbox.put(key, view)
+        self._mailboxes.append(mailbox)
+        return mailbox
+
+    def unwatch(self, mailbox: Mailbox) -> None:
+        """Forget a consumer."""
+        self._mailboxes.remove(mailbox)
+
+    def ages_s(self, now: float) -> Mapping[str, float]:
+        """Return, for each vehicle, the age of the oldest of its cameras' newest pictures."""
+        ages: dict[str, float] = {}
+        for view in tuple(self._views.values()):
+            ages[view.vehicle_id] = max(ages.get(view.vehicle_id, 0.0), view.age_s(now))
+        return ages
+
+    def _tell(self, key: CameraKey, entry: TwinView | Departure) -> None:
+        for mailbox in self._mailboxes:
+            self.missed += mailbox.put(key, entry)

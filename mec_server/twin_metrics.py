@@ -1,0 +1,89 @@
+"""What Prometheus sees of the twin and those who watch it. Names begin with ``rfedge_twin_``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from rfcore.wire.instruments import Family, Instruments
+
+__all__ = ["TwinMetrics"]
+
+AGE = Family(
+    "rfedge_twin_age_seconds",
+    "gauge",
+    "Seconds since the capture of the newest picture there is: of the vehicle where it is oldest.",
+)
+MISSED = Family(
+    "rfedge_twin_pictures_missed_total",
+    "counter",
+    "Pictures that a consumer was too slow for.",
+)
+
+
+class TwinMetrics:
+    """Ages and misses are read from the twin at the moment of a scrape."""
+
+    def __init__(
+        self,
+        make: Instruments,
+        ages_s: Callable[[], Mapping[str, float]],
+        missed: Callable[[], int],
+        *,
+        per_vehicle: bool = False,
+    ) -> None:
+        labels = ("vehicle",) if per_vehicle else ()
+        age = Family(AGE.name, AGE.kind, AGE.text, labels)
+        make.collector(age, _Ages(age, ages_s))
+        make.collector(MISSED, _Missed(missed))
+        self.consumers = make.gauge("rfedge_twin_consumers", "Consumers that watch the twin.")
+        self.ended = make.counter(
+            "rfedge_twin_consumers_ended",
+            "Consumers by how they ended: left, slow (took nothing for long), refused, drained.",
+            ("reason",),
+        )
+        self.sent = make.counter(
+            "rfedge_twin_pictures_sent", "Pictures handed to consumers, by encoding.", ("encoding",)
+        )
+        self.bytes = make.counter("rfedge_twin_sent_bytes", "Bytes handed to consumers.")
+        self.sent_age = make.seconds(
+            "rfedge_twin_sent_age_seconds", "Seconds from capture to handing over to a consumer."
+        )
+        for reason in ("left", "slow", "refused", "drained"):
+            self.ended.labels(reason)
+
+
+class _Ages(Collector):
+    def __init__(self, family: Family, ages_s: Callable[[], Mapping[str, float]]) -> None:
+        self._family = family
+        self._ages_s = ages_s
+
+    def describe(self) -> Iterable[Metric]:
+        return [self._empty()]
+
+    def collect(self) -> Iterable[Metric]:
+        metric, ages_s = self._empty(), self._ages_s()
+        if self._family.labels:
+            for vehicle_id, age_s in ages_s.items():
+                metric.add_metric([vehicle_id], age_s)
+        elif ages_s:
+            metric.add_metric([], max(ages_s.values()))
+        return [metric]
+
+    def _empty(self) -> GaugeMetricFamily:
+        return GaugeMetricFamily(
+            self._family.name, self._family.text, labels=list(self._family.labels)
+        )
+
+
+class _Missed(Collector):
+    def __init__(self, missed: Callable[[], int]) -> None:
+        self._missed = missed
+
+    def describe(self) -> Iterable[Metric]:
+        return [CounterMetricFamily(MISSED.name, MISSED.text)]
+
+    def collect(self) -> Iterable[Metric]:
+        return [CounterMetricFamily(MISSED.name, MISSED.text, self._missed())]

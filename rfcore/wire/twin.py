@@ -1,0 +1,186 @@
+"""What a server tells those who watch its twin: plain values, and between them and protobuf.
+
+What comes from a peer is checked here: a request that is wrong raises ``InvalidInput``, a response
+that is wrong ``ProtocolError``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from rfcore.camera import Intrinsics, Pose
+from rfcore.errors import InvalidInput, ProtocolError
+from rfcore.wire.checks import check_name, check_range
+from rfcore.wire.v1 import edge_pb2, twin_pb2
+
+__all__ = [
+    "MAX_WATCHED_VEHICLES",
+    "Departure",
+    "PictureEncoding",
+    "TwinPicture",
+    "Wish",
+    "watch_request",
+    "watch_response",
+    "watched",
+    "wish_of",
+]
+
+MAX_WATCHED_VEHICLES: Final = 256
+"""Vehicles one consumer may name; without naming any it sees all."""
+
+
+class PictureEncoding(StrEnum):
+    """How a picture travels: see twin.proto."""
+
+    NONE = "none"
+    I420 = "i420"
+    JPEG = "jpeg"
+    PNG = "png"
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a consumer wants to see; no vehicle named means all of them."""
+
+    vehicle_ids: frozenset[str] = frozenset()
+    encoding: PictureEncoding = PictureEncoding.JPEG
+
+    def includes(self, vehicle_id: str) -> bool:
+        """Return whether the consumer wants to see this vehicle."""
+        return not self.vehicle_ids or vehicle_id in self.vehicle_ids
+
+
+@dataclass(frozen=True)
+class TwinPicture:
+    """One reconstructed picture; ``pose`` is world_from_cam, tile-relative."""
+
+    vehicle_id: str
+    camera_id: str
+    session_id: str
+    epoch: int
+    sequence: int
+    capture_time_ns: int
+    age_ns: int
+    pose: Pose
+    intrinsics: Intrinsics
+    field_id: str
+    reconstruction_digest: bytes
+    encoding: PictureEncoding
+    picture: bytes
+    skipped: int = 0
+
+
+@dataclass(frozen=True)
+class Departure:
+    """A vehicle's camera is no longer seen."""
+
+    vehicle_id: str
+    camera_id: str
+
+
+def watch_request(wish: Wish) -> twin_pb2.WatchRequest:
+    """Return a consumer's request."""
+    return twin_pb2.WatchRequest(
+        vehicle_ids=sorted(wish.vehicle_ids), encoding=_encoding_to_wire(wish.encoding)
+    )
+
+
+def wish_of(request: twin_pb2.WatchRequest) -> Wish:
+    """Return what a consumer wants; raise ``InvalidInput`` for what nobody can have."""
+    check_range("vehicle_ids", len(request.vehicle_ids), 0, MAX_WATCHED_VEHICLES)
+    names = (check_name(f"vehicle_ids[{i}]", name) for i, name in enumerate(request.vehicle_ids))
+    if request.encoding == twin_pb2.PICTURE_ENCODING_UNSPECIFIED:
+        return Wish(frozenset(names))
+    return Wish(frozenset(names), _encoding_from_wire(request.encoding))
+
+
+def watch_response(message: TwinPicture | Departure) -> twin_pb2.WatchResponse:
+    """Return a server's message."""
+    if isinstance(message, Departure):
+        departure = twin_pb2.Departure(vehicle_id=message.vehicle_id, camera_id=message.camera_id)
+        return twin_pb2.WatchResponse(departure=departure)
+    return twin_pb2.WatchResponse(picture=_picture_to_wire(message))
+
+
+def watched(response: twin_pb2.WatchResponse) -> TwinPicture | Departure:
+    """Return what a server said; raise ``ProtocolError`` if it cannot be."""
+    try:
+        match response.WhichOneof("message"):
+            case "picture":
+                return _picture_from_wire(response.picture)
+            case "departure":
+                gone = response.departure
+                return Departure(
+                    check_name("departure.vehicle_id", gone.vehicle_id),
+                    check_name("departure.camera_id", gone.camera_id),
+                )
+    except InvalidInput as error:
+        raise ProtocolError(f"the server sent an impossible picture: {error}") from error
+    raise ProtocolError("the server sent a message this program does not know; update it")
+
+
+def _picture_to_wire(message: TwinPicture) -> twin_pb2.TwinPicture:
+    x_m, y_m, z_m = message.pose.translation_m
+    w, x, y, z = message.pose.rotation
+    k = message.intrinsics
+    return twin_pb2.TwinPicture(
+        vehicle_id=message.vehicle_id,
+        camera_id=message.camera_id,
+        session_id=message.session_id,
+        epoch=message.epoch,
+        sequence=message.sequence,
+        capture_time_ns=message.capture_time_ns,
+        age_ns=message.age_ns,
+        pose=edge_pb2.Pose(
+            x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
+        ),
+        intrinsics=edge_pb2.Intrinsics(
+            width_px=k.width_px,
+            height_px=k.height_px,
+            fx_px=k.fx_px,
+            fy_px=k.fy_px,
+            cx_px=k.cx_px,
+            cy_px=k.cy_px,
+        ),
+        field_id=message.field_id,
+        reconstruction_digest=message.reconstruction_digest,
+        encoding=_encoding_to_wire(message.encoding),
+        picture=message.picture,
+        skipped=message.skipped,
+    )
+
+
+def _picture_from_wire(picture: twin_pb2.TwinPicture) -> TwinPicture:
+    pose, k = picture.pose, picture.intrinsics
+    return TwinPicture(
+        vehicle_id=check_name("picture.vehicle_id", picture.vehicle_id),
+        camera_id=check_name("picture.camera_id", picture.camera_id),
+        session_id=picture.session_id,
+        epoch=picture.epoch,
+        sequence=picture.sequence,
+        capture_time_ns=picture.capture_time_ns,
+        age_ns=picture.age_ns,
+        pose=Pose(
+            (pose.x_m, pose.y_m, pose.z_m),
+            (pose.rotation_w, pose.rotation_x, pose.rotation_y, pose.rotation_z),
+        ),
+        intrinsics=Intrinsics(k.width_px, k.height_px, k.fx_px, k.fy_px, k.cx_px, k.cy_px),
+        field_id=picture.field_id,
+        reconstruction_digest=picture.reconstruction_digest,
+        encoding=_encoding_from_wire(picture.encoding),
+        picture=picture.picture,
+        skipped=picture.skipped,
+    )
+
+
+def _encoding_to_wire(encoding: PictureEncoding) -> twin_pb2.PictureEncoding.ValueType:
+    return twin_pb2.PictureEncoding.Value(f"PICTURE_ENCODING_{encoding.name}")
+
+
+def _encoding_from_wire(number: int) -> PictureEncoding:
+    for encoding in PictureEncoding:
+        if _encoding_to_wire(encoding) == number:
+            return encoding
+    raise InvalidInput("encoding", f"{number} is no picture encoding this program knows")

@@ -1,0 +1,233 @@
+"""Consumers of the twin beside real vehicles: exact, limited, and never in the way."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import av
+import grpc
+import numpy as np
+import pytest
+
+from mec_server.config import ConsumerLimits
+from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.image import I420, read_rgb
+from rfcore.native.yuv import rgb_from_i420
+from rfcore.wire.conventions import CHANNEL_OPTIONS
+from rfcore.wire.twin import (
+    Departure,
+    PictureEncoding,
+    TwinPicture,
+    Wish,
+    watch_request,
+    watched,
+)
+from rfcore.wire.v1 import twin_pb2_grpc
+from rfedge.watch import WatchSettings, watch
+
+
+@asynccontextmanager
+async def consumer(address: object, wish: Wish) -> AsyncIterator[Any]:
+    async with grpc.aio.insecure_channel(str(address), options=CHANNEL_OPTIONS) as channel:
+        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(watch_request(wish))
+        await call.initial_metadata()
+        yield call
+
+
+async def next_of(call: Any) -> TwinPicture | Departure:
+    response = await call.read()
+    assert response is not grpc.aio.EOF
+    return watched(response)
+
+
+async def seen_until_departure(call: Any) -> list[TwinPicture]:
+    pictures = []
+    while isinstance(message := await next_of(call), TwinPicture):
+        pictures.append(message)
+    return pictures
+
+
+def planes(picture: TwinPicture) -> I420:
+    k = picture.intrinsics
+    return I420.unpacked((k.width_px, k.height_px), picture.picture)
+
+
+async def test_a_consumer_sees_to_the_bit_what_the_vehicle_holds(serve: Any, travel: Any) -> None:
+    async with (
+        serve() as server,
+        consumer(server.address, Wish(encoding=PictureEncoding.I420)) as call,
+    ):
+        trip = await travel(server.address)
+        pictures = await seen_until_departure(call)
+    held = {line["sequence"]: line["reconstruction_digest"] for line in trip.lines}
+    assert [p.sequence for p in pictures] == sorted({p.sequence for p in pictures})
+    assert pictures[-1].sequence == 5, "the newest is always seen"
+    assert len(pictures) + pictures[-1].skipped == 6
+    for picture in pictures:
+        assert planes(picture).digest() == picture.reconstruction_digest
+        assert picture.reconstruction_digest.hex() == held[picture.sequence]
+        assert (picture.vehicle_id, picture.camera_id) == ("cav-1", "front")
+        assert picture.age_ns > 0
+
+
+@pytest.mark.parametrize(("encoding", "worst"), [("png", 0), ("jpeg", 12), ("none", None)])
+async def test_a_picture_comes_in_the_encoding_that_was_asked_for(
+    serve: Any, travel: Any, tmp_path: Path, encoding: str, worst: int | None
+) -> None:
+    """JPEG at quality 90 with half the chroma stays within a few levels on average."""
+    async with serve() as server:
+        async with consumer(server.address, Wish(encoding=PictureEncoding.I420)) as call:
+            await travel(server.address)
+            exact = (await seen_until_departure(call))[-1]
+        async with consumer(server.address, Wish(encoding=PictureEncoding(encoding))) as call:
+            await travel(server.address)
+            picture = (await seen_until_departure(call))[-1]
+    assert picture.encoding == encoding
+    if worst is None:
+        assert picture.picture == b""
+        return
+    (tmp_path / "picture").write_bytes(picture.picture)
+    error = np.abs(read_rgb(tmp_path / "picture").astype(int) - rgb_from_i420(planes(exact)))
+    assert error.mean() <= worst
+
+
+async def test_a_consumer_that_never_reads_slows_no_vehicle_and_is_let_go(
+    serve: Any, travel: Any
+) -> None:
+    """Its window is full after a few pictures; what it misses is counted, and patience ends."""
+    limits = ConsumerLimits(patience_s=0.3)
+    async with serve(consumers=limits) as server:
+        value = server.registry.get_sample_value
+        async with consumer(server.address, Wish(encoding=PictureEncoding.I420)):
+            while not value("rfedge_twin_pictures_missed_total"):
+                trip = await travel(server.address)
+                assert trip.counts == {"acked": 6}
+            while value("rfedge_twin_consumers_ended_total", {"reason": "slow"}) < 1:
+                await asyncio.sleep(0.01)
+            assert value("rfedge_twin_consumers") == 0
+        trip = await travel(server.address)
+        assert trip.counts == {"acked": 6}
+
+
+async def test_consumers_are_limited_and_one_that_leaves_makes_room(
+    serve: Any, travel: Any
+) -> None:
+    async with serve(consumers=ConsumerLimits(consumers=1)) as server:
+        value = server.registry.get_sample_value
+        async with consumer(server.address, Wish()) as first:
+            await travel(server.address)
+            assert isinstance(await next_of(first), TwinPicture)
+            async with consumer(server.address, Wish()) as second:
+                assert await second.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+                assert "1 consumers watch, 1 may" in await second.details()
+        while value("rfedge_twin_consumers"):
+            await asyncio.sleep(0.01)
+        assert value("rfedge_twin_consumers_ended_total", {"reason": "left"}) == 1
+        assert value("rfedge_twin_consumers_ended_total", {"reason": "refused"}) == 1
+        async with consumer(server.address, Wish()) as third:
+            await travel(server.address)
+            assert isinstance(await next_of(third), TwinPicture)
+
+
+@pytest.mark.parametrize(
+    ("wish", "problem"),
+    [
+        (Wish(frozenset({"../etc"})), "vehicle_ids"),
+        (Wish(frozenset(str(i) for i in range(257))), "vehicle_ids: 257 is outside 0..256"),
+    ],
+)
+async def test_a_wish_nobody_can_have_is_refused(serve: Any, wish: Wish, problem: str) -> None:
+    async with serve() as server, consumer(server.address, wish) as call:
+        assert await call.code() is grpc.StatusCode.INVALID_ARGUMENT
+        assert problem in await call.details()
+
+
+@asynccontextmanager
+async def consumer_of_stopping(serve: Any) -> AsyncIterator[Any]:
+    """A consumer whose server stops while it watches."""
+    async with AsyncExitStack() as stack:
+        server = await stack.enter_async_context(serve())
+        call = await stack.enter_async_context(consumer(server.address, Wish()))
+        assert server.registry.get_sample_value("rfedge_twin_consumers") == 1
+        await server.stop()
+        yield call
+
+
+async def test_a_server_that_drains_lets_consumers_go(serve: Any) -> None:
+    async with consumer_of_stopping(serve) as call:
+        assert await call.code() is grpc.StatusCode.OK
+
+
+async def test_the_age_of_the_twin_is_there_while_a_vehicle_streams(
+    serve: Any, travel: Any
+) -> None:
+    async with serve(metrics_per_vehicle=True) as server:
+        value = server.registry.get_sample_value
+        async with consumer(server.address, Wish(encoding=PictureEncoding.NONE)) as call:
+            driving = asyncio.create_task(travel(server.address))
+            while (age_s := value("rfedge_twin_age_seconds", {"vehicle": "cav-1"})) is None:
+                await asyncio.sleep(0)
+            assert age_s > 0
+            await driving
+            await seen_until_departure(call)
+        assert value("rfedge_twin_age_seconds", {"vehicle": "cav-1"}) is None
+
+
+@pytest.fixture
+def watch_command() -> Callable[..., Awaitable[list[str]]]:
+    """Return a coroutine that watches in a thread, and the lines it printed."""
+
+    async def run(address: object, **settings: Any) -> None:
+        await asyncio.to_thread(watch, WatchSettings(str(address), **settings))
+
+    return run
+
+
+async def test_the_watch_command_keeps_pictures_and_a_video(
+    serve: Any, travel: Any, watch_command: Any, tmp_path: Path, capsys: Any
+) -> None:
+    settings = {"folder": tmp_path / "kept", "video": tmp_path / "kept.mp4", "pictures": 4}
+    async with serve() as server:
+        watching = asyncio.create_task(watch_command(server.address, **settings))
+        while not server.registry.get_sample_value("rfedge_twin_consumers"):
+            await asyncio.sleep(0.01)
+        while not watching.done():
+            trip = await travel(server.address)
+        await watching
+    folder = tmp_path / "kept" / "cav-1" / "front"
+    index = [json.loads(line) for line in (folder / "index.jsonl").read_text().splitlines()]
+    assert len(index) == 4
+    known = {line["reconstruction_digest"] for line in trip.lines}
+    for line in index:
+        assert line["digest"] in known
+        assert read_rgb(folder / line["file"]).shape == (52, 76, 3)
+    with av.open(str(tmp_path / "kept.mp4")) as container:
+        times = [frame.time for frame in container.decode(video=0)]
+    captured = [line["capture_time_ns"] for line in index]
+    assert times == pytest.approx([(t - captured[0]) / 1e9 for t in captured], abs=2e-5)
+    assert capsys.readouterr().out.count("cav-1/front 0:") == 4
+
+
+async def test_a_server_that_refuses_a_watcher_is_one_clear_error(
+    serve: Any, watch_command: Any
+) -> None:
+    async with serve(consumers=ConsumerLimits(consumers=0)) as server:
+        with pytest.raises(RfedgeError, match="resource_exhausted: 0 consumers watch, 0 may"):
+            await watch_command(server.address)
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ({"address": "example.org:1"}, "not a loopback address"),
+        ({"pictures": 0}, "pictures: 0 must be at least 1"),
+        ({"video": Path("x.mp4"), "encoding": "jpeg"}, "jpeg makes no video"),
+        ({"folder": Path("x"), "encoding": "none"}, "leaves nothing to keep"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any], problem: str) -> None:
+    with pytest.raises(InvalidInput, match=problem):
+        WatchSettings(**{"address": "127.0.0.1:1", **settings})

@@ -1,0 +1,144 @@
+"""The twin holds the newest picture of every camera; a mailbox the newest nobody has taken."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mec_server.twin import Mailbox, Twin, TwinView
+from rfcore.camera import Intrinsics
+from rfcore.image import I420
+from rfcore.wire.messages import Frame
+from rfcore.wire.twin import Departure, Wish
+
+PICTURE = I420(*(np.zeros(size, np.uint8) for size in ((2, 2), (1, 1), (1, 1))))
+INTRINSICS = Intrinsics(2, 2, 1.0, 1.0, 1.0, 1.0)
+MakeView = Callable[..., TwinView]
+
+
+@pytest.fixture
+def view(make_frame: Callable[..., Frame]) -> MakeView:
+    def make(
+        vehicle: str = "cav-1", session: str = "s-1", sequence: int = 0, captured_ns: int = 1
+    ) -> TwinView:
+        frame = replace(make_frame(sequence), capture_time_ns=captured_ns)
+        return TwinView(
+            vehicle, session, frame, INTRINSICS, "ab" * 32, PICTURE, b"d" * 16, 10.0, 0.25
+        )
+
+    return make
+
+
+def taken(mailbox: Mailbox) -> list[tuple[str, int | None]]:
+    """Empty a mailbox; return (vehicle, sequence), None for a departure."""
+    entries = []
+    while (entry := mailbox.take()) is not None:
+        is_view = isinstance(entry, TwinView)
+        entries.append((entry.vehicle_id, entry.frame.packet.sequence if is_view else None))
+    return entries
+
+
+def test_a_mailbox_keeps_the_newest_of_each_camera_and_counts_what_was_missed(
+    view: MakeView,
+) -> None:
+    twin, calls = Twin(), []
+    mailbox = twin.watch(Wish(), lambda: calls.append(1))
+    for sequence in range(5):
+        twin.show(view("cav-1", sequence=sequence))
+    twin.show(view("cav-2", sequence=0))
+    assert len(mailbox) == 2
+    assert taken(mailbox) == [("cav-1", 4), ("cav-2", 0)]
+    assert mailbox.skipped[("cav-1", "front")] == twin.missed == 4
+    assert len(calls) == 6
+
+
+def test_a_camera_that_is_shown_often_does_not_push_the_others_back(view: MakeView) -> None:
+    twin = Twin()
+    mailbox = twin.watch(Wish(), lambda: None)
+    for sequence in range(3):
+        for vehicle in ("fast", "slow"):
+            if vehicle == "fast" or sequence == 0:
+                twin.show(view(vehicle, sequence=sequence))
+    assert taken(mailbox) == [("fast", 2), ("slow", 0)]
+
+
+def test_a_new_consumer_sees_at_once_what_is_there(view: MakeView) -> None:
+    twin = Twin()
+    twin.show(view("cav-1", sequence=7))
+    assert taken(twin.watch(Wish(), lambda: None)) == [("cav-1", 7)]
+
+
+def test_a_consumer_gets_only_the_vehicles_it_named(view: MakeView) -> None:
+    twin = Twin()
+    mailbox = twin.watch(Wish(frozenset({"cav-2"})), lambda: None)
+    for vehicle in ("cav-1", "cav-2"):
+        twin.show(view(vehicle))
+    twin.leave("s-1")
+    assert taken(mailbox) == [("cav-2", None)]
+
+
+def test_a_vehicle_with_two_streams_is_one_vehicle_and_the_newest_capture_wins(
+    view: MakeView,
+) -> None:
+    """As in a handover: the old stream's late picture does not replace the new stream's."""
+    twin = Twin()
+    twin.show(view(session="old", sequence=5, captured_ns=500))
+    twin.show(view(session="new", sequence=0, captured_ns=600))
+    twin.show(view(session="old", sequence=6, captured_ns=550))
+    mailbox = twin.watch(Wish(), lambda: None)
+    twin.leave("old")
+    assert taken(mailbox) == [("cav-1", 0)], "the old stream takes nobody with it"
+    twin.leave("new")
+    assert taken(mailbox) == [("cav-1", None)]
+    assert twin.ages_s(11.0) == {}
+
+
+def test_within_a_stream_a_clock_that_is_set_back_does_not_freeze_the_twin(view: MakeView) -> None:
+    twin = Twin()
+    mailbox = twin.watch(Wish(), lambda: None)
+    twin.show(view(sequence=0, captured_ns=10**18))
+    twin.show(view(sequence=1, captured_ns=5))
+    assert taken(mailbox) == [("cav-1", 1)]
+
+
+def test_the_age_is_that_of_the_oldest_newest_picture_and_grows(view: MakeView) -> None:
+    twin = Twin()
+    twin.show(view("cav-1"))
+    twin.show(replace(view("cav-2"), reconstructed_s=12.0, latency_s=0.1))
+    assert twin.ages_s(12.0) == {"cav-1": 2.25, "cav-2": 0.1}
+    assert twin.ages_s(9.0) == {"cav-1": 0.25, "cav-2": 0.1}, "never younger than at its birth"
+
+
+def test_a_consumer_that_left_costs_nothing(view: MakeView) -> None:
+    twin = Twin()
+    mailbox = twin.watch(Wish(), lambda: None)
+    twin.unwatch(mailbox)
+    twin.show(view())
+    assert len(mailbox) == 0
+
+
+@given(st.lists(st.tuples(st.sampled_from("ab"), st.booleans()), max_size=40))
+def test_what_was_shown_is_taken_or_missed_and_never_both(steps: list[tuple[str, bool]]) -> None:
+    mailbox, shown, got = Mailbox(Wish(), lambda: None), 0, 0
+    for name, is_take in steps:
+        if is_take:
+            got += mailbox.take() is not None
+        else:
+            frame = object.__new__(Frame)
+            entry = TwinView(name, "s", frame, INTRINSICS, "", PICTURE, b"", 0.0, 0.0)
+            mailbox.put((name, "front"), entry)
+            shown += 1
+        assert len(mailbox) <= 2
+    assert shown == got + sum(mailbox.skipped.values()) + len(mailbox)
+
+
+def test_a_departure_replaces_the_picture_that_was_not_taken(view: MakeView) -> None:
+    twin = Twin()
+    mailbox = twin.watch(Wish(), lambda: None)
+    twin.show(view())
+    twin.leave("s-1")
+    assert mailbox.take() == Departure("cav-1", "front")
+    assert mailbox.take() is None

@@ -1,0 +1,57 @@
+"""What consumers and servers say to each other survives the wire, and what is wrong is named."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rfcore.camera import Intrinsics, Pose
+from rfcore.errors import InvalidInput, ProtocolError
+from rfcore.wire.twin import (
+    Departure,
+    PictureEncoding,
+    TwinPicture,
+    Wish,
+    watch_request,
+    watch_response,
+    watched,
+    wish_of,
+)
+from rfcore.wire.v1 import twin_pb2
+
+PICTURE = TwinPicture(
+    "cav-1", "front", "s-1", 3, 7, 10**18, 5, Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)),
+    Intrinsics(4, 2, 1.0, 1.5, 2.0, 1.0), "ab" * 32, b"d" * 16, PictureEncoding.PNG, b"png", 9,
+)  # fmt: skip
+
+
+@given(
+    st.frozensets(st.from_regex(r"[a-z][a-z0-9._-]{0,20}", fullmatch=True), max_size=5),
+    st.sampled_from(PictureEncoding),
+)
+def test_a_wish_survives_the_wire(vehicles: frozenset[str], encoding: PictureEncoding) -> None:
+    wish = Wish(vehicles, encoding)
+    assert wish_of(watch_request(wish)) == wish
+
+
+@pytest.mark.parametrize("message", [PICTURE, Departure("cav-1", "front")])
+def test_a_message_survives_the_wire(message: TwinPicture | Departure) -> None:
+    sent = watch_response(message).SerializeToString()
+    assert watched(twin_pb2.WatchResponse.FromString(sent)) == message
+
+
+def test_a_wish_without_an_encoding_gets_jpeg() -> None:
+    assert wish_of(twin_pb2.WatchRequest()) == Wish(frozenset(), PictureEncoding.JPEG)
+
+
+def test_an_unknown_encoding_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="encoding: 99"):
+        wish_of(twin_pb2.WatchRequest(encoding=99))  # type: ignore[arg-type]
+
+
+def test_an_impossible_picture_is_the_servers_fault() -> None:
+    bad = watch_response(PICTURE)
+    bad.picture.pose.x_m = float("nan")
+    with pytest.raises(ProtocolError, match="impossible picture"):
+        watched(bad)
+    with pytest.raises(ProtocolError, match="update it"):
+        watched(twin_pb2.WatchResponse())
