@@ -6,7 +6,7 @@ import grpc
 import pytest
 
 from rfcore import errors
-from rfcore.errors import InvalidInput, PacketRejected, RejectReason, RfedgeError
+from rfcore.errors import InvalidInput, PacketRejected, RejectReason, RfedgeError, TrainingDiverged
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 from rfcore.wire.conventions import (
     CHANNEL_OPTIONS,
@@ -27,6 +27,8 @@ def every_error() -> Iterator[RfedgeError]:
             yield kind("field", "problem")
         elif issubclass(kind, PacketRejected):
             yield kind(RejectReason.CRC_MISMATCH, "problem")
+        elif issubclass(kind, TrainingDiverged):
+            yield kind(7, "means", "problem")
         else:
             yield kind("problem")
 
@@ -37,7 +39,7 @@ def test_every_error_has_a_status_and_only_the_root_is_internal_by_default(
 ) -> None:
     status = status_of(error)
     assert status is not grpc.StatusCode.OK
-    expected_internal = type(error).__name__ in ("RfedgeError", "CodecError")
+    expected_internal = type(error).__name__ in ("RfedgeError", "CodecError", "TrainingDiverged")
     assert (status is grpc.StatusCode.INTERNAL) == expected_internal
 
 
