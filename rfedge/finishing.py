@@ -18,7 +18,7 @@ from rfcore.metrics import psnr, ssim
 from rfcore.train.rungs import RungConfig, with_rungs
 from rfcore.views import PosedPicture
 
-__all__ = ["finish_field", "held_out_quality"]
+__all__ = ["finish_field", "fit_rungs", "held_out_quality"]
 
 
 def finish_field(
@@ -32,7 +32,7 @@ def finish_field(
 
     ``held_out`` may be empty: then the header states no quality.
     """
-    small = _with_bar(field, [view.camera for view in views], config, console).compressed()
+    small = fit_rungs(field, [view.camera for view in views], config, console).compressed()
     if not held_out:
         return small
     psnr_db, similarity = held_out_quality(small, held_out)
@@ -53,7 +53,7 @@ def held_out_quality(field: RadianceField, pictures: Sequence[PosedPicture]) -> 
     )
 
 
-def _with_bar(
+def fit_rungs(
     field: SplatField, cameras: list[Camera], config: RungConfig, console: Console
 ) -> SplatField:
     columns = (TextColumn("rungs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

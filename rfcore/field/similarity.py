@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Pose
+from rfcore.camera import Pose, TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.raster.gaussians import F32, Gaussians
 
@@ -50,6 +50,10 @@ class Similarity:
         x, y, z = (value * self.scale for value in other.pose.translation_m)
         inner = Pose((x, y, z), other.pose.rotation)
         return Similarity(self.pose.compose(inner), self.scale * other.scale)
+
+    def localised(self, origin: TileOrigin) -> Similarity:
+        """Return the transform into a tile's frame, from one into the global frame (float64)."""
+        return replace(self, pose=origin.localise(self.pose))
 
     def apply(self, points: F64) -> F64:
         """Map points [N, 3] from src to dst."""

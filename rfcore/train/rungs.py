@@ -18,7 +18,7 @@ import numpy as np
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
-from rfcore.field.detail import Rung, Rungs, splats_of_rung
+from rfcore.field.detail import Rung, Rungs, kept_of
 from rfcore.field.importance import contributions, most_important_first, reordered
 from rfcore.field.quality import DETAILS
 from rfcore.field.splats import SplatField
@@ -26,7 +26,7 @@ from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import LearningRates, Rasterizer, TrainableRasterizer
 from rfcore.train.schedule import view_order
 
-__all__ = ["RungConfig", "with_rungs"]
+__all__ = ["Progress", "RungConfig", "fitted", "with_rungs"]
 
 Progress = Callable[[int, int], None]
 """Told how many steps are done and how many there are."""
@@ -84,11 +84,37 @@ def with_rungs(
         field.gaussians, cameras, threads=settings.threads, antialiased=antialiased
     )
     ordered = reordered(field.gaussians, most_important_first(weights))
-    rungs = _fitted(ordered, antialiased, cameras, settings, progress) if len(ordered) else {}
+    wanted = len(ordered) and settings.iterations
+    rungs = _rungs(ordered, antialiased, cameras, settings, progress) if wanted else {}
     return SplatField(ordered, field.metadata, rungs=rungs, threads=settings.threads, isa=field.isa)
 
 
-def _fitted(
+def fitted(
+    start: Gaussians,
+    target: Rasterizer,
+    cameras: Sequence[Camera],
+    config: RungConfig,
+    progress: Progress | None = None,
+) -> Gaussians:
+    """Return ``start`` with scales and opacities that bring its pictures nearest to ``target``'s.
+
+    ``target`` says whether splats are drawn antialiased. Every call sees the cameras in the same
+    random order.
+    """
+    order = view_order(len(cameras), np.random.default_rng(config.seed))
+    rasterizer = TrainableRasterizer(
+        start, threads=config.threads, isa=target.isa, antialiased=target.antialiased
+    )
+    for iteration in range(config.iterations):
+        camera = cameras[next(order)]
+        rates = config.rates(iteration / config.iterations)
+        rasterizer.iterate(camera, target.render_colour(camera), rates)
+        if progress is not None:
+            progress(iteration + 1, config.iterations)
+    return rasterizer.gaussians()
+
+
+def _rungs(
     gaussians: Gaussians,
     antialiased: bool,
     cameras: Sequence[Camera],
@@ -97,27 +123,19 @@ def _fitted(
 ) -> Rungs:
     """Fit every rung, each starting from the one above it."""
     full = Rasterizer(gaussians, threads=config.threads, antialiased=antialiased)
-    order = view_order(len(cameras), np.random.default_rng(config.seed))
-    total = config.iterations * len(DETAILS[1:])
-    above, done = gaussians, 0
+    above = gaussians
     rungs: dict[float, Rung] = {}
-    for detail in DETAILS[1:] if config.iterations else ():
-        start = _widened(reordered(above, np.arange(_count(gaussians, detail))), config.widening)
-        rasterizer = TrainableRasterizer(start, threads=config.threads, antialiased=antialiased)
-        for iteration in range(config.iterations):
-            camera = cameras[next(order)]
-            rates = config.rates(iteration / config.iterations)
-            rasterizer.iterate(camera, full.render_colour(camera), rates)
-            done += 1
+    for number, detail in enumerate(DETAILS[1:]):
+
+        def moved(done: int, total: int, before: int = number) -> None:
             if progress is not None:
-                progress(done, total)
-        above = rasterizer.gaussians()
+                progress(before * total + done, total * len(DETAILS[1:]))
+
+        kept = np.arange(kept_of(len(gaussians), detail))
+        start = _widened(reordered(above, kept), config.widening)
+        above = fitted(start, full, cameras, config, moved)
         rungs[detail] = Rung(above.log_scales, above.opacity_logits)
     return rungs
-
-
-def _count(gaussians: Gaussians, detail: float) -> int:
-    return len(splats_of_rung(gaussians, {}, detail))
 
 
 def _widened(gaussians: Gaussians, widening: float) -> Gaussians:

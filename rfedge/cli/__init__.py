@@ -19,6 +19,7 @@ from rfedge.cli.decode import Decode
 from rfedge.cli.demo import Demo
 from rfedge.cli.encode import Encode
 from rfedge.cli.eval import Eval
+from rfedge.cli.field import Field
 from rfedge.cli.link import Link
 from rfedge.cli.render import Render
 from rfedge.cli.scene import Scene
@@ -31,6 +32,7 @@ Verb = (
     Annotated[Demo, subcommand("demo")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Render, subcommand("render")]
+    | Annotated[Field, subcommand("field")]
     | Annotated[Encode, subcommand("encode")]
     | Annotated[Decode, subcommand("decode")]
     | Annotated[Link, subcommand("link")]

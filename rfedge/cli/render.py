@@ -1,10 +1,10 @@
-"""``rfedge render``: look at a field along a drive."""
+"""``rfedge render``: look at a field, around it or along a drive."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional
 
@@ -13,37 +13,58 @@ __all__ = ["Render"]
 
 @dataclass(frozen=True)
 class Render:
-    """Render a field at every pose of a drive, as PNG files."""
+    """Render a field along a path, as PNG files or one MP4."""
 
     field: Annotated[Path, Positional]
-    """The field archive (.rff)."""
-    drive: Path
-    """A transforms.json with the poses; its pictures are used only to print PSNR."""
+    """The field archive (.rff), or the name it was imported under."""
     out: Path
-    """Folder for the PNG files."""
+    """Folder for the PNG files, or a file ending in .mp4."""
+    path: Literal["orbit", "drive"] | None = None
+    """Once around the field, or the poses of a drive (default: drive if there is one)."""
+    drive: Path | None = None
+    """A dataset with the poses; its pictures are used only to print PSNR."""
     psnr: bool = False
     """Print the PSNR of each render against the drive's picture, dB."""
+    frames: int = 96
+    """Pictures of an orbit."""
+    size: tuple[int, int] = (960, 540)
+    """Width and height of an orbit's pictures, px."""
+    up: Literal["z", "y", "-y"] = "z"
+    """Where up is in the field's frame (orbit)."""
+    rate_hz: float = 24.0
+    """Pictures per second of the MP4."""
+    detail: float = 1.0
+    """Share of the splats drawn: 1, 0.5, 0.25 or 0.1."""
+    sh_degree: int | None = None
+    """Highest degree of spherical harmonics drawn; default: all."""
     threads: int = 2
-    """Threads of the rasterizer."""
+    """Threads of the renderer."""
     isa: str | None = None
     """Force an instruction set: avx512, avx2, neon or scalar."""
 
     def run(self) -> None:
-        """Render the drive."""
-        import numpy as np
-
+        """Render the path."""
         from rfcore.dataset import read_dataset
-        from rfcore.field import load_field
-        from rfcore.image import write_png
-        from rfcore.metrics import psnr
+        from rfcore.errors import InvalidInput
+        from rfcore.field import Quality
+        from rfedge.fields.find import open_field
+        from rfedge.fields.path import drive_stops, orbit_stops, pictures_along, write_pictures
+        from rfedge.fields.viewpoints import OrbitSettings
+        from rfedge.video import write_mp4
 
-        field = load_field(self.field, threads=self.threads, isa=self.isa)
-        self.out.mkdir(parents=True, exist_ok=True)
-        drive = read_dataset(self.drive, tile_origin=field.metadata.tile_origin)
-        for picture in drive.pictures:
-            colour = field.render_colour(picture.camera)
-            rgb = np.floor(np.clip(colour, 0, 1) * 255 + 0.5).astype(np.uint8)
-            path = self.out / f"{Path(picture.name).stem}.png"
-            write_png(path, rgb)
-            note = f"  {psnr(rgb, picture.read()):.2f} dB" if self.psnr else ""
-            print(f"{path}{note}")
+        quality = Quality(self.detail, self.sh_degree)
+        field = open_field(self.field, threads=self.threads, isa=self.isa)
+        if self.path == "orbit" or (self.path is None and self.drive is None):
+            stops = orbit_stops(field, OrbitSettings(self.frames, *self.size, up=self.up))
+        elif self.drive is None:
+            raise InvalidInput("drive", "--path drive needs --drive, a dataset with the poses")
+        else:
+            origin = field.metadata.tile_origin
+            stops = drive_stops(read_dataset(self.drive, tile_origin=origin).pictures)
+        pictures = pictures_along(field, stops, quality)
+        if self.out.suffix == ".mp4":
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            count = write_mp4(self.out, (rgb for _, rgb in pictures), self.rate_hz)
+            print(f"{self.out}: {count} pictures")
+        else:
+            write_pictures(self.out, pictures, self.psnr)

@@ -8,6 +8,9 @@ import pytest
 
 VERBS = ("demo", "train", "render", "encode", "decode", "link", "watch", "bench", "eval")
 SCENE_VERBS = ("scene convert", "scene poses", "scene record-carla")
+FIELD_VERBS = tuple(
+    f"field {verb}" for verb in ("import", "info", "check", "slim", "rungs", "export")
+)
 HEAVY = ("torch", "cv2", "matplotlib", "av", "grpc")
 
 
@@ -18,7 +21,7 @@ def rfedge(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("verb", VERBS + SCENE_VERBS)
+@pytest.mark.parametrize("verb", VERBS + SCENE_VERBS + FIELD_VERBS)
 def test_every_verb_has_help_with_defaults(verb: str) -> None:
     done = rfedge(*verb.split(), "--help")
     assert done.returncode == 0, done.stderr

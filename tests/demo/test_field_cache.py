@@ -11,7 +11,7 @@ from rfcore.errors import DatasetError, FieldFormatError, InvalidData
 from rfcore.field import SplatField, load_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.train import SplatTrainingConfig
-from rfedge.demo import sample_field
+from rfedge.demo import make_sample_field, sample_field
 from rfedge.demo.field import FieldChoice, cache_path, choose_field
 from rfedge.demo.sample_field import sample_field_path, write_sample_field
 
@@ -69,7 +69,7 @@ def test_a_damaged_field_says_how_to_make_it_anew(tiny_sample: Path, tmp_path: P
 @pytest.fixture
 def shipped(tiny_sample: Path, tiny_gaussians: Gaussians) -> Path:
     """The field of the tiny sample, put where a shipped one lies."""
-    write_sample_field(tiny_sample, SplatField(tiny_gaussians).compressed(), 0)
+    write_sample_field(tiny_sample, SplatField(tiny_gaussians).compressed(), 0, "v1")
     return sample_field_path(tiny_sample)
 
 
@@ -118,15 +118,15 @@ def test_a_field_too_large_to_ship_is_not_left_there(
 ) -> None:
     monkeypatch.setattr(sample_field, "MAX_BYTES", 1000)
     with pytest.raises(InvalidData, match="over the 1000"):
-        write_sample_field(tiny_sample, SplatField(tiny_gaussians), 0)
+        write_sample_field(tiny_sample, SplatField(tiny_gaussians), 0, "v1")
     assert not sample_field_path(tiny_sample).exists()
 
 
 def test_making_the_sample_field_writes_what_the_demo_takes(
     tiny_sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sample_field, "SplatTrainingConfig", lambda threads: CONFIG)  # noqa: ARG005
+    monkeypatch.setattr(make_sample_field, "SplatTrainingConfig", lambda threads: CONFIG)  # noqa: ARG005
     monkeypatch.setattr("sys.argv", ["sample-field", str(tiny_sample)])
-    assert sample_field.main() == 0
+    assert make_sample_field.main() == 0
     path = chosen(tiny_sample, tmp_path / "c", SplatTrainingConfig())
     assert path == sample_field_path(tiny_sample)

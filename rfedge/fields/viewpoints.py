@@ -1,0 +1,105 @@
+"""Cameras for a field nobody gave cameras for: an orbit around it, and a look around inside it.
+
+A field's box reaches as far as its sky; the middle is therefore the median of its splats, and its
+radius the distance that three quarters of them lie within.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField, SplatField
+
+__all__ = ["UPS", "OrbitSettings", "look_around", "looking_at", "orbit"]
+
+F64 = NDArray[np.float64]
+UPS = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
+"""Up in ENU, in OpenGL's world, and in the world of OpenCV and most COLMAP models."""
+FIELD_OF_VIEW_RAD = math.radians(75)
+
+
+@dataclass(frozen=True)
+class OrbitSettings:
+    """Once around the middle, looking at it from above."""
+
+    frames: int = 96
+    width_px: int = 960
+    height_px: int = 540
+    up: str = "z"
+    elevation_rad: float = math.radians(25)
+    distance: float = 1.5
+    """In units of the field's radius."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.frames <= 100_000:
+            raise InvalidInput("frames", f"{self.frames} is outside 1..100000")
+        if self.up not in UPS:
+            raise InvalidInput("up", f"'{self.up}' is none of {', '.join(UPS)}")
+        if not 0.01 <= self.distance <= 100:
+            raise InvalidInput("distance", f"{self.distance} is outside 0.01..100")
+
+
+def orbit(field: RadianceField, settings: OrbitSettings) -> list[Camera]:
+    """Return the cameras of one turn around the field."""
+    middle, radius_m = _middle(field)
+    up = np.array(UPS[settings.up])
+    east, north = _across(up)
+    intrinsics = _intrinsics(settings.width_px, settings.height_px)
+    rise, reach = math.sin(settings.elevation_rad), math.cos(settings.elevation_rad)
+    cameras = []
+    for turn_rad in np.linspace(0, 2 * math.pi, settings.frames, endpoint=False):
+        outward = reach * (math.cos(turn_rad) * east + math.sin(turn_rad) * north) + rise * up
+        eye = middle + settings.distance * radius_m * outward
+        cameras.append(Camera(intrinsics, looking_at(eye, middle, up)))
+    return cameras
+
+
+def look_around(
+    field: RadianceField, width_px: int = 640, height_px: int = 360, up: str = "z"
+) -> list[Camera]:
+    """Return four cameras in the middle of the field, a quarter turn apart."""
+    middle, radius_m = _middle(field)
+    east, north = _across(np.array(UPS[up]))
+    intrinsics = _intrinsics(width_px, height_px)
+    return [
+        Camera(intrinsics, looking_at(middle, middle + radius_m * way, np.array(UPS[up])))
+        for way in (east, north, -east, -north)
+    ]
+
+
+def looking_at(eye: F64, target: F64, up: F64) -> Pose:
+    """Return ``world_from_cam`` (x right, y down, z forward) at ``eye`` looking at ``target``."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
+    return Pose.from_matrix(axes.tolist())
+
+
+def _intrinsics(width_px: int, height_px: int) -> Intrinsics:
+    focal_px = width_px / 2 / math.tan(FIELD_OF_VIEW_RAD / 2)
+    return Intrinsics(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2)
+
+
+def _middle(field: RadianceField) -> tuple[F64, float]:
+    """Return where the field is and its radius in metres, at least a millimetre."""
+    if isinstance(field, SplatField) and len(field.gaussians):
+        means = field.gaussians.means.astype(np.float64)
+        middle = np.median(means, axis=0)
+        radius_m = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.75))
+    else:
+        low, high = np.array(field.bounds.low_m), np.array(field.bounds.high_m)
+        middle, radius_m = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    return middle, max(radius_m, 1e-3)
+
+
+def _across(up: F64) -> tuple[F64, F64]:
+    """Return two directions that make a right-handed frame with ``up``."""
+    east = np.array([1.0, 0.0, 0.0])
+    return east, np.cross(up, east)

@@ -1,0 +1,182 @@
+"""``rfedge field`` and ``rfedge render``: files in, files and figures out, mistakes by name."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.errors import FieldFormatError, InvalidData, InvalidInput
+from rfcore.field import SplatField, load_field, read_ply, save_field, write_ply
+from rfcore.field.similarity import Similarity, moved
+from rfcore.image import read_rgb, write_png
+from rfcore.raster.gaussians import Gaussians
+from rfedge.cli.field_check import FieldCheck
+from rfedge.cli.field_export import FieldExport
+from rfedge.cli.field_import import FieldImport
+from rfedge.cli.field_info import FieldInfo
+from rfedge.cli.field_rungs import FieldRungs
+from rfedge.cli.field_slim import FieldSlim
+from rfedge.cli.render import Render
+
+HALF = float(np.sqrt(0.5))
+NERFSTUDIO = Similarity(Pose((0.3, -0.2, 0.1), (HALF, 0.0, HALF, 0.0)), 0.05)
+SIZE = (48, 36)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def splats() -> Gaussians:
+    rng = np.random.default_rng(2)
+    n = 200
+    sh = np.zeros((n, 4, 3), np.float32)
+    sh[:, 0] = rng.uniform(-1.5, 1.5, (n, 3))
+    return Gaussians(
+        means=rng.uniform([-3, -2, 3], [4, 2, 6], (n, 3)).astype(np.float32),
+        quaternions=rng.normal(size=(n, 4)).astype(np.float32),
+        log_scales=rng.uniform(-1.8, -1.0, (n, 3)).astype(np.float32),
+        opacity_logits=np.full(n, 2.5, np.float32),
+        sh=sh,
+    )
+
+
+@pytest.fixture
+def drive(here: Path, splats: Gaussians) -> Path:
+    """A transforms file with five pictures of the splats."""
+    field, frames = SplatField(splats), []
+    for number in range(5):
+        pose = Pose((number / 5 - 0.4, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+        camera = Camera(Intrinsics(*SIZE, 30.0, 30.0, 24.0, 18.0), pose)
+        rgb = np.floor(np.clip(field.render_colour(camera), 0, 1) * 255 + 0.5).astype(np.uint8)
+        write_png(here / f"{number}.png", rgb)
+        matrix = np.diag([1.0, -1.0, -1.0, 1.0])
+        matrix[:3, 3] = pose.translation_m
+        frames.append({"file_path": f"{number}.png", "transform_matrix": matrix.tolist()})
+    file = here / "transforms.json"
+    content = {"w": SIZE[0], "h": SIZE[1], "fl_x": 30.0, "frames": frames}
+    file.write_text(json.dumps(content))
+    return file
+
+
+def test_an_imported_ply_is_found_by_its_name_and_exported_exactly(
+    here: Path, splats: Gaussians, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_ply(here / "my.ply", splats)
+    FieldImport(here / "my.ply", "street", raw=True, antialiased=True).run()
+    said = capsys.readouterr().out
+    assert re.search(r"out/fields/street\.rff: field [0-9a-f]{64}, 200 splats, 0\.0\d MB", said)
+    assert "1280x720" in said
+    field = load_field(here / "out/fields/street.rff")
+    assert (field.metadata.name, field.metadata.antialiased) == ("street", True)
+    FieldExport(Path("street"), here / "back.ply").run()
+    back = read_ply(here / "back.ply")
+    a, b = (g.means[np.lexsort(g.means.T)] for g in (splats, back))
+    np.testing.assert_array_equal(a, b, "every value survives; the order is of importance")
+    FieldExport(Path("street"), here / "tenth.ply", detail=0.1).run()
+    np.testing.assert_array_equal(read_ply(here / "tenth.ply").sh, back.sh[:20])
+
+
+def test_a_field_of_nerfstudio_comes_back_to_its_world(
+    here: Path, splats: Gaussians, drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_ply(here / "ns.ply", moved(splats, NERFSTUDIO))
+    rotation, shift = NERFSTUDIO.rotation, np.array(NERFSTUDIO.pose.translation_m)
+    transform = np.column_stack([rotation, shift / NERFSTUDIO.scale]).tolist()
+    file = here / "dataparser_transforms.json"
+    file.write_text(json.dumps({"transform": transform, "scale": NERFSTUDIO.scale}))
+    FieldImport(here / "ns.ply", "plain").run()
+    with pytest.raises(InvalidData, match=r"none of \d+ conventions fits.*--transform"):
+        FieldCheck(Path("plain"), drive).run()
+    FieldCheck(Path("plain"), drive, transform=file, fix=here / "fixed.rff").run()
+    assert "fits the field is in nerfstudio's frame" in capsys.readouterr().out
+    FieldImport(here / "ns.ply", "street", transform=file).run()
+    for name in ("street", "fixed.rff"):
+        FieldCheck(Path(name), drive, out=here / "pairs.png").run()
+        assert "fits as it is: " in capsys.readouterr().out
+    assert read_rgb(here / "pairs.png").shape == (4 * SIZE[1], 2 * SIZE[0], 3)
+
+
+def test_a_tile_origin_is_taken_off_and_kept(here: Path, splats: Gaussians) -> None:
+    write_ply(here / "a.ply", splats)
+    FieldImport(here / "a.ply", "a", tile_origin=(1.0, 2.0, 3.0), raw=True).run()
+    field = load_field(here / "out/fields/a.rff")
+    assert field.metadata.tile_origin.up_m == 3.0
+    low_m = splats.means.min(axis=0).astype(np.float64) - [1, 2, 3]
+    np.testing.assert_allclose(field.bounds.low_m, low_m, atol=1e-6)
+
+
+def test_info_says_what_is_known_and_what_a_frame_takes(
+    here: Path, splats: Gaussians, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_field(SplatField(splats), here / "a.rff")
+    FieldInfo(here / "a.rff", size=(64, 48)).run()
+    said = capsys.readouterr().out
+    for expected in ("splats", "not measured", "imported", "64x48", "100 %", "10 %", "raw"):
+        assert expected in said
+
+
+def test_a_field_is_slimmed_with_and_without_cameras(
+    here: Path, splats: Gaussians, drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_field(SplatField(splats), here / "a.rff")
+    FieldSlim(here / "a.rff", 50, here / "b.rff").run()
+    FieldSlim(here / "a.rff", 50, here / "c.rff", drive=drive, iterations=5, raw=True).run()
+    assert capsys.readouterr().out.count("50 of 200 splats") == 2
+    assert load_field(here / "b.rff").primitives == load_field(here / "c.rff").primitives == 50
+
+
+def test_rungs_are_fitted_to_a_drives_cameras(here: Path, splats: Gaussians, drive: Path) -> None:
+    save_field(SplatField(splats), here / "a.rff")
+    FieldRungs(here / "a.rff", drive, here / "b.rff", iterations=5).run()
+    field = load_field(here / "b.rff")
+    assert isinstance(field, SplatField)
+    assert set(field.rungs) == {0.5, 0.25, 0.1}
+
+
+def test_a_field_is_looked_at_around_and_along_a_drive(
+    here: Path, splats: Gaussians, drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_field(SplatField(splats), here / "a.rff")
+    Render(here / "a.rff", here / "orbit", frames=3, size=(32, 24), up="-y").run()
+    assert sorted(p.name for p in (here / "orbit").iterdir()) == [
+        "00000.png",
+        "00001.png",
+        "00002.png",
+    ]
+    Render(here / "a.rff", here / "drive", drive=drive, psnr=True, detail=0.5, sh_degree=0).run()
+    assert len(re.findall(r"\d\.png  \d+\.\d\d dB", capsys.readouterr().out)) == 5
+    Render(here / "a.rff", here / "film" / "a.mp4", path="drive", drive=drive).run()
+    assert "5 pictures" in capsys.readouterr().out
+    assert (here / "film" / "a.mp4").stat().st_size > 500
+
+
+@pytest.mark.parametrize(
+    ("verb", "error", "named"),
+    [
+        (FieldImport(Path("none.ply"), "a"), FieldFormatError, r"none\.ply: cannot be read"),
+        (FieldImport(Path("a.splat"), "a"), FieldFormatError, "another format"),
+        (FieldImport(Path("empty.ply"), "a"), InvalidInput, "holds no splats"),
+        (FieldImport(Path("empty.ply"), "a", out=Path("a.ply")), InvalidInput, r"end in \.rff"),
+        (FieldExport(Path("a.rff"), Path("a.txt")), InvalidInput, r"end in \.ply"),
+        (FieldExport(Path("a.rff"), Path("b.ply"), detail=0.3), InvalidInput, "none of 1, 0.5"),
+        (FieldInfo(Path("nowhere")), FieldFormatError, "nowhere: cannot be read"),
+        (FieldSlim(Path("a.rff"), 9999, Path("b.rff")), InvalidInput, r"outside 1\.\.200"),
+        (Render(Path("a.rff"), Path("o"), path="drive"), InvalidInput, "needs --drive"),
+        (Render(Path("a.rff"), Path("o"), frames=0), InvalidInput, "frames"),
+    ],
+)
+def test_a_mistake_is_named_and_leaves_nothing_behind(
+    here: Path, splats: Gaussians, verb, error: type[Exception], named: str
+) -> None:
+    save_field(SplatField(splats), here / "a.rff")
+    write_ply(here / "empty.ply", Gaussians(*(a[:0] for a in vars(splats).values())))
+    with pytest.raises(error, match=named):
+        verb.run()
+    assert sorted(p.name for p in here.iterdir()) == ["a.rff", "empty.ply"]

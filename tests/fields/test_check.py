@@ -1,0 +1,132 @@
+"""A field put in each wrong convention is found out, named, and put right."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera, Pose
+from rfcore.errors import InvalidInput
+from rfcore.field import SplatField
+from rfcore.field.similarity import Similarity, moved
+from rfcore.raster.gaussians import Gaussians
+from rfcore.views import PosedPicture
+from rfedge.fields.check import check_field, in_drive_world, pairs_picture
+from rfedge.fields.conventions import AS_GIVEN, AS_OPENGL, known_conventions
+
+HALF = np.sqrt(0.5)
+TURNED = (0.8, 0.6 * HALF, 0.0, 0.6 * HALF)
+NERFSTUDIO = Similarity(Pose((0.3, -0.2, 0.1), TURNED), 0.02)
+STILL = (1.0, 0.0, 0.0, 0.0)
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+def in_frame(field: SplatField, field_from_world: Similarity) -> SplatField:
+    return SplatField(moved(field.gaussians, field_from_world), field.metadata)
+
+
+def with_poses(pictures: list[PosedPicture], change) -> list[PosedPicture]:
+    return [
+        replace(p, camera=Camera(p.camera.intrinsics, change(p.camera.world_from_cam)))
+        for p in pictures
+    ]
+
+
+def test_a_field_that_fits_is_not_searched_for(place) -> None:
+    fit = check_field(place.field, place.pictures)
+    assert (fit.convention, fit.fits, fit.tried) == (AS_GIVEN, True, 1)
+    assert fit.psnr_db > 50
+
+
+@pytest.mark.parametrize(
+    ("field_from_world", "named"),
+    [
+        (Similarity(Pose(ORIGIN, STILL), 100.0), "the field is in centimetres"),
+        (Similarity(Pose(ORIGIN, STILL), 1000.0), "the field is in millimetres"),
+        (Similarity(Pose(ORIGIN, STILL), 0.01), "the field is in hundreds of metres"),
+        (Similarity(Pose(ORIGIN, (0.0, 1.0, 0.0, 0.0))), "the field's axes are x, -y, -z of"),
+        (Similarity(Pose(ORIGIN, (HALF, HALF, 0.0, 0.0))), "the field's axes are x, -z, y of"),
+        (Similarity(Pose(ORIGIN, (HALF, 0.0, 0.0, -HALF))), "the field's axes are y, -x, z of"),
+        (Similarity(Pose(ORIGIN, (0.5, 0.5, 0.5, 0.5))), "the field's axes are z, x, y of"),
+        (
+            Similarity(Pose(ORIGIN, (HALF, -HALF, 0.0, 0.0)), 100.0),
+            "in centimetres, the field's axes are x, z, -y of",
+        ),
+    ],
+)
+def test_a_field_in_other_axes_or_units_is_named_and_put_right(
+    place, field_from_world: Similarity, named: str
+) -> None:
+    wrong = in_frame(place.field, field_from_world)
+    fit = check_field(wrong, place.pictures)
+    assert fit.fits
+    assert named in fit.convention.name
+    assert fit.psnr_db > fit.as_given_db + 10
+    assert check_field(in_drive_world(wrong, fit.convention), place.pictures).tried == 1
+
+
+@pytest.mark.parametrize(
+    ("field_from_world", "named"),
+    [
+        (NERFSTUDIO, "the field is in nerfstudio's frame"),
+        (NERFSTUDIO.compose(NERFSTUDIO), "applied instead of undone"),
+        (NERFSTUDIO.inverse(), "undone twice"),
+        (
+            Similarity(Pose((15.0, -10.0, 5.0), TURNED)),
+            "in nerfstudio's frame, not scaled",
+        ),
+        (Similarity(Pose(ORIGIN, TURNED)), "turned as nerfstudio turns"),
+        (
+            NERFSTUDIO.compose(Similarity(Pose(ORIGIN, (HALF, HALF, 0.0, 0.0)))),
+            "nerfstudio's frame, the field's axes are x, -z, y of the drive's world",
+        ),
+    ],
+)
+def test_nerfstudios_transform_is_tried_every_way(
+    place, field_from_world: Similarity, named: str
+) -> None:
+    fit = check_field(in_frame(place.field, field_from_world), place.pictures, NERFSTUDIO)
+    assert fit.fits
+    assert named in fit.convention.name
+    assert fit.psnr_db > 30
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda pose: pose.inverse(), "poses inverted"),
+        (lambda pose: pose.compose(AS_OPENGL), "OpenGL camera axes"),
+        (lambda pose: pose.compose(AS_OPENGL).inverse(), "poses inverted, OpenGL camera axes"),
+    ],
+)
+def test_poses_of_another_convention_are_blamed_on_the_drive(place, change, named: str) -> None:
+    fit = check_field(place.field, with_poses(place.pictures, change))
+    assert fit.fits
+    assert named == fit.convention.name
+    assert fit.psnr_db > 40
+    with pytest.raises(InvalidInput, match=f"drive's poses are to be changed: {named}"):
+        in_drive_world(place.field, fit.convention)
+
+
+def test_a_field_of_another_place_fits_nowhere(place) -> None:
+    g = place.field.gaussians
+    rng = np.random.default_rng(9)
+    order = rng.permutation(len(g))
+    other = Gaussians(g.means[order], g.quaternions, g.log_scales, g.opacity_logits, g.sh)
+    fit = check_field(SplatField(other), place.pictures)
+    assert not fit.fits
+    assert fit.tried == len(list(known_conventions(None))) == 4 * 4 * 24
+
+
+def test_pairs_show_the_camera_beside_the_render(place) -> None:
+    rgb, values_db = pairs_picture(place.field, place.pictures, AS_GIVEN)
+    assert rgb.shape == (4 * 64, 2 * 96, 3)
+    assert len(values_db) == 4
+    assert min(values_db) > 50
+    np.testing.assert_array_equal(rgb[:64, :96], place.pictures[0].read())
+    np.testing.assert_array_equal(rgb[-64:, :96], place.pictures[-1].read())
+
+
+def test_a_drive_without_pictures_is_refused(place) -> None:
+    with pytest.raises(InvalidInput, match="has no pictures"):
+        check_field(place.field, [])
