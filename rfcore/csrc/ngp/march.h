@@ -185,12 +185,12 @@ RF_INLINE void composite(const Chunk& chunk, Rays* rays) {
         const float before = rays->transmittance[r];
         if (before < kMinTransmittance) continue;
         const bool far = chunk.step[s] < 0.0f;
-        const float weight = far ? before : before * (1.0f - chunk.survival[s]);
+        const float weight = far ? before : before * chunk.alpha[s];
         for (int c = 0; c < 3; ++c) rays->colour[c][r] += weight * chunk.colour[c][s];
         if (far) continue;
         rays->depth[r] += weight * chunk.distance[s];
         rays->weight[r] += weight;
-        rays->transmittance[r] = before * chunk.survival[s];
+        rays->transmittance[r] = __builtin_fmaf(-before, chunk.alpha[s], before);
         if (rays->transmittance[r] < kMinTransmittance) rays->done[r] = true;
     }
 }

@@ -42,8 +42,8 @@ RF_INLINE void composite_backward(Chunk* chunk, const Rays& total,
         const int r = chunk->ray[s];
         const float before = replay->transmittance[r];
         const bool far = chunk->step[s] < 0.0f, counts = before >= kMinTransmittance;
-        const float survival = far ? 0.0f : chunk->survival[s], after = before * survival;
-        const float weight = far ? before : before * (1.0f - survival);
+        const float alpha = far ? 1.0f : chunk->alpha[s], weight = before * alpha;
+        const float after = __builtin_fmaf(-before, alpha, before);
         float d_thickness = 0.0f;
         for (int c = 0; c < 3; ++c) {
             const float colour = chunk->colour[c][s], d = d_colour[c][r];

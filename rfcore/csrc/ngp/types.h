@@ -78,7 +78,7 @@ struct alignas(64) Chunk {
     float distance[kChunk];      // along the ray, m
     float step[kChunk];          // what the sample stands for, m
     float density[kChunk];       // 1/m
-    float survival[kChunk];      // exp(-density step)
+    float alpha[kChunk];         // 1 - exp(-density step)
     float colour[3][kChunk];
     float raw_density[kChunk];   // before the exponential; in training its gradient
     float encoded[kMaxEncoded][kChunk];  // in training their gradient

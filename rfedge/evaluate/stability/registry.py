@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from rfedge.evaluate.stability import delta, files, pictures, poses, splats, training
+from rfedge.evaluate.stability import (
+    delta,
+    files,
+    hash_grids,
+    pictures,
+    poses,
+    splats,
+    training,
+)
 from rfedge.evaluate.stability.case import Case
 
 __all__ = ["CASES"]
@@ -10,6 +18,7 @@ __all__ = ["CASES"]
 CASES: tuple[Case, ...] = (
     *splats.CASES,
     *training.CASES,
+    *hash_grids.CASES,
     *poses.CASES,
     *pictures.CASES,
     *delta.CASES,
