@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.dataset.keys import pose_of_quaternion
+from rfcore.dataset.keys import pose_of_quaternion, shortened
 from rfcore.dataset.lens_keys import LENS_KEYS, lens_of
 from rfcore.dataset.source import SourceCamera, SourcePoints
 from rfcore.errors import DatasetError, InvalidInput
@@ -26,6 +26,7 @@ MODEL_IDS = {
     4: "OPENCV",
     5: "OPENCV_FISHEYE",
 }
+MAX_NAME = 60
 ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 COLMAP_LENS_KEYS = {**LENS_KEYS, "OPENCV": ("k1", "k2", "p1", "p2")}
 
@@ -76,6 +77,8 @@ def camera_of(
 
 def image_of(where: str, name: str, camera_id: int, numbers: Sequence[float]) -> ColmapImage:
     """Return an image from qw, qx, qy, qz, tx, ty, tz."""
-    where = f"{where} ({name})"
+    if not name.isprintable() or not name:
+        raise DatasetError(f"{where}: name {shortened(name)} is empty or not printable")
+    where = f"{where} ({name[:MAX_NAME]})"
     pose = pose_of_quaternion(where, numbers[4:7], numbers[:4])
     return ColmapImage(where, name, camera_id, pose)

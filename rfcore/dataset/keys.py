@@ -23,6 +23,7 @@ __all__ = [
     "pose_of_quaternion",
     "pose_of_rows",
     "read_file",
+    "shortened",
     "side_px",
     "text",
     "text_lines",
@@ -30,6 +31,8 @@ __all__ = [
 
 FILE_NORM_TOLERANCE = 1e-3
 """Trajectories are printed with as few as four decimals."""
+
+MAX_SHOWN = 60
 
 Table = Mapping[str, Any]
 
@@ -56,9 +59,9 @@ def number(where: str, keys: Table, key: str, minimum: float = -math.inf) -> flo
         raise DatasetError(f"{where}: key '{key}' is missing")
     value = keys[key]
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise DatasetError(f"{where}: key '{key}' is {value!r}, not a number")
-    if not math.isfinite(value):
-        raise DatasetError(f"{where}: key '{key}' is {value}, must be finite")
+        raise DatasetError(f"{where}: key '{key}' is {shortened(value)}, not a number")
+    if not math.isfinite(_float(value)):
+        raise DatasetError(f"{where}: key '{key}' is {shortened(value)}, must be finite")
     if value < minimum:
         raise DatasetError(f"{where}: key '{key}' is {value}, must be at least {minimum:g}")
     return float(value)
@@ -73,10 +76,12 @@ def side_px(where: str, keys: Table, key: str) -> int:
 
 
 def text(where: str, keys: Table, key: str) -> str:
-    """Return a string that is not empty."""
+    """Return a string that is not empty and can be printed."""
     value = keys.get(key)
     if not isinstance(value, str) or not value:
         raise DatasetError(f"{where}: key '{key}' is missing or not a string")
+    if not value.isprintable():
+        raise DatasetError(f"{where}: key '{key}' is {shortened(value)}, which is not printable")
     return value
 
 
@@ -89,9 +94,11 @@ def matrix_rows(where: str, keys: Table, key: str, columns: int = 4) -> list[Seq
         raise DatasetError(f"{where}: key '{key}' is missing or not {columns}x{columns}")
     for i, row in enumerate(matrix):
         for j, value in enumerate(row):
-            whole = isinstance(value, int | float) and not isinstance(value, bool)
-            if not whole or not math.isfinite(value):
-                raise DatasetError(f"{where}: {key}[{i}][{j}] is {value!r}, not a finite number")
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not is_number or not math.isfinite(_float(value)):
+                raise DatasetError(
+                    f"{where}: {key}[{i}][{j}] is {shortened(value)}, not a finite number"
+                )
     return matrix
 
 
@@ -134,3 +141,20 @@ def text_lines(file: Path) -> list[str]:
         return read_file(file).decode().splitlines()
     except UnicodeDecodeError as error:
         raise DatasetError(f"{file}: not a text file ({error.reason})") from error
+
+
+def shortened(value: object) -> str:
+    """Return a value as an error shows it: on one line, and not a page of digits."""
+    try:
+        shown = repr(value)
+    except ValueError:
+        return "a number of more digits than are printed"
+    return shown if len(shown) <= MAX_SHOWN else shown[:MAX_SHOWN] + "..."
+
+
+def _float(value: float) -> float:
+    """A whole number beyond every float is infinite."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf

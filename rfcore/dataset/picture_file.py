@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from rfcore.camera import MAX_SIDE_PX, Intrinsics
+from rfcore.dataset.keys import shortened
 from rfcore.errors import DatasetError
 from rfcore.image import Rgb, read_rgb
 
@@ -24,6 +25,8 @@ __all__ = [
 ]
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG", ".WEBP")
+MAX_PART_BYTES = 255
+"""What Linux file systems take."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_BARE = frozenset(range(0xD0, 0xD9)) | {0x01}
@@ -34,6 +37,8 @@ JPEG_END = b"\xff\xd9"
 def inside(where: str, folder: Path, name: str) -> Path:
     """Return ``folder / name``; raise ``DatasetError`` for a name that leaves the folder."""
     path = PurePosixPath(name)
+    if any(len(part.encode()) > MAX_PART_BYTES for part in path.parts):
+        raise DatasetError(f"{where}: path {shortened(name)} is too long")
     if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
         raise DatasetError(f"{where}: path '{name}' leaves the dataset's folder {folder}")
     return folder / path
