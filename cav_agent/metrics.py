@@ -9,6 +9,7 @@ from __future__ import annotations
 from prometheus_client import CollectorRegistry
 
 from cav_agent.frames import FrameResult
+from rfcore.codec import references_name
 from rfcore.wire.instruments import Instruments
 
 __all__ = ["AgentMetrics"]
@@ -34,7 +35,11 @@ class AgentMetrics:
         self._sent = make.counter(
             "rfedge_agent_sent_bytes", "Bytes of coded frames sent: pose, header and payload."
         )
-        self._payload = make.counter("rfedge_agent_payload_bytes", "Bytes of P slices sent.")
+        self._payload = make.counter(
+            "rfedge_agent_payload_bytes",
+            "Bytes of P slices sent, by the reference pictures they predict from.",
+            ("references",),
+        )
         self._stages = make.seconds(
             "rfedge_agent_stage_seconds",
             "Time of a frame by stage; link is from sending to Ack without the server's own time.",
@@ -72,7 +77,8 @@ class AgentMetrics:
         reason = result.reason.partition(":")[0][:40]
         self._frames.labels(str(result.outcome), reason).inc()
         if result.packet is not None:
-            self._payload.inc(len(result.packet.payload))
+            references = references_name(result.packet.references)
+            self._payload.labels(references).inc(len(result.packet.payload))
             self._sent.inc(result.packet_bytes)
         for stage, spent_s in result.stage_s.items():
             self._stages.labels(stage).observe(spent_s)

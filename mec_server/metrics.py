@@ -13,6 +13,7 @@ from dataclasses import fields
 from prometheus_client import CollectorRegistry
 
 from rfcore.codec import references_name
+from rfcore.errors import RejectReason
 from rfcore.field import RadianceField
 from rfcore.wire.instruments import Instruments
 from rfcore.wire.messages import Ack, Frame, Nack, ServerMessage, StageTimes
@@ -79,6 +80,14 @@ class ServerMetrics:
             ("field", "kind"),
         )
         self._streams: Tally[str] = Tally()
+        if not per_vehicle:
+            self._begin_at_zero()
+
+    def _begin_at_zero(self) -> None:
+        """Let each reason exist before its first frame: a rate needs two samples."""
+        self.frames.labels("acked", "")
+        for reason in RejectReason:
+            self.frames.labels("nacked", reason)
 
     def field_opened(self, field: RadianceField) -> None:
         """Tell which field was opened."""

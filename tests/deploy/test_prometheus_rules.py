@@ -1,7 +1,6 @@
 """The rules are valid, tested by promtool, and ask only for metrics that exist."""
 
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -13,14 +12,6 @@ DEPLOY = Path(__file__).parents[2] / "deploy/prometheus"
 RULES = (DEPLOY / "rules.yml").read_text()
 TESTS = "".join(path.read_text() for path in sorted((DEPLOY / "tests").glob("*.yml")))
 DECLARED = {family.name: family for listed in families().values() for family in listed}
-
-
-@pytest.fixture
-def promtool() -> str:
-    path = shutil.which("promtool")
-    if path is None:
-        pytest.fail("promtool is missing: run `make test-system-packages` (Debian's prometheus)")
-    return path
 
 
 def passes(*command: str) -> None:
