@@ -18,14 +18,21 @@ from rfcore.metrics import psnr
 from rfcore.train import (
     FieldTrainer,
     HeldOut,
+    NgpTrainer,
+    NgpTrainingConfig,
     SplatTrainer,
     SplatTrainingConfig,
     held_out_quality,
 )
 from rfcore.train.start import random_points
-from rfcore.views import PointCloud, PosedPicture
+from rfcore.views import PosedPicture
 from rfedge.training_loop import LoopLimits, LoopStatus, TrainingLoop
-from rfedge.training_memory import available_bytes, check_memory, splat_training_bytes
+from rfedge.training_memory import (
+    available_bytes,
+    check_memory,
+    ngp_training_bytes,
+    splat_training_bytes,
+)
 
 __all__ = [
     "UNLIMITED_ITERATIONS",
@@ -49,7 +56,8 @@ class TrainingJob:
     name: str
     dataset: Dataset
     held_out: Dataset | None
-    config: SplatTrainingConfig
+    config: SplatTrainingConfig | NgpTrainingConfig
+    """Whose it is says what is trained."""
     seed: int
     limits: LoopLimits = field(default_factory=LoopLimits)
     resume: bool = False
@@ -116,29 +124,31 @@ def train(job: TrainingJob, console: Console) -> Trained:
 
 
 def _trainer(job: TrainingJob) -> FieldTrainer:
-    return SplatTrainer(job.dataset.pictures, _start(job), job.config, seed=job.seed)
-
-
-def _start(job: TrainingJob) -> PointCloud:
-    """Return the dataset's points, or random ones in the volume its cameras see."""
-    if job.dataset.points is not None:
-        return job.dataset.points
-    rng = np.random.default_rng([job.seed, 2])
-    return random_points(job.dataset.pictures, job.config.gaussians, rng)
+    pictures, points = job.dataset.pictures, job.dataset.points
+    if isinstance(job.config, NgpTrainingConfig):
+        return NgpTrainer(pictures, points, job.config, seed=job.seed)
+    if points is None:
+        rng = np.random.default_rng([job.seed, 2])
+        points = random_points(pictures, job.config.gaussians, rng)
+    return SplatTrainer(pictures, points, job.config, seed=job.seed)
 
 
 def _announce(job: TrainingJob, console: Console) -> None:
     config, pictures = job.config, job.dataset.pictures
     sizes = [(k.width_px, k.height_px) for k in (p.camera.intrinsics for p in pictures)]
-    most = max(config.gaussians, config.density.limit)
-    needed = splat_training_bytes(most, config.bands.degree, sizes)
+    if isinstance(config, NgpTrainingConfig):
+        what, needed = "a hash grid", ngp_training_bytes(config.model, sizes)
+    else:
+        most = max(config.gaussians, config.density.limit)
+        what = f"{most:,} Gaussians at most"
+        what += "" if job.dataset.points is not None else ", from random points,"
+        needed = splat_training_bytes(most, config.bands.degree, sizes)
     length = f"{config.iterations:,} iterations"
     if job.limits.minutes is not None:
         length = f"{job.limits.minutes:g} minutes"
-    points = "" if job.dataset.points is not None else ", from random points"
     console.print(
-        f"[bold]Training[/] {most:,} Gaussians at most on {len(pictures)} pictures, {length}"
-        f"{points}; about {needed / 2**30:.1f} GiB of memory"
+        f"[bold]Training[/] {what} on {len(pictures)} pictures, {length}; about "
+        f"{needed / 2**30:.1f} GiB of memory"
     )
     check_memory(needed, available_bytes())
 
@@ -201,6 +211,6 @@ def _run_with_bar(loop: TrainingLoop, console: Console) -> None:
 def _state(status: LoopStatus) -> str:
     quality = f", held out {status.psnr_db:.2f} dB" if status.psnr_db is not None else ""
     return (
-        f"{status.iteration:,} iterations, {status.primitives:,} splats, "
+        f"{status.iteration:,} iterations, {status.primitives:,} primitives, "
         f"loss {status.loss:.4f}{quality}"
     )

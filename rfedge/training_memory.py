@@ -9,8 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from rfcore.errors import InvalidInput
+from rfcore.ngp.shape import FEATURES
+from rfcore.train import NgpModel
 
-__all__ = ["available_bytes", "check_memory", "splat_training_bytes"]
+__all__ = ["available_bytes", "check_memory", "ngp_training_bytes", "splat_training_bytes"]
 
 BASE_BYTES = 350 << 20
 """The interpreter, numpy, OpenCV and the report's libraries."""
@@ -24,6 +26,10 @@ SPLAT_BYTES = 64 + 3 * 16 + 2 * 4 + 8
 ENTRIES_PER_GAUSSIAN = 5
 """Overlaps with tiles of 16x16 pixels; 3 to 4 on the street at 640x360."""
 ENTRY_BYTES = 64 + 3 * 4
+NGP_CELL_BYTES = 5
+"""Of the occupancy grid: a float and a bit, twice while it is built anew."""
+NGP_SCRATCH_BYTES = 150 << 20
+"""Samples and activations of one batch."""
 PICTURE_FLOATS = 9
 """Colour, target, gradient: three channels each."""
 
@@ -37,6 +43,15 @@ def splat_training_bytes(gaussians: int, sh_degree: int, sizes_px: list[tuple[in
     pixels = [width * height for width, height in sizes_px]
     of_pictures = 3 * sum(pixels) + 4 * PICTURE_FLOATS * max(pixels, default=0)
     return BASE_BYTES + int(of_gaussians + of_entries + of_pictures)
+
+
+def ngp_training_bytes(model: NgpModel, sizes_px: list[tuple[int, int]]) -> int:
+    """Return an estimate of the peak for a hash grid and pictures of ``sizes_px``."""
+    table = 4 * FEATURES * model.L << model.log2_T
+    # Parameters, gradient, two moments, and one copy for a measurement or a checkpoint's four.
+    of_grid = 8 * table + NGP_CELL_BYTES * model.occupancy
+    pixels = sum(width * height for width, height in sizes_px)
+    return BASE_BYTES + NGP_SCRATCH_BYTES + of_grid + 3 * pixels
 
 
 def available_bytes(meminfo: Path = Path("/proc/meminfo")) -> int | None:

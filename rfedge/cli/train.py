@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from rfcore.dataset import Dataset
     from rfcore.field import RadianceField
-    from rfcore.train import SplatTrainingConfig
+    from rfcore.train import NgpTrainingConfig, SplatTrainingConfig
     from rfedge.training import TrainingJob
 
 __all__ = ["Train"]
@@ -70,8 +70,8 @@ class Train:
     """Write the result as JSON to this file, or to standard output for "-"."""
     report: Path | None = None
     """Write a page with held-out pictures and the curve of quality over time (.html)."""
-    kind: Literal["splats"] = "splats"
-    """What to train."""
+    kind: Literal["splats", "ngp"] = "splats"
+    """3D Gaussians, or the hash grid of Instant-NGP, which takes none of their settings."""
 
     def run(self) -> None:
         """Train, write the archive and what was asked for beside it."""
@@ -91,7 +91,7 @@ class Train:
         field = self._finished(job, trained.field, console)
         self.out.parent.mkdir(parents=True, exist_ok=True)
         field_id = save_field(field, self.out)
-        console.print(f"{self.out}: field {field_id}, {trained.primitives:,} Gaussians")
+        console.print(f"{self.out}: field {field_id}, {trained.primitives:,} primitives")
         result = training_result(job, trained, field, self.out)
         if self.json is not None:
             write_json(result, self.json)
@@ -111,6 +111,7 @@ class Train:
             minutes=self.minutes,
             checkpoint=self.out.with_suffix(".ckpt") if writes_checkpoints else None,
             checkpoint_every=self.checkpoint_every or 1000,
+            measurements=12 if self.kind == "splats" else 4,  # rendering a hash grid takes seconds
         )
         config = self._config(dataset.exposure_varies)
         return TrainingJob(self.name, dataset, held_out, config, self.seed, limits, self.resume)
@@ -129,13 +130,16 @@ class Train:
         )
         return read_views(choice)
 
-    def _config(self, exposure_varies: bool) -> SplatTrainingConfig:
+    def _config(self, exposure_varies: bool) -> SplatTrainingConfig | NgpTrainingConfig:
         from dataclasses import replace
 
-        from rfcore.train import DensityControl
+        from rfcore.train import DensityControl, NgpTrainingConfig
         from rfedge.training import UNLIMITED_ITERATIONS, training_config
 
         iterations = UNLIMITED_ITERATIONS if self.minutes is not None else self.iterations
+        if self.kind == "ngp":
+            ngp = NgpTrainingConfig(threads=self.threads)
+            return ngp if iterations is None else replace(ngp, iterations=iterations)
         config = training_config(self.gaussians, iterations, self.threads)
         if self.limit is not None:
             config = replace(config, density=DensityControl(limit=self.limit))

@@ -6,11 +6,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
+from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
-from rfcore.field import load_field
+from rfcore.field import load_field, save_field
+from rfcore.train import NgpModel, NgpTrainingConfig
 from rfedge.cli.train import Train
-from rfedge.training_views import share_of_views, size_px_from
+from rfedge.training import TrainingJob, train
+from rfedge.training_loop import LoopLimits
+from rfedge.training_result import training_result
+from rfedge.training_views import share_of_views, size_px_from, split_every
 
 VIEWS = 8
 
@@ -77,6 +83,20 @@ def test_an_interrupted_run_ends_with_the_same_bytes(wall: Path, tmp_path: Path)
 def test_a_run_may_be_limited_by_time(wall: Path, tmp_path: Path) -> None:
     verb(wall, tmp_path / "a.rff", minutes=0.02).run()
     assert load_field(tmp_path / "a.rff").metadata.held_out_psnr_db is not None
+
+
+def test_a_hash_grid_is_trained_by_the_same_loop(wall: Path, tmp_path: Path) -> None:
+    dataset, held_out = split_every(read_dataset(wall), 4)
+    model = NgpModel(L=4, log2_T=10, N_max=64, occupancy=4000)
+    config = NgpTrainingConfig(iterations=4, batch_samples=4096, model=model)
+    job = TrainingJob("wall", dataset, held_out, config, 1, LoopLimits(measurements=4))
+    trained = train(job, Console(quiet=True))
+    archive = tmp_path / "a.rff"
+    save_field(trained.field, archive)
+    said = training_result(job, trained, load_field(archive), archive)
+    assert said["field"] == f"ngp {trained.field.field_id}"
+    assert len(said["curve"]) == 4
+    assert said["held_out"]["psnr_db"] == pytest.approx(said["curve"][-1][1], abs=1e-6)
 
 
 def test_declared_exposure_is_learned_and_nothing_else_is(wall: Path, tmp_path: Path) -> None:
