@@ -11,6 +11,7 @@ from rfcore.dataset.assemble import localised
 from rfcore.dataset.points import read_points
 from rfcore.errors import InvalidInput
 from rfcore.views import PosedPicture
+from rfedge.training_depth import points_from_depth_maps
 
 __all__ = ["ViewChoice", "read_views", "share_of_views", "size_px_from", "split_every"]
 
@@ -26,12 +27,16 @@ class ViewChoice:
     """Of the pictures that are not held out."""
     points: Path | None = None
     """A .ply instead of the dataset's own points."""
+    depths: Path | None = None
+    """A folder of depth maps to take points from instead."""
     size_px: tuple[int, int] | None = None
     undistort: bool = False
 
     def __post_init__(self) -> None:
         if self.held_out is not None and self.holdout is not None:
             raise InvalidInput("holdout", "goes without --held-out: choose one of the two")
+        if self.points is not None and self.depths is not None:
+            raise InvalidInput("depths", "goes without --points: choose one of the two")
         if not 0 < self.percent <= 100:
             raise InvalidInput("views_percent", f"{self.percent} is outside 0..100")
 
@@ -53,7 +58,11 @@ def read_views(choice: ViewChoice) -> tuple[Dataset, Dataset | None]:
     if choice.points is not None:
         points = localised(read_points(choice.points), dataset.tile_origin)
         dataset = replace(dataset, points=points)
-    return replace(dataset, pictures=share_of_views(dataset.pictures, choice.percent)), held_out
+    dataset = replace(dataset, pictures=share_of_views(dataset.pictures, choice.percent))
+    if choice.depths is not None:
+        points = points_from_depth_maps(dataset.pictures, choice.depths)
+        dataset = replace(dataset, points=points)
+    return dataset, held_out
 
 
 def split_every(dataset: Dataset, every: int) -> tuple[Dataset, Dataset]:

@@ -23,9 +23,9 @@ __all__ = ["Train"]
 class Train:
     """Train a radiance field from posed pictures.
 
-    Gaussians start at the dataset's points, at those of --points, or at random ones in the volume
-    the cameras see. A run limited by iterations gives the same bytes every time, interrupted or
-    not; one limited by --minutes depends on the machine.
+    Gaussians start at the dataset's points, at those of --points or --depths, or at random ones in
+    the volume the cameras see. A run limited by iterations gives the same bytes every time,
+    interrupted or not; one limited by --minutes depends on the machine.
     """
 
     dataset: Annotated[Path, Positional]
@@ -40,6 +40,8 @@ class Train:
     """Train on this share of the pictures, evenly spread."""
     points: Path | None = None
     """A .ply of coloured surface points, when the dataset does not name one."""
+    depths: Path | None = None
+    """A folder of depth maps to take points from: NAME.npy in metres or 16-bit NAME.png in mm."""
     size: str | None = None
     """Reduce pictures to WIDTHxHEIGHT, in pixels."""
     undistort: bool = False
@@ -125,6 +127,7 @@ class Train:
             holdout=self.holdout,
             percent=self.views_percent,
             points=self.points,
+            depths=self.depths,
             size_px=size_px_from(self.size) if self.size is not None else None,
             undistort=self.undistort,
         )

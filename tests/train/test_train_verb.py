@@ -9,14 +9,20 @@ import pytest
 from rich.console import Console
 
 from rfcore.dataset import read_dataset
-from rfcore.errors import InvalidInput
+from rfcore.errors import DatasetError, InvalidInput
 from rfcore.field import load_field, save_field
 from rfcore.train import NgpModel, NgpTrainingConfig
 from rfedge.cli.train import Train
 from rfedge.training import TrainingJob, train
 from rfedge.training_loop import LoopLimits
 from rfedge.training_result import training_result
-from rfedge.training_views import share_of_views, size_px_from, split_every
+from rfedge.training_views import (
+    ViewChoice,
+    read_views,
+    share_of_views,
+    size_px_from,
+    split_every,
+)
 
 VIEWS = 8
 
@@ -99,6 +105,32 @@ def test_a_hash_grid_is_trained_by_the_same_loop(wall: Path, tmp_path: Path) -> 
     assert said["held_out"]["psnr_db"] == pytest.approx(said["curve"][-1][1], abs=1e-6)
 
 
+@pytest.mark.parametrize("suffix", [".npy", ".png"])
+def test_points_may_come_from_depth_maps(wall: Path, tmp_path: Path, suffix: str) -> None:
+    for i in range(3):  # not every picture needs one
+        if suffix == ".npy":
+            np.save(tmp_path / f"{i}.npy", np.full((32, 48), 4.0, np.float32))
+        else:
+            cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((32, 48), 4000, np.uint16))
+    dataset, _ = read_views(ViewChoice(wall, depths=tmp_path))
+    assert dataset.points is not None
+    assert len(dataset.points.xyz_m) == 3 * 32 * 48
+    # OpenCV axes of a camera that looks along -z of the world
+    np.testing.assert_allclose(dataset.points.xyz_m[:, 2], -4.0, rtol=1e-6)
+
+
+def test_bad_depth_maps_are_refused_by_name(wall: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="holds no depth map"):
+        read_views(ViewChoice(wall, depths=tmp_path))
+    for content in (np.zeros((5, 5), np.float32), np.zeros((32, 48, 3), np.float32)):
+        np.save(tmp_path / "0.npy", content)
+        with pytest.raises(DatasetError, match=r"0\.npy"):
+            read_views(ViewChoice(wall, depths=tmp_path))
+    (tmp_path / "0.npy").write_bytes(b"nonsense")
+    with pytest.raises(DatasetError, match=r"0\.npy"):
+        read_views(ViewChoice(wall, depths=tmp_path))
+
+
 def test_declared_exposure_is_learned_and_nothing_else_is(wall: Path, tmp_path: Path) -> None:
     content = json.loads((wall / "transforms.json").read_text())
     results = {}
@@ -118,6 +150,7 @@ def test_declared_exposure_is_learned_and_nothing_else_is(wall: Path, tmp_path: 
         ({"holdout": 1}, "holdout"),
         ({"holdout": 4, "held_out": Path("x")}, "holdout"),
         ({"views_percent": 0.0}, "views_percent"),
+        ({"points": Path("x"), "depths": Path("x")}, "depths"),
         ({"size": "24"}, "size"),
         ({"size": "24x0"}, "size"),
     ],
