@@ -47,7 +47,7 @@ check: build  ## lint, types, layers, generated files
 		else echo "buf lint was not run: it needs node and its registry"; fi
 
 sample-field: build  ## train the field that ships in samples/fields (some minutes)
-	$(BIN)/python -m rfedge.demo.make_sample_field samples/street
+	$(BIN)/python -m rfedge.demo.make_sample_field samples/street $(ARGS)
 
 bench: build  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench raster

@@ -8,17 +8,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from rfcore.camera import Camera
-from rfcore.field import RadianceField, SplatField
-from rfcore.metrics import psnr, ssim
+from rfcore.field import SplatField
+from rfcore.train import held_out_quality
 from rfcore.train.rungs import RungConfig, with_rungs
 from rfcore.views import PosedPicture
 
-__all__ = ["finish_field", "fit_rungs", "held_out_quality"]
+__all__ = ["finish_field", "fit_rungs"]
 
 
 def finish_field(
@@ -35,22 +34,10 @@ def finish_field(
     small = fit_rungs(field, [view.camera for view in views], config, console).compressed()
     if not held_out:
         return small
-    psnr_db, similarity = held_out_quality(small, held_out)
-    console.print(f"  as written: {psnr_db:.2f} dB, SSIM {similarity:.3f} on the held-out pictures")
-    measured = replace(small.metadata, held_out_psnr_db=psnr_db, held_out_ssim=similarity)
+    quality = held_out_quality(small, held_out)
+    console.print(f"  as written: {quality.psnr_db:.2f} dB, SSIM {quality.ssim:.3f} held out")
+    measured = replace(small.metadata, held_out_psnr_db=quality.psnr_db, held_out_ssim=quality.ssim)
     return small.described(measured)
-
-
-def held_out_quality(field: RadianceField, pictures: Sequence[PosedPicture]) -> tuple[float, float]:
-    """Return the mean over ``pictures`` of PSNR in dB and of SSIM, RGB clipped to 0..1."""
-    pairs = [
-        (np.clip(field.render_colour(p.camera).astype(np.float64), 0, 1), p.read() / 255.0)
-        for p in pictures
-    ]
-    return (
-        float(np.mean([psnr(render, picture, peak=1.0) for render, picture in pairs])),
-        float(np.mean([ssim(render, picture, peak=1.0) for render, picture in pairs])),
-    )
 
 
 def fit_rungs(

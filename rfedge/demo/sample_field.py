@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from rfcore.dataset import verify_manifest, write_manifest
 from rfcore.errors import DatasetError, InvalidData
-from rfcore.field import SplatField, save_field
+from rfcore.field import SplatField
+from rfcore.field.load import encode_field
 from rfcore.files import write_whole
 from rfedge.provenance import host
 
-__all__ = ["check_sample_field", "sample_field_path", "write_sample_field"]
+__all__ = ["Making", "check_sample_field", "sample_field_path", "write_sample_field"]
 
 COMMAND = "make sample-field"
 MAX_BYTES = 8_000_000
@@ -44,37 +46,41 @@ def check_sample_field(sample: Path) -> None:
         raise DatasetError(f"{path}: made from another {sample}; run {COMMAND}, or use --train")
 
 
-def write_sample_field(sample: Path, field: SplatField, seconds: int, made_by: str) -> int:
+@dataclass(frozen=True)
+class Making:
+    """How a field was made: by which command, at which revision, in how long."""
+
+    command: str
+    revision: str
+    seconds: int
+
+
+def write_sample_field(sample: Path, field: SplatField, making: Making) -> int:
     """Write the field, its record and the manifest; return the field's size in bytes.
 
-    ``made_by`` is the revision that trained it.
+    Raises ``InvalidData`` for one too large to ship, and leaves what was there.
     """
-    path = sample_field_path(sample)
+    path, data = sample_field_path(sample), encode_field(field)
+    if len(data) > MAX_BYTES:
+        raise InvalidData(f"{path}: {len(data)} bytes are over the {MAX_BYTES} a sample may take")
     path.parent.mkdir(exist_ok=True)
-    save_field(field, path)
-    size_bytes = path.stat().st_size
-    if size_bytes > MAX_BYTES:
-        path.unlink()
-        raise InvalidData(f"{path}: {size_bytes} bytes are over the {MAX_BYTES} a sample may take")
-    record = _record(sample, field, seconds, made_by)
+    write_whole(path, data)
+    record = _record(sample, field, making) | {"bytes": len(data)}
     write_whole(path.with_suffix(".json"), json.dumps(record, indent=1) + "\n")
     write_manifest(path.parent)
-    return size_bytes
+    return len(data)
 
 
-def _record(sample: Path, field: SplatField, seconds: int, made_by: str) -> dict[str, Any]:
+def _record(sample: Path, field: SplatField, making: Making) -> dict[str, Any]:
     metadata = field.metadata
     return {
         "field": f"splats {field.field_id}",
-        "command": COMMAND,
-        "revision": made_by,
+        **asdict(making),
         "host": host(),
         "sample_manifest_sha256": _manifest_digest(sample),
         "training_digest": metadata.training_digest,
         "held_out": {"psnr_db": metadata.held_out_psnr_db, "ssim": metadata.held_out_ssim},
-        "seconds": seconds,
         "primitives": field.primitives,
-        "bytes": sample_field_path(sample).stat().st_size,
     }
 
 

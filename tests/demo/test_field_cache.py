@@ -13,7 +13,7 @@ from rfcore.raster.gaussians import Gaussians
 from rfcore.train import SplatTrainingConfig
 from rfedge.demo import make_sample_field, sample_field
 from rfedge.demo.field import FieldChoice, cache_path, choose_field
-from rfedge.demo.sample_field import sample_field_path, write_sample_field
+from rfedge.demo.sample_field import Making, sample_field_path, write_sample_field
 
 CONFIG = SplatTrainingConfig(gaussians=100, iterations=3)
 SILENT = Console(quiet=True)
@@ -69,7 +69,9 @@ def test_a_damaged_field_says_how_to_make_it_anew(tiny_sample: Path, tmp_path: P
 @pytest.fixture
 def shipped(tiny_sample: Path, tiny_gaussians: Gaussians) -> Path:
     """The field of the tiny sample, put where a shipped one lies."""
-    write_sample_field(tiny_sample, SplatField(tiny_gaussians).compressed(), 0, "v1")
+    write_sample_field(
+        tiny_sample, SplatField(tiny_gaussians).compressed(), Making("by hand", "v1", 0)
+    )
     return sample_field_path(tiny_sample)
 
 
@@ -118,15 +120,27 @@ def test_a_field_too_large_to_ship_is_not_left_there(
 ) -> None:
     monkeypatch.setattr(sample_field, "MAX_BYTES", 1000)
     with pytest.raises(InvalidData, match="over the 1000"):
-        write_sample_field(tiny_sample, SplatField(tiny_gaussians), 0, "v1")
+        write_sample_field(tiny_sample, SplatField(tiny_gaussians), Making("by hand", "v1", 0))
     assert not sample_field_path(tiny_sample).exists()
 
 
 def test_making_the_sample_field_writes_what_the_demo_takes(
     tiny_sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(make_sample_field, "SplatTrainingConfig", lambda threads: CONFIG)  # noqa: ARG005
-    monkeypatch.setattr("sys.argv", ["sample-field", str(tiny_sample)])
+    options = ["--iterations", "3", "--gaussians", "100", "--limit", "120"]
+    monkeypatch.setattr("sys.argv", ["sample-field", str(tiny_sample), *options])
     assert make_sample_field.main() == 0
     path = chosen(tiny_sample, tmp_path / "c", SplatTrainingConfig())
     assert path == sample_field_path(tiny_sample)
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert record["command"] == (
+        'make sample-field ARGS="--gaussians 100 --iterations 3 --limit 120"'
+    )
+
+
+def test_a_sample_that_cannot_be_read_has_no_field_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["sample-field", str(tmp_path)])
+    assert make_sample_field.main() == 2
+    assert "manifest.json" in capsys.readouterr().err
