@@ -73,7 +73,7 @@ def decode_columns(
     widths = _checked(header["bytes"], columns, 1, 4)
     data = _inflated(stream, count * sum(widths))
     planes = np.frombuffer(data, np.uint8).reshape(sum(widths), count)
-    values = np.empty(shape, np.int32)
+    values = np.empty((columns, count), np.int32).T
     first = 0
     for column, (low, width) in enumerate(zip(lowest, widths, strict=True)):
         values[:, column] = _column(planes[first : first + width]) + low

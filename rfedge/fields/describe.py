@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -12,6 +13,9 @@ from rfcore.field import Quality, RadianceField, SplatField
 from rfcore.field.detail import kept_of
 from rfcore.field.load import encode_field
 from rfcore.field.quality import DETAILS
+from rfcore.metrics import psnr
+from rfcore.views import PosedPicture
+from rfedge.fields.check import to_rgb
 from rfedge.fields.speed import frame_ms
 
 __all__ = ["describe_field", "print_rungs", "size_mb"]
@@ -48,17 +52,36 @@ def describe_field(field: RadianceField) -> list[tuple[str, str]]:
     return rows
 
 
-def print_rungs(console: Console, field: SplatField, cameras: Sequence[Camera]) -> None:
-    """Measure a frame of every rung on this machine and print the table."""
+def print_rungs(
+    console: Console,
+    field: SplatField,
+    cameras: Sequence[Camera],
+    pictures: Sequence[PosedPicture] = (),
+) -> None:
+    """Measure every rung on this machine and print the table.
+
+    The time of a frame from ``cameras``, and where there are ``pictures`` the mean PSNR to them.
+    """
     k = cameras[0].intrinsics
     table = Table(title=f"a frame of {k.width_px}x{k.height_px} px here")
-    for heading in ("detail", "splats", "ms"):
+    for heading in ("detail", "splats", "ms", *(["dB"] if pictures else [])):
         table.add_column(heading, justify="right")
-    for detail in DETAILS:
-        ms = frame_ms(field, cameras, Quality(detail))
-        splats = kept_of(field.primitives, detail)
-        table.add_row(f"{100 * detail:g} %", f"{splats:,}", f"{ms:.1f}")
+    for quality in map(Quality, DETAILS):
+        splats = kept_of(field.primitives, quality.detail)
+        ms = frame_ms(field, cameras, quality)
+        cells = [f"{100 * quality.detail:g} %", f"{splats:,}", f"{ms:.1f}"]
+        if pictures:
+            cells.append(f"{_mean_psnr_db(field, pictures, quality):.2f}")
+        table.add_row(*cells)
     console.print(table)
+
+
+def _mean_psnr_db(
+    field: RadianceField, pictures: Sequence[PosedPicture], quality: Quality
+) -> float:
+    colours = [field.render_colour(picture.camera, quality) for picture in pictures]
+    pairs = zip(colours, pictures, strict=True)
+    return float(np.mean([psnr(to_rgb(colour), seen.read()) for colour, seen in pairs]))
 
 
 def _quality(psnr_db: float | None, ssim: float | None) -> str:

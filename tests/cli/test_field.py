@@ -113,13 +113,16 @@ def test_a_tile_origin_is_taken_off_and_kept(here: Path, splats: Gaussians) -> N
 
 
 def test_info_says_what_is_known_and_what_a_frame_takes(
-    here: Path, splats: Gaussians, capsys: pytest.CaptureFixture[str]
+    here: Path, splats: Gaussians, drive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_field(SplatField(splats), here / "a.rff")
     FieldInfo(here / "a.rff", size=(64, 48)).run()
     said = capsys.readouterr().out
     for expected in ("splats", "not measured", "imported", "64x48", "100 %", "10 %", "raw"):
         assert expected in said
+    assert "dB" not in said
+    FieldInfo(here / "a.rff", drive=drive).run()
+    assert "dB" in capsys.readouterr().out
 
 
 def test_a_field_is_slimmed_with_and_without_cameras(

@@ -48,6 +48,15 @@ def test_an_unknown_id_names_itself_and_what_is_here(
     assert repr(name) in str(caught.value)
 
 
+def test_a_compressed_field_is_kept_as_it_came(make_gaussians, tmp_path: Path) -> None:
+    store = FieldStore(tmp_path)
+    field = SplatField(make_gaussians(30)).compressed()
+    data = encode_field(field)
+    assert store.add(data) == field.field_id
+    assert store.path(field.field_id).read_bytes() == data
+    assert store.load(field.field_id, threads=2).field_id == field.field_id
+
+
 def test_damaged_bytes_are_not_added(make_gaussians, tmp_path: Path) -> None:
     store = FieldStore(tmp_path)
     field = SplatField(make_gaussians())
