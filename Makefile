@@ -9,7 +9,7 @@ TORCH_INDEX ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo sample-field test test-slow test-prometheus test-system-packages check build bench proto figures
+.PHONY: help demo sample-field test test-slow test-prometheus test-netns test-system-packages check build bench proto figures
 
 help:  ## show the targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -37,6 +37,9 @@ test-system-packages:  ## install the programs that test-slow uses (root, Debian
 
 test-prometheus: build test-system-packages  ## test rules with promtool, and dashboards on a live run
 	$(BIN)/python -m pytest -m prometheus --timeout 600
+
+test-netns: build test-system-packages  ## compare the link with the kernel's own shaper (root)
+	$(BIN)/python -m pytest -m netns --timeout 600
 
 check: build  ## lint, types, layers, generated files
 	$(BIN)/ruff format --check .

@@ -1,0 +1,214 @@
+"""The link against the kernel's own: token buckets (tc tbf) between network namespaces.
+
+Needs root, ``ip`` and ``tc`` (make test-system-packages). The kernel counts Ethernet frames, so a
+datagram of n bytes is n + 42 long on its wire; its bucket lets a burst of 1600 bytes ahead, which
+the machine, an exact serialiser, does not.
+"""
+
+import asyncio
+import ctypes
+import itertools
+import json
+import os
+import shutil
+import socket
+import statistics
+import struct
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TypeVar
+
+import pytest
+
+from rfcore.link import Arrival, LinkProfile, delivery_times
+from rfedge.link_proxy import LinkProxy, ProxySettings
+
+pytestmark = [pytest.mark.slow, pytest.mark.netns]
+
+RATE_BPS = 2e6
+BURST_BYTES = 1600
+OVERHEAD_BYTES = 14 + 20 + 8
+CLONE_NEWNET = 0x40000000
+SO_TIMESTAMPNS = 35
+NUMBERS = itertools.count()
+LIBC = ctypes.CDLL(None, use_errno=True)
+Result = TypeVar("Result")
+
+
+def run(command: str) -> str:
+    done = subprocess.run(command.split(), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{command}: {done.stderr}"
+    return done.stdout
+
+
+def within(namespace: str, make: Callable[[], Result]) -> Result:
+    """Call ``make`` on a thread that lives in ``namespace``; sockets made there stay there."""
+    made: list[Result | BaseException] = []
+
+    def enter() -> None:
+        handle = os.open(f"/run/netns/{namespace}", os.O_RDONLY)
+        try:
+            if LIBC.setns(handle, CLONE_NEWNET):
+                raise OSError(ctypes.get_errno(), "setns")
+            made.append(make())
+        except BaseException as error:  # carried to the thread that asked
+            made.append(error)
+        finally:
+            os.close(handle)
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    if isinstance(made[0], BaseException):
+        raise made[0]
+    return made[0]
+
+
+@dataclass(frozen=True)
+class Wire:
+    """Two namespaces and the addresses of the ends; from ``near`` on it is shaped."""
+
+    near: str
+    far: str
+    near_address: str = "10.213.0.1"
+    far_address: str = "10.213.0.2"
+
+    def sent_bytes(self) -> int:
+        """What left the near end so far, as the kernel counts it."""
+        shown = run(f"ip netns exec {self.near} tc -s -j qdisc show dev rfnear")
+        return int(next(q for q in json.loads(shown) if q["kind"] == "tbf")["bytes"])
+
+
+@pytest.fixture
+def wire() -> Iterator[Wire]:
+    if os.geteuid() != 0:
+        pytest.skip("network namespaces need root")
+    for name in ("ip", "tc"):
+        if shutil.which(name) is None:
+            pytest.fail(f"{name} is missing: run `make test-system-packages`")
+    number = f"{os.getpid()}-{next(NUMBERS)}"
+    ends = Wire(f"rfn{number}", f"rff{number}")
+    for name in (ends.near, ends.far):
+        run(f"ip netns add {name}")
+    try:
+        run(f"ip -n {ends.near} link add rfnear type veth peer name rffar netns {ends.far}")
+        for name, device, address in (
+            (ends.near, "rfnear", ends.near_address),
+            (ends.far, "rffar", ends.far_address),
+        ):
+            run(f"ip -n {name} addr add {address}/24 dev {device}")
+            run(f"ip -n {name} link set {device} up")
+        run(
+            f"ip netns exec {ends.near} tc qdisc add dev rfnear root tbf "
+            f"rate {RATE_BPS:.0f}bit burst {BURST_BYTES} limit 10000000"
+        )
+        yield ends
+    finally:
+        for name in (ends.near, ends.far):
+            run(f"ip netns del {name}")
+
+
+def udp(address: str) -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+    made.bind((address, 0))
+    made.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    made.settimeout(20.0)
+    return made
+
+
+def stamp_s(sock: socket.socket) -> float:
+    """Receive a datagram; return when the kernel did, in seconds of the Unix epoch."""
+    _, ancillary, _, _ = sock.recvmsg(2048, 64)
+    seconds, nanoseconds = struct.unpack("qq", ancillary[0][2])
+    return float(seconds + nanoseconds / 1e9)
+
+
+def test_datagrams_leave_the_kernels_bucket_when_the_machine_says(wire: Wire) -> None:
+    """Three bursts with rests between; the bucket's head start is the only difference allowed.
+
+    A token bucket lets burst bytes through at once, so the kernel may lead by burst / rate. The
+    kernel stamps what it receives, so a busy machine that hears of it late changes nothing.
+    """
+    near = within(wire.near, lambda: udp(wire.near_address))
+    far = within(wire.far, lambda: udp(wire.far_address))
+    near.connect(far.getsockname())
+    heard_s: list[float] = []
+    count = 3 * 40
+
+    def hear() -> None:
+        while len(heard_s) < count:
+            heard_s.append(stamp_s(far))
+
+    listener = threading.Thread(target=hear)
+    listener.start()
+    begin_s, schedule = time.time(), []
+    for burst in range(3):
+        time.sleep(max(0.0, begin_s + 0.6 * burst - time.time()))
+        for size_bytes in (200, 1000, 1400, 600) * 10:
+            schedule.append(Arrival(time.time() - begin_s, size_bytes + OVERHEAD_BYTES))
+            near.send(bytes(size_bytes))
+    listener.join()
+    near.close()
+    far.close()
+    predicted_s = delivery_times(LinkProfile(RATE_BPS), schedule)
+    lead_s = BURST_BYTES * 8 / RATE_BPS
+    late_s = [h - begin_s - p for h, p in zip(heard_s, predicted_s, strict=True)]
+    assert min(late_s) >= -lead_s - 0.001
+    assert -lead_s - 0.001 <= statistics.median(late_s) <= 0.002
+    slope = (heard_s[39] - heard_s[4]) / (predicted_s[39] - predicted_s[4])
+    assert slope == pytest.approx(1.0, abs=0.02)
+
+
+async def test_the_proxy_takes_as_long_as_the_kernel_for_the_same_bytes(wire: Wire) -> None:
+    """Seconds a byte on the wire, of one TCP transfer through each."""
+    size_bytes = 400_000
+    kernel_s = await asyncio.to_thread(_transfer, wire, size_bytes)
+    kernel_s_per_byte = kernel_s / wire.sent_bytes()
+    proxy_s_per_byte = await _through_proxy(size_bytes) / size_bytes
+    assert kernel_s_per_byte == pytest.approx(8 / RATE_BPS, rel=0.03)
+    assert proxy_s_per_byte == pytest.approx(kernel_s_per_byte, rel=0.05)
+
+
+def _transfer(wire: Wire, size_bytes: int) -> float:
+    """Return how long TCP takes through the kernel's bucket, from the first byte on."""
+    listener = within(wire.far, lambda: socket.create_server((wire.far_address, 0)))
+    near = within(wire.near, lambda: socket.create_connection(listener.getsockname(), 10))
+    far, _ = listener.accept()
+    sender = threading.Thread(target=near.sendall, args=(bytes(size_bytes),))
+    begin_s = time.perf_counter()
+    sender.start()
+    left = size_bytes
+    while left:
+        left -= len(far.recv(65536))
+    took_s = time.perf_counter() - begin_s
+    sender.join()
+    for open_socket in (near, far, listener):
+        open_socket.close()
+    return took_s
+
+
+async def _through_proxy(size_bytes: int) -> float:
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[float] = loop.create_future()
+
+    async def sink(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readexactly(size_bytes)
+        done.set_result(loop.time())
+        writer.close()
+
+    server = await asyncio.start_server(sink, "127.0.0.1", 0)
+    address = f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    proxy = LinkProxy(ProxySettings(address, uplink_bps=RATE_BPS, delay_ms=0.0))
+    await proxy.start()
+    _, writer = await asyncio.open_connection(proxy.address.host, proxy.address.port)
+    begin_s = loop.time()
+    writer.write(bytes(size_bytes))
+    took_s = await done - begin_s
+    writer.close()
+    await proxy.stop()
+    server.close()
+    return took_s
