@@ -52,15 +52,13 @@ def read_ply(path: Path, tile_origin: TileOrigin | None = None) -> Gaussians:
             f"{path}: has filter_3D of Mip-Splatting; fuse it with its create_fused_ply.py first"
         )
     rest = _rest_names(path, table)
-    origin = tile_origin if tile_origin is not None else TileOrigin()
-    offset_m = np.array([origin.east_m, origin.north_m, origin.up_m])
     try:
         return Gaussians(
-            means=_single(_columns(table, XYZ) - offset_m),
-            quaternions=_single(_columns(table, ROTATION)),
-            log_scales=_single(_columns(table, SCALES)),
-            opacity_logits=_single(_columns(table, ("opacity",))[:, 0]),
-            sh=_single(_coefficients(table, rest)),
+            means=_means(table, tile_origin if tile_origin is not None else TileOrigin()),
+            quaternions=_columns(table, ROTATION),
+            log_scales=_columns(table, SCALES),
+            opacity_logits=_columns(table, ("opacity",))[:, 0].copy(),
+            sh=_coefficients(table, rest),
         )
     except InvalidInput as error:
         raise FieldFormatError(f"{path}: {error}") from error
@@ -100,19 +98,28 @@ def _rest_names(path: Path, table: Table) -> tuple[str, ...]:
     return names
 
 
-def _columns(table: Table, names: tuple[str, ...]) -> NDArray[np.float64]:
-    if not names:
-        return np.empty((len(table), 0))
-    return np.stack([table[name].astype(np.float64) for name in names], axis=1)
-
-
-def _coefficients(table: Table, rest: tuple[str, ...]) -> NDArray[np.float64]:
-    """Return [N, K, 3] from channel-major columns."""
-    bands = _columns(table, rest).reshape(len(table), 3, len(rest) // 3)
-    return np.concatenate([_columns(table, DC)[:, None], bands.transpose(0, 2, 1)], axis=1)
-
-
-def _single(values: NDArray[np.float64]) -> F32:
-    """Round to float32; a value beyond its range becomes infinite and is refused as such."""
+def _means(table: Table, origin: TileOrigin) -> F32:
+    """Subtract in float64: global coordinates need it."""
+    offset_m = np.array([origin.east_m, origin.north_m, origin.up_m])
+    means = np.stack([table[axis].astype(np.float64) for axis in XYZ], axis=1) - offset_m
     with np.errstate(over="ignore"):
-        return np.ascontiguousarray(values, dtype=np.float32)
+        return np.ascontiguousarray(means, dtype=np.float32)
+
+
+def _columns(table: Table, names: tuple[str, ...]) -> F32:
+    """Return [N, C]; a value beyond float32 becomes infinite and is refused as such."""
+    columns = np.empty((len(table), len(names)), np.float32)
+    with np.errstate(over="ignore"):
+        for column, name in enumerate(names):
+            columns[:, column] = table[name]
+    return columns
+
+
+def _coefficients(table: Table, rest: tuple[str, ...]) -> F32:
+    """Return [N, K, 3] from channel-major columns."""
+    bands = len(rest) // 3
+    sh = np.empty((len(table), 1 + bands, 3), np.float32)
+    for channel in range(3):
+        names = (DC[channel], *rest[channel * bands : (channel + 1) * bands])
+        sh[:, :, channel] = _columns(table, names)
+    return sh

@@ -8,7 +8,6 @@ float32 it was written from.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -25,6 +24,8 @@ NAMES = {np.dtype("<f4"): "float", np.dtype("<f8"): "double", np.dtype("u1"): "u
 ROWS_AT_ONCE = 4096
 SHORTEST_VALUE_BYTES = 2
 """A digit and what separates it from the next."""
+LONGEST_VALUE_BYTES = 64
+"""On average over a row; a longer line is no row, and is not read to its end."""
 
 Table = NDArray[np.void]
 
@@ -80,11 +81,13 @@ def _check_size(path: Path, header: Header, file: BinaryIO) -> None:
 
 def _text_rows(path: Path, header: Header, file: BinaryIO) -> Table:
     names = header.dtype.names or ()
+    limit_bytes = LONGEST_VALUE_BYTES * len(names)
     table = np.empty(header.count, header.dtype)
     for start in range(0, header.count, ROWS_AT_ONCE):
-        lines = list(islice(file, min(ROWS_AT_ONCE, header.count - start)))
+        wanted = min(ROWS_AT_ONCE, header.count - start)
+        lines = [line for _ in range(wanted) if (line := file.readline(limit_bytes))]
         values = _numbers(path, lines, start, len(names))
-        if start + len(lines) < min(start + ROWS_AT_ONCE, header.count):
+        if len(lines) < wanted:
             raise FieldFormatError(
                 f"{path}: {start + len(lines)} rows, the header claims {header.count}"
             )

@@ -203,6 +203,7 @@ def test_every_truncated_text_is_refused(make_gaussians, tmp_path: Path) -> None
         (b"element vertex 3", b"element vertex 2000000000", "claims 68000000000 bytes"),
         (b"\n0.125730", b"\nnan 0.125730", "row 0 has 18 numbers, not 17"),
         (b"\n0.125730", b"\nzero.125730", "could not convert"),
+        (b"\n0.125730", b"\n" + b" " * 2000 + b"0.125730", "row 0 has 0 numbers"),
         (b"\n0.125730217", b"\nnan", "means: 1 of 3 .* number 0"),
     ],
 )
