@@ -41,11 +41,11 @@ class Video:
             self._container = av.open(str(file))
             self._stream = self._container.streams.video[0]
             self._pts = self._presentation_times()
-        except (FFmpegError, OSError, IndexError) as error:
+            if not self._pts:
+                raise DatasetError(f"{file}: holds no frames")
+            self._check_size(intrinsics)
+        except (FFmpegError, OSError, IndexError, StopIteration) as error:
             raise DatasetError(f"{file}: not a readable video ({error})") from error
-        if not self._pts:
-            raise DatasetError(f"{file}: holds no frames")
-        self._check_size(intrinsics)
         self._frames = self._container.decode(self._stream)
         self._next = -1
 

@@ -8,6 +8,7 @@ from typing import Annotated
 from tyro.conf import subcommand
 
 from rfedge.cli.scene_convert import SceneConvert
+from rfedge.cli.scene_plan import ScenePlan
 from rfedge.cli.scene_poses import ScenePoses
 from rfedge.cli.scene_record_carla import SceneRecordCarla
 
@@ -16,11 +17,12 @@ __all__ = ["Scene"]
 
 @dataclass(frozen=True)
 class Scene:
-    """Make datasets: convert recordings, find poses, record a simulator."""
+    """Make datasets: convert recordings, find poses, record a simulator, plan a scene."""
 
     verb: (
         Annotated[SceneConvert, subcommand("convert")]
         | Annotated[ScenePoses, subcommand("poses")]
+        | Annotated[ScenePlan, subcommand("plan")]
         | Annotated[SceneRecordCarla, subcommand("record-carla")]
     )
 

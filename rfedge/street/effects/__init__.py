@@ -1,0 +1,65 @@
+"""The effects a scene may declare: one module each, imported only when it is declared.
+
+They run in the order below. Those of the street change what is rendered (geometry, light,
+surfaces), those of the air and of the sensor change rendered frames, which are linear, so that
+another exposure or another noise needs no new render. A module holds one frozen dataclass, its
+settings; that of an effect on frames has ``apply(frame, rng) -> frame``.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from enum import StrEnum
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+__all__ = ["EFFECTS", "Effect", "Stage", "load_effect", "rng_of"]
+
+
+class Stage(StrEnum):
+    """What an effect changes."""
+
+    GEOMETRY = "geometry"
+    LIGHT = "light"
+    SURFACE = "surface"
+    AIR = "air"
+    SENSOR = "sensor"
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An entry of the registry: the module is ``rfedge.street.effects.<name>``."""
+
+    name: str
+    stage: Stage
+    settings: str
+    why: str
+
+    @property
+    def on_frames(self) -> bool:
+        """Whether it changes rendered frames rather than the scene."""
+        return self.stage in (Stage.AIR, Stage.SENSOR)
+
+
+EFFECTS = (
+    Effect("haze", Stage.AIR, "Haze", "distant things lose contrast"),
+    Effect("rain", Stage.AIR, "Rain", "falling drops streak over the picture"),
+    Effect("lens", Stage.SENSOR, "LensDistortion", "straight lines bend"),
+    Effect("rolling_shutter", Stage.SENSOR, "RollingShutter", "rows are exposed one by one"),
+    Effect("exposure", Stage.SENSOR, "ExposureDrift", "brightness drifts over a drive"),
+    Effect("noise", Stage.SENSOR, "SensorNoise", "photons and electrons are counted"),
+)
+
+
+def load_effect(effect: Effect) -> type[Any]:
+    """Import an effect's module and return its settings."""
+    settings: type[Any] = getattr(import_module(f"{__name__}.{effect.name}"), effect.settings)
+    return settings
+
+
+def rng_of(effect: Effect, seed: int, frame: int) -> np.random.Generator:
+    """Return the random numbers of one effect in one frame, whatever other effects run."""
+    return np.random.default_rng([seed, frame, zlib.crc32(effect.name.encode())])
