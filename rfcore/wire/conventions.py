@@ -21,8 +21,9 @@ MAX_MESSAGE_BYTES: Final = 1 << 20
 
 STREAM_METHOD: Final = "/rfcore.wire.v1.EdgeService/Stream"
 
-RENDERER_CONTRACT: Final = "splats-f32-2"
-"""Name of the bit-exact contract of ``rfcore.raster.native``; changes when its pixels change."""
+RENDERER_CONTRACT: Final = "splats-f32-2.ngp-f32-1"
+"""Names of the bit-exact contracts of ``rfcore.raster.native`` and ``rfcore.ngp.native``; a part
+changes when its pixels change."""
 
 FRAME_BUDGET_BUCKETS_S: Final = (
     0.001, 0.002, 0.005, 0.010, 0.0167, 0.0333, 0.050, 0.0667, 0.100, 0.200, 0.500, 1.0, 2.0, 5.0,
