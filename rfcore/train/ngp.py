@@ -42,6 +42,8 @@ REBUILD_EVERY = 64
 FIRST_SAMPLES_PER_RAY = 64.0
 FIRST_PEAK = 2.0
 """Of a cell, times the threshold: kept until a dozen visits have found it empty."""
+BLIND_SHARE = 0.25
+"""Of the occupancy's cells, without points: all begin occupied, and each has to be visited."""
 
 
 @dataclass(frozen=True)
@@ -260,9 +262,9 @@ class NgpTrainer:
 def _shape(model: NgpModel, cameras: Sequence[Camera], points: PointCloud | None) -> NgpShape:
     space = space_around(cameras, points)
     grid = HashGrid(grid_levels(model.L, model.N_min, model.N_max, space.aspect), model.log2_T)
-    return NgpShape(
-        grid, space, _marching(model, space), model.hidden, occupancy_cells(space, model.occupancy)
-    )
+    budget = model.occupancy if points is not None else round(BLIND_SHARE * model.occupancy)
+    cells = occupancy_cells(space, budget)
+    return NgpShape(grid, space, _marching(model, space), model.hidden, cells)
 
 
 def _marching(model: NgpModel, space: Space) -> Marching:

@@ -14,7 +14,7 @@ from rfedge.provenance import host, revision
 
 __all__ = ["CASES", "print_rows", "run_case", "write_json"]
 
-CASES = ("raster", "train", "codec")
+CASES = ("raster", "train", "codec", "ngp")
 
 
 def run_case(case: str, *, rows: Rows = "all") -> dict[str, Any]:
@@ -38,6 +38,10 @@ def _rows_of(case: str, rows: Rows) -> list[Row]:
         from rfedge.bench.codec import codec_rows
 
         return codec_rows()
+    if case == "ngp":
+        from rfedge.bench.ngp import ngp_rows
+
+        return ngp_rows()
     raise InvalidInput("case", f"{case!r} is not one of {', '.join(CASES)}")
 
 

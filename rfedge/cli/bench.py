@@ -14,7 +14,7 @@ __all__ = ["Bench"]
 class Bench:
     """Check a part against its definition, then time it: medians of at least 20 repetitions."""
 
-    case: Annotated[Literal["raster", "train", "codec"], Positional]
+    case: Annotated[Literal["raster", "train", "codec", "ngp"], Positional]
     """What to measure."""
     rows: Literal["all", "native"] = "all"
     """`native` leaves out the timing of the slow torch reference (raster only)."""

@@ -51,7 +51,7 @@ def view_digest(isa: str | None = None) -> str:
 
 
 def rays(seed: int) -> RayBatch:
-    """Directions with three exact components of one vector, turned into the eight octants."""
+    """Rays along one vector, turned into the eight octants."""
     rng = np.random.default_rng(seed)
     directions = np.array([0.28, 0.6, 0.7493997598078078], np.float32) * rng.choice(
         [-1, 1], (64, 3)

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from rfcore.camera import Camera
 from rfcore.ngp import reference
 from rfcore.ngp.native import NgpRenderer
 from rfcore.ngp.parameters import NgpParameters
 from rfcore.ngp.reference import Rays
 from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space, grid_levels
 
-NumbersMaker = Callable[..., NgpParameters]
+CameraMaker = Callable[..., Camera]
 
 
 def constant_field(log_density: float, unbounded: bool = False) -> NgpParameters:
@@ -104,7 +105,7 @@ def test_a_ray_in_a_face_is_inside() -> None:
 
 def test_what_is_left_of_an_unbounded_ray_meets_the_colour_at_infinity() -> None:
     field = constant_field(-30.0, unbounded=True)
-    colour, distance, opacity = cast(field, ray((0, 0, 0), (0.3, 0.2, 1)))
+    colour, _, opacity = cast(field, ray((0, 0, 0), (0.3, 0.2, 1)))
     assert opacity == pytest.approx(0.0, abs=1e-9)
     assert colour == pytest.approx(COLOUR, abs=1e-9)
 
@@ -117,7 +118,7 @@ def test_an_empty_unbounded_field_is_its_sky_and_has_no_depth() -> None:
     assert colour == pytest.approx(COLOUR, abs=1e-12)
 
 
-def test_nothing_behind_an_opaque_sample_counts(numbers: NumbersMaker) -> None:
+def test_nothing_behind_an_opaque_sample_counts() -> None:
     field = constant_field(10.0)
     near = cast(field, ray((0, 0, -3), (0, 0, 1)))
     cut = replace(field.shape, marching=Marching(0.5, 2 ** (1 / 400), 850))

@@ -31,8 +31,11 @@ RF_INLINE Mask locate(const Space& space, const Points& p, Points* u) {
         for (int i = 0; i < 3; ++i) u->axis[i] = unit(fma(x.axis[i], splat(0.5f), splat(0.5f)));
         return ge(one, norm);
     }
-    const Lanes inverse = one / max(norm, one);
-    const Lanes quarter = (splat(2.0f) - inverse) * inverse * splat(0.25f);
+    Lanes quarter = splat(0.25f);
+    if (any(gt(norm, one))) {  // else the same value, without the division
+        const Lanes inverse = one / max(norm, one);
+        quarter = (splat(2.0f) - inverse) * inverse * splat(0.25f);
+    }
     for (int i = 0; i < 3; ++i) u->axis[i] = unit(fma(x.axis[i], quarter, splat(0.5f)));
     return ge(norm, zero());
 }

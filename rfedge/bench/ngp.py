@@ -1,0 +1,150 @@
+"""Time the native hash grid renderer on a field trained on the spot, beside the torch reference.
+
+The field learns the sample street for a fixed number of iterations first, so that rays meet
+surfaces as in use. Before anything is timed, a small picture must follow the reference in float64:
+every pixel within 2e-5, but for those where a sample rounds across the face of a cell.
+
+``samples_per_ray`` is what was evaluated, ``budget`` what was asked for (null: unhurried).
+``psnr_to_reference_db`` compares with the unhurried picture (null: it is that one), ``held_out_db``
+with pictures the field was not trained on. ``torch_ms_scaled`` is the reference's time on a crop,
+scaled to the picture by its pixels: an estimate, not a measurement.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter_ns
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera
+from rfcore.dataset import read_dataset
+from rfcore.errors import RfedgeError
+from rfcore.field import NgpField
+from rfcore.metrics import psnr
+from rfcore.ngp.native import NgpRenderer
+from rfcore.ngp.parameters import NgpParameters
+from rfcore.train import NgpTrainer, NgpTrainingConfig
+from rfcore.views import PosedPicture
+from rfedge.bench.timing import median_ms
+
+__all__ = ["check_against_reference", "ngp_rows"]
+
+STREET = Path("samples/street")
+ITERATIONS = 600
+SIZES_PX = ((300, 168), (640, 360))
+THREADS = (1, 2)
+BUDGETS = (None, 32, 16, 8)
+CHECK_SIZE_PX = (48, 27)
+TOLERANCE = 2e-5
+MAX_FLIPPED = 0.02
+"""Share of pixels where a sample may round across the face of an occupied cell."""
+HELD_OUT_EVERY = 8
+
+
+def ngp_rows() -> list[dict[str, Any]]:
+    """Return a row per size, number of threads and budget.
+
+    Raises ``DatasetError`` without the sample street (run it from the repository), ``RfedgeError``
+    when the renderer is wrong.
+    """
+    held_out = read_dataset(STREET / "transforms_drive_empty.json").pictures[::HELD_OUT_EVERY]
+    numbers = _trained()
+    check_against_reference(numbers, _resized(held_out[0].camera, CHECK_SIZE_PX))
+    renderers = [NgpRenderer(numbers, threads=threads) for threads in THREADS]
+    rows = []
+    for size in SIZES_PX:
+        torch_ms = _torch_ms(numbers, _resized(held_out[0].camera, CHECK_SIZE_PX), size)
+        for renderer in renderers:
+            for budget in BUDGETS:
+                row = _row(renderer, held_out, size, budget)
+                rows.append({**row, "torch_ms_scaled": torch_ms})
+    return rows
+
+
+def check_against_reference(numbers: NgpParameters, camera: Camera) -> None:
+    """Raise ``RfedgeError`` unless the native colours follow the float64 reference."""
+    got = NgpRenderer(numbers).render_colour(camera)
+    error = np.abs(got - _reference_colour(numbers, camera)).max(axis=2)
+    flipped = float((error > TOLERANCE).mean())
+    if not flipped <= MAX_FLIPPED:
+        raise RfedgeError(
+            f"the hash grid renderer is off by up to {error.max():.2g} from the reference on "
+            f"{flipped:.2%} of the pixels (limit {MAX_FLIPPED:.0%}): nothing was timed"
+        )
+
+
+def _trained() -> NgpParameters:
+    """Return a field after a short training, rounded as its file would be."""
+    dataset = read_dataset(STREET / "transforms_train.json")
+    config = NgpTrainingConfig(iterations=ITERATIONS, threads=max(THREADS))
+    trainer = NgpTrainer(dataset.pictures, dataset.points, config, seed=1)
+    for _ in trainer.steps():
+        pass
+    field: NgpField = trainer.field()
+    return field.numbers
+
+
+def _row(
+    renderer: NgpRenderer,
+    held_out: tuple[PosedPicture, ...],
+    size: tuple[int, int],
+    budget: int | None,
+) -> dict[str, Any]:
+    camera = _resized(held_out[0].camera, size)
+    picture = renderer.render_colour(camera, budget)
+    samples = renderer.samples / (size[0] * size[1])
+    to_reference = None
+    if budget is not None:
+        to_reference = psnr(_shown(picture), _shown(renderer.render_colour(camera)), peak=1.0)
+    return {
+        "width": size[0],
+        "height": size[1],
+        "threads": renderer.threads,
+        "frame_ms": median_ms(lambda: renderer.render_colour(camera, budget)),
+        "samples_per_ray": round(samples, 2),
+        "psnr_to_reference_db": to_reference,
+        "budget": budget,
+        "held_out_db": _held_out_db(renderer, held_out, budget),
+        "isa": renderer.isa,
+    }
+
+
+def _held_out_db(
+    renderer: NgpRenderer, held_out: tuple[PosedPicture, ...], budget: int | None
+) -> float:
+    """Return the mean PSNR over the pictures, at their own size."""
+    qualities = [
+        psnr(_shown(renderer.render_colour(p.camera, budget)), p.read() / 255.0, peak=1.0)
+        for p in held_out
+    ]
+    return float(np.mean(qualities))
+
+
+def _shown(colour: NDArray[np.float32]) -> NDArray[np.float64]:
+    return np.clip(colour.astype(np.float64), 0.0, 1.0)
+
+
+def _resized(camera: Camera, size: tuple[int, int]) -> Camera:
+    return Camera(camera.intrinsics.resized(*size), camera.world_from_cam)
+
+
+def _torch_ms(numbers: NgpParameters, camera: Camera, size: tuple[int, int]) -> float:
+    """Return the reference's time on a small picture, scaled to one of ``size``."""
+    start = perf_counter_ns()
+    _reference_colour(numbers, camera)
+    pixels = camera.intrinsics.width_px * camera.intrinsics.height_px
+    return (perf_counter_ns() - start) / 1e6 * size[0] * size[1] / pixels
+
+
+def _reference_colour(numbers: NgpParameters, camera: Camera) -> NDArray[np.float64]:
+    import torch
+
+    from rfcore.ngp import reference
+
+    with torch.no_grad():
+        colour, _, _ = reference.render(reference.parameters(numbers), numbers, camera)
+    picture: NDArray[np.float64] = colour.numpy()
+    return picture
