@@ -17,8 +17,8 @@ from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space
 from rfcore.ngp.trainable import NgpRates, RayBatch, TrainableNgp
 from rfcore.raster.native import available_isas
 
-VIEW_DIGEST = "0ed608787c2589425f56f221bddc53cc"
-TRAINED_DIGEST = "9c71a9fefb0b7812f9fd1f1f4fb9a78e"
+VIEW_DIGEST = "1eb19561b910760200843ed8e9ad4734"
+TRAINED_DIGEST = "973c0b6b3959073ce9457f89c5d4f7f2"
 
 
 def numbers() -> NgpParameters:
