@@ -24,10 +24,12 @@ test-slow: build test-system-packages  ## run the tests that take more than ten 
 	$(BIN)/python -m pytest -m slow --timeout 600
 
 # Debian packages that slow tests use beside Python: cross compiler and emulator for
-# tests/native/test_aarch64.py, promtool and prometheus for tests/deploy, ip and tc for tests/link.
+# tests/native/test_aarch64.py, promtool and prometheus for tests/deploy, ip and tc for tests/link,
+# OpenH264 for tests/codec/test_second_decoder.py.
 # A test fails without its program, and says so.
-SYSTEM_PACKAGES := g++-aarch64-linux-gnu qemu-user prometheus iproute2
-SYSTEM_PROGRAMS := aarch64-linux-gnu-g++ qemu-aarch64 promtool prometheus ip tc
+SYSTEM_PACKAGES := g++-aarch64-linux-gnu qemu-user prometheus iproute2 \
+	gstreamer1.0-tools gstreamer1.0-plugins-bad
+SYSTEM_PROGRAMS := aarch64-linux-gnu-g++ qemu-aarch64 promtool prometheus ip tc gst-inspect-1.0
 test-system-packages:  ## install the programs that test-slow uses (root, Debian)
 	@if (for name in $(SYSTEM_PROGRAMS); do command -v $$name >/dev/null || exit 1; done); then :; \
 	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \

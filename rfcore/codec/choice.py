@@ -47,6 +47,10 @@ POOR = 0.5
 WORTH = 0.015
 """Of the cost so far: another reference must save at least so much."""
 
+GOOD = 0.9
+"""Of the cost of intra prediction: what an adapted render must stay below. Where the light of a
+whole street was changed it reaches 0.75, as in the right light; a field of noon at dusk 1.2."""
+
 NOTICEABLE_LEVELS = 2
 """Median difference of block means from which a change of light is looked for."""
 PHOTOMETRIC_BITS = 12 * 16
@@ -79,13 +83,19 @@ def choose_references(frame: I420, prediction: Prediction, crf: float, most: int
 
 
 def choose_photometric(frame: I420, render: I420, crf: float) -> Photometric:
-    """Return how the render's light is to be changed, if that saves more than it costs to say."""
+    """Return how the render's light is to be changed, if that saves more than it costs to say.
+
+    It must make a good reference of the render: shadows that have moved and lamps that were lit are
+    beyond one matrix, and half a change of light only disturbs what is carried from frame to frame.
+    """
     if min(frame.size_px) < BLOCK_PX or _light_difference(frame, render) < NOTICEABLE_LEVELS:
         return ()
     found = solve(frame, render)
     costs = _Costs(frame, crf)
-    saved = _total(costs.of(render)) - _total(costs.of(adapt(render, found)))
-    return found if saved > costs.price_of(PHOTOMETRIC_BITS) else ()
+    adapted = _total(costs.of(adapt(render, found)))
+    saved = _total(costs.of(render)) - adapted
+    pays = saved > costs.price_of(PHOTOMETRIC_BITS) and adapted < GOOD * costs.intra
+    return found if pays else ()
 
 
 class _Costs:

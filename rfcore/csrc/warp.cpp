@@ -108,10 +108,11 @@ private:
     std::vector<std::int16_t> samples_;
 };
 
-// Writes `gain` 64ths of the plane's value at each known (u, v), in 1/64 sample (on top of
-// the render if the plane is a difference), and the render elsewhere. Eight columns are summed although six have taps, so that a row is one vector.
+// Writes the plane's value at each known (u, v), in 1/64 sample, on top of the render if the plane is
+// a difference, and the render elsewhere. Eight columns are summed although six have taps, so that a
+// row of them is one vector.
 RFCORE_PER_ISA
-void interpolate_row(const Plane& plane, const Row& at, int count, std::int32_t gain,
+void interpolate_row(const Plane& plane, const Row& at, int count, std::int32_t doubt,
                      const std::uint8_t* render, std::uint8_t* out) {
     const std::int32_t *u = at.u.data(), *v = at.v.data();
     const std::int32_t with_render = plane.is_difference() ? 1 : 0;
@@ -130,7 +131,8 @@ void interpolate_row(const Plane& plane, const Row& at, int count, std::int32_t 
         }
         std::int32_t sum = 0;
         for (int i = 0; i < kTaps; ++i) sum += columns[i] * across[i];
-        const std::int32_t value = ((sum * gain + (1 << 17)) >> 18) + with_render * render[n];
+        sum -= std::min(std::max(sum >> 2, -(doubt << 12)), doubt << 12);
+        const std::int32_t value = ((sum + (1 << 11)) >> 12) + with_render * render[n];
         out[n] = static_cast<std::uint8_t>(std::min(std::max(value, 1), 255));
     }
 }
@@ -160,7 +162,7 @@ private:
         locate_row(in_.depth + start, geometry_, size_, y, row.u.data(), row.v.data(),
                    row.z.data());
         drop_hidden(in_.previous_depth, size_.width_px, row);
-        interpolate_row(y_, row, size_.width_px, in_.gain, in_.render.y + start, out_.y + start);
+        interpolate_row(y_, row, size_.width_px, in_.doubt, in_.render.y + start, out_.y + start);
         return size_.width_px - std::count(row.u.begin(), row.u.end(), kNowhere);
     }
 
@@ -173,8 +175,8 @@ private:
             middle_.v[c] = all ? centre(top.v[a] + top.v[b] + bottom.v[a] + bottom.v[b]) : 0;
         }
         const std::size_t start = static_cast<std::size_t>(line) * half_width_;
-        interpolate_row(u_, middle_, half_width_, in_.gain, in_.render.u + start, out_.u + start);
-        interpolate_row(v_, middle_, half_width_, in_.gain, in_.render.v + start, out_.v + start);
+        interpolate_row(u_, middle_, half_width_, in_.doubt, in_.render.u + start, out_.u + start);
+        interpolate_row(v_, middle_, half_width_, in_.doubt, in_.render.v + start, out_.v + start);
     }
 
     // Four luma positions to the chroma sample in their middle: (mean - 1/2) / 2.

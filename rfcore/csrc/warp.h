@@ -23,9 +23,10 @@ struct WarpInputs {
     const float* depth;
     ConstI420Planes render;
     // What the previous picture was predicted to be, or null. With it, not the picture is carried
-    // but what it differs by, `gain` 64ths of which are added to the render.
+    // but what it differs by, less a quarter of that and at most `doubt` levels, and added to the
+    // render.
     ConstI420Planes previous_render;
-    std::int32_t gain;
+    std::int32_t doubt;
 };
 
 // Returns how many luma samples came from the previous picture; the others are the render's.

@@ -162,7 +162,7 @@ def warp_i420(
     depth: _F32,
     render: tuple[_U8, _U8, _U8],
     previous_render: tuple[_U8, _U8, _U8] | None,
-    gain: int,
+    doubt: int,
     numbers: Sequence[float],
     y: _U8,
     u: _U8,

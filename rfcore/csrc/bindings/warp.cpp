@@ -71,7 +71,7 @@ void bind_warp(nb::module_& m) {
     m.def(
         "warp_i420",
         [](const Picture& previous, InDepth previous_depth, InDepth depth, const Picture& render,
-           const std::optional<Picture>& previous_render, std::int32_t gain, const std::vector<double>& numbers,
+           const std::optional<Picture>& previous_render, std::int32_t doubt, const std::vector<double>& numbers,
            OutPlane y, OutPlane u, OutPlane v) {
             const PictureSize size = size_of(y);
             require_i420(size, y, u, v);
@@ -86,12 +86,12 @@ void bind_warp(nb::module_& m) {
                                 depth.data(),
                                 planes_of(render),
                                 previous_render ? planes_of(*previous_render) : ConstI420Planes{},
-                                gain};
+                                doubt};
             const nb::gil_scoped_release released;
             return warp_i420(in, geometry, size, {y.data(), u.data(), v.data()});
         },
         nb::arg("previous"), nb::arg("previous_depth"), nb::arg("depth"), nb::arg("render"),
-        nb::arg("previous_render").none(), nb::arg("gain"), nb::arg("numbers"), nb::arg("y"),
+        nb::arg("previous_render").none(), nb::arg("doubt"), nb::arg("numbers"), nb::arg("y"),
         nb::arg("u"), nb::arg("v"));
     m.def(
         "block_costs",

@@ -1,0 +1,180 @@
+"""What the sender decides: references by their use, light only when it pays."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.codec import (
+    INTRA,
+    RENDER_ONLY,
+    CodecConfig,
+    DeltaDecoder,
+    DeltaEncoder,
+    FrameChoice,
+    Past,
+    Reference,
+)
+from rfcore.codec.choice import choose_photometric, choose_references
+from rfcore.codec.photometric import adapt, check_photometric, solve
+from rfcore.codec.prediction import Prediction
+from rfcore.errors import InvalidInput
+from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
+
+PictureMaker = Callable[..., I420]
+PairMaker = Callable[..., tuple[I420, I420]]
+SIZE_PX = (320, 192)
+
+
+@pytest.fixture
+def seen() -> PosedDepth:
+    width, height = SIZE_PX
+    camera = Camera(Intrinsics(width, height, width, width, 160, 96), Pose.identity())
+    return PosedDepth(camera, np.full((height, width), 10, np.float32))
+
+
+def shade(picture: I420, gain: float, levels: float) -> I420:
+    """The same street under another light: every channel of RGB scaled and raised alike."""
+    luma = (picture.y - 16.0) * gain + levels + 16
+    chroma = [(plane - 128.0) * gain + 128 for plane in picture.planes[1:]]
+    y, u, v = (np.clip(np.rint(p), 1, 255).astype(np.uint8) for p in (luma, *chroma))
+    return I420(y, u, v)
+
+
+# --- references
+
+
+def test_a_render_like_the_frame_is_enough(pair: PairMaker) -> None:
+    frame, render = pair(*SIZE_PX)
+    assert choose_references(frame, Prediction(render), 23) == RENDER_ONLY
+
+
+def test_a_render_that_shows_nothing_is_not_used(
+    pair: PairMaker, noise: PictureMaker, seen: PosedDepth
+) -> None:
+    frame, render = pair(*SIZE_PX)
+    for useless in (noise(*SIZE_PX, 1), shade(noise(*SIZE_PX, 2), 1.0, 0.0)):
+        assert choose_references(frame, Prediction(useless), 23) == INTRA
+        other = Past(noise(*SIZE_PX, 3), seen, noise(*SIZE_PX, 4))
+        chosen = choose_references(frame, Prediction(useless, seen, other), 23)
+        assert chosen == (Reference.PREVIOUS,)
+    assert choose_references(frame, Prediction(render), 23) == RENDER_ONLY
+
+
+def test_what_the_last_frame_taught_comes_first(pair: PairMaker, seen: PosedDepth) -> None:
+    """The cars are not in the render; nobody moved, so the correction has them."""
+    frame, render = pair(*SIZE_PX)
+    chosen = choose_references(frame, Prediction(render, seen, Past(frame, seen, render)), 23)
+    assert chosen[0] is Reference.PREVIOUS
+    assert chosen[-1] in (Reference.CORRECTION, Reference.WARP)
+
+
+@pytest.mark.parametrize("most", [1, 2, 3])
+def test_no_more_references_than_allowed(pair: PairMaker, seen: PosedDepth, most: int) -> None:
+    frame, render = pair(*SIZE_PX)
+    prediction = Prediction(render, seen, Past(frame, seen, render))
+    assert 1 <= len(choose_references(frame, prediction, 23, most)) <= most
+
+
+@pytest.mark.parametrize("size_px", [(1, 1), (7, 40), (40, 7)])
+def test_pictures_smaller_than_a_block_have_the_render(
+    picture: PictureMaker, size_px: tuple[int, int]
+) -> None:
+    frame = picture(*size_px)
+    assert choose_references(frame, Prediction(frame), 23) == RENDER_ONLY
+    assert choose_photometric(frame, frame, 23) == ()
+
+
+# --- light
+
+
+@pytest.mark.parametrize(("gain", "levels"), [(0.6, 0.0), (0.8, 12.0), (1.3, -6.0), (1.0, 20.0)])
+def test_a_change_of_light_is_found_and_undone(
+    picture: PictureMaker, gain: float, levels: float
+) -> None:
+    """Rounding twice leaves at most one level each: shading and adapting."""
+    frame, render = shade(picture(*SIZE_PX), gain, levels), picture(*SIZE_PX)
+    undone = adapt(render, solve(frame, render))
+    for a, b in zip(undone.planes, frame.planes, strict=True):
+        assert np.abs(a.astype(int) - b).mean() < 1
+        assert np.abs(a.astype(int) - b).max() <= 3
+
+
+def test_what_the_field_has_never_seen_does_not_bend_the_light(pair: PairMaker) -> None:
+    frame, render = pair(*SIZE_PX)
+    dark = shade(frame, 0.7, 0.0)
+    matrix = np.array(solve(dark, render)).reshape(3, 4)
+    assert abs(matrix[0, 0] / 4096 - 0.7) < 0.02
+    assert abs(matrix[0, 3] / 16) < 3
+
+
+def test_light_is_sent_when_it_pays_and_beats_weighted_prediction(pair: PairMaker) -> None:
+    """A warm light moves chroma with luma, which a gain and an offset a plane cannot say."""
+    frame, render = pair(*SIZE_PX)
+    warm = adapt(frame, (3300, 0, 0, 0, -500, 3300, 0, 0, 600, 0, 3300, 0))
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX))
+    sent = encoder.encode(encoder.start(0), warm, render)
+    assert len(sent.packet.photometric) == 12
+    without = encoder.encode(
+        encoder.start(0), warm, render, choice=FrameChoice(RENDER_ONLY, photometric=())
+    )
+    assert len(sent.packet.payload) + 24 < 0.8 * len(without.packet.payload)
+    decoder = DeltaDecoder(encoder.header)
+    decoded = decoder.decode(decoder.start(0), sent.packet, render)
+    assert decoded.frame.digest() == sent.reconstruction.digest()
+
+
+def test_light_that_did_not_change_is_not_sent(pair: PairMaker, noise: PictureMaker) -> None:
+    frame, render = pair(*SIZE_PX)
+    assert choose_photometric(frame, render, 23) == ()
+    assert choose_photometric(frame, noise(*SIZE_PX, 1), 23) == ()
+
+
+@pytest.mark.parametrize("size_px", [(1, 1), (2, 2), (3, 5), (101, 67)])
+def test_the_identity_changes_no_sample_above_zero(
+    noise: PictureMaker, size_px: tuple[int, int]
+) -> None:
+    picture = noise(*size_px, 1)
+    identity = (4096, 0, 0, 0, 0, 4096, 0, 0, 0, 0, 4096, 0)
+    for a, b in zip(adapt(picture, identity).planes, picture.planes, strict=True):
+        assert np.array_equal(a, np.maximum(b, 1))
+    assert adapt(picture, ()) is picture
+
+
+@pytest.mark.parametrize("size_px", [(4, 2), (5, 3)])
+def test_adapting_is_its_definition(noise: PictureMaker, size_px: tuple[int, int]) -> None:
+    """Sample by sample in Python's integers, with the largest numbers there may be."""
+    picture = noise(*size_px, 3)
+    rng = np.random.default_rng(1)
+    numbers = tuple(int(n) for n in rng.integers(-(1 << 15), 1 << 15, 12))
+    m = np.array(numbers, object).reshape(3, 4)
+    got = adapt(picture, numbers)
+    width, height = size_px
+    y, u, v = (plane.astype(object) for plane in picture.planes)
+
+    def value(row: int, luma: int, i: int, j: int, black: int) -> int:
+        sum_ = m[row, 0] * luma + m[row, 1] * (u[j, i] - 128) + m[row, 2] * (v[j, i] - 128)
+        return min(max(((sum_ + m[row, 3] * 256 + 2048) >> 12) + black, 1), 255)
+
+    for j in range(height):
+        for i in range(width):
+            assert got.y[j, i] == value(0, y[j, i] - 16, i // 2, j // 2, 16)
+    for j in range((height + 1) // 2):
+        for i in range((width + 1) // 2):
+            rows, columns = (2 * j, min(2 * j + 1, height - 1)), (2 * i, min(2 * i + 1, width - 1))
+            mean = (sum(y[r, c] - 16 for r in rows for c in columns) + 2) >> 2
+            assert got.u[j, i] == value(1, mean, i, j, 128)
+            assert got.v[j, i] == value(2, mean, i, j, 128)
+
+
+def test_numbers_that_cannot_be_are_refused(pair: PairMaker) -> None:
+    for numbers, named in (((1, 2), "2 numbers"), ((1 << 15, *[0] * 11), "32768 is outside")):
+        with pytest.raises(InvalidInput, match=named):
+            check_photometric(numbers)
+    encoder = DeltaEncoder(CodecConfig(32, 32))
+    packet = encoder.encode(encoder.start(0), *pair(32, 32)).packet
+    with pytest.raises(InvalidInput, match="photometric"):
+        replace(packet, photometric=(1,))
