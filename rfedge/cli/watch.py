@@ -32,17 +32,21 @@ class Watch:
     """Watch a server on another machine in plaintext."""
 
     def run(self) -> None:
-        """Watch until the server ends the stream, enough was seen, or SIGINT."""
+        """Watch until the server ends the stream, enough was seen, SIGINT or SIGTERM."""
+        import signal
+        from contextlib import suppress
+
         from rfedge.watch import WatchSettings, watch
 
-        watch(
-            WatchSettings(
-                address=self.address,
-                vehicle_ids=frozenset(self.vehicle),
-                folder=self.dir,
-                video=self.mp4,
-                encoding=self.encoding,
-                pictures=self.pictures,
-                allow_insecure=self.allow_insecure,
-            )
+        settings = WatchSettings(
+            address=self.address,
+            vehicle_ids=frozenset(self.vehicle),
+            folder=self.dir,
+            video=self.mp4,
+            encoding=self.encoding,
+            pictures=self.pictures,
+            allow_insecure=self.allow_insecure,
         )
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with suppress(KeyboardInterrupt):  # the usual end; files are closed on the way
+            watch(settings)
