@@ -1,0 +1,79 @@
+"""What a vehicle counts: ends by reason, bytes by reference, and its name only when asked."""
+
+from collections.abc import Callable
+
+import pytest
+from prometheus_client import CollectorRegistry
+
+from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
+from cav_agent.metrics import AgentMetrics
+from rfcore.wire.messages import StageTimes
+
+
+@pytest.fixture
+def registry() -> CollectorRegistry:
+    return CollectorRegistry()
+
+
+@pytest.fixture
+def metrics(registry: CollectorRegistry) -> AgentMetrics:
+    return AgentMetrics(registry)
+
+
+@pytest.fixture
+def acked(
+    make_capture: Callable[..., Capture], encode: Callable[[EncodeJob], EncodedFrame]
+) -> FrameResult:
+    capture = make_capture(0)
+    done = encode(EncodeJob(capture, 0, 1))
+    return FrameResult(
+        capture,
+        Outcome.ACKED,
+        packet=done.packet,
+        packet_bytes=340,
+        stage_s=done.stage_s,
+        server=StageTimes(total_ns=10**7),
+        latency_s=0.08,
+        link_s=0.04,
+    )
+
+
+def test_an_acknowledged_picture_is_counted_with_its_bytes_and_times(
+    metrics: AgentMetrics, registry: CollectorRegistry, acked: FrameResult
+) -> None:
+    metrics.ended(acked)
+    value = registry.get_sample_value
+    assert value("rfedge_agent_frames_total", {"result": "acked", "reason": ""}) == 1
+    assert value("rfedge_agent_payload_bytes_total", {"references": "render"}) == 100
+    assert value("rfedge_agent_sent_bytes_total") == 340
+    for stage, spent_s in (("render", 0.01), ("encode", 0.02), ("link", 0.04)):
+        assert value("rfedge_agent_stage_seconds_sum", {"stage": stage}) == spent_s
+    assert value("rfedge_agent_capture_to_ack_seconds_sum") == 0.08
+
+
+def test_a_picture_dropped_before_it_was_coded_has_a_reason_and_no_bytes(
+    metrics: AgentMetrics, registry: CollectorRegistry, make_capture: Callable[..., Capture]
+) -> None:
+    metrics.ended(FrameResult(make_capture(0), Outcome.DROPPED, "superseded: by picture 1"))
+    dropped = {"result": "dropped", "reason": "superseded"}
+    assert registry.get_sample_value("rfedge_agent_frames_total", dropped) == 1
+    assert registry.get_sample_value("rfedge_agent_sent_bytes_total") == 0
+
+
+def test_a_lost_connection_is_counted_and_shown(
+    metrics: AgentMetrics, registry: CollectorRegistry
+) -> None:
+    metrics.connected(True)
+    assert registry.get_sample_value("rfedge_agent_connected") == 1
+    metrics.connected(False)
+    assert registry.get_sample_value("rfedge_agent_connected") == 0
+    assert registry.get_sample_value("rfedge_agent_connections_lost_total") == 1
+
+
+def test_a_vehicle_is_named_only_when_asked(
+    metrics: AgentMetrics, registry: CollectorRegistry
+) -> None:
+    named = {"vehicle": "cav-7", "camera": "front"}
+    assert registry.get_sample_value("rfedge_agent_info", named) is None
+    metrics.travelling("cav-7", "front")
+    assert registry.get_sample_value("rfedge_agent_info", named) == 1
