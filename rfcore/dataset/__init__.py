@@ -2,14 +2,13 @@
 
 from rfcore.dataset.assemble import Dataset, Distortion, ReadOptions
 from rfcore.dataset.manifest import verify_manifest, write_manifest
-from rfcore.dataset.read import read_dataset, read_transforms
+from rfcore.dataset.read import read_dataset
 
 __all__ = [
     "Dataset",
     "Distortion",
     "ReadOptions",
     "read_dataset",
-    "read_transforms",
     "verify_manifest",
     "write_manifest",
 ]

@@ -19,7 +19,7 @@ from rfcore.dataset.source import Source
 from rfcore.dataset.transforms import read_transforms_source, transforms_file
 from rfcore.errors import DatasetError
 
-__all__ = ["read_dataset", "read_source", "read_transforms"]
+__all__ = ["read_dataset", "read_source"]
 
 EXPECTED = (
     "transforms.json, sparse/0 of COLMAP, calib.txt of KITTI, cameras.json of INRIA, camera.toml"
@@ -77,8 +77,3 @@ def _candidates(folder: Path) -> list[Path]:
     if model is not None:
         found.append(next(f for f in (model / "images.bin", model / "images.txt") if f.is_file()))
     return found
-
-
-def read_transforms(path: Path, tile_origin: TileOrigin | None = None) -> Dataset:
-    """Read a dataset whose pictures have no lens distortion."""
-    return read_dataset(path, tile_origin=tile_origin)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from rfcore.dataset import read_transforms
+from rfcore.dataset import read_dataset
 from rfcore.errors import FieldFormatError
 from rfcore.field import SplatField, load_field, save_field
 from rfcore.train import SplatTrainingConfig
@@ -58,8 +58,8 @@ def choose_field(choice: FieldChoice, console: Console) -> Path:
 
 def trained_field(sample: Path, config: SplatTrainingConfig, console: Console) -> SplatField:
     """Train the field of a sample and finish it: rungs, compression, quality on the empty drive."""
-    views = read_transforms(sample / "transforms_train.json")
-    held_out = read_transforms(sample / "transforms_drive_empty.json")
+    views = read_dataset(sample / "transforms_train.json")
+    held_out = read_dataset(sample / "transforms_drive_empty.json")
     job = TrainingJob(name=sample.name, dataset=views, held_out=held_out, config=config, seed=SEED)
     field = train_field(job, console)
     rungs = RungConfig(threads=config.threads)

@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import Console
 
 from rfcore.camera import Camera
-from rfcore.dataset import Dataset, read_transforms, verify_manifest
+from rfcore.dataset import Dataset, read_dataset, verify_manifest
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField, load_field
 from rfcore.files import write_whole
@@ -126,7 +126,7 @@ def _drive_outcome(
     agent_rows = _json_lines(work / "agent.jsonl")
     saved = work / "saved" / VEHICLE / CAMERA
     index = {_address(row): row for row in _json_lines(saved / "index.jsonl")}
-    dataset = read_transforms(drive_path)
+    dataset = read_dataset(drive_path)
     if not index:
         raise RfedgeError(f"drive {drive}: the server reconstructed nothing, see {work}")
     return DriveOutcome(
@@ -209,8 +209,8 @@ def _rendered(field: RadianceField, camera: Camera) -> Rgb:
 
 def _wrong_street(sample: Path, field: RadianceField) -> Rgb:
     """A render of the same field from a training view far from the drive."""
-    train = read_transforms(sample / "transforms_train.json")
-    drive = read_transforms(sample / f"transforms_drive_{DRIVES[0]}.json")
+    train = read_dataset(sample / "transforms_train.json")
+    drive = read_dataset(sample / f"transforms_drive_{DRIVES[0]}.json")
     start = drive.pictures[0].camera.world_from_cam.translation_m
     farthest = max(
         train.pictures,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Camera
-from rfcore.dataset import read_transforms, verify_manifest
+from rfcore.dataset import read_dataset, verify_manifest
 from rfcore.views import PointCloud, PosedPicture
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "street"
@@ -21,7 +21,7 @@ def test_every_file_is_as_it_was_listed() -> None:
 
 
 def test_the_training_views_come_with_points() -> None:
-    train = read_transforms(SAMPLE / "transforms_train.json")
+    train = read_dataset(SAMPLE / "transforms_train.json")
     assert len(train.pictures) == 120
     assert train.points is not None
     assert len(train.points.xyz_m) == 150_000
@@ -29,7 +29,7 @@ def test_the_training_views_come_with_points() -> None:
 
 @pytest.mark.parametrize("name", ["empty", "vehicles"])
 def test_a_drive_is_24_pictures_at_10_hz(name: str) -> None:
-    drive = read_transforms(SAMPLE / f"transforms_drive_{name}.json")
+    drive = read_dataset(SAMPLE / f"transforms_drive_{name}.json")
     assert len(drive.pictures) == 24
     assert drive.rate_hz == pytest.approx(10.0)
     assert drive.pictures[-1].read().shape == (360, 640, 3)
@@ -37,7 +37,7 @@ def test_a_drive_is_24_pictures_at_10_hz(name: str) -> None:
 
 def test_the_two_drives_take_the_same_path() -> None:
     empty, vehicles = (
-        read_transforms(SAMPLE / f"transforms_drive_{name}.json").pictures
+        read_dataset(SAMPLE / f"transforms_drive_{name}.json").pictures
         for name in ("empty", "vehicles")
     )
     assert [p.camera for p in empty] == [p.camera for p in vehicles]
@@ -46,7 +46,7 @@ def test_the_two_drives_take_the_same_path() -> None:
 
 def test_the_points_have_the_colour_of_the_pixels_they_land_on() -> None:
     """Some are occluded, so the median is asked; poses of other views give 50 levels or more."""
-    train = read_transforms(SAMPLE / "transforms_train.json")
+    train = read_dataset(SAMPLE / "transforms_train.json")
     assert train.points is not None
     for picture in train.pictures[::40]:
         assert median_colour_error(picture, train.points) < 15

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from rfcore.codec import CodecConfig, DeltaEncoder
-from rfcore.dataset import Dataset, read_transforms
+from rfcore.dataset import Dataset, read_dataset
 from rfcore.errors import InvalidData
 from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_rgb
@@ -18,7 +18,7 @@ SETTINGS = CodingSettings(preset="veryfast", crf=27.0)
 
 @pytest.fixture
 def drive(tiny_sample: Path) -> Dataset:
-    return read_transforms(tiny_sample / "transforms_drive_vehicles.json")
+    return read_dataset(tiny_sample / "transforms_drive_vehicles.json")
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from mec_server.config import ServerConfig
 from mec_server.server import EdgeServer
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec import CodecConfig
-from rfcore.dataset import read_transforms
+from rfcore.dataset import read_dataset
 from rfcore.field import SplatField, save_field
 from rfcore.image import write_png
 from rfcore.raster.gaussians import Gaussians
@@ -117,7 +117,7 @@ class CodedStreet:
 
 @pytest.fixture(scope="session")
 def coded(street: Street) -> CodedStreet:
-    pictures = read_transforms(street.drive).pictures
+    pictures = read_dataset(street.drive).pictures
     pipeline = Pipeline(street.field, CodecConfig(76, 52, "ultrafast"), time.perf_counter_ns)
     camera = CameraDescription("front", INTRINSICS, pipeline.header)
     contract = RendererContract(RENDERER_CONTRACT, exact=True)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cav_agent.config import PaceKind
-from rfcore.dataset import read_transforms
+from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable
 from rfcore.image import read_rgb
 from rfcore.raster.native import available_isas
@@ -33,7 +33,7 @@ async def test_the_server_ends_up_with_the_pictures_of_the_vehicles_closed_loop(
     assert [line["digest"] for line in index] == [
         line["reconstruction_digest"] for line in trip.lines
     ]
-    for line, picture in zip(index, read_transforms(street.drive).pictures, strict=True):
+    for line, picture in zip(index, read_dataset(street.drive).pictures, strict=True):
         shown = read_rgb(tmp_path / "cav-1/front" / line["file"])
         error = np.abs(shown.astype(int) - picture.read()).mean()
         assert error < 12, "CRF 23 of a noisy picture stays within a few levels of it"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from rfcore.dataset import read_transforms
+from rfcore.dataset import read_dataset
 from rfcore.train import SplatTrainer, SplatTrainingConfig, mean_psnr_db
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "street"
@@ -14,8 +14,8 @@ SAMPLE = Path(__file__).parents[2] / "samples" / "street"
 @pytest.mark.sample
 @pytest.mark.timeout(900)
 def test_the_held_out_drive_of_the_sample_reaches_26_db() -> None:
-    train = read_transforms(SAMPLE / "transforms_train.json")
-    held_out = read_transforms(SAMPLE / "transforms_drive_empty.json")
+    train = read_dataset(SAMPLE / "transforms_train.json")
+    held_out = read_dataset(SAMPLE / "transforms_drive_empty.json")
     assert train.points is not None
     trainer = SplatTrainer(train.pictures, train.points, SplatTrainingConfig(threads=2))
     for _ in trainer.steps():
