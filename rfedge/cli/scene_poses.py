@@ -24,7 +24,9 @@ class ScenePoses:
     camera: Literal["dataset", "estimate"] = "dataset"
     """With --register-to: take the dataset's camera, or estimate the intrinsics."""
     camera_model: str = "SIMPLE_RADIAL"
-    """COLMAP camera model where intrinsics are estimated."""
+    """COLMAP camera model of the new pictures, where it is not the dataset's camera."""
+    parameters: tuple[float, ...] = ()
+    """Its known parameters in COLMAP's order, which are held; default: estimated."""
     matching: Literal["exhaustive", "sequential"] = "exhaustive"
     """Match all pairs, or neighbours in a long drive."""
     max_side_px: int = 1600
@@ -51,6 +53,7 @@ class ScenePoses:
             matching=Matching(self.matching),
             camera=SharedCamera(self.camera),
             model=self.camera_model,
+            parameters=self.parameters,
             max_side_px=self.max_side_px,
             features=self.features,
             threads=self.threads,

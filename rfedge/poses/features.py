@@ -52,6 +52,7 @@ def add_new(place: Workplace, names: Sequence[str], settings: PoseSettings) -> N
     """Add the new pictures: with the dataset's camera, or with one that is to be estimated."""
     options = pycolmap.ImageReaderOptions()
     options.camera_model = settings.model
+    options.camera_params = ",".join(map(repr, settings.parameters))
     with pycolmap.Database.open(place.database) as database:
         cameras = database.read_all_cameras()
     if cameras and settings.camera is SharedCamera.DATASET:

@@ -24,6 +24,9 @@ from rfedge.poses.settings import PoseSettings, SharedCamera
 
 __all__ = ["Solution", "solve_poses"]
 
+ANY_FORWARD_MOTION = 1.0
+"""A drive moves forward; COLMAP's default, 0.95, would refuse every pair to start from."""
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -41,7 +44,7 @@ def solve_poses(
 
     Raises ``DatasetError`` when fewer than two pictures, or none of the new ones, can be placed.
     """
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     place = Workplace(root)
     origin = chosen_origin(known) if known else TileOrigin()
     if known:
@@ -55,7 +58,10 @@ def solve_poses(
 def _alone(place: Workplace, settings: PoseSettings) -> pycolmap.Reconstruction:
     folder = place.root / "model"
     folder.mkdir()
-    models = pycolmap.incremental_mapping(place.database, place.root, folder, _options(settings))
+    options = _options(settings)
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not settings.parameters
+    options.mapper.init_max_forward_motion = ANY_FORWARD_MOTION
+    models = pycolmap.incremental_mapping(place.database, place.root, folder, options)
     if not models:
         raise DatasetError("no two pictures share enough to start from; take them closer together")
     return max(models.values(), key=lambda model: model.num_reg_images())
@@ -69,7 +75,7 @@ def _registered(
     options = _options(settings)
     options.fix_existing_frames = True
     options.constant_cameras = held
-    if settings.camera is SharedCamera.DATASET:
+    if settings.camera is SharedCamera.DATASET or settings.parameters:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
     for name in ("given", "model"):
         (place.root / name).mkdir()

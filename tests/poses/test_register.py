@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from rfcore.dataset import read_dataset
 from rfcore.dataset.read import read_source
 from rfcore.dataset.source import SourcePicture
 from rfcore.dataset.write import WrittenPicture, write_transforms
-from rfcore.errors import DatasetError
+from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import write_png
 from rfedge.poses import PoseSettings, pose_dataset
 
@@ -73,6 +74,45 @@ def test_half_of_a_drive_is_placed_among_the_other_half(
     assert np.median(shifts) < 0.05
     assert placed.points is not None
     assert len(placed.points.xyz_m) > 100
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_drive_alone_finds_how_the_camera_turns(tmp_path: Path) -> None:
+    """The world is COLMAP's own, so turns between pictures are compared, and shifts by ratio."""
+    true = read_source(SAMPLE / "transforms_drive_empty.json").pictures[:16:2]
+    (tmp_path / "images").mkdir()
+    for i, picture in enumerate(true):
+        write_png(tmp_path / "images" / f"{i}.png", picture.read())
+    known = PoseSettings(
+        model="PINHOLE",
+        parameters=(320.0, 320.0, 320.0, 180.0),
+        max_side_px=640,
+        features=2048,
+        threads=1,
+    )
+    pose_dataset(tmp_path / "images", tmp_path / "out", None, known)
+    found = read_source(tmp_path / "out").pictures
+    assert len(found) == len(true)
+    assert found[0].camera == true[0].camera
+    steps = [
+        (relative(a, b), relative(c, d))
+        for (a, b), (c, d) in zip(pairwise(found), pairwise(true), strict=True)
+    ]
+    assert np.median([turn_deg(ours, theirs) for ours, theirs in steps]) < 0.1
+    ratios = [math.hypot(*o.translation_m) / math.hypot(*t.translation_m) for o, t in steps]
+    assert max(ratios) / min(ratios) < 1.1
+
+
+def relative(a: SourcePicture, b: SourcePicture) -> Pose:
+    return a.world_from_cam.inverse().compose(b.world_from_cam)
+
+
+def test_parameters_belong_to_their_model() -> None:
+    with pytest.raises(InvalidInput, match="PINHOLE has 4, not 3"):
+        PoseSettings(model="PINHOLE", parameters=(1.0, 2.0, 3.0))
+    with pytest.raises(DatasetError, match="camera model FOV is none of"):
+        PoseSettings(model="FOV")
 
 
 def test_too_few_pictures_are_refused(tmp_path: Path) -> None:
