@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from time import monotonic
 
 import numpy as np
@@ -59,7 +60,7 @@ class TrainingJob:
     config: SplatTrainingConfig | NgpTrainingConfig
     """Whose it is says what is trained."""
     seed: int
-    limits: LoopLimits = field(default_factory=LoopLimits)
+    limits: LoopLimits = field(default_factory=partial(LoopLimits, measurements=0))
     resume: bool = False
 
 

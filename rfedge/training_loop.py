@@ -30,15 +30,15 @@ class LoopLimits:
     checkpoint_every: int = 1000
     """Iterations between two checkpoints."""
     measurements: int = 12
-    """Points of the curve of quality over time."""
+    """Points of the curve of quality over time; 0: none is measured."""
 
     def __post_init__(self) -> None:
         if self.minutes is not None and not 0 < self.minutes <= MAX_MINUTES:
             raise InvalidInput("minutes", f"{self.minutes} is outside 0..{MAX_MINUTES:.0f}")
         if self.checkpoint_every < 1:
             raise InvalidInput("checkpoint_every", f"{self.checkpoint_every} must be at least 1")
-        if not 1 <= self.measurements <= 1000:
-            raise InvalidInput("measurements", f"{self.measurements} is outside 1..1000")
+        if not 0 <= self.measurements <= 1000:
+            raise InvalidInput("measurements", f"{self.measurements} is outside 0..1000")
 
 
 @dataclass(frozen=True)
@@ -111,8 +111,9 @@ class TrainingLoop:
             )
 
     def _measurement_is_due(self) -> bool:
+        points = self._limits.measurements
         ended = self.trainer.finished or self.progress >= 1.0
-        return ended or self.progress >= (len(self.curve) + 1) / self._limits.measurements
+        return points > 0 and (ended or self.progress >= (len(self.curve) + 1) / points)
 
     def _take_measurement(self, measure: Measure) -> None:
         at_s, before_s = self.seconds, self._clock()

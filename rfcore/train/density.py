@@ -28,8 +28,8 @@ class DensityControl:
 
     limit: int = 0
     """At most so many Gaussians; the ones the run starts with count."""
-    drawn_by: Literal["opacity", "gradient"] = "opacity"
-    split: Literal["in_place", "long_axis"] = "in_place"
+    drawn_by: Literal["opacity", "gradient"] = "gradient"
+    split: Literal["in_place", "long_axis"] = "long_axis"
     interval: int = 100
     """Iterations between two rounds."""
     growth: float = 0.05

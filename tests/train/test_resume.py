@@ -20,7 +20,9 @@ from rfcore.train import (
 PLAIN = SplatTrainingConfig(gaussians=200, iterations=40)
 EVERYTHING = replace(
     PLAIN,
-    density=DensityControl(limit=300, interval=7, noise=0.5, stop=0.9),
+    density=DensityControl(
+        limit=300, drawn_by="opacity", split="in_place", interval=7, noise=0.5, stop=0.9
+    ),
     regularisation=Regularisation(0.01, 0.01),
     bands=Bands(rise=0.1),
     antialiased=True,

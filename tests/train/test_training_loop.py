@@ -93,6 +93,12 @@ def test_the_curve_has_so_many_points_and_ends_at_the_end() -> None:
     assert told[-1].psnr_db == 44.0
 
 
+def test_without_measurements_there_is_no_curve() -> None:
+    loop = loop_of(Steps(5), LoopLimits(measurements=0), measuring_s=9.0)
+    assert all(status.psnr_db is None for status in statuses(loop))
+    assert (loop.curve, loop.seconds) == ([], 10.0)
+
+
 @pytest.fixture
 def checkpoint_path(tmp_path: Path) -> Iterator[Path]:
     yield tmp_path / "run.ckpt"
@@ -132,7 +138,7 @@ def test_resuming_needs_a_checkpoint() -> None:
         ({"minutes": 0.0}, "minutes"),
         ({"minutes": float("nan")}, "minutes"),
         ({"checkpoint_every": 0}, "checkpoint_every"),
-        ({"measurements": 0}, "measurements"),
+        ({"measurements": -1}, "measurements"),
     ],
 )
 def test_limits_that_make_no_sense_are_refused(change: Mapping[str, Any], named: str) -> None:
