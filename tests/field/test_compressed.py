@@ -1,12 +1,15 @@
 """A compressed archive holds nearly the same splats, the same for everybody, and no surprise."""
 
 import hashlib
+import tracemalloc
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import FieldFormatError, InvalidInput
@@ -203,3 +206,37 @@ def test_values_no_grid_holds_are_refused_by_name(make_gaussians, name: str) -> 
     huge.flat[-1] = 1e30
     with pytest.raises(InvalidInput, match=f"gaussians.{name}: 1e\\+30 is too large"):
         SplatField(replace(g, **{name: huge})).compressed()
+
+
+@given(st.data())
+def test_streams_made_to_harm_give_splats_or_are_refused(
+    make_gaussians, data: st.DataObject
+) -> None:
+    """Whoever writes the file writes its digests: beneath them anything may stand."""
+    archive = field_of(make_gaussians(20, 1), 0.5).compressed().archive()
+    name = data.draw(st.sampled_from(sorted(archive.arrays)))
+    numbers = archive.metadata["encoding"]["streams"][name]
+    stream = archive.arrays[name].copy()
+    stream[data.draw(st.integers(0, len(stream) - 1))] ^= data.draw(st.integers(0, 255))
+    lowest = [data.draw(st.integers(-(2**24), 2**24)) for _ in numbers["lowest"]]
+    streams = {**archive.metadata["encoding"]["streams"], name: {**numbers, "lowest": lowest}}
+    encoding = {**archive.metadata["encoding"], "streams": streams}
+    metadata = {**archive.metadata, "encoding": encoding}
+    del metadata["bounds"]
+    harmful = Archive(archive.kind, metadata, {**archive.arrays, name: stream})
+    try:
+        field = decode_field(encode_archive(harmful))
+    except FieldFormatError:
+        return
+    assert np.isfinite(field.render_colour(CAMERA)).all()
+
+
+def test_a_count_that_lies_allocates_nothing(make_gaussians) -> None:
+    lie = with_encoding(field_of(make_gaussians(20, 3)).compressed(), {"count": 50_000_000})
+    tracemalloc.start()
+    try:
+        with pytest.raises(FieldFormatError, match="a bomb"):
+            decode_field(lie)
+        assert tracemalloc.get_traced_memory()[1] < 10 * len(lie) + 1_000_000
+    finally:
+        tracemalloc.stop()

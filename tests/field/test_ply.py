@@ -1,5 +1,6 @@
 """INRIA .ply files: exact both ways, by header name, refused with a reason."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -223,3 +224,18 @@ def test_text_that_is_not_rows_of_numbers_is_refused_by_name(
 def test_other_formats_of_splats_are_refused_by_their_name(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(FieldFormatError, match=f"{suffix} is another format; export it as .ply"):
         read_ply(tmp_path / f"a.{suffix}")
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+def test_a_count_that_lies_allocates_nothing(make_gaussians, tmp_path: Path, form: str) -> None:
+    file = tmp_path / "a.ply"
+    write_ply(file, make_gaussians(4, 3))
+    edited(file, "binary_little_endian", form)
+    edited(file, "element vertex 4", "element vertex 2000000000")
+    tracemalloc.start()
+    try:
+        with pytest.raises(FieldFormatError, match="the header claims"):
+            read_ply(file)
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    finally:
+        tracemalloc.stop()
