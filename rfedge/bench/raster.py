@@ -19,6 +19,7 @@ from rfcore.camera import Camera
 from rfcore.errors import RfedgeError
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
+from rfedge.bench.modes import mode_rows
 from rfedge.bench.rows import Rows
 from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.bench.timing import median_ms
@@ -38,10 +39,14 @@ MAX_FLIPPED = 0.01
 def raster_rows(rows: Rows = "all") -> list[dict[str, Any]]:
     """Return one row per size and number of threads; ``native`` leaves the reference out.
 
+    ``modes`` returns those of ``rfedge.bench.modes`` instead.
+
     Raises ``RfedgeError`` when the renderer is wrong.
     """
     gaussians = street_gaussians()
     check_against_reference(gaussians, street_camera(*CHECK_SIZE_PX))
+    if rows == "modes":
+        return mode_rows(gaussians)
     rasterizers = [Rasterizer(gaussians, threads=threads) for threads in THREADS]
     result = []
     for size in SIZES_PX:

@@ -8,8 +8,9 @@ __all__ = ["Row", "Rows", "flattened"]
 
 Row = dict[str, Any]
 
-Rows = Literal["all", "native"]
-"""Which rows to run: ``native`` leaves out what only the slow reference fills in."""
+Rows = Literal["all", "native", "modes"]
+"""Which rows to run: ``native`` leaves out what only the slow reference fills in, ``modes`` are
+the specialisations of the renderer instead."""
 
 
 def flattened(row: Row) -> Row:

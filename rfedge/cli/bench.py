@@ -16,8 +16,9 @@ class Bench:
 
     case: Annotated[Literal["raster", "train", "codec", "ngp"], Positional]
     """What to measure."""
-    rows: Literal["all", "native"] = "all"
-    """`native` leaves out the timing of the slow torch reference (raster only)."""
+    rows: Literal["all", "native", "modes"] = "all"
+    """`native` leaves out the timing of the slow torch reference; `modes` shows what SH degree,
+    antialiasing, depth and opacity cost, as ratios (raster only)."""
     json: str | None = None
     """Write one JSON object to this file; `-` is standard output."""
 

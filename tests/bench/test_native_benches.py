@@ -8,13 +8,14 @@ import pytest
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.native import Rasterizer
-from rfedge.bench import print_rows, raster, results, run_case, timing, train, write_json
+from rfedge.bench import modes, print_rows, raster, results, run_case, timing, train, write_json
 from rfedge.bench.street import street_camera, street_gaussians
 
 RASTER_KEYS = [
     *("width", "height", "gaussians", "visible", "blends_per_px", "threads", "isa"),
     *("native_ms", "reference_ms", "max_abs_error"),
 ]
+MODE_KEYS = ["width", "height", "gaussians", "isa", "mode", "native_ms", "ratio"]
 TRAIN_KEYS = ["width", "height", "gaussians", "threads", "iteration_ms"]
 
 
@@ -41,6 +42,24 @@ def test_raster_rows_have_the_published_keys_and_null_where_not_run() -> None:
     assert rows[2]["reference_ms"] is rows[2]["max_abs_error"] is None
     native = run_case("raster", rows="native")["rows"]
     assert all(row["reference_ms"] is None and row["native_ms"] > 0 for row in native)
+
+
+@pytest.mark.usefixtures("small")
+def test_modes_are_compared_with_the_whole_colour(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(modes, "SIZES_PX", ((30, 20),))
+    rows = run_case("raster", rows="modes")["rows"]
+    assert [list(row) for row in rows] == [MODE_KEYS] * 6
+    by_mode = {row["mode"]: row for row in rows}
+    assert by_mode[modes.BASELINE]["ratio"] == 1.0
+    assert {"degree 0", "antialiased", "depth and opacity"} < set(by_mode)
+    assert all(row["native_ms"] > 0 for row in rows)
+
+
+def test_calls_that_are_compared_take_turns() -> None:
+    order: list[str] = []
+    calls = {name: lambda name=name: order.append(name) for name in "ab"}
+    assert set(timing.medians_ms(calls, repetitions=2)) == {"a", "b"}
+    assert "".join(order) == "ababab"
 
 
 @pytest.mark.usefixtures("small")
