@@ -77,7 +77,11 @@ RF_INLINE uint32_t start_gradient(const BlendBackwardJob& job, int tile_x, int t
     return start_transmittance(*job.camera, tile_x, tile_y, g->transmittance);
 }
 
+#if defined(RF_ISA_AVX512)
+constexpr int kReplayUnroll = 8;  // 4 take 2 % longer, 2 take 7 %
+#else
 constexpr int kReplayUnroll = 4;
+#endif
 
 // Replay `listed` splats, a multiple of kReplayUnroll, over block `b`; return how many were
 // replayed before the block was opaque.
