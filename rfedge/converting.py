@@ -32,7 +32,7 @@ def convert_dataset(
     pictures = dataset.pictures[chosen]
     if not pictures:
         raise InvalidInput("offset", f"leaves none of the {len(dataset.pictures)} pictures")
-    timed = dataset.rate_hz is not None
+    timed = any(picture.time_ns for picture in dataset.pictures)
     written = []
     with whole_folder(out) as folder:
         (folder / "images").mkdir()

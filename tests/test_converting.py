@@ -45,6 +45,16 @@ def test_a_converted_dataset_needs_no_lens(distorted: Path, tmp_path: Path) -> N
         assert (found.read() == given.read()[0, 0]).all()
 
 
+def test_pictures_of_one_time_keep_it(distorted: Path, tmp_path: Path) -> None:
+    """Several cameras take a picture at once: there is a time, but no rate."""
+    content = (distorted / "transforms.json").read_text()
+    (distorted / "transforms.json").write_text(content.replace('"time": 0.1', '"time": 0.2'))
+    convert_dataset(distorted, tmp_path / "out", None)
+    dataset = read_dataset(tmp_path / "out")
+    assert dataset.rate_hz is None
+    assert [p.time_ns for p in dataset.pictures] == [0, 200_000_000, 200_000_000, 300_000_000]
+
+
 def test_a_fault_leaves_nothing_behind(distorted: Path, tmp_path: Path) -> None:
     content = (distorted / "3.png").read_bytes()
     (distorted / "3.png").write_bytes(content[: len(content) // 2])

@@ -128,8 +128,8 @@ def _pinhole(picture: SourcePicture, distortion: Distortion) -> Intrinsics:
         return picture.camera.intrinsics
     if distortion is Distortion.REFUSE:
         raise DatasetError(
-            f"{picture.where}: lens distortion {lens}; choose that pictures are undistorted, "
-            "or undistort them once with `rfedge scene convert`"
+            f"{picture.where}: lens distortion {lens}; train with --undistort, or write "
+            "undistorted pictures once with `rfedge scene convert`"
         )
     try:
         return pinhole_of(picture.camera.intrinsics, lens)
