@@ -171,16 +171,21 @@ private:
         for (int c = 0; c < half_width_; ++c) {
             const int a = 2 * c, b = std::min(2 * c + 1, size_.width_px - 1);
             const bool all = known(top, a) && known(top, b) && known(bottom, a) && known(bottom, b);
-            middle_.u[c] = all ? centre(top.u[a] + top.u[b] + bottom.u[a] + bottom.u[b]) : kNowhere;
-            middle_.v[c] = all ? centre(top.v[a] + top.v[b] + bottom.v[a] + bottom.v[b]) : 0;
+            const std::int32_t u = top.u[a] + top.u[b] + bottom.u[a] + bottom.u[b];
+            const std::int32_t v = top.v[a] + top.v[b] + bottom.v[a] + bottom.v[b];
+            middle_.u[c] = all ? centre(u, a != b) : kNowhere;
+            middle_.v[c] = all ? centre(v, &top != &bottom) : 0;
         }
         const std::size_t start = static_cast<std::size_t>(line) * half_width_;
         interpolate_row(u_, middle_, half_width_, in_.doubt, in_.render.u + start, out_.u + start);
         interpolate_row(v_, middle_, half_width_, in_.doubt, in_.render.v + start, out_.v + start);
     }
 
-    // Four luma positions to the chroma sample in their middle: (mean - 1/2) / 2.
-    static std::int32_t centre(std::int32_t sum) { return (sum - 2 * kSteps + 4) >> 3; }
+    // Four luma positions to the chroma sample in their middle: (mean - 1/2) / 2 between a pair,
+    // mean / 2 on the last of an odd number, which stands for both.
+    static std::int32_t centre(std::int32_t sum, bool pair) {
+        return (sum - (pair ? 2 * kSteps : 0) + 4) >> 3;
+    }
 
     const WarpInputs& in_;
     const WarpGeometry& geometry_;

@@ -20,7 +20,7 @@ Lanczos-3, six taps a side at 6 bits, products summed without rounding, then
 
 Chroma sits in the middle of its 2x2 luma samples (``rfcore.native.yuv``): it is known when all
 four are, and its position is ((u1 + u2 + u3 + u4) / 4 - 0.5) / 2, rounded half up to 1/64. A last
-odd row or column counts twice.
+odd column counts twice, and its u without the - 0.5, for it is where its chroma is; so v of a row.
 
 The *correction* carries, instead of the picture, its signed difference from the field's render at
 its own pose, and adds most of it to the present render: with ``sum`` as above,

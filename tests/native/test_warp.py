@@ -80,7 +80,12 @@ def definition(
         np.pad(a, pad, mode="edge").reshape(-(-height // 2), 2, -(-width // 2), 2)
         for a in (u, v, known)
     ]
-    u_c, v_c = ((q.sum(axis=(1, 3)) - 128 + 4) >> 3 for q in quads[:2])
+    half_u, half_v = np.full(-(-width // 2), 128), np.full((-(-height // 2), 1), 128)
+    half_u[width // 2 :], half_v[height // 2 :] = 0, 0
+    u_c, v_c = (
+        (q.sum(axis=(1, 3)) - half + 4) >> 3
+        for q, half in zip(quads[:2], (half_u, half_v), strict=True)
+    )
     known_c = quads[2].all(axis=(1, 3))
     places = [(u, v, known), *[(np.where(known_c, u_c, 0), np.where(known_c, v_c, 0), known_c)] * 2]
     planes = []

@@ -10,6 +10,7 @@ from rfedge.evaluate.stability import (
     poses,
     splats,
     training,
+    warps,
 )
 from rfedge.evaluate.stability.case import Case
 
@@ -21,6 +22,7 @@ CASES: tuple[Case, ...] = (
     *hash_grids.CASES,
     *poses.CASES,
     *pictures.CASES,
+    *warps.CASES,
     *delta.CASES,
     *files.CASES,
 )

@@ -1,19 +1,17 @@
-// Draws and trains one scene and writes every byte that came of it, for test_aarch64.py to compare
-// with the bytes of the machine that runs the tests.
+// Draws and trains one scene of splats and writes every byte that came of it, for
+// test_aarch64_splats.py to compare with the bytes of the machine that runs the tests.
 //
-// usage: exactness_driver ISA THREADS SCENE RESULT
+// usage: exactness_splats ISA THREADS SCENE RESULT
 //
-// SCENE: int32 count, degree, width, height, steps, antialiased; double camera[16] (make_camera); float
-// rates[9]; then float means, quaternions, log_scales, opacity_logits, sh and target [H, W, 3].
+// SCENE: int32 count, degree, width, height, steps, antialiased; double camera[16] (make_camera);
+// float rates[11]; then float means, quaternions, log_scales, opacity_logits, sh and target
+// [H, W, 3].
 // RESULT: float colour, depth, opacity; bytes Y, U, V of the colour and RGB of those; double loss
 // of every step; float parameters after the last step, in the order of SCENE.
-#include <cstdio>
 #include <cstdlib>
 #include <cstring>
-#include <stdexcept>
-#include <string>
-#include <vector>
 
+#include "exactness_file.h"
 #include "raster/camera.h"
 #include "raster/rasterizer.h"
 #include "raster/trainable.h"
@@ -22,34 +20,6 @@
 namespace {
 
 using namespace rfcore::raster;
-
-class File {
-  public:
-    File(const char* path, const char* mode) : file_(std::fopen(path, mode)) {
-        if (file_ == nullptr) throw std::runtime_error(std::string("cannot open ") + path);
-    }
-    ~File() { std::fclose(file_); }
-    File(const File&) = delete;
-    File& operator=(const File&) = delete;
-
-    template <typename T>
-    std::vector<T> read(size_t count) {
-        std::vector<T> values(count);
-        if (std::fread(values.data(), sizeof(T), count, file_) != count) {
-            throw std::runtime_error("the scene ends too soon");
-        }
-        return values;
-    }
-    template <typename T>
-    void write(const std::vector<T>& values) {
-        if (std::fwrite(values.data(), sizeof(T), values.size(), file_) != values.size()) {
-            throw std::runtime_error("cannot write the result");
-        }
-    }
-
-  private:
-    std::FILE* file_;
-};
 
 struct Parameters {
     int degree;
@@ -80,10 +50,10 @@ Scene read_scene(const char* path) {
     const auto header = in.read<int>(6);
     const auto n = static_cast<size_t>(header[0]);
     const auto numbers = in.read<double>(16);
-    const auto rates = in.read<float>(9);
+    const auto rates = in.read<float>(11);
     Scene scene{make_camera(numbers.data(), header[2], header[3]), header[4], header[5] != 0, {},
                 {},  {}};
-    static_assert(sizeof scene.rates == 9 * sizeof(float), "nine rates");
+    static_assert(sizeof scene.rates == 11 * sizeof(float), "eleven rates");
     std::memcpy(&scene.rates, rates.data(), sizeof scene.rates);
     const auto sh_count = 3 * static_cast<size_t>(coefficients_of(header[1]));
     scene.parameters = {header[1],           in.read<float>(3 * n), in.read<float>(4 * n),
@@ -133,7 +103,7 @@ void train(const Scene& scene, const Kernels& kernels, int threads, File& out) {
 
 int main(int argc, char** argv) {
     try {
-        if (argc != 5) throw std::runtime_error("usage: exactness_driver ISA THREADS SCENE RESULT");
+        if (argc != 5) throw std::runtime_error("usage: exactness_splats ISA THREADS SCENE RESULT");
         const Kernels* kernels = kernels_named(argv[1]);
         if (kernels == nullptr) throw std::runtime_error(std::string("no kernels named ") + argv[1]);
         const int threads = std::atoi(argv[2]);
@@ -142,7 +112,7 @@ int main(int argc, char** argv) {
         draw(scene, *kernels, threads, out);
         train(scene, *kernels, threads, out);
     } catch (const std::exception& error) {
-        std::fprintf(stderr, "exactness_driver: %s\n", error.what());
+        std::fprintf(stderr, "exactness_splats: %s\n", error.what());
         return 1;
     }
     return 0;
