@@ -41,8 +41,8 @@ class Decoded:
     """A frame and the receiver's next state; ``lost`` packets are missing right before this one.
 
     ``exact``: the frame is the sender's to the bit; otherwise the render differed by rounding.
-    ``stage_ns`` has "splice" (checks, the references as pictures) and "decode" (the slice, the
-    digest).
+    ``stage_ns`` has "references" (checks, making what is not the render), "splice" (the references
+    as pictures of the decoder) and "decode" (the slice, the digest).
     """
 
     frame: I420
@@ -98,7 +98,9 @@ class DeltaDecoder:
         past = self._past(state, packet)
         self._check_payload(packet)
         prediction = Prediction(adapt(render, packet.photometric), seen, past)
-        spliced_ns, frame = self._reconstruct(packet, prediction)
+        pictures = _pictures(packet, prediction)
+        made_ns = self._clock_ns()
+        spliced_ns, frame = self._reconstruct(packet, pictures)
         made = Past(frame, seen, prediction.render)
         if same_render and made.digest != packet.reconstruction_digest:
             self._splice.reset()
@@ -107,7 +109,8 @@ class DeltaDecoder:
                 f"packet {packet.sequence} decodes to another picture than the sender's",
             )
         stage_ns = {
-            "splice": spliced_ns - started_ns,
+            "references": made_ns - started_ns,
+            "splice": spliced_ns - made_ns,
             "decode": self._clock_ns() - spliced_ns,
         }
         lost = packet.sequence - state.next_sequence
@@ -159,12 +162,8 @@ class DeltaDecoder:
         except BitstreamError as error:
             raise PacketRejected(RejectReason.MALFORMED_PAYLOAD, str(error)) from error
 
-    def _reconstruct(self, packet: DeltaPacket, prediction: Prediction) -> tuple[int, I420]:
+    def _reconstruct(self, packet: DeltaPacket, pictures: tuple[I420, ...]) -> tuple[int, I420]:
         """Return the time at which the references stood, and the decoded frame."""
-        try:
-            pictures = prediction.pictures(packet.references)
-        except InvalidInput as error:
-            raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
         if not packet.payload:
             return self._clock_ns(), without_zeros(pictures[0])
         try:
@@ -173,6 +172,13 @@ class DeltaDecoder:
             return spliced_ns, self._splice.decode(packet.payload)
         except CodecError as error:
             raise PacketRejected(RejectReason.DECODER_FAILED, str(error)) from error
+
+
+def _pictures(packet: DeltaPacket, prediction: Prediction) -> tuple[I420, ...]:
+    try:
+        return prediction.pictures(packet.references)
+    except InvalidInput as error:
+        raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
 
 
 def _check_order(state: DecoderState, packet: DeltaPacket) -> None:

@@ -98,13 +98,21 @@ class H264Decoder:
 
         FFmpeg conceals some damage without saying so: callers compare a digest.
         """
+        return self._picture_of(self._frame(access_unit))
+
+    def feed(self, access_unit: bytes) -> None:
+        """Decode like ``decode``, for the sake of what comes after: the picture is not copied."""
+        self._frame(access_unit)
+
+    def _frame(self, access_unit: bytes) -> av.VideoFrame:
         try:
             frames = self._context.decode(av.Packet(access_unit))
         except (FFmpegError, ValueError, MemoryError) as error:
             raise CodecError(f"H.264 decoder: {error}") from error
         if len(frames) != 1:
             raise CodecError(f"H.264 decoder returned {len(frames)} pictures for one access unit")
-        return self._picture_of(frames[0])
+        self._check(frames[0])
+        return frames[0]
 
     def decode_all(self, access_units: Sequence[bytes]) -> list[I420]:
         """Decode a stream to its end, pictures that were held back included."""
@@ -116,13 +124,16 @@ class H264Decoder:
         return [self._picture_of(frame) for frame in frames]
 
     def _picture_of(self, frame: av.VideoFrame) -> I420:
+        self._check(frame)
+        y, u, v = (_plane_view(plane).copy() for plane in frame.planes)
+        return I420(y, u, v)
+
+    def _check(self, frame: av.VideoFrame) -> None:
         if frame.is_corrupt:
             raise CodecError("H.264 decoder marks the picture as corrupt")
         size_px = (frame.width, frame.height)
         if size_px != self._size_px or frame.format.name != "yuv420p":
             raise CodecError(f"H.264 decoder returned {size_px} px {frame.format.name}")
-        y, u, v = (_plane_view(plane).copy() for plane in frame.planes)
-        return I420(y, u, v)
 
     def _open(self) -> av.VideoCodecContext:
         width_px, height_px = self._size_px

@@ -10,7 +10,8 @@ that its ``idr_pic_id``, which is always 0, never follows another 0 (7.4.3).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -68,7 +69,8 @@ class SpliceDecoder:
             place = PcmPlace(self._log2_max_frame_num, frame_num, self._idr_pic_id)
             unit = join_nals([pcm_picture(picture, place)])
             known = self._knows_parameter_sets
-            self._decode(unit if known else self._parameter_sets + unit)
+            with self._fresh_after_errors():
+                self._decoder.feed(unit if known else self._parameter_sets + unit)
             self._knows_parameter_sets = True
 
     def decode(self, payload: bytes) -> I420:
@@ -76,7 +78,8 @@ class SpliceDecoder:
 
         Raises ``CodecError`` when the decoder notices damage; it does not notice all of it.
         """
-        picture = self._decode(join_nals([payload]))
+        with self._fresh_after_errors():
+            picture = self._decoder.decode(join_nals([payload]))
         width_px, height_px = self._config.size_px
         half_height, half_width = (height_px + 1) // 2, (width_px + 1) // 2
         return I420(
@@ -90,9 +93,10 @@ class SpliceDecoder:
         self._decoder.reset()
         self._knows_parameter_sets = False
 
-    def _decode(self, access_unit: bytes) -> I420:
+    @contextmanager
+    def _fresh_after_errors(self) -> Iterator[None]:
         try:
-            return self._decoder.decode(access_unit)
+            yield
         except CodecError:
             self.reset()
             raise

@@ -1,22 +1,30 @@
 """Time the delta codec on both ends: 640x360 and 1280x720, 200k Gaussians, medium, CRF 23.
 
 The camera frame is the street's own render from the true pose plus seeded texture and boxes the
-field has never seen, so the P picture has something to code. Before anything is timed, the
-receiver's picture must equal the sender's closed loop on every frame.
+field has never seen, so the P picture has something to code; the camera drives 20 cm a frame. Each
+size is coded against one reference (the render) and against three (previous frame, render,
+correction). On every frame the receiver's picture must equal the sender's closed loop.
 """
 
 from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter_ns
 from typing import Any, TypeVar
 
 import numpy as np
 
 from rfcore.camera import Camera
-from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder
+from rfcore.codec import (
+    CodecConfig,
+    DeltaDecoder,
+    DeltaEncoder,
+    FrameChoice,
+    Reference,
+    References,
+)
 from rfcore.errors import CodecError
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth
@@ -29,39 +37,50 @@ __all__ = ["codec_rows"]
 T = TypeVar("T")
 
 SIZES_PX = ((640, 360), (1280, 720))
+ONE: References = (Reference.RENDER,)
+THREE: References = (Reference.PREVIOUS, Reference.RENDER, Reference.CORRECTION)
+STEP_M = 0.2
 REPETITIONS = 20
 WARM_UP = 3
 
 
 @dataclass(frozen=True)
 class Ends:
-    """Everything one size needs: a renderer, the codec's two ends, and a camera frame."""
+    """Everything one size needs: a renderer, the codec's two ends, and the first camera."""
 
     rasterizer: Rasterizer
     camera: Camera
-    frame: I420
     encoder: DeltaEncoder
     decoder: DeltaDecoder
 
-    def render(self) -> tuple[I420, PosedDepth]:
+    def at(self, index: int) -> Camera:
+        """Return the camera of frame ``index``."""
+        x_m, y_m, z_m = self.camera.world_from_cam.translation_m
+        pose = replace(self.camera.world_from_cam, translation_m=(x_m, y_m, z_m + STEP_M * index))
+        return Camera(self.camera.intrinsics, pose)
+
+    def render(self, camera: Camera) -> tuple[I420, PosedDepth]:
         """Render as both ends do: field, then the project's own YUV conversion."""
-        view = self.rasterizer.render(self.camera)
-        return i420_from_colour(view.colour), PosedDepth(self.camera, view.depth)
+        view = self.rasterizer.render(camera)
+        return i420_from_colour(view.colour), PosedDepth(camera, view.depth)
 
 
 def codec_rows(threads: int = 1) -> list[dict[str, Any]]:
-    """Return one row a size: medians in ms of the sender's and the receiver's stages."""
+    """Return a row for each size and number of references: medians in ms of both ends' stages."""
     gaussians = street_gaussians()
     rasterizer = Rasterizer(gaussians, threads=threads)
-    return [_row(_ends(rasterizer, *size)) for size in SIZES_PX]
+    return [
+        _row(_ends(rasterizer, *size), references)
+        for size in SIZES_PX
+        for references in (ONE, THREE)
+    ]
 
 
 def _ends(rasterizer: Rasterizer, width_px: int, height_px: int) -> Ends:
     camera = street_camera(width_px, height_px)
     encoder = DeltaEncoder(CodecConfig(width_px, height_px), clock_ns=perf_counter_ns)
     decoder = DeltaDecoder(encoder.header, clock_ns=perf_counter_ns)
-    frame = _camera_frame(rasterizer.render_colour(camera))
-    return Ends(rasterizer, camera, frame, encoder, decoder)
+    return Ends(rasterizer, camera, encoder, decoder)
 
 
 def _camera_frame(colour: np.ndarray[Any, np.dtype[np.float32]]) -> I420:
@@ -75,15 +94,20 @@ def _camera_frame(colour: np.ndarray[Any, np.dtype[np.float32]]) -> I420:
     return i420_from_rgb(np.clip(rgb, 0, 255).astype(np.uint8))
 
 
-def _row(ends: Ends) -> dict[str, Any]:
+def _row(ends: Ends, references: References) -> dict[str, Any]:
     sender: dict[str, list[float]] = {}
     receiver: dict[str, list[float]] = {}
     send_state, receive_state = ends.encoder.start(1), ends.decoder.start(1)
     for repetition in range(WARM_UP + REPETITIONS):
-        render_ms, render = _timed(ends.render)
-        total_ms, encoded = _timed(lambda: ends.encoder.encode(send_state, ends.frame, *render))  # noqa: B023
+        camera = ends.at(repetition)
+        frame = _camera_frame(ends.rasterizer.render_colour(camera))
+        render_ms, (render, seen) = _timed(lambda: ends.render(camera))  # noqa: B023
+        choice = FrameChoice(references if repetition else ONE)
+        total_ms, encoded = _timed(
+            lambda: ends.encoder.encode(send_state, frame, render, seen, choice)  # noqa: B023
+        )
         decode_ms, decoded = _timed(
-            lambda: ends.decoder.decode(receive_state, encoded.packet, *render)  # noqa: B023
+            lambda: ends.decoder.decode(receive_state, encoded.packet, render, seen)  # noqa: B023
         )
         if decoded.frame.digest() != encoded.reconstruction.digest():
             raise CodecError("the receiver's picture differs from the sender's closed loop")
@@ -91,10 +115,11 @@ def _row(ends: Ends) -> dict[str, Any]:
         if repetition >= WARM_UP:
             _note(sender, render_ms, total_ms, encoded.stage_ns)
             _note(receiver, render_ms, decode_ms, decoded.stage_ns)
-    width_px, height_px = ends.frame.size_px
+    k = ends.camera.intrinsics
     return {
-        "width": width_px,
-        "height": height_px,
+        "width": k.width_px,
+        "height": k.height_px,
+        "references": len(references),
         "sender_ms": {stage: statistics.median(ms) for stage, ms in sender.items()},
         "receiver_ms": {stage: statistics.median(ms) for stage, ms in receiver.items()},
     }

@@ -30,6 +30,9 @@ class Recording:
         self.units: list[bytes] = []
         self.pictures: list[I420] = []
 
+    def feed(self, unit: bytes) -> None:
+        self.decode(unit)
+
     def decode(self, unit: bytes) -> I420:
         picture: I420 = self._decoder.decode(unit)
         self.units.append(unit)

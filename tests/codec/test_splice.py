@@ -134,4 +134,4 @@ def test_stage_times_come_from_the_clock_given(pair: PairMaker) -> None:
     decoder = DeltaDecoder(encoder.header, clock_ns=lambda: next(ticks))
     decoded = decoder.decode(decoder.start(0), encoded.packet, render)
     assert encoded.stage_ns == {"references": 10, "encode": 10, "closed_loop": 10}
-    assert decoded.stage_ns == {"splice": 10, "decode": 10}
+    assert decoded.stage_ns == {"references": 10, "splice": 10, "decode": 10}
