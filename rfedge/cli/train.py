@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Train"]
 
+DEFAULT_LIMIT = 250_000
+"""Gaussians of a run limited by time: about what two cores train in five minutes."""
+
 
 @dataclass(frozen=True)
 class Train:
@@ -53,7 +56,8 @@ class Train:
     gaussians: int | None = None
     """At most how many Gaussians to start with, drawn from the points at random."""
     limit: int | None = None
-    """Density control: let the set grow to so many Gaussians, replacing those that show nothing."""
+    """Density control: let the set grow to so many Gaussians, replacing those that show nothing;
+    default: 250000 with --minutes, else the set stays as it is."""
     antialiased: bool = False
     """Splats made fainter where they are smaller than a pixel; for pictures of several sizes."""
     seed: int = 1
@@ -144,8 +148,11 @@ class Train:
             ngp = NgpTrainingConfig(threads=self.threads)
             return ngp if iterations is None else replace(ngp, iterations=iterations)
         config = training_config(self.gaussians, iterations, self.threads)
-        if self.limit is not None:
-            config = replace(config, density=DensityControl(limit=self.limit))
+        limit = self.limit
+        if limit is None and self.minutes is not None:
+            limit = DEFAULT_LIMIT
+        if limit is not None:
+            config = replace(config, density=DensityControl(limit=limit))
         return replace(config, antialiased=self.antialiased, exposure=exposure_varies)
 
     def _finished(
