@@ -1,0 +1,133 @@
+"""Our codec as one more coder of a clip: a field's renders, any references, whole wire messages.
+
+A frame's bytes are those of the message that would go over the link: pose, digests, header and
+slice. The sender's processor time holds the render, the choice of references, x264 and the closed
+loop. Pictures are what a receiver decoded from those very packets, not what the sender believes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import process_time_ns
+
+import numpy as np
+
+from rfcore.camera import Camera
+from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, FrameChoice
+from rfcore.codec.encoder import Encoded
+from rfcore.codec.references import References, references_name
+from rfcore.errors import CodecError, InvalidInput
+from rfcore.field import RadianceField
+from rfcore.image import I420
+from rfcore.metrics import ssim
+from rfcore.native.warp import PosedDepth
+from rfcore.native.yuv import i420_from_colour
+from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.messages import Frame
+from rfedge.evaluate.clip import CodedClip, luma_mse
+
+__all__ = ["FieldCoder", "SeenClip", "see_clip"]
+
+CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0, 38.0)
+MESSAGE_CAMERA = "front"
+FIELD_PREFIX_BYTES = 8
+
+
+@dataclass(frozen=True)
+class SeenClip:
+    """A field seen from every pose of a clip, as both ends hold it, and what rendering took."""
+
+    cameras: tuple[Camera, ...]
+    renders: tuple[I420, ...]
+    depths: tuple[PosedDepth, ...]
+    field_id: str
+    render_cpu_ms: float
+
+
+def see_clip(field: RadianceField, cameras: Sequence[Camera]) -> SeenClip:
+    """Render ``field`` from every camera, once for all operating points."""
+    field.render(cameras[0])  # what is made lazily is not held against the first frame
+    began_ns = process_time_ns()
+    views = [field.render(camera) for camera in cameras]
+    renders = tuple(i420_from_colour(view.colour) for view in views)
+    cpu_ms = (process_time_ns() - began_ns) / 1e6
+    depths = tuple(PosedDepth(c, view.depth) for c, view in zip(cameras, views, strict=True))
+    return SeenClip(tuple(cameras), renders, depths, field.field_id, cpu_ms)
+
+
+class FieldCoder:
+    """Codes the clip a field was seen along. ``references`` None leaves them to the encoder."""
+
+    def __init__(
+        self,
+        seen: SeenClip,
+        name: str,
+        *,
+        preset: str,
+        references: References | None = None,
+        points: Sequence[float] = CRFS,
+    ) -> None:
+        self.name = name
+        self.points = tuple(points)
+        self._seen = seen
+        self._preset = preset
+        self._choice = FrameChoice(references=references)
+
+    def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
+        """Code and decode ``frames`` at CRF ``point``; ``rate_hz`` changes nothing here.
+
+        Raises ``InvalidInput`` for a clip of another length, ``CodecError`` if a receiver does not
+        see what the sender promised.
+        """
+        del rate_hz
+        if len(frames) != len(self._seen.renders):
+            raise InvalidInput("frames", f"{len(frames)} where {len(self._seen.renders)} were seen")
+        config = CodecConfig(*frames[0].size_px, preset=self._preset, crf=point)
+        began_ns = process_time_ns()
+        encoder = DeltaEncoder(config)
+        coded = self._coded(encoder, frames)
+        cpu_ms = (process_time_ns() - began_ns) / 1e6 + self._seen.render_cpu_ms
+        decoded = self._decoded(encoder, coded)
+        pairs = list(zip(decoded, frames, strict=True))
+        return CodedClip(
+            point,
+            np.array([self._message_bytes(k, made) for k, made in enumerate(coded)]),
+            np.array([luma_mse(*pair) for pair in pairs]),
+            np.array([ssim(ours.y, theirs.y) for ours, theirs in pairs]),
+            cpu_ms,
+            {
+                "references": tuple(references_name(made.packet.references) for made in coded),
+                "slice_bytes": tuple(len(made.packet.payload) for made in coded),
+            },
+        )
+
+    def _coded(self, encoder: DeltaEncoder, frames: Sequence[I420]) -> list[Encoded]:
+        state = encoder.start(1)
+        coded = []
+        for index, frame in enumerate(frames):
+            # Temporal references exist from the second frame on.
+            choice = self._choice if index else FrameChoice()
+            render, depth = self._seen.renders[index], self._seen.depths[index]
+            made = encoder.encode(state, frame, render, depth, choice)
+            state = made.state
+            coded.append(made)
+        return coded
+
+    def _decoded(self, encoder: DeltaEncoder, coded: Sequence[Encoded]) -> list[I420]:
+        decoder = DeltaDecoder(encoder.header)
+        state = decoder.start(1)
+        pictures = []
+        for index, made in enumerate(coded):
+            render, depth = self._seen.renders[index], self._seen.depths[index]
+            decoded = decoder.decode(state, made.packet, render, depth)
+            state = decoded.state
+            if decoded.frame.digest() != made.reconstruction.digest():
+                raise CodecError(f"frame {index} decodes to another picture than was promised")
+            pictures.append(decoded.frame)
+        return pictures
+
+    def _message_bytes(self, index: int, made: Encoded) -> int:
+        pose = self._seen.cameras[index].world_from_cam
+        field_id = bytes.fromhex(self._seen.field_id)[:FIELD_PREFIX_BYTES]
+        return len(client_message_to_bytes(Frame(MESSAGE_CAMERA, 0, pose, field_id, made.packet)))
