@@ -45,10 +45,20 @@ class ClipCoder(Protocol):
 
     ``name`` labels it in tables. ``points`` are its operating points (CRF, QP or whatever it
     takes), ordered from best to worst quality, and must span the quality window asked about.
+    ``version`` names the program behind it: finished pieces of another version are done anew.
     """
 
-    name: str
-    points: Sequence[float]
+    @property
+    def name(self) -> str:
+        """The label, with every setting that changes the result."""
+
+    @property
+    def points(self) -> Sequence[float]:
+        """The operating points."""
+
+    @property
+    def version(self) -> str:
+        """What the result depends on besides name, point and clip."""
 
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` with low delay: no frame may wait for a later one."""

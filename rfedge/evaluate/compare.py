@@ -14,7 +14,7 @@ import numpy as np
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfedge.evaluate.cells import CellStore
+from rfedge.evaluate.cells import CellKey, CellStore
 from rfedge.evaluate.clip import ClipCoder, CodedClip
 from rfedge.evaluate.rate_curve import (
     RateCurve,
@@ -45,6 +45,17 @@ class Contest:
     frames_digest: str
     field_psnr_db: float | None
 
+    def cell_key(self, coder: ClipCoder, point: float) -> CellKey:
+        """Name the piece that ``coder`` at ``point`` makes of this clip."""
+        return {
+            "scene": self.scene,
+            "hz": self.rate_hz,
+            "frames": self.frames_digest,
+            "method": coder.name,
+            "point": point,
+            "version": coder.version,
+        }
+
 
 @dataclass(frozen=True)
 class Performance:
@@ -64,23 +75,15 @@ class Performance:
         return float(np.mean([clip.cpu_ms / len(clip.frame_bytes) for clip in self.clips]))
 
 
-def perform(contest: Contest, coder: ClipCoder, revision: str, store: CellStore) -> Performance:
+def perform(contest: Contest, coder: ClipCoder, store: CellStore) -> Performance:
     """Code the contest's clip at every point of ``coder``, taking from ``store`` what is there."""
     clips = []
     for point in coder.points:
-        key: dict[str, str | float | int | None] = {
-            "scene": contest.scene,
-            "hz": contest.rate_hz,
-            "frames": contest.frames_digest,
-            "method": coder.name,
-            "point": point,
-            "revision": revision,
-        }
 
         def make(point: float = point) -> CodedClip:
             return coder.code(contest.frames, contest.rate_hz, point)
 
-        clips.append(store.clip(key, make))
+        clips.append(store.clip(contest.cell_key(coder, point), make))
     return Performance(coder.name, tuple(clips))
 
 

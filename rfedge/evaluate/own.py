@@ -63,12 +63,14 @@ class FieldCoder:
         self,
         seen: SeenClip,
         name: str,
+        version: str,
         *,
         preset: str,
         references: References | None = None,
         points: Sequence[float] = CRFS,
     ) -> None:
         self.name = name
+        self.version = version
         self.points = tuple(points)
         self._seen = seen
         self._preset = preset
@@ -77,17 +79,19 @@ class FieldCoder:
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` at CRF ``point``; ``rate_hz`` changes nothing here.
 
-        Raises ``InvalidInput`` for a clip of another length, ``CodecError`` if a receiver does not
-        see what the sender promised.
+        The clip may be the beginning of the one that was seen. Raises ``InvalidInput`` for a longer
+        one, ``CodecError`` if a receiver does not see what the sender promised.
         """
         del rate_hz
-        if len(frames) != len(self._seen.renders):
-            raise InvalidInput("frames", f"{len(frames)} where {len(self._seen.renders)} were seen")
+        seen = len(self._seen.renders)
+        if not 0 < len(frames) <= seen:
+            raise InvalidInput("frames", f"{len(frames)} are outside the 1..{seen} that were seen")
         config = CodecConfig(*frames[0].size_px, preset=self._preset, crf=point)
         began_ns = process_time_ns()
         encoder = DeltaEncoder(config)
         coded = self._coded(encoder, frames)
-        cpu_ms = (process_time_ns() - began_ns) / 1e6 + self._seen.render_cpu_ms
+        cpu_ms = (process_time_ns() - began_ns) / 1e6
+        cpu_ms += self._seen.render_cpu_ms * len(frames) / seen
         decoded = self._decoded(encoder, coded)
         pairs = list(zip(decoded, frames, strict=True))
         return CodedClip(

@@ -44,6 +44,11 @@ class Rival:
     options: Mapping[str, str]
     points: Sequence[float] = field(default=X264_CRFS)
 
+    @property
+    def version(self) -> str:
+        """The libraries come with PyAV."""
+        return f"PyAV {av.__version__}"
+
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` at CRF ``point``.
 

@@ -1,0 +1,68 @@
+"""Our codec as a coder of clips: real packets of a real field, decoded by a receiver."""
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.codec.references import RENDER_ONLY
+from rfcore.errors import InvalidInput
+from rfcore.field import SplatField
+from rfcore.native.yuv import i420_from_colour
+from rfcore.raster.gaussians import Gaussians
+from rfedge.evaluate.own import FieldCoder, see_clip
+
+INTRINSICS = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
+
+
+def street(seed):
+    rng = np.random.default_rng(seed)
+    sh = np.zeros((300, 1, 3), np.float32)
+    sh[:, 0] = rng.uniform(-1.5, 1.5, (300, 3))
+    return SplatField(
+        Gaussians(
+            means=rng.uniform([-3, -2, 4], [3, 2, 8], (300, 3)).astype(np.float32),
+            quaternions=np.tile(np.float32([1, 0, 0, 0]), (300, 1)),
+            log_scales=np.full((300, 3), np.log(0.25), np.float32),
+            opacity_logits=np.full(300, 2.0, np.float32),
+            sh=sh,
+        )
+    )
+
+
+CAMERAS = [Camera(INTRINSICS, Pose((0.05 * k, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))) for k in range(4)]
+FRAMES = [i420_from_colour(street(1).render_colour(camera)) for camera in CAMERAS]
+
+
+def coded(field, point=23.0, **how):
+    coder = FieldCoder(see_clip(field, CAMERAS), "ours", "test", preset="veryfast", **how)
+    return coder.code(FRAMES, 10, point)
+
+
+def test_the_right_field_costs_less_and_shows_more_than_a_wrong_one():
+    right, wrong = coded(street(1)), coded(street(2))
+    assert right.frame_bytes.sum() < wrong.frame_bytes.sum()
+    assert right.luma_mse.mean() < wrong.luma_mse.mean()
+
+
+def test_a_frame_costs_its_slice_and_its_header():
+    clip = coded(street(2))
+    headers = clip.frame_bytes - np.array(clip.notes["slice_bytes"])
+    assert (headers > 60).all()
+    assert (headers < 300).all()
+
+
+def test_the_references_are_told_frame_by_frame():
+    assert coded(street(2), references=RENDER_ONLY).notes["references"] == ("render",) * 4
+
+
+def test_processor_time_holds_the_render():
+    seen = see_clip(street(2), CAMERAS)
+    slow = type(seen)(seen.cameras, seen.renders, seen.depths, seen.field_id, 1e6)
+    clip = FieldCoder(slow, "ours", "test", preset="veryfast").code(FRAMES[:2], 10, 30.0)
+    assert clip.cpu_ms == pytest.approx(5e5, rel=0.1)
+
+
+def test_more_frames_than_were_seen_are_refused():
+    coder = FieldCoder(see_clip(street(1), CAMERAS[:2]), "ours", "test", preset="veryfast")
+    with pytest.raises(InvalidInput, match=r"1\.\.2"):
+        coder.code(FRAMES, 10, 23.0)
