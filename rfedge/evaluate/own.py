@@ -16,7 +16,7 @@ import numpy as np
 from rfcore.camera import Camera
 from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, FrameChoice
 from rfcore.codec.encoder import Encoded
-from rfcore.codec.references import References, references_name
+from rfcore.codec.references import References, is_temporal, references_name
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.field import RadianceField
 from rfcore.image import I420
@@ -75,6 +75,9 @@ class FieldCoder:
         self._seen = seen
         self._preset = preset
         self._choice = FrameChoice(references=references)
+        # Temporal references exist from the second frame on.
+        temporal = references is not None and is_temporal(references)
+        self._first_choice = FrameChoice() if temporal else self._choice
 
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` at CRF ``point``; ``rate_hz`` changes nothing here.
@@ -110,8 +113,7 @@ class FieldCoder:
         state = encoder.start(1)
         coded = []
         for index, frame in enumerate(frames):
-            # Temporal references exist from the second frame on.
-            choice = self._choice if index else FrameChoice()
+            choice = self._choice if index else self._first_choice
             render, depth = self._seen.renders[index], self._seen.depths[index]
             made = encoder.encode(state, frame, render, depth, choice)
             state = made.state
