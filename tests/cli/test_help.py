@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-VERBS = ("demo", "train", "render", "encode", "decode", "link", "watch", "bench", "eval")
+VERBS = ("demo", "train", "render", "encode", "decode", "link", "watch", "bench")
+EVAL_VERBS = ("eval compare", "eval stability")
 SCENE_VERBS = ("scene convert", "scene poses", "scene record-carla")
 FIELD_VERBS = tuple(
     f"field {verb}" for verb in ("import", "info", "check", "slim", "rungs", "export")
@@ -21,7 +22,7 @@ def rfedge(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("verb", VERBS + SCENE_VERBS + FIELD_VERBS)
+@pytest.mark.parametrize("verb", VERBS + SCENE_VERBS + FIELD_VERBS + EVAL_VERBS)
 def test_every_verb_has_help_with_defaults(verb: str) -> None:
     done = rfedge(*verb.split(), "--help")
     assert done.returncode == 0, done.stderr
@@ -49,6 +50,7 @@ def test_the_help_loads_nothing_heavy() -> None:
         (("link", "--to", "nonsense"), "nonsense"),
         (("link", "--to", "127.0.0.1:1", "--profile", "missing.toml"), "missing.toml"),
         (("watch", "nonsense"), "nonsense"),
+        (("eval", "compare", "field.rff", "drive.json"), "NAME@HZ=DATASET"),
         (("scene", "convert", "nowhere", "--out", "o"), "nowhere"),
         (("scene", "convert", "nowhere", "--out", "o", "--size", "big"), "'big' is not WIDTHx"),
         (("scene", "poses", "nowhere", "--out", "o"), "nowhere: holds 0 pictures"),
