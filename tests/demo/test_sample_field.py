@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from rfcore.dataset import read_transforms
+from rfcore.dataset import read_dataset
 from rfcore.field import Quality, SplatField, load_field
 from rfcore.field.load import encode_field
 from rfcore.train import DensityControl, SplatTrainingConfig, mean_psnr_db
@@ -36,7 +36,7 @@ def test_the_shipped_field_is_as_good_as_its_record_says() -> None:
     stated_db = json.loads(path.with_suffix(".json").read_text())["held_out"]["psnr_db"]
     field = load_field(path, threads=2)
     assert field.metadata.held_out_psnr_db == stated_db
-    pictures = read_transforms(SAMPLE / "transforms_drive_empty.json").pictures[::4]
+    pictures = read_dataset(SAMPLE / "transforms_drive_empty.json").pictures[::4]
     assert mean_psnr_db(field, pictures) == pytest.approx(stated_db, abs=0.5)
     assert stated_db > 26.5
     half = np.clip(field.render_colour(pictures[0].camera, Quality(0.5)), 0, 1)
@@ -48,8 +48,8 @@ def test_the_shipped_field_is_as_good_as_its_record_says() -> None:
 @pytest.mark.sample
 @pytest.mark.timeout(600)
 def test_compression_costs_a_quarter_of_the_bytes_and_a_fifth_of_a_db_at_most() -> None:
-    views = read_transforms(SAMPLE / "transforms_train.json")
-    drive = read_transforms(SAMPLE / "transforms_drive_empty.json")
+    views = read_dataset(SAMPLE / "transforms_train.json")
+    drive = read_dataset(SAMPLE / "transforms_drive_empty.json")
     config = SplatTrainingConfig(
         gaussians=30_000, iterations=400, density=DensityControl(limit=0), threads=2
     )
