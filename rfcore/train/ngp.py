@@ -42,7 +42,7 @@ REBUILD_EVERY = 64
 FIRST_SAMPLES_PER_RAY = 64.0
 FIRST_PEAK = 2.0
 """Of a cell, times the threshold: kept until a dozen visits have found it empty."""
-BLIND_SHARE = 0.25
+BLIND_SHARE = 1 / 15
 """Of the occupancy's cells, without points: all begin occupied, and each has to be visited."""
 
 
@@ -53,13 +53,14 @@ class NgpModel:
     L: int = 16
     log2_T: int = 18
     N_min: int = 16
-    N_max: int = 2048
+    N_max: int = 4096
     """Cells along the longest side, of all space: the box is half of that."""
     hidden: int = 32
-    occupancy: int = 8_000_000
-    """Cells of the occupancy grid, about."""
-    steps_per_doubling: int = 48
-    """Steps along a ray until its distance has doubled: 48 are a step of 1.4 % of it."""
+    occupancy: int = 30_000_000
+    """Cells of the occupancy grid, about. With N_max 4096 and 64 steps, the street's held-out drive
+    is at 23.3 dB after 1000 iterations instead of 23.0 dB with 2048, 8 million and 48."""
+    steps_per_doubling: int = 64
+    """Steps along a ray until its distance has doubled: 64 are a step of 1.1 % of it."""
     near_share: float = 0.008
     """Where rays begin, in longest half sides of the box."""
     far_share: float = 8.0

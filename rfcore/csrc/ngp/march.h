@@ -113,13 +113,24 @@ struct Filling {
 constexpr float kAtInfinity = -1.0f;  // as a step
 
 // How many occupied steps make one sample of ray r, so that `budget` samples reach to its end.
+// What is found on the way is kept in rays->windows.
 template <bool kUnbounded>
-RF_INLINE int steps_per_sample(const Field& field, const Rays& rays, int r, int budget) {
+RF_INLINE int steps_per_sample(const Field& field, Rays* rays, int r, int budget) {
+    uint16_t* window = rays->windows + static_cast<size_t>(r) * kMaxWindows;
     int occupied = 0;
     for (int k = 0; k < field.steps; k += kLanes) {
-        occupied += __builtin_popcount(occupied_steps<kUnbounded>(field, rays, r, k));
+        const uint32_t set = occupied_steps<kUnbounded>(field, *rays, r, k);
+        *window++ = static_cast<uint16_t>(set);
+        occupied += __builtin_popcount(set);
     }
     return occupied <= budget ? 1 : (occupied + budget - 1) / budget;
+}
+
+// The occupied steps of the window of 16 that begins with step `base`.
+template <bool kUnbounded>
+RF_INLINE uint32_t window_at(const Field& field, const Rays& rays, int r, int base) {
+    if (rays.windows == nullptr) return occupied_steps<kUnbounded>(field, rays, r, base);
+    return rays.windows[static_cast<size_t>(r) * kMaxWindows + static_cast<size_t>(base / kLanes)];
 }
 
 // Append the next samples of ray r, at most a round of them. Up to `skip` occupied steps in a row
@@ -131,7 +142,7 @@ static void fill_ray(const Field& field, Rays* rays, int r, Filling* filling) {
     const int before = filling->count, skip = rays->skip[r];
     while (room > 0 && k < field.steps) {
         const int base = k / kLanes * kLanes;
-        uint32_t set = occupied_steps<kUnbounded>(field, *rays, r, base) & (0xffffu << (k - base));
+        uint32_t set = window_at<kUnbounded>(field, *rays, r, base) & (0xffffu << (k - base));
         k = base + kLanes;
         while (set != 0 && room > 0) {
             const int first = __builtin_ctz(set);

@@ -39,7 +39,7 @@ RF_INLINE void start_tile(const RenderJob& job, int x0, int y0, Rays* rays, floa
         rays->done[r] = outside;
         if (!outside && job.samples_per_ray > 0) {
             rays->skip[r] =
-                steps_per_sample<kUnbounded>(*job.field, *rays, r, job.samples_per_ray);
+                steps_per_sample<kUnbounded>(*job.field, rays, r, job.samples_per_ray);
         }
     }
 }
@@ -74,6 +74,8 @@ static void render_tile(const RenderJob& job, int tile, Chunk* chunks) {
     Rays rays;
     Activations scratch;
     alignas(64) float z_share[kBlockRays];
+    uint16_t windows[kBlockRays * kMaxWindows];
+    rays.windows = job.samples_per_ray > 0 ? windows : nullptr;
     start_tile<kUnbounded>(job, x0, y0, &rays, z_share);
     uint64_t samples = 0;
     while (!all_done(rays)) {

@@ -90,6 +90,7 @@ static void train_block(const TrainJob& job, int block) {
     const int first = block * job.rays_per_block;
     const int left = job.rays - first;
     rays.count = left < job.rays_per_block ? left : job.rays_per_block;
+    rays.windows = nullptr;
     start_block(job, first, &rays);
     int count = 0;
     while (!all_done(rays)) {

@@ -22,6 +22,7 @@ constexpr int kColourInputs = kHarmonics + kGeometry;
 constexpr int kMatrices = 5;  // two of the density network, three of the colour network
 constexpr int kBlockRays = 256;
 constexpr int kRoundSamples = 8;  // of a ray, before it is looked at again
+constexpr int kMaxWindows = 512;  // of 16 steps: rfcore/ngp/shape.py takes 8192 steps at most
 constexpr int kEdgePad = 32;      // readable floats behind the last edge
 constexpr float kMinTransmittance = 1e-4f;
 constexpr float kMaxLogDensity = 15.0f;
@@ -100,6 +101,7 @@ struct alignas(64) Rays {
     int32_t left[kBlockRays];    // samples it may still take
     int32_t skip[kBlockRays];    // rendering at a budget: occupied steps merged into one sample
     bool done[kBlockRays];
+    uint16_t* windows;  // [kBlockRays][kMaxWindows] occupied steps, 16 a word; null: not known yet
     int count;
 };
 
