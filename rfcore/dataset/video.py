@@ -85,6 +85,8 @@ class Video:
         return sorted({packet.pts for packet in packets if packet.pts is not None and packet.size})
 
     def _check_size(self, intrinsics: Intrinsics) -> None:
+        if self._stream.codec_context is None:
+            raise DatasetError(f"{self.file}: is of a codec that is not known")
         found = (self._stream.codec_context.width, self._stream.codec_context.height)
         if found != (intrinsics.width_px, intrinsics.height_px):
             raise DatasetError(

@@ -62,6 +62,14 @@ def mutated(content: bytes, rng: np.random.Generator) -> bytes:
     return content[:at] + b"9" * 400 + content[at:]
 
 
+def test_a_video_of_an_unknown_codec_is_refused(golden: Any, tmp_path: Path) -> None:
+    folder = golden.write("video", tmp_path / "d")
+    content = (folder / "drive.mp4").read_bytes()
+    (folder / "drive.mp4").write_bytes(content.replace(b"avc1\0\0", b"zzz9\0\0"))
+    with pytest.raises(DatasetError, match=r"drive\.mp4: (is of a codec|not a readable video)"):
+        read_dataset(folder)
+
+
 def test_a_whole_number_beyond_every_float_is_refused(golden: Any, tmp_path: Path) -> None:
     folder = golden.write("transforms", tmp_path / "d")
     text = (folder / "transforms.json").read_text()
