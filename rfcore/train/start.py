@@ -30,12 +30,16 @@ class RandomStart:
     cameras look, or, where their axes do not meet, the distance between cameras. A point counts
     when ``seen_by`` cameras have it in view. ``sky`` is the share put at ``farthest``: it shows
     what lies beyond everything.
+
+    Measured on the fox (docs/training.md): from 0.2 to 8 with two cameras and a tenth in the sky
+    held-out pictures reach 19.9 dB, with these values and SH degree 1, 25.8 dB; Gaussians near a
+    camera that few others see are learned by heart.
     """
 
-    nearest: float = 0.2
-    farthest: float = 8.0
-    seen_by: int = 2
-    sky: float = 0.1
+    nearest: float = 0.5
+    farthest: float = 4.0
+    seen_by: int = 6
+    sky: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 < self.nearest < self.farthest <= 1e4:

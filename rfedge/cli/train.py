@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Train"]
 
+SH_RISE = 0.1
+"""Share of the run after which one more band joins: the same quality, in less time."""
 DEFAULT_LIMIT = 250_000
 """Gaussians of a run limited by time: about what two cores train in five minutes."""
 
@@ -58,6 +60,8 @@ class Train:
     limit: int | None = None
     """Density control: let the set grow to so many Gaussians, replacing those that show nothing;
     default: 250000 with --minutes, else the set stays as it is."""
+    sh_degree: int = 3
+    """Bands of the colour's dependence on direction, 0..3; few pictures call for few."""
     antialiased: bool = False
     """Splats made fainter where they are smaller than a pixel; for pictures of several sizes."""
     seed: int = 1
@@ -140,7 +144,7 @@ class Train:
     def _config(self, exposure_varies: bool) -> SplatTrainingConfig | NgpTrainingConfig:
         from dataclasses import replace
 
-        from rfcore.train import DensityControl, NgpTrainingConfig
+        from rfcore.train import Bands, DensityControl, NgpTrainingConfig
         from rfedge.training import UNLIMITED_ITERATIONS, training_config
 
         iterations = UNLIMITED_ITERATIONS if self.minutes is not None else self.iterations
@@ -153,7 +157,8 @@ class Train:
             limit = DEFAULT_LIMIT
         if limit is not None:
             config = replace(config, density=DensityControl(limit=limit))
-        return replace(config, antialiased=self.antialiased, exposure=exposure_varies)
+        bands = Bands(self.sh_degree, SH_RISE if self.sh_degree else 0.0)
+        return replace(config, bands=bands, antialiased=self.antialiased, exposure=exposure_varies)
 
     def _finished(
         self, job: TrainingJob, trained: RadianceField, console: Console
