@@ -61,7 +61,7 @@ class Train:
     """Density control: let the set grow to so many Gaussians, replacing those that show nothing;
     default: 250000 with --minutes, else the set stays as it is."""
     sh_degree: int = 3
-    """Bands of the colour's dependence on direction, 0..3; few pictures call for few."""
+    """Bands of the colour's dependence on direction, 0..3."""
     antialiased: bool = False
     """Splats made fainter where they are smaller than a pixel; for pictures of several sizes."""
     seed: int = 1
