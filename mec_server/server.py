@@ -49,14 +49,14 @@ class EdgeServer:
             store, threads=config.threads, isa=config.isa, opened=self._metrics.field_opened
         )
         self._shelf = FieldShelf(store, load)
-        self._twin = Twin()
+        twin = Twin()  # the metrics outlive the server in their thread, and shall not hold it
         watched = TwinMetrics(
             self._metrics.instruments,
-            lambda: self._twin.ages_s(time.monotonic()),
-            lambda: self._twin.missed,
+            lambda: twin.ages_s(time.monotonic()),
+            lambda: twin.missed,
             per_vehicle=config.metrics_per_vehicle,
         )
-        self._twin_service = TwinService(self._twin, watched, config.consumers)
+        self._twin_service = TwinService(twin, watched, config.consumers)
         self._executor = ThreadPoolExecutor(config.workers, "worker")
         self._recorder = self._open_recorder(config.save)
         self._health = health_aio.HealthServicer()
@@ -67,7 +67,7 @@ class EdgeServer:
                 self._executor,
                 self._metrics,
                 config.limits,
-                self._twin,
+                twin,
                 self._recorder,
             )
         )
