@@ -4,7 +4,7 @@
 // usage: exactness_warp ISA THREADS SCENE RESULT (the first two are as for the other programs;
 // the compiler alone vectorises here)
 //
-// SCENE: int32 width, height, gain; float rotation[9], translation[3], fx, fy, cx, cy; bytes Y, U, V
+// SCENE: int32 width, height, doubt; float rotation[9], translation[3], fx, fy, cx, cy; bytes Y, U, V
 // of the previous picture, of the render and of the previous render; float previous depth, depth.
 // RESULT: bytes Y, U, V carried and corrected; int32 SATD and SSD of the previous picture's blocks
 // against the render.
@@ -49,11 +49,11 @@ void run(const char* scene, const char* result) {
     const auto depth = in.read<float>(previous.y.size());
     Planes carried(size), corrected(size);
     const WarpInputs plain{previous.view(), previous_depth.data(), depth.data(),
-                           render.view(),   {nullptr, nullptr, nullptr}, 64};
+                           render.view(),   {nullptr, nullptr, nullptr}, 0};
     warp_i420(plain, geometry[0], size, carried.out());
     WarpInputs correction = plain;
     correction.previous_render = previous_render.view();
-    correction.gain = header[2];
+    correction.doubt = header[2];
     warp_i420(correction, geometry[0], size, corrected.out());
     write_planes(out, carried);
     write_planes(out, corrected);

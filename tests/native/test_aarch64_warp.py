@@ -9,7 +9,7 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420
 from rfcore.native.warp import (
-    CORRECTION_GAIN,
+    CORRECTION_DOUBT,
     PosedDepth,
     Seen,
     block_costs,
@@ -58,7 +58,7 @@ def test_aarch64_carries_a_picture_to_the_same_bytes(
     costs = block_costs(previous.y, render.y)
     here += costs.satd.tobytes() + costs.ssd.tobytes()
     numbers = struct.pack("<16f", *warp_numbers(BEFORE, NOW))
-    scene = struct.pack("<3i", 83, 45, CORRECTION_GAIN) + numbers
+    scene = struct.pack("<3i", 83, 45, CORRECTION_DOUBT) + numbers
     scene += as_bytes(previous, render, previous_render)
     scene += seen_before.depth.tobytes() + seen.depth.tobytes()
     assert first_difference(emulated("exactness_warp", "neon", 1, scene), here) is None
