@@ -1,7 +1,7 @@
 """How much memory a training run takes, said before it starts.
 
-The estimate is the sum of what is allocated, for the largest set the run may grow to; measured
-peaks were within 15 % of it (tests/train/test_training_memory.py measures one).
+The estimate is the sum of what is allocated, for the largest set the run may grow to. The one run
+that tests/train/test_training_memory.py measures stays within 15 % of it.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from rfcore.errors import InvalidInput
 from rfcore.views import PosedPicture
 from rfedge.training_depth import points_from_depth_maps
 
-__all__ = ["ViewChoice", "read_views", "share_of_views", "size_px_from", "split_every"]
+__all__ = ["ViewChoice", "read_views", "share_of_views", "split_every"]
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,3 @@ def share_of_views(pictures: Sequence[PosedPicture], percent: float) -> tuple[Po
     """Return ``percent`` of the pictures, at least one, spread evenly over all of them."""
     count = max(1, round(len(pictures) * percent / 100))
     return tuple(pictures[i * len(pictures) // count] for i in range(count))
-
-
-def size_px_from(text: str) -> tuple[int, int]:
-    """Return (width, height) of ``WIDTHxHEIGHT``; raise ``InvalidInput`` for anything else."""
-    width, times, height = text.partition("x")
-    if times and width.isdecimal() and height.isdecimal() and int(width) and int(height):
-        return int(width), int(height)
-    raise InvalidInput("size", f"'{text}' is not WIDTHxHEIGHT, as 640x360")

@@ -127,7 +127,8 @@ class Train:
         return TrainingJob(self.name, dataset, held_out, config, self.seed, limits, self.resume)
 
     def _views(self) -> tuple[Dataset, Dataset | None]:
-        from rfedge.training_views import ViewChoice, read_views, size_px_from
+        from rfedge.sizes import parse_size
+        from rfedge.training_views import ViewChoice, read_views
 
         choice = ViewChoice(
             dataset=self.dataset,
@@ -136,7 +137,7 @@ class Train:
             percent=self.views_percent,
             points=self.points,
             depths=self.depths,
-            size_px=size_px_from(self.size) if self.size is not None else None,
+            size_px=parse_size(self.size) if self.size is not None else None,
             undistort=self.undistort,
         )
         return read_views(choice)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from rfcore.errors import InvalidInput
 from rfedge.bench.rows import flattened
+from rfedge.report.evaluations import compare_section, training_section
+from rfedge.report.markdown_parts import Row, cell, heading, table
 from rfedge.report.summary import METRIC, SUMMARY
 
 __all__ = ["results_page"]
@@ -24,15 +24,17 @@ Generated from `results/*.json` by `make figures`; each table names its command,
 Machines are shared and noisy: compare within a table, not across hosts.
 """
 
-Row = Mapping[str, Any]
-
 
 def results_page(folder: Path) -> str:
     """Return the page of every result file in ``folder``, in the order of their names.
 
-    Raises ``InvalidInput`` for a file that is neither a demo nor a bench result.
+    Training runs, in ``folder/train``, share one table at the end. Raises ``InvalidInput`` for a
+    file that holds none of the known results.
     """
     sections = [_section(path) for path in sorted(folder.glob("*.json"))]
+    runs = sorted(folder.glob("train/*.json"))
+    if runs:
+        sections.append(training_section(runs))
     return "\n".join([INTRODUCTION, *sections])
 
 
@@ -41,7 +43,9 @@ def _section(path: Path) -> str:
     if result.get("format") == "rfedge-demo-1":
         return _demo(path, result)
     if result.get("format") == "rfedge-stability-1":
-        return f"{_heading(path, result)}\n\n{len(result['cases'])} cases: `docs/stability.md`.\n"
+        return f"{heading(path, result)}\n\n{len(result['cases'])} cases: `docs/stability.md`.\n"
+    if result.get("case") == "compare":
+        return compare_section(path, result)
     if "case" in result:
         return _bench(path, result)
     raise InvalidInput("results", f"{path} is neither a demo nor a bench result")
@@ -64,36 +68,14 @@ def _demo(path: Path, result: Row) -> str:
         f"{settings['rate_hz']:g} Hz, link {settings['link_bps'] / 1e6:g} Mbit/s and "
         f"{settings['link_delay_ms']:g} ms."
     )
-    return "\n\n".join([_heading(path, result), facts, _table(["", *sequences], rows), ""])
+    return "\n\n".join([heading(path, result), facts, table(["", *sequences], rows), ""])
 
 
 def _bench(path: Path, result: Row) -> str:
     rows = [flattened(row) for row in result["rows"]]
     columns = list(rows[0])
-    cells = [[_cell(row[column]) for column in columns] for row in rows]
-    return "\n\n".join([_heading(path, result), _table(columns, cells), ""])
-
-
-def _heading(path: Path, result: Row) -> str:
-    command = result.get("command") or f"rfedge bench {result['case']}"
-    host = result["host"]
-    return (
-        f"## {path.stem}\n\n`{command}` at `{result['revision']}`; {host['cpu']}, "
-        f"{host['cores']} cores, {host['isa']}."
-    )
-
-
-def _cell(value: Any) -> str:
-    if value is None:
-        return "not run"
-    if isinstance(value, float):
-        return f"{value:.3g}" if abs(value) < 0.01 else f"{value:.2f}"
-    return str(value)
-
-
-def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [list(columns), ["---", *["---:"] * (len(columns) - 1)], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    cells = [[cell(row[column]) for column in columns] for row in rows]
+    return "\n\n".join([heading(path, result), table(columns, cells), ""])
 
 
 if __name__ == "__main__":

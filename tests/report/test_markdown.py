@@ -26,6 +26,50 @@ def test_a_bench_result_becomes_a_table_with_its_provenance(tmp_path: Path) -> N
     assert "`rfedge bench codec` at `abc123`; C, 2 cores, avx2." in page
 
 
+def test_training_runs_share_a_table_and_name_their_commands(tmp_path: Path) -> None:
+    run = {
+        "views": 120,
+        "width": 640,
+        "height": 360,
+        "held_out": {"psnr_db": 28.517, "ssim": None},
+        "seconds": 299.6,
+        "iterations": 5000,
+        "primitives": 250_000,
+        "bytes": 5_040_000,
+        "command": "rfedge train street --minutes 5",
+        "revision": "abc123",
+    }
+    (tmp_path / "train").mkdir()
+    (tmp_path / "train" / "street.json").write_text(json.dumps(run))
+    page = results_page(tmp_path)
+    assert "| street | 120 | 640x360 | 28.52 | - | 300 | 5000 | 250000 | 5.0 |" in page
+    assert "* street: `rfedge train street --minutes 5` at `abc123`" in page
+
+
+def test_a_comparison_names_field_quality_and_interval_beside_its_figure(tmp_path: Path) -> None:
+    row = {
+        "scene": "yardstick-empty",
+        "hz": 10.0,
+        "method": "rfedge-veryfast-0123",
+        "rival": "x264-lowdelay",
+        "rival_setting": "x264-lowdelay-veryfast",
+        "window_db": [32.0, 35.0],
+        "bd_rate_percent": -57.31,
+        "ci95": [-60.04, -54.0],
+        "saving_percent_at_db": {"31": 80.2, "33": 55.1, "35": 40.0},
+        "cpu_ms": 90.4,
+        "rival_cpu_ms": 19.6,
+        "field_psnr_db": 28.123,
+    }
+    host = {"cpu": "C", "cores": 2, "isa": "avx2"}
+    result = {"case": "compare", "command": "rfedge eval compare", "revision": "abc123"}
+    (tmp_path / "compare.json").write_text(json.dumps({**result, "host": host, "rows": [row]}))
+    assert (
+        "| yardstick-empty | 10 | rfedge-veryfast | x264-lowdelay (x264-lowdelay-veryfast) "
+        "| 32..35 | -57.3 | -60.0..-54.0 | 80 / 55 / 40 | 90 | 20 | 28.12 |"
+    ) in results_page(tmp_path)
+
+
 def test_a_foreign_file_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "notes.json").write_text("{}")
     with pytest.raises(InvalidInput, match=r"notes\.json is neither"):

@@ -20,7 +20,6 @@ from rfedge.training_views import (
     ViewChoice,
     read_views,
     share_of_views,
-    size_px_from,
     split_every,
 )
 
@@ -166,7 +165,3 @@ def test_a_share_of_the_views_is_spread_evenly() -> None:
     assert share_of_views(views, 50) == tuple(range(0, 120, 2))
     assert share_of_views(views, 100) == views
     assert share_of_views(views, 0.1) == (0,)
-
-
-def test_sizes_are_width_times_height() -> None:
-    assert size_px_from("640x360") == (640, 360)
