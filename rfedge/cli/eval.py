@@ -8,6 +8,7 @@ from typing import Annotated
 from tyro.conf import subcommand
 
 from rfedge.cli.eval_compare import EvalCompare
+from rfedge.cli.eval_paper import EvalPaper
 from rfedge.cli.eval_stability import EvalStability
 
 __all__ = ["Eval"]
@@ -19,6 +20,7 @@ class Eval:
 
     verb: (
         Annotated[EvalCompare, subcommand("compare")]
+        | Annotated[EvalPaper, subcommand("paper")]
         | Annotated[EvalStability, subcommand("stability")]
     )
 

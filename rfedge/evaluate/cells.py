@@ -20,9 +20,10 @@ from rfcore.errors import InvalidData
 from rfcore.files import write_whole
 from rfedge.evaluate.clip import CodedClip
 
-__all__ = ["CellKey", "CellStore"]
+__all__ = ["CellKey", "CellStore", "Rows"]
 
 CellKey = Mapping[str, str | float | int | None]
+Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,27 @@ class CellStore:
         """
         path = self.path(key)
         if path.exists():
-            return _clip_of(path, key)
+            return _clip_of(path, _stored(path, key))
         clip = make()
-        self.folder.mkdir(parents=True, exist_ok=True)
-        write_whole(path, json.dumps({"key": dict(key), "clip": _fields(clip)}, indent=1) + "\n")
+        self._keep(key, _fields(clip))
         return clip
+
+    def rows(self, key: CellKey, make: Callable[[], Rows]) -> Rows:
+        """Return the rows of ``key``, from the folder or by ``make``; raises as ``clip``."""
+        path = self.path(key)
+        if path.exists():
+            stored = _stored(path, key)
+            if not isinstance(stored, list):
+                raise _damaged(path, "it holds no rows")
+            return stored
+        rows = make()
+        self._keep(key, rows)
+        return rows
+
+    def _keep(self, key: CellKey, result: object) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        content = json.dumps({"key": dict(key), "result": result}, indent=1)
+        write_whole(self.path(key), content + "\n")
 
     def has(self, key: CellKey) -> bool:
         """Tell whether the cell is there already."""
@@ -65,12 +82,18 @@ def _fields(clip: CodedClip) -> dict[str, Any]:
     }
 
 
-def _clip_of(path: Path, key: CellKey) -> CodedClip:
+def _stored(path: Path, key: CellKey) -> Any:
     try:
         stored = json.loads(path.read_text())
         if stored["key"] != dict(key):
             raise ValueError("it was made for another key")
-        clip = stored["clip"]
+        return stored["result"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise _damaged(path, error) from error
+
+
+def _clip_of(path: Path, clip: Any) -> CodedClip:
+    try:
         return CodedClip(
             clip["point"],
             np.array(clip["frame_bytes"], np.int64),
@@ -79,5 +102,9 @@ def _clip_of(path: Path, key: CellKey) -> CodedClip:
             clip["cpu_ms"],
             {name: tuple(values) for name, values in clip["notes"].items()},
         )
-    except (ValueError, KeyError, TypeError) as error:
-        raise InvalidData(f"{path}: not a finished cell ({error}); delete it to redo it") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, why: object) -> InvalidData:
+    return InvalidData(f"{path}: not a finished cell ({why}); delete it to redo it")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 VERBS = ("demo", "train", "render", "encode", "decode", "link", "watch", "bench")
-EVAL_VERBS = ("eval compare", "eval stability")
+EVAL_VERBS = ("eval compare", "eval paper", "eval stability")
 SCENE_VERBS = ("scene convert", "scene poses", "scene record-carla")
 FIELD_VERBS = tuple(
     f"field {verb}" for verb in ("import", "info", "check", "slim", "rungs", "export")

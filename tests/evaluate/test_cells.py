@@ -48,7 +48,7 @@ def test_a_computation_that_fails_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("damage", ["", "{}", '{"key": {}, "clip": {}}'])
+@pytest.mark.parametrize("damage", ["", "{}", '{"key": {}, "result": {}}'])
 def test_a_damaged_cell_is_refused_by_name(tmp_path, damage):
     store = CellStore(tmp_path)
     store.clip(KEY, lambda: CLIP)
@@ -66,3 +66,20 @@ def test_a_cell_says_what_it_is(tmp_path):
 def test_a_clip_has_one_value_per_frame():
     with pytest.raises(InvalidInput, match="one value per frame"):
         CodedClip(1.0, np.array([1, 2]), np.array([1.0]), np.ones(2), 0.0)
+
+
+def test_rows_are_kept_like_clips(tmp_path):
+    store, rows = CellStore(tmp_path), [{"frame": "a", "bytes": 3}, {"frame": "b", "bytes": 4}]
+    assert store.rows(KEY, lambda: rows) is rows
+    assert store.rows(KEY, forbidden) == rows
+
+
+def test_rows_are_not_taken_for_a_clip_nor_a_clip_for_rows(tmp_path):
+    store = CellStore(tmp_path)
+    store.rows(KEY, lambda: [{"a": 1}])
+    with pytest.raises(InvalidData):
+        store.clip(KEY, forbidden)
+    other = {**KEY, "hz": 2}
+    store.clip(other, lambda: CLIP)
+    with pytest.raises(InvalidData, match="no rows"):
+        store.rows(other, forbidden)

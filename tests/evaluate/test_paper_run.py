@@ -1,0 +1,100 @@
+"""The verb ``rfedge eval paper``: rows whose means are known, and a quick run on the sample."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rfcore.errors import InvalidInput
+from rfedge.evaluate.paper_run import PaperJob, named_path, run_paper
+from rfedge.evaluate.paper_summary import means_of, savings_by_frame
+from rfedge.report.paper import write_paper_figures
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+ROW_KEYS = {
+    *("field", "scene", "width", "height", "preset", "crf", "frame"),
+    *("i_bytes", "p_bytes", "header_bytes", "camera_i_bytes", "i_psnr_db", "psnr_db"),
+    *("camera_i_psnr_db", "rf_psnr_db", "ssim"),
+}
+
+
+def row(frame, crf, savings, **other):
+    return {
+        "field": "3dgs",
+        "scene": "empty",
+        "width": 300,
+        "height": 168,
+        "render": "downscaled",
+        "preset": "medium",
+        "crf": crf,
+        "frame": frame,
+        "savings_percent": savings,
+        "rf_psnr_db": 27.0,
+        "rf_ssim": 0.8,
+        "second_type": "P",
+        **other,
+    }
+
+
+ROWS = [row("a", 18, 40.0), row("a", 23, 50.0), row("b", 18, 60.0), row("b", 23, 70.0)]
+
+
+def test_a_frames_savings_are_its_mean_over_settings_and_the_spread_is_over_frames():
+    (mean,) = means_of(ROWS)
+    assert (mean.frames, mean.savings_percent) == (2, 55.0)
+    assert mean.sd_percent == pytest.approx(np.std([45.0, 65.0], ddof=1))
+    assert mean.ci95_percent == pytest.approx(1.96 * mean.sd_percent / 2**0.5)
+
+
+def test_a_clip_whose_second_picture_is_no_p_picture_is_counted():
+    (mean,) = means_of([*ROWS[:3], row("b", 23, 70.0, second_type="I")])
+    assert mean.second_not_p == 0.25
+
+
+def test_savings_by_frame_leave_out_what_was_rendered_natively():
+    curves = savings_by_frame([*ROWS, row("a", 18, 0.0, render="native")], "3dgs", "empty")
+    assert list(curves) == [(300, 168)]
+    np.testing.assert_allclose(curves[(300, 168)], [45.0, 65.0])
+
+
+def test_every_figure_has_its_numbers_beside_it(tmp_path):
+    paths = write_paper_figures(ROWS, tmp_path)
+    assert {path.name for path in paths} == {
+        "savings_empty_3dgs.svg",
+        "savings_empty_3dgs.csv",
+        "savings_by_crf_preset.svg",
+        "savings_by_crf_preset.csv",
+    }
+    assert (tmp_path / "savings_empty_3dgs.csv").read_text() == (
+        "image,300x168\n0,45.00\n1,65.00\n"
+    )
+    assert "medium,18,50.00" in (tmp_path / "savings_by_crf_preset.csv").read_text()
+
+
+@pytest.mark.parametrize("text", ["x.rff", "=x", "a="])
+def test_a_field_without_a_name_is_refused(text):
+    with pytest.raises(InvalidInput, match="NAME=PATH"):
+        named_path(text)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_quick_run_gives_the_published_rows_and_its_controls(tmp_path):
+    job = PaperJob(
+        fields=[f"3dgs={SAMPLES / 'fields' / 'street.rff'}"],
+        drives=[f"empty={SAMPLES / 'street' / 'transforms_drive_empty.json'}"],
+        sizes_px=[(300, 168)],
+        out=tmp_path / "paper.json",
+        cells=tmp_path / "cells",
+        quick=True,
+    )
+    rows = run_paper(job, Console(quiet=True))["rows"]
+    assert rows == json.loads(job.out.read_text())["rows"]
+    assert all(set(row) >= ROW_KEYS for row in rows)
+    assert run_paper(job, Console(quiet=True))["rows"] == rows
+    means = {(mean.field, mean.making): mean.savings_percent for mean in means_of(rows)}
+    field = means["3dgs", "downscaled"]
+    assert field > means["3dgs:behind", "downscaled"] > 0
+    assert field > means["3dgs:grey", "downscaled"]
