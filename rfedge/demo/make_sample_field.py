@@ -36,6 +36,8 @@ class MakeSampleField:
     """Training iterations; default: the trainer's own."""
     limit: int | None = None
     """Density control: let the set grow to so many Gaussians."""
+    antialiased: bool = False
+    """Draw splats smaller than a pixel fainter; the field says so."""
 
     def run(self) -> None:
         """Make it; raise ``RfedgeError`` when the sample is damaged or the field too large."""
@@ -50,6 +52,7 @@ class MakeSampleField:
     def _config(self) -> SplatTrainingConfig:
         threads = len(os.sched_getaffinity(0))
         config = training_config(self.gaussians, self.iterations, threads)
+        config = replace(config, antialiased=self.antialiased)
         if self.limit is None:
             return config
         return replace(config, density=DensityControl(limit=self.limit))
@@ -57,6 +60,8 @@ class MakeSampleField:
     def _command(self) -> str:
         given = {n: getattr(self, n) for n in ("gaussians", "iterations", "limit")}
         options = " ".join(f"--{n} {v}" for n, v in given.items() if v is not None)
+        options += " --antialiased" if self.antialiased else ""
+        options = options.strip()
         return f'make sample-field ARGS="{options}"' if options else "make sample-field"
 
 
