@@ -31,13 +31,15 @@ class Capture:
 class EncodeJob:
     """Code ``capture`` in ``epoch``; a new epoch numbers its packets afresh.
 
-    ``base`` is the frame it may be predicted from; ``None``: nothing but the render.
+    ``base`` is the frame it may be predicted from; ``None``: nothing but the render. ``exact``:
+    whether the server's renders are ours to the bit.
     """
 
     capture: Capture
     epoch: int
     connection: int
     base: FrameAddress | None = None
+    exact: bool = True
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from rfcore.codec import (
     DeltaEncoder,
     Encoded,
     EncoderState,
+    FrameChoice,
     Past,
     StreamHeader,
 )
@@ -71,7 +72,8 @@ class Pipeline:
         render = i420_from_colour(view.colour)
         rendered_ns = self._clock_ns()
         seen = PosedDepth(camera, view.depth)
-        encoded = self._encoder.encode(self._state_for(job), frame, render, seen)
+        choice = FrameChoice(coarse=not job.exact)
+        encoded = self._encoder.encode(self._state_for(job), frame, render, seen, choice)
         self._remember(encoded)
         return EncodedFrame(
             encoded.packet,

@@ -21,7 +21,7 @@ from enum import StrEnum
 from cav_agent.config import AgentLimits
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
-from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, MAX_PAYLOAD_BYTES
+from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import (
     Ack,
@@ -185,8 +185,9 @@ class AgentSession:
         ready = self.state is LinkState.STREAMING and self._job is None
         if not ready or not self._slot or self._used >= self._granted:
             return None
-        base = self._sent if self.exact else None
-        self._job = EncodeJob(self._slot.popleft(), self._epoch, self._connection, base)
+        exact = bool(self.exact)
+        base = self._sent if exact else None
+        self._job = EncodeJob(self._slot.popleft(), self._epoch, self._connection, base, exact)
         self._epoch_used = True
         return self._job
 
@@ -232,7 +233,7 @@ class AgentSession:
             self._camera_id,
             capture.capture_time_ns,
             capture.picture.camera.world_from_cam,
-            bytes.fromhex(self._hello.field_ids[0])[:FIELD_ID_PREFIX_BYTES],
+            b"",  # the field of Hello; an agent has one
             encoded.packet,
         )
 

@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import grpc
 import structlog
@@ -112,6 +112,7 @@ class Vehicle:
                     f"{picture.name} has other intrinsics than {pictures[0].name}; "
                     "one stream is one camera",
                 )
+        pictures = tuple(map(_posed_for_the_wire, pictures))
         codec = CodecConfig(intrinsics.width_px, intrinsics.height_px, config.preset, config.crf)
         pipeline = Pipeline(field, codec, time.perf_counter_ns)
         camera = CameraDescription(config.camera, intrinsics, pipeline.header)
@@ -157,6 +158,13 @@ class Vehicle:
     async def _pass_on_stop(self, agent: Agent) -> None:
         await self._stopped.wait()
         agent.stop()
+
+
+def _posed_for_the_wire(picture: PosedPicture) -> PosedPicture:
+    """Round the pose before anything is rendered at it: both ends then have the same one."""
+    camera = picture.camera
+    rounded = replace(camera, world_from_cam=camera.world_from_cam.rounded())
+    return replace(picture, camera=rounded)
 
 
 def _log_failure(session_id: str, result: FrameResult) -> None:

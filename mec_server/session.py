@@ -137,7 +137,7 @@ class ServerSession:
             raise InvalidInput(
                 "frame.field_id_prefix",
                 f"{frame.field_id_prefix.hex()} is not a field of this Hello "
-                f"({', '.join(self._fields.values())})",
+                f"({', '.join(dict.fromkeys(self._fields.values()))})",
             )
         return self._lanes[frame.camera_id]
 
@@ -178,6 +178,7 @@ class ServerSession:
             self._lanes[camera.camera_id] = Lane(camera, self._limits.window_frames)
         for field_id in job.hello.field_ids:
             self._fields[bytes.fromhex(field_id)[:FIELD_ID_PREFIX_BYTES]] = field_id
+        self._fields[b""] = job.hello.field_ids[0]
         self._outbox.append(Welcome(self.session_id, job.exact))
         for camera_id, lane in self._lanes.items():
             self._outbox.append(Credit(camera_id, lane.granted))

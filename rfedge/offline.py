@@ -25,7 +25,6 @@ __all__ = ["CodingSettings", "DecodedFrame", "decode_drive", "encode_drive"]
 OFFLINE_VEHICLE = "offline"
 CAMERA_ID = "front"
 RENDERER = RendererContract(RENDERER_CONTRACT, exact=True)
-FIELD_ID_PREFIX_BYTES = 8
 
 
 @dataclass(frozen=True)
@@ -58,14 +57,15 @@ def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSetting
         if picture.camera.intrinsics != intrinsics:
             raise DatasetError(f"{picture.name}: its camera differs from the first picture's")
         frame = i420_from_rgb(picture.read())
-        encoded = encoder.encode(state, frame, *rendered(field, picture.camera))
+        pose = picture.camera.world_from_cam.rounded()
+        encoded = encoder.encode(state, frame, *rendered(field, Camera(intrinsics, pose)))
         state = encoded.state
         frames.append(
             Frame(
                 CAMERA_ID,
                 picture.time_ns,
-                picture.camera.world_from_cam,
-                bytes.fromhex(field.field_id)[:FIELD_ID_PREFIX_BYTES],
+                pose,
+                b"",
                 encoded.packet,
             )
         )

@@ -130,3 +130,19 @@ def test_bad_poses_are_refused_by_name(
 def test_a_mirrored_matrix_is_refused_as_left_handed() -> None:
     with pytest.raises(InvalidInput, match="left-handed"):
         Pose.from_matrix([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]])
+
+
+@given(poses())
+def test_a_rounded_pose_is_near_and_stays_as_it_is(pose: Pose) -> None:
+    """Half a step of float32: 2**-25 of a number below 1, 2**-24 of any; the angle between unit
+    quaternions is twice the one between them as vectors."""
+    rounded = pose.rounded()
+    assert rounded.rounded() == rounded
+    for near, true in zip(rounded.translation_m, pose.translation_m, strict=True):
+        assert abs(near - true) <= 2**-24 * abs(true) + 2**-149
+    assert math.dist(rounded.rotation, pose.rotation) <= 2 * 2**-24
+
+
+def test_a_pose_beyond_float32_cannot_be_rounded() -> None:
+    with pytest.raises(InvalidInput, match=r"pose.translation_m"):
+        Pose((1e39, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)).rounded()

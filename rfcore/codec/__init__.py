@@ -4,13 +4,14 @@ from rfcore.codec.config import CodecConfig
 from rfcore.codec.decoder import Decoded, DeltaDecoder
 from rfcore.codec.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.header import StreamHeader
-from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
 from rfcore.codec.references import INTRA, RENDER_ONLY, Reference, References, references_name
 from rfcore.codec.state import KEPT_FRAMES, DecoderState, EncoderState, Past
 
 __all__ = [
     "INTRA",
     "KEPT_FRAMES",
+    "NEEDED_BYTES",
     "RENDER_ONLY",
     "CodecConfig",
     "Decoded",

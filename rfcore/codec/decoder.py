@@ -31,6 +31,8 @@ __all__ = ["Decoded", "DeltaDecoder"]
 
 Clock = Callable[[], int]
 
+_COARSE_NEEDED = "between renderers that are not exact the sender must send them"
+
 
 def _stopped_clock() -> int:
     return 0
@@ -57,6 +59,8 @@ class DeltaDecoder:
 
     With ``exact=False`` the sender's renderer may differ by rounding: a reference that fails the
     exact digest but passes the coarse one is accepted, and its reconstruction cannot be checked.
+    Between exact renderers no packet needs the coarse one; where it is there, it is used to say
+    what kind of difference led to ``REFERENCE_MISMATCH``.
     """
 
     def __init__(
@@ -120,6 +124,12 @@ class DeltaDecoder:
         """Tell whether the renders are identical; raise if they may not be used together."""
         if render.digest() == packet.reference_digest:
             return True
+        if not packet.reference_coarse:
+            raise PacketRejected(
+                RejectReason.REFERENCE_MISMATCH,
+                "our render is not the sender's, and the packet has no block means to say by how "
+                f"much: {'another pose, field or camera' if self._exact else _COARSE_NEEDED}",
+            )
         difference = coarse_difference(coarse_digest(render), packet.reference_coarse)
         rounding_sized = difference <= COARSE_TOLERANCE
         if rounding_sized and not self._exact:

@@ -14,7 +14,7 @@ from rfcore.codec.choice import choose_photometric, choose_references
 from rfcore.codec.coarse import coarse_digest
 from rfcore.codec.config import CRF_RANGE, REFERENCE_FRAMES, CodecConfig
 from rfcore.codec.header import StreamHeader
-from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
 from rfcore.codec.photometric import Photometric, adapt
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.reference import without_zeros
@@ -42,7 +42,8 @@ class FrameChoice:
     ``references``: the pictures to predict from; ``None`` leaves it to the encoder, which takes at
     most ``most``: each costs as much time as coding a frame. ``crf``
     replaces the configured one. ``photometric``: see there; ``None`` leaves it to the encoder.
-    ``pose_only``: send no slice; the frame is its only reference.
+    ``pose_only``: send no slice; the frame is its only reference. ``coarse``: add the block means
+    of the render, by which a receiver whose renderer is not exact tells rounding from a wrong pose.
     """
 
     references: References | None = None
@@ -50,6 +51,7 @@ class FrameChoice:
     photometric: Photometric | None = None
     pose_only: bool = False
     most: int = REFERENCE_FRAMES
+    coarse: bool = False
 
     def __post_init__(self) -> None:
         if self.references is not None:
@@ -135,12 +137,12 @@ class DeltaEncoder:
             epoch=state.epoch,
             sequence=state.next_sequence,
             reference_digest=render.digest(),
-            reference_coarse=coarse_digest(render),
+            reference_coarse=coarse_digest(render) if choice.coarse else b"",
             reconstruction_digest=reconstruction.digest(),
             payload=payload,
             crc32=0,
             references=references,
-            needed_digest=past.digest if past is not None and is_temporal(references) else b"",
+            needed_digest=_name(past) if is_temporal(references) else b"",
             photometric=photometric,
         ).sealed()
         stage_ns = {
@@ -163,6 +165,10 @@ class DeltaEncoder:
             return without_zeros(pictures[0])
         self._splice.predict_from(*pictures)
         return self._splice.decode(payload)
+
+
+def _name(past: Past | None) -> bytes:
+    return b"" if past is None else past.digest[:NEEDED_BYTES]
 
 
 def _require_size(name: str, picture: I420, config: CodecConfig) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from rfcore.codec.coarse import COARSE_BYTES
@@ -10,9 +11,14 @@ from rfcore.codec.photometric import Photometric, check_photometric
 from rfcore.codec.references import RENDER_ONLY, References, check_references, is_temporal
 from rfcore.errors import InvalidInput
 
-__all__ = ["DIGEST_BYTES", "DeltaPacket"]
+__all__ = ["DIGEST_BYTES", "NEEDED_BYTES", "DeltaPacket"]
 
 DIGEST_BYTES = 16
+
+NEEDED_BYTES = 4
+"""Enough to tell a handful of kept frames apart; two of the same name end in the reconstruction's
+digest, not in a wrong picture."""
+
 _UINT32, _UINT64 = 1 << 32, 1 << 64
 
 
@@ -24,10 +30,12 @@ class DeltaPacket:
     ``payload`` is one NAL unit without start code; empty, the frame is its only reference as it is.
     ``reference_digest`` and ``reference_coarse`` are of the sender's render (whatever the frame is
     predicted from: they say that pose and field are the same), ``reconstruction_digest`` is of what
-    the receiver must get (``I420.digest``). ``needed_digest`` names the earlier frame that
-    ``references`` call for, and is empty when they call for none; ``photometric`` changes the
-    render before it is used. ``crc32`` covers all other fields (``expected_crc32``): a damaged
-    sequence number would otherwise make every later packet look stale.
+    the receiver must get (``I420.digest``). ``reference_coarse`` is empty between exact renderers,
+    where no difference is small enough. ``needed_digest`` names the earlier frame that
+    ``references`` call for by the first bytes of its digest (4 as we write it, up to all 16), and
+    is empty when they call for none; ``photometric`` changes the render before it is used.
+    ``crc32`` covers all other fields (``expected_crc32``): a damaged sequence number would
+    otherwise make every later packet look stale.
     """
 
     epoch: int
@@ -46,22 +54,16 @@ class DeltaPacket:
             value = getattr(self, name)
             if not 0 <= value < limit:
                 raise InvalidInput(f"packet.{name}", f"{value} is outside 0..{limit - 1}")
-        for name, length in (
-            ("reference_digest", DIGEST_BYTES),
-            ("reference_coarse", COARSE_BYTES),
-            ("reconstruction_digest", DIGEST_BYTES),
-        ):
-            got = len(getattr(self, name))
-            if got != length:
-                raise InvalidInput(f"packet.{name}", f"{got} bytes where {length} are expected")
         check_references(self.references)
         check_photometric(self.photometric)
-        needed = DIGEST_BYTES if is_temporal(self.references) else 0
-        if len(self.needed_digest) != needed:
-            raise InvalidInput(
-                "packet.needed_digest",
-                f"{len(self.needed_digest)} bytes where {needed} are expected",
-            )
+        needed = range(NEEDED_BYTES, DIGEST_BYTES + 1) if is_temporal(self.references) else (0,)
+        for name, lengths in (
+            ("reference_digest", (DIGEST_BYTES,)),
+            ("reference_coarse", (0, COARSE_BYTES)),
+            ("reconstruction_digest", (DIGEST_BYTES,)),
+            ("needed_digest", needed),
+        ):
+            _require_length(name, getattr(self, name), lengths)
 
     def expected_crc32(self) -> int:
         """Return zlib.crc32 of epoch and sequence (8 bytes each, big-endian), the digests in the
@@ -83,3 +85,9 @@ class DeltaPacket:
     def sealed(self) -> DeltaPacket:
         """Return the packet with the CRC its other fields call for."""
         return replace(self, crc32=self.expected_crc32())
+
+
+def _require_length(name: str, value: bytes, lengths: Sequence[int]) -> None:
+    if len(value) not in lengths:
+        expected = " or ".join(str(length) for length in sorted({lengths[0], lengths[-1]}))
+        raise InvalidInput(f"packet.{name}", f"{len(value)} bytes where {expected} are expected")

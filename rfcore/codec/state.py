@@ -1,10 +1,10 @@
 """What each end remembers between frames: sequence numbers, and frames to predict from.
 
 A frame's state is named by the digest of its picture. A packet that predicts from an earlier frame
-says which (``DeltaPacket.needed_digest``), and its own ``reconstruction_digest`` names the state it
-makes. The sender predicts from one frame at a time, and which one is the caller's choice: the last
-sent, or, after a loss, the last that is known to have been decoded. The receiver keeps the last
-few, so that rolling back needs no new start.
+says which (``DeltaPacket.needed_digest``, the first bytes of the name), and its own
+``reconstruction_digest`` names the state it makes. The sender predicts from one frame at a time,
+and which one is the caller's choice: the last sent, or, after a loss, the last that is known to
+have been decoded. The receiver keeps the last few, so that rolling back needs no new start.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ class DecoderState:
         _require_counts(self.epoch, self.next_sequence)
 
     def past(self, digest: bytes) -> Past | None:
-        """Return the kept frame of that digest, if there is one."""
-        return next((past for past in self.kept if past.digest == digest), None)
+        """Return the newest kept frame whose digest begins with ``digest``, if there is one."""
+        return next((past for past in self.kept if past.digest.startswith(digest)), None)
 
     def after(self, sequence: int, past: Past) -> DecoderState:
         """Return the state once the packet ``sequence`` has become ``past``."""

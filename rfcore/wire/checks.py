@@ -16,6 +16,7 @@ __all__ = [
     "MAX_FIELDS",
     "MAX_PAYLOAD_BYTES",
     "MAX_TRANSLATION_M",
+    "check_absent_or",
     "check_bytes",
     "check_field_id",
     "check_name",
@@ -72,6 +73,13 @@ def check_bytes(field: str, value: bytes, shortest: int, longest: int) -> bytes:
     if not shortest <= len(value) <= longest:
         limit = f"{shortest}" if shortest == longest else f"{shortest}..{longest}"
         raise InvalidInput(field, f"{len(value)} bytes, expected {limit}")
+    return value
+
+
+def check_absent_or(field: str, value: bytes, length: int) -> bytes:
+    """Return ``value`` if it is ``length`` bytes long, or empty because it was left out."""
+    if len(value) not in (0, length):
+        raise InvalidInput(field, f"{len(value)} bytes, expected 0 or {length}")
     return value
 
 

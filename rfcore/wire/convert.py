@@ -7,6 +7,8 @@ one that spoils a single frame raises ``FrameRefused``, which also says which fr
 
 from __future__ import annotations
 
+from array import array
+
 from google.protobuf.message import DecodeError
 
 from rfcore.camera import Intrinsics, Pose
@@ -18,6 +20,7 @@ from rfcore.wire.checks import (
     MAX_FIELDS,
     MAX_PAYLOAD_BYTES,
     MAX_TRANSLATION_M,
+    check_absent_or,
     check_bytes,
     check_field_id,
     check_name,
@@ -155,27 +158,27 @@ def _frame_or_refusal(frame: pb.Frame) -> Frame:
 
 def _frame_from_wire(frame: pb.Frame) -> Frame:
     check_range("frame.capture_time_ns", frame.capture_time_ns, 0, 2**63 - 1)
-    prefix = check_bytes(
-        "frame.field_id_prefix",
-        frame.field_id_prefix,
-        FIELD_ID_PREFIX_BYTES,
-        FIELD_ID_PREFIX_BYTES,
-    )
     return Frame(
         check_name("frame.camera_id", frame.camera_id),
         frame.capture_time_ns,
-        _pose_from_wire(frame.pose),
-        prefix,
+        _pose_from_wire(frame),
+        check_absent_or("frame.field_id_prefix", frame.field_id_prefix, FIELD_ID_PREFIX_BYTES),
         _packet_from_wire(frame),
     )
 
 
-def _pose_from_wire(pose: pb.Pose) -> Pose:
+def _pose_from_wire(frame: pb.Frame) -> Pose:
     """Return a checked pose; ``Pose`` itself refuses what is not finite or not a rotation."""
-    checked = Pose(
-        (pose.x_m, pose.y_m, pose.z_m),
-        (pose.rotation_w, pose.rotation_x, pose.rotation_y, pose.rotation_z),
-    )
+    if frame.HasField("pose"):
+        check_range("frame.pose_f32", len(frame.pose_f32), 0, 0)
+        p = frame.pose
+        numbers = [p.x_m, p.y_m, p.z_m, p.rotation_w, p.rotation_x, p.rotation_y, p.rotation_z]
+    else:
+        check_range("frame.pose_f32", len(frame.pose_f32), 7, 7)
+        numbers = list(frame.pose_f32)
+    x_m, y_m, z_m, *turn = numbers
+    w, x, y, z = turn
+    checked = Pose((x_m, y_m, z_m), (w, x, y, z))
     for axis, value in zip("xyz", checked.translation_m, strict=True):
         check_range(f"pose.{axis}_m", value, -MAX_TRANSLATION_M, MAX_TRANSLATION_M)
     return checked
@@ -187,7 +190,7 @@ def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
         epoch=frame.epoch,
         sequence=frame.sequence,
         reference_digest=check_bytes("frame.reference_digest", frame.reference_digest, 16, 16),
-        reference_coarse=check_bytes("frame.reference_coarse", frame.reference_coarse, 64, 64),
+        reference_coarse=check_absent_or("frame.reference_coarse", frame.reference_coarse, 64),
         reconstruction_digest=check_bytes(
             "frame.reconstruction_digest", frame.reconstruction_digest, 16, 16
         ),
@@ -207,17 +210,12 @@ def _references_from_wire(frame: pb.Frame) -> References:
 
 
 def _frame_to_wire(frame: Frame) -> pb.Frame:
-    packet, pose = frame.packet, frame.pose
-    x_m, y_m, z_m = pose.translation_m
-    w, x, y, z = pose.rotation
-    return pb.Frame(
+    packet = frame.packet
+    message = pb.Frame(
         camera_id=frame.camera_id,
         epoch=packet.epoch,
         sequence=packet.sequence,
         capture_time_ns=frame.capture_time_ns,
-        pose=pb.Pose(
-            x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
-        ),
         field_id_prefix=frame.field_id_prefix,
         references=[pb.Reference.Value(f"REFERENCE_{r.name}") for r in packet.references],
         reference_digest=packet.reference_digest,
@@ -227,4 +225,18 @@ def _frame_to_wire(frame: Frame) -> pb.Frame:
         crc32=packet.crc32,
         needed_digest=packet.needed_digest,
         photometric=packet.photometric,
+    )
+    _add_pose(message, frame.pose)
+    return message
+
+
+def _add_pose(message: pb.Frame, pose: Pose) -> None:
+    """Put the pose in, in 4 bytes a number if that keeps every bit."""
+    numbers = (*pose.translation_m, *pose.rotation)
+    if tuple(array("f", numbers)) == numbers:
+        message.pose_f32.extend(numbers)
+        return
+    x_m, y_m, z_m, w, x, y, z = numbers
+    message.pose.CopyFrom(
+        pb.Pose(x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z)
     )

@@ -67,7 +67,8 @@ class Hello:
 
 @dataclass(frozen=True)
 class Frame:
-    """One coded picture: ``pose`` is world_from_cam, tile-relative."""
+    """One coded picture: ``pose`` is world_from_cam, tile-relative; short on the wire when it is
+    ``Pose.rounded``. An empty ``field_id_prefix`` means the first field of Hello."""
 
     camera_id: str
     capture_time_ns: int

@@ -21,6 +21,7 @@ import numpy as np
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec import (
     INTRA,
+    NEEDED_BYTES,
     CodecConfig,
     DecoderState,
     DeltaDecoder,
@@ -195,7 +196,7 @@ def exchange_references(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     count = int(rng.integers(4))
     order = [Reference(int(n)) for n in rng.permutation(4)[:count] + 1]
     needs = any(reference is not Reference.RENDER for reference in order)
-    needed = (packet.needed_digest or rng.bytes(16)) if needs else b""
+    needed = (packet.needed_digest or rng.bytes(NEEDED_BYTES)) if needs else b""
     return replace(packet, references=tuple(order), needed_digest=needed)
 
 

@@ -31,7 +31,7 @@ __all__ = ["FieldCoder", "SeenClip", "see_clip"]
 
 CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0, 38.0)
 MESSAGE_CAMERA = "front"
-FIELD_PREFIX_BYTES = 8
+MESSAGE_TIME_NS = 1_700_000_000_000_000_000
 
 
 @dataclass(frozen=True)
@@ -134,6 +134,7 @@ class FieldCoder:
         return pictures
 
     def _message_bytes(self, index: int, made: Encoded) -> int:
-        pose = self._seen.cameras[index].world_from_cam
-        field_id = bytes.fromhex(self._seen.field_id)[:FIELD_PREFIX_BYTES]
-        return len(client_message_to_bytes(Frame(MESSAGE_CAMERA, 0, pose, field_id, made.packet)))
+        # A vehicle renders at the rounded pose, 4e-5 px away, and stamps the frame with the time.
+        pose = self._seen.cameras[index].world_from_cam.rounded()
+        message = Frame(MESSAGE_CAMERA, MESSAGE_TIME_NS, pose, b"", made.packet)
+        return len(client_message_to_bytes(message))

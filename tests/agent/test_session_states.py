@@ -136,4 +136,4 @@ def test_between_inexact_renderers_no_frame_has_a_base(
     sender = Sender(session, make_capture, encode)
     sender.acked(sender.send())
     sender.send()
-    assert [job.base for job in sender.jobs] == [None, None]
+    assert [(job.base, job.exact) for job in sender.jobs] == [(None, False)] * 2

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, Encoded
+from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, Encoded, FrameChoice
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
 
@@ -23,7 +23,7 @@ def encoder() -> DeltaEncoder:
 @pytest.fixture(scope="module")
 def sent(encoder: DeltaEncoder, pair: PairMaker) -> Encoded:
     state = replace(encoder.start(5), next_sequence=10)
-    return encoder.encode(state, *pair(*SIZE_PX))
+    return encoder.encode(state, *pair(*SIZE_PX), choice=FrameChoice(coarse=True))
 
 
 def perturbed(picture: I420, seed: int = 0) -> I420:
@@ -130,6 +130,24 @@ def test_an_exact_receiver_refuses_rounding_and_says_what_it_is(
     assert caught.value.reason == RejectReason.REFERENCE_MISMATCH
 
 
+@pytest.mark.parametrize(
+    ("exact", "named"),
+    [(True, "another pose, field or camera"), (False, "the sender must send them")],
+)
+def test_without_block_means_any_difference_of_the_renders_is_refused(
+    encoder: DeltaEncoder, pair: PairMaker, exact: bool, named: str
+) -> None:
+    frame, render = pair(*SIZE_PX)
+    sent = encoder.encode(encoder.start(0), frame, render)
+    assert sent.packet.reference_coarse == b""
+    decoder = DeltaDecoder(encoder.header, exact=exact)
+    with pytest.raises(PacketRejected, match=f"no block means to say by how much: .*{named}") as no:
+        decoder.decode(decoder.start(0), sent.packet, perturbed(render))
+    assert no.value.reason == RejectReason.REFERENCE_MISMATCH
+    shown = decoder.decode(decoder.start(0), sent.packet, render)
+    assert shown.frame.digest() == sent.reconstruction.digest()
+
+
 @pytest.mark.parametrize("exact", [False, True])
 @pytest.mark.parametrize("wrong", ["4 px off", "16 px off", "black", "noise"])
 def test_a_render_of_another_pose_or_field_is_refused(
@@ -183,7 +201,7 @@ def test_pictures_of_another_size_are_the_callers_mistake(
         ({"sequence": 1 << 64}, "packet.sequence"),
         ({"crc32": 1 << 32}, "packet.crc32"),
         ({"reference_digest": b"short"}, "packet.reference_digest: 5 bytes where 16"),
-        ({"reference_coarse": b""}, "packet.reference_coarse: 0 bytes where 64"),
+        ({"reference_coarse": b"c"}, "packet.reference_coarse: 1 bytes where 0 or 64"),
         ({"reconstruction_digest": bytes(17)}, "packet.reconstruction_digest: 17 bytes"),
     ],
 )

@@ -1,12 +1,13 @@
 """Packets of every kind, coded once and for all, decode to the digests they carry.
 
-``tests/data/delta_packets.npz`` holds them as they go over the wire, with renders and depth: a
+``tests/data/delta_packets*.npz`` hold them as they go over the wire, with renders and depth: a
 receiver of today understands a sender of the day they were made. See make_delta_packets.py there.
 """
 
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from rfcore.codec import DeltaDecoder, Reference
 from rfcore.image import I420
@@ -14,12 +15,13 @@ from rfcore.native.warp import PosedDepth
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.messages import Frame, Hello
 
-GOLDEN = Path(__file__).parents[1] / "data" / "delta_packets.npz"
+DATA = Path(__file__).parents[1] / "data"
 FRAMES = 7
 
 
-def test_golden_packets_decode_to_their_digests() -> None:
-    with np.load(GOLDEN, allow_pickle=False) as stored:
+@pytest.mark.parametrize("name", ["delta_packets.npz", "delta_packets_long.npz"])
+def test_golden_packets_decode_to_their_digests(name: str) -> None:
+    with np.load(DATA / name, allow_pickle=False) as stored:
         arrays = dict(stored)
     hello = client_message_from_bytes(arrays["hello"].tobytes())
     assert isinstance(hello, Hello)

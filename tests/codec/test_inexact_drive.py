@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfcore.codec import RENDER_ONLY, CodecConfig, DeltaDecoder, DeltaEncoder
+from rfcore.codec import RENDER_ONLY, CodecConfig, DeltaDecoder, DeltaEncoder, FrameChoice
 from rfcore.image import I420
 
 PairMaker = Callable[..., tuple[I420, I420]]
 SIZE_PX = (96, 64)
 FRAMES = 300
+WITH_COARSE = FrameChoice(coarse=True)
 
 
 def perturbed(picture: I420, rng: np.random.Generator) -> I420:
@@ -39,7 +40,7 @@ def test_over_300_frames_the_error_does_not_grow_and_is_visible(pair: PairMaker)
     errors = []
     for index in range(FRAMES):
         frame, render = pair(*SIZE_PX, 0.5 * index)
-        sent = encoder.encode(replace(sending, past=None), frame, render)
+        sent = encoder.encode(replace(sending, past=None), frame, render, choice=WITH_COARSE)
         assert sent.packet.references == RENDER_ONLY
         got = decoder.decode(receiving, sent.packet, perturbed(render, rng))
         assert not got.exact

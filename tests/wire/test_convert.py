@@ -41,12 +41,6 @@ def test_a_frame_survives_the_wire(frame: Frame) -> None:
     assert client_message_from_bytes(client_message_to_bytes(frame)) == frame
 
 
-@pytest.mark.parametrize("field", ["reference_digest", "reconstruction_digest", "payload"])
-def test_a_frame_costs_little_more_than_its_parts(frame: Frame, field: str) -> None:
-    assert getattr(frame.packet, field) in client_message_to_bytes(frame)
-    assert len(client_message_to_bytes(frame)) - len(frame.packet.payload) < 220
-
-
 ADDRESS = FrameAddress("front", 2, 7)
 
 
@@ -76,14 +70,18 @@ Change = Callable[[pb.StreamRequest], object]
         (lambda m: setattr(m.frame.pose, "y_m", math.inf), "pose.translation_m"),
         (lambda m: setattr(m.frame.pose, "z_m", 2e6), r"pose.z_m: 2000000.0 is outside"),
         (lambda m: setattr(m.frame.pose, "rotation_w", 0.9), "pose.rotation: quaternion of norm"),
-        (lambda m: m.frame.ClearField("pose"), "pose.rotation: quaternion of norm 0"),
+        (lambda m: m.frame.ClearField("pose"), "frame.pose_f32: 0 is outside 7..7"),
+        (lambda m: m.frame.pose_f32.extend([0.0] * 7), "frame.pose_f32: 7 is outside 0..0"),
         (lambda m: setattr(m.frame, "camera_id", "../etc"), "frame.camera_id: '../etc'"),
         (lambda m: setattr(m.frame, "camera_id", "a" * 65), "frame.camera_id"),
         (lambda m: setattr(m.frame, "payload", b"x" * 1_000_001), "frame.payload: 1000001 bytes"),
         (lambda m: setattr(m.frame, "reference_digest", b"x"), "frame.reference_digest: 1 bytes"),
-        (lambda m: setattr(m.frame, "reference_coarse", b"x"), "frame.reference_coarse"),
+        (lambda m: setattr(m.frame, "reference_coarse", b"x"), "frame.reference_coarse: 1 bytes"),
         (lambda m: setattr(m.frame, "reconstruction_digest", b""), "frame.reconstruction_digest"),
-        (lambda m: setattr(m.frame, "field_id_prefix", b"x"), "frame.field_id_prefix: 1 bytes"),
+        (
+            lambda m: setattr(m.frame, "field_id_prefix", b"x"),
+            "frame.field_id_prefix: 1 bytes, expected 0 or 8",
+        ),
         (lambda m: m.frame.references.append(77), "frame.references: 77"),
         (lambda m: setattr(m.frame, "sequence", 2**63), "frame.sequence"),
         (lambda m: setattr(m.frame, "capture_time_ns", 2**64 - 1), "frame.capture_time_ns"),

@@ -374,25 +374,33 @@ class Frame(_message.Message):
     CRC32_FIELD_NUMBER: _builtins.int
     NEEDED_DIGEST_FIELD_NUMBER: _builtins.int
     PHOTOMETRIC_FIELD_NUMBER: _builtins.int
+    POSE_F32_FIELD_NUMBER: _builtins.int
     camera_id: _builtins.str
     epoch: _builtins.int
     """A new epoch starts the state of both ends afresh; sequences count from 0 in it."""
     sequence: _builtins.int
     capture_time_ns: _builtins.int
     field_id_prefix: _builtins.bytes
-    """First 8 bytes of the sha256 of the field; the whole id is in Hello."""
+    """First 8 bytes of the sha256 of the field; the whole id is in Hello. Empty: its first field."""
     reference_digest: _builtins.bytes
-    """BLAKE2b-128 of the render at the frame's pose, and its 8x8 block means."""
+    """BLAKE2b-128 of the render at the frame's pose."""
     reference_coarse: _builtins.bytes
+    """Its 8x8 block means, by which a receiver tells rounding from a wrong pose or field; empty
+    between exact renderers, where every difference is refused.
+    """
     reconstruction_digest: _builtins.bytes
     """BLAKE2b-128 of the picture that the receiver must end up with."""
     payload: _builtins.bytes
     crc32: _builtins.int
     """CRC-32 (zlib) of everything above that the codec relies on; see rfcore.codec.packet."""
     needed_digest: _builtins.bytes
-    """The reconstruction_digest of the earlier frame that the references call for; else empty."""
+    """The first 4 to 16 bytes of the reconstruction_digest of the earlier frame that the references
+    call for; else empty.
+    """
     @_builtins.property
-    def pose(self) -> Global___Pose: ...
+    def pose(self) -> Global___Pose:
+        """Either: the pose in float64. Or, in less than half the bytes, pose_f32."""
+
     @_builtins.property
     def references(self) -> _containers.RepeatedScalarFieldContainer[Global___Reference.ValueType]:
         """In the order they are fed to the decoder: the last one is reference 0. Without any, the slice is
@@ -404,6 +412,10 @@ class Frame(_message.Message):
         """What the render's colours are changed by before it is a reference: nothing, or the 12 numbers
         of a matrix from Y, Cb, Cr, 1 to Y, Cb, Cr (rfcore.codec.photometric).
         """
+
+    @_builtins.property
+    def pose_f32(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """x, y, z in metres, rotation w, x, y, z, as in Pose, when float32 holds them exactly."""
 
     def __init__(
         self,
@@ -422,10 +434,11 @@ class Frame(_message.Message):
         crc32: _builtins.int = ...,
         needed_digest: _builtins.bytes = ...,
         photometric: _abc.Iterable[_builtins.int] | None = ...,
+        pose_f32: _abc.Iterable[_builtins.float] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["pose", b"pose"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "needed_digest", b"needed_digest", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "reconstruction_digest", b"reconstruction_digest", "reference_coarse", b"reference_coarse", "reference_digest", b"reference_digest", "references", b"references", "sequence", b"sequence"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "needed_digest", b"needed_digest", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "reconstruction_digest", b"reconstruction_digest", "reference_coarse", b"reference_coarse", "reference_digest", b"reference_digest", "references", b"references", "sequence", b"sequence"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
