@@ -33,6 +33,13 @@ def truncated(frame: Frame) -> Frame:
 def changed(frame: Frame, **fields: float) -> bytes:
     """Return the frame's bytes with numbers of its pose replaced, unchecked."""
     request = pb.StreamRequest.FromString(client_message_to_bytes(frame))
+    x_m, y_m, z_m = frame.pose.translation_m
+    w, x, y, z = frame.pose.rotation
+    pose = pb.Pose(
+        x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
+    )
+    request.frame.ClearField("pose_f32")
+    request.frame.pose.CopyFrom(pose)
     for name, value in fields.items():
         setattr(request.frame.pose, name, value)
     return request.SerializeToString()
