@@ -45,10 +45,11 @@ class EncodeJob:
 @dataclass(frozen=True)
 class EncodedFrame:
     """A coded picture; ``stage_s`` has read, convert, render, references, encode and
-    closed_loop."""
+    closed_loop; ``tries`` is how often it was coded, to fit the payload's limit."""
 
     packet: DeltaPacket
     stage_s: Mapping[str, float]
+    tries: int = 1
 
 
 class Outcome(StrEnum):
@@ -79,3 +80,4 @@ class FrameResult:
     server_digest: bytes = b""
     latency_s: float | None = None
     link_s: float | None = None
+    tries: int = 1

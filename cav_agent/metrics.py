@@ -40,6 +40,10 @@ class AgentMetrics:
             "Bytes of P slices sent, by the reference pictures they predict from.",
             ("references",),
         )
+        self._recoded = make.counter(
+            "rfedge_agent_recoded_frames",
+            "Frames coded again at a higher CRF because their P slice was above the limit.",
+        )
         self._stages = make.seconds(
             "rfedge_agent_stage_seconds",
             "Time of a frame by stage; link is from sending to Ack without the server's own time.",
@@ -80,6 +84,8 @@ class AgentMetrics:
             references = references_name(result.packet.references)
             self._payload.labels(references).inc(len(result.packet.payload))
             self._sent.inc(result.packet_bytes)
+        if result.tries > 1:
+            self._recoded.inc()
         for stage, spent_s in result.stage_s.items():
             self._stages.labels(stage).observe(spent_s)
         if result.server is not None and result.link_s is not None and result.latency_s is not None:

@@ -27,6 +27,7 @@ from rfcore.image import Rgb
 from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
 from rfcore.views import PosedPicture, View
+from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 
 __all__ = ["Pipeline", "Renderer"]
 
@@ -41,12 +42,22 @@ class Renderer(Protocol):
 
 
 class Pipeline:
-    """Codes the pictures of one camera against renders of one field; one caller at a time."""
+    """Codes the pictures of one camera against renders of one field; one caller at a time.
 
-    def __init__(self, renderer: Renderer, config: CodecConfig, clock_ns: ClockNs) -> None:
+    A slice above ``limit_bytes`` is coded again at a higher CRF, as long as there is one.
+    """
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        config: CodecConfig,
+        clock_ns: ClockNs,
+        limit_bytes: int = MAX_PAYLOAD_BYTES,
+    ) -> None:
         self._renderer = renderer
         self._config = config
         self._clock_ns = clock_ns
+        self._limit_bytes = limit_bytes
         self._encoder = DeltaEncoder(config, clock_ns)
         self._state: EncoderState | None = None
         self._pasts: dict[tuple[int, int] | None, Past] = {}
@@ -72,7 +83,7 @@ class Pipeline:
         render = i420_from_colour(view.colour)
         rendered_ns = self._clock_ns()
         seen = PosedDepth(camera, view.depth)
-        choice = FrameChoice(coarse=not job.exact)
+        choice = FrameChoice(coarse=not job.exact, limit_bytes=self._limit_bytes)
         encoded = self._encoder.encode(self._state_for(job), frame, render, seen, choice)
         self._remember(encoded)
         return EncodedFrame(
@@ -83,6 +94,7 @@ class Pipeline:
                 "render": (rendered_ns - converted_ns) / 1e9,
                 **{stage: ns / 1e9 for stage, ns in encoded.stage_ns.items()},
             },
+            encoded.tries,
         )
 
     def _state_for(self, job: EncodeJob) -> EncoderState:

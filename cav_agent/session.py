@@ -201,10 +201,14 @@ class AgentSession:
             packet=encoded.packet,
             packet_bytes=len(client_message_to_bytes(frame)),
             stage_s=encoded.stage_s,
+            tries=encoded.tries,
         )
         self._pending[frame.address] = Pending(result, now, job.base)
         if len(encoded.packet.payload) > MAX_PAYLOAD_BYTES:
-            problem = f"{len(encoded.packet.payload)} bytes of payload exceed {MAX_PAYLOAD_BYTES}"
+            problem = (
+                f"{len(encoded.packet.payload)} bytes of payload exceed {MAX_PAYLOAD_BYTES} "
+                "even at the highest CRF"
+            )
             self._finish(frame.address, Outcome.DROPPED, f"oversize: {problem}", now)
             self._start_epoch()
         elif job.connection != self._connection or self.state is not LinkState.STREAMING:

@@ -168,8 +168,19 @@ def _posed_for_the_wire(picture: PosedPicture) -> PosedPicture:
 
 
 def _log_failure(session_id: str, result: FrameResult) -> None:
-    """Say which frame was sent in vain; one dropped before it was encoded is only counted."""
-    if result.packet is None or result.outcome is Outcome.ACKED:
+    """Say which frame was coded in vain, or worse than asked for to fit the limit; one dropped
+    before it was encoded is only counted."""
+    if result.packet is None:
+        return
+    if result.tries > 1:
+        log.warning(
+            "slice above the limit coded again",
+            session=session_id,
+            seq=result.packet.sequence,
+            tries=result.tries,
+            payload_bytes=len(result.packet.payload),
+        )
+    if result.outcome is Outcome.ACKED:
         return
     log.warning(
         f"frame {result.outcome}",

@@ -9,13 +9,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rfcore.camera import Camera
-from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder
+from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, Encoded, FrameChoice
 from rfcore.dataset import Dataset
-from rfcore.errors import DatasetError, InvalidData
+from rfcore.errors import CodecError, DatasetError, InvalidData
 from rfcore.field import RadianceField
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
+from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.drive_file import CodedDrive
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
@@ -25,6 +26,7 @@ __all__ = ["CodingSettings", "DecodedFrame", "decode_drive", "encode_drive"]
 OFFLINE_VEHICLE = "offline"
 CAMERA_ID = "front"
 RENDERER = RendererContract(RENDERER_CONTRACT, exact=True)
+FITTING = FrameChoice(limit_bytes=MAX_PAYLOAD_BYTES)
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,8 @@ class DecodedFrame:
 def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSettings) -> CodedDrive:
     """Code every picture of a drive against the field's render at its pose.
 
-    Raises ``DatasetError`` if the pictures are not all of one camera.
+    Raises ``DatasetError`` if the pictures are not all of one camera, ``CodecError`` for a picture
+    whose slice is too long for a message at every CRF.
     """
     intrinsics = dataset.pictures[0].camera.intrinsics
     config = CodecConfig(intrinsics.width_px, intrinsics.height_px, settings.preset, settings.crf)
@@ -58,7 +61,9 @@ def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSetting
             raise DatasetError(f"{picture.name}: its camera differs from the first picture's")
         frame = i420_from_rgb(picture.read())
         pose = picture.camera.world_from_cam.rounded()
-        encoded = encoder.encode(state, frame, *rendered(field, Camera(intrinsics, pose)))
+        seen = rendered(field, Camera(intrinsics, pose))
+        encoded = encoder.encode(state, frame, *seen, FITTING)
+        _require_fit(picture.name, encoded)
         state = encoded.state
         frames.append(
             Frame(
@@ -71,6 +76,15 @@ def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSetting
         )
     camera = CameraDescription(CAMERA_ID, intrinsics, encoder.header)
     return CodedDrive(Hello(OFFLINE_VEHICLE, (camera,), (field.field_id,), RENDERER), tuple(frames))
+
+
+def _require_fit(name: str, encoded: Encoded) -> None:
+    size_bytes = len(encoded.packet.payload)
+    if size_bytes > MAX_PAYLOAD_BYTES:
+        raise CodecError(
+            f"{name}: {size_bytes} bytes of P slice at the highest CRF, the limit is "
+            f"{MAX_PAYLOAD_BYTES}; scale the pictures down"
+        )
 
 
 def decode_drive(drive: CodedDrive, field: RadianceField) -> Iterator[DecodedFrame]:

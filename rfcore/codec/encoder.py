@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from rfcore.codec.choice import choose_photometric, choose_references
 from rfcore.codec.coarse import coarse_digest
 from rfcore.codec.config import CRF_RANGE, REFERENCE_FRAMES, CodecConfig
+from rfcore.codec.fit import FittedSlice, code_to_fit
 from rfcore.codec.header import StreamHeader
 from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
 from rfcore.codec.photometric import Photometric, adapt
@@ -44,6 +45,8 @@ class FrameChoice:
     replaces the configured one. ``photometric``: see there; ``None`` leaves it to the encoder.
     ``pose_only``: send no slice; the frame is its only reference. ``coarse``: add the block means
     of the render, by which a receiver whose renderer is not exact tells rounding from a wrong pose.
+    ``limit_bytes``: a longer slice is coded again at higher CRFs (``rfcore.codec.fit``); one that
+    is too long even at the highest is returned all the same.
     """
 
     references: References | None = None
@@ -52,12 +55,15 @@ class FrameChoice:
     pose_only: bool = False
     most: int = REFERENCE_FRAMES
     coarse: bool = False
+    limit_bytes: int | None = None
 
     def __post_init__(self) -> None:
         if self.references is not None:
             check_references(self.references)
         if self.crf is not None and not CRF_RANGE[0] <= self.crf <= CRF_RANGE[1]:
             raise InvalidInput("crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}")
+        if self.limit_bytes is not None and self.limit_bytes < 1:
+            raise InvalidInput("limit_bytes", f"{self.limit_bytes} must be at least 1")
         if not 1 <= self.most <= REFERENCE_FRAMES:
             raise InvalidInput("most", f"{self.most} references are outside 1..{REFERENCE_FRAMES}")
         if self.pose_only and (self.references is None or len(self.references) != 1):
@@ -72,13 +78,14 @@ class Encoded:
     """A packet, what the receiver will see, and the sender's next state.
 
     ``stage_ns`` has "references" (warp, choice), "encode" (x264) and "closed_loop" (decoding as the
-    receiver does, digests).
+    receiver does, digests). ``tries``: how often the frame was coded to fit a limit.
     """
 
     packet: DeltaPacket
     reconstruction: I420
     state: EncoderState
     stage_ns: Mapping[str, int]
+    tries: int = 1
 
 
 class DeltaEncoder:
@@ -129,9 +136,9 @@ class DeltaEncoder:
             references = choose_references(frame, prediction, crf, choice.most)
         pictures = prediction.pictures(references)
         chosen_ns = self._clock_ns()
-        payload = b"" if choice.pose_only else self._slice(pictures, frame, crf)
+        made = self._fitted(pictures, frame, crf, choice)
         encoded_ns = self._clock_ns()
-        reconstruction = self._reconstruct(pictures, payload)
+        reconstruction = self._reconstruct(pictures, made.payload)
         past = state.past
         packet = DeltaPacket(
             epoch=state.epoch,
@@ -139,7 +146,7 @@ class DeltaEncoder:
             reference_digest=render.digest(),
             reference_coarse=coarse_digest(render) if choice.coarse else b"",
             reconstruction_digest=reconstruction.digest(),
-            payload=payload,
+            payload=made.payload,
             crc32=0,
             references=references,
             needed_digest=_name(past) if is_temporal(references) else b"",
@@ -150,9 +157,20 @@ class DeltaEncoder:
             "encode": encoded_ns - chosen_ns,
             "closed_loop": self._clock_ns() - encoded_ns,
         }
-        made = Past(reconstruction, seen, prediction.render)
-        following = EncoderState(state.epoch, state.next_sequence + 1, made)
-        return Encoded(packet, reconstruction, following, stage_ns)
+        shown = Past(reconstruction, seen, prediction.render)
+        following = EncoderState(state.epoch, state.next_sequence + 1, shown)
+        return Encoded(packet, reconstruction, following, stage_ns, made.tries)
+
+    def _fitted(
+        self, pictures: tuple[I420, ...], frame: I420, crf: float, choice: FrameChoice
+    ) -> FittedSlice:
+        if choice.pose_only:
+            return FittedSlice(b"", crf, 1)
+        if choice.limit_bytes is None:
+            return FittedSlice(self._slice(pictures, frame, crf), crf, 1)
+        return code_to_fit(
+            lambda higher: self._slice(pictures, frame, higher), crf, choice.limit_bytes
+        )
 
     def _slice(self, pictures: tuple[I420, ...], frame: I420, crf: float) -> bytes:
         coded = encode_slice(self._config, pictures, frame, crf)

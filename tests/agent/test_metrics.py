@@ -1,6 +1,7 @@
 """What a vehicle counts: ends by reason, bytes by reference, and its name only when asked."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 from prometheus_client import CollectorRegistry
@@ -77,3 +78,11 @@ def test_a_vehicle_is_named_only_when_asked(
     assert registry.get_sample_value("rfedge_agent_info", named) is None
     metrics.travelling("cav-7", "front")
     assert registry.get_sample_value("rfedge_agent_info", named) == 1
+
+
+def test_a_picture_coded_again_to_fit_is_counted(
+    metrics: AgentMetrics, registry: CollectorRegistry, acked: FrameResult
+) -> None:
+    metrics.ended(acked)
+    metrics.ended(replace(acked, tries=3))
+    assert registry.get_sample_value("rfedge_agent_recoded_frames_total") == 1

@@ -306,6 +306,7 @@ def test_a_payload_no_server_would_take_is_dropped_here(
     session.encoded(encode(job, 1_000_001), 1.0)
     assert session.messages_to_send(1.0) == []
     (result,) = session.take_results()
+    assert result.outcome is Outcome.DROPPED
     assert result.reason.startswith("oversize: 1000001 bytes")
 
 

@@ -1,0 +1,50 @@
+"""From a captured picture to a packet that a server takes, however noisy the picture."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cav_agent.frames import Capture, EncodeJob
+from cav_agent.pipeline import Pipeline
+from rfcore.camera import Camera
+from rfcore.codec import CodecConfig
+from rfcore.views import View
+
+LIMIT_BYTES = 300
+
+
+class Grey:
+    """A field that has seen nothing."""
+
+    def render(self, camera: Camera) -> View:
+        k = camera.intrinsics
+        side = (k.height_px, k.width_px)
+        flat = np.full(side, 0.5, np.float32)
+        return View(np.full((*side, 3), 0.5, np.float32), flat * 10, flat)
+
+
+@pytest.fixture
+def noisy(make_capture: Callable[..., Capture]) -> Capture:
+    capture = make_capture(0)
+    pixels = np.random.default_rng(3).integers(0, 256, (16, 32, 3), dtype=np.uint8)
+    return replace(capture, picture=replace(capture.picture, read=lambda: pixels))
+
+
+def test_a_noise_picture_is_coded_until_its_slice_is_below_the_limit(noisy: Capture) -> None:
+    config = CodecConfig(32, 16, preset="ultrafast", crf=10)
+    free = Pipeline(Grey(), config, lambda: 0).encode(EncodeJob(noisy, 0, 1))
+    made = Pipeline(Grey(), config, lambda: 0, LIMIT_BYTES).encode(EncodeJob(noisy, 0, 1))
+    assert free.tries == 1
+    assert len(free.packet.payload) > LIMIT_BYTES >= len(made.packet.payload)
+    assert made.tries > 1
+
+
+def test_block_means_are_sent_only_where_the_server_is_not_exact(noisy: Capture) -> None:
+    pipeline = Pipeline(Grey(), CodecConfig(32, 16, preset="ultrafast"), lambda: 0)
+    lengths = [
+        len(pipeline.encode(EncodeJob(noisy, 0, 1, exact=exact)).packet.reference_coarse)
+        for exact in (True, False)
+    ]
+    assert lengths == [0, 64]

@@ -1,0 +1,88 @@
+"""No slice above its limit: the machine by itself on models of a rate, and x264 on noise."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, FrameChoice
+from rfcore.codec.fit import MAX_TRIES, code_to_fit
+from rfcore.errors import InvalidInput
+from rfcore.image import I420
+
+PictureMaker = Callable[..., I420]
+SIZE_PX = (160, 96)
+
+
+def halving(first_bytes: int, crf_to_halve: float) -> Callable[[float], bytes]:
+    return lambda crf: bytes(max(1, round(first_bytes * 2 ** ((23 - crf) / crf_to_halve))))
+
+
+@given(
+    first_bytes=st.integers(1, 200_000),
+    crf_to_halve=st.floats(3, 40),
+    limit_bytes=st.integers(1, 50_000),
+    crf=st.floats(1, 51),
+)
+def test_whatever_the_rate_it_fits_if_the_highest_crf_does(
+    first_bytes: int, crf_to_halve: float, limit_bytes: int, crf: float
+) -> None:
+    code = halving(first_bytes, crf_to_halve)
+    made = code_to_fit(code, crf, limit_bytes)
+    assert made.tries <= MAX_TRIES
+    assert made.payload == code(made.crf)
+    assert crf <= made.crf <= 51
+    assert (len(made.payload) <= limit_bytes) or made.crf == 51
+    if len(code(crf)) <= limit_bytes:
+        assert (made.crf, made.tries) == (crf, 1)
+
+
+@given(first_bytes=st.integers(20_000, 200_000), crf_to_halve=st.floats(6, 20))
+def test_a_steady_rate_takes_three_codings_and_wastes_a_tenth(
+    first_bytes: int, crf_to_halve: float
+) -> None:
+    """The second step knows the slope; it aims at 0.95, and the least step, 1 CRF, may
+    take 11 % more where 6 halve."""
+    limit_bytes = first_bytes // 2
+    made = code_to_fit(halving(first_bytes, crf_to_halve), 23, limit_bytes)
+    assert made.tries <= 3
+    assert 0.94 * 2 ** (-1 / 6) < len(made.payload) / limit_bytes <= 1
+    assert made.crf <= 23 + crf_to_halve * (1 + math.log2(1 / 0.95)) + 1.01
+
+
+@pytest.mark.parametrize("share", [0.9, 0.5, 0.3])
+def test_noise_is_coded_again_until_it_fits_and_decodes(noise: PictureMaker, share: float) -> None:
+    frame, render = noise(*SIZE_PX, 1), noise(*SIZE_PX, 2)
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX))
+    free = encoder.encode(encoder.start(0), frame, render)
+    limit_bytes = int(share * len(free.packet.payload))
+    made = encoder.encode(
+        encoder.start(0), frame, render, choice=FrameChoice(limit_bytes=limit_bytes)
+    )
+    assert free.tries == 1
+    assert 1 < made.tries <= MAX_TRIES
+    assert len(made.packet.payload) <= limit_bytes
+    decoder = DeltaDecoder(encoder.header)
+    shown = decoder.decode(decoder.start(0), made.packet, render)
+    assert shown.frame.digest() == made.reconstruction.digest()
+
+
+def test_what_no_crf_makes_fit_comes_back_too_long(noise: PictureMaker) -> None:
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, preset="ultrafast"))
+    choice = FrameChoice(limit_bytes=1)
+    made = encoder.encode(encoder.start(0), noise(*SIZE_PX, 1), noise(*SIZE_PX, 2), choice=choice)
+    assert len(made.packet.payload) > 1
+    at_the_highest = encoder.encode(
+        encoder.start(0),
+        noise(*SIZE_PX, 1),
+        noise(*SIZE_PX, 2),
+        choice=FrameChoice(made.packet.references, crf=51, photometric=made.packet.photometric),
+    )
+    assert made.packet.payload == at_the_highest.packet.payload
+
+
+def test_a_limit_below_one_byte_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="limit_bytes: 0"):
+        FrameChoice(limit_bytes=0)
