@@ -15,6 +15,7 @@ from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.vehicle import Vehicle
 from rfcore.errors import RfedgeError
 from rfcore.wire.logs import LogForm, configure_logs
+from rfcore.wire.tls import TlsFiles
 
 __all__ = ["main"]
 
@@ -40,6 +41,9 @@ def run(
     metrics_per_vehicle: Flag = False,
     log: LogForm = LogForm.AUTO,
     report: Path | None = None,
+    tls_cert: Path | None = None,
+    tls_key: Path | None = None,
+    tls_ca: Path | None = None,
     allow_insecure: Flag = False,
 ) -> AgentConfig:
     """Send a drive to an edge server, as differences to a radiance field that both hold.
@@ -64,6 +68,9 @@ def run(
         metrics_per_vehicle: Show the name of the vehicle in the metrics.
         log: console lines, json lines, or auto: console on a terminal.
         report: File for one JSON line per picture.
+        tls_cert: Certificate of this vehicle (PEM); it names --vehicle.
+        tls_key: Its private key.
+        tls_ca: Certificate of the authority that vouches for the server.
         allow_insecure: Send plaintext to another machine.
     """
     return AgentConfig(
@@ -85,6 +92,7 @@ def run(
         metrics_per_vehicle=metrics_per_vehicle,
         log=log,
         report=report,
+        tls=TlsFiles.of(tls_cert, tls_key, tls_ca),
         allow_insecure=allow_insecure,
     )
 

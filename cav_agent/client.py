@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -55,6 +55,7 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.02, 1.0
 class Equipment:
     """What the agent works with: a drive, a way to encode, and who wants to know.
 
+    ``reached`` waits so many seconds for the server (None: for ever) or raises ``TimeoutError``.
     ``ended`` is told of every picture's end, ``connected`` when the server welcomed us or was lost.
     """
 
@@ -62,6 +63,7 @@ class Equipment:
     pace: Pace
     encode: Callable[[EncodeJob], EncodedFrame]
     executor: Executor
+    reached: Callable[[float | None], Awaitable[None]]
     ended: Callable[[FrameResult], None]
     connected: Callable[[bool], None]
 
@@ -194,8 +196,7 @@ class Agent:
         limit_s = self._limits.give_up_s
         left_s = self._streaming_at_s + limit_s - time.monotonic() if limit_s else None
         try:
-            async with asyncio.timeout(left_s):
-                await self._channel.channel_ready()
+            await self._equipment.reached(left_s)
         except TimeoutError as error:
             raise RfedgeError(f"no server welcomed this vehicle within {limit_s:g} s") from error
 

@@ -10,6 +10,7 @@ from rfcore.codec.config import CRF_RANGE, PRESETS
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import check_field_id, check_name
 from rfcore.wire.logs import LogForm
+from rfcore.wire.tls import TlsFiles
 
 __all__ = ["AgentConfig", "AgentLimits", "PaceKind"]
 
@@ -53,7 +54,7 @@ class AgentConfig:
     ``drive``: a dataset in time order. ``fields``: directory of field archives; one the server has
     and it lacks is fetched into it. ``field``: which one; the server's only one when not given.
     ``report``: file for one JSON line per picture. ``threads`` per render. ``isa`` forces an
-    instruction set.
+    instruction set. ``tls``: without it the stream is plaintext.
     """
 
     server: str
@@ -74,6 +75,7 @@ class AgentConfig:
     metrics_per_vehicle: bool = False
     report: Path | None = None
     log: LogForm = LogForm.AUTO
+    tls: TlsFiles | None = None
     allow_insecure: bool = False
     limits: AgentLimits = AgentLimits()
 

@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import grpc
 import structlog
@@ -19,6 +20,7 @@ from cav_agent.frames import FrameResult, Outcome
 from cav_agent.metrics import AgentMetrics
 from cav_agent.pace import Lockstep, Pace, Realtime
 from cav_agent.pipeline import Pipeline
+from cav_agent.reach import ServerEnd
 from cav_agent.report import Report
 from cav_agent.session import AgentSession
 from rfcore.codec import CodecConfig
@@ -27,7 +29,7 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import FieldStore, RadianceField
 from rfcore.views import PosedPicture
 from rfcore.wire.address import Address
-from rfcore.wire.conventions import CHANNEL_OPTIONS, RENDERER_CONTRACT
+from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.messages import CameraDescription, Hello, RendererContract
 
 __all__ = ["Vehicle"]
@@ -49,8 +51,10 @@ class Vehicle:
 
     def __init__(self, config: AgentConfig) -> None:
         self.registry = CollectorRegistry()
-        self._address = Address.parse("server", config.server)
-        self._address.require_private("server", config.allow_insecure)
+        address = Address.parse("server", config.server)
+        if config.tls is None:
+            address.require_private("server", config.allow_insecure)
+        self._server = ServerEnd(address, config.tls)
         self._config = config
         self._metrics = AgentMetrics(self.registry)
         self._stopped = asyncio.Event()
@@ -70,9 +74,7 @@ class Vehicle:
     async def _travel(self) -> Counter[str]:
         executor = ThreadPoolExecutor(1, "encoder")
         try:
-            async with grpc.aio.insecure_channel(
-                str(self._address), options=CHANNEL_OPTIONS
-            ) as channel:
+            async with self._server.open() as channel:
                 field = await self._field(channel)
                 loop = asyncio.get_running_loop()
                 journey = await loop.run_in_executor(executor, self._prepare, field)
@@ -90,12 +92,15 @@ class Vehicle:
         """Load the field, fetched from the server if it is not here."""
         config = self._config
         store = FieldStore(config.fields)
+        within_s = config.limits.give_up_s or None
         try:
-            async with asyncio.timeout(config.limits.give_up_s or None):
+            if config.field not in store.ids():
+                await self._server.reached(channel, within_s)
+            async with asyncio.timeout(within_s):
                 field_id = await choose_field(channel, config.field)
         except TimeoutError as error:
             raise RfedgeError(
-                f"no server at {self._address} within {config.limits.give_up_s:g} s"
+                f"no server at {self._server.address} within {within_s:g} s"
             ) from error
         if field_id not in store.ids():
             await fetch_field(channel, store, field_id, config.fields)
@@ -141,6 +146,7 @@ class Vehicle:
             pace,
             journey.pipeline.encode,
             executor,
+            partial(self._server.reached, channel),
             ended,
             self._metrics.connected,
         )

@@ -14,6 +14,7 @@ from mec_server.config import ConsumerLimits, ServerConfig
 from mec_server.server import EdgeServer
 from rfcore.errors import RfedgeError
 from rfcore.wire.logs import LogForm, configure_logs
+from rfcore.wire.tls import TlsFiles
 
 __all__ = ["main"]
 
@@ -33,6 +34,9 @@ def run(
     workers: int = 2,
     isa: str | None = None,
     ready_file: Path | None = None,
+    tls_cert: Path | None = None,
+    tls_key: Path | None = None,
+    tls_ca: Path | None = None,
     allow_insecure: Flag = False,
 ) -> ServerConfig:
     """Reconstruct what vehicles see, against the radiance fields held here.
@@ -50,6 +54,9 @@ def run(
         workers: Frames reconstructed at once.
         isa: Instruction set to force (avx512, avx2, scalar); the best of this machine without it.
         ready_file: File that receives HOST:PORT once vehicles are accepted.
+        tls_cert: Certificate of this server (PEM); with the next two, plaintext is not taken.
+        tls_key: Its private key.
+        tls_ca: Certificate of the authority that vouches for vehicles and consumers.
         allow_insecure: Accept plaintext from other machines.
     """
     return ServerConfig(
@@ -65,6 +72,7 @@ def run(
         workers=workers,
         isa=isa,
         ready_file=ready_file,
+        tls=TlsFiles.of(tls_cert, tls_key, tls_ca),
         allow_insecure=allow_insecure,
     )
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rfcore.errors import InvalidInput
 from rfcore.wire.logs import LogForm
+from rfcore.wire.tls import TlsFiles
 
 __all__ = ["ConsumerLimits", "ServerConfig", "SessionLimits"]
 
@@ -53,7 +54,7 @@ class ServerConfig:
     are written without it. ``listen`` and ``metrics_port``: port 0 takes a free one; no metrics are
     served without a port, and ``metrics_per_vehicle`` tells vehicles apart in them. ``threads`` per
     render, ``workers`` frames at once. ``isa`` forces an instruction set. ``ready_file`` receives
-    the address once connections are accepted.
+    the address once connections are accepted. ``tls``: only clients with a certificate are let in.
     """
 
     fields: Path
@@ -66,6 +67,7 @@ class ServerConfig:
     workers: int = 2
     isa: str | None = None
     ready_file: Path | None = None
+    tls: TlsFiles | None = None
     log: LogForm = LogForm.AUTO
     consumers: ConsumerLimits = ConsumerLimits()
     allow_insecure: bool = False

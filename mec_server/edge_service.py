@@ -27,6 +27,7 @@ from rfcore.errors import InvalidInput, PacketRejected, RfedgeError
 from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_message_to_bytes
+from rfcore.wire.identity import peer_identity
 from rfcore.wire.messages import Frame
 from rfcore.wire.status import status_of
 
@@ -100,7 +101,11 @@ class _Stream:
         session_id = uuid.uuid4().hex[:12]
         self._log = log.bind(session=session_id, peer=context.peer())
         self._session = ServerSession(
-            session_id, around.held_field_ids(), time.monotonic(), around.limits
+            session_id,
+            around.held_field_ids(),
+            time.monotonic(),
+            around.limits,
+            peer_identity(context.auth_context()),
         )
 
     def drain(self) -> None:

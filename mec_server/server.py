@@ -40,7 +40,8 @@ class EdgeServer:
     def __init__(self, config: ServerConfig) -> None:
         self.registry = CollectorRegistry()
         self.address = Address.parse("listen", config.listen)
-        self.address.require_private("listen", config.allow_insecure)
+        if config.tls is None:
+            self.address.require_private("listen", config.allow_insecure)
         self._config = config
         store = FieldStore(config.fields)
         self._metrics = ServerMetrics(self.registry, per_vehicle=config.metrics_per_vehicle)
@@ -84,7 +85,7 @@ class EdgeServer:
         """
         count = await asyncio.to_thread(self._shelf.warm_up)
         try:
-            port = self._server.add_insecure_port(str(self.address))
+            port = self._open_port()
         except RuntimeError as error:
             raise RfedgeError(f"cannot listen on {self.address}: {error}") from error
         self.address = Address(self.address.host, port)
@@ -93,7 +94,12 @@ class EdgeServer:
         await self._set_health(health_pb2.HealthCheckResponse.SERVING)
         if self._config.ready_file is not None:
             write_whole(self._config.ready_file, f"{self.address}\n")
-        log.info("serving", address=str(self.address), fields=count)
+        log.info(
+            "serving",
+            address=str(self.address),
+            fields=count,
+            tls=self._config.tls is not None,
+        )
         return self.address
 
     async def stop(self) -> None:
@@ -108,6 +114,12 @@ class EdgeServer:
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
         log.info("stopped")
+
+    def _open_port(self) -> int:
+        tls = self._config.tls
+        if tls is None:
+            return self._server.add_insecure_port(str(self.address))
+        return self._server.add_secure_port(str(self.address), tls.server_credentials())
 
     def _open_recorder(self, directory: Path | None) -> Recorder | None:
         if directory is None:

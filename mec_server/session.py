@@ -20,6 +20,7 @@ from mec_server.config import SessionLimits
 from mec_server.jobs import DecodeJob, DecodeOutcome, End, OpenJob
 from mec_server.lane import Lane, Waiting
 from rfcore.errors import (
+    AccessDenied,
     InvalidInput,
     PacketRejected,
     ProtocolError,
@@ -30,6 +31,7 @@ from rfcore.errors import (
 from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, shown
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import FrameRefused
+from rfcore.wire.identity import PeerIdentity
 from rfcore.wire.messages import (
     Ack,
     ClientMessage,
@@ -57,7 +59,10 @@ class SessionState(StrEnum):
 
 
 class ServerSession:
-    """One vehicle's stream; ``held_field_ids`` are the fields this server has."""
+    """One vehicle's stream; ``held_field_ids`` are the fields this server has.
+
+    ``identity``: whom its certificate names; without one any name is taken.
+    """
 
     def __init__(
         self,
@@ -65,6 +70,7 @@ class ServerSession:
         held_field_ids: Sequence[str],
         now: float,
         limits: SessionLimits | None = None,
+        identity: PeerIdentity | None = None,
     ) -> None:
         self.session_id = session_id
         self.hello: Hello | None = None
@@ -72,6 +78,7 @@ class ServerSession:
         self.closed: End | None = None
         self._limits = limits or SessionLimits()
         self._held = tuple(held_field_ids)
+        self._identity = identity
         self._lanes: dict[str, Lane] = {}
         self._fields: dict[bytes, str] = {}
         self._opening: OpenJob | None = None
@@ -103,6 +110,12 @@ class ServerSession:
         if self.state is not SessionState.AWAITING_HELLO:
             self._close(ProtocolError("a stream has one Hello; open another stream"))
             return
+        if self._identity is not None:
+            try:
+                self._identity.check_vehicle(hello.vehicle_id)
+            except AccessDenied as error:
+                self._close(error)
+                return
         unknown = [field_id for field_id in hello.field_ids if field_id not in self._held]
         if unknown:
             self._outbox.append(FieldNotice(self._held))

@@ -11,6 +11,7 @@
     ├── UnknownField            a field id that no store here holds
     ├── PacketRejected          a delta packet that must not be shown; carries a RejectReason
     ├── ProtocolError           the peer broke the session's rules
+    ├── AccessDenied            a certificate is refused, or does not permit what was asked
     ├── BackendUnavailable      an instruction set or device this machine does not have
     ├── CodecError              encoder or decoder did not do what its configuration promises
     └── TrainingDiverged        a training run no longer gets anywhere
@@ -22,6 +23,7 @@ it as one line and exit with status 2; services map it to one gRPC status (``rfc
 from enum import StrEnum
 
 __all__ = [
+    "AccessDenied",
     "BackendUnavailable",
     "BitstreamError",
     "CodecError",
@@ -101,6 +103,10 @@ class PacketRejected(RfedgeError):
 
 class ProtocolError(RfedgeError):
     """The peer broke the rules of the session."""
+
+
+class AccessDenied(RfedgeError):
+    """A certificate is refused, or does not permit what was asked."""
 
 
 class BackendUnavailable(RfedgeError):

@@ -16,6 +16,8 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.address import Address
 from rfcore.wire.checks import check_name
 from rfcore.wire.conventions import CHANNEL_OPTIONS
+from rfcore.wire.handshake import check_handshake
+from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
@@ -45,10 +47,13 @@ class WatchSettings:
     video: Path | None = None
     encoding: str | None = None
     pictures: int | None = None
+    tls: TlsFiles | None = None
     allow_insecure: bool = False
 
     def __post_init__(self) -> None:
-        Address.parse("address", self.address).require_private("address", self.allow_insecure)
+        address = Address.parse("address", self.address)
+        if self.tls is None:
+            address.require_private("address", self.allow_insecure)
         for name in self.vehicle_ids:
             check_name("vehicle", name)
         if self.pictures is not None and self.pictures < 1:
@@ -96,19 +101,22 @@ class _Stream:
 
     def __init__(self, settings: WatchSettings) -> None:
         self._settings = settings
-        self._channel = grpc.insecure_channel(
-            settings.address,
-            options=(
-                *(o for o in CHANNEL_OPTIONS if o[0] != "grpc.max_receive_message_length"),
-                ("grpc.max_receive_message_length", LONGEST_MESSAGE_BYTES),
-            ),
+        options = (
+            *(o for o in CHANNEL_OPTIONS if o[0] != "grpc.max_receive_message_length"),
+            ("grpc.max_receive_message_length", LONGEST_MESSAGE_BYTES),
         )
+        if settings.tls is None:
+            self._channel = grpc.insecure_channel(settings.address, options=options)
+        else:
+            credentials = settings.tls.channel_credentials()
+            self._channel = grpc.secure_channel(settings.address, credentials, options=options)
 
     def __enter__(self) -> Iterator[TwinPicture | Departure]:
         try:
             grpc.channel_ready_future(self._channel).result(timeout=CONNECT_S)
         except grpc.FutureTimeoutError as error:
             self._channel.close()
+            check_handshake(Address.parse("address", self._settings.address), self._settings.tls)
             raise RfedgeError(
                 f"no server at {self._settings.address} within {CONNECT_S:g} s"
             ) from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import grpc
 
 from rfcore.errors import (
+    AccessDenied,
     BackendUnavailable,
     CodecError,
     InvalidData,
@@ -23,6 +24,7 @@ STATUS_OF: tuple[tuple[type[RfedgeError], grpc.StatusCode], ...] = (
     (InvalidData, grpc.StatusCode.DATA_LOSS),
     (PacketRejected, grpc.StatusCode.ABORTED),
     (ProtocolError, grpc.StatusCode.FAILED_PRECONDITION),
+    (AccessDenied, grpc.StatusCode.PERMISSION_DENIED),
     (BackendUnavailable, grpc.StatusCode.UNIMPLEMENTED),
     (CodecError, grpc.StatusCode.INTERNAL),
 )

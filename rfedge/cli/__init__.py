@@ -15,6 +15,7 @@ from tyro.conf import OmitSubcommandPrefixes, subcommand
 
 from rfcore.errors import RfedgeError
 from rfedge.cli.bench import Bench
+from rfedge.cli.certs import Certs
 from rfedge.cli.decode import Decode
 from rfedge.cli.demo import Demo
 from rfedge.cli.encode import Encode
@@ -38,6 +39,7 @@ Verb = (
     | Annotated[Link, subcommand("link")]
     | Annotated[Scene, subcommand("scene")]
     | Annotated[Watch, subcommand("watch")]
+    | Annotated[Certs, subcommand("certs")]
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Eval, subcommand("eval")]
 )

@@ -27,7 +27,12 @@ class Watch:
     """How pictures travel; default: i420 (exact) for a video, jpeg for a folder, else none."""
     pictures: int | None = None
     """Stop after so many pictures."""
-
+    tls_cert: Path | None = None
+    """Certificate of this consumer (PEM), for a server that has one."""
+    tls_key: Path | None = None
+    """Its private key."""
+    tls_ca: Path | None = None
+    """Certificate of the authority that vouches for the server."""
     allow_insecure: Annotated[bool, FlagCreatePairsOff] = False
     """Watch a server on another machine in plaintext."""
 
@@ -36,6 +41,7 @@ class Watch:
         import signal
         from contextlib import suppress
 
+        from rfcore.wire.tls import TlsFiles
         from rfedge.watch import WatchSettings, watch
 
         settings = WatchSettings(
@@ -45,6 +51,7 @@ class Watch:
             video=self.mp4,
             encoding=self.encoding,
             pictures=self.pictures,
+            tls=TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca),
             allow_insecure=self.allow_insecure,
         )
         signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -8,11 +8,12 @@ import pytest
 
 VERBS = ("demo", "train", "render", "encode", "decode", "link", "watch", "bench")
 EVAL_VERBS = ("eval compare", "eval paper", "eval stability")
+CERTS_VERBS = ("certs init", "certs show")
 SCENE_VERBS = ("scene convert", "scene poses", "scene record-carla")
 FIELD_VERBS = tuple(
     f"field {verb}" for verb in ("import", "info", "check", "slim", "rungs", "export")
 )
-HEAVY = ("torch", "cv2", "matplotlib", "av", "grpc")
+HEAVY = ("torch", "cv2", "matplotlib", "av", "grpc", "cryptography")
 
 
 def rfedge(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -22,7 +23,7 @@ def rfedge(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("verb", VERBS + SCENE_VERBS + FIELD_VERBS + EVAL_VERBS)
+@pytest.mark.parametrize("verb", VERBS + SCENE_VERBS + FIELD_VERBS + EVAL_VERBS + CERTS_VERBS)
 def test_every_verb_has_help_with_defaults(verb: str) -> None:
     done = rfedge(*verb.split(), "--help")
     assert done.returncode == 0, done.stderr
@@ -50,6 +51,9 @@ def test_the_help_loads_nothing_heavy() -> None:
         (("link", "--to", "nonsense"), "nonsense"),
         (("link", "--to", "127.0.0.1:1", "--profile", "missing.toml"), "missing.toml"),
         (("watch", "nonsense"), "nonsense"),
+        (("watch", "127.0.0.1:1", "--tls-cert", "c.pem"), "belong together"),
+        (("certs", "show", "nowhere"), "nowhere"),
+        (("certs", "init", "--vehicles", "a/b"), "'a/b' must be"),
         (("eval", "compare", "field.rff", "drive.json"), "NAME@HZ=DATASET"),
         (("scene", "convert", "nowhere", "--out", "o"), "nowhere"),
         (("scene", "convert", "nowhere", "--out", "o", "--size", "big"), "'big' is not WIDTHx"),

@@ -9,6 +9,7 @@ from mec_server.config import SessionLimits
 from mec_server.jobs import DecodeJob, DecodeOutcome, OpenJob
 from mec_server.session import ServerSession, SessionState
 from rfcore.errors import (
+    AccessDenied,
     CodecError,
     InvalidInput,
     PacketRejected,
@@ -18,6 +19,7 @@ from rfcore.errors import (
 )
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import FrameRefused
+from rfcore.wire.identity import PeerIdentity, Role, identity_uri
 from rfcore.wire.messages import (
     Ack,
     Credit,
@@ -103,6 +105,23 @@ def test_hello_is_answered_with_welcome_and_credit_for_every_camera(hello: Hello
         Credit("rear", 2),
     ]
     assert session.messages_to_send(0.1) == [], "each message is handed out once"
+
+
+def test_a_name_that_the_certificate_does_not_bear_learns_nothing_else(hello: Hello) -> None:
+    stranger = PeerIdentity((identity_uri(Role.VEHICLE, "stranger"),))
+    session = ServerSession("s-1", [OTHER], now=0.0, identity=stranger)
+    session.receive(hello, 0.0)
+    assert session.closed is not None
+    assert isinstance(session.closed.error, AccessDenied)
+    assert session.jobs_to_start(0.0) == []
+    assert session.messages_to_send(0.0) == [], "not even which fields are held"
+
+
+def test_the_name_of_the_certificate_is_welcome(hello: Hello) -> None:
+    identity = PeerIdentity((identity_uri(Role.VEHICLE, hello.vehicle_id),))
+    session = ServerSession("s-1", [FIELD], now=0.0, identity=identity)
+    session.receive(hello, 0.0)
+    assert len(session.jobs_to_start(0.0)) == 1
 
 
 def test_an_unknown_field_is_refused_with_both_ids_named(hello: Hello) -> None:

@@ -1,0 +1,88 @@
+"""Mutual TLS: three PEM files a process, checked once, and the gRPC credentials made of them.
+
+Both ends prove who they are to the same certificate authority. Files are read at the start; a new
+certificate needs a new start.
+"""
+
+from __future__ import annotations
+
+import ssl
+from dataclasses import dataclass
+from pathlib import Path
+
+import grpc
+
+from rfcore.errors import InvalidInput
+
+__all__ = ["TlsFiles"]
+
+
+@dataclass(frozen=True)
+class TlsFiles:
+    """Own certificate, its private key, and the authority both ends trust; PEM.
+
+    Raises ``InvalidInput`` when one cannot be read or the key is not the certificate's.
+    """
+
+    certificate: Path
+    key: Path
+    authority: Path
+
+    def __post_init__(self) -> None:
+        for option, path in self._options():
+            try:
+                path.read_bytes()
+            except OSError as error:
+                raise InvalidInput(option, f"{path}: {error.strerror}") from error
+        self.client_context()
+
+    @staticmethod
+    def of(certificate: Path | None, key: Path | None, authority: Path | None) -> TlsFiles | None:
+        """Return the files of ``--tls-cert --tls-key --tls-ca``: all three, or None without any."""
+        if certificate is None and key is None and authority is None:
+            return None
+        if certificate is None or key is None or authority is None:
+            raise InvalidInput("tls", "--tls-cert, --tls-key and --tls-ca belong together")
+        return TlsFiles(certificate, key, authority)
+
+    def client_context(self) -> ssl.SSLContext:
+        """Return a context of the standard library that connects as gRPC does."""
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.set_alpn_protocols(["h2"])
+        try:
+            context.load_verify_locations(self.authority)
+        except ssl.SSLError as error:
+            raise InvalidInput("tls_ca", f"{self.authority} holds no certificate") from error
+        try:
+            # Without a password an encrypted key would ask for one on the terminal.
+            context.load_cert_chain(self.certificate, self.key, password="")
+        except ssl.SSLError as error:
+            raise InvalidInput(
+                "tls_cert",
+                f"{self.certificate} and {self.key} are no certificate and its unencrypted key "
+                f"({error.reason or error})",
+            ) from error
+        return context
+
+    def channel_credentials(self) -> grpc.ChannelCredentials:
+        """Return what a client shows, and what it wants to see."""
+        return grpc.ssl_channel_credentials(
+            root_certificates=self.authority.read_bytes(),
+            private_key=self.key.read_bytes(),
+            certificate_chain=self.certificate.read_bytes(),
+        )
+
+    def server_credentials(self) -> grpc.ServerCredentials:
+        """Return what a server shows; a client without a certificate is not let in."""
+        return grpc.ssl_server_credentials(
+            [(self.key.read_bytes(), self.certificate.read_bytes())],
+            root_certificates=self.authority.read_bytes(),
+            require_client_auth=True,
+        )
+
+    def _options(self) -> tuple[tuple[str, Path], ...]:
+        return (
+            ("tls_cert", self.certificate),
+            ("tls_key", self.key),
+            ("tls_ca", self.authority),
+        )

@@ -1,0 +1,245 @@
+"""Mutual TLS between the real services: who is let in as whom, and what the others are told."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from cav_agent.config import AgentLimits
+from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
+from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
+from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.handshake import own_problem
+from rfcore.wire.tls import TlsFiles
+from rfcore.wire.twin import PictureEncoding, TwinPicture, Wish, watch_request, watched
+from rfcore.wire.v1 import twin_pb2_grpc
+from rfedge.certs.folder import write_certificates
+from rfedge.certs.issue import Members, certify
+from rfedge.watch import WatchSettings, watch
+
+Files = Callable[[str], TlsFiles]
+SOON_S = AgentLimits(give_up_s=5.0)
+
+
+@pytest.fixture
+def authority(tmp_path: Path) -> Callable[..., Files]:
+    """Return a function that makes an authority's folder, and one that names files in it."""
+
+    def make(folder: str = "certs", age_days: int = 0) -> Files:
+        now = datetime.now(UTC) - timedelta(days=age_days)
+        issued = certify(Members(("cav-1", "cav-2"), ("watch",)), now, days=30)
+        write_certificates(tmp_path / folder, issued)
+
+        def files(name: str) -> TlsFiles:
+            root = tmp_path / folder
+            return TlsFiles(root / f"{name}.pem", root / f"{name}.key", root / "ca.pem")
+
+        return files
+
+    return make
+
+
+@pytest.fixture
+def certs(authority: Any) -> Files:
+    files: Files = authority()
+    return files
+
+
+def mixed(own: TlsFiles, trusted: TlsFiles) -> TlsFiles:
+    """What somebody shows who has a foreign certificate, and trusts the right authority."""
+    return replace(own, authority=trusted.authority)
+
+
+def channel_to(address: object, tls: TlsFiles) -> grpc.aio.Channel:
+    credentials = tls.channel_credentials()
+    return grpc.aio.secure_channel(str(address), credentials, options=CHANNEL_OPTIONS)
+
+
+async def test_a_vehicle_with_its_certificate_drives_and_gets_its_field(
+    certs: Files, serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    async with serve(tls=certs("server")) as server:
+        tls = certs("vehicle-cav-1")
+        trip = await travel(server.address, tls=tls, field=None, fields=tmp_path / "mine")
+    assert trip.counts == {"acked": 6}
+
+
+async def test_encryption_changes_no_byte_of_a_packet_or_picture(
+    certs: Files, serve: Any, travel: Any
+) -> None:
+    async with serve() as server:
+        plain = await travel(server.address)
+    async with serve(tls=certs("server")) as server:
+        secret = await travel(server.address, tls=certs("vehicle-cav-1"))
+    for key in ("reconstruction_digest", "server_digest", "payload_bytes"):
+        assert [line[key] for line in plain.lines] == [line[key] for line in secret.lines]
+
+
+@pytest.mark.parametrize("name", ["vehicle-cav-2", "consumer-watch"])
+async def test_a_vehicle_may_not_go_by_another_name_than_its_certificates(
+    certs: Files, serve: Any, travel: Any, name: str
+) -> None:
+    async with serve(tls=certs("server")) as server:
+        with pytest.raises(ProtocolError, match="'cav-1' is not whom its certificate names") as e:
+            await travel(server.address, tls=certs(name))
+    assert f"spiffe://rfedge/{name.replace('-', '/', 1)}" in str(e.value)
+
+
+async def test_a_false_name_is_permission_denied_and_leaves_the_others_alone(
+    certs: Files, serve: Any, travel: Any, coded: Any
+) -> None:
+    async with (
+        serve(tls=certs("server")) as server,
+        channel_to(server.address, certs("vehicle-cav-2")) as channel,
+    ):
+        stream = channel.stream_stream(STREAM_METHOD)()
+        await stream.write(client_message_to_bytes(coded.hello))
+        assert await stream.code() is grpc.StatusCode.PERMISSION_DENIED
+        assert "'cav-raw' is not whom its certificate names" in (await stream.details() or "")
+        trip = await travel(server.address, tls=certs("vehicle-cav-1"))
+    assert trip.counts == {"acked": 6}
+
+
+async def test_an_expired_vehicle_is_told_so_in_one_line(
+    authority: Any, certs: Files, serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    """Both ends know the authority that signed it, and trust another for the server."""
+    old, new = authority("old", age_days=60)("vehicle-cav-1"), certs("server")
+    both = tmp_path / "both.pem"
+    both.write_bytes(old.authority.read_bytes() + new.authority.read_bytes())
+    async with serve(tls=replace(new, authority=both)) as server:
+        with pytest.raises(AccessDenied) as caught:
+            await travel(server.address, tls=replace(old, authority=both))
+    refused = f"{server.address} refuses {old.certificate}: certificate has expired"
+    assert str(caught.value) == refused
+
+
+async def test_an_expired_server_is_not_trusted(authority: Any, serve: Any, travel: Any) -> None:
+    old = authority("old", age_days=60)
+    async with serve(tls=old("server")) as server:
+        with pytest.raises(AccessDenied, match="is refused: certificate has expired"):
+            await travel(server.address, tls=old("vehicle-cav-1"))
+
+
+async def test_a_vehicle_of_another_authority_is_refused_by_the_server(
+    authority: Any, certs: Files, serve: Any, travel: Any
+) -> None:
+    foreign = authority("foreign")
+    async with serve(tls=certs("server")) as server:
+        tls = mixed(foreign("vehicle-cav-1"), certs("server"))
+        with pytest.raises(AccessDenied, match=r"refuses .*1\.pem: unable to get local issuer"):
+            await travel(server.address, tls=tls)
+
+
+async def test_a_server_of_another_authority_is_refused_by_the_vehicle(
+    authority: Any, certs: Files, serve: Any, travel: Any
+) -> None:
+    foreign = authority("foreign")
+    async with serve(tls=certs("server")) as server:
+        with pytest.raises(AccessDenied, match=r"certificate of .* is refused: .*foreign/ca\.pem"):
+            await travel(server.address, tls=foreign("vehicle-cav-1"))
+
+
+async def test_a_vehicles_certificate_makes_no_server(
+    certs: Files, serve: Any, travel: Any
+) -> None:
+    async with serve(tls=certs("vehicle-cav-2")) as server:
+        with pytest.raises(AccessDenied, match="is refused: "):
+            await travel(server.address, tls=certs("vehicle-cav-1"))
+
+
+async def test_plaintext_to_a_server_with_certificates_is_explained(
+    certs: Files, serve: Any, travel: Any
+) -> None:
+    async with serve(tls=certs("server")) as server:
+        with pytest.raises(AccessDenied, match="wants TLS; give --tls-cert"):
+            await travel(server.address, limits=AgentLimits(give_up_s=0.2))
+
+
+async def test_certificates_for_a_plaintext_server_are_explained(
+    certs: Files, serve: Any, travel: Any
+) -> None:
+    async with serve() as server:
+        with pytest.raises(AccessDenied, match="speaks plaintext"):
+            await travel(server.address, tls=certs("vehicle-cav-1"), limits=SOON_S)
+
+
+async def test_a_server_that_is_not_there_is_no_refusal(certs: Files, travel: Any) -> None:
+    limits = AgentLimits(give_up_s=0.2)
+    with pytest.raises(RfedgeError, match=r"no server welcomed this vehicle within 0\.2 s"):
+        await travel("localhost:1", tls=certs("vehicle-cav-1"), limits=limits)
+
+
+def test_a_certificate_that_is_good_has_no_problem(certs: Files) -> None:
+    for name in ("vehicle-cav-1", "consumer-watch"):
+        assert own_problem(certs(name)) == ""
+
+
+@pytest.mark.parametrize("service", ["health", "watch", "edge"])
+async def test_no_service_answers_without_a_certificate(
+    certs: Files, serve: Any, service: str
+) -> None:
+    async with serve(tls=certs("server")) as server:
+        ca = certs("server").authority.read_bytes()
+        credentials = grpc.ssl_channel_credentials(ca)
+        async with grpc.aio.secure_channel(str(server.address), credentials) as channel:
+            if service == "health":
+                stub = health_pb2_grpc.HealthStub(channel)
+                call: Any = stub.Check(health_pb2.HealthCheckRequest())
+            elif service == "watch":
+                call = twin_pb2_grpc.TwinServiceStub(channel).Watch(watch_request(Wish()))
+            else:
+                call = channel.stream_stream(STREAM_METHOD)()
+            assert await call.code() is grpc.StatusCode.UNAVAILABLE
+
+
+async def test_a_consumer_asks_for_health_and_sees_the_drive(
+    certs: Files, serve: Any, travel: Any
+) -> None:
+    async with (
+        serve(tls=certs("server")) as server,
+        channel_to(server.address, certs("consumer-watch")) as channel,
+    ):
+        health = await health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest())
+        assert health.status == health_pb2.HealthCheckResponse.SERVING
+        wish = Wish(encoding=PictureEncoding.NONE)
+        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(watch_request(wish))
+        await call.initial_metadata()
+        await travel(server.address, tls=certs("vehicle-cav-1"))
+        seen = watched(await call.read())
+        assert isinstance(seen, TwinPicture)
+        assert seen.vehicle_id == "cav-1"
+
+
+def test_a_watcher_in_plaintext_is_told_what_is_missing(
+    certs: Files, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server here is one handshake: what the watcher says does not need more."""
+    monkeypatch.setattr("rfedge.watch.CONNECT_S", 0.1)
+    credentials = certs("server").server_credentials()
+    server = grpc.server(None)
+    port = server.add_secure_port("127.0.0.1:0", credentials)
+    server.start()
+    try:
+        with pytest.raises(AccessDenied, match="wants TLS"):
+            watch(WatchSettings(f"127.0.0.1:{port}"))
+    finally:
+        server.stop(None).wait()
+
+
+def test_files_that_do_not_belong_together_are_refused_by_option(certs: Files) -> None:
+    one, two = certs("vehicle-cav-1"), certs("vehicle-cav-2")
+    with pytest.raises(InvalidInput, match=r"^tls_cert: .*no certificate and its unencrypted key"):
+        replace(one, key=two.key)
+    with pytest.raises(InvalidInput, match=r"^tls_ca: .* holds no certificate"):
+        replace(one, authority=one.key)
+    with pytest.raises(InvalidInput, match=r"^tls_key: .*No such file"):
+        replace(one, key=Path("missing.key"))
+    with pytest.raises(InvalidInput, match=r"^tls: .*belong together"):
+        TlsFiles.of(one.certificate, one.key, None)
+    assert TlsFiles.of(None, None, None) is None
