@@ -46,7 +46,8 @@ class SeenClip:
 
 
 def see_clip(field: RadianceField, cameras: Sequence[Camera]) -> SeenClip:
-    """Render ``field`` from every camera, once for all operating points."""
+    """Render ``field`` from every camera, its pose rounded as a vehicle does before it renders."""
+    cameras = [Camera(c.intrinsics, c.world_from_cam.rounded()) for c in cameras]
     field.render(cameras[0])  # what is made lazily is not held against the first frame
     began_ns = process_time_ns()
     views = [field.render(camera) for camera in cameras]
@@ -134,7 +135,6 @@ class FieldCoder:
         return pictures
 
     def _message_bytes(self, index: int, made: Encoded) -> int:
-        # A vehicle renders at the rounded pose, 4e-5 px away, and stamps the frame with the time.
-        pose = self._seen.cameras[index].world_from_cam.rounded()
+        pose = self._seen.cameras[index].world_from_cam
         message = Frame(MESSAGE_CAMERA, MESSAGE_TIME_NS, pose, b"", made.packet)
         return len(client_message_to_bytes(message))
