@@ -24,7 +24,14 @@ from rfcore.image import I420
 from rfcore.metrics import ssim
 from rfedge.evaluate.clip import CodedClip, luma_mse
 
-__all__ = ["Rival", "svtav1_lowdelay", "x264_lowdelay", "x265_lowdelay"]
+__all__ = [
+    "Rival",
+    "picture",
+    "svtav1_lowdelay",
+    "video_frame",
+    "x264_lowdelay",
+    "x265_lowdelay",
+]
 
 X264_CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0)
 X265_CRFS = (19.0, 22.0, 25.0, 28.0, 31.0, 34.0, 37.0)
@@ -75,7 +82,7 @@ class Rival:
         packets = []
         try:
             for index, frame in enumerate(frames):
-                made = encoder.encode(_video_frame(frame, index))
+                made = encoder.encode(video_frame(frame, index))
                 if len(made) != 1:
                     raise CodecError(f"{self.name}: frame {index} came out as {len(made)} packets")
                 packets.append(bytes(made[0]))
@@ -102,7 +109,7 @@ class Rival:
         decoder = _opened(self.decoder, "r")
         decoder.thread_count = 1
         frames = [f for packet in packets for f in decoder.decode(av.Packet(packet))]
-        return [_picture(frame) for frame in (*frames, *decoder.decode(None))]
+        return [picture(frame) for frame in (*frames, *decoder.decode(None))]
 
 
 def x264_lowdelay(preset: str, name: str | None = None, **params: str) -> Rival:
@@ -155,15 +162,17 @@ def _joined(options: Mapping[str, str]) -> str:
     return ":".join(f"{name}={value}" for name, value in options.items())
 
 
-def _video_frame(picture: I420, index: int) -> av.VideoFrame:
-    frame = av.VideoFrame(*picture.size_px, "yuv420p")
-    for plane, source in zip(frame.planes, picture.planes, strict=True):
-        _samples(plane)[:] = source
+def video_frame(source: I420, index: int, pixel_format: str = "yuv420p") -> av.VideoFrame:
+    """Return a picture of even size as PyAV's encoders take it, the ``index``-th of its clip."""
+    frame = av.VideoFrame(*source.size_px, pixel_format)
+    for plane, samples in zip(frame.planes, source.planes, strict=True):
+        _samples(plane)[:] = samples
     frame.pts = index
     return frame
 
 
-def _picture(frame: av.VideoFrame) -> I420:
+def picture(frame: av.VideoFrame) -> I420:
+    """Return what a decoder showed."""
     y, u, v = (_samples(plane).copy() for plane in frame.planes)
     return I420(y, u, v)
 
