@@ -53,10 +53,15 @@ class RateCurve:
         self.check_spans(window_db)
         return float(self._log_rate.integrate(low, high)) / (high - low)
 
+    def spans(self, window_db: Window) -> bool:
+        """Tell whether the curve covers all of ``window_db``."""
+        low, high = window_db
+        return bool(self.psnr_db[0] <= low and high <= self.psnr_db[-1])
+
     def check_spans(self, window_db: Window) -> None:
         """Raise ``InvalidInput`` unless the curve covers all of ``window_db``."""
         low, high = window_db
-        if low < self.psnr_db[0] or high > self.psnr_db[-1]:
+        if not self.spans(window_db):
             raise InvalidInput(
                 "window_db",
                 f"{low:g}..{high:g} dB is not within the curve's {self.psnr_db[0]:.2f}.."
