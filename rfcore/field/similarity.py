@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Pose, TileOrigin
 from rfcore.errors import InvalidInput
+from rfcore.harmonics import CONSTANT, higher_harmonics
 from rfcore.raster.gaussians import F32, Gaussians
 
 __all__ = ["Similarity", "moved", "spherical_harmonics"]
@@ -80,25 +81,7 @@ def spherical_harmonics(directions: F64) -> F64:
     Same order and signs as ``rfcore.raster.reference`` (Kerbl et al. 2023; Sloan 2013).
     """
     x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
-    basis = [
-        0.28209479177387814 * np.ones_like(x),
-        -0.4886025119029199 * y,
-        0.4886025119029199 * z,
-        -0.4886025119029199 * x,
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2 * zz - xx - yy),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (xx - yy),
-        -0.5900435899266435 * y * (3 * xx - yy),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * zz - xx - yy),
-        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-        -0.4570457994644658 * x * (4 * zz - xx - yy),
-        1.445305721320277 * z * (xx - yy),
-        -0.5900435899266435 * x * (xx - 3 * yy),
-    ]
+    basis = [CONSTANT * np.ones_like(x), *higher_harmonics(x, y, z)]
     return np.stack(basis, axis=1)
 
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from rfcore.camera import Camera
+from rfcore.harmonics import CONSTANT, higher_harmonics
 from rfcore.ngp.parameters import NgpParameters
 from rfcore.ngp.shape import HashGrid, NgpShape, Space
 
@@ -142,25 +143,7 @@ def radiance(
 def harmonics(directions: Tensor) -> Tensor:
     """Return the 16 real spherical harmonics of degree 0..3 [S, 16], in the INRIA order."""
     x, y, z = directions.unbind(dim=1)
-    xx, yy, zz = x * x, y * y, z * z
-    basis = (
-        0.28209479177387814 * torch.ones_like(x),
-        -0.4886025119029199 * y,
-        0.4886025119029199 * z,
-        -0.4886025119029199 * x,
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2 * zz - xx - yy),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (xx - yy),
-        -0.5900435899266435 * y * (3 * xx - yy),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * zz - xx - yy),
-        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-        -0.4570457994644658 * x * (4 * zz - xx - yy),
-        1.445305721320277 * z * (xx - yy),
-        -0.5900435899266435 * x * (xx - 3 * yy),
-    )
+    basis = (CONSTANT * torch.ones_like(x), *higher_harmonics(x, y, z))
     return torch.stack(basis, dim=1)
 
 

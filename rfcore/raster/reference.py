@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rfcore.camera import Camera
+from rfcore.harmonics import CONSTANT, higher_harmonics
 from rfcore.raster.gaussians import Gaussians
 
 __all__ = ["loss_l1_dssim", "parameters", "render", "spherical_harmonics"]
@@ -125,25 +126,7 @@ def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
     Signs and order of the INRIA implementation: Y_lm with m = -l..l, Condon-Shortley phase in.
     """
     x, y, z = directions.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    basis = [
-        torch.full_like(x, 0.28209479177387814),
-        -0.4886025119029199 * y,
-        0.4886025119029199 * z,
-        -0.4886025119029199 * x,
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2 * zz - xx - yy),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (xx - yy),
-        -0.5900435899266435 * y * (3 * xx - yy),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * zz - xx - yy),
-        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-        -0.4570457994644658 * x * (4 * zz - xx - yy),
-        1.445305721320277 * z * (xx - yy),
-        -0.5900435899266435 * x * (xx - 3 * yy),
-    ]
+    basis = [torch.full_like(x, CONSTANT), *higher_harmonics(x, y, z)]
     return torch.stack(basis[: (degree + 1) ** 2], dim=-1)
 
 
