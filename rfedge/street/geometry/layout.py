@@ -1,0 +1,164 @@
+"""Where things are in the street: a plan, drawn from the scene's geometry and seed alone.
+
+The street runs along x, centred on 0; traffic keeps right, so the lane of who drives along +x lies
+at y < 0. ``side`` is +1 for the left edge of the road (y > 0) and -1 for the right one. From the
+middle outwards: lane, parking bay, kerb, lamps and trees, pavement, facades.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from rfedge.street.scene_file import Geometry
+
+__all__ = ["Layout", "Place", "Plot"]
+
+ROAD_HALF_M = 6.6
+KERB_M = 0.3
+PAVEMENT_UP_M = 0.14
+FACADE_M = 10.2
+LANE_M = 2.1
+BAY_M, BAY_LENGTH_M = 5.4, 6.2
+LAMP_M, LAMP_SPACING_M = 7.3, 24.0
+TREE_M, TREE_SPACING_M = 7.7, 11.0
+SIGN_M, SIGN_SPACING_M = 7.0, 19.0
+CROSSING_SPACING_M, CROSSING_M = 80.0, 3.2
+BEYOND_M = 40.0
+"""How far road and pavement go on behind the last facades."""
+SIDES = (1, -1)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A spot on the ground: ``side`` of the road, and the heading (rad, from x towards y)."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    side: int
+    heading_rad: float
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A building's ground: from ``start_m`` to ``end_m`` along x, its facade at ``y_m``.
+
+    The facade looks towards the road. The ground floor is ``ground_m`` high, each of the
+    ``floors`` above ``floor_m``; ``style`` numbers the looks.
+    """
+
+    side: int
+    start_m: float
+    end_m: float
+    y_m: float
+    ground_m: float
+    floors: int
+    floor_m: float
+    style: int
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The plan of a street."""
+
+    geometry: Geometry
+
+    @property
+    def start_m(self) -> float:
+        """Where the facades begin, x."""
+        return -0.5 * self.geometry.length_m * self.geometry.tiles
+
+    @property
+    def end_m(self) -> float:
+        """Where the facades end, x."""
+        return -self.start_m
+
+    @cached_property
+    def plots(self) -> tuple[Plot, ...]:
+        """The buildings, side by side, on both sides."""
+        rng = np.random.default_rng([self.geometry.seed, 1])
+        return tuple(plot for side in SIDES for plot in self._row(side, rng))
+
+    @cached_property
+    def crossings_x_m(self) -> tuple[float, ...]:
+        """The middles of the zebra crossings, which are 3.2 m wide along x."""
+        first = self.start_m + 0.5 * CROSSING_SPACING_M - 20.0
+        return tuple(np.arange(first, self.end_m - 5.0, CROSSING_SPACING_M).tolist())
+
+    @cached_property
+    def lamps(self) -> tuple[Place, ...]:
+        """The feet of the lamp posts, staggered; they look towards the road."""
+        return self._along(LAMP_M, 8.0, LAMP_SPACING_M, stagger_m=12.0)
+
+    @cached_property
+    def trees(self) -> tuple[Place, ...]:
+        """Where trees may stand: off lamps and crossings; the headings are by chance."""
+        rng = np.random.default_rng([self.geometry.seed, 2])
+        taken = [(lamp.x_m, lamp.side) for lamp in self.lamps]
+        kept = []
+        for place in self._along(TREE_M, 4.0, TREE_SPACING_M, stagger_m=5.0):
+            moved_m, heading_rad, chance = rng.uniform((-1, 0, 0), (1, 2 * np.pi, 1))
+            x_m = place.x_m + moved_m
+            free = all(abs(x_m - x) > 2.0 for x, side in taken if side == place.side)
+            if chance < 0.8 and free and not self.at_crossing(x_m, 3.0):
+                kept.append(Place(x_m, place.y_m, place.z_m, place.side, heading_rad))
+        return tuple(kept)
+
+    @cached_property
+    def signposts(self) -> tuple[Place, ...]:
+        """Feet of traffic signs; the headings look at who drives towards them."""
+        found = self._along(SIGN_M, 15.0, SIGN_SPACING_M, stagger_m=9.0)
+        return tuple(
+            Place(p.x_m, p.y_m, p.z_m, p.side, 0.0 if p.side > 0 else np.pi) for p in found
+        )
+
+    @cached_property
+    def bays(self) -> tuple[Place, ...]:
+        """Middles of the parking bays, off the crossings; headings along the traffic."""
+        found = self._along(BAY_M, 5.0, BAY_LENGTH_M, stagger_m=0.0)
+        return tuple(
+            Place(p.x_m, p.y_m, 0.0, p.side, np.pi if p.side > 0 else 0.0)
+            for p in found
+            if not self.at_crossing(p.x_m, 5.0)
+        )
+
+    def at_crossing(self, x_m: float, margin_m: float) -> bool:
+        """Whether x is on a crossing or nearer to it than the margin."""
+        reach_m = 0.5 * CROSSING_M + margin_m
+        return any(abs(x_m - crossing) < reach_m for crossing in self.crossings_x_m)
+
+    def _along(
+        self, y_m: float, first_m: float, spacing_m: float, stagger_m: float
+    ) -> tuple[Place, ...]:
+        return tuple(
+            Place(float(x), side * y_m, PAVEMENT_UP_M, side, -0.5 * np.pi * side)
+            for side in SIDES
+            for x in np.arange(
+                self.start_m + first_m + (stagger_m if side < 0 else 0.0), self.end_m, spacing_m
+            )
+        )
+
+    def _row(self, side: int, rng: np.random.Generator) -> list[Plot]:
+        plots: list[Plot] = []
+        x = self.start_m
+        while x < self.end_m - 6.0:
+            if plots and rng.random() < 0.1:
+                x += rng.uniform(3.0, 6.0)
+            width = rng.uniform(9.0, 17.0)
+            plots.append(
+                Plot(
+                    side=side,
+                    start_m=x,
+                    end_m=x + width,
+                    y_m=side * FACADE_M,
+                    ground_m=4.2,
+                    floors=int(rng.integers(2, 6)),
+                    floor_m=rng.uniform(3.1, 3.5),
+                    style=int(rng.integers(0, 2**31)),
+                )
+            )
+            x += width
+        return plots
