@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from mec_server.config import ConsumerLimits, ServerConfig
+from mec_server.config import ConsumerLimits, DecoderKind, ServerConfig
 from mec_server.server import EdgeServer
 from rfcore.errors import RfedgeError
 from rfcore.wire.logs import LogForm, configure_logs
@@ -32,6 +32,7 @@ def run(
     log: LogForm = LogForm.AUTO,
     threads: int = 1,
     workers: int = 2,
+    decoder: Annotated[DecoderKind, tyro.conf.EnumChoicesFromValues] = DecoderKind.AUTO,
     isa: str | None = None,
     ready_file: Path | None = None,
     tls_cert: Path | None = None,
@@ -52,6 +53,9 @@ def run(
         log: console lines, json lines, or auto: console on a terminal.
         threads: Threads per render; the pictures do not depend on it.
         workers: Frames reconstructed at once.
+        decoder: Where packets are decoded. in-process: in the server. child: in processes with
+            limits, one a camera. bubblewrap: in sandboxes. auto: in-process if only this machine
+            can reach the server, else bubblewrap where it works, else child.
         isa: Instruction set to force (avx512, avx2, scalar); the best of this machine without it.
         ready_file: File that receives HOST:PORT once vehicles are accepted.
         tls_cert: Certificate of this server (PEM); with the next two, plaintext is not taken.
@@ -70,6 +74,7 @@ def run(
         log=log,
         threads=threads,
         workers=workers,
+        decoder=decoder,
         isa=isa,
         ready_file=ready_file,
         tls=TlsFiles.of(tls_cert, tls_key, tls_ca),

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
 from rfcore.errors import InvalidInput
 from rfcore.wire.logs import LogForm
 from rfcore.wire.tls import TlsFiles
 
-__all__ = ["ConsumerLimits", "ServerConfig", "SessionLimits"]
+__all__ = ["ConsumerLimits", "DecoderKind", "ServerConfig", "SessionLimits"]
+
+
+class DecoderKind(StrEnum):
+    """Where packets are decoded; AUTO: in the server if only this machine can reach it, else under
+    bubblewrap where that works, else in processes with limits."""
+
+    AUTO = "auto"
+    IN_PROCESS = "in-process"
+    CHILD = "child"
+    BUBBLEWRAP = "bubblewrap"
 
 
 @dataclass(frozen=True)
@@ -55,6 +66,7 @@ class ServerConfig:
     served without a port, and ``metrics_per_vehicle`` tells vehicles apart in them. ``threads`` per
     render, ``workers`` frames at once. ``isa`` forces an instruction set. ``ready_file`` receives
     the address once connections are accepted. ``tls``: only clients with a certificate are let in.
+    ``decoder``: where packets are decoded.
     """
 
     fields: Path
@@ -70,6 +82,7 @@ class ServerConfig:
     tls: TlsFiles | None = None
     log: LogForm = LogForm.AUTO
     consumers: ConsumerLimits = ConsumerLimits()
+    decoder: DecoderKind = DecoderKind.AUTO
     allow_insecure: bool = False
     drain_s: float = 5.0
     limits: SessionLimits = SessionLimits()

@@ -17,7 +17,7 @@ import grpc
 import structlog
 
 from mec_server.config import SessionLimits
-from mec_server.handlers import CameraDecoder, FieldSource, Reconstruction, open_cameras
+from mec_server.handlers import CameraDecoder, FieldSource, Reconstruction, Tools, open_cameras
 from mec_server.jobs import DecodeJob, End, OpenJob
 from mec_server.metrics import ServerMetrics
 from mec_server.recorder import Recorder, Recording
@@ -47,6 +47,7 @@ class Surroundings:
     fields: FieldSource
     held_field_ids: Callable[[], tuple[str, ...]]
     executor: Executor
+    tools: Tools
     metrics: ServerMetrics
     limits: SessionLimits
     twin: Twin
@@ -96,6 +97,7 @@ class _Stream:
         self._around = around
         self._context = context
         self._wake = asyncio.Event()
+        self._opening: asyncio.Future[dict[str, CameraDecoder]] | None = None
         self._decoders: dict[str, CameraDecoder] = {}
         self._metrics = around.metrics.of(UNKNOWN_VEHICLE)
         session_id = uuid.uuid4().hex[:12]
@@ -117,6 +119,8 @@ class _Stream:
         """Let nothing remain of this stream, in the twin or in the metrics."""
         self._around.twin.leave(self._session.session_id)
         self._metrics.forget()
+        if self._opening is not None:
+            self._opening.add_done_callback(_close_decoders)
 
     async def run(self, requests: AsyncIterator[bytes]) -> End:
         """Serve until the session is closed; return how it ended."""
@@ -177,10 +181,12 @@ class _Stream:
 
     async def _open(self, job: OpenJob) -> None:
         around = self._around
+        # Not on the workers: a decoder process may take a while to start, and others have frames.
+        self._opening = asyncio.get_running_loop().run_in_executor(
+            None, open_cameras, job, around.fields, around.tools
+        )
         try:
-            self._decoders = await asyncio.get_running_loop().run_in_executor(
-                around.executor, open_cameras, job, around.fields, time.perf_counter_ns
-            )
+            self._decoders = await asyncio.shield(self._opening)
         except RfedgeError as error:
             self._session.open_failed(error, time.monotonic())
             return
@@ -241,3 +247,12 @@ class _Stream:
             kept = Recording(hello.vehicle_id, job.frame, done.picture)
             await loop.run_in_executor(executor, recorder.save, kept)
         return done
+
+
+def _close_decoders(opening: asyncio.Future[dict[str, CameraDecoder]]) -> None:
+    """Close, on threads, what was opened for a stream that is over."""
+    if opening.cancelled() or opening.exception() is not None:
+        return
+    loop = asyncio.get_running_loop()
+    for decoder in opening.result().values():
+        loop.run_in_executor(None, decoder.close)

@@ -10,17 +10,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+from mec_server.decoders import OpenDecoder
 from mec_server.jobs import DecodeJob, DecodeOutcome, OpenJob
 from rfcore.camera import Camera
 from rfcore.codec import DecoderState, DeltaDecoder
-from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason
+from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason, RfedgeError
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour
 from rfcore.views import View
 from rfcore.wire.messages import CameraDescription, StageTimes
 
-__all__ = ["CameraDecoder", "FieldSource", "Reconstruction", "Renderer", "open_cameras"]
+__all__ = ["CameraDecoder", "FieldSource", "Reconstruction", "Renderer", "Tools", "open_cameras"]
 
 ClockNs = Callable[[], int]
 
@@ -40,6 +41,14 @@ class FieldSource(Protocol):
 
 
 @dataclass(frozen=True)
+class Tools:
+    """A clock for the stages, and where decoders come from."""
+
+    clock_ns: ClockNs
+    open_decoder: OpenDecoder
+
+
+@dataclass(frozen=True)
 class Reconstruction:
     """A frame as the vehicle's closed loop holds it, with what the session answers."""
 
@@ -55,13 +64,17 @@ class CameraDecoder:
         camera: CameraDescription,
         renderers: Mapping[str, Renderer],
         exact: bool,
-        clock_ns: ClockNs,
+        tools: Tools,
     ) -> None:
         self._camera = camera
         self._renderers = renderers
-        self._clock_ns = clock_ns
-        self._decoder = DeltaDecoder(camera.codec, exact, clock_ns)
+        self._clock_ns = tools.clock_ns
+        self._decoder = DeltaDecoder(camera.codec, exact, tools.clock_ns, tools.open_decoder)
         self._state: DecoderState | None = None
+
+    def close(self) -> None:
+        """Let go of the decoder; waits for a frame that is being decoded."""
+        self._decoder.close()
 
     def reconstruct(self, job: DecodeJob) -> Reconstruction:
         """Return the frame of ``job``; raise ``PacketRejected`` and stay good for the next."""
@@ -98,18 +111,22 @@ class CameraDecoder:
             raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
 
 
-def open_cameras(job: OpenJob, fields: FieldSource, clock_ns: ClockNs) -> dict[str, CameraDecoder]:
-    """Return a decoder for each camera of a Hello.
+def open_cameras(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, CameraDecoder]:
+    """Return a decoder for each camera of a Hello, to be closed one by one.
 
-    Raises ``InvalidInput`` for a codec header that our encoder would not have made, and what
-    ``fields`` raises.
+    Raises ``InvalidInput`` for a codec header that our encoder would not have made, ``CodecError``
+    if there is no decoder to be had, and what ``fields`` raises.
     """
     renderers = {field_id: fields.open(field_id) for field_id in job.hello.field_ids}
     decoders: dict[str, CameraDecoder] = {}
     for index, camera in enumerate(job.hello.cameras):
         try:
-            decoders[camera.camera_id] = CameraDecoder(camera, renderers, job.exact, clock_ns)
-        except InvalidInput as error:
+            decoders[camera.camera_id] = CameraDecoder(camera, renderers, job.exact, tools)
+        except RfedgeError as error:
+            for opened in decoders.values():
+                opened.close()
+            if not isinstance(error, InvalidInput):
+                raise
             name = f"hello.cameras[{index}].{error.field}"
             raise InvalidInput(name, error.problem) from error
     return decoders

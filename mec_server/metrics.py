@@ -12,6 +12,7 @@ from dataclasses import fields
 
 from prometheus_client import CollectorRegistry
 
+from mec_server.decoder_process import LossCause
 from rfcore.codec import references_name
 from rfcore.errors import RejectReason
 from rfcore.field import RadianceField
@@ -70,6 +71,11 @@ class ServerMetrics:
             "rfedge_server_inexact_frames",
             "Frames decoded against a render that differs from the vehicle's by rounding.",
         )
+        self.decoders_lost = make.counter(
+            "rfedge_server_decoders_lost",
+            "Decoder processes that died in use: by a signal, by themselves, or for being slow.",
+            ("cause",),
+        )
         self.recording = make.gauge(
             "rfedge_server_recording",
             "1 while pictures are recorded, 0 when none are asked for or the disk refused.",
@@ -88,6 +94,8 @@ class ServerMetrics:
         self.frames.labels("acked", "")
         for reason in RejectReason:
             self.frames.labels("nacked", reason)
+        for cause in LossCause:
+            self.decoders_lost.labels(cause)
 
     def field_opened(self, field: RadianceField) -> None:
         """Tell which field was opened."""

@@ -14,9 +14,11 @@ from grpc_health.v1.health import aio as health_aio
 from prometheus_client import CollectorRegistry, start_http_server
 
 from mec_server.config import ServerConfig
+from mec_server.decoders import Decoders
 from mec_server.edge_service import EdgeService, Surroundings
 from mec_server.field_service import FieldService
 from mec_server.fields import FieldShelf, field_loader
+from mec_server.handlers import Tools
 from mec_server.metrics import ServerMetrics
 from mec_server.recorder import Recorder
 from mec_server.twin import Twin
@@ -59,6 +61,7 @@ class EdgeServer:
         )
         self._twin_service = TwinService(twin, watched, config.consumers)
         self._executor = ThreadPoolExecutor(config.workers, "worker")
+        self._decoders = Decoders(config.decoder, not self.address.is_loopback, self._metrics)
         self._recorder = self._open_recorder(config.save)
         self._health = health_aio.HealthServicer()
         self._edge = EdgeService(
@@ -66,6 +69,7 @@ class EdgeServer:
                 self._shelf,
                 store.ids,
                 self._executor,
+                Tools(time.perf_counter_ns, self._decoders.open),
                 self._metrics,
                 config.limits,
                 twin,
@@ -84,6 +88,7 @@ class EdgeServer:
         Raises ``RfedgeError`` for a damaged field or a port that cannot be had.
         """
         count = await asyncio.to_thread(self._shelf.warm_up)
+        await asyncio.to_thread(self._decoders.start)
         try:
             port = self._open_port()
         except RuntimeError as error:
@@ -99,6 +104,7 @@ class EdgeServer:
             address=str(self.address),
             fields=count,
             tls=self._config.tls is not None,
+            decoder=str(self._decoders.kind),
         )
         return self.address
 
@@ -110,6 +116,7 @@ class EdgeServer:
         self._twin_service.drain()
         await self._server.stop(self._config.drain_s)
         await asyncio.to_thread(self._executor.shutdown)
+        await asyncio.to_thread(self._decoders.close)
         self._twin_service.close()
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)

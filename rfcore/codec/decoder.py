@@ -15,13 +15,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from rfcore.codec.coarse import COARSE_TOLERANCE, coarse_difference, coarse_digest
+from rfcore.codec.h264 import H264Decoder
 from rfcore.codec.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.photometric import adapt
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.reference import without_zeros
 from rfcore.codec.references import is_temporal
-from rfcore.codec.splice import SpliceDecoder
+from rfcore.codec.splice import PictureDecoder, SpliceDecoder
 from rfcore.codec.state import DecoderState, Past
 from rfcore.errors import BitstreamError, CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
@@ -60,16 +61,25 @@ class DeltaDecoder:
     With ``exact=False`` the sender's renderer may differ by rounding: a reference that fails the
     exact digest but passes the coarse one is accepted, and its reconstruction cannot be checked.
     Between exact renderers no packet needs the coarse one; where it is there, it is used to say
-    what kind of difference led to ``REFERENCE_MISMATCH``.
+    what kind of difference led to ``REFERENCE_MISMATCH``. ``open_decoder`` makes
+    the standard decoder that sees the sender's bytes.
     """
 
     def __init__(
-        self, header: StreamHeader, exact: bool = True, clock_ns: Clock = _stopped_clock
+        self,
+        header: StreamHeader,
+        exact: bool = True,
+        clock_ns: Clock = _stopped_clock,
+        open_decoder: Callable[[tuple[int, int]], PictureDecoder] = H264Decoder,
     ) -> None:
         self._config = header.config
-        self._splice = SpliceDecoder(header)
+        self._splice = SpliceDecoder(header, open_decoder)
         self._exact = exact
         self._clock_ns = clock_ns
+
+    def close(self) -> None:
+        """Let go of the standard decoder."""
+        self._splice.close()
 
     def start(self, epoch: int, after: DecoderState | None = None) -> DecoderState:
         """Return the state before the first packet of a (re)started stream.

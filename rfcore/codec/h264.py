@@ -93,6 +93,9 @@ class H264Decoder:
         """Forget everything, parameter sets included."""
         self._context = self._open()
 
+    def close(self) -> None:
+        """Nothing is held but memory, which goes with the object."""
+
     def decode(self, access_unit: bytes) -> I420:
         """Decode one access unit (byte stream) of one whole picture, or raise ``CodecError``.
 

@@ -10,8 +10,9 @@ that its ``idr_pic_id``, which is always 0, never follows another 0 (7.4.3).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Protocol
 
 import numpy as np
 
@@ -24,22 +25,43 @@ from rfcore.codec.reference import PcmPlace, pcm_picture, pcm_pps
 from rfcore.errors import BitstreamError, CodecError
 from rfcore.image import I420
 
-__all__ = ["SpliceDecoder", "grey"]
+__all__ = ["PictureDecoder", "SpliceDecoder", "grey"]
 
 _P_SLICE, _I_SLICE = 0, 2
+
+
+class PictureDecoder(Protocol):
+    """A standard decoder for access units of one size, as ``rfcore.codec.h264.H264Decoder``."""
+
+    def decode(self, access_unit: bytes) -> I420:
+        """Return the picture of one access unit; raise ``CodecError``."""
+
+    def feed(self, access_unit: bytes) -> None:
+        """Decode for the sake of what comes after; raise ``CodecError``."""
+
+    def reset(self) -> None:
+        """Forget everything, parameter sets included."""
+
+    def close(self) -> None:
+        """Let go of what the decoder holds; it is not used again."""
 
 
 class SpliceDecoder:
     """Decodes slices against references. One caller at a time.
 
-    Raises ``InvalidInput`` for a header that our encoder would not make.
+    Raises ``InvalidInput`` for a header that our encoder would not make, before it has
+    ``open_decoder`` make a decoder for the coded size.
     """
 
-    def __init__(self, header: StreamHeader) -> None:
+    def __init__(
+        self,
+        header: StreamHeader,
+        open_decoder: Callable[[tuple[int, int]], PictureDecoder] = H264Decoder,
+    ) -> None:
         self._config = header.config
         self._log2_max_frame_num = check_header(header).log2_max_frame_num
         self._parameter_sets = join_nals([header.sps, header.pps, pcm_pps()])
-        self._decoder = H264Decoder(header.config.coded_size_px)
+        self._decoder = open_decoder(header.config.coded_size_px)
         self._knows_parameter_sets = False
         self._idr_pic_id = 1
 
@@ -90,8 +112,12 @@ class SpliceDecoder:
 
     def reset(self) -> None:
         """Start over with a fresh decoder, whatever the last payload did to the old one."""
-        self._decoder.reset()
         self._knows_parameter_sets = False
+        self._decoder.reset()
+
+    def close(self) -> None:
+        """Let go of the decoder."""
+        self._decoder.close()
 
     @contextmanager
     def _fresh_after_errors(self) -> Iterator[None]:

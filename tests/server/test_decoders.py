@@ -1,0 +1,221 @@
+"""Decoding in other processes: the same pictures and errors, and a death costs one picture."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from prometheus_client import CollectorRegistry
+
+from mec_server import bubblewrap, decoder_process
+from mec_server.bubblewrap import bubblewrap_command
+from mec_server.config import DecoderKind
+from mec_server.decoder_child import ADDRESS_SPACE_BYTES
+from mec_server.decoder_pool import ChildDecoder, DecoderPool
+from mec_server.decoder_process import DecoderLost, LossCause, child_environment
+from mec_server.decoders import Decoders
+from mec_server.metrics import ServerMetrics
+from rfcore.codec.h264 import EncoderOptions, H264Decoder, PictureKind, encode_pictures
+from rfcore.errors import BackendUnavailable, CodecError, RfedgeError
+from rfcore.image import I420
+
+SIZE_PX = (96, 64)
+WRAPPERS = {
+    "child": lambda: (),
+    "bubblewrap": lambda: bubblewrap_command(child_environment()),
+}
+
+
+def clip(size_px: tuple[int, int], count: int) -> list[bytes]:
+    rng = np.random.default_rng(3)
+    width, height = size_px
+    half = (height // 2, width // 2)
+    pictures = [
+        I420(*(rng.integers(16, 235, s, np.uint8) for s in ((height, width), half, half)))
+        for _ in range(count)
+    ]
+    options = EncoderOptions(size_px, "ultrafast", 40.0, {"keyint": "infinite"})
+    return encode_pictures(options, [(picture, PictureKind.CHOSEN) for picture in pictures])
+
+
+@pytest.fixture(scope="module")
+def units() -> list[bytes]:
+    return clip(SIZE_PX, 4)
+
+
+@pytest.fixture(scope="module", params=list(WRAPPERS))
+def pool(request: pytest.FixtureRequest) -> Iterator[DecoderPool]:
+    """Processes with limits, and the same in a sandbox (Debian: bubblewrap)."""
+    made = DecoderPool(WRAPPERS[request.param](), lambda lost: LOST.append(lost))
+    made.wait_until_ready()
+    yield made
+    made.close()
+
+
+LOST: list[DecoderLost] = []
+
+
+@pytest.fixture
+def decoder(pool: DecoderPool) -> Iterator[ChildDecoder]:
+    LOST.clear()
+    opened = pool.open(SIZE_PX)
+    yield opened
+    opened.close()
+
+
+def python_of(decoder: ChildDecoder) -> int:
+    """Return the process that decodes: bubblewrap's is its grandchild."""
+    assert decoder._process is not None
+    pid = decoder._process.pid
+    while children := Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        pid = int(children[0])
+    return pid
+
+
+def test_pictures_are_those_of_a_decoder_in_this_process(
+    decoder: ChildDecoder, units: Sequence[bytes]
+) -> None:
+    here = H264Decoder(SIZE_PX)
+    for unit in units[:-1]:
+        assert decoder.decode(unit).digest() == here.decode(unit).digest()
+    decoder.feed(units[-1])
+
+
+def test_what_ffmpeg_refuses_is_the_same_error_and_the_process_lives_on(
+    decoder: ChildDecoder, units: Sequence[bytes]
+) -> None:
+    for bad in (b"", b"\x00\x00\x00\x01\x65garbage", clip((192, 128), 1)[0]):
+        with pytest.raises(CodecError) as there:
+            decoder.decode(bad)
+        with pytest.raises(CodecError) as here:
+            H264Decoder(SIZE_PX).decode(bad)
+        assert str(there.value) == str(here.value)
+        decoder.reset()
+    decoder.decode(units[0])
+    assert LOST == []
+
+
+def test_a_killed_process_costs_one_picture(decoder: ChildDecoder, units: Sequence[bytes]) -> None:
+    expected = decoder.decode(units[0]).digest()
+    os.kill(python_of(decoder), signal.SIGKILL)
+    with pytest.raises(DecoderLost, match="was killed by SIGKILL"):
+        decoder.decode(units[1])
+    decoder.reset()
+    assert decoder.decode(units[0]).digest() == expected
+    assert [lost.cause for lost in LOST] == [LossCause.SIGNAL]
+
+
+def test_a_process_that_hangs_is_killed(
+    decoder: ChildDecoder, units: Sequence[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hung = python_of(decoder)
+    os.kill(hung, signal.SIGSTOP)
+    with monkeypatch.context() as patience:
+        patience.setattr(decoder_process, "ANSWER_S", 0.05)
+        with pytest.raises(DecoderLost, match="did not answer"):
+            decoder.decode(units[0])
+    decoder.decode(units[0])
+    assert [lost.cause for lost in LOST] == [LossCause.TIMEOUT]
+    while Path(f"/proc/{hung}/exe").exists():
+        os.sched_yield()
+
+
+def test_a_process_has_the_limits_it_is_said_to_have(
+    decoder: ChildDecoder, units: Sequence[bytes]
+) -> None:
+    decoder.decode(units[0])
+    lines = Path(f"/proc/{python_of(decoder)}/limits").read_text().splitlines()
+    limits = {line[:26].strip(): line[26:].split()[:2] for line in lines}
+    assert limits["Max address space"] == [str(ADDRESS_SPACE_BYTES)] * 2
+    assert limits["Max open files"] == ["16", "16"]
+    for nothing in ("Max file size", "Max processes", "Max core file size"):
+        assert limits[nothing] == ["0", "0"]
+    assert int(limits["Max cpu time"][0]) < 60, "moves along with what was used"
+
+
+def test_a_process_ends_when_its_decoder_is_closed(pool: DecoderPool) -> None:
+    decoder = pool.open(SIZE_PX)
+    pid = python_of(decoder)
+    decoder.close()
+    while Path(f"/proc/{pid}/exe").exists():  # the kernel ends a sandbox after its front
+        os.sched_yield()
+    with pytest.raises(CodecError, match="its stream is over"):
+        decoder.decode(b"\x00\x00\x00\x01\x65")
+
+
+def test_bubblewrap_shows_no_network_no_process_and_no_file_of_ours(units: Sequence[bytes]) -> None:
+    pool = DecoderPool(WRAPPERS["bubblewrap"](), lambda _: None)
+    decoder = pool.open(SIZE_PX)
+    try:
+        decoder.decode(units[0])
+        proc = Path(f"/proc/{python_of(decoder)}")
+        for namespace in ("net", "pid", "ipc", "mnt", "uts"):
+            there, here = (p / "ns" / namespace for p in (proc, Path("/proc/self")))
+            assert there.readlink() != here.readlink(), namespace
+        root = proc / "root"
+        assert not (root / "etc/passwd").exists()
+        assert not (root / "tmp").exists()
+        assert not (root / str(Path(__file__)).lstrip("/")).exists()
+        mounts = (proc / "mounts").read_text().splitlines()
+        writable = [m.split()[1] for m in mounts if "rw" in m.split()[3].split(",")]
+        assert all(place.startswith(("/dev", "/proc")) for place in writable), writable
+    finally:
+        decoder.close()
+        pool.close()
+
+
+@pytest.fixture
+def decoders() -> Callable[[DecoderKind, bool], Decoders]:
+    return lambda kind, reachable: Decoders(kind, reachable, ServerMetrics(CollectorRegistry()))
+
+
+def test_auto_decodes_in_the_server_only_where_no_other_machine_can_reach_it(
+    decoders: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert decoders(DecoderKind.AUTO, False).kind is DecoderKind.IN_PROCESS
+    exposed = decoders(DecoderKind.AUTO, True)
+    exposed.start()
+    exposed.close()
+    assert exposed.kind is DecoderKind.BUBBLEWRAP
+    monkeypatch.setattr(bubblewrap.shutil, "which", lambda _: None)
+    without = decoders(DecoderKind.AUTO, True)
+    without.start()
+    without.close()
+    assert without.kind is DecoderKind.CHILD
+
+
+def test_a_sandbox_that_was_asked_for_and_cannot_be_had_is_an_error(
+    decoders: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bubblewrap.shutil, "which", lambda _: None)
+    with pytest.raises(BackendUnavailable, match=r"bwrap is not on PATH; install bubblewrap"):
+        decoders(DecoderKind.BUBBLEWRAP, True).start()
+    monkeypatch.setattr(bubblewrap.shutil, "which", lambda _: "/bin/false")
+    with pytest.raises(BackendUnavailable, match=r"^decoder bubblewrap: .* ended with status 1"):
+        decoders(DecoderKind.BUBBLEWRAP, True).start()
+
+
+def test_a_process_that_cannot_start_says_why() -> None:
+    pool = DecoderPool((sys.executable, "-c", "raise SystemExit('no room')"), lambda _: None)
+    with pytest.raises(RfedgeError, match="ended with status 1 at its start: no room"):
+        pool.wait_until_ready()
+    pool.close()
+
+
+def test_a_lost_decoder_is_counted_by_cause(units: Sequence[bytes]) -> None:
+    registry = CollectorRegistry()
+    made = Decoders(DecoderKind.CHILD, True, ServerMetrics(registry))
+    made.start()
+    decoder: Any = made.open(SIZE_PX)
+    os.kill(python_of(decoder), signal.SIGSEGV)
+    with pytest.raises(CodecError, match="SIGSEGV"):
+        decoder.decode(units[0])
+    decoder.close()
+    made.close()
+    name = "rfedge_server_decoders_lost_total"
+    assert registry.get_sample_value(name, {"cause": "signal"}) == 1
+    assert registry.get_sample_value(name, {"cause": "timeout"}) == 0
