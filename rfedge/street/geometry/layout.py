@@ -12,9 +12,24 @@ from functools import cached_property
 
 import numpy as np
 
+from rfedge.street.geometry.mesh import F64
 from rfedge.street.scene_file import Geometry
 
-__all__ = ["Layout", "Place", "Plot"]
+__all__ = [
+    "BAY_LENGTH_M",
+    "BEYOND_M",
+    "CROSSING_M",
+    "FACADE_M",
+    "FASCIA_M",
+    "KERB_M",
+    "LANE_M",
+    "PAVEMENT_UP_M",
+    "ROAD_HALF_M",
+    "SIDES",
+    "Layout",
+    "Place",
+    "Plot",
+]
 
 ROAD_HALF_M = 6.6
 KERB_M = 0.3
@@ -26,6 +41,8 @@ LAMP_M, LAMP_SPACING_M = 7.3, 24.0
 TREE_M, TREE_SPACING_M = 7.7, 11.0
 SIGN_M, SIGN_SPACING_M = 7.0, 19.0
 CROSSING_SPACING_M, CROSSING_M = 80.0, 3.2
+FASCIA_M = (3.35, 3.95)
+"""Height of the band over the ground floor that facades leave bare for a sign."""
 BEYOND_M = 40.0
 """How far road and pavement go on behind the last facades."""
 SIDES = (1, -1)
@@ -47,7 +64,7 @@ class Plot:
     """A building's ground: from ``start_m`` to ``end_m`` along x, its facade at ``y_m``.
 
     The facade looks towards the road. The ground floor is ``ground_m`` high, each of the
-    ``floors`` above ``floor_m``; ``style`` numbers the looks.
+    ``floors`` above ``floor_m``; ``style`` seeds the looks.
     """
 
     side: int
@@ -58,6 +75,26 @@ class Plot:
     floors: int
     floor_m: float
     style: int
+
+    @property
+    def width_m(self) -> float:
+        """How wide the facade is."""
+        return self.end_m - self.start_m
+
+    @property
+    def height_m(self) -> float:
+        """From the road to the eaves."""
+        return self.ground_m + self.floors * self.floor_m + 0.6
+
+    @property
+    def world_from_facade(self) -> F64:
+        """From (along the facade to the right, up, out of the wall) to the world, 4x4."""
+        along = (float(self.side), 0.0, 0.0)
+        corner = (self.start_m if self.side > 0 else self.end_m, self.y_m, 0.0)
+        outwards = (0.0, -float(self.side), 0.0)
+        matrix = np.eye(4)
+        matrix[:3] = np.stack([along, (0.0, 0.0, 1.0), outwards, corner], axis=1)
+        return matrix
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,111 @@
+"""Road, kerbs, pavements, markings and manholes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rfedge.street.geometry.ground_texture import (
+    ASPHALT_TILE_M,
+    SLAB_TILE_M,
+    asphalt,
+    paint,
+    slabs,
+)
+from rfedge.street.geometry.layout import (
+    BAY_LENGTH_M,
+    BEYOND_M,
+    CROSSING_M,
+    KERB_M,
+    PAVEMENT_UP_M,
+    ROAD_HALF_M,
+    SIDES,
+    Layout,
+)
+from rfedge.street.geometry.material import Material
+from rfedge.street.geometry.mesh import F64, Label, Mesh
+from rfedge.street.geometry.solids import Stuff, boxes, disc, quads
+from rfedge.street.geometry.world import Part
+
+__all__ = ["road"]
+
+ASPHALT = Stuff("asphalt", Label.ROAD, ASPHALT_TILE_M)
+SLABS = Stuff("slabs", Label.PAVEMENT, SLAB_TILE_M)
+KERB = Stuff("kerb", Label.PAVEMENT)
+PAINT = Stuff("paint", Label.MARKING, 2.0)
+IRON = Stuff("iron", Label.ROAD)
+BAY_LINE_M = 4.2
+PAINT_UP_M = 0.004
+"""Markings lie this much above the road, less than any depth map resolves at 10 m."""
+PAVEMENT_TO_M = 30.0
+
+
+def road(layout: Layout, rng: np.random.Generator) -> Part:
+    """Return the ground of the street."""
+    start, end = layout.start_m - BEYOND_M, layout.end_m + BEYOND_M
+    meshes = [_flat(ASPHALT, np.array([[start, -ROAD_HALF_M, end, ROAD_HALF_M]]), 0.0)]
+    meshes += [mesh for side in SIDES for mesh in _edge(side, start, end)]
+    meshes += _markings(layout)
+    meshes += _manholes(layout, rng)
+    return Part(
+        tuple(meshes),
+        (
+            Material("asphalt", asphalt(rng), roughness=0.8),
+            Material("slabs", slabs(rng)),
+            Material("kerb", (0.42, 0.41, 0.39)),
+            Material("paint", paint(rng)),
+            Material("iron", (0.06, 0.06, 0.065), roughness=0.45, metallic=0.4),
+        ),
+    )
+
+
+def _edge(side: int, start: float, end: float) -> list[Mesh]:
+    """Kerb stones of a metre with joints between them, and the pavement behind."""
+    stones = np.arange(start, end, 1.0)
+    inner, outer = sorted((side * ROAD_HALF_M, side * (ROAD_HALF_M + KERB_M)))
+    ones = np.ones_like(stones)
+    low = np.stack([stones + 0.006, inner * ones, -0.1 * ones], axis=1)
+    high = np.stack([stones + 0.994, outer * ones, PAVEMENT_UP_M * ones], axis=1)
+    near, far = sorted((side * (ROAD_HALF_M + KERB_M), side * PAVEMENT_TO_M))
+    pavement = np.array([[start, near, end, far]])
+    return [boxes(KERB, low, high), _flat(SLABS, pavement, PAVEMENT_UP_M)]
+
+
+def _markings(layout: Layout) -> list[Mesh]:
+    start, end = layout.start_m, layout.end_m
+    dashes = np.arange(start, end, 6.0)
+    kept = dashes[[not layout.at_crossing(x + 1.5, 2.0) for x in dashes]]
+    areas = [_strips(kept, 3.0, -0.07, 0.07)]
+    for side in SIDES:
+        line, kerb = side * BAY_LINE_M, side * ROAD_HALF_M
+        areas.append(np.array([[start, line - 0.06, end, line + 0.06]]))
+        bays = np.arange(start, end, BAY_LENGTH_M)
+        areas.append(_strips(bays, 0.1, min(line, kerb), max(line, kerb)))
+    for crossing in layout.crossings_x_m:
+        across = np.arange(-6.0, 6.0, 1.0)
+        left = np.full_like(across, crossing - CROSSING_M / 2)
+        areas.append(np.stack([left, across + 0.25, left + CROSSING_M, across + 0.75], axis=1))
+    return [_flat(PAINT, np.concatenate(areas), PAINT_UP_M)]
+
+
+def _manholes(layout: Layout, rng: np.random.Generator) -> list[Mesh]:
+    count = max(int((layout.end_m - layout.start_m) / 25), 1)
+    x = rng.uniform(layout.start_m, layout.end_m, count)
+    y = rng.uniform(-3.0, 3.0, count)
+    centres = np.stack([x, y, np.full(count, 0.006)], axis=1)
+    return [disc(IRON, centre, (0, 0, 1), 0.33) for centre in centres]
+
+
+def _strips(start: F64, length: float, low: float, high: float) -> F64:
+    ones = np.ones_like(start)
+    return np.stack([start, low * ones, start + length, high * ones], axis=1)
+
+
+def _flat(stuff: Stuff, areas: F64, z_m: float) -> Mesh:
+    """Rectangles (x0, y0, x1, y1) [N, 4] that look up; their texture lies on the ground."""
+    x0, y0, x1, y1 = areas.T
+    corners = np.stack(
+        [np.stack([x, y], axis=1) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], axis=1
+    )
+    up = np.full((*corners.shape[:2], 1), z_m)
+    uv = corners * (1, -1) / stuff.tile_m
+    return quads(stuff, np.concatenate([corners, up], axis=2), uv)
