@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from mec_server.config import ConsumerLimits, DecoderKind, ServerConfig
+from mec_server.config import ConsumerLimits, DecoderKind, ServerConfig, VehicleQuota
 from mec_server.server import EdgeServer
 from rfcore.errors import RfedgeError
 from rfcore.wire.logs import LogForm, configure_logs
@@ -29,6 +29,10 @@ def run(
     metrics_host: str = "127.0.0.1",
     metrics_per_vehicle: Flag = False,
     max_consumers: int = 8,
+    max_streams: int = 256,
+    vehicle_streams: int = 8,
+    vehicle_frames_per_s: float = 500.0,
+    vehicle_bytes_per_s: float = 32e6,
     log: LogForm = LogForm.AUTO,
     threads: int = 1,
     workers: int = 2,
@@ -50,6 +54,10 @@ def run(
         metrics_host: Address the metrics are served on.
         metrics_per_vehicle: Tell vehicles apart in the metrics; each costs its own time series.
         max_consumers: How many may watch the twin at once (`rfedge watch`).
+        max_streams: How many streams of vehicles may be open at once.
+        vehicle_streams: How many of them one vehicle may have.
+        vehicle_frames_per_s: How many frames it may send, over all its streams.
+        vehicle_bytes_per_s: How many bytes these may have.
         log: console lines, json lines, or auto: console on a terminal.
         threads: Threads per render; the pictures do not depend on it.
         workers: Frames reconstructed at once.
@@ -71,6 +79,8 @@ def run(
         metrics_host=metrics_host,
         metrics_per_vehicle=metrics_per_vehicle,
         consumers=ConsumerLimits(max_consumers),
+        max_streams=max_streams,
+        quota=VehicleQuota(vehicle_streams, vehicle_frames_per_s, vehicle_bytes_per_s),
         log=log,
         threads=threads,
         workers=workers,

@@ -10,7 +10,7 @@ from rfcore.errors import InvalidInput
 from rfcore.wire.logs import LogForm
 from rfcore.wire.tls import TlsFiles
 
-__all__ = ["ConsumerLimits", "DecoderKind", "ServerConfig", "SessionLimits"]
+__all__ = ["ConsumerLimits", "DecoderKind", "ServerConfig", "SessionLimits", "VehicleQuota"]
 
 
 class DecoderKind(StrEnum):
@@ -44,6 +44,24 @@ class SessionLimits:
 
 
 @dataclass(frozen=True)
+class VehicleQuota:
+    """What one vehicle may use at most, over all its streams: far above what an honest one does,
+    far below what would starve the others."""
+
+    streams: int = 8
+    frames_per_s: float = 500.0
+    bytes_per_s: float = 32e6
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.streams <= 1000:
+            raise InvalidInput("quota.streams", f"{self.streams} is outside 1..1000")
+        for name in ("frames_per_s", "bytes_per_s"):
+            value = getattr(self, name)
+            if not 1 <= value <= 1e12:
+                raise InvalidInput(f"quota.{name}", f"{value} is outside 1..1e12")
+
+
+@dataclass(frozen=True)
 class ConsumerLimits:
     """``consumers`` may watch at once; one that takes nothing for ``patience_s`` is let go."""
 
@@ -66,7 +84,8 @@ class ServerConfig:
     served without a port, and ``metrics_per_vehicle`` tells vehicles apart in them. ``threads`` per
     render, ``workers`` frames at once. ``isa`` forces an instruction set. ``ready_file`` receives
     the address once connections are accepted. ``tls``: only clients with a certificate are let in.
-    ``decoder``: where packets are decoded.
+    ``decoder``: where packets are decoded. ``max_streams`` may be open, ``quota`` of them and what
+    they carry be one vehicle's.
     """
 
     fields: Path
@@ -83,12 +102,14 @@ class ServerConfig:
     log: LogForm = LogForm.AUTO
     consumers: ConsumerLimits = ConsumerLimits()
     decoder: DecoderKind = DecoderKind.AUTO
+    max_streams: int = 256
+    quota: VehicleQuota = VehicleQuota()
     allow_insecure: bool = False
     drain_s: float = 5.0
     limits: SessionLimits = SessionLimits()
 
     def __post_init__(self) -> None:
-        for name, highest in (("threads", 256), ("workers", 256)):
+        for name, highest in (("threads", 256), ("workers", 256), ("max_streams", 100_000)):
             value = getattr(self, name)
             if not 1 <= value <= highest:
                 raise InvalidInput(name, f"{value} is outside 1..{highest}")

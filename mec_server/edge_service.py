@@ -17,18 +17,20 @@ import grpc
 import structlog
 
 from mec_server.config import SessionLimits
+from mec_server.decoder_process import DecoderLost
 from mec_server.handlers import CameraDecoder, FieldSource, Reconstruction, Tools, open_cameras
 from mec_server.jobs import DecodeJob, End, OpenJob
 from mec_server.metrics import ServerMetrics
+from mec_server.quotas import Allowance, Limit, Quotas
 from mec_server.recorder import Recorder, Recording
-from mec_server.session import ServerSession
+from mec_server.session import ServerSession, SessionState
 from mec_server.twin import Twin, TwinView
-from rfcore.errors import InvalidInput, PacketRejected, RfedgeError
+from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeError
 from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_message_to_bytes
 from rfcore.wire.identity import peer_identity
-from rfcore.wire.messages import Frame
+from rfcore.wire.messages import Frame, Hello
 from rfcore.wire.status import status_of
 
 __all__ = ["EdgeService", "Surroundings"]
@@ -50,6 +52,8 @@ class Surroundings:
     tools: Tools
     metrics: ServerMetrics
     limits: SessionLimits
+    quotas: Quotas
+    max_streams: int
     twin: Twin
     recorder: Recorder | None = None
 
@@ -77,6 +81,8 @@ class EdgeService:
             stream.drain()
 
     async def _handle(self, requests: AsyncIterator[bytes], context: Context) -> None:
+        if len(self._streams) >= self._around.max_streams:
+            await self._turn_away(context)
         stream = _Stream(self._around, context)
         self._streams.add(stream)
         self._around.metrics.sessions.inc()
@@ -87,7 +93,18 @@ class EdgeService:
             self._around.metrics.sessions.dec()
             stream.leave()
         if end.error is not None:
+            if isinstance(end.error, LimitExceeded):
+                self._around.metrics.limited.labels(end.error.limit).inc()
             await context.abort(status_of(end.error), str(end.error))
+
+    async def _turn_away(self, context: Context) -> None:
+        error = LimitExceeded(
+            Limit.SERVER_STREAMS,
+            f"{len(self._streams)} streams are open, as many as may be; try again later",
+        )
+        self._around.metrics.limited.labels(error.limit).inc()
+        log.warning("stream refused", peer=context.peer(), problem=str(error))
+        await context.abort(status_of(error), str(error))
 
 
 class _Stream:
@@ -97,6 +114,9 @@ class _Stream:
         self._around = around
         self._context = context
         self._wake = asyncio.Event()
+        self._identity = peer_identity(context.auth_context())
+        self._allowance: Allowance | None = None
+        self._overrunning = False
         self._opening: asyncio.Future[dict[str, CameraDecoder]] | None = None
         self._decoders: dict[str, CameraDecoder] = {}
         self._metrics = around.metrics.of(UNKNOWN_VEHICLE)
@@ -107,7 +127,7 @@ class _Stream:
             around.held_field_ids(),
             time.monotonic(),
             around.limits,
-            peer_identity(context.auth_context()),
+            self._identity,
         )
 
     def drain(self) -> None:
@@ -119,6 +139,8 @@ class _Stream:
         """Let nothing remain of this stream, in the twin or in the metrics."""
         self._around.twin.leave(self._session.session_id)
         self._metrics.forget()
+        if self._allowance is not None:
+            self._allowance.leave()
         if self._opening is not None:
             self._opening.add_done_callback(_close_decoders)
 
@@ -148,10 +170,37 @@ class _Stream:
                 self._session.refuse(error, now)
             else:
                 if isinstance(message, Frame):
-                    self._metrics.received(message, len(data))
-                self._session.receive(message, now)
+                    self._receive_frame(message, len(data), now)
+                else:
+                    self._receive_hello(message, now)
             self._wake.set()
         self.drain()
+
+    def _receive_hello(self, hello: Hello, now: float) -> None:
+        session = self._session
+        session.receive(hello, now)
+        if session.state is not SessionState.OPENING or self._allowance is not None:
+            return
+        named = self._identity.uris[0] if self._identity is not None else hello.vehicle_id
+        try:
+            self._allowance = self._around.quotas.enter(named, now)
+        except LimitExceeded as error:
+            session.end(error)
+
+    def _receive_frame(self, frame: Frame, message_bytes: int, now: float) -> None:
+        self._metrics.received(frame, message_bytes)
+        try:
+            if self._allowance is not None:
+                self._allowance.spend(message_bytes, now)
+        except LimitExceeded as error:
+            self._around.metrics.limited.labels(error.limit).inc()
+            if not self._overrunning:  # once until it is over: the log has quotas, too
+                self._log.warning("frames refused", reason=error.limit, problem=str(error))
+            self._overrunning = True
+            self._session.overrun(frame, error, now)
+        else:
+            self._overrunning = False
+            self._session.receive(frame, now)
 
     async def _write(self) -> None:
         messages = self._session.messages_to_send(time.monotonic())
@@ -209,6 +258,7 @@ class _Stream:
                 problem=error.problem,
             )
             self._session.rejected(job, error, time.monotonic())
+            self._count_lost_decoder(error)
             return
         now = time.monotonic()
         self._session.decoded(job, done.outcome, now)
@@ -217,6 +267,14 @@ class _Stream:
         if not done.outcome.exact:
             self._around.metrics.inexact.inc()
         self._show(job, done, now, latency_s)
+
+    def _count_lost_decoder(self, error: PacketRejected) -> None:
+        if self._allowance is None or not isinstance(error.__cause__, DecoderLost):
+            return
+        try:
+            self._allowance.lost_decoder(time.monotonic())
+        except LimitExceeded as barred:
+            self._session.end(barred)
 
     def _show(self, job: DecodeJob, done: Reconstruction, now: float, latency_s: float) -> None:
         hello, session = self._session.hello, self._session

@@ -13,6 +13,7 @@ from dataclasses import fields
 from prometheus_client import CollectorRegistry
 
 from mec_server.decoder_process import LossCause
+from mec_server.quotas import Limit
 from rfcore.codec import references_name
 from rfcore.errors import RejectReason
 from rfcore.field import RadianceField
@@ -71,6 +72,11 @@ class ServerMetrics:
             "rfedge_server_inexact_frames",
             "Frames decoded against a render that differs from the vehicle's by rounding.",
         )
+        self.limited = make.counter(
+            "rfedge_server_limited",
+            "Streams refused or ended, and frames refused, because of a limit or quota.",
+            ("limit",),
+        )
         self.decoders_lost = make.counter(
             "rfedge_server_decoders_lost",
             "Decoder processes that died in use: by a signal, by themselves, or for being slow.",
@@ -94,6 +100,8 @@ class ServerMetrics:
         self.frames.labels("acked", "")
         for reason in RejectReason:
             self.frames.labels("nacked", reason)
+        for limit in Limit:
+            self.limited.labels(limit)
         for cause in LossCause:
             self.decoders_lost.labels(cause)
 

@@ -20,6 +20,7 @@ from mec_server.field_service import FieldService
 from mec_server.fields import FieldShelf, field_loader
 from mec_server.handlers import Tools
 from mec_server.metrics import ServerMetrics
+from mec_server.quotas import Quotas
 from mec_server.recorder import Recorder
 from mec_server.twin import Twin
 from mec_server.twin_metrics import TwinMetrics
@@ -72,6 +73,8 @@ class EdgeServer:
                 Tools(time.perf_counter_ns, self._decoders.open),
                 self._metrics,
                 config.limits,
+                Quotas(config.quota),
+                config.max_streams,
                 twin,
                 self._recorder,
             )

@@ -19,9 +19,11 @@ from enum import StrEnum
 from mec_server.config import SessionLimits
 from mec_server.jobs import DecodeJob, DecodeOutcome, End, OpenJob
 from mec_server.lane import Lane, Waiting
+from mec_server.quotas import Limit
 from rfcore.errors import (
     AccessDenied,
     InvalidInput,
+    LimitExceeded,
     PacketRejected,
     ProtocolError,
     RejectReason,
@@ -46,6 +48,10 @@ from rfcore.wire.messages import (
 )
 
 __all__ = ["ServerSession", "SessionState"]
+
+
+MAX_UNUSABLE = 64
+"""Messages in a row that are refused before any work is spent on them; then the stream ends."""
 
 
 class SessionState(StrEnum):
@@ -84,8 +90,13 @@ class ServerSession:
         self._opening: OpenJob | None = None
         self._outbox: deque[ServerMessage] = deque()
         self._deadline_s = now + self._limits.hello_s
+        self._unusable = 0
 
     # --- what the vehicle said
+
+    def end(self, error: RfedgeError) -> None:
+        """End the stream for a reason that lies outside of the conversation."""
+        self._close(error)
 
     def receive(self, message: ClientMessage, now: float) -> None:
         """Take one checked message."""
@@ -105,6 +116,26 @@ class ServerSession:
             lane.refuse(address.epoch, address.sequence)
         self._nack(address, RejectReason.INVALID_ARGUMENT, str(error))
         self._alive(now)
+        self._unusable_frame()
+
+    def overrun(self, frame: Frame, error: LimitExceeded, now: float) -> None:
+        """Answer for a frame beyond the vehicle's quota; the session lives on."""
+        lane = self._lanes.get(frame.camera_id)
+        if lane is not None:
+            lane.refuse(frame.packet.epoch, frame.packet.sequence)
+        self._nack(frame.address, RejectReason.OVERLOADED, str(error))
+        self._alive(now)
+        self._unusable_frame()
+
+    def _unusable_frame(self) -> None:
+        self._unusable += 1
+        if self._unusable >= MAX_UNUSABLE:
+            self._close(
+                LimitExceeded(
+                    Limit.UNUSABLE_FRAMES,
+                    f"{self._unusable} messages in a row could not be used; each was answered",
+                )
+            )
 
     def _receive_hello(self, hello: Hello) -> None:
         if self.state is not SessionState.AWAITING_HELLO:
@@ -140,6 +171,7 @@ class ServerSession:
         except PacketRejected as error:
             self._lanes[frame.camera_id].refuse(frame.packet.epoch, frame.packet.sequence)
             self._nack(frame.address, error.reason, error.problem)
+            self._unusable_frame()
 
     def _lane_of(self, frame: Frame) -> Lane:
         if frame.camera_id not in self._lanes:
@@ -210,6 +242,7 @@ class ServerSession:
 
     def decoded(self, job: DecodeJob, outcome: DecodeOutcome, now: float) -> None:
         """The frame of ``job`` was reconstructed."""
+        self._unusable = 0
         lane = self._lanes[job.frame.camera_id]
         for gap in lane.succeed(outcome.lost):
             address = replace(job.frame.address, sequence=gap.first)

@@ -12,6 +12,7 @@
     ├── PacketRejected          a delta packet that must not be shown; carries a RejectReason
     ├── ProtocolError           the peer broke the session's rules
     ├── AccessDenied            a certificate is refused, or does not permit what was asked
+    ├── LimitExceeded           a peer asks for more than it may have
     ├── BackendUnavailable      an instruction set or device this machine does not have
     ├── CodecError              encoder or decoder did not do what its configuration promises
     └── TrainingDiverged        a training run no longer gets anywhere
@@ -31,6 +32,7 @@ __all__ = [
     "FieldFormatError",
     "InvalidData",
     "InvalidInput",
+    "LimitExceeded",
     "PacketRejected",
     "ProtocolError",
     "RejectReason",
@@ -107,6 +109,14 @@ class ProtocolError(RfedgeError):
 
 class AccessDenied(RfedgeError):
     """A certificate is refused, or does not permit what was asked."""
+
+
+class LimitExceeded(RfedgeError):
+    """A peer asks for more than it may have; ``limit`` is a word that can be counted."""
+
+    def __init__(self, limit: str, problem: str) -> None:
+        super().__init__(f"{limit}: {problem}")
+        self.limit = limit
 
 
 class BackendUnavailable(RfedgeError):

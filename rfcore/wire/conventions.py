@@ -73,4 +73,8 @@ SERVER_OPTIONS: Final[Options] = (
     # Two servers on one port would share the vehicles between them at random.
     ("grpc.so_reuseport", 0),
     ("grpc.max_concurrent_streams", 256),
+    # By default a peer may take two minutes over its handshake, and hold a connection for it; and
+    # there may be any number of connections.
+    ("grpc.server_handshake_timeout_ms", 5_000),
+    ("grpc.max_allowed_incoming_connections", 1_024),
 )

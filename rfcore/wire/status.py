@@ -10,6 +10,7 @@ from rfcore.errors import (
     CodecError,
     InvalidData,
     InvalidInput,
+    LimitExceeded,
     PacketRejected,
     ProtocolError,
     RfedgeError,
@@ -25,6 +26,7 @@ STATUS_OF: tuple[tuple[type[RfedgeError], grpc.StatusCode], ...] = (
     (PacketRejected, grpc.StatusCode.ABORTED),
     (ProtocolError, grpc.StatusCode.FAILED_PRECONDITION),
     (AccessDenied, grpc.StatusCode.PERMISSION_DENIED),
+    (LimitExceeded, grpc.StatusCode.RESOURCE_EXHAUSTED),
     (BackendUnavailable, grpc.StatusCode.UNIMPLEMENTED),
     (CodecError, grpc.StatusCode.INTERNAL),
 )

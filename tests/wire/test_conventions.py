@@ -6,7 +6,14 @@ import grpc
 import pytest
 
 from rfcore import errors
-from rfcore.errors import InvalidInput, PacketRejected, RejectReason, RfedgeError, TrainingDiverged
+from rfcore.errors import (
+    InvalidInput,
+    LimitExceeded,
+    PacketRejected,
+    RejectReason,
+    RfedgeError,
+    TrainingDiverged,
+)
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 from rfcore.wire.conventions import (
     CHANNEL_OPTIONS,
@@ -23,7 +30,7 @@ def every_error() -> Iterator[RfedgeError]:
         kind = getattr(errors, name)
         if kind is RejectReason:
             continue
-        if issubclass(kind, InvalidInput):
+        if issubclass(kind, InvalidInput | LimitExceeded):
             yield kind("field", "problem")
         elif issubclass(kind, PacketRejected):
             yield kind(RejectReason.CRC_MISMATCH, "problem")

@@ -1,0 +1,90 @@
+"""What one vehicle may use, on a clock the test turns."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mec_server.config import VehicleQuota
+from mec_server.quotas import BARRED_S, MAX_LOST_DECODERS, Limit, Quotas, TokenBucket
+from rfcore.errors import InvalidInput, LimitExceeded
+
+times = st.lists(st.tuples(st.floats(0, 2), st.floats(0.1, 20)), max_size=60)
+
+
+@given(times)
+def test_a_bucket_never_lets_more_through_than_its_rate_one_burst_and_one_message(
+    steps: list[tuple[float, float]],
+) -> None:
+    bucket, now, taken = TokenBucket(10.0, 0.0), 0.0, 0.0
+    for pause_s, amount in steps:
+        now += pause_s
+        taken += amount if bucket.take(amount, now) else 0.0
+        assert taken <= 10.0 * now + 10.0 + 20.0 + 1e-6
+
+
+def test_a_vehicle_within_its_rate_is_never_refused() -> None:
+    allowance = Quotas(VehicleQuota(frames_per_s=20, bytes_per_s=20_000)).enter("cav-1", 0.0)
+    for i in range(1000):
+        allowance.spend(1000, i / 20)
+
+
+@pytest.mark.parametrize(
+    ("message_bytes", "limit"), [(1, Limit.FRAME_RATE), (100_000, Limit.BYTE_RATE)]
+)
+def test_the_rate_that_is_exceeded_is_named_and_holds_for_all_streams_together(
+    message_bytes: int, limit: Limit
+) -> None:
+    quotas = Quotas(VehicleQuota(frames_per_s=20, bytes_per_s=100_000))
+    one, two = quotas.enter("cav-1", 0.0), quotas.enter("cav-1", 0.0)
+    for _ in range(20 if limit is Limit.FRAME_RATE else 1):
+        one.spend(message_bytes, 0.0)
+    with pytest.raises(LimitExceeded, match=rf"^{limit}: more than ") as caught:
+        one.spend(message_bytes, 0.0)
+    assert caught.value.limit == limit
+    with pytest.raises(LimitExceeded):
+        two.spend(message_bytes, 0.0)
+    quotas.enter("cav-2", 0.0).spend(message_bytes, 0.0)
+    two.spend(message_bytes, 1.0)
+
+
+def test_streams_of_one_vehicle_are_counted_and_given_back() -> None:
+    quotas = Quotas(VehicleQuota(streams=2))
+    first, _ = quotas.enter("cav-1", 0.0), quotas.enter("cav-1", 0.0)
+    with pytest.raises(LimitExceeded, match=r"^vehicle_streams: .* 2 streams open, 2 may be"):
+        quotas.enter("cav-1", 0.0)
+    quotas.enter("cav-2", 0.0)
+    first.leave()
+    quotas.enter("cav-1", 0.0)
+
+
+def test_who_costs_three_decoders_in_a_minute_stays_out_for_it_and_then_comes_back() -> None:
+    quotas = Quotas(VehicleQuota())
+    allowance = quotas.enter("cav-1", 0.0)
+    for i in range(MAX_LOST_DECODERS - 1):
+        allowance.lost_decoder(float(i))
+    with pytest.raises(LimitExceeded, match=r"^lost_decoders: .* cost 3 decoders within 60 s"):
+        allowance.lost_decoder(10.0)
+    allowance.leave()
+    with pytest.raises(LimitExceeded):
+        quotas.enter("cav-1", BARRED_S - 0.1)
+    quotas.enter("cav-1", BARRED_S)
+
+
+def test_a_decoder_lost_now_and_then_bars_nobody() -> None:
+    allowance = Quotas(VehicleQuota()).enter("cav-1", 0.0)
+    for i in range(20):
+        allowance.lost_decoder(i * BARRED_S / (MAX_LOST_DECODERS - 1))
+
+
+def test_vehicles_that_left_cost_no_memory() -> None:
+    quotas = Quotas(VehicleQuota())
+    for i in range(100):
+        quotas.enter(f"cav-{i}", 0.0).leave()
+    quotas.enter("cav-last", 0.0)
+    assert list(quotas._accounts) == ["cav-last"]
+
+
+@pytest.mark.parametrize("change", [{"streams": 0}, {"frames_per_s": 0.0}, {"bytes_per_s": 0.0}])
+def test_a_quota_that_lets_nobody_in_is_refused(change: dict[str, float]) -> None:
+    with pytest.raises(InvalidInput, match=rf"^quota\.{next(iter(change))}: "):
+        VehicleQuota(**change)  # type: ignore[arg-type]
