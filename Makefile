@@ -9,7 +9,8 @@ TORCH_INDEX ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo sample-field test test-slow test-prometheus test-netns test-system-packages check build bench proto figures
+.PHONY: help demo sample-field test test-slow test-prometheus test-netns test-compose \
+	test-system-packages check build bench proto figures images up down operations-figures
 
 help:  ## show the targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -21,7 +22,7 @@ test: build  ## run the test suite
 	$(BIN)/python -m pytest -m "not slow"
 
 test-slow: build test-system-packages  ## run the tests that take more than ten seconds each
-	$(BIN)/python -m pytest -m slow --timeout 600
+	$(BIN)/python -m pytest -m "slow and not compose" --timeout 600
 
 # Debian packages that slow tests use beside Python: cross compiler and emulator for
 # tests/native/test_aarch64.py, promtool and prometheus for tests/deploy, ip and tc for tests/link,
@@ -42,6 +43,32 @@ test-prometheus: build test-system-packages  ## test rules with promtool, and da
 
 test-netns: build test-system-packages  ## compare the link with the kernel's own shaper (root)
 	$(BIN)/python -m pytest -m netns --timeout 600
+
+test-compose: images  ## start docker-compose.yml and look at it (root, docker, docker-compose)
+	$(BIN)/python -m pytest -m compose --timeout 1200
+
+# Wheels are collected here where Python is the image's; else the build does it, which takes longer.
+WHEELS_HERE = $(shell $(BIN)/python -c 'import sys; print(sys.version_info[:2] == (3, 11))')
+images: build  ## build the images rfedge-runtime and rfedge-full
+	@for image in runtime full; do \
+		if [ "$(WHEELS_HERE)" = True ]; then \
+			PYTHON=$(BIN)/python TORCH_INDEX="$(TORCH_INDEX)" deploy/wheelhouse.sh $$image build/wheels/$$image; fi && \
+		docker build -q --target $$image --build-arg TORCH_INDEX="$(TORCH_INDEX)" -t rfedge-$$image:local . || exit 1; done
+	@docker image ls --format '{{.Repository}}:{{.Tag}} {{.Size}}' 'rfedge-*'
+
+# STAND_IN=1: Debian's Prometheus and no Grafana, where no image registry can be reached.
+COMPOSE_FILES := -f docker-compose.yml $(if $(STAND_IN),-f deploy/stand-in/docker-compose.yml)
+COMPOSE = $(shell docker compose version >/dev/null 2>&1 && echo docker compose || echo docker-compose)
+up:  ## start two roadside servers, four vehicles, Prometheus and Grafana in containers
+	$(COMPOSE) $(COMPOSE_FILES) up -d
+	@. ./.env && echo "dashboards  http://localhost:$$GRAFANA_PORT/dashboards" && \
+		echo "Prometheus  http://localhost:$$PROMETHEUS_PORT/targets"
+
+down:  ## stop them and remove their volumes
+	$(COMPOSE) $(COMPOSE_FILES) down -v
+
+operations-figures: build  ## plot every panel of what `make up` started, into docs/operations.md
+	$(BIN)/python deploy/compose/show.py
 
 check: build  ## lint, types, layers, generated files
 	$(BIN)/ruff format --check .

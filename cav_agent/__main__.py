@@ -100,7 +100,7 @@ def run(
 def main() -> None:
     """Parse the command line and drive; exit 2 with one line when it cannot be done."""
     try:
-        config = tyro.cli(run, prog="cav-agent")
+        config = tyro.cli(run, prog="cav-agent", config=(tyro.conf.EnumChoicesFromValues,))
         configure_logs(sys.stderr, config.log)
         asyncio.run(travel(config))
     except (RfedgeError, OSError) as error:

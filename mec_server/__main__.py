@@ -95,7 +95,7 @@ def run(
 def main() -> None:
     """Parse the command line and serve until SIGTERM or SIGINT; exit 2 on a user's mistake."""
     try:
-        config = tyro.cli(run, prog="mec-server")
+        config = tyro.cli(run, prog="mec-server", config=(tyro.conf.EnumChoicesFromValues,))
         configure_logs(sys.stderr, config.log)
         asyncio.run(serve(config))
     except (RfedgeError, OSError) as error:

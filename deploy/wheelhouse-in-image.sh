@@ -1,0 +1,9 @@
+#!/bin/sh
+# Collects and compiles the wheels inside the build, which needs a package index: runtime|full
+set -eu
+apt-get update
+apt-get install -y --no-install-recommends g++ python3-dev python3-venv
+python3 -m venv /build
+/build/bin/pip install -q "pip>=25.1"
+/build/bin/pip install -q --group build
+PYTHON=/build/bin/python PATH="/build/bin:$PATH" deploy/wheelhouse.sh "$1" "build/wheels/$1"

@@ -1,0 +1,230 @@
+"""The compose file starts commands that exist, on files that exist, and locks their doors."""
+
+import asyncio
+import importlib.util
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tyro
+import yaml
+from tyro.conf import OmitSubcommandPrefixes
+
+import cav_agent.__main__ as agent_command
+import mec_server.__main__ as server_command
+from rfcore.dataset import read_dataset
+from rfcore.link.profile_file import read_link
+from rfcore.wire.tls import TlsFiles
+from rfedge.cli import Verb
+from rfedge.cli.certs_init import CertsInit
+
+ROOT = Path(__file__).parents[2]
+COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
+STAND_IN = yaml.safe_load((ROOT / "deploy/stand-in/docker-compose.yml").read_text())
+ENV = dict(re.findall(r"^(\w+)=(.*)$", (ROOT / ".env").read_text(), re.MULTILINE))
+SERVICES: dict[str, Any] = COMPOSE["services"]
+OURS = [name for name, service in SERVICES.items() if service["image"] == "${RFEDGE_IMAGE}"]
+LASTING = [name for name in SERVICES if "healthcheck" in SERVICES[name]]
+
+
+def filled(text: str) -> str:
+    """Return ``text`` with its variables as .env has them; a missing one is an error."""
+    return re.sub(r"\$\{(\w+)\}", lambda found: ENV[found[1]], text)
+
+
+def command(name: str) -> list[str]:
+    """Return the words that a service runs; of a shell's line, those of the command of ours."""
+    words = [filled(str(word)) for word in SERVICES[name]["command"]]
+    if words[:2] == ["sh", "-c"]:
+        words = shlex.split(words[2].rpartition("|| ")[2])
+    return words
+
+
+def running(program: str) -> list[str]:
+    return [name for name in OURS if command(name)[0] == program]
+
+
+def host_path(name: str, path: str) -> Path:
+    """Return the file of the checkout that a service sees at ``path``."""
+    for volume in SERVICES[name]["volumes"]:
+        source, target = volume.split(":")[:2]
+        if path == target or path.startswith(f"{target}/"):
+            assert source.startswith("./"), f"{path} of {name} is in no bind mount"
+            return ROOT / source / path.removeprefix(target).lstrip("/")
+    pytest.fail(f"{name} has nothing at {path}")
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that the one-shot service makes, by the very words it runs."""
+    folder = tmp_path_factory.mktemp("certs") / "demo"
+    words = [word.replace("/certs/demo", str(folder)) for word in command("certificates")]
+    tyro.cli(Verb, args=words[1:], config=(OmitSubcommandPrefixes,)).run()
+    return folder
+
+
+def config_of(
+    name: str, module: Any, certificates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Any:
+    """Return what a service's program makes of its command line."""
+    words = [word.replace("/certs/demo", str(certificates)) for word in command(name)]
+    words = [re.sub(r"=/(fields|cache)$", f"={tmp_path}", word) for word in words]
+    configs: list[Any] = []
+    start = "travel" if module is agent_command else "serve"
+    monkeypatch.setattr(module, start, configs.append)
+    monkeypatch.setattr(asyncio, "run", lambda _: None)
+    monkeypatch.setattr(module, "configure_logs", lambda *_: None)
+    monkeypatch.setattr(sys, "argv", words)
+    module.main()
+    return configs[0]
+
+
+@pytest.mark.parametrize("name", running("mec-server"))
+def test_a_server_takes_its_command_line(
+    name: str, certificates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = config_of(name, server_command, certificates, tmp_path, monkeypatch)
+    assert isinstance(config.tls, TlsFiles)
+    assert config.metrics_port == 9100
+
+
+@pytest.mark.parametrize("name", running("cav-agent"))
+def test_a_vehicle_takes_its_command_line_and_is_whom_its_certificate_names(
+    name: str, certificates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = config_of(name, agent_command, certificates, tmp_path, monkeypatch)
+    assert config.vehicle == name
+    assert config.tls.certificate.name == f"vehicle-{name}.pem"
+    assert config.loop, "a demo goes on"
+
+
+@pytest.mark.parametrize("name", running("rfedge"))
+def test_a_verb_takes_its_command_line(name: str) -> None:
+    verb = tyro.cli(Verb, args=command(name)[1:], config=(OmitSubcommandPrefixes,))
+    assert verb is not None
+
+
+def test_every_link_leads_from_a_vehicle_to_a_server_that_its_certificate_names() -> None:
+    init: Any = tyro.cli(Verb, args=command("certificates")[1:], config=(OmitSubcommandPrefixes,))
+    made: CertsInit = init.verb
+    servers, links = running("mec-server"), running("rfedge")
+    links.remove("certificates")
+    assert set(made.vehicles) == set(running("cav-agent"))
+    assert set(made.hosts) == {*servers, *links, "localhost", "127.0.0.1"}
+    for name in links:
+        link: Any = tyro.cli(Verb, args=command(name)[1:], config=(OmitSubcommandPrefixes,))
+        assert link.to.partition(":")[0] in servers
+        read_link(host_path(name, str(link.profile)))
+    for name in running("cav-agent"):
+        (server,) = (word for word in command(name) if word.startswith("--server="))
+        assert server.removeprefix("--server=") == f"link-{name.removeprefix('cav-')}:50051"
+
+
+def test_every_vehicle_has_a_link_of_its_own_kind_and_a_drive_of_its_own() -> None:
+    links = [name for name in running("rfedge") if name.startswith("link-")]
+    profiles = {word for name in links for word in command(name) if "--profile" in word}
+    assert len(profiles) == len(links) == len(running("cav-agent")) == 4
+    drives = {host_path(name, "/drive/transforms.json") for name in running("cav-agent")}
+    assert len(drives) == 4
+
+
+@pytest.mark.sample
+@pytest.mark.parametrize("name", running("cav-agent"))
+def test_a_drive_comes_back_to_where_it_began_and_its_pictures_are_there(
+    name: str, tmp_path: Path
+) -> None:
+    for folder in ("drive_empty", "drive_vehicles"):
+        (tmp_path / folder).symlink_to(host_path(name, f"/drive/{folder}"))
+    transforms = host_path(name, "/drive/transforms.json")
+    (tmp_path / "transforms.json").write_text(transforms.read_text())
+    pictures = read_dataset(tmp_path).pictures
+    east_m = [picture.camera.world_from_cam.translation_m[0] for picture in pictures]
+    step_m = max(abs(b - a) for a, b in zip(east_m, [*east_m[1:], east_m[0]], strict=True))
+    assert step_m < 1.0, "the longest step, the one back to the beginning included"
+
+
+def test_the_drives_are_what_their_description_makes(tmp_path: Path) -> None:
+    path = ROOT / "deploy/compose/drives.py"
+    spec = importlib.util.spec_from_file_location("drives", path)
+    assert spec is not None
+    assert spec.loader is not None
+    drives = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(drives)
+    drives.write_drives(tmp_path)
+    committed = sorted((ROOT / "deploy/compose/drives").glob("*.json"))
+    assert [path.name for path in committed] == sorted(path.name for path in tmp_path.iterdir())
+    for path in committed:
+        assert path.read_text() == (tmp_path / path.name).read_text()
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_a_service_may_do_little(name: str) -> None:
+    service = SERVICES[name]
+    assert service["read_only"] is True
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert service.get("user", "of the image") != "root"
+
+
+def test_the_images_of_ours_do_not_run_as_root() -> None:
+    stages = re.split(r"^FROM ", (ROOT / "Dockerfile").read_text(), flags=re.MULTILINE)
+    for stage in stages:
+        if re.match(r"python AS (runtime|full)\n", stage):
+            assert re.search(r"^USER rfedge$", stage, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", LASTING)
+def test_what_runs_for_ever_is_bounded_and_comes_back(name: str) -> None:
+    service = SERVICES[name]
+    assert service["restart"] == "unless-stopped"
+    assert {"mem_limit", "cpus"} <= set(service)
+
+
+def test_everything_that_is_served_is_scraped() -> None:
+    targets = {
+        target
+        for path in sorted((ROOT / "deploy/compose/targets").glob("*.json"))
+        for entry in json.loads(path.read_text())
+        for target in entry["targets"]
+    }
+    serving = {name for name in OURS if any("--metrics-port" in w for w in command(name))}
+    assert targets == {f"{name}:9100" for name in serving}
+    assert serving == {name for name in OURS if name in LASTING}
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_what_is_mounted_is_there_and_ports_stay_on_this_machine(name: str) -> None:
+    for volume in SERVICES[name].get("volumes", []):
+        source = volume.split(":")[0]
+        assert (ROOT / source).exists() if source.startswith("./") else source in COMPOSE["volumes"]
+    for port in SERVICES[name].get("ports", []):
+        assert filled(port).startswith("127.0.0.1:")
+
+
+def test_foreign_images_are_pinned() -> None:
+    for name in set(SERVICES) - set(OURS):
+        assert re.search(r":v?\d+\.\d+\.\d+$", filled(SERVICES[name]["image"]))
+
+
+def test_the_stand_in_changes_nothing_but_images() -> None:
+    assert set(STAND_IN["services"]["prometheus"]) == {"image", "build"}
+    assert set(STAND_IN["services"]["grafana"]) == {"profiles"}
+
+
+def test_the_runtime_image_lacks_what_the_services_may_not_import() -> None:
+    path = ROOT / "deploy/requirements.py"
+    spec = importlib.util.spec_from_file_location("requirements", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    runtime = module.requirements("runtime", ROOT / "pyproject.toml")
+    full = module.requirements("full", ROOT / "pyproject.toml")
+    left_out = {re.split(r"[<>=]", line)[0] for line in set(full) - set(runtime)}
+    assert left_out == module.ONLY_FULL
+    with pytest.raises(ValueError, match="neither runtime nor full"):
+        module.requirements("both", ROOT / "pyproject.toml")
