@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from rfcore.codec import DeltaPacket
+from rfcore.codec.ladder import FULL_RUNG, Rung
 from rfcore.views import PosedPicture
 from rfcore.wire.messages import FrameAddress, StageTimes
 
@@ -45,11 +46,13 @@ class EncodeJob:
 @dataclass(frozen=True)
 class EncodedFrame:
     """A coded picture; ``stage_s`` has read, convert, render, references, encode and
-    closed_loop; ``tries`` is how often it was coded, to fit the payload's limit."""
+    closed_loop; ``tries`` is how often it was coded, to fit the payload's limit; ``rung`` is the
+    setting it was coded with."""
 
     packet: DeltaPacket
     stage_s: Mapping[str, float]
     tries: int = 1
+    rung: Rung = FULL_RUNG
 
 
 class Outcome(StrEnum):
@@ -81,3 +84,4 @@ class FrameResult:
     latency_s: float | None = None
     link_s: float | None = None
     tries: int = 1
+    rung: Rung | None = None

@@ -11,9 +11,11 @@ from dataclasses import replace
 from typing import Protocol
 
 from cav_agent.frames import EncodedFrame, EncodeJob
+from cav_agent.rungs import FixedRung, Rungs
 from rfcore.camera import Camera, Intrinsics
 from rfcore.codec import (
     KEPT_FRAMES,
+    RENDER_ONLY,
     CodecConfig,
     DeltaEncoder,
     Encoded,
@@ -22,7 +24,9 @@ from rfcore.codec import (
     Past,
     StreamHeader,
 )
+from rfcore.codec.ladder import Rung
 from rfcore.errors import InvalidInput
+from rfcore.field import Quality
 from rfcore.image import Rgb
 from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
@@ -37,14 +41,15 @@ ClockNs = Callable[[], int]
 class Renderer(Protocol):
     """A radiance field, ready to be looked at."""
 
-    def render(self, camera: Camera) -> View:
+    def render(self, camera: Camera, quality: Quality) -> View:
         """Return colour and depth seen from ``camera``."""
 
 
 class Pipeline:
     """Codes the pictures of one camera against renders of one field; one caller at a time.
 
-    A slice above ``limit_bytes`` is coded again at a higher CRF, as long as there is one.
+    A slice above ``limit_bytes`` is coded again at a higher CRF, as long as there is one. ``rungs``
+    says how each frame is coded; without it all are at the configured preset, with all there is.
     """
 
     def __init__(
@@ -53,11 +58,13 @@ class Pipeline:
         config: CodecConfig,
         clock_ns: ClockNs,
         limit_bytes: int = MAX_PAYLOAD_BYTES,
+        rungs: Rungs | None = None,
     ) -> None:
         self._renderer = renderer
         self._config = config
         self._clock_ns = clock_ns
         self._limit_bytes = limit_bytes
+        self._rungs = rungs or FixedRung(Rung(preset=config.preset))
         self._encoder = DeltaEncoder(config, clock_ns)
         self._state: EncoderState | None = None
         self._pasts: dict[tuple[int, int] | None, Past] = {}
@@ -73,28 +80,37 @@ class Pipeline:
         Raises ``DatasetError`` for a picture that cannot be read, ``InvalidInput`` for one of
         another size, ``CodecError`` when x264 fails.
         """
+        rung = self._rungs.current
         started_ns = self._clock_ns()
         rgb = self._read(job.capture.picture)
         read_ns = self._clock_ns()
         frame = i420_from_rgb(rgb)
         converted_ns = self._clock_ns()
         camera = job.capture.picture.camera
-        view = self._renderer.render(camera)
+        view = self._renderer.render(camera, rung.quality)
         render = i420_from_colour(view.colour)
         rendered_ns = self._clock_ns()
         seen = PosedDepth(camera, view.depth)
-        choice = FrameChoice(coarse=not job.exact, limit_bytes=self._limit_bytes)
+        choice = self._choice(job, rung)
         encoded = self._encoder.encode(self._state_for(job), frame, render, seen, choice)
         self._remember(encoded)
-        return EncodedFrame(
-            encoded.packet,
-            {
-                "read": (read_ns - started_ns) / 1e9,
-                "convert": (converted_ns - read_ns) / 1e9,
-                "render": (rendered_ns - converted_ns) / 1e9,
-                **{stage: ns / 1e9 for stage, ns in encoded.stage_ns.items()},
-            },
-            encoded.tries,
+        stage_s = {
+            "read": (read_ns - started_ns) / 1e9,
+            "convert": (converted_ns - read_ns) / 1e9,
+            "render": (rendered_ns - converted_ns) / 1e9,
+            **{stage: ns / 1e9 for stage, ns in encoded.stage_ns.items()},
+        }
+        self._rungs.coded(stage_s, self._clock_ns() / 1e9)
+        return EncodedFrame(encoded.packet, stage_s, encoded.tries, rung)
+
+    def _choice(self, job: EncodeJob, rung: Rung) -> FrameChoice:
+        return FrameChoice(
+            references=None if rung.references else RENDER_ONLY,
+            photometric=None if rung.photometric else (),
+            most=max(1, rung.references),
+            coarse=not job.exact,
+            limit_bytes=self._limit_bytes,
+            preset=rung.preset,
         )
 
     def _state_for(self, job: EncodeJob) -> EncoderState:

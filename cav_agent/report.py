@@ -46,6 +46,7 @@ def report_line(result: FrameResult) -> dict[str, Any]:
         "references": [r.name.lower() for r in packet.references] if packet else None,
         "payload_bytes": len(packet.payload) if packet else None,
         "tries": result.tries if packet else None,
+        "rung": result.rung.name if result.rung else None,
         "packet_bytes": result.packet_bytes if packet else None,
         "reference_digest": packet.reference_digest.hex() if packet else None,
         "reconstruction_digest": packet.reconstruction_digest.hex() if packet else None,

@@ -202,6 +202,7 @@ class AgentSession:
             packet_bytes=len(client_message_to_bytes(frame)),
             stage_s=encoded.stage_s,
             tries=encoded.tries,
+            rung=encoded.rung,
         )
         self._pending[frame.address] = Pending(result, now, job.base)
         if len(encoded.packet.payload) > MAX_PAYLOAD_BYTES:
@@ -239,6 +240,7 @@ class AgentSession:
             capture.picture.camera.world_from_cam,
             b"",  # the field of Hello; an agent has one
             encoded.packet,
+            encoded.rung.quality,
         )
 
     def _finish(self, address: FrameAddress, outcome: Outcome, reason: str, now: float) -> None:

@@ -15,6 +15,7 @@ from mec_server.jobs import DecodeJob, DecodeOutcome, OpenJob
 from rfcore.camera import Camera
 from rfcore.codec import DecoderState, DeltaDecoder
 from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason, RfedgeError
+from rfcore.field import Quality
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour
@@ -29,7 +30,7 @@ ClockNs = Callable[[], int]
 class Renderer(Protocol):
     """A radiance field, ready to be looked at."""
 
-    def render(self, camera: Camera) -> View:
+    def render(self, camera: Camera, quality: Quality) -> View:
         """Return colour and depth seen from ``camera``."""
 
 
@@ -105,7 +106,7 @@ class CameraDecoder:
     def _render(self, job: DecodeJob) -> tuple[I420, PosedDepth]:
         camera = job.frame.camera(self._camera.intrinsics)
         try:
-            view = self._renderers[job.field_id].render(camera)
+            view = self._renderers[job.field_id].render(camera, job.frame.quality)
             return i420_from_colour(view.colour), PosedDepth(camera, view.depth)
         except InvalidInput as error:
             raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error

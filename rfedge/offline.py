@@ -12,7 +12,7 @@ from rfcore.camera import Camera
 from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, Encoded, FrameChoice
 from rfcore.dataset import Dataset
 from rfcore.errors import CodecError, DatasetError, InvalidData
-from rfcore.field import RadianceField
+from rfcore.field import FULL, Quality, RadianceField
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
@@ -101,13 +101,15 @@ def decode_drive(drive: CodedDrive, field: RadianceField) -> Iterator[DecodedFra
     decoder = DeltaDecoder(camera.codec)
     state = decoder.start(drive.frames[0].packet.epoch) if drive.frames else decoder.start(1)
     for frame in drive.frames:
-        seen = rendered(field, frame.camera(camera.intrinsics))
+        seen = rendered(field, frame.camera(camera.intrinsics), frame.quality)
         decoded = decoder.decode(state, frame.packet, *seen)
         state = decoded.state
         yield DecodedFrame(frame.packet.sequence, decoded.frame)
 
 
-def rendered(field: RadianceField, camera: Camera) -> tuple[I420, PosedDepth]:
+def rendered(
+    field: RadianceField, camera: Camera, quality: Quality = FULL
+) -> tuple[I420, PosedDepth]:
     """Return the field's picture and depth as both ends of the codec hold them."""
-    view = field.render(camera)
+    view = field.render(camera, quality)
     return i420_from_colour(view.colour), PosedDepth(camera, view.depth)

@@ -8,11 +8,11 @@ outlive a frame. One caller at a time.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rfcore.codec.choice import choose_photometric, choose_references
 from rfcore.codec.coarse import coarse_digest
-from rfcore.codec.config import CRF_RANGE, REFERENCE_FRAMES, CodecConfig
+from rfcore.codec.config import CRF_RANGE, PRESETS, REFERENCE_FRAMES, CodecConfig
 from rfcore.codec.fit import FittedSlice, code_to_fit
 from rfcore.codec.header import StreamHeader
 from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
@@ -46,7 +46,8 @@ class FrameChoice:
     ``pose_only``: send no slice; the frame is its only reference. ``coarse``: add the block means
     of the render, by which a receiver whose renderer is not exact tells rounding from a wrong pose.
     ``limit_bytes``: a longer slice is coded again at higher CRFs (``rfcore.codec.fit``); one that
-    is too long even at the highest is returned all the same.
+    is too long even at the highest is returned all the same. ``preset`` replaces the configured
+    one; the parameter sets of a stream are those of any.
     """
 
     references: References | None = None
@@ -56,8 +57,11 @@ class FrameChoice:
     most: int = REFERENCE_FRAMES
     coarse: bool = False
     limit_bytes: int | None = None
+    preset: str | None = None
 
     def __post_init__(self) -> None:
+        if self.preset is not None and self.preset not in PRESETS:
+            raise InvalidInput("preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
         if self.references is not None:
             check_references(self.references)
         if self.crf is not None and not CRF_RANGE[0] <= self.crf <= CRF_RANGE[1]:
@@ -166,15 +170,16 @@ class DeltaEncoder:
     ) -> FittedSlice:
         if choice.pose_only:
             return FittedSlice(b"", crf, 1)
+        preset = choice.preset or self._config.preset
         if choice.limit_bytes is None:
-            return FittedSlice(self._slice(pictures, frame, crf), crf, 1)
+            return FittedSlice(self._slice(pictures, frame, crf, preset), crf, 1)
         return code_to_fit(
-            lambda higher: self._slice(pictures, frame, higher), crf, choice.limit_bytes
+            lambda higher: self._slice(pictures, frame, higher, preset), crf, choice.limit_bytes
         )
 
-    def _slice(self, pictures: tuple[I420, ...], frame: I420, crf: float) -> bytes:
-        coded = encode_slice(self._config, pictures, frame, crf)
-        if coded.header != self._header:
+    def _slice(self, pictures: tuple[I420, ...], frame: I420, crf: float, preset: str) -> bytes:
+        coded = encode_slice(replace(self._config, preset=preset), pictures, frame, crf)
+        if (coded.header.sps, coded.header.pps) != (self._header.sps, self._header.pps):
             raise CodecError("x264 changed its parameter sets within a stream")
         return coded.payload
 

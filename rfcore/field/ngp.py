@@ -20,6 +20,7 @@ from rfcore.field.archive import Archive, encode_archive
 from rfcore.field.interface import NGP, Bounds, FieldMetadata
 from rfcore.field.ngp_archive import as_stored, bounds_of, ngp_archive
 from rfcore.field.quality import FULL, Quality
+from rfcore.field.scale import colour_at_scale, view_at_scale
 from rfcore.native.raster import check_backend
 from rfcore.ngp.native import NgpRenderer
 from rfcore.ngp.parameters import NgpParameters
@@ -85,8 +86,14 @@ class NgpField:
 
     def render(self, camera: Camera, quality: Quality = FULL) -> View:
         """Render colour, depth and opacity as ``camera`` sees them."""
+        return view_at_scale(self._view, camera, quality)
+
+    def _view(self, camera: Camera, quality: Quality) -> View:
         return self.renderer().render(camera, quality.samples_per_ray)
 
     def render_colour(self, camera: Camera, quality: Quality = FULL) -> NDArray[np.float32]:
         """Render colour alone, float32 [H, W, 3]: the bytes of ``render``, sooner."""
+        return colour_at_scale(self._colour, camera, quality)
+
+    def _colour(self, camera: Camera, quality: Quality) -> NDArray[np.float32]:
         return self.renderer().render_colour(camera, quality.samples_per_ray)

@@ -20,6 +20,7 @@ from rfcore.field.detail import Rungs, check_rungs, splats_of_rung
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata
 from rfcore.field.metadata import stored_metadata
 from rfcore.field.quality import FULL, Quality
+from rfcore.field.scale import colour_at_scale, view_at_scale
 from rfcore.field.splat_archive import splat_archive
 from rfcore.field.splat_codec import compressed_archive, splats_of_compressed
 from rfcore.native.raster import check_backend
@@ -119,10 +120,16 @@ class SplatField:
 
     def render(self, camera: Camera, quality: Quality = FULL) -> View:
         """Render colour, depth and opacity as ``camera`` sees them."""
+        return view_at_scale(self._view, camera, quality)
+
+    def _view(self, camera: Camera, quality: Quality) -> View:
         return self.rasterizer(quality.detail).render(camera, sh_degree=self._degree(quality))
 
     def render_colour(self, camera: Camera, quality: Quality = FULL) -> NDArray[np.float32]:
         """Render colour alone, float32 [H, W, 3]: the bytes of ``render``, sooner."""
+        return colour_at_scale(self._colour, camera, quality)
+
+    def _colour(self, camera: Camera, quality: Quality) -> NDArray[np.float32]:
         rasterizer = self.rasterizer(quality.detail)
         return rasterizer.render_colour(camera, sh_degree=self._degree(quality))
 

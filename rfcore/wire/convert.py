@@ -14,6 +14,7 @@ from google.protobuf.message import DecodeError
 from rfcore.camera import Intrinsics, Pose
 from rfcore.codec import CodecConfig, DeltaPacket, Reference, References, StreamHeader
 from rfcore.errors import InvalidInput
+from rfcore.field.quality import FULL, Quality
 from rfcore.wire.checks import (
     FIELD_ID_PREFIX_BYTES,
     MAX_CAMERAS,
@@ -164,7 +165,21 @@ def _frame_from_wire(frame: pb.Frame) -> Frame:
         _pose_from_wire(frame),
         check_absent_or("frame.field_id_prefix", frame.field_id_prefix, FIELD_ID_PREFIX_BYTES),
         _packet_from_wire(frame),
+        _quality_from_wire(frame.quality) if frame.HasField("quality") else FULL,
     )
+
+
+def _quality_from_wire(quality: pb.Quality) -> Quality:
+    """Return a checked quality; ``Quality`` itself refuses what is not on the ladder."""
+    try:
+        return Quality(
+            (quality.detail_percent or 100) / 100,
+            quality.sh_degree if quality.HasField("sh_degree") else None,
+            quality.samples_per_ray or None,
+            (quality.scale_percent or 100) / 100,
+        )
+    except InvalidInput as error:
+        raise InvalidInput(f"frame.{error.field}", error.problem) from error
 
 
 def _pose_from_wire(frame: pb.Frame) -> Pose:
@@ -227,7 +242,18 @@ def _frame_to_wire(frame: Frame) -> pb.Frame:
         photometric=packet.photometric,
     )
     _add_pose(message, frame.pose)
+    if frame.quality != FULL:
+        message.quality.CopyFrom(_quality_to_wire(frame.quality))
     return message
+
+
+def _quality_to_wire(quality: Quality) -> pb.Quality:
+    return pb.Quality(
+        detail_percent=0 if quality.detail == 1 else round(100 * quality.detail),
+        sh_degree=quality.sh_degree,
+        samples_per_ray=quality.samples_per_ray or 0,
+        scale_percent=0 if quality.scale == 1 else round(100 * quality.scale),
+    )
 
 
 def _add_pose(message: pb.Frame, pose: Pose) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec import DeltaPacket, StreamHeader
 from rfcore.errors import RejectReason
+from rfcore.field.quality import FULL, Quality
 
 __all__ = [
     "Ack",
@@ -68,13 +69,15 @@ class Hello:
 @dataclass(frozen=True)
 class Frame:
     """One coded picture: ``pose`` is world_from_cam, tile-relative; short on the wire when it is
-    ``Pose.rounded``. An empty ``field_id_prefix`` means the first field of Hello."""
+    ``Pose.rounded``. An empty ``field_id_prefix`` means the first field of Hello. ``quality`` is
+    what the vehicle rendered the field with, and the server is to render it with."""
 
     camera_id: str
     capture_time_ns: int
     pose: Pose
     field_id_prefix: bytes
     packet: DeltaPacket
+    quality: Quality = FULL
 
     @property
     def address(self) -> FrameAddress:

@@ -10,6 +10,7 @@ from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from rfcore.camera import Camera
 from rfcore.codec import CodecConfig
+from rfcore.field import Quality
 from rfcore.views import View
 
 LIMIT_BYTES = 300
@@ -18,7 +19,7 @@ LIMIT_BYTES = 300
 class Grey:
     """A field that has seen nothing."""
 
-    def render(self, camera: Camera) -> View:
+    def render(self, camera: Camera, quality: Quality) -> View:  # noqa: ARG002
         k = camera.intrinsics
         side = (k.height_px, k.width_px)
         flat = np.full(side, 0.5, np.float32)

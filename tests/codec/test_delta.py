@@ -6,7 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, Encoded, FrameChoice
+from rfcore.codec import (
+    RENDER_ONLY,
+    CodecConfig,
+    DeltaDecoder,
+    DeltaEncoder,
+    Encoded,
+    FrameChoice,
+)
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
 
@@ -210,3 +217,20 @@ def test_packets_that_cannot_be_are_refused_by_field(
 ) -> None:
     with pytest.raises(InvalidInput, match=named):
         replace(sent.packet, **change)  # type: ignore[arg-type]
+
+
+def test_frames_of_one_stream_may_have_any_preset(pair: PairMaker) -> None:
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, preset="veryfast"))
+    decoder = DeltaDecoder(encoder.header)
+    sending, receiving = encoder.start(1), decoder.start(1)
+    payloads = set()
+    for preset in ("ultrafast", "medium", None, "veryslow"):
+        choice = FrameChoice(preset=preset, references=RENDER_ONLY)
+        made = encoder.encode(sending, *pair(*SIZE_PX), choice=choice)
+        got = decoder.decode(receiving, made.packet, pair(*SIZE_PX)[1])
+        assert got.frame.digest() == made.reconstruction.digest()
+        sending, receiving = made.state, got.state
+        payloads.add(made.packet.payload)
+    assert len(payloads) == 4, "the preset reaches the encoder"
+    with pytest.raises(InvalidInput, match="preset: 'placebo' is none of"):
+        FrameChoice(preset="placebo")

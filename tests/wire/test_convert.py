@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from rfcore.camera import Pose
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
+from rfcore.field import Quality
 from rfcore.wire.convert import (
     FrameRefused,
     client_message_from_bytes,
@@ -183,3 +185,43 @@ def test_a_pose_keeps_every_bit(
     got = client_message_from_bytes(client_message_to_bytes(sent))
     assert isinstance(got, Frame)
     assert (got.pose.translation_m, got.pose.rotation) == (away, (w, x, y, z))
+
+
+@pytest.mark.parametrize(
+    "quality",
+    [
+        Quality(),
+        Quality(0.5),
+        Quality(0.25, 0),
+        Quality(0.1, 3),
+        Quality(samples_per_ray=4096),
+        Quality(0.5, 1, 16, 0.5),
+    ],
+    ids=str,
+)
+def test_a_quality_survives_the_wire_and_full_quality_costs_nothing(
+    frame: Frame, quality: Quality
+) -> None:
+    sent = replace(frame, quality=quality)
+    data = client_message_to_bytes(sent)
+    assert client_message_from_bytes(data) == sent
+    more = len(data) - len(client_message_to_bytes(frame))
+    assert more == 0 if quality == Quality() else 0 < more <= 14
+
+
+@pytest.mark.parametrize(
+    ("knobs", "named"),
+    [
+        ({"detail_percent": 30}, r"frame\.quality\.detail: 0\.3 is none of"),
+        ({"sh_degree": 4}, r"frame\.quality\.sh_degree: 4"),
+        ({"samples_per_ray": 5000}, r"frame\.quality\.samples_per_ray: 5000"),
+        ({"scale_percent": 25}, r"frame\.quality\.scale: 0\.25"),
+    ],
+)
+def test_a_quality_off_the_ladder_spoils_its_frame_alone(
+    frame: Frame, knobs: dict[str, int], named: str
+) -> None:
+    request = pb.StreamRequest.FromString(client_message_to_bytes(frame))
+    request.frame.quality.CopyFrom(pb.Quality(**knobs))
+    with pytest.raises(FrameRefused, match=named):
+        client_message_from_bytes(request.SerializeToString())

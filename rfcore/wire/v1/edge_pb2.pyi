@@ -355,6 +355,42 @@ class Pose(_message.Message):
 Global___Pose: _TypeAlias = Pose  # noqa: Y015
 
 @_typing.final
+class Quality(_message.Message):
+    """How much of the field is drawn; what is absent is the most there is."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    DETAIL_PERCENT_FIELD_NUMBER: _builtins.int
+    SH_DEGREE_FIELD_NUMBER: _builtins.int
+    SAMPLES_PER_RAY_FIELD_NUMBER: _builtins.int
+    SCALE_PERCENT_FIELD_NUMBER: _builtins.int
+    detail_percent: _builtins.int
+    """Share of the splats: 50, 25 or 10 percent, the most important first."""
+    sh_degree: _builtins.int
+    """Highest degree of spherical harmonics."""
+    samples_per_ray: _builtins.int
+    """Samples along a ray of a hash grid."""
+    scale_percent: _builtins.int
+    """50: rendered at half the width and height, and enlarged."""
+    def __init__(
+        self,
+        *,
+        detail_percent: _builtins.int = ...,
+        sh_degree: _builtins.int | None = ...,
+        samples_per_ray: _builtins.int = ...,
+        scale_percent: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_sh_degree", b"_sh_degree", "sh_degree", b"sh_degree"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_sh_degree", b"_sh_degree", "detail_percent", b"detail_percent", "samples_per_ray", b"samples_per_ray", "scale_percent", b"scale_percent", "sh_degree", b"sh_degree"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__sh_degree: _TypeAlias = _typing.Literal["sh_degree"]  # noqa: Y015
+    _WhichOneofArgType__sh_degree: _TypeAlias = _typing.Literal["_sh_degree", b"_sh_degree"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__sh_degree) -> _WhichOneofReturnType__sh_degree | None: ...
+
+Global___Quality: _TypeAlias = Quality  # noqa: Y015
+
+@_typing.final
 class Frame(_message.Message):
     """One picture: its pose and the slice that turns the references into it."""
 
@@ -375,6 +411,7 @@ class Frame(_message.Message):
     NEEDED_DIGEST_FIELD_NUMBER: _builtins.int
     PHOTOMETRIC_FIELD_NUMBER: _builtins.int
     POSE_F32_FIELD_NUMBER: _builtins.int
+    QUALITY_FIELD_NUMBER: _builtins.int
     camera_id: _builtins.str
     epoch: _builtins.int
     """A new epoch starts the state of both ends afresh; sequences count from 0 in it."""
@@ -417,6 +454,10 @@ class Frame(_message.Message):
     def pose_f32(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """x, y, z in metres, rotation w, x, y, z, as in Pose, when float32 holds them exactly."""
 
+    @_builtins.property
+    def quality(self) -> Global___Quality:
+        """How the field was rendered at the frame's pose; absent: with all it has."""
+
     def __init__(
         self,
         *,
@@ -435,10 +476,11 @@ class Frame(_message.Message):
         needed_digest: _builtins.bytes = ...,
         photometric: _abc.Iterable[_builtins.int] | None = ...,
         pose_f32: _abc.Iterable[_builtins.float] | None = ...,
+        quality: Global___Quality | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["pose", b"pose"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["pose", b"pose", "quality", b"quality"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "needed_digest", b"needed_digest", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "reconstruction_digest", b"reconstruction_digest", "reference_coarse", b"reference_coarse", "reference_digest", b"reference_digest", "references", b"references", "sequence", b"sequence"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "needed_digest", b"needed_digest", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "quality", b"quality", "reconstruction_digest", b"reconstruction_digest", "reference_coarse", b"reference_coarse", "reference_digest", b"reference_digest", "references", b"references", "sequence", b"sequence"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -1,0 +1,136 @@
+"""Which rung to code on, so that a frame is ready within a deadline. A machine without clock.
+
+The ladder's times are another machine's. ``slowness`` is how much longer a frame takes here and
+now, a running mean over the last few; a rung is predicted to take its ladder time times that. After
+a frame that was late the best rung that is predicted to fit is taken at once; a better one only
+when it has been predicted to fit with room to spare for a while, which doubles each time a climb
+had to be taken back soon, so that a load near a rung's edge does not make it flap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rfcore.codec.ladder import MeasuredRung
+from rfcore.errors import InvalidInput
+
+__all__ = ["DeadlineController", "DeadlineLimits", "Step"]
+
+
+@dataclass(frozen=True)
+class DeadlineLimits:
+    """``room``: share of the deadline a better rung must stay below before it is climbed to, for
+    ``patience_s`` at first and ``longest_patience_s`` at most. ``memory``: weight of the newest
+    frame in the running mean."""
+
+    room: float = 0.85
+    patience_s: float = 2.0
+    longest_patience_s: float = 60.0
+    memory: float = 0.25
+
+    def __post_init__(self) -> None:
+        for name in ("room", "memory"):
+            if not 0 < getattr(self, name) <= 1:
+                raise InvalidInput(f"deadline.{name}", f"{getattr(self, name)} is outside 0..1")
+        if not 0 < self.patience_s <= self.longest_patience_s:
+            raise InvalidInput("deadline.patience_s", f"{self.patience_s} s is out of range")
+
+
+@dataclass(frozen=True)
+class Step:
+    """A change of rung: ``down`` to a faster one, or up."""
+
+    before: MeasuredRung
+    after: MeasuredRung
+    slowness: float
+
+    @property
+    def down(self) -> bool:
+        """Tell whether accuracy was given up."""
+        return self.after.rate_percent > self.before.rate_percent
+
+
+class DeadlineController:
+    """Chooses among ``rungs``, fewest bits first, each faster than the one before it."""
+
+    def __init__(
+        self,
+        rungs: Sequence[MeasuredRung],
+        deadline_ms: float,
+        limits: DeadlineLimits | None = None,
+    ) -> None:
+        if not rungs:
+            raise InvalidInput("ladder", "has no rungs")
+        if not (math.isfinite(deadline_ms) and deadline_ms > 0):
+            raise InvalidInput("deadline_ms", f"{deadline_ms} must be above 0 ms")
+        self._rungs = tuple(rungs)
+        self._deadline_ms = deadline_ms
+        self._limits = limits or DeadlineLimits()
+        self._patience_s = self._limits.patience_s
+        self._room_since_s: float | None = None
+        self._climbed_s = -math.inf
+        self.slowness: float | None = None
+        self.missed = 0
+        self.current = self._best(1.0)
+
+    @property
+    def position(self) -> int:
+        """How many better rungs there are."""
+        return self._rungs.index(self.current)
+
+    def measured(self, rung: MeasuredRung, sender_ms: float, now: float) -> Step | None:
+        """Take a frame's time on ``rung``; return the change of rung that follows, if any.
+
+        The first frame alone says how fast this machine is, whatever rung it was on.
+        """
+        if not (math.isfinite(sender_ms) and sender_ms > 0):
+            raise InvalidInput("sender_ms", f"{sender_ms} must be above 0 ms")
+        ratio = sender_ms / rung.sender_ms
+        first = self.slowness is None
+        before = ratio if self.slowness is None else self.slowness
+        self.slowness = before + self._limits.memory * (ratio - before)
+        late = sender_ms > self._deadline_ms
+        self.missed += late
+        if first:
+            return self._move(self._best(1 / self._limits.room))
+        if rung is not self.current:
+            return None  # a frame that was begun before the last change
+        if late and self._predicted_ms(self.current) > self._deadline_ms:
+            return self._fall(now)
+        return self._climb(now)
+
+    def _fall(self, now: float) -> Step | None:
+        if now - self._climbed_s < 2 * self._patience_s:
+            self._patience_s = min(2 * self._patience_s, self._limits.longest_patience_s)
+        self._room_since_s = None
+        return self._move(self._best(1.0))
+
+    def _climb(self, now: float) -> Step | None:
+        better = self._best(1 / self._limits.room)
+        if better.rate_percent >= self.current.rate_percent:
+            self._room_since_s = None
+            return None
+        if self._room_since_s is None:
+            self._room_since_s = now
+        if now - self._room_since_s < self._patience_s:
+            return None
+        if now - self._climbed_s > 4 * self._patience_s:
+            self._patience_s = self._limits.patience_s
+        self._room_since_s, self._climbed_s = None, now
+        return self._move(better)
+
+    def _best(self, factor: float) -> MeasuredRung:
+        """Return the first rung whose predicted time, times ``factor``, fits; else the fastest."""
+        fitting = (r for r in self._rungs if factor * self._predicted_ms(r) <= self._deadline_ms)
+        return next(fitting, self._rungs[-1])
+
+    def _predicted_ms(self, rung: MeasuredRung) -> float:
+        return rung.sender_ms * (1.0 if self.slowness is None else self.slowness)
+
+    def _move(self, after: MeasuredRung) -> Step | None:
+        before, self.current = self.current, after
+        if before is after:
+            return None
+        return Step(before, after, 1.0 if self.slowness is None else self.slowness)
