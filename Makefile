@@ -86,9 +86,10 @@ bench: build  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench train
 	$(BIN)/rfedge bench codec
 
-figures: build  ## regenerate docs/results.md, docs/metrics.md and the dashboards
+figures: build  ## regenerate docs/results.md, docs/ladder.md, docs/metrics.md and the dashboards
 	$(BIN)/python -m rfedge.report.markdown results > docs/results.md.part
 	mv docs/results.md.part docs/results.md
+	$(BIN)/python -m rfedge.report.ladder results docs
 	$(BIN)/python -m rfedge.report.metrics_page > docs/metrics.md.part
 	mv docs/metrics.md.part docs/metrics.md
 	$(BIN)/python -m rfedge.dashboards deploy/grafana/dashboards

@@ -8,6 +8,7 @@ from typing import Annotated
 from tyro.conf import subcommand
 
 from rfedge.cli.eval_compare import EvalCompare
+from rfedge.cli.eval_ladder import EvalLadder
 from rfedge.cli.eval_paper import EvalPaper
 from rfedge.cli.eval_stability import EvalStability
 
@@ -20,6 +21,7 @@ class Eval:
 
     verb: (
         Annotated[EvalCompare, subcommand("compare")]
+        | Annotated[EvalLadder, subcommand("ladder")]
         | Annotated[EvalPaper, subcommand("paper")]
         | Annotated[EvalStability, subcommand("stability")]
     )

@@ -44,6 +44,8 @@ def _section(path: Path) -> str:
         return _demo(path, result)
     if result.get("format") == "rfedge-stability-1":
         return f"{heading(path, result)}\n\n{len(result['cases'])} cases: `docs/stability.md`.\n"
+    if result.get("case") == "ladder":
+        return f"{heading(path, result)}\n\n{len(result['rows'])} rungs: `docs/ladder.md`.\n"
     if result.get("case") == "compare":
         return compare_section(path, result)
     if "case" in result:
