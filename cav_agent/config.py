@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Suppress
 
 from rfcore.codec.config import CRF_RANGE, PRESETS
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import check_field_id, check_name
 from rfcore.wire.logs import LogForm
-from rfcore.wire.tls import TlsFiles
+from rfcore.wire.settings import MetricsSettings, RenderSettings, TransportSettings
 
 __all__ = ["AgentConfig", "AgentLimits", "PaceKind"]
 
@@ -49,35 +52,39 @@ class PaceKind(StrEnum):
 
 @dataclass(frozen=True)
 class AgentConfig:
-    """One vehicle process with one camera.
-
-    ``drive``: a dataset in time order. ``fields``: directory of field archives; one the server has
-    and it lacks is fetched into it. ``field``: which one; the server's only one when not given.
-    ``report``: file for one JSON line per picture. ``threads`` per render. ``isa`` forces an
-    instruction set. ``tls``: without it the stream is plaintext.
-    """
+    """Send a drive to an edge server, as differences to a radiance field that both hold."""
 
     server: str
+    """HOST:PORT of mec-server (or of `rfedge link` in front of it)."""
     drive: Path
-    fields: Path
+    """Dataset in time order: a transforms.json, or the folder of the only one."""
+    fields: Path = Path("~/.cache/rfedge/fields")
+    """Directory of field archives; a field the server has is fetched into it."""
     camera: str = "front"
+    """Name of the camera on the wire."""
     rate: float = 10.0
+    """Pictures per second in realtime pace."""
     loop: bool = False
+    """Begin again after the last picture."""
     pace: PaceKind = PaceKind.REALTIME
+    """realtime: capture at the rate, drop what the link cannot take. lockstep: capture the next
+    picture when the previous was answered."""
     field: str | None = None
+    """Field id (sha256); the server's only field without it."""
     vehicle: str = "cav-1"
+    """Name of the vehicle on the wire."""
     crf: float = 23.0
+    """H.264 quality, 1 (best) to 51; 23 is x264's default."""
     preset: str = "medium"
-    threads: int = 1
-    isa: str | None = None
-    metrics_port: int | None = None
-    metrics_host: str = "127.0.0.1"
-    metrics_per_vehicle: bool = False
-    report: Path | None = None
+    """x264 preset, ultrafast to veryslow."""
     log: LogForm = LogForm.AUTO
-    tls: TlsFiles | None = None
-    allow_insecure: bool = False
-    limits: AgentLimits = AgentLimits()
+    """console lines, json lines, or auto: console on a terminal."""
+    report: Path | None = None
+    """File for one JSON line per picture."""
+    render: RenderSettings = RenderSettings()
+    metrics: MetricsSettings = MetricsSettings()
+    transport: TransportSettings = TransportSettings()
+    limits: Annotated[AgentLimits, Suppress] = AgentLimits()
 
     def __post_init__(self) -> None:
         check_name("camera", self.camera)
@@ -90,7 +97,3 @@ class AgentConfig:
             raise InvalidInput("crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}")
         if self.preset not in PRESETS:
             raise InvalidInput("preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
-        if not 1 <= self.threads <= 256:
-            raise InvalidInput("threads", f"{self.threads} is outside 1..256")
-        if self.metrics_port is not None and not 0 <= self.metrics_port <= 65535:
-            raise InvalidInput("metrics_port", f"{self.metrics_port} is outside 0..65535")

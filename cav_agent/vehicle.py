@@ -52,9 +52,10 @@ class Vehicle:
     def __init__(self, config: AgentConfig) -> None:
         self.registry = CollectorRegistry()
         address = Address.parse("server", config.server)
-        if config.tls is None:
-            address.require_private("server", config.allow_insecure)
-        self._server = ServerEnd(address, config.tls)
+        tls = config.transport.tls()
+        if tls is None:
+            address.require_private("server", config.transport.allow_insecure)
+        self._server = ServerEnd(address, tls)
         self._config = config
         self._metrics = AgentMetrics(self.registry)
         self._stopped = asyncio.Event()
@@ -65,7 +66,7 @@ class Vehicle:
 
     async def run(self) -> Counter[str]:
         """Drive; return how many pictures ended how. Raises ``RfedgeError``."""
-        if self._config.metrics_per_vehicle:
+        if self._config.metrics.per_vehicle:
             self._metrics.travelling(self._config.vehicle, self._config.camera)
         self._serve_metrics()
         with structlog.contextvars.bound_contextvars(vehicle=self._config.vehicle):
@@ -83,15 +84,16 @@ class Vehicle:
             executor.shutdown()
 
     def _serve_metrics(self) -> None:
-        port = self._config.metrics_port
+        port = self._config.metrics.port
         if port is not None:
-            server, _ = start_http_server(port, self._config.metrics_host, self.registry)
+            server, _ = start_http_server(port, self._config.metrics.host, self.registry)
             log.info("metrics", port=server.server_port)
 
     async def _field(self, channel: grpc.aio.Channel) -> RadianceField:
         """Load the field, fetched from the server if it is not here."""
         config = self._config
-        store = FieldStore(config.fields)
+        fields = config.fields.expanduser()
+        store = FieldStore(fields)
         within_s = config.limits.give_up_s or None
         try:
             if config.field not in store.ids():
@@ -103,8 +105,9 @@ class Vehicle:
                 f"no server at {self._server.address} within {within_s:g} s"
             ) from error
         if field_id not in store.ids():
-            await fetch_field(channel, store, field_id, config.fields)
-        return await asyncio.to_thread(store.load, field_id, threads=config.threads, isa=config.isa)
+            await fetch_field(channel, store, field_id, fields)
+        render = config.render
+        return await asyncio.to_thread(store.load, field_id, threads=render.threads, isa=render.isa)
 
     def _prepare(self, field: RadianceField) -> Journey:
         config = self._config

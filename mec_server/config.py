@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Suppress, arg
 
 from rfcore.errors import InvalidInput
 from rfcore.wire.logs import LogForm
-from rfcore.wire.tls import TlsFiles
+from rfcore.wire.settings import MetricsSettings, RenderSettings, TransportSettings
 
 __all__ = ["ConsumerLimits", "DecoderKind", "ServerConfig", "SessionLimits", "VehicleQuota"]
 
@@ -48,9 +51,12 @@ class VehicleQuota:
     """What one vehicle may use at most, over all its streams: far above what an honest one does,
     far below what would starve the others."""
 
-    streams: int = 8
-    frames_per_s: float = 500.0
-    bytes_per_s: float = 32e6
+    streams: Annotated[int, arg(name="vehicle-streams")] = 8
+    """How many streams one vehicle may have."""
+    frames_per_s: Annotated[float, arg(name="vehicle-frames-per-s")] = 500.0
+    """How many frames it may send, over all its streams."""
+    bytes_per_s: Annotated[float, arg(name="vehicle-bytes-per-s")] = 32e6
+    """How many bytes these may have."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.streams <= 1000:
@@ -63,10 +69,11 @@ class VehicleQuota:
 
 @dataclass(frozen=True)
 class ConsumerLimits:
-    """``consumers`` may watch at once; one that takes nothing for ``patience_s`` is let go."""
+    """Those who watch the twin (`rfedge watch`); one that takes nothing for long is let go."""
 
-    consumers: int = 8
-    patience_s: float = 10.0
+    consumers: Annotated[int, arg(name="max-consumers")] = 8
+    """How many may watch at once."""
+    patience_s: Annotated[float, Suppress] = 10.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.consumers <= 1000:
@@ -77,44 +84,39 @@ class ConsumerLimits:
 
 @dataclass(frozen=True)
 class ServerConfig:
-    """One edge server process.
-
-    ``fields``: directory of field archives. ``save``: directory for reconstructed pictures, none
-    are written without it. ``listen`` and ``metrics_port``: port 0 takes a free one; no metrics are
-    served without a port, and ``metrics_per_vehicle`` tells vehicles apart in them. ``threads`` per
-    render, ``workers`` frames at once. ``isa`` forces an instruction set. ``ready_file`` receives
-    the address once connections are accepted. ``tls``: only clients with a certificate are let in.
-    ``decoder``: where packets are decoded. ``max_streams`` may be open, ``quota`` of them and what
-    they carry be one vehicle's.
-    """
+    """Reconstruct what vehicles see, against the radiance fields held here."""
 
     fields: Path
+    """Directory of field archives (.rff)."""
     listen: str = "127.0.0.1:50051"
+    """HOST:PORT to accept vehicles on; port 0 takes a free one."""
     save: Path | None = None
-    metrics_port: int | None = None
-    metrics_host: str = "127.0.0.1"
-    metrics_per_vehicle: bool = False
-    threads: int = 1
+    """Directory for reconstructed pictures (PNG) and their index; none without it."""
     workers: int = 2
-    isa: str | None = None
-    ready_file: Path | None = None
-    tls: TlsFiles | None = None
-    log: LogForm = LogForm.AUTO
-    consumers: ConsumerLimits = ConsumerLimits()
+    """Frames reconstructed at once."""
     decoder: DecoderKind = DecoderKind.AUTO
+    """Where packets are decoded. in-process: in the server. child: in processes with limits, one a
+    camera. bubblewrap: in sandboxes. auto: in-process if only this machine can reach the server,
+    else bubblewrap where it works, else child."""
+    log: LogForm = LogForm.AUTO
+    """console lines, json lines, or auto: console on a terminal."""
+    ready_file: Path | None = None
+    """File that receives HOST:PORT once vehicles are accepted."""
+    render: RenderSettings = RenderSettings()
+    metrics: MetricsSettings = MetricsSettings()
+    transport: TransportSettings = TransportSettings()
+    consumers: ConsumerLimits = ConsumerLimits()
     max_streams: int = 256
+    """How many streams of vehicles may be open at once."""
     quota: VehicleQuota = VehicleQuota()
-    allow_insecure: bool = False
-    drain_s: float = 5.0
-    limits: SessionLimits = SessionLimits()
+    drain_s: Annotated[float, Suppress] = 5.0
+    limits: Annotated[SessionLimits, Suppress] = SessionLimits()
 
     def __post_init__(self) -> None:
-        for name, highest in (("threads", 256), ("workers", 256), ("max_streams", 100_000)):
+        for name, highest in (("workers", 256), ("max_streams", 100_000)):
             value = getattr(self, name)
             if not 1 <= value <= highest:
                 raise InvalidInput(name, f"{value} is outside 1..{highest}")
-        if self.metrics_port is not None and not 0 <= self.metrics_port <= 65535:
-            raise InvalidInput("metrics_port", f"{self.metrics_port} is outside 0..65535")
         if not self.fields.is_dir():
             raise InvalidInput("fields", f"{self.fields} is not a directory")
         if not self.drain_s >= 0:

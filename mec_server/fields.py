@@ -16,6 +16,7 @@ import structlog
 from mec_server.handlers import Renderer
 from rfcore.errors import InvalidInput
 from rfcore.field import FieldStore, RadianceField
+from rfcore.wire.settings import RenderSettings
 
 __all__ = ["CHUNK_BYTES", "FieldShelf", "Store", "field_loader", "read_chunks"]
 
@@ -65,11 +66,7 @@ class FieldShelf:
 
 
 def field_loader(
-    store: FieldStore,
-    *,
-    threads: int,
-    isa: str | None,
-    opened: Callable[[RadianceField], None],
+    store: FieldStore, render: RenderSettings, *, opened: Callable[[RadianceField], None]
 ) -> Callable[[str], RadianceField]:
     """Return how a shelf opens fields of ``store``: whole, checked, and with a renderer built.
 
@@ -79,7 +76,7 @@ def field_loader(
     """
 
     def load(field_id: str) -> RadianceField:
-        field = store.load(field_id, threads=threads, isa=isa)
+        field = store.load(field_id, threads=render.threads, isa=render.isa)
         field.prepare()
         log.info(
             "field opened",

@@ -43,22 +43,21 @@ class EdgeServer:
     def __init__(self, config: ServerConfig) -> None:
         self.registry = CollectorRegistry()
         self.address = Address.parse("listen", config.listen)
-        if config.tls is None:
-            self.address.require_private("listen", config.allow_insecure)
+        self._tls = config.transport.tls()
+        if self._tls is None:
+            self.address.require_private("listen", config.transport.allow_insecure)
         self._config = config
         store = FieldStore(config.fields)
-        self._metrics = ServerMetrics(self.registry, per_vehicle=config.metrics_per_vehicle)
+        self._metrics = ServerMetrics(self.registry, per_vehicle=config.metrics.per_vehicle)
         self._metrics.workers.set(config.workers)
-        load = field_loader(
-            store, threads=config.threads, isa=config.isa, opened=self._metrics.field_opened
-        )
+        load = field_loader(store, config.render, opened=self._metrics.field_opened)
         self._shelf = FieldShelf(store, load)
         twin = Twin()  # the metrics outlive the server in their thread, and shall not hold it
         watched = TwinMetrics(
             self._metrics.instruments,
             lambda: twin.ages_s(time.monotonic()),
             lambda: twin.missed,
-            per_vehicle=config.metrics_per_vehicle,
+            per_vehicle=config.metrics.per_vehicle,
         )
         self._twin_service = TwinService(twin, watched, config.consumers)
         self._executor = ThreadPoolExecutor(config.workers, "worker")
@@ -106,7 +105,7 @@ class EdgeServer:
             "serving",
             address=str(self.address),
             fields=count,
-            tls=self._config.tls is not None,
+            tls=self._tls is not None,
             decoder=str(self._decoders.kind),
         )
         return self.address
@@ -126,10 +125,9 @@ class EdgeServer:
         log.info("stopped")
 
     def _open_port(self) -> int:
-        tls = self._config.tls
-        if tls is None:
+        if self._tls is None:
             return self._server.add_insecure_port(str(self.address))
-        return self._server.add_secure_port(str(self.address), tls.server_credentials())
+        return self._server.add_secure_port(str(self.address), self._tls.server_credentials())
 
     def _open_recorder(self, directory: Path | None) -> Recorder | None:
         if directory is None:
@@ -142,9 +140,9 @@ class EdgeServer:
         log.error("recording stopped, streaming goes on", problem=str(error))
 
     def _serve_metrics(self) -> None:
-        port = self._config.metrics_port
+        port = self._config.metrics.port
         if port is not None:
-            server, _ = start_http_server(port, self._config.metrics_host, self.registry)
+            server, _ = start_http_server(port, self._config.metrics.host, self.registry)
             log.info("metrics", port=server.server_port)
 
     async def _set_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:

@@ -41,6 +41,7 @@ from rfcore.wire.messages import (
     ServerMessage,
     Welcome,
 )
+from rfcore.wire.settings import TransportSettings
 
 INTRINSICS = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
 FRAMES = 6
@@ -131,13 +132,21 @@ def coded(street: Street) -> CodedStreet:
     return CodedStreet(hello, frames)
 
 
+def secured(changes: dict[str, Any]) -> dict[str, Any]:
+    """Return the changes with ``tls`` files as the transport that services are told of."""
+    tls = changes.pop("tls", None)
+    if tls is None:
+        return changes
+    return changes | {"transport": TransportSettings(tls.certificate, tls.key, tls.authority)}
+
+
 @pytest.fixture
 def serve(street: Street) -> Callable[..., Any]:
     """Return a context manager that runs a server in this process."""
 
     @asynccontextmanager
     async def run(**changes: Any) -> AsyncIterator[EdgeServer]:
-        config = replace(ServerConfig(street.store, "127.0.0.1:0"), **changes)
+        config = replace(ServerConfig(street.store, "127.0.0.1:0"), **secured(changes))
         server = EdgeServer(config)
         await server.start()
         try:
@@ -172,7 +181,7 @@ def travel(street: Street, tmp_path: Path) -> Callable[..., Awaitable[Trip]]:
             preset="ultrafast",
             report=report,
         )
-        counts = await Vehicle(replace(config, **changes)).run()
+        counts = await Vehicle(replace(config, **secured(changes))).run()
         return Trip(counts, [json.loads(line) for line in report.read_text().splitlines()])
 
     return run

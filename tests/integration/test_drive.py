@@ -14,6 +14,7 @@ from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable
 from rfcore.image import read_rgb
 from rfcore.raster.native import available_isas
+from rfcore.wire.settings import RenderSettings
 from rfedge.link_proxy import LinkProxy, ProxySettings
 
 
@@ -50,8 +51,8 @@ async def test_neither_instruction_set_nor_threads_at_either_end_change_a_byte(
         agent_isa, server_isa = pairs[number % len(pairs)]
         agent_threads, server_threads = threads[number % len(threads)]
         saved = tmp_path / str(number)
-        async with serve(save=saved, isa=server_isa, threads=server_threads) as server:
-            trip = await travel(server.address, isa=agent_isa, threads=agent_threads)
+        async with serve(save=saved, render=RenderSettings(server_threads, server_isa)) as server:
+            trip = await travel(server.address, render=RenderSettings(agent_threads, agent_isa))
         assert trip.counts == {"acked": 6}
         closed_loop = [line["reconstruction_digest"] for line in trip.lines]
         assert [line["digest"] for line in index_of(saved)] == closed_loop
@@ -138,5 +139,5 @@ async def test_the_server_counts_frames_bytes_and_seconds(
 
 async def test_a_server_that_forces_a_missing_instruction_set_does_not_start(serve: Any) -> None:
     with pytest.raises(BackendUnavailable):
-        async with serve(isa="neon"):
+        async with serve(render=RenderSettings(isa="neon")):
             pass

@@ -21,6 +21,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from cav_agent.config import AgentConfig, AgentLimits, PaceKind
 from cav_agent.vehicle import Vehicle
 from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.wire.settings import TransportSettings
 
 Process = asyncio.subprocess.Process
 
@@ -161,7 +162,6 @@ async def test_an_agent_told_to_stop_finishes_its_frame_and_ends_cleanly(
     ("change", "named"),
     [
         ({"--server": "192.0.2.1:50051"}, "not encrypted; give --allow-insecure"),
-        ({"--rate": "0"}, "rate: 0.0 Hz is outside"),
         ({"--drive": "/nonexistent"}, "/nonexistent"),
     ],
 )
@@ -178,6 +178,19 @@ async def test_a_users_mistake_is_one_line_and_exit_2(
     assert len(lines) == 1
     assert lines[0].startswith("cav-agent: ")
     assert named in lines[0]
+
+
+async def test_an_option_outside_its_limits_is_refused_before_anything_starts(
+    street: Any, tmp_path: Path
+) -> None:
+    arguments = agent_arguments(street, "127.0.0.1:1", tmp_path / "report.jsonl")
+    arguments[arguments.index("--rate") + 1] = "0"
+    agent = await start("cav_agent", *arguments)
+    _, told = await agent.communicate()
+    assert agent.returncode == 2
+    assert "rate: 0.0 Hz is outside 0.01..1000 Hz" in told.decode()
+    assert "Traceback" not in told.decode()
+    assert not (tmp_path / "report.jsonl").exists()
 
 
 @pytest.mark.parametrize("module", ["cav_agent.__main__", "mec_server.__main__"])
@@ -230,7 +243,9 @@ async def test_plaintext_is_served_to_this_machine_only_unless_allowed(serve: An
     with pytest.raises(InvalidInput, match=r"listen: 0\.0\.0\.0:0 is not a loopback address"):
         async with serve(listen="0.0.0.0:0"):
             pass
-    async with serve(listen="0.0.0.0:0", allow_insecure=True) as server:
+    async with serve(
+        listen="0.0.0.0:0", transport=TransportSettings(allow_insecure=True)
+    ) as server:
         assert server.address.port > 0
 
 

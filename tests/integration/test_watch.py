@@ -19,6 +19,7 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import I420, read_rgb
 from rfcore.native.yuv import rgb_from_i420
 from rfcore.wire.conventions import CHANNEL_OPTIONS
+from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
@@ -167,7 +168,7 @@ async def test_a_server_that_drains_lets_consumers_go(serve: Any) -> None:
 async def test_the_age_of_the_twin_is_there_while_a_vehicle_streams(
     serve: Any, travel: Any
 ) -> None:
-    async with serve(metrics_per_vehicle=True) as server:
+    async with serve(metrics=MetricsSettings(per_vehicle=True)) as server:
         value = server.registry.get_sample_value
         async with consumer(server.address, Wish(encoding=PictureEncoding.NONE)) as call:
             driving = asyncio.create_task(travel(server.address))

@@ -14,8 +14,6 @@ from rfcore.errors import InvalidInput
     ("change", "named"),
     [
         ({"workers": 0}, "workers: 0 is outside 1..256"),
-        ({"threads": 1000}, "threads: 1000 is outside 1..256"),
-        ({"metrics_port": -1}, "metrics_port: -1 is outside"),
         ({"drain_s": -1.0}, "drain_s: -1.0 must not be negative"),
         ({"fields": Path("/nonexistent")}, "fields: /nonexistent is not a directory"),
     ],

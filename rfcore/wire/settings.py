@@ -1,0 +1,78 @@
+"""Settings that both services take on their command lines, in groups.
+
+Each group is one box of ``--help``. Option names are flat (``--metrics-port``, ``--tls-cert``), as
+operators write them in unit files; the group is only how the program holds them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import EnumChoicesFromValues, FlagCreatePairsOff, OmitArgPrefixes, arg
+
+from rfcore.errors import InvalidInput
+from rfcore.wire.tls import TlsFiles
+
+__all__ = ["OPTIONS", "MetricsSettings", "RenderSettings", "TransportSettings"]
+
+# How a service's configuration becomes options: flat names, words of enumerations as they
+# are in logs, and flags without a --no- twin.
+OPTIONS = (OmitArgPrefixes, EnumChoicesFromValues, FlagCreatePairsOff)
+
+PORT_MAX = 65535
+
+
+@dataclass(frozen=True)
+class MetricsSettings:
+    """Where Prometheus may collect metrics."""
+
+    port: Annotated[int | None, arg(name="metrics-port")] = None
+    """Port for Prometheus; 0 takes a free one, none are served without it."""
+    host: Annotated[str, arg(name="metrics-host")] = "127.0.0.1"
+    """Address the metrics are served on."""
+    per_vehicle: Annotated[bool, arg(name="metrics-per-vehicle")] = False
+    """Tell vehicles apart in the metrics; each costs its own time series."""
+
+    def __post_init__(self) -> None:
+        if self.port is not None and not 0 <= self.port <= PORT_MAX:
+            raise InvalidInput("metrics_port", f"{self.port} is outside 0..{PORT_MAX}")
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How fields are rendered; the pictures do not depend on it."""
+
+    threads: int = 1
+    """Threads per render."""
+    isa: str | None = None
+    """Instruction set to force (avx512, avx2, scalar); the best of this machine without it."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.threads <= 256:
+            raise InvalidInput("threads", f"{self.threads} is outside 1..256")
+
+
+@dataclass(frozen=True)
+class TransportSettings:
+    """Who this process is, and whom it speaks to; plaintext without certificates."""
+
+    certificate: Annotated[Path | None, arg(name="tls-cert")] = None
+    """Certificate of this process (PEM); a vehicle's names --vehicle."""
+    key: Annotated[Path | None, arg(name="tls-key")] = None
+    """Its private key."""
+    authority: Annotated[Path | None, arg(name="tls-ca")] = None
+    """Certificate of the authority that vouches for the other end."""
+    allow_insecure: bool = False
+    """Speak plaintext with other machines."""
+
+    def __post_init__(self) -> None:
+        self.tls()
+
+    def tls(self) -> TlsFiles | None:
+        """Return the files mutual TLS needs, or None when plaintext is spoken.
+
+        Raises ``InvalidInput`` when only some of the three are given, or one cannot be used.
+        """
+        return TlsFiles.of(self.certificate, self.key, self.authority)
