@@ -24,6 +24,9 @@ class EvalCompare:
     """The field archive (.rff) both ends hold."""
     drives: Annotated[tuple[str, ...], Positional]
     """NAME@HZ=DATASET for each drive, such as `yardstick-empty@10=street/transforms_drive.json`."""
+    background: tuple[str, ...] = ()
+    """The same for the empty street of a drive, frame by frame at its poses: tells what is not in
+    the field, for the split of the bits and for a rival that sends only the foreground."""
     preset: Preset = "veryfast"
     """x264 preset of ours and of the anchor."""
     out: Path = Path("results/compare.json")
@@ -34,12 +37,17 @@ class EvalCompare:
     """More codecs to compare with, as package.module:Class (see docs/evaluation.md)."""
     quick: bool = False
     """Eight frames and few rivals: to see that it works, not for figures."""
+    retime: bool = False
+    """Take the processor times anew (on a quiet machine) and keep everything else."""
+    figures: Path | None = None
+    """Folder for the curves as SVG, with their numbers as CSV."""
 
     def run(self) -> None:
         """Run what is not there yet and write the rows."""
         from rich.console import Console
 
-        from rfedge.evaluate.compare_run import CompareJob, run_compare
+        from rfedge.evaluate.compare_bout import CompareJob
+        from rfedge.evaluate.compare_run import run_compare
 
         job = CompareJob(
             field=self.field,
@@ -47,7 +55,15 @@ class EvalCompare:
             preset=self.preset,
             out=self.out,
             cells=self.cells,
+            backgrounds=self.background,
             methods=self.method,
             quick=self.quick,
+            retime=self.retime,
         )
-        run_compare(job, Console())
+        console = Console()
+        result = run_compare(job, console)
+        if self.figures is not None:
+            from rfedge.report.compare_figures import write_compare_figures
+
+            for path in write_compare_figures(result, self.figures):
+                console.print(f"  {path}")

@@ -2,7 +2,8 @@
 
 A cell is one clip coded by one method at one operating point. Its key names everything the result
 depends on (digests of inputs, method, options, revision of the program); its file is named by the
-digest of the key and holds key and result. Files appear whole or not at all and are never changed.
+digest of the key and holds key and result. Files appear whole or not at all and are never changed;
+only processor times are forgotten and taken again.
 """
 
 from __future__ import annotations
@@ -60,6 +61,10 @@ class CellStore:
         self.folder.mkdir(parents=True, exist_ok=True)
         content = json.dumps({"key": dict(key), "result": result}, indent=1)
         write_whole(self.path(key), content + "\n")
+
+    def forget(self, key: CellKey) -> None:
+        """Remove the cell of ``key``, if there is one: for what the machine disturbed."""
+        self.path(key).unlink(missing_ok=True)
 
     def has(self, key: CellKey) -> bool:
         """Tell whether the cell is there already."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 
-__all__ = ["ClipCoder", "CodedClip", "luma_mse"]
+__all__ = ["ClipCoder", "CodedClip", "luma_mse", "luma_sse"]
 
 
 @dataclass(frozen=True)
@@ -68,3 +68,9 @@ def luma_mse(decoded: I420, frame: I420) -> float:
     """Return the mean squared error of the luma planes."""
     difference = decoded.y.astype(np.float64) - frame.y
     return float(np.mean(difference * difference))
+
+
+def luma_sse(decoded: I420, frame: I420, where: NDArray[np.bool_]) -> float:
+    """Return the sum of squared errors of the luma over the pixels ``where`` is true."""
+    difference = (decoded.y.astype(np.float64) - frame.y)[where]
+    return float(difference @ difference)

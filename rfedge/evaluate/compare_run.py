@@ -2,88 +2,32 @@
 
 from __future__ import annotations
 
-import hashlib
-import importlib
 import json
-import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from time import monotonic
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-from rfcore.codec.references import RENDER_ONLY
-from rfcore.dataset import Dataset, read_dataset
-from rfcore.errors import InvalidInput
-from rfcore.field import RadianceField, load_field
+from rfcore.field import load_field
 from rfcore.files import write_whole
-from rfcore.native.yuv import i420_from_rgb
-from rfcore.train import mean_psnr_db
+from rfedge.evaluate.bit_split import SplitClip, split_rows
 from rfedge.evaluate.cells import CellStore
 from rfedge.evaluate.clip import ClipCoder
-from rfedge.evaluate.compare import BEST, Contest, Performance, compare_rows, perform
-from rfedge.evaluate.own import FieldCoder, see_clip
-from rfedge.evaluate.rivals import svtav1_lowdelay, x264_lowdelay, x265_lowdelay
+from rfedge.evaluate.compare import BEST, MIDDLE_DB, Performance, compare_rows, perform
+from rfedge.evaluate.compare_bout import Bout, CompareJob, read_bouts
+from rfedge.evaluate.compare_tables import break_even_row, curve_rows
+from rfedge.evaluate.foreground import foreground_row
 from rfedge.provenance import host, revision
 
-__all__ = ["CompareJob", "DriveName", "foreign_coder", "rival_families", "run_compare"]
+__all__ = ["run_compare"]
 
-QUICK_FRAMES = 8
 PROBE_FRAMES = 2
+ANCHOR = "x264-lowdelay"
 Row = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class CompareJob:
-    """What to compare; see ``rfedge eval compare --help``."""
-
-    field: Path
-    drives: Sequence[str]
-    preset: str
-    out: Path
-    cells: Path
-    methods: Sequence[str] = ()
-    quick: bool = False
-
-    def __post_init__(self) -> None:
-        if self.out.suffix != ".json":
-            raise InvalidInput("out", f"{self.out} must end in .json")
-
-
-@dataclass(frozen=True)
-class DriveName:
-    """A drive as it is named on the command line: ``NAME@HZ=DATASET``."""
-
-    scene: str
-    rate_hz: float
-    dataset: Path
-
-    @staticmethod
-    def parse(text: str) -> DriveName:
-        """Raise ``InvalidInput`` for text of another form."""
-        found = re.fullmatch(r"([\w.-]+)@(\d+(?:\.\d+)?)=(.+)", text)
-        if not found or float(found[2]) <= 0:
-            raise InvalidInput("drives", f"{text!r} is not NAME@HZ=DATASET, as empty@10=drive.json")
-        return DriveName(found[1], float(found[2]), Path(found[3]))
-
-
-@dataclass(frozen=True)
-class Bout:
-    """One drive with everybody who codes it."""
-
-    contest: Contest
-    methods: Sequence[ClipCoder]
-    families: Mapping[str, Sequence[ClipCoder]]
-
-    @property
-    def coders(self) -> list[ClipCoder]:
-        """All of them, ours first."""
-        return [*self.methods, *(coder for family in self.families.values() for coder in family)]
 
 
 def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
@@ -91,14 +35,16 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
 
     Raises ``InvalidInput`` or ``DatasetError`` before anything is coded if an input is wrong.
     """
-    names = [DriveName.parse(text) for text in job.drives]
     field = load_field(job.field)
-    bouts = [_bout(job, name, field) for name in names]
+    bouts = read_bouts(job, field)
     store = CellStore(job.cells)
     left_s = sum(_seconds_left(bout, store) for bout in bouts)
     cells = sum(len(coder.points) for bout in bouts for coder in bout.coders)
     console.print(f"{cells} clips to code, about {left_s / 60:.1f} minutes of them left to do")
-    rows = [row for bout in bouts for row in _rows(bout, store, console)]
+    tables: dict[str, list[Row]] = {}
+    for bout in bouts:
+        for name, rows in _tables(job, bout, store, console).items():
+            tables.setdefault(name, []).extend(rows)
     result = {
         "case": "compare",
         "command": shlex.join(["rfedge", *sys.argv[1:]]),
@@ -106,68 +52,14 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
         "revision": revision(),
         "quick": job.quick,
         "field_id": field.field_id,
+        "field_bytes": job.field.stat().st_size,
         "frames": {f"{b.contest.scene}@{b.contest.rate_hz:g}": _frames(b) for b in bouts},
-        "rows": rows,
+        **tables,
     }
     job.out.parent.mkdir(parents=True, exist_ok=True)
     write_whole(job.out, json.dumps(result, indent=1) + "\n")
-    _print(rows, console)
+    _print(tables["rows"], console)
     return result
-
-
-def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
-    """Return the rivals by codec: the anchor alone of its kind, the others at several settings."""
-    x264 = [x264_lowdelay(p) for p in ("medium", "slower", "veryslow") if not quick]
-    refresh = x264_lowdelay(
-        preset, f"x264-intra-refresh-{preset}", **{"intra-refresh": "1", "keyint": "30"}
-    )
-    families: dict[str, list[ClipCoder]] = {
-        "x264-lowdelay": [x264_lowdelay(preset)],
-        "x264-stronger": list(x264),
-        "x264-intra-refresh": [] if quick else [refresh],
-        "x265-lowdelay": [] if quick else [x265_lowdelay(p) for p in ("veryfast", "medium")],
-        "svtav1-lowdelay": [svtav1_lowdelay(p) for p in ((8,) if quick else (10, 8, 6, 4))],
-    }
-    return {name: family for name, family in families.items() if family}
-
-
-def foreign_coder(text: str) -> ClipCoder:
-    """Return an instance of ``package.module:Class``; raise ``InvalidInput`` if there is none."""
-    module, _, name = text.partition(":")
-    try:
-        coder: ClipCoder = getattr(importlib.import_module(module), name)()
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise InvalidInput("method", f"{text!r} is no package.module:Class ({error})") from error
-    missing = [key for key in ("name", "points", "version", "code") if not hasattr(coder, key)]
-    if missing:
-        raise InvalidInput("method", f"{text!r} lacks {', '.join(missing)} of a ClipCoder")
-    return coder
-
-
-def _bout(job: CompareJob, name: DriveName, field: RadianceField) -> Bout:
-    dataset = read_dataset(name.dataset)
-    pictures = dataset.pictures[: QUICK_FRAMES if job.quick else None]
-    frames = [i420_from_rgb(picture.read()) for picture in pictures]
-    digest = hashlib.sha256(b"".join(frame.digest() for frame in frames)).hexdigest()
-    quality_db = mean_psnr_db(field, pictures)
-    contest = Contest(name.scene, name.rate_hz, frames, digest, quality_db)
-    families = rival_families(job.preset, quick=job.quick)
-    families |= {coder.name: [coder] for coder in map(foreign_coder, job.methods)}
-    return Bout(contest, _own(job, field, dataset, len(frames)), families)
-
-
-def _own(job: CompareJob, field: RadianceField, dataset: Dataset, count: int) -> list[ClipCoder]:
-    seen = see_clip(field, [picture.camera for picture in dataset.pictures[:count]])
-    mark = f"{job.preset}-{field.field_id[:12]}"
-    ours = FieldCoder(seen, f"rfedge-{mark}", revision(), preset=job.preset)
-    plain = FieldCoder(
-        seen,
-        f"rfedge-render-only-{mark}",
-        revision(),
-        preset=job.preset,
-        references=RENDER_ONLY,
-    )
-    return [ours, plain]
 
 
 def _seconds_left(bout: Bout, store: CellStore) -> float:
@@ -183,14 +75,37 @@ def _seconds_left(bout: Bout, store: CellStore) -> float:
     return total_s
 
 
-def _rows(bout: Bout, store: CellStore, console: Console) -> list[Row]:
+def _tables(
+    job: CompareJob, bout: Bout, store: CellStore, console: Console
+) -> dict[str, list[Row]]:
+    contest = bout.contest
+
     def performed(coder: ClipCoder) -> Performance:
-        console.print(f"  {bout.contest.scene} {bout.contest.rate_hz:g} Hz: {coder.name}")
-        return perform(bout.contest, coder, store)
+        console.print(f"  {contest.scene} {contest.rate_hz:g} Hz: {coder.name}")
+        return perform(contest, coder, store, retime=job.retime)
 
     families = {n: [performed(c) for c in family] for n, family in bout.families.items()}
     methods = [performed(coder) for coder in bout.methods]
-    return [row for method in methods for row in compare_rows(bout.contest, method, families)]
+    anchor, field_bytes = families[ANCHOR][0], job.field.stat().st_size
+    foreground = []
+    if bout.foreground_only is not None:
+        theirs = performed(bout.foreground_only).clips
+        foreground = [foreground_row(contest, methods[0].clips, theirs, bout.foregrounds)]
+    return {
+        "rows": [row for method in methods for row in compare_rows(contest, method, families)],
+        "break_even": [break_even_row(contest, m, anchor, field_bytes) for m in methods],
+        "bits": _bits(job, bout, methods[0], store),
+        "foreground": foreground,
+        "curves": curve_rows(contest, methods, families),
+    }
+
+
+def _bits(job: CompareJob, bout: Bout, ours: Performance, store: CellStore) -> list[Row]:
+    contest, crf = bout.contest, ours.nearest(MIDDLE_DB).point
+    clip = SplitClip(contest.frames, bout.seen, bout.foregrounds, job.preset, crf)
+    key = {**contest.cell_key(bout.methods[0], crf), "split": 1, "background": bout.background}
+    same = {"scene": contest.scene, "hz": contest.rate_hz, "method": ours.name, "crf": crf}
+    return [same | row for row in store.rows(key, lambda: split_rows(clip))]
 
 
 def _frames(bout: Bout) -> dict[str, Any]:

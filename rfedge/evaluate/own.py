@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from time import process_time_ns
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, FrameChoice
@@ -25,22 +26,27 @@ from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Frame
-from rfedge.evaluate.clip import CodedClip, luma_mse
+from rfedge.evaluate.clip import CodedClip, luma_mse, luma_sse
 
 __all__ = ["FieldCoder", "SeenClip", "see_clip"]
 
 CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0, 38.0)
+COVERED = 0.5
 MESSAGE_CAMERA = "front"
 MESSAGE_TIME_NS = 1_700_000_000_000_000_000
 
 
 @dataclass(frozen=True)
 class SeenClip:
-    """A field seen from every pose of a clip, as both ends hold it, and what rendering took."""
+    """A field seen from every pose of a clip, as both ends hold it, and what rendering took.
+
+    ``covered``: bool [H, W] a frame, where the field shows anything (opacity above 1/2).
+    """
 
     cameras: tuple[Camera, ...]
     renders: tuple[I420, ...]
     depths: tuple[PosedDepth, ...]
+    covered: tuple[NDArray[np.bool_], ...]
     field_id: str
     render_cpu_ms: float
 
@@ -54,11 +60,15 @@ def see_clip(field: RadianceField, cameras: Sequence[Camera]) -> SeenClip:
     renders = tuple(i420_from_colour(view.colour) for view in views)
     cpu_ms = (process_time_ns() - began_ns) / 1e6
     depths = tuple(PosedDepth(c, view.depth) for c, view in zip(cameras, views, strict=True))
-    return SeenClip(tuple(cameras), renders, depths, field.field_id, cpu_ms)
+    covered = tuple(view.opacity > COVERED for view in views)
+    return SeenClip(tuple(cameras), renders, depths, covered, field.field_id, cpu_ms)
 
 
 class FieldCoder:
-    """Codes the clip a field was seen along. ``references`` None leaves them to the encoder."""
+    """Codes the clip a field was seen along. ``references`` None leaves them to the encoder.
+
+    With ``foregrounds``, bool [H, W] a frame, the notes have the luma's squared error there.
+    """
 
     def __init__(
         self,
@@ -69,12 +79,14 @@ class FieldCoder:
         preset: str,
         references: References | None = None,
         points: Sequence[float] = CRFS,
+        foregrounds: Sequence[NDArray[np.bool_]] = (),
     ) -> None:
         self.name = name
         self.version = version
         self.points = tuple(points)
         self._seen = seen
         self._preset = preset
+        self._foregrounds = foregrounds
         self._choice = FrameChoice(references=references)
         # Temporal references exist from the second frame on.
         temporal = references is not None and is_temporal(references)
@@ -98,16 +110,20 @@ class FieldCoder:
         cpu_ms += self._seen.render_cpu_ms * len(frames) / seen
         decoded = self._decoded(encoder, coded)
         pairs = list(zip(decoded, frames, strict=True))
+        notes: dict[str, tuple[float | str, ...]] = {
+            "references": tuple(references_name(made.packet.references) for made in coded),
+            "slice_bytes": tuple(len(made.packet.payload) for made in coded),
+        }
+        if self._foregrounds:
+            masked = zip(pairs, self._foregrounds, strict=False)
+            notes["foreground_sse"] = tuple(luma_sse(*pair, mask) for pair, mask in masked)
         return CodedClip(
             point,
             np.array([self._message_bytes(k, made) for k, made in enumerate(coded)]),
             np.array([luma_mse(*pair) for pair in pairs]),
             np.array([ssim(ours.y, theirs.y) for ours, theirs in pairs]),
             cpu_ms,
-            {
-                "references": tuple(references_name(made.packet.references) for made in coded),
-                "slice_bytes": tuple(len(made.packet.payload) for made in coded),
-            },
+            notes,
         )
 
     def _coded(self, encoder: DeltaEncoder, frames: Sequence[I420]) -> list[Encoded]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from time import process_time_ns
 from typing import Any, Literal, cast
@@ -25,11 +25,14 @@ from rfcore.metrics import ssim
 from rfedge.evaluate.clip import CodedClip, luma_mse
 
 __all__ = [
+    "CodedPictures",
     "Rival",
     "picture",
     "svtav1_lowdelay",
     "video_frame",
+    "x264_for_psnr",
     "x264_lowdelay",
+    "x265_for_psnr",
     "x265_lowdelay",
 ]
 
@@ -39,6 +42,15 @@ SVT_CRFS = (20.0, 27.0, 34.0, 41.0, 48.0, 55.0)
 """Spans the headline window of 32..35 dB on street pictures, with room on either side."""
 
 os.environ.setdefault("SVT_LOG", "1")  # read when the library opens: errors only
+
+
+@dataclass(frozen=True)
+class CodedPictures:
+    """Bytes of each frame, the pictures a decoder made of them, and the sender's time."""
+
+    frame_bytes: Sequence[int]
+    decoded: Sequence[I420]
+    cpu_ms: float
 
 
 @dataclass(frozen=True)
@@ -64,18 +76,22 @@ class Rival:
         """
         if not frames or any(n % 2 for n in frames[0].size_px):
             raise InvalidInput("frames", "a rival needs frames of one even size")
+        made = self.pictures(frames, rate_hz, point)
+        pairs = list(zip(made.decoded, frames, strict=True))
+        return CodedClip(
+            point,
+            np.array(made.frame_bytes),
+            np.array([luma_mse(*pair) for pair in pairs]),
+            np.array([ssim(ours.y, theirs.y) for ours, theirs in pairs]),
+            made.cpu_ms,
+        )
+
+    def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
+        """Return what ``code`` measures; raises as it does, but does not look at the sizes."""
         began_ns = process_time_ns()
         packets = self._encoded(frames, rate_hz, point)
         cpu_ms = (process_time_ns() - began_ns) / 1e6
-        decoded = self._decoded(packets)
-        pairs = list(zip(decoded, frames, strict=True))
-        return CodedClip(
-            point,
-            np.array([len(packet) for packet in packets]),
-            np.array([luma_mse(*pair) for pair in pairs]),
-            np.array([ssim(ours.y, theirs.y) for ours, theirs in pairs]),
-            cpu_ms,
-        )
+        return CodedPictures([len(packet) for packet in packets], self._decoded(packets), cpu_ms)
 
     def _encoded(self, frames: Sequence[I420], rate_hz: float, point: float) -> list[bytes]:
         encoder = self._encoder(frames[0].size_px, rate_hz, point)
@@ -123,17 +139,34 @@ def x264_lowdelay(preset: str, name: str | None = None, **params: str) -> Rival:
     )
 
 
+def x264_for_psnr(preset: str) -> Rival:
+    """Return the same with ``tune=psnr``, as whoever compares PSNRs should have it."""
+    plain = x264_lowdelay(preset, f"x264-lowdelay-psnr-{preset}")
+    return replace(plain, options={**plain.options, "tune": "zerolatency,psnr"})
+
+
 def x265_lowdelay(preset: str) -> Rival:
     """Return x265 with ``tune=zerolatency``, one key frame."""
+    return _x265(f"x265-lowdelay-{preset}", preset, {})
+
+
+def x265_for_psnr(preset: str) -> Rival:
+    """Return the same as ``tune=psnr`` would have it; x265 takes one tune only."""
+    tuned = {"aq-mode": "0", "psy-rd": "0", "psy-rdoq": "0"}
+    return _x265(f"x265-lowdelay-psnr-{preset}", preset, tuned)
+
+
+def _x265(name: str, preset: str, params: Mapping[str, str]) -> Rival:
     options = {
         "keyint": "-1",
         "scenecut": "0",
         "log-level": "none",
         "pools": "none",
         "frame-threads": "1",
+        **params,
     }
     return Rival(
-        f"x265-lowdelay-{preset}",
+        name,
         "libx265",
         "hevc",
         {"preset": preset, "tune": "zerolatency", "x265-params": _joined(options)},

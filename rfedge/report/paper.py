@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,9 +15,9 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from rfcore.files import write_whole
 from rfedge.evaluate.paper_summary import means_of, savings_by_frame
 from rfedge.report.figures import STYLE
+from rfedge.report.svg_file import write_figure
 
 __all__ = ["paper_table", "write_paper_figures"]
 
@@ -56,8 +54,8 @@ def write_paper_figures(rows: Sequence[Row], folder: Path) -> list[Path]:
     written = []
     for field, scene in pairs:
         curves = savings_by_frame(rows, field, scene)
-        written += _write(folder / f"savings_{scene}_{field}", *_per_image(curves))
-    return written + _write(folder / "savings_by_crf_preset", *_by_setting(rows))
+        written += write_figure(folder / f"savings_{scene}_{field}", *_per_image(curves))
+    return written + write_figure(folder / "savings_by_crf_preset", *_by_setting(rows))
 
 
 def _per_image(curves: dict[tuple[int, int], Any]) -> tuple[Figure, list[list[str]]]:
@@ -105,14 +103,3 @@ def _mean_of(rows: Sequence[Row], field: str, setting: tuple[str, float]) -> flo
         if row["field"] == field and (row["preset"], row["crf"]) == setting
     ]
     return float(np.mean(chosen))
-
-
-def _write(stem: Path, figure: Figure, lines: Sequence[Sequence[str]]) -> list[Path]:
-    drawing, numbers = io.StringIO(), io.StringIO()
-    figure.savefig(drawing, format="svg", bbox_inches="tight", metadata={"Date": None})
-    plt.close(figure)
-    csv.writer(numbers, lineterminator="\n").writerows(lines)
-    paths = [stem.with_name(stem.name + ".svg"), stem.with_name(stem.name + ".csv")]
-    for path, content in zip(paths, (drawing.getvalue(), numbers.getvalue()), strict=True):
-        write_whole(path, content)
-    return paths

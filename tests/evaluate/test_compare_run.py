@@ -9,7 +9,10 @@ from rich.console import Console
 
 from rfcore.errors import InvalidInput
 from rfedge.evaluate.compare import BEST
-from rfedge.evaluate.compare_run import CompareJob, DriveName, foreign_coder, run_compare
+from rfedge.evaluate.compare_bout import CompareJob
+from rfedge.evaluate.compare_rivals import foreign_coder
+from rfedge.evaluate.compare_run import run_compare
+from rfedge.evaluate.drives import DriveName
 from rfedge.evaluate.rivals import x264_lowdelay
 
 SAMPLES = Path(__file__).parents[2] / "samples"

@@ -5,7 +5,13 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfedge.evaluate.rivals import svtav1_lowdelay, x264_lowdelay, x265_lowdelay
+from rfedge.evaluate.rivals import (
+    svtav1_lowdelay,
+    x264_for_psnr,
+    x264_lowdelay,
+    x265_for_psnr,
+    x265_lowdelay,
+)
 
 RIVALS = [x264_lowdelay("veryfast"), x265_lowdelay("ultrafast"), svtav1_lowdelay(10)]
 
@@ -57,3 +63,17 @@ def test_keyframes_can_be_asked_of_x264():
     sizes = rival.code(panning_clip(), 10, 23.0).frame_bytes
     assert sizes[2] > 3 * sizes[1]
     assert sizes[4] > 3 * sizes[3]
+
+
+@pytest.mark.parametrize(
+    ("plain", "tuned"),
+    [
+        (x264_lowdelay("veryfast"), x264_for_psnr("veryfast")),
+        (x265_lowdelay("ultrafast"), x265_for_psnr("ultrafast")),
+    ],
+    ids=["x264", "x265"],
+)
+def test_tuning_for_psnr_changes_the_stream(plain, tuned):
+    clip = panning_clip()
+    coded = [rival.code(clip, 10, 30.0).frame_bytes.tolist() for rival in (plain, tuned)]
+    assert coded[0] != coded[1]
