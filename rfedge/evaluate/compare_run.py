@@ -20,6 +20,7 @@ from rfedge.evaluate.clip import ClipCoder
 from rfedge.evaluate.compare import BEST, MIDDLE_DB, Performance, compare_rows, perform
 from rfedge.evaluate.compare_bout import Bout, CompareJob, read_bouts
 from rfedge.evaluate.compare_tables import break_even_row, curve_rows
+from rfedge.evaluate.drives import DriveName
 from rfedge.evaluate.foreground import foreground_row
 from rfedge.provenance import host, revision
 
@@ -35,6 +36,8 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
 
     Raises ``InvalidInput`` or ``DatasetError`` before anything is coded if an input is wrong.
     """
+    for text in (*job.drives, *job.backgrounds):
+        DriveName.parse(text)
     field = load_field(job.field)
     bouts = read_bouts(job, field)
     store = CellStore(job.cells)
