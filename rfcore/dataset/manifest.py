@@ -1,29 +1,36 @@
 """A list of a directory's files with their SHA-256, so that damage is noticed before use.
 
-``manifest.json`` is ``{"sha256": {"train/000.jpg": "<hex>", ...}}`` with paths relative to it.
+``manifest.json`` is ``{"sha256": {"train/000.jpg": "<hex>", ...}}`` with paths relative to it;
+other keys say how the directory was made and are not read.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from rfcore.errors import DatasetError
+from rfcore.files import write_whole
 
 __all__ = ["MANIFEST_NAME", "verify_manifest", "write_manifest"]
 
 MANIFEST_NAME = "manifest.json"
 
 
-def write_manifest(directory: Path) -> Path:
-    """List every file under ``directory`` with its SHA-256; return the manifest's path."""
+def write_manifest(directory: Path, about: Mapping[str, Any] | None = None) -> Path:
+    """List every file under ``directory`` with its SHA-256; return the manifest's path.
+
+    ``about`` stands before the list: what made the directory.
+    """
     files = sorted(path for path in directory.rglob("*") if path.is_file())
     target = directory / MANIFEST_NAME
     digests = {
         path.relative_to(directory).as_posix(): _sha256(path) for path in files if path != target
     }
-    target.write_text(json.dumps({"sha256": digests}, indent=1) + "\n")
+    write_whole(target, json.dumps({**(about or {}), "sha256": digests}, indent=1) + "\n")
     return target
 
 

@@ -20,7 +20,7 @@ from rfcore.field.ply_table import write_vertices
 from rfcore.files import write_whole
 from rfcore.lens import FisheyeLens
 
-__all__ = ["WrittenPicture", "write_points", "write_transforms"]
+__all__ = ["POINTS_NAME", "WrittenPicture", "transforms_of", "write_points", "write_transforms"]
 
 POINTS_NAME = "points.ply"
 COLUMNS = [(n, "<f8") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
@@ -40,14 +40,21 @@ def write_transforms(
     folder: Path, pictures: Sequence[WrittenPicture], points: SourcePoints | None
 ) -> None:
     """Write ``points.ply``, if there are points, and then ``transforms.json``."""
+    if points is not None:
+        write_points(folder / POINTS_NAME, points)
+    content = transforms_of(pictures, POINTS_NAME if points is not None else None)
+    write_whole(folder / "transforms.json", json.dumps(content, indent=1) + "\n")
+
+
+def transforms_of(pictures: Sequence[WrittenPicture], points_name: str | None) -> dict[str, Any]:
+    """Return the content of a ``transforms.json``; a camera that all share stands at the top."""
     cameras = {picture.camera for picture in pictures}
     shared = _camera_keys(pictures[0].camera) if len(cameras) == 1 else {}
     content: dict[str, Any] = dict(shared)
-    if points is not None:
-        write_points(folder / POINTS_NAME, points)
-        content["ply_file_path"] = POINTS_NAME
+    if points_name is not None:
+        content["ply_file_path"] = points_name
     content["frames"] = [_frame(picture, not shared) for picture in pictures]
-    write_whole(folder / "transforms.json", json.dumps(content, indent=1) + "\n")
+    return content
 
 
 def _frame(picture: WrittenPicture, own_camera: bool) -> dict[str, Any]:

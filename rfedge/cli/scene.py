@@ -7,6 +7,7 @@ from typing import Annotated
 
 from tyro.conf import subcommand
 
+from rfedge.cli.scene_build import SceneBuild
 from rfedge.cli.scene_convert import SceneConvert
 from rfedge.cli.scene_plan import ScenePlan
 from rfedge.cli.scene_poses import ScenePoses
@@ -17,10 +18,11 @@ __all__ = ["Scene"]
 
 @dataclass(frozen=True)
 class Scene:
-    """Make datasets: convert recordings, find poses, record a simulator, plan a scene."""
+    """Make datasets: render a street, convert recordings, find poses, record a simulator."""
 
     verb: (
-        Annotated[SceneConvert, subcommand("convert")]
+        Annotated[SceneBuild, subcommand("build")]
+        | Annotated[SceneConvert, subcommand("convert")]
         | Annotated[ScenePoses, subcommand("poses")]
         | Annotated[ScenePlan, subcommand("plan")]
         | Annotated[SceneRecordCarla, subcommand("record-carla")]

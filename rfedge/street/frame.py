@@ -19,7 +19,8 @@ F32 = NDArray[np.float32]
 @dataclass(frozen=True)
 class LinearFrame:
     """``colour`` float32 [H, W, 3], linear, 1 is white; ``depth_m`` float32 [H, W], z, infinite in
-    the sky. ``velocity_mps`` and ``turn_radps`` are the camera's, in its own axes.
+    the sky; ``labels`` uint8 [H, W], what each pixel shows (``geometry.mesh.Label``), where that is
+    known. ``velocity_mps`` and ``turn_radps`` are the camera's, in its own axes.
     """
 
     colour: F32
@@ -28,6 +29,7 @@ class LinearFrame:
     time_s: float = 0.0
     velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    labels: NDArray[np.uint8] | None = None
 
 
 def display_rgb(frame: LinearFrame) -> Rgb:

@@ -39,10 +39,12 @@ class LensDistortion:
         """Resample the frame; its camera becomes a ``LensCamera``."""
         lens = BrownLens(self.k1, self.k2, self.p1, self.p2)
         intrinsics, u_px, v_px = _source_map(frame.camera.intrinsics, lens)
+        nearest = v_px.astype(int), u_px.astype(int)
         return replace(
             frame,
             colour=sampled(frame.colour, u_px, v_px),
-            depth_m=frame.depth_m[v_px.astype(int), u_px.astype(int)],
+            depth_m=frame.depth_m[nearest],
+            labels=None if frame.labels is None else frame.labels[nearest],
             camera=LensCamera(intrinsics, lens, frame.camera.world_from_cam),
         )
 

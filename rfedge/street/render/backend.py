@@ -34,6 +34,7 @@ PROBE = """
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 ball = {"type": "scene", "ball": {"type": "sphere"}, "light": {"type": "constant"},
+        "path": {"type": "path", "max_depth": 3},
         "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}}
 assert mi.render(mi.load_dict(ball), spp=1).numpy().size
 """

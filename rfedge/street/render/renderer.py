@@ -51,7 +51,7 @@ class RenderedView:
 
 
 class Renderer:
-    """Renders views of a world. One in a process: Mitsuba holds one backend."""
+    """Renders views of a world."""
 
     def __init__(self, world: World, quality: Quality, backend: Backend, threads: int) -> None:
         self._mi = load_mitsuba(backend, threads)
@@ -66,6 +66,7 @@ class Renderer:
 
     def render(self, camera: Camera, time_s: float = 0.0) -> RenderedView:
         """Return what the camera sees at that time."""
+        self._mi.set_variant(self._backend.variant)
         self._stage.at(time_s)
         sensor = self._mi.load_dict(_sensor(self._mi, camera))
         noisy = self._pass(sensor, self._light, self._quality.samples)[..., :3]

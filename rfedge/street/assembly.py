@@ -1,0 +1,48 @@
+"""A scene's world: the parts that its geometry asks for, then the effects that change the street.
+
+Each part and each effect has random numbers of its own, so that leaving one out moves no other.
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+
+from rfedge.street.effects import EFFECTS, rng_of
+from rfedge.street.geometry.building import buildings
+from rfedge.street.geometry.lamp import lamps, railings, wires
+from rfedge.street.geometry.layout import Layout
+from rfedge.street.geometry.road import road
+from rfedge.street.geometry.sky import clear_sky
+from rfedge.street.geometry.world import World
+from rfedge.street.scene_file import Scene
+
+__all__ = ["plain_world", "world_of"]
+
+
+def world_of(scene: Scene) -> World:
+    """Return everything that is rendered of a scene."""
+    world = plain_world(scene)
+    for effect in EFFECTS:
+        if effect.name in scene.effects and not effect.on_frames:
+            settings = scene.effects[effect.name]
+            world = settings.change(world, rng_of(effect, scene.geometry.seed, 0))
+    return world
+
+
+def plain_world(scene: Scene) -> World:
+    """Return the street without any effect, under a clear sky."""
+    geometry = scene.geometry
+    layout = Layout(geometry)
+    parts = {"road": road, "buildings": buildings, "lamps": lamps, "railings": railings}
+    if geometry.wires:
+        parts["wires"] = wires
+    world = World(layout, clear_sky(_rng(geometry.seed, "sky")))
+    for name, part in parts.items():
+        world = world.plus(part(layout, _rng(geometry.seed, name)))
+    return world
+
+
+def _rng(seed: int, name: str) -> np.random.Generator:
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])

@@ -1,0 +1,130 @@
+"""Which pictures a scene wants: its splits as lists of posed shots.
+
+* ``drive``: the moving camera at the full rate; lower rates are every n-th of it.
+* ``train``: cars with the rig go through the street, alternately in both directions; at each of
+  ``views`` places another of its cameras takes a picture.
+* ``eval``: ``stations`` of the whole rig between the places of ``train``.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfedge.carla_recorder.rig import RIG
+from rfedge.street.geometry.layout import Layout
+from rfedge.street.scene_file import Scene
+from rfedge.street.trajectory import Motion, drive_motion, drive_pose, mounted, on_lane
+
+__all__ = ["Shot", "Split", "shots_of", "thinned_indices"]
+
+ENDS_M = 14.0
+"""Cars keep so far from where the facades end."""
+STRIDE = 7
+"""Cameras are taken in steps of it: it has no factor in common with 18."""
+AHEAD_M, ASIDE_M, TURN_RAD = 0.3, 0.3, 0.03
+STANDING = Motion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+class Split(StrEnum):
+    """A part of the dataset; also its folder."""
+
+    DRIVE = "drive"
+    TRAIN = "train"
+    EVAL = "eval"
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture to take."""
+
+    split: Split
+    index: int
+    camera: Camera
+    time_s: float = 0.0
+    motion: Motion = STANDING
+
+    @property
+    def name(self) -> str:
+        """Its number in the folder."""
+        return f"{self.index:06d}"
+
+    @property
+    def number(self) -> int:
+        """A number that no shot of another split has, for what is random in each picture."""
+        return self.index + 1_000_000 * list(Split).index(self.split)
+
+
+def shots_of(scene: Scene, split: Split, size_px: tuple[int, int] | None = None) -> list[Shot]:
+    """Return a split's shots, at ``size_px`` or the size that the scene names."""
+    if split is Split.DRIVE:
+        k = _intrinsics(size_px or scene.drive.size_px, scene.rig.fov_deg)
+        return [_drive_shot(scene, i, k) for i in range(scene.drive.frames)]
+    settings, poses = (
+        (scene.train, _train_poses(scene))
+        if split is Split.TRAIN
+        else (scene.evaluation, _evaluation_poses(scene))
+    )
+    k = _intrinsics(size_px or settings.size_px, scene.rig.fov_deg)
+    return [Shot(split, i, Camera(k, pose)) for i, pose in enumerate(poses)]
+
+
+def thinned_indices(scene: Scene, rate_hz: float) -> range:
+    """Return which frames of the drive a lower rate keeps."""
+    return range(0, scene.drive.frames, round(scene.drive.rate_hz / rate_hz))
+
+
+def _intrinsics(size_px: tuple[int, int], fov_deg: float) -> Intrinsics:
+    width, height = size_px
+    focal_px = width / (2 * float(np.tan(np.radians(fov_deg) / 2)))
+    return Intrinsics(width, height, focal_px, focal_px, width / 2, height / 2)
+
+
+def _drive_shot(scene: Scene, index: int, intrinsics: Intrinsics) -> Shot:
+    time_s = index / scene.drive.rate_hz
+    return Shot(
+        split=Split.DRIVE,
+        index=index,
+        camera=Camera(intrinsics, drive_pose(scene.drive, time_s)),
+        time_s=time_s,
+        motion=drive_motion(scene.drive, time_s),
+    )
+
+
+def _train_poses(scene: Scene) -> list[Pose]:
+    rng = np.random.default_rng([scene.geometry.seed, zlib.crc32(b"train")])
+    mounts = RIG[: scene.rig.cameras]
+    poses = []
+    for i, x_m in enumerate(_places(scene, scene.train.views)):
+        ahead, left, turn = rng.uniform(-1, 1, 3) * (AHEAD_M, ASIDE_M, TURN_RAD)
+        place, heading = on_lane(x_m + ahead, _direction(scene, i), left)
+        mount = mounts[i // _directions(scene) * STRIDE % len(mounts)]
+        poses.append(mounted(mount, place, heading + turn))
+    return poses
+
+
+def _evaluation_poses(scene: Scene) -> list[Pose]:
+    poses = []
+    for i, x_m in enumerate(_places(scene, scene.evaluation.stations)):
+        place, heading = on_lane(x_m, _direction(scene, i), 0.0)
+        poses += [mounted(mount, place, heading) for mount in RIG[: scene.rig.cameras]]
+    return poses
+
+
+def _places(scene: Scene, count: int) -> list[float]:
+    """The middles of ``count`` equal stretches of the street."""
+    layout = Layout(scene.geometry)
+    ends = np.linspace(layout.start_m + ENDS_M, layout.end_m - ENDS_M, count + 1)
+    return ((ends[1:] + ends[:-1]) / 2).tolist()  # type: ignore[no-any-return]
+
+
+def _directions(scene: Scene) -> int:
+    return 2 if scene.rig.directions == "both" else 1
+
+
+def _direction(scene: Scene, index: int) -> int:
+    return -1 if _directions(scene) == 2 and index % 2 else 1

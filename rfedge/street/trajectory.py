@@ -1,0 +1,91 @@
+"""How cars drive through the street, and where their cameras are then.
+
+A car's axes are x forward, y left, z up, its origin on the road. It keeps right: towards +x it
+drives at y < 0. Camera axes are OpenCV's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rfcore.camera import Pose
+from rfedge.carla_recorder.rig import Mount
+from rfedge.street.geometry.layout import LANE_M
+from rfedge.street.geometry.mesh import F64
+from rfedge.street.scene_file import Drive
+
+__all__ = ["Motion", "drive_motion", "drive_pose", "looking", "mounted", "on_lane"]
+
+EYE_UP_M = 1.62
+"""The drive's camera is behind the windscreen."""
+SWAY_M, SWAY_PERIOD_S = 0.2, 7.3
+YAW_RAD, YAW_PERIOD_S = 0.02, 4.8
+PITCH_RAD, PITCH_PERIOD_S = 0.003, 0.7
+STEP_S = 1e-3
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How a camera moves, in its own axes."""
+
+    velocity_mps: tuple[float, float, float]
+    turn_radps: tuple[float, float, float]
+
+
+def looking(position_m: F64, yaw_rad: float, pitch_rad: float) -> Pose:
+    """Return world_from_cam of a level camera: yaw from x towards y, pitch up."""
+    forward = np.array(
+        [
+            np.cos(yaw_rad) * np.cos(pitch_rad),
+            np.sin(yaw_rad) * np.cos(pitch_rad),
+            np.sin(pitch_rad),
+        ]
+    )
+    right = np.array([np.sin(yaw_rad), -np.cos(yaw_rad), 0.0])
+    axes = np.stack([right, np.cross(forward, right), forward, position_m], axis=1)
+    return Pose.from_matrix(axes.tolist())
+
+
+def on_lane(x_m: float, direction: int, left_m: float) -> tuple[F64, float]:
+    """Return place and heading of a car that drives along +1 or -1 x, so far left of its lane."""
+    place = np.array([x_m, direction * (left_m - LANE_M), 0.0])
+    return place, 0.0 if direction > 0 else float(np.pi)
+
+
+def mounted(mount: Mount, place: F64, heading_rad: float) -> Pose:
+    """Return world_from_cam of a camera of the rig, in whose axes y is right and yaw clockwise."""
+    cos, sin = np.cos(heading_rad), np.sin(heading_rad)
+    forward_m, left_m = mount.x_m, -mount.y_m
+    shift = np.array([cos * forward_m - sin * left_m, sin * forward_m + cos * left_m, mount.z_m])
+    yaw_rad = heading_rad - np.radians(mount.yaw_deg)
+    return looking(place + shift, float(yaw_rad), float(np.radians(mount.pitch_deg)))
+
+
+def drive_pose(drive: Drive, time_s: float) -> Pose:
+    """Return world_from_cam of the drive, whose middle is the street's: it sways as cars do."""
+    x_m = drive.speed_mps * (time_s - 0.5 * drive.duration_s)
+    rate = 2 * np.pi / SWAY_PERIOD_S
+    left_m = drive.lane_offset_m + SWAY_M * np.sin(rate * time_s)
+    place, _ = on_lane(x_m, 1, left_m)
+    sideways_mps = SWAY_M * rate * np.cos(rate * time_s)
+    heading = np.arctan2(sideways_mps, max(drive.speed_mps, 1.0))
+    yaw = heading + YAW_RAD * np.sin(2 * np.pi * time_s / YAW_PERIOD_S)
+    pitch = PITCH_RAD * np.sin(2 * np.pi * time_s / PITCH_PERIOD_S)
+    return looking(place + np.array([0.0, 0.0, EYE_UP_M]), float(yaw), float(pitch))
+
+
+def drive_motion(drive: Drive, time_s: float) -> Motion:
+    """Return the drive's velocity and turn rate by differences over 2 ms."""
+    before, after = (drive_pose(drive, time_s + step) for step in (-STEP_S, STEP_S))
+    now = np.array(drive_pose(drive, time_s).rotation_matrix())
+    moved = np.array(after.translation_m) - np.array(before.translation_m)
+    turned = before.inverse().compose(after).rotation
+    half_angle = np.array(turned[1:]) * np.sign(turned[0])
+    velocity = now.T @ moved / (2 * STEP_S)
+    return Motion(_triple(velocity), _triple(2 * half_angle / (2 * STEP_S)))
+
+
+def _triple(values: F64) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])
