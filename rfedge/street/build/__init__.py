@@ -1,0 +1,1 @@
+"""Building a scene's pictures on disk: in parallel, resumable, the same bytes for the same seed."""

@@ -1,0 +1,100 @@
+"""What stands beside the pictures: transforms, points and the manifest.
+
+``transforms_SPLIT.json`` lists the finished shots of a split, ``transforms_drive_RATEhz.json``
+those that a lower rate keeps, ``..._measured.json`` the same pictures with the poses as measured,
+where the scene declares noise. ``transforms.json`` is the training views' or, without any, that of
+the first split there is.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfcore.camera import Pose
+from rfcore.dataset import write_manifest
+from rfcore.dataset.points import read_points
+from rfcore.dataset.source import SourceCamera, SourcePoints
+from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, write_points
+from rfcore.files import write_whole
+from rfcore.lens import LensCamera
+from rfedge.street.build.shot_files import ShotFiles
+from rfedge.street.build.studio import Order, camera_of_pictures
+from rfedge.street.measured_pose import measured_pose
+from rfedge.street.shots import Shot, Split, shots_of, thinned_indices
+
+__all__ = ["list_dataset"]
+
+
+def list_dataset(order: Order, about: dict[str, Any]) -> dict[str, int]:
+    """Write transforms, points and manifest of what is finished; return how many of each split."""
+    finished = {split: _finished(order, split) for split in Split}
+    finished = {split: shots for split, shots in finished.items() if shots}
+    if not finished:
+        return {}
+    first = Split.TRAIN if Split.TRAIN in finished else next(iter(finished))
+    write_points(order.folder / POINTS_NAME, _points(order.folder, finished[first]))
+    for split, shots in finished.items():
+        _list_split(order, split, shots)
+        if split is first:
+            _write(order.folder / "transforms.json", _written(order, shots, measured=False))
+    write_manifest(order.folder, about)
+    return {str(split): len(shots) for split, shots in finished.items()}
+
+
+def _finished(order: Order, split: Split) -> list[Shot]:
+    shots = shots_of(order.scene, split, order.size_px)
+    return [shot for shot in shots if ShotFiles.of(order.folder, shot).done]
+
+
+def _list_split(order: Order, split: Split, shots: Sequence[Shot]) -> None:
+    kept = {"": shots}
+    if split is Split.DRIVE:
+        for rate_hz in order.scene.drive.thinned_hz:
+            indices = thinned_indices(order.scene, rate_hz)
+            kept[f"_{rate_hz:g}hz"] = [shot for shot in shots if shot.index in indices]
+    noise = order.scene.pose_noise
+    noisy = noise.position_m > 0 or noise.rotation_deg > 0
+    for suffix, chosen in kept.items():
+        stem = order.folder / f"transforms_{split}{suffix}"
+        if chosen:
+            _write(stem.with_suffix(".json"), _written(order, chosen, measured=False))
+        if chosen and noisy:
+            measured = stem.with_name(f"{stem.name}_measured.json")
+            _write(measured, _written(order, chosen, measured=True))
+
+
+def _written(order: Order, shots: Sequence[Shot], measured: bool) -> list[WrittenPicture]:
+    seen_by = camera_of_pictures(order.scene, shots[0].camera)
+    lens = seen_by.lens if isinstance(seen_by, LensCamera) else None
+    camera = SourceCamera(seen_by.intrinsics, lens)
+    return [
+        WrittenPicture(
+            file_path=ShotFiles.of(order.folder, shot).picture_name,
+            camera=camera,
+            world_from_cam=_pose(order, shot, measured),
+            time_ns=round(shot.time_s * 1e9) if shot.split is Split.DRIVE else None,
+        )
+        for shot in shots
+    ]
+
+
+def _pose(order: Order, shot: Shot, measured: bool) -> Pose:
+    true = shot.camera.world_from_cam
+    return measured_pose(true, order.scene.pose_noise, shot.number) if measured else true
+
+
+def _write(file: Path, pictures: list[WrittenPicture]) -> None:
+    write_whole(file, json.dumps(transforms_of(pictures, POINTS_NAME), indent=1) + "\n")
+
+
+def _points(folder: Path, shots: Sequence[Shot]) -> SourcePoints:
+    each = [read_points(ShotFiles.of(folder, shot).points) for shot in shots]
+    return SourcePoints(
+        np.concatenate([points.xyz_m for points in each]),
+        np.concatenate([points.rgb for points in each]),
+    )
