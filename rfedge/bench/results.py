@@ -17,15 +17,22 @@ __all__ = ["CASES", "print_rows", "run_case", "write_json"]
 CASES = ("raster", "train", "codec", "ngp")
 
 
-def run_case(case: str, *, rows: Rows = "all") -> dict[str, Any]:
-    """Run one of ``CASES`` and return its result; ``rows`` matters to ``raster`` alone.
+def run_case(case: str, *, rows: Rows = "all", field: Path | None = None) -> dict[str, Any]:
+    """Run one of ``CASES`` and return its result.
+
+    ``rows`` matters to ``raster`` alone, ``field`` (an archive of the street) to ``ngp``.
 
     Raises ``InvalidInput`` for an unknown case, ``RfedgeError`` when a result is wrong.
     """
-    return {"case": case, "host": host(), "revision": revision(), "rows": _rows_of(case, rows)}
+    return {
+        "case": case,
+        "host": host(),
+        "revision": revision(),
+        "rows": _rows_of(case, rows, field),
+    }
 
 
-def _rows_of(case: str, rows: Rows) -> list[Row]:
+def _rows_of(case: str, rows: Rows, field: Path | None) -> list[Row]:
     if case == "raster":
         from rfedge.bench.raster import raster_rows
 
@@ -41,7 +48,7 @@ def _rows_of(case: str, rows: Rows) -> list[Row]:
     if case == "ngp":
         from rfedge.bench.ngp import ngp_rows
 
-        return ngp_rows()
+        return ngp_rows(field)
     raise InvalidInput("case", f"{case!r} is not one of {', '.join(CASES)}")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional
@@ -19,6 +20,9 @@ class Bench:
     rows: Literal["all", "native", "modes"] = "all"
     """`native` leaves out the timing of the slow torch reference; `modes` shows what SH degree,
     antialiasing, depth and opacity cost, as ratios (raster only)."""
+    field: Path | None = None
+    """A trained hash grid of the sample street to time, instead of one learnt on the spot (ngp
+    only)."""
     json: str | None = None
     """Write one JSON object to this file; `-` is standard output."""
 
@@ -26,7 +30,7 @@ class Bench:
         """Run one case and print its rows."""
         from rfedge.bench import print_rows, run_case, write_json
 
-        result = run_case(self.case, rows=self.rows)
+        result = run_case(self.case, rows=self.rows, field=self.field)
         if self.json is None:
             print_rows(result)
         else:

@@ -1,19 +1,20 @@
 """The bench of hash grids checks before it times, and its rows have the published keys."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.errors import RfedgeError
+from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.ngp.native import NgpRenderer
 from rfcore.ngp.parameters import F32, NgpParameters, initial_parameters
 from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space, grid_levels
-from rfcore.views import PosedPicture
 from rfedge.bench import ngp
 
 KEYS = [
     *("width", "height", "threads", "frame_ms", "samples_per_ray", "psnr_to_reference_db"),
-    *("budget", "held_out_db", "isa"),
+    *("budget", "isa"),
 ]
 CAMERA = Camera(Intrinsics(30, 20, 20.0, 20.0, 15.0, 10.0), Pose((0, 0, -0.5), (1.0, 0, 0, 0)))
 
@@ -30,9 +31,8 @@ def numbers() -> NgpParameters:
 
 
 def test_a_row_has_the_published_keys(numbers: NgpParameters) -> None:
-    picture = PosedPicture("a", CAMERA, lambda: np.zeros((20, 30, 3), np.uint8))
     renderer = NgpRenderer(numbers, threads=2)
-    unhurried, hurried = (ngp._row(renderer, (picture,), (30, 20), n) for n in (None, 4))
+    unhurried, hurried = (ngp._row(renderer, CAMERA, n) for n in (None, 4))
     assert list(unhurried) == list(hurried) == KEYS
     assert unhurried["psnr_to_reference_db"] is None
     assert 10 < hurried["psnr_to_reference_db"] < 100
@@ -52,3 +52,8 @@ def test_a_wrong_renderer_is_not_timed(
     monkeypatch.setattr(ngp, "NgpRenderer", Wrong)
     with pytest.raises(RfedgeError, match="nothing was timed"):
         ngp.check_against_reference(numbers, CAMERA)
+
+
+def test_a_field_of_splats_is_not_a_hash_grid() -> None:
+    with pytest.raises(InvalidInput, match="holds splats; give one of kind ngp"):
+        ngp.ngp_rows(Path("samples/fields/street.rff"))
