@@ -26,7 +26,7 @@ from rfcore.errors import ProtocolError, RfedgeError
 from rfcore.views import PosedPicture
 from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.convert_answers import server_message_from_bytes
+from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import Welcome
 
 __all__ = ["Agent", "Equipment"]
@@ -226,10 +226,10 @@ class Agent:
 
     async def _read(self, stream: Stream) -> None:
         async for data in stream:
-            message = server_message_from_bytes(data)
-            self._session.receive(message, time.monotonic())
-            if isinstance(message, Welcome):
-                self._equipment.connected(True)
+            for message in server_messages_from_bytes(data):
+                self._session.receive(message, time.monotonic())
+                if isinstance(message, Welcome):
+                    self._equipment.connected(True)
             self._drive_wake.set()
 
     async def _write(self, stream: Stream) -> None:

@@ -9,6 +9,7 @@ import sys
 import tyro
 
 from mec_server.config import ServerConfig
+from mec_server.handlers import OpenCameras, open_cameras
 from mec_server.server import EdgeServer
 from rfcore.errors import RfedgeError
 from rfcore.wire.logs import configure_logs
@@ -28,9 +29,9 @@ def main() -> None:
         sys.exit(2)
 
 
-async def serve(config: ServerConfig) -> None:
+async def serve(config: ServerConfig, opened: OpenCameras = open_cameras) -> None:
     """Serve until told to stop, then drain."""
-    server = EdgeServer(config)
+    server = EdgeServer(config, opened)
     stopped = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)

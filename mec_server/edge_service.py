@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import grpc
 import structlog
 
+from mec_server.alarm import Alarm
 from mec_server.config import SessionLimits
 from mec_server.decoder_process import DecoderLost
-from mec_server.handlers import CameraDecoder, FieldSource, Reconstruction, Tools, open_cameras
+from mec_server.handlers import Decoder, FieldSource, OpenCameras, Reconstruction, Tools
 from mec_server.jobs import DecodeJob, End, OpenJob
 from mec_server.metrics import ServerMetrics
 from mec_server.quotas import Allowance, Limit, Quotas
@@ -28,7 +29,7 @@ from mec_server.twin import Twin, TwinView
 from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeError
 from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_from_bytes
-from rfcore.wire.convert_answers import server_message_to_bytes
+from rfcore.wire.convert_answers import server_messages_to_bytes
 from rfcore.wire.identity import peer_identity
 from rfcore.wire.messages import Frame, Hello
 from rfcore.wire.status import status_of
@@ -55,6 +56,7 @@ class Surroundings:
     quotas: Quotas
     max_streams: int
     twin: Twin
+    open_cameras: OpenCameras
     recorder: Recorder | None = None
 
 
@@ -114,11 +116,12 @@ class _Stream:
         self._around = around
         self._context = context
         self._wake = asyncio.Event()
+        self._alarm = Alarm(self._wake)
         self._identity = peer_identity(context.auth_context())
         self._allowance: Allowance | None = None
         self._overrunning = False
-        self._opening: asyncio.Future[dict[str, CameraDecoder]] | None = None
-        self._decoders: dict[str, CameraDecoder] = {}
+        self._opening: asyncio.Future[dict[str, Decoder]] | None = None
+        self._decoders: dict[str, Decoder] = {}
         self._metrics = around.metrics.of(UNKNOWN_VEHICLE)
         session_id = uuid.uuid4().hex[:12]
         self._log = log.bind(session=session_id, peer=context.peer())
@@ -156,6 +159,7 @@ class _Stream:
                 await self._rest()
             await self._write()
             reader.cancel()
+        self._alarm.cancel()
         end = self._session.closed
         self._log.info("stream closed", error=str(end.error) if end.error else None)
         return end
@@ -205,21 +209,17 @@ class _Stream:
     async def _write(self) -> None:
         messages = self._session.messages_to_send(time.monotonic())
         self._metrics.answered(messages)
-        for message in messages:
-            await self._context.write(server_message_to_bytes(message))
+        for data in server_messages_to_bytes(messages):
+            await self._context.write(data)
 
     async def _rest(self) -> None:
         """Wait until something happens or the session's timer runs out."""
         if self._session.closed is not None:
             return
-        timer = self._session.get_timer()
-        timeout = None if timer is None else max(0.0, timer - time.monotonic())
-        try:
-            async with asyncio.timeout(timeout):
-                await self._wake.wait()
-        except TimeoutError:
-            self._session.handle_timer(time.monotonic())
+        self._alarm.by(self._session.get_timer())
+        await self._wake.wait()
         self._wake.clear()
+        self._session.handle_timer(time.monotonic())
 
     async def _work(self, job: OpenJob | DecodeJob) -> None:
         if isinstance(job, OpenJob):
@@ -232,7 +232,7 @@ class _Stream:
         around = self._around
         # Not on the workers: a decoder process may take a while to start, and others have frames.
         self._opening = asyncio.get_running_loop().run_in_executor(
-            None, open_cameras, job, around.fields, around.tools
+            None, around.open_cameras, job, around.fields, around.tools
         )
         try:
             self._decoders = await asyncio.shield(self._opening)
@@ -307,7 +307,7 @@ class _Stream:
         return done
 
 
-def _close_decoders(opening: asyncio.Future[dict[str, CameraDecoder]]) -> None:
+def _close_decoders(opening: asyncio.Future[dict[str, Decoder]]) -> None:
     """Close, on threads, what was opened for a stream that is over."""
     if opening.cancelled() or opening.exception() is not None:
         return

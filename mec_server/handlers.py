@@ -22,7 +22,16 @@ from rfcore.native.yuv import i420_from_colour
 from rfcore.views import View
 from rfcore.wire.messages import CameraDescription, StageTimes
 
-__all__ = ["CameraDecoder", "FieldSource", "Reconstruction", "Renderer", "Tools", "open_cameras"]
+__all__ = [
+    "CameraDecoder",
+    "Decoder",
+    "FieldSource",
+    "OpenCameras",
+    "Reconstruction",
+    "Renderer",
+    "Tools",
+    "open_cameras",
+]
 
 ClockNs = Callable[[], int]
 
@@ -55,6 +64,19 @@ class Reconstruction:
 
     picture: I420
     outcome: DecodeOutcome
+
+
+class Decoder(Protocol):
+    """Who reconstructs the frames of one camera."""
+
+    def reconstruct(self, job: DecodeJob) -> Reconstruction:
+        """Return the frame of ``job``; raise ``PacketRejected`` and stay good for the next."""
+
+    def close(self) -> None:
+        """Let go of what it holds."""
+
+
+OpenCameras = Callable[[OpenJob, FieldSource, Tools], dict[str, Decoder]]
 
 
 class CameraDecoder:
@@ -112,14 +134,14 @@ class CameraDecoder:
             raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
 
 
-def open_cameras(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, CameraDecoder]:
+def open_cameras(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
     """Return a decoder for each camera of a Hello, to be closed one by one.
 
     Raises ``InvalidInput`` for a codec header that our encoder would not have made, ``CodecError``
     if there is no decoder to be had, and what ``fields`` raises.
     """
     renderers = {field_id: fields.open(field_id) for field_id in job.hello.field_ids}
-    decoders: dict[str, CameraDecoder] = {}
+    decoders: dict[str, Decoder] = {}
     for index, camera in enumerate(job.hello.cameras):
         try:
             decoders[camera.camera_id] = CameraDecoder(camera, renderers, job.exact, tools)

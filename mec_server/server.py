@@ -18,7 +18,7 @@ from mec_server.decoders import Decoders
 from mec_server.edge_service import EdgeService, Surroundings
 from mec_server.field_service import FieldService
 from mec_server.fields import FieldShelf, field_loader
-from mec_server.handlers import Tools
+from mec_server.handlers import OpenCameras, Tools, open_cameras
 from mec_server.metrics import ServerMetrics
 from mec_server.quotas import Quotas
 from mec_server.recorder import Recorder
@@ -38,9 +38,12 @@ SERVICES = ("", *(f"rfcore.wire.v1.{name}Service" for name in ("Edge", "Field", 
 
 
 class EdgeServer:
-    """Serves the fields of ``config.fields``; ``start``, then ``stop``."""
+    """Serves the fields of ``config.fields``; ``start``, then ``stop``.
 
-    def __init__(self, config: ServerConfig) -> None:
+    ``opened`` makes the decoders of a Hello; a load test has others.
+    """
+
+    def __init__(self, config: ServerConfig, opened: OpenCameras = open_cameras) -> None:
         self.registry = CollectorRegistry()
         self.address = Address.parse("listen", config.listen)
         self._tls = config.transport.tls()
@@ -75,6 +78,7 @@ class EdgeServer:
                 Quotas(config.quota),
                 config.max_streams,
                 twin,
+                opened,
                 self._recorder,
             )
         )

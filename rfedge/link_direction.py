@@ -14,12 +14,12 @@ from typing import Protocol
 from rfcore.link import DirectionPlan, Link
 from rfcore.link.meter import BusyMeter
 
-__all__ = ["Direction", "Sender"]
+__all__ = ["SPIN_S", "Direction", "Sender"]
 
 SPIN_S = 0.0002
 """How long before a release the pump stops sleeping and yields in a loop: the kernel's timer slack
 of 50 us and the loop's own time. Longer would make the scheduler see a busy process and interrupt
-it just when it matters."""
+it just when it matters. Many links in one process would spin all the time; they are given 0."""
 
 
 class Sender(Protocol):
@@ -50,11 +50,17 @@ def _ignore(transit_s: float) -> None:
 class Direction:
     """One direction of the link: senders push, the pump releases to receivers on time."""
 
-    def __init__(self, plan: DirectionPlan, transit: Callable[[float], None] = _ignore) -> None:
+    def __init__(
+        self,
+        plan: DirectionPlan,
+        transit: Callable[[float], None] = _ignore,
+        spin_s: float = SPIN_S,
+    ) -> None:
         self.meter = BusyMeter()
         self.senders: set[Sender] = set()
         self.profile = plan.profile
         self._transit = transit
+        self._spin_s = spin_s
         self._link: Link[Packet] = plan.link(time.perf_counter())
         self._arrived = asyncio.Event()
         self._holding = False
@@ -87,7 +93,7 @@ class Direction:
                 self._arrived.clear()
                 await self._arrived.wait()
                 continue
-            await _sleep_until(next_s)
+            await _sleep_until(next_s, self._spin_s)
             self._release(time.perf_counter())
             if self._holding and not self._link.is_full(time.perf_counter()):
                 self._holding = False
@@ -122,8 +128,8 @@ class Direction:
         }
 
 
-async def _sleep_until(due_s: float) -> None:
-    ahead_s = due_s - time.perf_counter() - SPIN_S
+async def _sleep_until(due_s: float, spin_s: float) -> None:
+    ahead_s = due_s - time.perf_counter() - spin_s
     if ahead_s > 0:
         await asyncio.sleep(ahead_s)
     while time.perf_counter() < due_s:

@@ -30,7 +30,7 @@ from rfcore.files import write_whole
 from rfcore.link import DirectionPlan, LinkPlan, LinkProfile
 from rfcore.link.profile_file import read_link
 from rfcore.wire.address import Address
-from rfedge.link_direction import Direction
+from rfedge.link_direction import SPIN_S, Direction
 from rfedge.link_metrics import LinkMetrics
 from rfedge.link_side import Side
 
@@ -49,7 +49,7 @@ class ProxySettings:
     ``profile`` is a link profile in a file; without it a constant rate and ``delay_ms`` one way, in
     either direction. ``report`` receives JSON after each connection and at the end; ``ready_file``
     receives HOST:PORT once connections are accepted. ``metrics_port``: port 0 takes a free one;
-    no metrics are served without it.
+    no metrics are served without it. ``spin_s``: see ``rfedge.link_direction``.
     """
 
     to: str
@@ -63,6 +63,7 @@ class ProxySettings:
     report: Path | None = None
     ready_file: Path | None = None
     allow_insecure: bool = False
+    spin_s: float = SPIN_S
 
     def __post_init__(self) -> None:
         for field in ("listen", "to"):
@@ -99,8 +100,8 @@ class LinkProxy:
         self._lives = plan.connection_lives()
         self.registry = CollectorRegistry()
         self._metrics = LinkMetrics(self.registry)
-        self._up = Direction(plan.uplink, self._metrics.transit("up"))
-        self._down = Direction(plan.downlink, self._metrics.transit("down"))
+        self._up = Direction(plan.uplink, self._metrics.transit("up"), settings.spin_s)
+        self._down = Direction(plan.downlink, self._metrics.transit("down"), settings.spin_s)
         self._metrics.observe({"up": self._up, "down": self._down})
         self._connections = 0
         self._connections_cut = 0

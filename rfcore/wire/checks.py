@@ -15,6 +15,7 @@ __all__ = [
     "MAX_CAMERAS",
     "MAX_FIELDS",
     "MAX_PAYLOAD_BYTES",
+    "MAX_RATE_HZ",
     "MAX_TRANSLATION_M",
     "check_absent_or",
     "check_bytes",
@@ -32,6 +33,9 @@ MAX_FIELDS = 64
 
 MAX_PAYLOAD_BYTES = 1_000_000
 """One picture's P slice; with its header it stays below the 1 MiB receive limit."""
+
+MAX_RATE_HZ = 1000.0
+"""Pictures per second of one camera; faster ones exist, but not on a vehicle."""
 
 MAX_TRANSLATION_M = 1e6
 """A pose this far from its tile's origin belongs to another tile."""

@@ -20,6 +20,7 @@ from rfcore.wire.checks import (
     MAX_CAMERAS,
     MAX_FIELDS,
     MAX_PAYLOAD_BYTES,
+    MAX_RATE_HZ,
     MAX_TRANSLATION_M,
     check_absent_or,
     check_bytes,
@@ -104,7 +105,12 @@ def _camera_from_wire(field: str, camera: pb.CameraDescription) -> CameraDescrip
                 f"{field}.codec.{side}",
                 f"{getattr(header, side)} px, but intrinsics.{side} is {getattr(k, side)} px",
             )
-    return CameraDescription(check_name(f"{field}.camera_id", camera.camera_id), intrinsics, codec)
+    return CameraDescription(
+        check_name(f"{field}.camera_id", camera.camera_id),
+        intrinsics,
+        codec,
+        check_range(f"{field}.rate_hz", camera.rate_hz, 0.0, MAX_RATE_HZ),
+    )
 
 
 def _codec_from_wire(header: pb.CodecHeader) -> StreamHeader:
@@ -146,6 +152,7 @@ def _camera_to_wire(camera: CameraDescription) -> pb.CameraDescription:
             sps=camera.codec.sps,
             pps=camera.codec.pps,
         ),
+        rate_hz=camera.rate_hz,
     )
 
 

@@ -5,9 +5,12 @@ A server is not trusted either: what cannot be one of its messages raises ``Prot
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from google.protobuf.message import DecodeError
 
 from rfcore.errors import ProtocolError, RejectReason
+from rfcore.wire.checks import MAX_RATE_HZ
 from rfcore.wire.messages import (
     Ack,
     Credit,
@@ -20,47 +23,70 @@ from rfcore.wire.messages import (
 )
 from rfcore.wire.v1 import edge_pb2 as pb
 
-__all__ = ["server_message_from_bytes", "server_message_to_bytes"]
+__all__ = ["server_messages_from_bytes", "server_messages_to_bytes"]
 
 REASONS = {reason: pb.RejectReason.Value(f"REJECT_REASON_{reason.name}") for reason in RejectReason}
 REASONS_BACK = {number: reason for reason, number in REASONS.items()}
 
 
-def server_message_from_bytes(data: bytes) -> ServerMessage:
-    """Parse what a server sent; raise ``ProtocolError`` if it is not one of its messages."""
+def server_messages_from_bytes(data: bytes) -> list[ServerMessage]:
+    """Parse what a server sent at once: a message, or an answer and the Credit after it.
+
+    Raises ``ProtocolError`` if it is not one of its messages.
+    """
     response = pb.StreamResponse()
     try:
         response.ParseFromString(data)
     except DecodeError as error:
         raise ProtocolError(f"{len(data)} bytes from the server are no StreamResponse") from error
+    messages: list[ServerMessage] = []
     match response.WhichOneof("message"):
         case "welcome":
-            return Welcome(response.welcome.session_id, response.welcome.exact)
+            messages.append(_welcome_from_wire(response.welcome))
         case "ack":
-            return _ack_from_wire(response.ack)
+            messages.append(_ack_from_wire(response.ack))
         case "nack":
-            return _nack_from_wire(response.nack)
+            messages.append(_nack_from_wire(response.nack))
         case "field_notice":
-            return FieldNotice(tuple(response.field_notice.field_ids))
-        case "credit":
-            return Credit(response.credit.camera_id, response.credit.frames)
-    raise ProtocolError("the server sent a message this vehicle does not know; update it")
+            messages.append(FieldNotice(tuple(response.field_notice.field_ids)))
+    if response.HasField("credit"):
+        messages.append(Credit(response.credit.camera_id, response.credit.frames))
+    if not messages:
+        raise ProtocolError("the server sent a message this vehicle does not know; update it")
+    return messages
 
 
-def server_message_to_bytes(message: ServerMessage) -> bytes:
-    """Serialise a server's message."""
+def server_messages_to_bytes(messages: Iterable[ServerMessage]) -> list[bytes]:
+    """Serialise a server's messages in order; a Credit travels with the message before it."""
+    responses: list[pb.StreamResponse] = []
+    for message in messages:
+        if not isinstance(message, Credit):
+            responses.append(_response(message))
+            continue
+        if not responses or responses[-1].HasField("credit"):
+            responses.append(pb.StreamResponse())
+        responses[-1].credit.camera_id = message.camera_id
+        responses[-1].credit.frames = message.frames
+    return [response.SerializeToString() for response in responses]
+
+
+def _response(message: Welcome | Ack | Nack | FieldNotice) -> pb.StreamResponse:
     match message:
-        case Welcome(session_id, exact):
-            response = pb.StreamResponse(welcome=pb.Welcome(session_id=session_id, exact=exact))
+        case Welcome(session_id, exact, rate_hz):
+            welcome = pb.Welcome(session_id=session_id, exact=exact, rate_hz=rate_hz)
+            return pb.StreamResponse(welcome=welcome)
         case Ack():
-            response = pb.StreamResponse(ack=_ack_to_wire(message))
+            return pb.StreamResponse(ack=_ack_to_wire(message))
         case Nack():
-            response = pb.StreamResponse(nack=_nack_to_wire(message))
+            return pb.StreamResponse(nack=_nack_to_wire(message))
         case FieldNotice(field_ids):
-            response = pb.StreamResponse(field_notice=pb.FieldNotice(field_ids=field_ids))
-        case Credit(camera_id, frames):
-            response = pb.StreamResponse(credit=pb.Credit(camera_id=camera_id, frames=frames))
-    return response.SerializeToString()
+            return pb.StreamResponse(field_notice=pb.FieldNotice(field_ids=field_ids))
+
+
+def _welcome_from_wire(welcome: pb.Welcome) -> Welcome:
+    if not 0 <= welcome.rate_hz <= MAX_RATE_HZ:
+        raise ProtocolError(f"the server granted {welcome.rate_hz} Hz; 0..{MAX_RATE_HZ:g} can be")
+    return Welcome(welcome.session_id, welcome.exact, welcome.rate_hz)
 
 
 def _ack_from_wire(ack: pb.Ack) -> Ack:

@@ -49,11 +49,13 @@ class RendererContract:
 
 @dataclass(frozen=True)
 class CameraDescription:
-    """One camera of a vehicle: its geometry and how its pictures are coded."""
+    """One camera of a vehicle: its geometry, how its pictures are coded, and how many a second it
+    would send (0: not said)."""
 
     camera_id: str
     intrinsics: Intrinsics
     codec: StreamHeader
+    rate_hz: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -91,10 +93,14 @@ class Frame:
 
 @dataclass(frozen=True)
 class Welcome:
-    """The server accepted Hello; ``exact`` says whether the renderers agree to the bit."""
+    """The server accepted Hello; ``exact`` says whether the renderers agree to the bit.
+
+    Each camera may send ``rate_hz`` pictures per second; 0: as many as Credit allows.
+    """
 
     session_id: str
     exact: bool
+    rate_hz: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from rfedge.cli.encode import Encode
 from rfedge.cli.eval import Eval
 from rfedge.cli.field import Field
 from rfedge.cli.link import Link
+from rfedge.cli.loadtest import LoadTest
 from rfedge.cli.render import Render
 from rfedge.cli.scene import Scene
 from rfedge.cli.train import Train
@@ -37,6 +38,7 @@ Verb = (
     | Annotated[Encode, subcommand("encode")]
     | Annotated[Decode, subcommand("decode")]
     | Annotated[Link, subcommand("link")]
+    | Annotated[LoadTest, subcommand("loadtest")]
     | Annotated[Scene, subcommand("scene")]
     | Annotated[Watch, subcommand("watch")]
     | Annotated[Certs, subcommand("certs")]

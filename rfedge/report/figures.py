@@ -15,7 +15,20 @@ mpl.use("svg")
 
 from matplotlib import pyplot as plt
 
-__all__ = ["bytes_chart", "curve_chart", "quality_chart", "stages_chart"]
+__all__ = [
+    "GRID",
+    "INK",
+    "MUTED",
+    "PAYLOAD",
+    "RENDER",
+    "STYLE",
+    "bytes_chart",
+    "curve_chart",
+    "new_axes",
+    "quality_chart",
+    "stages_chart",
+    "svg",
+]
 
 INK, MUTED, GRID = "#1c2733", "#6b7785", "#dfe4ea"
 PAYLOAD, HEADER, RECONSTRUCTION, RENDER = "#2563eb", "#93b4f5", "#2563eb", "#d97706"
@@ -61,7 +74,7 @@ def bytes_chart(frames: Sequence[Frame]) -> str:
         axes.bar(number, header, bottom=payload, color=HEADER, label="pose and header")
         axes.set(xlabel="frame", ylabel="bytes")
         axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
-        return _svg(figure)
+        return svg(figure)
 
 
 def quality_chart(frames: Sequence[Frame]) -> str:
@@ -84,7 +97,7 @@ def quality_chart(frames: Sequence[Frame]) -> str:
             )
         axes.set(xlabel="frame", ylabel="PSNR against the camera, dB")
         axes.margins(x=0.02)
-        return _svg(figure)
+        return svg(figure)
 
 
 def curve_chart(curve: Sequence[Sequence[float]]) -> str:
@@ -104,7 +117,7 @@ def curve_chart(curve: Sequence[Sequence[float]]) -> str:
         axes.set(xlabel="seconds of training", ylabel="held-out PSNR, dB")
         axes.set_xlim(left=0)
         axes.margins(y=0.15)
-        return _svg(figure)
+        return svg(figure)
 
 
 def stages_chart(stages_ms: Mapping[str, float]) -> str:
@@ -125,10 +138,16 @@ def stages_chart(stages_ms: Mapping[str, float]) -> str:
             )
         axes.invert_yaxis()
         axes.set_xlabel("ms, median over the drive")
-        return _svg(figure)
+        return svg(figure)
 
 
-def _svg(figure: Any) -> str:
+def new_axes(height_in: float = 2.8) -> tuple[Any, Any]:
+    """Return figure and axes of the page's width."""
+    return plt.subplots(figsize=(7.2, height_in))
+
+
+def svg(figure: Any) -> str:
+    """Return a figure as an SVG element, and close it."""
     buffer = io.StringIO()
     figure.savefig(
         buffer,

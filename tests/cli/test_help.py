@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-VERBS = ("demo", "train", "render", "encode", "decode", "link", "watch", "bench")
+VERBS = ("demo", "train", "render", "encode", "decode", "link", "loadtest", "watch", "bench")
 EVAL_VERBS = ("eval compare", "eval paper", "eval stability")
 CERTS_VERBS = ("certs init", "certs show")
 SCENE_VERBS = ("scene convert", "scene poses", "scene record-carla")
@@ -50,6 +50,9 @@ def test_the_help_loads_nothing_heavy() -> None:
         (("decode", "missing.rfv", "--field", "f.rff", "--out", "o"), "missing.rfv"),
         (("link", "--to", "nonsense"), "nonsense"),
         (("link", "--to", "127.0.0.1:1", "--profile", "missing.toml"), "missing.toml"),
+        (("loadtest", "--hz", "0"), "0.1..1000 Hz"),
+        (("loadtest", "--live", "--mode", "receiver"), "live vehicles need mode full"),
+        (("loadtest", "--field", "missing.rff"), "missing.rff"),
         (("watch", "nonsense"), "nonsense"),
         (("watch", "127.0.0.1:1", "--tls-cert", "c.pem"), "belong together"),
         (("certs", "show", "nowhere"), "nowhere"),

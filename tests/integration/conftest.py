@@ -20,6 +20,7 @@ from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from cav_agent.vehicle import Vehicle
 from mec_server.config import ServerConfig
+from mec_server.handlers import OpenCameras, open_cameras
 from mec_server.server import EdgeServer
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec import CodecConfig
@@ -29,7 +30,7 @@ from rfcore.image import write_png
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RENDERER_CONTRACT, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.convert_answers import server_message_from_bytes
+from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import (
     Ack,
     CameraDescription,
@@ -145,9 +146,9 @@ def serve(street: Street) -> Callable[..., Any]:
     """Return a context manager that runs a server in this process."""
 
     @asynccontextmanager
-    async def run(**changes: Any) -> AsyncIterator[EdgeServer]:
+    async def run(opened: OpenCameras = open_cameras, **changes: Any) -> AsyncIterator[EdgeServer]:
         config = replace(ServerConfig(street.store, "127.0.0.1:0"), **secured(changes))
-        server = EdgeServer(config)
+        server = EdgeServer(config, opened)
         await server.start()
         try:
             yield server
@@ -203,9 +204,9 @@ class RawVehicle:
         while True:
             data = await self.stream.read()
             assert data is not grpc.aio.EOF, "the server closed the stream"
-            message = server_message_from_bytes(data)
-            if not isinstance(message, Credit):
-                return message
+            for message in server_messages_from_bytes(data):
+                if not isinstance(message, Credit):
+                    return message
 
     async def ask(self, message: Hello | Frame | bytes) -> ServerMessage:
         """Send a message and return the answer."""

@@ -17,7 +17,7 @@ from rfcore.wire.convert import (
     client_message_from_bytes,
     client_message_to_bytes,
 )
-from rfcore.wire.convert_answers import server_message_from_bytes, server_message_to_bytes
+from rfcore.wire.convert_answers import server_messages_from_bytes, server_messages_to_bytes
 from rfcore.wire.messages import (
     Ack,
     Credit,
@@ -50,6 +50,7 @@ ADDRESS = FrameAddress("front", 2, 7)
     "message",
     [
         Welcome("s-1", exact=True),
+        Welcome("s-1", exact=False, rate_hz=2.5),
         Ack(ADDRESS, StageTimes(1, 2, 3, 4, 10), b"d" * 16),
         *[Nack(ADDRESS, reason, "why", count=2) for reason in RejectReason],
         Nack(ADDRESS, RejectReason.CRC_MISMATCH, "why", last_good_sequence=0, current_epoch=9),
@@ -59,7 +60,23 @@ ADDRESS = FrameAddress("front", 2, 7)
     ids=str,
 )
 def test_an_answer_survives_the_wire(message: ServerMessage) -> None:
-    assert server_message_from_bytes(server_message_to_bytes(message)) == message
+    (data,) = server_messages_to_bytes([message])
+    assert server_messages_from_bytes(data) == [message]
+
+
+def test_a_credit_travels_with_the_answer_before_it() -> None:
+    ack = Ack(ADDRESS, StageTimes(), b"d" * 16)
+    messages = [ack, Credit("front", 3), Credit("rear", 4), ack]
+    packets = server_messages_to_bytes(messages)
+    assert len(packets) == 3
+    assert [m for data in packets for m in server_messages_from_bytes(data)] == messages
+
+
+@pytest.mark.parametrize("rate_hz", [-1.0, 1001.0, math.nan])
+def test_a_rate_that_cannot_be_granted_is_refused(rate_hz: float) -> None:
+    (data,) = server_messages_to_bytes([Welcome("s-1", exact=True, rate_hz=rate_hz)])
+    with pytest.raises(ProtocolError, match="Hz"):
+        server_messages_from_bytes(data)
 
 
 Change = Callable[[pb.StreamRequest], object]
@@ -141,7 +158,7 @@ def test_arbitrary_bytes_from_a_vehicle_raise_our_errors_only(data: bytes) -> No
 @given(data=st.binary(max_size=200))
 def test_arbitrary_bytes_from_a_server_raise_our_errors_only(data: bytes) -> None:
     with suppress(ProtocolError):
-        server_message_from_bytes(data)
+        server_messages_from_bytes(data)
 
 
 def test_untrusted_text_is_escaped_and_cut_short_in_messages(frame: Frame) -> None:

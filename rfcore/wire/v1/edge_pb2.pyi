@@ -136,7 +136,9 @@ class StreamResponse(_message.Message):
     @_builtins.property
     def field_notice(self) -> Global___FieldNotice: ...
     @_builtins.property
-    def credit(self) -> Global___Credit: ...
+    def credit(self) -> Global___Credit:
+        """Alone, or beside the answer that changed it: a message less for every frame."""
+
     def __init__(
         self,
         *,
@@ -150,7 +152,7 @@ class StreamResponse(_message.Message):
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
     _ClearFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "credit", b"credit", "field_notice", b"field_notice", "message", b"message", "nack", b"nack", "welcome", b"welcome"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["welcome", "ack", "nack", "field_notice", "credit"]  # noqa: Y015
+    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["welcome", "ack", "nack", "field_notice"]  # noqa: Y015
     _WhichOneofArgType_message: _TypeAlias = _typing.Literal["message", b"message"]  # noqa: Y015
     def WhichOneof(self, oneof_group: _WhichOneofArgType_message) -> _WhichOneofReturnType_message | None: ...
 
@@ -198,7 +200,10 @@ class CameraDescription(_message.Message):
     CAMERA_ID_FIELD_NUMBER: _builtins.int
     INTRINSICS_FIELD_NUMBER: _builtins.int
     CODEC_FIELD_NUMBER: _builtins.int
+    RATE_HZ_FIELD_NUMBER: _builtins.int
     camera_id: _builtins.str
+    rate_hz: _builtins.float
+    """Pictures per second it would send; 0 or absent: not said."""
     @_builtins.property
     def intrinsics(self) -> Global___Intrinsics: ...
     @_builtins.property
@@ -209,10 +214,11 @@ class CameraDescription(_message.Message):
         camera_id: _builtins.str = ...,
         intrinsics: Global___Intrinsics | None = ...,
         codec: Global___CodecHeader | None = ...,
+        rate_hz: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["codec", b"codec", "intrinsics", b"intrinsics"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "codec", b"codec", "intrinsics", b"intrinsics"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "codec", b"codec", "intrinsics", b"intrinsics", "rate_hz", b"rate_hz"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -492,19 +498,25 @@ class Welcome(_message.Message):
 
     SESSION_ID_FIELD_NUMBER: _builtins.int
     EXACT_FIELD_NUMBER: _builtins.int
+    RATE_HZ_FIELD_NUMBER: _builtins.int
     session_id: _builtins.str
     """Distinguishes this session in the logs of both ends."""
     exact: _builtins.bool
     """Whether both renderers keep the same contract exactly."""
+    rate_hz: _builtins.float
+    """Pictures per second that each camera may send; 0: as many as Credit allows. A later Welcome of
+    the same session changes it.
+    """
     def __init__(
         self,
         *,
         session_id: _builtins.str = ...,
         exact: _builtins.bool = ...,
+        rate_hz: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["exact", b"exact", "session_id", b"session_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["exact", b"exact", "rate_hz", b"rate_hz", "session_id", b"session_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -1,0 +1,105 @@
+"""What a load test puts on a server, and when it counts as held."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from rfcore.errors import InvalidInput
+from rfcore.wire.checks import MAX_CAMERAS, MAX_PAYLOAD_BYTES
+
+__all__ = ["Bounds", "Load", "Mode", "Vehicles"]
+
+
+class Mode(StrEnum):
+    """How much of its work the server does for each frame.
+
+    ``transport``: everything but the numerical work; frames are parsed, checked (order, CRC),
+    queued to a worker, acknowledged, counted. ``receiver``: all of it, with renders that were kept
+    from the first time a pose was seen. ``full``: ``mec-server`` as it is.
+    """
+
+    TRANSPORT = "transport"
+    RECEIVER = "receiver"
+    FULL = "full"
+
+
+class Vehicles(StrEnum):
+    """``canned`` packets are replayed; ``live`` vehicles are processes that render and encode."""
+
+    CANNED = "canned"
+    LIVE = "live"
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """When a load is held.
+
+    Of all pictures that were due, ``on_time_percent`` are acknowledged within ``deadline_ms``; so
+    are 99 % of those that were acknowledged; the worst vehicle has at least ``fairness`` of the
+    best one's share in time; the server's memory grows less than ``growth_mb_per_minute``, beyond
+    ``settling_mb`` that allocators take when they like.
+    """
+
+    deadline_ms: float = 100.0
+    on_time_percent: float = 99.0
+    fairness: float = 0.5
+    growth_mb_per_minute: float = 1.0
+    settling_mb: float = 8.0
+
+    def __post_init__(self) -> None:
+        if not self.deadline_ms > 0:
+            raise InvalidInput("deadline-ms", f"{self.deadline_ms:g} must be above 0 ms")
+        if not 0 <= self.on_time_percent <= 100:
+            raise InvalidInput("on-time-percent", f"{self.on_time_percent:g} is outside 0..100")
+        if not 0 <= self.fairness <= 1:
+            raise InvalidInput("fairness", f"{self.fairness:g} is outside 0..1")
+
+
+@dataclass(frozen=True)
+class Load:
+    """``vehicles`` of ``cameras`` cameras at ``hz`` pictures per second, for ``duration_s``.
+
+    Pictures that are due in the first ``warm_up_s`` are sent and not counted. ``link``: a profile,
+    of which each vehicle gets a link of its own; None: loopback. ``size_bytes``: payload of a frame
+    in transport mode; other modes send what the encoder made of the drive. ``vehicle_ms``: what a
+    canned vehicle waits before it sends a picture, for the time a real one needs to encode it.
+    """
+
+    mode: Mode
+    vehicles: int
+    hz: float
+    duration_s: float = 20.0
+    warm_up_s: float = 5.0
+    cameras: int = 1
+    size_bytes: int = 4096
+    link: Path | None = None
+    kind: Vehicles = Vehicles.CANNED
+    vehicle_ms: float = 0.0
+    bounds: Bounds = Bounds()
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.vehicles <= 1000:
+            raise InvalidInput("vehicles", f"{self.vehicles} is outside 1..1000")
+        if not 0.1 <= self.hz <= 1000:
+            raise InvalidInput("hz", f"{self.hz:g} is outside 0.1..1000 Hz")
+        if not 1 <= self.duration_s <= 86_400:
+            raise InvalidInput("duration", f"{self.duration_s:g} is outside 1..86400 s")
+        if not 0 <= self.warm_up_s <= 600:
+            raise InvalidInput("warm-up", f"{self.warm_up_s:g} is outside 0..600 s")
+        if not 1 <= self.cameras <= MAX_CAMERAS:
+            raise InvalidInput("cameras", f"{self.cameras} is outside 1..{MAX_CAMERAS}")
+        if not 1 <= self.size_bytes <= MAX_PAYLOAD_BYTES:
+            raise InvalidInput("size", f"{self.size_bytes} is outside 1..{MAX_PAYLOAD_BYTES} bytes")
+        if not 0 <= self.vehicle_ms < 1e3 * 60:
+            raise InvalidInput("vehicle-ms", f"{self.vehicle_ms:g} is outside 0..60000 ms")
+        self._check_kind()
+
+    def _check_kind(self) -> None:
+        if self.kind is Vehicles.CANNED:
+            return
+        if self.mode is not Mode.FULL:
+            raise InvalidInput("live", f"live vehicles need mode full, not {self.mode}")
+        if self.cameras != 1:
+            raise InvalidInput("cameras", f"{self.cameras}: a live vehicle has one camera")

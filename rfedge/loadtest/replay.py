@@ -1,0 +1,148 @@
+"""One camera of a canned vehicle: what is due when, what is sent, and how each picture ended.
+
+Sans-IO; times are seconds on one monotonic clock. Pictures are due at ``start_s + i / hz`` whatever
+became of those before. As in the agent, the newest waits for credit and replaces the one that
+waited. After a picture that was dropped or refused the next ones are sent alone, in a new epoch,
+until the drive begins again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from rfcore.wire.messages import Ack, Credit, Frame, FrameAddress, Nack, ServerMessage
+from rfedge.loadtest.canned import CannedDrive
+
+__all__ = ["End", "Replay", "Schedule", "Shot"]
+
+
+class End(StrEnum):
+    """How a picture ended; ``open``: it was not answered when the test was over."""
+
+    ACKED = "acked"
+    NACKED = "nacked"
+    DROPPED = "dropped"
+    OPEN = "open"
+
+
+@dataclass
+class Shot:
+    """One picture: when it was due, when it was handed to the socket, when it was answered."""
+
+    due_s: float
+    sent_s: float | None = None
+    ended_s: float | None = None
+    end: End = End.OPEN
+
+    @property
+    def latency_s(self) -> float | None:
+        """From due to Ack."""
+        if self.end is not End.ACKED or self.ended_s is None:
+            return None
+        return self.ended_s - self.due_s
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Pictures at ``start_s + i / hz`` until ``end_s``, ready to send ``ready_s`` later."""
+
+    start_s: float
+    end_s: float
+    hz: float
+    ready_s: float = 0.0
+
+
+NEVER = Schedule(float("inf"), float("inf"), 1.0)
+
+
+class Replay:
+    """Replays ``drive`` as camera ``camera_id``; ``wall_ns`` is the Unix time of a moment."""
+
+    def __init__(self, camera_id: str, drive: CannedDrive, wall_ns: Callable[[float], int]) -> None:
+        self.shots: list[Shot] = []
+        self._camera_id = camera_id
+        self._drive = drive
+        self._schedule = NEVER
+        self._wall_ns = wall_ns
+        self._granted = 0
+        self._used = 0
+        self._waiting: int | None = None
+        self._pending: dict[FrameAddress, Shot] = {}
+        self._epoch = -1
+        self._sequence = 0
+        self._chained = False
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether every picture was sent or dropped, and answered."""
+        return self._waiting is None and not self._pending and self.get_timer() is None
+
+    def begin(self, schedule: Schedule) -> None:
+        """Follow ``schedule`` from now on; before, nothing is due."""
+        self._schedule = schedule
+
+    def get_timer(self) -> float | None:
+        """Return when the next picture is ready, or None when there is no other."""
+        due_s = self._due_s(len(self.shots))
+        return None if due_s >= self._schedule.end_s else due_s + self._schedule.ready_s
+
+    def frame_to_send(self, now: float) -> Frame | None:
+        """Return the frame to hand to the socket now, or None: not due, or no credit."""
+        while (timer := self.get_timer()) is not None and timer <= now:
+            if self._waiting is not None:
+                self._drop(self._waiting, now)
+            self._waiting = len(self.shots)
+            self.shots.append(Shot(self._due_s(self._waiting)))
+        if self._waiting is None or self._used >= self._granted:
+            return None
+        index, self._waiting = self._waiting, None
+        self._used += 1
+        return self._sent(index, now)
+
+    def receive(self, message: ServerMessage, now: float) -> None:
+        """Take an answer; answers for other cameras are not ours."""
+        match message:
+            case Credit(camera_id, frames) if camera_id == self._camera_id:
+                self._granted = max(self._granted, frames)
+            case Ack(address):
+                if (shot := self._pending.pop(address, None)) is not None:
+                    shot.ended_s, shot.end = now, End.ACKED
+            case Nack(address):
+                if (shot := self._pending.pop(address, None)) is not None:
+                    shot.ended_s, shot.end = now, End.NACKED
+                    self._chained = False
+
+    def give_up(self) -> None:
+        """The stream is lost: what was still to come is dropped."""
+        while self._due_s(len(self.shots)) < self._schedule.end_s:
+            self.shots.append(Shot(self._due_s(len(self.shots)), end=End.DROPPED))
+
+    def _due_s(self, index: int) -> float:
+        return self._schedule.start_s + index / self._schedule.hz
+
+    def _drop(self, index: int, now: float) -> None:
+        shot = self.shots[index]
+        shot.ended_s, shot.end = now, End.DROPPED
+        self._chained = False
+
+    def _sent(self, index: int, now: float) -> Frame:
+        shot = self.shots[index]
+        shot.sent_s = now
+        position = index % len(self._drive.chain)
+        if position == 0 or not self._chained:
+            self._epoch += 1
+            self._sequence = 0
+            self._chained = position == 0
+        canned = (self._drive.chain if self._chained else self._drive.alone)[position]
+        packet = replace(canned.packet, epoch=self._epoch, sequence=self._sequence).sealed()
+        self._sequence += 1
+        frame = replace(
+            canned,
+            camera_id=self._camera_id,
+            capture_time_ns=self._wall_ns(shot.due_s),
+            packet=packet,
+        )
+        self._pending[frame.address] = shot
+        return frame

@@ -1,0 +1,149 @@
+"""The result of a load test as files: JSON, a page, a figure; and rows of a committed result."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from rfcore.files import write_whole
+from rfedge.loadtest.figures import latency_chart, uplink_chart
+from rfedge.loadtest.run import Run
+from rfedge.loadtest.uplink import MOST, RATES_MBPS, Traffic, vehicles_carried
+from rfedge.provenance import host, revision
+
+__all__ = ["LoadResult", "record", "write_result"]
+
+KEY = ("mode", "kind", "vehicles", "cameras", "hz", "width", "height", "link", "vehicle_ms")
+"""What tells one row of a committed result from another."""
+
+
+@dataclass(frozen=True)
+class LoadResult:
+    """Runs of one load with different numbers of vehicles, in the order of their numbers."""
+
+    runs: Sequence[Run]
+
+    @property
+    def most_held(self) -> int:
+        """The largest number that held, 0 if none did."""
+        return max((run.load.vehicles for run in self.runs if run.verdict.held), default=0)
+
+    def headline(self) -> str:
+        """Return the result in a line."""
+        load, row = self.runs[0].load, self.runs[0].row
+        what = f"{load.mode}, {row['width']}x{row['height']}, {load.hz:g} Hz"
+        if len(self.runs) > 1:
+            return f"{self.most_held} vehicles held ({what})"
+        held = "held" if self.most_held else "not held"
+        return f"{load.vehicles} vehicles {held} ({what})"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the content of ``result.json``."""
+        return {
+            "case": "loadtest",
+            "command": " ".join(["rfedge", *sys.argv[1:]]),
+            "revision": revision(),
+            "host": host(),
+            "rows": [_finite(run.row) for run in self.runs],
+        }
+
+
+def write_result(result: LoadResult, out: Path) -> None:
+    """Write ``result.json``, ``report.html`` and ``vehicles_vs_uplink.svg`` into ``out``."""
+    out.mkdir(parents=True, exist_ok=True)
+    content = result.as_json()
+    write_whole(out / "result.json", json.dumps(content, indent=1) + "\n")
+    figure = _uplink(result)
+    write_whole(out / "vehicles_vs_uplink.svg", figure + "\n")
+    write_whole(out / "report.html", _page(result, content, figure))
+
+
+def record(path: Path, content: Mapping[str, Any]) -> None:
+    """Put the rows of ``content`` into the result at ``path``, in place of those of the same load.
+
+    Each row keeps the command and revision it was made by.
+    """
+    old = json.loads(path.read_text())["rows"] if path.exists() else []
+    made = {key: content[key] for key in ("command", "revision")}
+    new = [{**row, **made} for row in content["rows"]]
+    told = {_key(row) for row in new}
+    rows = sorted([row for row in old if _key(row) not in told] + new, key=_order)
+    whole = {**content, "command": "rfedge loadtest", "rows": rows}
+    write_whole(path, json.dumps(whole, indent=1) + "\n")
+
+
+def _key(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in KEY)
+
+
+def _order(row: Mapping[str, Any]) -> tuple[str, ...]:
+    order = ("transport", "receiver", "full")
+    return (str(order.index(row["mode"])), row["kind"], f"{row['hz']:9.3f}{row['vehicles']:6d}")
+
+
+def _finite(row: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON knows no infinity: what nothing was measured of is null."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in row.items()
+    }
+
+
+def _uplink(result: LoadResult) -> str:
+    run = result.runs[-1]
+    sizes = [size for size in run.payload_bytes for _ in range(run.load.cameras)]
+    budget_s = run.load.bounds.deadline_ms / 2e3
+    traffic = Traffic(sizes, run.load.hz * run.load.cameras, budget_s)
+    carried = [(rate, vehicles_carried(traffic, 1e6 * rate)) for rate in RATES_MBPS]
+    return uplink_chart(carried, result.most_held or None, MOST)
+
+
+def _page(result: LoadResult, content: Mapping[str, Any], figure: str) -> str:
+    environment = Environment(
+        loader=PackageLoader("rfedge.loadtest", "."), autoescape=True, undefined=StrictUndefined
+    )
+    environment.filters["ms"] = lambda value: "-" if value is None else f"{value:.1f}"
+    last = result.runs[-1]
+    latency_ms = {f"{run.load.vehicles} vehicles": run.latency_ms for run in result.runs}
+    return environment.get_template("loadtest.html.j2").render(
+        headline=result.headline(),
+        what=_what(last),
+        rows=content["rows"],
+        deadline_ms=last.load.bounds.deadline_ms,
+        latency_svg=latency_chart(latency_ms, last.load.bounds.deadline_ms),
+        uplink_svg=figure,
+        payload_bytes=last.row["payload_bytes"],
+        hz=last.load.hz,
+        budget_ms=last.load.bounds.deadline_ms / 2,
+        provenance=json.dumps(
+            {key: content[key] for key in ("command", "revision", "host")}, indent=2
+        ),
+    )
+
+
+def _what(run: Run) -> str:
+    load = run.load
+    does = {
+        "transport": "The server parses, checks, queues, acknowledges and counts; it neither "
+        "renders nor decodes.",
+        "receiver": "The server decodes against renders that it kept: each pose is rendered once.",
+        "full": "The server renders and decodes every frame, as always.",
+    }[load.mode]
+    link = f"a link of its own ({load.link.stem})" if load.link else "loopback"
+    vehicles = (
+        "Canned vehicles replay packets that were coded before, so the vehicles' own time is not "
+        f"in the latency beyond {load.vehicle_ms:g} ms"
+        if load.kind == "canned"
+        else "Live vehicles render and encode on this machine"
+    )
+    return (
+        f"{does} {vehicles}. {load.cameras} camera(s) a vehicle, each vehicle over {link}; "
+        f"{load.duration_s:g} s counted after {load.warm_up_s:g} s of warm-up."
+    )

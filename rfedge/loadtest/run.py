@@ -1,0 +1,131 @@
+"""One run: server, links and fleet as processes, watched while the counted part goes on."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rfcore.field import load_field
+from rfedge.demo.processes import Service, command_of, service
+from rfedge.loadtest.brought import Brought, links_busy, measured
+from rfedge.loadtest.canned import CannedDrive, canned_drive, payload_drive
+from rfedge.loadtest.drive import drive_canned
+from rfedge.loadtest.live import drive_live
+from rfedge.loadtest.plan import Load, Mode, Vehicles
+from rfedge.loadtest.verdict import Verdict, judge
+
+__all__ = ["Run", "TestBed", "run_load"]
+
+
+@dataclass(frozen=True)
+class TestBed:
+    """What loads are run on: a field (the only one in its folder), a drive of pictures for it, a
+    server of so many workers, and folders for packets that were coded and for the processes' logs.
+    """
+
+    field: Path
+    drive: Path
+    workers: int
+    cache: Path
+    work: Path
+    preset: str = "medium"
+    crf: float = 23.0
+
+    __test__ = False
+
+
+@dataclass(frozen=True)
+class Run:
+    """One load with what it brought. ``row`` is its row of ``results/loadtest.json``."""
+
+    load: Load
+    verdict: Verdict
+    row: Mapping[str, Any]
+    latency_ms: Sequence[float]
+    payload_bytes: Sequence[int]
+
+
+def run_load(load: Load, bed: TestBed) -> Run:
+    """Run one load to its end; raise ``RfedgeError`` naming the process that failed."""
+    folder = _canned(load, bed)
+    drive = CannedDrive.read(folder)
+    bed.work.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as processes:
+        server = processes.enter_context(_server(load, bed))
+        addresses = [server.address] * load.vehicles
+        pids = {"server": server.process.pid}
+        if load.link is not None:
+            links = processes.enter_context(_links(load, load.link, server, bed.work))
+            addresses = links.address.split("\n")
+            pids["links"] = links.process.pid
+        if load.kind is Vehicles.LIVE:
+            brought = drive_live(load, addresses, pids, bed.work, _agent(bed))
+        else:
+            brought = drive_canned(load, addresses, pids, bed.work, folder)
+    busy = links_busy(bed.work / "links.jsonl", load) if load.link is not None else 0.0
+    found = measured(load, brought, busy, bed.workers)
+    verdict = judge(found, load.bounds)
+    row = _row(load, drive, brought, verdict)
+    latency_ms = [ms for vehicle in found.vehicles for ms in vehicle.latency_ms]
+    return Run(load, verdict, row, latency_ms, [len(f.packet.payload) for f in drive.chain])
+
+
+def _canned(load: Load, bed: TestBed) -> Path:
+    field = load_field(bed.field)
+    if load.mode is not Mode.TRANSPORT:
+        return canned_drive(bed.drive, field, bed.cache, bed.preset, bed.crf)
+    folder = bed.cache / f"payload-{load.size_bytes}"
+    payload_drive(field.field_id, load.size_bytes).write(folder)
+    return folder
+
+
+def _server(load: Load, bed: TestBed) -> Any:
+    fields, workers = str(bed.field.parent), str(bed.workers)
+    if load.mode is Mode.FULL:
+        command = [*command_of("mec-server"), "--fields", fields, "--workers", workers]
+        return service("mec-server", [*command, "--listen", "127.0.0.1:0"], bed.work)
+    module = [sys.executable, "-m", "rfedge.loadtest.server"]
+    return service("mec-server", [*module, load.mode, fields, workers], bed.work)
+
+
+def _links(load: Load, profile: Path, server: Service, work: Path) -> Any:
+    module = [sys.executable, "-m", "rfedge.loadtest.links", str(profile), str(load.vehicles)]
+    return service("links", [*module, server.address, str(work / "links.jsonl")], work)
+
+
+def _agent(bed: TestBed) -> Sequence[str]:
+    return [
+        *command_of("cav-agent"),
+        *("--drive", str(bed.drive), "--fields", str(bed.field.parent)),
+        *("--preset", bed.preset, "--crf", str(bed.crf), "--loop"),
+    ]
+
+
+def _row(load: Load, drive: CannedDrive, brought: Brought, verdict: Verdict) -> dict[str, Any]:
+    k = drive.intrinsics
+    return {
+        "mode": str(load.mode),
+        "vehicles": load.vehicles,
+        "hz": load.hz,
+        "width": k.width_px,
+        "height": k.height_px,
+        "held": verdict.held,
+        "p50_ms": verdict.p50_ms,
+        "p99_ms": verdict.p99_ms,
+        "on_time_percent": verdict.on_time_percent,
+        "on_time_at_least_percent": verdict.on_time_at_least_percent,
+        "fairness": verdict.fairness,
+        "limited_by": verdict.limited_by,
+        "broken": list(verdict.broken),
+        "kind": str(load.kind),
+        "cameras": load.cameras,
+        "payload_bytes": drive.mean_payload_bytes,
+        "link": None if load.link is None else load.link.stem,
+        "duration_s": load.duration_s,
+        "vehicle_ms": load.vehicle_ms,
+        **brought.row(),
+    }

@@ -1,0 +1,131 @@
+"""The server of a load test without some of its work: ``mec_server.server``, served by itself.
+
+``python -m rfedge.loadtest.server transport|receiver FIELDS WORKERS --ready-file FILE``
+
+Streams, sessions, queues, workers, metrics, logs and the twin are the server's own. In transport
+mode a worker compares CRCs and shows a grey picture; in receiver mode it decodes against renders
+that are kept, so that each pose is rendered once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+
+from mec_server.__main__ import serve
+from mec_server.config import ServerConfig
+from mec_server.handlers import (
+    Decoder,
+    FieldSource,
+    OpenCameras,
+    Reconstruction,
+    Renderer,
+    Tools,
+    open_cameras,
+)
+from mec_server.jobs import DecodeJob, DecodeOutcome, OpenJob
+from rfcore.camera import Camera
+from rfcore.errors import PacketRejected, RejectReason
+from rfcore.field import Quality
+from rfcore.image import I420
+from rfcore.views import View
+from rfcore.wire.logs import configure_logs
+from rfcore.wire.messages import CameraDescription, StageTimes
+from rfedge.loadtest.plan import Mode
+
+__all__ = ["KeptFields", "KeptRenders", "PassingDecoder", "passing", "with_kept_renders"]
+
+MAX_KEPT = 64
+"""Renders of 640x360 are 4.6 MB each."""
+
+
+class PassingDecoder:
+    """Takes frames without looking at their pictures."""
+
+    def __init__(self, camera: CameraDescription) -> None:
+        width_px, height_px = camera.intrinsics.width_px, camera.intrinsics.height_px
+        half = ((height_px + 1) // 2, (width_px + 1) // 2)
+        luma = np.full((height_px, width_px), 128, np.uint8)
+        self._grey = I420(luma, np.full(half, 128, np.uint8), np.full(half, 128, np.uint8))
+
+    def reconstruct(self, job: DecodeJob) -> Reconstruction:
+        """Return grey for an undamaged packet."""
+        packet = job.frame.packet
+        if packet.crc32 != packet.expected_crc32():
+            raise PacketRejected(RejectReason.CRC_MISMATCH, f"packet {packet.sequence}")
+        outcome = DecodeOutcome(0, packet.reconstruction_digest, StageTimes())
+        return Reconstruction(self._grey, outcome)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class KeptRenders:
+    """A field whose renders are kept; shared by the sessions, each pose of which is the same."""
+
+    def __init__(self, renderer: Renderer) -> None:
+        self._renderer = renderer
+        self._views: OrderedDict[tuple[Camera, Quality], View] = OrderedDict()
+
+    def render(self, camera: Camera, quality: Quality) -> View:
+        """Return the view, rendered now or before."""
+        view = self._views.get((camera, quality))
+        if view is None:
+            view = self._views[camera, quality] = self._renderer.render(camera, quality)
+            while len(self._views) > MAX_KEPT:
+                self._views.popitem(last=False)
+        return view
+
+
+class KeptFields:
+    """The fields of a server, each once and with its kept renders."""
+
+    def __init__(self, fields: FieldSource) -> None:
+        self._fields = fields
+        self._kept: dict[str, KeptRenders] = {}
+
+    def open(self, field_id: str) -> Renderer:
+        """Return a field; raise what the server's own source raises."""
+        if field_id not in self._kept:
+            self._kept[field_id] = KeptRenders(self._fields.open(field_id))
+        return self._kept[field_id]
+
+
+def passing(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
+    """Return decoders that do nothing, for ``mec_server.handlers.open_cameras``."""
+    del fields, tools
+    return {camera.camera_id: PassingDecoder(camera) for camera in job.hello.cameras}
+
+
+def with_kept_renders() -> OpenCameras:
+    """Return ``open_cameras`` with one set of kept renders for all sessions."""
+    kept: list[KeptFields] = []
+
+    def opened(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
+        if not kept:
+            kept.append(KeptFields(fields))
+        return open_cameras(job, kept[0], tools)
+
+    return opened
+
+
+def main(arguments: list[str]) -> None:
+    """Serve until SIGTERM."""
+    mode, fields, workers, _, ready_file = arguments
+    config = ServerConfig(
+        fields=Path(fields),
+        listen="127.0.0.1:0",
+        workers=int(workers),
+        ready_file=Path(ready_file),
+    )
+    configure_logs(sys.stderr)
+    opened = passing if Mode(mode) is Mode.TRANSPORT else with_kept_renders()
+    asyncio.run(serve(config, opened))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,57 @@
+"""How many vehicles one uplink carries, on the virtual clock: exact, and at once.
+
+Vehicles of a cell share its throughput. Each sends the drive's packets at its rate, at moments
+spread over a period; a packet that is transmitted later than the budget is late. What remains of
+the deadline after the uplink (server, way back, the vehicle's own time) is the caller's to take
+off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rfcore.link import LinkProfile
+from rfcore.link.virtual import Arrival, delivery_times
+from rfedge.loadtest.search import largest_held
+
+__all__ = ["RATES_MBPS", "Traffic", "on_time_share", "vehicles_carried"]
+
+RATES_MBPS = (0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
+MOST = 64
+PERIODS = 50
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """What one vehicle sends, ``hz`` packets a second of ``sizes_bytes`` in turn, and the share of
+    them that must be through within ``budget_s``."""
+
+    sizes_bytes: Sequence[int]
+    hz: float
+    budget_s: float
+    share: float = 0.99
+
+
+def vehicles_carried(traffic: Traffic, rate_bps: float) -> int:
+    """Return how many vehicles an uplink of ``rate_bps`` carries, at most 64."""
+
+    def held(vehicles: int) -> bool:
+        return on_time_share(traffic, rate_bps, vehicles) >= traffic.share
+
+    return largest_held(1, held, MOST)
+
+
+def on_time_share(traffic: Traffic, rate_bps: float, vehicles: int) -> float:
+    """Return the share of packets that are through within the budget."""
+    sizes, period_s = traffic.sizes_bytes, 1.0 / traffic.hz
+    schedule = [
+        Arrival((n + v / vehicles) * period_s, sizes[(n + v) % len(sizes)])
+        for n in range(PERIODS)
+        for v in range(vehicles)
+    ]
+    due_s = delivery_times(LinkProfile(rate_bps), schedule)
+    in_time = (
+        done_s - sent.at_s <= traffic.budget_s for sent, done_s in zip(schedule, due_s, strict=True)
+    )
+    return sum(in_time) / len(schedule)

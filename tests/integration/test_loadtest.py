@@ -1,0 +1,162 @@
+"""Canned vehicles against real servers: their packets are decoded, and every picture counted."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rfcore.codec import DeltaDecoder
+from rfcore.field.quality import FULL
+from rfcore.native.warp import PosedDepth
+from rfcore.native.yuv import i420_from_colour
+from rfedge.loadtest.canned import CannedDrive, canned_drive, payload_drive
+from rfedge.loadtest.command import Command
+from rfedge.loadtest.fleet import FleetSpec, run_fleet
+from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
+from rfedge.loadtest.result import record
+from rfedge.loadtest.run import TestBed
+from rfedge.loadtest.server import KeptRenders, passing, with_kept_renders
+
+PATIENT = Bounds(deadline_ms=60_000.0, on_time_percent=0.0, fairness=0.0, settling_mb=1e6)
+"""What is right is tested here; what is fast depends on who else uses this machine."""
+
+
+@pytest.fixture(scope="session")
+def canned(street: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return canned_drive(street.drive, street.field, tmp_path_factory.mktemp("canned"), "ultrafast")
+
+
+def test_canned_frames_decode_in_a_chain_and_alone(street: Any, canned: Path) -> None:
+    drive = CannedDrive.read(canned)
+    for frames in (drive.chain, drive.alone):
+        decoder = DeltaDecoder(drive.hello.cameras[0].codec)
+        state = decoder.start(frames[0].packet.epoch)
+        for frame in frames:
+            camera = frame.camera(drive.intrinsics)
+            view = street.field.render(camera)
+            if frame.packet.epoch != state.epoch:
+                state = decoder.start(frame.packet.epoch)
+            seen = PosedDepth(camera, view.depth)
+            done = decoder.decode(state, frame.packet, i420_from_colour(view.colour), seen)
+            assert done.exact
+            state = done.state
+    assert any(len(frame.packet.references) > 1 for frame in drive.chain)
+
+
+def test_a_coded_drive_is_coded_once(street: Any, canned: Path) -> None:
+    before = (canned / "chain.rfv").stat().st_mtime_ns
+    again = canned_drive(street.drive, street.field, canned.parent, "ultrafast")
+    assert (again, (again / "chain.rfv").stat().st_mtime_ns) == (canned, before)
+
+
+def spec_of(address: object, drive: Path, **changes: Any) -> FleetSpec:
+    values: dict[str, Any] = {
+        "addresses": (str(address),) * 3,
+        "hz": 10.0,
+        "cameras": 2,
+        "warm_up_s": 0.2,
+        "duration_s": 0.5,
+        "ready_s": 0.0,
+        "drive": str(drive),
+    }
+    return FleetSpec(**{**values, **changes})
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+async def test_a_fleet_counts_every_picture_and_the_server_refuses_none(
+    serve: Callable[..., Any], street: Any, canned: Path, tmp_path: Path, mode: Mode
+) -> None:
+    drive, opened = canned, None
+    if mode is Mode.TRANSPORT:
+        payload_drive(street.field_id, 2000).write(tmp_path)
+        drive, opened = tmp_path, passing
+    elif mode is Mode.RECEIVER:
+        opened = with_kept_renders()
+    started: list[bool] = []
+    async with serve(**({"opened": opened} if opened else {})) as server:
+        spec = spec_of(server.address, drive)
+        result = await run_fleet(spec, lambda: started.append(True))
+    assert started == [True]
+    for vehicle in result["vehicles"]:
+        assert (vehicle["refused"], vehicle["failed"], vehicle["nacked"]) == ("", "", 0)
+        assert vehicle["due"] == 2 * 5
+        assert vehicle["latency_ms"], "the newest picture always gets through"
+
+
+async def test_vehicles_that_reach_nobody_are_counted_as_failed(
+    canned: Path, monkeypatch: pytest.MonkeyPatch, free_port: int
+) -> None:
+    monkeypatch.setattr("rfedge.loadtest.fleet.CONNECT_S", 0.2)
+    result = await run_fleet(spec_of(f"127.0.0.1:{free_port}", canned), lambda: None)
+    assert all(vehicle["failed"] for vehicle in result["vehicles"])
+    assert all(vehicle["due"] == 10 for vehicle in result["vehicles"])
+
+
+def test_kept_renders_are_rendered_once(street: Any) -> None:
+    asked: list[object] = []
+
+    class Counting:
+        def render(self, camera: Any, quality: Any) -> Any:
+            asked.append(camera)
+            return street.field.render(camera, quality)
+
+    kept = KeptRenders(Counting())
+    frame = payload_drive("ab" * 32, 10).chain[0]
+    camera = frame.camera(payload_drive("ab" * 32, 10).intrinsics)
+    assert kept.render(camera, FULL) is kept.render(camera, FULL)
+    assert len(asked) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mode", "kind", "link"),
+    [
+        (Mode.TRANSPORT, Vehicles.CANNED, None),
+        (Mode.RECEIVER, Vehicles.CANNED, "samples/links/steady.toml"),
+        (Mode.FULL, Vehicles.CANNED, None),
+        (Mode.FULL, Vehicles.LIVE, "samples/links/steady.toml"),
+    ],
+)
+def test_the_command_leaves_a_page_and_rows(
+    street: Any, tmp_path: Path, mode: Mode, kind: Vehicles, link: str | None
+) -> None:
+    root = Path(__file__).parents[2]
+    load = Load(
+        mode, 2, 5.0, 2.0, 0.5, link=root / link if link else None, kind=kind, bounds=PATIENT
+    )
+    field = next(street.store.glob("*.rff"))
+    bed = TestBed(field, street.drive, 2, tmp_path / "cache", tmp_path / "work", "ultrafast")
+    committed = tmp_path / "results.json"
+    result = Command(load, bed, tmp_path / "out", committed).run(find_limit=False)
+    assert result.most_held == 2, result.runs[0].verdict.broken
+    (row,) = json.loads(committed.read_text())["rows"]
+    assert (row["mode"], row["nacked"], row["refused"], row["held"]) == (mode, 0, 0, True)
+    assert row["server_cores"] > 0.0
+    assert (row["links_cores"] > 0.0) == (link is not None)
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "2 vehicles held" in page
+    assert page.count("<svg") == 2
+    assert (tmp_path / "out" / "vehicles_vs_uplink.svg").read_text().startswith("<svg")
+
+
+def test_a_committed_row_is_replaced_by_the_same_load_and_kept_beside_others(
+    tmp_path: Path,
+) -> None:
+    row = dict.fromkeys(("kind", "cameras", "width", "height", "link", "vehicle_ms"), 1)
+    row = {**row, "mode": "full", "kind": "canned", "vehicles": 4, "hz": 5.0, "held": False}
+    path = tmp_path / "loadtest.json"
+
+    def run(**changes: Any) -> None:
+        content = {"case": "loadtest", "command": "c", "revision": "r", "host": {}}
+        record(path, {**content, "rows": [{**row, **changes}]})
+
+    run()
+    run(held=True)
+    run(mode="transport", vehicles=100)
+    rows = json.loads(path.read_text())["rows"]
+    assert [(r["mode"], r["vehicles"], r["held"]) for r in rows] == [
+        ("transport", 100, False),
+        ("full", 4, True),
+    ]

@@ -1,0 +1,79 @@
+"""A load is held when every bound is kept, and the resource that is at its limit is named."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from rfedge.loadtest.plan import Bounds
+from rfedge.loadtest.verdict import Measured, Resources, VehicleCount, judge, limit, wilson_lower
+
+IDLE = Resources(0.1, 0.1, 0.1, 0.1, 0.2, 0.0, 1.0)
+
+
+def vehicle(on_time: int, due: int = 100, ms: float = 20.0) -> VehicleCount:
+    return VehicleCount(due, on_time, [ms] * on_time)
+
+
+def run_of(*vehicles: VehicleCount, growth_mb: float = 0.0) -> Measured:
+    return Measured(vehicles, len(vehicles), growth_mb, 1.0, IDLE)
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "lower"), [(10, 10, 0.7225), (95, 100, 0.8882), (0, 10, 0.0)]
+)
+def test_wilsons_bound_is_the_published_one(successes: int, trials: int, lower: float) -> None:
+    """Against tables of the score interval (Newcombe 1998)."""
+    assert wilson_lower(successes, trials) == pytest.approx(lower, abs=5e-5)
+
+
+def test_wilsons_bound_solves_its_equation() -> None:
+    """The bound is the share p from which the observed one is 1.96 standard errors away."""
+    p = wilson_lower(870, 1000)
+    assert (0.87 - p) / math.sqrt(p * (1 - p) / 1000) == pytest.approx(1.959964, abs=1e-5)
+
+
+def test_a_good_run_is_held() -> None:
+    verdict = judge(run_of(vehicle(100), vehicle(99)), Bounds())
+    assert verdict.held
+    assert (verdict.p50_ms, verdict.on_time_percent) == (20.0, 99.5)
+
+
+@pytest.mark.parametrize(
+    ("measured", "said"),
+    [
+        (run_of(vehicle(98)), "98.00 % on time"),
+        (run_of(vehicle(100, ms=130.0)), "p99 130 ms above 100 ms"),
+        (run_of(*[vehicle(100)] * 200, vehicle(40)), "fairness 0.40"),
+        (run_of(vehicle(100), growth_mb=9.5), "memory grew 9.5 MB, 9.0 may be"),
+        (replace(run_of(vehicle(100)), wanted_vehicles=3), "2 vehicles were not admitted"),
+        (run_of(vehicle(0)), "p99 inf ms"),
+    ],
+)
+def test_a_broken_bound_is_named(measured: Measured, said: str) -> None:
+    verdict = judge(measured, Bounds())
+    assert not verdict.held
+    assert said in "; ".join(verdict.broken)
+
+
+def test_pictures_that_never_came_count_against_the_share() -> None:
+    verdict = judge(run_of(VehicleCount(100, 90, [5.0] * 90)), Bounds())
+    assert verdict.on_time_percent == 90.0
+    assert verdict.p99_ms == 5.0, "of those acknowledged"
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({}, "nothing"),
+        ({"server_loop": 0.9}, "server's event loop"),
+        ({"workers": 0.9}, "server's workers"),
+        ({"link": 0.9}, "link"),
+        ({"machine": 0.97}, "CPU of the machine"),
+        ({"machine": 0.97, "others": 0.5}, "CPU of the machine, which others use too"),
+        ({"generator": 0.9, "server_loop": 0.9}, "generator"),
+        ({"generator_lag_ms": 25.0}, "generator"),
+    ],
+)
+def test_the_resource_at_its_limit_is_named(change: dict[str, float], named: str) -> None:
+    assert limit(replace(IDLE, **change)) == named
