@@ -41,8 +41,10 @@ class ScenePlan:
         planned = planned_effects(scene, process_time)
         if not planned:
             print("  effects     none: pictures are as rendered")
-        total_ms = sum(effect.cost_ms for effect in planned)
+        total_ms = sum(effect.cost_ms for effect in planned if effect.each_frame)
         for effect in planned:
             share = 100 * effect.cost_ms / total_ms if total_ms else 0.0
             cost = f"{effect.cost_ms:.1f} ms a frame, {share:.0f} % of all effects"
+            if not effect.each_frame:
+                cost = f"{effect.cost_ms:.0f} ms once, before the first frame"
             print(f"  {effect.stage:<11} {effect.name}: {effect.why}; {cost}")

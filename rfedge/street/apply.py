@@ -12,7 +12,7 @@ __all__ = ["apply_effects"]
 def apply_effects(scene: Scene, frame: LinearFrame, index: int) -> LinearFrame:
     """Return frame ``index`` as the scene's air and sensor make it; without effects, unchanged."""
     for effect in EFFECTS:
-        if effect.name in scene.effects:
+        if effect.on_frames and effect.name in scene.effects:
             rng = rng_of(effect, scene.geometry.seed, index)
             frame = scene.effects[effect.name].apply(frame, rng)
     return frame

@@ -1,15 +1,19 @@
-"""What a scene will run, and what each effect costs: measured here and now, on a plain frame."""
+"""What a scene will run, and what each effect costs, measured here and now.
+
+Effects on frames are run on a plain one of the drive's size. Those that change the street run once,
+before the first frame; they are run on the scene's own street, made only if there is one.
+"""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfedge.street.effects import EFFECTS, Stage, rng_of
+from rfedge.street.effects import EFFECTS, Effect, Stage, rng_of
 from rfedge.street.frame import LinearFrame
 from rfedge.street.scene_file import Scene
 
@@ -20,30 +24,57 @@ REPETITIONS = 5
 
 @dataclass(frozen=True)
 class PlannedEffect:
-    """An effect that will run, with its settings and its median processor time a frame."""
+    """An effect that will run, with its settings and its median processor time.
+
+    ``each_frame``: whether that is spent in every frame, or once before the first.
+    """
 
     name: str
     stage: Stage
     why: str
     settings: object
     cost_ms: float
+    each_frame: bool = True
 
 
 def planned_effects(scene: Scene, cpu_s: Callable[[], float]) -> tuple[PlannedEffect, ...]:
-    """Run each declared effect on a frame of the drive's size; ``cpu_s`` reads processor time."""
+    """Run each declared effect; ``cpu_s`` reads processor time."""
+    declared = [effect for effect in EFFECTS if effect.name in scene.effects]
+    changes = [effect for effect in declared if not effect.on_frames]
     frame = plain_frame(*scene.drive.size_px, scene.rig.fov_deg)
-    planned = []
-    for effect in EFFECTS:
-        if effect.name in scene.effects:
-            settings = scene.effects[effect.name]
+    planned = [
+        _planned(scene, effect, cost_ms) for effect, cost_ms in _changed(scene, changes, cpu_s)
+    ]
+    for effect in declared:
+        if effect.on_frames:
+            apply = scene.effects[effect.name].apply
             times_s = []
             for i in range(REPETITIONS):
                 start_s = cpu_s()
-                settings.apply(frame, rng_of(effect, scene.geometry.seed, i))
+                apply(frame, rng_of(effect, scene.geometry.seed, i))
                 times_s.append(cpu_s() - start_s)
-            cost_ms = 1e3 * statistics.median(times_s)
-            planned.append(PlannedEffect(effect.name, effect.stage, effect.why, settings, cost_ms))
+            planned.append(_planned(scene, effect, 1e3 * statistics.median(times_s)))
     return tuple(planned)
+
+
+def _changed(
+    scene: Scene, changes: Sequence[Effect], cpu_s: Callable[[], float]
+) -> Iterator[tuple[Effect, float]]:
+    """Change the scene's street by one effect after the other, in milliseconds each."""
+    if not changes:
+        return
+    from rfedge.street.assembly import plain_world
+
+    world = plain_world(scene)
+    for effect in changes:
+        start_s = cpu_s()
+        world = scene.effects[effect.name].change(world, rng_of(effect, scene.geometry.seed, 0))
+        yield effect, 1e3 * (cpu_s() - start_s)
+
+
+def _planned(scene: Scene, effect: Effect, cost_ms: float) -> PlannedEffect:
+    settings = scene.effects[effect.name]
+    return PlannedEffect(effect.name, effect.stage, effect.why, settings, cost_ms, effect.on_frames)
 
 
 def plain_frame(width_px: int, height_px: int, fov_deg: float) -> LinearFrame:

@@ -218,7 +218,10 @@ def test_a_lens_is_written_with_its_pictures(tmp_path: Path) -> None:
 
 def test_the_cost_is_said_before_it_starts(tmp_path: Path) -> None:
     said = build(tmp_path / "s", splits="drive", frames="0:3")
-    assert said.index("3 frames, 16 samples a pixel: about") < said.index("3 drive")
+    cost, *progress = said.splitlines()
+    assert cost.startswith("3 frames, 16 samples a pixel: about")
+    assert [line.split(",")[0] for line in progress[:3]] == [f"{n} of 3 frames" for n in (1, 2, 3)]
+    assert progress[2].endswith("0 s left")
 
 
 def test_the_scalar_variant_is_said_in_one_line(

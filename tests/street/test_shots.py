@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from rfcore.camera import Pose
 from rfcore.errors import InvalidInput
 from rfedge.carla_recorder.rig import RIG
+from rfedge.street import load_scene
 from rfedge.street.build.selection import Selection
 from rfedge.street.measured_pose import measured_pose
 from rfedge.street.scene_file import Drive, PoseNoise, Rig, Scene
@@ -170,3 +172,15 @@ def test_shots_keep_their_names_at_any_size() -> None:
     for one, other in itertools.islice(zip(small, large, strict=True), 5):
         assert one.name == other.name
         assert one.camera.world_from_cam == other.camera.world_from_cam
+
+
+def test_the_empty_streets_drive_has_sixteen_frames_at_two_hertz(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(Path(__file__).parents[2])
+    scene = load_scene("street-empty")
+    assert len(thinned_indices(scene, 2.0)) == 16
+    x = places(shots_of(scene, Split.DRIVE))[:, 0]
+    trained = places(shots_of(scene, Split.TRAIN))[:, 0]
+    assert trained.min() < x.min()
+    assert x.max() < trained.max()

@@ -12,7 +12,7 @@ from rfedge.street.render.backend import Backend
 from rfedge.street.render.renderer import Quality
 from rfedge.street.shots import Shot
 
-__all__ = ["cost_line"]
+__all__ = ["cost_line", "time_text"]
 
 START_S = 15.0
 """Making the world and compiling kernels, in each worker."""
@@ -35,12 +35,13 @@ def cost_line(
     used = min(cores, workers if not backend.vectorised else cores)
     room_mb = pixels * PIXEL_BYTES / 1e6
     return (
-        f"{len(shots)} frames, {quality.samples} samples a pixel: about {_time(core_s)} of one "
-        f"core, {_time(core_s / used)} on {used}, {room_mb:.0f} MB"
+        f"{len(shots)} frames, {quality.samples} samples a pixel: about {time_text(core_s)} of one "
+        f"core, {time_text(core_s / used)} on {used}, {room_mb:.0f} MB"
     )
 
 
-def _time(seconds: float) -> str:
+def time_text(seconds: float) -> str:
+    """Return a duration in the unit that fits it."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

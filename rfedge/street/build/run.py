@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import shlex
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from rfcore.errors import InvalidInput
 from rfedge.provenance import host, revision
@@ -18,12 +18,12 @@ from rfedge.street.build.cost import cost_line
 from rfedge.street.build.crew import take_all
 from rfedge.street.build.listing import list_dataset
 from rfedge.street.build.origin import claim_folder, origin_of
+from rfedge.street.build.progress import show_progress
 from rfedge.street.build.selection import Selection
 from rfedge.street.build.shot_files import ShotFiles
 from rfedge.street.build.studio import Order
 from rfedge.street.render.backend import chosen_backend
 from rfedge.street.render.renderer import Quality
-from rfedge.street.shots import Shot
 
 __all__ = ["Settings", "build_scene"]
 
@@ -63,17 +63,10 @@ def build_scene(selection: Selection, settings: Settings, console: Console) -> N
         console.print(f"{len(shots) - len(missing)} of {len(shots)} frames are there already")
     if missing:
         console.print(cost_line(missing, quality, backend, cores, settings.workers))
-        _take(order, missing, settings.workers, console)
+        taken = take_all(order, missing, min(settings.workers, len(missing)))
+        show_progress(taken, len(missing), console, time.monotonic)
     counts = list_dataset(order, _about(order))
     console.print(f"{settings.out}: " + ", ".join(f"{n} {split}" for split, n in counts.items()))
-
-
-def _take(order: Order, shots: list[Shot], workers: int, console: Console) -> None:
-    columns = (TextColumn("frames"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("frames", total=len(shots))
-        for _ in take_all(order, shots, min(workers, len(shots))):
-            bar.advance(task)
 
 
 def _about(order: Order) -> dict[str, Any]:
