@@ -120,7 +120,7 @@ class Agent:
             self._advance(now)
             if self._is_done(now):
                 break
-            job = self._session.job_to_start()
+            job = self._session.job_to_start(now)
             if job is not None:
                 encoding = asyncio.create_task(self._encode(job))
             self._write_wake.set()

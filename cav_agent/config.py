@@ -77,6 +77,9 @@ class AgentConfig:
     """H.264 quality, 1 (best) to 51; 23 is x264's default."""
     preset: str = "medium"
     """x264 preset, ultrafast to veryslow."""
+    max_delay_ms: float | None = None
+    """From capture to Ack, at most; quality falls to keep it, from --crf on, and pictures are
+    dropped when the lowest cannot. Without it every frame has --crf."""
     log: LogForm = LogForm.AUTO
     """console lines, json lines, or auto: console on a terminal."""
     report: Path | None = None
@@ -97,3 +100,5 @@ class AgentConfig:
             raise InvalidInput("crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}")
         if self.preset not in PRESETS:
             raise InvalidInput("preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
+        if self.max_delay_ms is not None and not 10 <= self.max_delay_ms <= 60_000:
+            raise InvalidInput("max_delay_ms", f"{self.max_delay_ms} ms is outside 10..60000 ms")

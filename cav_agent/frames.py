@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from cav_agent.rate_control import ByteBudget
 from rfcore.codec import DeltaPacket
 from rfcore.codec.ladder import FULL_RUNG, Rung
 from rfcore.views import PosedPicture
@@ -33,7 +34,8 @@ class EncodeJob:
     """Code ``capture`` in ``epoch``; a new epoch numbers its packets afresh.
 
     ``base`` is the frame it may be predicted from; ``None``: nothing but the render. ``exact``:
-    whether the server's renders are ours to the bit.
+    whether the server's renders are ours to the bit. ``budget``: the bytes it may take;
+    ``None``: the configured CRF.
     """
 
     capture: Capture
@@ -41,18 +43,20 @@ class EncodeJob:
     connection: int
     base: FrameAddress | None = None
     exact: bool = True
+    budget: ByteBudget | None = None
 
 
 @dataclass(frozen=True)
 class EncodedFrame:
     """A coded picture; ``stage_s`` has read, convert, render, references, encode and
     closed_loop; ``tries`` is how often it was coded, to fit the payload's limit; ``rung`` is the
-    setting it was coded with."""
+    setting it was coded with, ``crf`` its quality."""
 
     packet: DeltaPacket
     stage_s: Mapping[str, float]
     tries: int = 1
     rung: Rung = FULL_RUNG
+    crf: float | None = None
 
 
 class Outcome(StrEnum):
@@ -85,3 +89,5 @@ class FrameResult:
     link_s: float | None = None
     tries: int = 1
     rung: Rung | None = None
+    crf: float | None = None
+    budget: ByteBudget | None = None

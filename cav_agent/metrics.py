@@ -44,6 +44,16 @@ class AgentMetrics:
             "rfedge_agent_recoded_frames",
             "Frames coded again at a higher CRF because their P slice was above the limit.",
         )
+        self._crf = make.gauge("rfedge_agent_crf", "CRF of the last coded frame, 1 (best) to 51.")
+        self._target = make.gauge(
+            "rfedge_agent_target_bytes",
+            "Bytes the last frame's P slice was to take; 0 without --max-delay-ms.",
+        )
+        self._rate = make.gauge(
+            "rfedge_agent_proven_bytes_per_second",
+            "Throughput that the last answers prove, base delay counted as transmission; "
+            "0 without --max-delay-ms.",
+        )
         self._stages = make.seconds(
             "rfedge_agent_stage_seconds",
             "Time of a frame by stage; link is from sending to Ack without the server's own time.",
@@ -86,8 +96,16 @@ class AgentMetrics:
             self._sent.inc(result.packet_bytes)
         if result.tries > 1:
             self._recoded.inc()
+        self._chosen(result)
         for stage, spent_s in result.stage_s.items():
             self._stages.labels(stage).observe(spent_s)
         if result.server is not None and result.link_s is not None and result.latency_s is not None:
             self._stages.labels("link").observe(result.link_s)
             self._latency.observe(result.latency_s)
+
+    def _chosen(self, result: FrameResult) -> None:
+        if result.crf is not None:
+            self._crf.set(result.crf)
+        if result.budget is not None:
+            self._target.set(result.budget.target_bytes)
+            self._rate.set((result.budget.rate_bps or 0.0) / 8)

@@ -22,6 +22,8 @@ from rfcore.codec import (
     EncoderState,
     FrameChoice,
     Past,
+    RateModel,
+    RateTarget,
     StreamHeader,
 )
 from rfcore.codec.ladder import Rung
@@ -67,6 +69,7 @@ class Pipeline:
         self._rungs = rungs or FixedRung(Rung(preset=config.preset))
         self._encoder = DeltaEncoder(config, clock_ns)
         self._state: EncoderState | None = None
+        self._rate = RateModel()
         self._pasts: dict[tuple[int, int] | None, Past] = {}
 
     @property
@@ -101,16 +104,20 @@ class Pipeline:
             **{stage: ns / 1e9 for stage, ns in encoded.stage_ns.items()},
         }
         self._rungs.coded(stage_s, self._clock_ns() / 1e9)
-        return EncodedFrame(encoded.packet, stage_s, encoded.tries, rung)
+        return EncodedFrame(encoded.packet, stage_s, encoded.tries, rung, encoded.crf)
 
     def _choice(self, job: EncodeJob, rung: Rung) -> FrameChoice:
+        budget, limit_bytes = job.budget, self._limit_bytes
+        if budget is not None:
+            limit_bytes = min(limit_bytes, budget.limit_bytes)
         return FrameChoice(
             references=None if rung.references else RENDER_ONLY,
             photometric=None if rung.photometric else (),
             most=max(1, rung.references),
             coarse=not job.exact,
-            limit_bytes=self._limit_bytes,
+            limit_bytes=limit_bytes,
             preset=rung.preset,
+            target=None if budget is None else RateTarget(budget.target_bytes, self._rate),
         )
 
     def _state_for(self, job: EncodeJob) -> EncoderState:
@@ -123,6 +130,7 @@ class Pipeline:
 
     def _remember(self, encoded: Encoded) -> None:
         self._state = encoded.state
+        self._rate = encoded.rate or self._rate
         made = encoded.state.past
         if made is not None:
             self._pasts[encoded.packet.epoch, encoded.packet.sequence] = made

@@ -47,6 +47,8 @@ def report_line(result: FrameResult) -> dict[str, Any]:
         "payload_bytes": len(packet.payload) if packet else None,
         "tries": result.tries if packet else None,
         "rung": result.rung.name if result.rung else None,
+        "crf": result.crf,
+        "target_bytes": result.budget.target_bytes if result.budget else None,
         "packet_bytes": result.packet_bytes if packet else None,
         "reference_digest": packet.reference_digest.hex() if packet else None,
         "reconstruction_digest": packet.reconstruction_digest.hex() if packet else None,

@@ -20,6 +20,7 @@ from enum import StrEnum
 
 from cav_agent.config import AgentLimits
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
+from cav_agent.rate_control import ByteBudget, RateControl
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 from rfcore.wire.convert import client_message_to_bytes
@@ -58,9 +59,15 @@ class Pending:
 
 
 class AgentSession:
-    """One camera's stream to one server; ``hello`` names that camera first."""
+    """One camera's stream to one server; ``hello`` names that camera first. ``rate_control`` says
+    how many bytes each frame may take; without it all have the configured CRF."""
 
-    def __init__(self, hello: Hello, limits: AgentLimits | None = None) -> None:
+    def __init__(
+        self,
+        hello: Hello,
+        limits: AgentLimits | None = None,
+        rate_control: RateControl | None = None,
+    ) -> None:
         self.state = LinkState.DISCONNECTED
         self.session_id = ""
         self.exact: bool | None = None
@@ -69,6 +76,7 @@ class AgentSession:
         self._hello = hello
         self._camera_id = hello.cameras[0].camera_id
         self._limits = limits or AgentLimits()
+        self._rate_control = rate_control
         self._epoch = 0
         self._epoch_used = False
         self._connection = 0
@@ -170,26 +178,42 @@ class AgentSession:
     def offer(self, capture: Capture) -> None:
         """Take a picture; the oldest that waits is dropped when there is no room for it."""
         if len(self._slot) >= self._limits.slot_frames:
-            dropped = self._slot.popleft()
-            self._results.append(FrameResult(dropped, Outcome.DROPPED, "superseded"))
+            self._drop("superseded")
         self._slot.append(capture)
+        if self._rate_control is not None:
+            self._rate_control.captured(capture.captured_s)
 
     def stop(self) -> None:
         """Drop what waits for the encoder; what is being encoded or unanswered goes on."""
         while self._slot:
-            waiting = self._slot.popleft()
-            self._results.append(FrameResult(waiting, Outcome.DROPPED, "stopping"))
+            self._drop("stopping")
 
-    def job_to_start(self) -> EncodeJob | None:
-        """Return the picture to encode now, or None without picture, credit or free encoder."""
+    def _drop(self, reason: str) -> None:
+        self._results.append(FrameResult(self._slot.popleft(), Outcome.DROPPED, reason))
+
+    def job_to_start(self, now: float) -> EncodeJob | None:
+        """Return the picture to encode now; None without picture, credit, free encoder or room."""
         ready = self.state is LinkState.STREAMING and self._job is None
+        self._drop_late(now)
         if not ready or not self._slot or self._used >= self._granted:
             return None
+        budget: ByteBudget | None = None
+        if self._rate_control is not None:
+            budget = self._rate_control.budget(self._slot[0].captured_s, now)
+            if budget is None:
+                return None
         exact = bool(self.exact)
         base = self._sent if exact else None
-        self._job = EncodeJob(self._slot.popleft(), self._epoch, self._connection, base, exact)
+        self._job = EncodeJob(
+            self._slot.popleft(), self._epoch, self._connection, base, exact, budget
+        )
         self._epoch_used = True
         return self._job
+
+    def _drop_late(self, now: float) -> None:
+        control = self._rate_control
+        while control is not None and self._slot and control.is_late(self._slot[0].captured_s, now):
+            self._drop("too late")
 
     def encoded(self, encoded: EncodedFrame, now: float) -> None:
         """The picture of the running job became ``encoded``: send it, if its stream still is."""
@@ -203,7 +227,12 @@ class AgentSession:
             stage_s=encoded.stage_s,
             tries=encoded.tries,
             rung=encoded.rung,
+            crf=encoded.crf,
+            budget=job.budget,
         )
+        if self._rate_control is not None:
+            payload_bytes = len(encoded.packet.payload)
+            self._rate_control.coded(encoded.stage_s, payload_bytes, result.packet_bytes)
         self._pending[frame.address] = Pending(result, now, job.base)
         if len(encoded.packet.payload) > MAX_PAYLOAD_BYTES:
             problem = (
@@ -249,6 +278,12 @@ class AgentSession:
         reading_s = result.stage_s.get("read", 0.0)
         latency_s = now - result.capture.captured_s - reading_s
         self._results.append(replace(result, outcome=outcome, reason=reason, latency_s=latency_s))
+        if self._rate_control is None:
+            return
+        if outcome in (Outcome.ACKED, Outcome.NACKED):
+            self._rate_control.answered(address, latency_s, now)
+        else:
+            self._rate_control.lost(address)
 
     # --- what goes out, and time
 
@@ -260,6 +295,9 @@ class AgentSession:
             if isinstance(message, Frame):
                 sent = replace(self._pending[message.address], sent_s=now)
                 self._pending[message.address] = sent
+                if self._rate_control is not None:
+                    size_bytes = sent.result.packet_bytes
+                    self._rate_control.sent(message.address, size_bytes, now)
         return messages
 
     def take_results(self) -> list[FrameResult]:

@@ -20,6 +20,7 @@ from cav_agent.frames import FrameResult, Outcome
 from cav_agent.metrics import AgentMetrics
 from cav_agent.pace import Lockstep, Pace, Realtime
 from cav_agent.pipeline import Pipeline
+from cav_agent.rate_control import QualitySteps, RateControl
 from cav_agent.reach import ServerEnd
 from cav_agent.report import Report
 from cav_agent.session import AgentSession
@@ -137,9 +138,12 @@ class Vehicle:
         config = self._config
         report = Report(config.report) if config.report is not None else None
 
+        steps = QualitySteps()
+
         def ended(result: FrameResult) -> None:
             self._metrics.ended(result)
             _log_failure(session.session_id, result)
+            _log_quality(session.session_id, result, steps)
             if report is not None:
                 report.ended(result)
 
@@ -153,7 +157,7 @@ class Vehicle:
             ended,
             self._metrics.connected,
         )
-        session = AgentSession(journey.hello, config.limits)
+        session = AgentSession(journey.hello, config.limits, _rate_control(config))
         agent = Agent(channel, session, equipment, config.limits)
         stopping = asyncio.create_task(self._pass_on_stop(agent))
         try:
@@ -181,7 +185,7 @@ def _log_failure(session_id: str, result: FrameResult) -> None:
     before it was encoded is only counted."""
     if result.packet is None:
         return
-    if result.tries > 1:
+    if result.tries > 1 and result.budget is None:
         log.warning(
             "slice above the limit coded again",
             session=session_id,
@@ -198,6 +202,28 @@ def _log_failure(session_id: str, result: FrameResult) -> None:
         seq=result.packet.sequence,
         reason=result.reason,
     )
+
+
+def _log_quality(session_id: str, result: FrameResult, steps: QualitySteps) -> None:
+    """Say when the link made quality fall, or let it rise, by much."""
+    if result.budget is None or result.crf is None:
+        return
+    step = steps.step(result.crf)
+    if step is not None:
+        before, after = step
+        rate_bps = result.budget.rate_bps
+        log.info(
+            "quality falls" if after > before else "quality rises",
+            session=session_id,
+            crf=round(after, 1),
+            crf_before=round(before, 1),
+            target_bytes=round(result.budget.target_bytes),
+            proven_mbps=None if rate_bps is None else round(rate_bps / 1e6, 3),
+        )
+
+
+def _rate_control(config: AgentConfig) -> RateControl | None:
+    return None if config.max_delay_ms is None else RateControl(config.max_delay_ms / 1e3)
 
 
 def _pace(config: AgentConfig, pictures: int) -> Pace:

@@ -5,8 +5,10 @@ from rfcore.codec.decoder import Decoded, DeltaDecoder
 from rfcore.codec.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.header import StreamHeader
 from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
+from rfcore.codec.rate import RateModel, RateTarget
 from rfcore.codec.references import INTRA, RENDER_ONLY, Reference, References, references_name
 from rfcore.codec.state import KEPT_FRAMES, DecoderState, EncoderState, Past
+from rfcore.codec.throughput import PathEstimator
 
 __all__ = [
     "INTRA",
@@ -23,6 +25,9 @@ __all__ = [
     "EncoderState",
     "FrameChoice",
     "Past",
+    "PathEstimator",
+    "RateModel",
+    "RateTarget",
     "Reference",
     "References",
     "StreamHeader",

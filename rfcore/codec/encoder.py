@@ -18,6 +18,7 @@ from rfcore.codec.header import StreamHeader
 from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
 from rfcore.codec.photometric import Photometric, adapt
 from rfcore.codec.prediction import Prediction
+from rfcore.codec.rate import RateModel, RateTarget, bits_curve
 from rfcore.codec.reference import without_zeros
 from rfcore.codec.references import References, check_references, is_temporal
 from rfcore.codec.slices import encode_slice
@@ -47,7 +48,8 @@ class FrameChoice:
     of the render, by which a receiver whose renderer is not exact tells rounding from a wrong pose.
     ``limit_bytes``: a longer slice is coded again at higher CRFs (``rfcore.codec.fit``); one that
     is too long even at the highest is returned all the same. ``preset`` replaces the configured
-    one; the parameter sets of a stream are those of any.
+    one; the parameter sets of a stream are those of any. ``target``: the bytes aimed at, by a CRF
+    that is predicted before coding and never below ``crf``.
     """
 
     references: References | None = None
@@ -58,6 +60,7 @@ class FrameChoice:
     coarse: bool = False
     limit_bytes: int | None = None
     preset: str | None = None
+    target: RateTarget | None = None
 
     def __post_init__(self) -> None:
         if self.preset is not None and self.preset not in PRESETS:
@@ -82,7 +85,8 @@ class Encoded:
     """A packet, what the receiver will see, and the sender's next state.
 
     ``stage_ns`` has "references" (warp, choice), "encode" (x264) and "closed_loop" (decoding as the
-    receiver does, digests). ``tries``: how often the frame was coded to fit a limit.
+    receiver does, digests). ``tries``: how often the frame was coded to fit a limit. ``crf``: the
+    one it was coded at in the end. ``rate``: what a target's model learnt from it.
     """
 
     packet: DeltaPacket
@@ -90,6 +94,8 @@ class Encoded:
     state: EncoderState
     stage_ns: Mapping[str, int]
     tries: int = 1
+    crf: float = 0.0
+    rate: RateModel | None = None
 
 
 class DeltaEncoder:
@@ -130,7 +136,7 @@ class DeltaEncoder:
         for name, picture in (("frame", frame), ("render", render)):
             _require_size(name, picture, self._config)
         started_ns = self._clock_ns()
-        crf = self._config.crf if choice.crf is None else choice.crf
+        crf = self._first_crf(choice)
         photometric = choice.photometric
         if photometric is None:
             photometric = choose_photometric(frame, render, crf)
@@ -140,7 +146,7 @@ class DeltaEncoder:
             references = choose_references(frame, prediction, crf, choice.most)
         pictures = prediction.pictures(references)
         chosen_ns = self._clock_ns()
-        made = self._fitted(pictures, frame, crf, choice)
+        made, rate = self._coded(pictures, frame, choice, references)
         encoded_ns = self._clock_ns()
         reconstruction = self._reconstruct(pictures, made.payload)
         past = state.past
@@ -163,7 +169,31 @@ class DeltaEncoder:
         }
         shown = Past(reconstruction, seen, prediction.render)
         following = EncoderState(state.epoch, state.next_sequence + 1, shown)
-        return Encoded(packet, reconstruction, following, stage_ns, made.tries)
+        return Encoded(packet, reconstruction, following, stage_ns, made.tries, made.crf, rate)
+
+    def _first_crf(self, choice: FrameChoice) -> float:
+        """Return the CRF that references are chosen for: with a target, about the one to come."""
+        lowest = self._config.crf if choice.crf is None else choice.crf
+        if choice.target is None or choice.target.model.crf is None:
+            return lowest
+        return max(lowest, choice.target.model.crf)
+
+    def _coded(
+        self,
+        pictures: tuple[I420, ...],
+        frame: I420,
+        choice: FrameChoice,
+        references: References,
+    ) -> tuple[FittedSlice, RateModel | None]:
+        """Return the slice at the CRF asked for, or at the one that a target calls for."""
+        lowest = self._config.crf if choice.crf is None else choice.crf
+        target = choice.target
+        if target is None or choice.pose_only:
+            return self._fitted(pictures, frame, lowest, choice), None
+        curve = bits_curve(frame, pictures, lowest)
+        crf = target.model.crf_for(target.size_bytes, curve, references)
+        made = self._fitted(pictures, frame, crf, choice)
+        return made, target.model.after(made.crf, curve, references, len(made.payload))
 
     def _fitted(
         self, pictures: tuple[I420, ...], frame: I420, crf: float, choice: FrameChoice

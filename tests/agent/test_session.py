@@ -27,7 +27,7 @@ Encode = Callable[..., EncodedFrame]
 def send(session: AgentSession, capture: Capture, encode: Encode, now: float = 1.0) -> Frame:
     """Offer, encode and send one picture; return the frame as the server would get it."""
     session.offer(capture)
-    job = session.job_to_start()
+    job = session.job_to_start(0.0)
     assert job is not None
     session.encoded(encode(job), now)
     (frame,) = session.messages_to_send(now)
@@ -79,15 +79,15 @@ def test_nothing_is_encoded_before_welcome_and_credit(
 ) -> None:
     session = AgentSession(hello)
     session.offer(make_capture(0))
-    assert session.job_to_start() is None
+    assert session.job_to_start(0.0) is None
     session.connected(0.0)
-    assert session.job_to_start() is None
+    assert session.job_to_start(0.0) is None
     session.receive(Welcome("s-1", exact=True), 0.0)
-    assert session.job_to_start() is None
+    assert session.job_to_start(0.0) is None
     session.receive(Credit("rear", 2), 0.0)
-    assert session.job_to_start() is None
+    assert session.job_to_start(0.0) is None
     session.receive(Credit("front", 2), 0.0)
-    assert session.job_to_start() is not None
+    assert session.job_to_start(0.0) is not None
 
 
 # --- pictures and credits
@@ -98,7 +98,7 @@ def test_the_newest_picture_wins_and_the_older_is_reported_dropped(
 ) -> None:
     for index in range(4):
         session.offer(make_capture(index))
-    job = session.job_to_start()
+    job = session.job_to_start(0.0)
     assert job is not None
     assert job.capture.index == 3
     assert outcomes(session.take_results()) == [(0, "dropped"), (1, "dropped"), (2, "dropped")]
@@ -110,10 +110,10 @@ def test_credit_bounds_what_is_sent_and_answers_free_it(
     first = send(session, make_capture(0), encode)
     send(session, make_capture(1), encode)
     session.offer(make_capture(2))
-    assert session.job_to_start() is None
+    assert session.job_to_start(0.0) is None
     session.receive(ack(first), 2.0)
     session.receive(Credit("front", 3), 2.0)
-    assert session.job_to_start() is not None
+    assert session.job_to_start(0.0) is not None
 
 
 def test_credit_never_falls(
@@ -126,9 +126,9 @@ def test_credit_never_falls(
 
 def test_one_picture_is_encoded_at_a_time(session: AgentSession, make_capture: MakeCapture) -> None:
     session.offer(make_capture(0))
-    assert session.job_to_start() is not None
+    assert session.job_to_start(0.0) is not None
     session.offer(make_capture(1))
-    assert session.job_to_start() is None
+    assert session.job_to_start(0.0) is None
 
 
 def test_a_frame_carries_the_pose_the_field_and_the_capture_time(
@@ -245,9 +245,9 @@ def test_a_lost_connection_loses_what_was_unanswered_and_the_next_starts_afresh(
     session.messages_to_send(3.0)
     session.receive(Welcome("s-2", exact=True), 3.0)
     session.offer(make_capture(1))
-    assert session.job_to_start() is None, "credit is granted anew"
+    assert session.job_to_start(0.0) is None, "credit is granted anew"
     session.receive(Credit("front", 2), 3.0)
-    job = session.job_to_start()
+    job = session.job_to_start(0.0)
     assert job is not None
     assert job.epoch == 1
 
@@ -265,7 +265,7 @@ def test_a_picture_encoded_for_a_lost_connection_is_lost(
     session: AgentSession, make_capture: MakeCapture, encode: Encode
 ) -> None:
     session.offer(make_capture(0))
-    job = session.job_to_start()
+    job = session.job_to_start(0.0)
     assert job is not None
     session.connection_lost("UNAVAILABLE", 1.0)
     session.connected(1.1)
@@ -291,7 +291,7 @@ def test_a_picture_that_cannot_be_coded_uses_no_credit(
 ) -> None:
     for index in range(3):
         session.offer(make_capture(index))
-        assert session.job_to_start() is not None
+        assert session.job_to_start(0.0) is not None
         session.encoding_failed(RfedgeError("not a readable picture"))
     assert outcomes(session.take_results()) == [(i, "dropped") for i in range(3)]
     assert send(session, make_capture(3), encode).packet.sequence == 0
@@ -301,7 +301,7 @@ def test_a_payload_no_server_would_take_is_dropped_here(
     session: AgentSession, make_capture: MakeCapture, encode: Encode
 ) -> None:
     session.offer(make_capture(0))
-    job = session.job_to_start()
+    job = session.job_to_start(0.0)
     assert isinstance(job, EncodeJob)
     session.encoded(encode(job, 1_000_001), 1.0)
     assert session.messages_to_send(1.0) == []

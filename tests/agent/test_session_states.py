@@ -25,7 +25,7 @@ class Sender:
 
     def start(self) -> EncodeJob:
         self.session.offer(self._make_capture(len(self.jobs)))
-        job = self.session.job_to_start()
+        job = self.session.job_to_start(0.0)
         assert job is not None
         self.jobs.append(job)
         return job

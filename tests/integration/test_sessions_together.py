@@ -66,7 +66,7 @@ class World:
         if self.agent.broken is not None:
             self.agent.connection_lost(self.agent.broken, self.now)
             self.connect()
-        while (job := self.agent.job_to_start()) is not None:
+        while (job := self.agent.job_to_start(0.0)) is not None:
             self.agent.encoded(self.encode(job), self.now)
             self.exchange()
         self.results += self.agent.take_results()

@@ -1,0 +1,110 @@
+"""What a path takes is learnt from answers: against a path whose truth is known."""
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rfcore.codec import PathEstimator
+from rfcore.errors import InvalidInput
+
+MS = 1_000_000
+
+
+def answered(path: PathEstimator, sizes: list[int], base_ms: float, ns_per_byte: float) -> int:
+    """Send packets one after the other, each after the answer to the last; return the time."""
+    now = 0
+    for key, size_bytes in enumerate(sizes):
+        path.sent(key, size_bytes, now)
+        now += round(base_ms * MS + ns_per_byte * size_bytes)
+        path.answered(key, now)
+        now += 10 * MS
+    return now
+
+
+@given(
+    sizes=st.lists(st.integers(200, 100_000), min_size=1, max_size=20),
+    base_ms=st.floats(0, 200),
+    ns_per_byte=st.floats(80, 80_000),
+    spare_ms=st.integers(1, 1000),
+)
+def test_what_it_says_has_room_has(
+    sizes: list[int], base_ms: float, ns_per_byte: float, spare_ms: int
+) -> None:
+    """On a steady path, wherever its delay is above that of the shortest packet."""
+    path = PathEstimator()
+    now = answered(path, sizes, base_ms, ns_per_byte)
+    spare_ns = spare_ms * MS
+    room = path.room_bytes(now, now + spare_ns, now)
+    shortest_ns = base_ms * MS + ns_per_byte * min(sizes)
+    if spare_ns >= base_ms * MS + ns_per_byte * max(sizes):
+        assert base_ms * MS + ns_per_byte * room <= spare_ns * (1 + 1e-6)
+    elif spare_ns < shortest_ns:
+        assert room <= min(sizes) * spare_ns / shortest_ns * (1 + 1e-6)
+
+
+@given(
+    sizes=st.lists(st.integers(200, 100_000), min_size=1, max_size=10),
+    waits_ms=st.lists(st.integers(1, 1000), min_size=2, max_size=5),
+)
+def test_later_is_never_less_room(sizes: list[int], waits_ms: list[int]) -> None:
+    path = PathEstimator()
+    now = answered(path, sizes, 20, 1000)
+    path.sent("flying", 5000, now)
+    rooms = [path.room_bytes(now, now + wait * MS, now) for wait in sorted(waits_ms)]
+    assert rooms == sorted(rooms)
+    assert not any(room != room for room in rooms), "NaN"
+
+
+def test_the_proven_rate_is_at_most_the_paths() -> None:
+    path = PathEstimator()
+    assert path.rate_bps is None
+    answered(path, [1000, 20_000, 4000], 20, 1000)
+    rate_bps = path.rate_bps
+    assert rate_bps is not None
+    assert rate_bps == pytest.approx(8 * 20_000 / 0.04)
+    assert rate_bps < 8e6
+
+
+def test_an_overdue_packet_leaves_no_room_before_its_answer() -> None:
+    path = PathEstimator()
+    now = answered(path, [4000] * 8, 20, 1000)
+    assert path.room_bytes(now, now + 100 * MS, now) > 4000
+    path.sent("late", 4000, now)
+    assert path.room_bytes(now + 10 * MS, now + 110 * MS, now + 10 * MS) > 4000
+    late = now + 300 * MS
+    assert path.room_bytes(late, late + 100 * MS, late) <= 0
+
+
+def test_what_waits_before_it_takes_from_the_room() -> None:
+    rooms = []
+    for flying in range(4):
+        path = PathEstimator()
+        now = answered(path, [1000, 8000, 2000, 8000], 20, 1000)
+        for key in range(flying):
+            path.sent(f"flying {key}", 20_000, now)
+        rooms.append(path.room_bytes(now, now + 200 * MS, now))
+    assert all(more > less for more, less in itertools.pairwise(rooms))
+
+
+def test_a_fallen_rate_is_believed_at_once() -> None:
+    path = PathEstimator()
+    now = answered(path, [8000] * 8, 20, 800)
+    assert path.sustained_bytes(100 * MS, now) > 8000
+    path.sent("slow", 8000, now)
+    now += round(20 * MS + 26_667 * 8000)
+    path.answered("slow", now)
+    assert path.sustained_bytes(100 * MS, now) < 1.2 * 100 * MS / 26_667
+
+
+def test_packets_without_answer_are_forgotten() -> None:
+    path = PathEstimator()
+    path.sent("a", 1000, 0)
+    assert path.flying_bytes == 1000
+    path.lost("a")
+    path.lost("unknown")
+    path.answered("unknown", 5)
+    assert path.flying_bytes == 0
+    with pytest.raises(InvalidInput, match=r"packet\.size_bytes: 0"):
+        path.sent("b", 0, 0)
