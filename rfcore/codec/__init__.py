@@ -5,6 +5,7 @@ from rfcore.codec.decoder import Decoded, DeltaDecoder
 from rfcore.codec.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.header import StreamHeader
 from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
+from rfcore.codec.qp_map import QpMap, qp_map_of_mask
 from rfcore.codec.rate import RateModel, RateTarget
 from rfcore.codec.references import INTRA, RENDER_ONLY, Reference, References, references_name
 from rfcore.codec.state import KEPT_FRAMES, DecoderState, EncoderState, Past
@@ -26,10 +27,12 @@ __all__ = [
     "FrameChoice",
     "Past",
     "PathEstimator",
+    "QpMap",
     "RateModel",
     "RateTarget",
     "Reference",
     "References",
     "StreamHeader",
+    "qp_map_of_mask",
     "references_name",
 ]

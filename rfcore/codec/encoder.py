@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 from rfcore.codec.choice import choose_photometric, choose_references
 from rfcore.codec.coarse import coarse_digest
@@ -18,6 +19,7 @@ from rfcore.codec.header import StreamHeader
 from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
 from rfcore.codec.photometric import Photometric, adapt
 from rfcore.codec.prediction import Prediction
+from rfcore.codec.qp_map import QpMap, check_qp_map
 from rfcore.codec.rate import RateModel, RateTarget, bits_curve
 from rfcore.codec.reference import without_zeros
 from rfcore.codec.references import References, check_references, is_temporal
@@ -49,7 +51,8 @@ class FrameChoice:
     ``limit_bytes``: a longer slice is coded again at higher CRFs (``rfcore.codec.fit``); one that
     is too long even at the highest is returned all the same. ``preset`` replaces the configured
     one; the parameter sets of a stream are those of any. ``target``: the bytes aimed at, by a CRF
-    that is predicted before coding and never below ``crf``.
+    that is predicted before coding and never below ``crf``. ``qp_map``: where the frame is coded
+    finer or coarser.
     """
 
     references: References | None = None
@@ -61,6 +64,7 @@ class FrameChoice:
     limit_bytes: int | None = None
     preset: str | None = None
     target: RateTarget | None = None
+    qp_map: QpMap | None = None
 
     def __post_init__(self) -> None:
         if self.preset is not None and self.preset not in PRESETS:
@@ -135,6 +139,8 @@ class DeltaEncoder:
         """
         for name, picture in (("frame", frame), ("render", render)):
             _require_size(name, picture, self._config)
+        if choice.qp_map is not None:
+            check_qp_map(choice.qp_map, self._config)
         started_ns = self._clock_ns()
         crf = self._first_crf(choice)
         photometric = choice.photometric
@@ -200,15 +206,16 @@ class DeltaEncoder:
     ) -> FittedSlice:
         if choice.pose_only:
             return FittedSlice(b"", crf, 1)
-        preset = choice.preset or self._config.preset
+        code = partial(self._slice, pictures, frame, choice)
         if choice.limit_bytes is None:
-            return FittedSlice(self._slice(pictures, frame, crf, preset), crf, 1)
-        return code_to_fit(
-            lambda higher: self._slice(pictures, frame, higher, preset), crf, choice.limit_bytes
-        )
+            return FittedSlice(code(crf), crf, 1)
+        return code_to_fit(code, crf, choice.limit_bytes)
 
-    def _slice(self, pictures: tuple[I420, ...], frame: I420, crf: float, preset: str) -> bytes:
-        coded = encode_slice(replace(self._config, preset=preset), pictures, frame, crf)
+    def _slice(
+        self, pictures: tuple[I420, ...], frame: I420, choice: FrameChoice, crf: float
+    ) -> bytes:
+        config = replace(self._config, preset=choice.preset or self._config.preset)
+        coded = encode_slice(config, pictures, frame, crf, choice.qp_map)
         if (coded.header.sps, coded.header.pps) != (self._header.sps, self._header.pps):
             raise CodecError("x264 changed its parameter sets within a stream")
         return coded.payload

@@ -19,19 +19,22 @@ own. What matters; figures are for a 640x360 street with unseen vehicles, medium
   the frame, most of which the references explain, and on noise that looks sharp. Without them 10 %
   fewer bits give the same PSNR, as they do in any stream; so whoever compares with x264 should say
   which of the two had them (``--tune psnr``).
+* A map of quantiser offsets needs adaptive quantisation on, or FFmpeg leaves it out; at a strength
+  of 1e-4 it moves no quantiser of its own (equal bytes without a map), and leaves the PPS alone.
 * Every block chooses its reference (``mixed-refs``), also where the preset would not let it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rfcore.codec.bitstream import split_nals
 from rfcore.codec.config import REFERENCE_FRAMES, CodecConfig
 from rfcore.codec.h264 import EncoderOptions, PictureKind, encode_pictures
 from rfcore.codec.header import StreamHeader
 from rfcore.codec.parameter_sets import NAL_IDR, NAL_P, NAL_PPS, NAL_SPS, nal_type
+from rfcore.codec.qp_map import QpMap
 from rfcore.codec.reference import without_zeros
 from rfcore.errors import CodecError
 from rfcore.image import I420
@@ -54,6 +57,8 @@ _SUBME = {
 _TRELLIS = 2
 """For every preset: 1 ms of 70 at veryfast, and 5 % fewer bits at equal PSNR."""
 
+_HEED_REGIONS = {"aq-mode": "1", "aq-strength": "0.0001"}
+
 _UNSENT_QP = 8
 """Between 2 and 10 P slices grow by 0.5 % and the time for three references falls by 12 %."""
 
@@ -67,18 +72,25 @@ class CodedSlice:
 
 
 def encode_slice(
-    config: CodecConfig, references: Sequence[I420], frame: I420, crf: float | None = None
+    config: CodecConfig,
+    references: Sequence[I420],
+    frame: I420,
+    crf: float | None = None,
+    qp_map: QpMap | None = None,
 ) -> CodedSlice:
     """Encode ``frame`` against ``references``, the last one reference 0; against none as an I
-    picture. ``crf`` replaces the configured one.
+    picture. ``crf`` replaces the configured one, ``qp_map`` is added to it.
 
     Raises ``CodecError`` if x264 makes anything but one slice of the frame. The caller checks
     sizes, and the header.
     """
     unsent = [without_zeros(picture) for picture in references]
     kinds = [PictureKind.I, *[PictureKind.P] * len(unsent)]
+    regions = () if qp_map is None else qp_map.regions()
     options = slice_options(config, len(unsent), crf)
-    units = encode_pictures(options, list(zip([*unsent, frame], kinds, strict=True)))
+    if regions:
+        options = replace(options, params={**options.params, **_HEED_REGIONS})
+    units = encode_pictures(options, list(zip([*unsent, frame], kinds, strict=True)), regions)
     first = {nal_type(nal): nal for nal in split_nals(units[0])}
     if not {NAL_SPS, NAL_PPS} <= first.keys():
         raise CodecError(f"x264 made NAL units {sorted(first)} without parameter sets")
