@@ -3,7 +3,8 @@
 They run in the order below. Those of the street change what is rendered (geometry, light,
 surfaces), those of the air and of the sensor change rendered frames, which are linear, so that
 another exposure or another noise needs no new render. A module holds one frozen dataclass, its
-settings; that of an effect on frames has ``apply(frame, rng) -> frame``.
+settings; that of an effect on the street has ``change(world, rng) -> world``, that of an effect on
+frames ``apply(frame, rng) -> frame``. Of several lights, the last in the order is the one seen.
 """
 
 from __future__ import annotations
@@ -45,6 +46,11 @@ class Effect:
 
 
 EFFECTS = (
+    Effect("parked", Stage.GEOMETRY, "ParkedVehicles", "vehicles stand in the parking bays"),
+    Effect("traffic", Stage.GEOMETRY, "Traffic", "vehicles drive on both lanes"),
+    Effect("dusk", Stage.LIGHT, "Dusk", "the sun is low"),
+    Effect("overcast", Stage.LIGHT, "Overcast", "clouds hide the sun"),
+    Effect("wet_road", Stage.SURFACE, "WetRoad", "water darkens the ground and mirrors"),
     Effect("haze", Stage.AIR, "Haze", "distant things lose contrast"),
     Effect("rain", Stage.AIR, "Rain", "falling drops streak over the picture"),
     Effect("lens", Stage.SENSOR, "LensDistortion", "straight lines bend"),
