@@ -14,7 +14,9 @@ from rfedge.street.geometry.building import buildings
 from rfedge.street.geometry.lamp import lamps, railings, wires
 from rfedge.street.geometry.layout import Layout
 from rfedge.street.geometry.road import road
+from rfedge.street.geometry.sign import signs
 from rfedge.street.geometry.sky import clear_sky
+from rfedge.street.geometry.tree import trees
 from rfedge.street.geometry.world import World
 from rfedge.street.scene_file import Scene
 
@@ -38,6 +40,10 @@ def plain_world(scene: Scene) -> World:
     parts = {"road": road, "buildings": buildings, "lamps": lamps, "railings": railings}
     if geometry.wires:
         parts["wires"] = wires
+    if geometry.trees:
+        parts["trees"] = trees
+    if geometry.signs:
+        parts["signs"] = signs
     world = World(layout, clear_sky(_rng(geometry.seed, "sky")))
     for name, part in parts.items():
         world = world.plus(part(layout, _rng(geometry.seed, name)))

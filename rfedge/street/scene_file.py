@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rfcore.errors import InvalidInput
-from rfedge.street.effects import EFFECTS, load_effect
+from rfedge.street.effects import EFFECTS, Stage, load_effect
 from rfedge.street.schema import OneOf, Range, TomlFile
 
 __all__ = ["Drive", "Evaluation", "Geometry", "PoseNoise", "Rig", "Scene", "Training", "load_scene"]
@@ -134,6 +134,9 @@ def load_scene(name_or_path: str) -> Scene:
     declared = file.table("effects")
     file.require_known("effects", declared, {effect.name for effect in EFFECTS})
     order = [effect for effect in EFFECTS if effect.name in declared]
+    lights = [effect.name for effect in order if effect.stage is Stage.LIGHT]
+    if len(lights) > 1:
+        raise file.error(f"effects.{lights[1]}", f"is a second light beside {lights[0]}")
     return Scene(
         name=file.content["name"],
         field=file.content["field"],

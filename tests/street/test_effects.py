@@ -27,6 +27,7 @@ from rfedge.street.scene_file import Scene
 
 ROOT = Path(__file__).parents[2]
 NAMES = tuple(effect.name for effect in EFFECTS)
+ON_FRAMES = tuple(effect for effect in EFFECTS if effect.on_frames)
 
 
 def rng() -> np.random.Generator:
@@ -45,7 +46,7 @@ def scene(**effects: Any) -> Scene:
     return Scene("x", "x", effects={e.name: effects[e.name] for e in EFFECTS if e.name in effects})
 
 
-@pytest.mark.parametrize("effect", EFFECTS, ids=NAMES)
+@pytest.mark.parametrize("effect", ON_FRAMES, ids=lambda effect: effect.name)
 def test_an_effect_keeps_the_form_of_a_frame(effect: Any, frame: LinearFrame) -> None:
     settings = load_effect(effect)()
     before = frame.colour.copy()

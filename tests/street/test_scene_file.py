@@ -60,7 +60,7 @@ def test_effects_run_in_the_registrys_order(tmp_path: Path) -> None:
         ),
         (START + "[drive]\nsize_px = [640, 9]\n", r"line 4: drive.size_px: is 9, outside 16"),
         (START + "[drive]\nthinned_hz = [7]\n", r"line 4: drive.thinned_hz: 7 does not divide"),
-        (START + "[effects.nose]\n", r"line 3: effects.nose: is none of exposure, haze"),
+        (START + "[effects.nose]\n", r"line 3: effects.nose: is none of dusk, exposure, haze"),
         (START + "[effects.noise]\nread_e = 'x'\n", r"line 4: effects.noise.read_e: is 'x', not a"),
         (START + "[effects]\nnoise = 3\n", r"line 4: effects.noise: is not a table"),
         (START + "[drive\n", r"s\.toml: .*line 3"),
@@ -76,5 +76,5 @@ def test_a_mistake_names_its_line_and_key(tmp_path: Path, text: str, said: str) 
 
 def test_a_name_that_is_no_scene_lists_those_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    with pytest.raises(InvalidInput, match=r"'street-moon'.*street-empty, street-sensor"):
+    with pytest.raises(InvalidInput, match=r"'street-moon'.*street-dusk, street-empty"):
         load_scene("street-moon")

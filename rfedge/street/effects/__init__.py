@@ -4,7 +4,7 @@ They run in the order below. Those of the street change what is rendered (geomet
 surfaces), those of the air and of the sensor change rendered frames, which are linear, so that
 another exposure or another noise needs no new render. A module holds one frozen dataclass, its
 settings; that of an effect on the street has ``change(world, rng) -> world``, that of an effect on
-frames ``apply(frame, rng) -> frame``. Of several lights, the last in the order is the one seen.
+frames ``apply(frame, rng) -> frame``. A scene has one light.
 """
 
 from __future__ import annotations

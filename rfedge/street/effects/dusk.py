@@ -13,7 +13,7 @@ from rfedge.street.schema import Range
 
 __all__ = ["Dusk"]
 
-DUSK_WHITE = 0.55
+DUSK_WHITE = 0.9
 
 
 @dataclass(frozen=True)

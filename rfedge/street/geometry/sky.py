@@ -31,7 +31,7 @@ __all__ = ["HEIGHT", "NOON", "Daylight", "clear_sky", "overcast_sky", "sunny_sky
 
 HEIGHT = 640
 """Rows of a sky picture: 0.28 degrees each."""
-OVERCAST_WHITE = 0.7
+OVERCAST_WHITE = 1.0
 OVERCAST_TINT = np.array([0.97, 1.0, 1.05])
 
 
@@ -47,7 +47,7 @@ class Daylight:
     elevation_deg: float
     turbidity: float
     cover: float
-    white: float = 1.1
+    white: float = 1.6
 
     def __post_init__(self) -> None:
         if not 1.0 <= self.elevation_deg <= 90.0:

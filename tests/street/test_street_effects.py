@@ -1,0 +1,232 @@
+"""Effects that change the street: vehicles where they belong, light, water; nothing undeclared."""
+
+import hashlib
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfcore.errors import InvalidInput
+from rfedge.street import load_scene
+from rfedge.street.effects import EFFECTS, Stage, load_effect
+from rfedge.street.effects.dusk import Dusk
+from rfedge.street.effects.overcast import Overcast
+from rfedge.street.effects.parked import ParkedVehicles
+from rfedge.street.effects.traffic import Traffic
+from rfedge.street.effects.wet_road import WetRoad
+from rfedge.street.geometry.layout import Layout
+from rfedge.street.geometry.mesh import Label, Mesh, placed
+from rfedge.street.geometry.road import road
+from rfedge.street.geometry.world import Sky, World
+from rfedge.street.scene_file import Geometry
+from rfedge.street.shots import Split, shots_of
+
+ROOT = Path(__file__).parents[2]
+ON_STREET = tuple(effect for effect in EFFECTS if not effect.on_frames)
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
+@pytest.fixture(scope="module")
+def street() -> World:
+    """60 m of road without anything on it, under a plain sky."""
+    layout = Layout(Geometry(length_m=60.0))
+    sky = Sky(np.full((16, 32, 3), 0.5, np.float32))
+    return World(layout, sky).plus(road(layout, rng()))
+
+
+def digest(world: World) -> str:
+    found = hashlib.sha256(world.sky.radiance.tobytes())
+    moving = [
+        placed(m, mover.world_from_mover(0.7)) for mover in world.movers for m in mover.meshes
+    ]
+    for mesh in (*world.meshes, *moving):
+        found.update(mesh.material.encode() + mesh.vertices.tobytes())
+    for name, material in sorted(world.materials.items()):
+        found.update(name.encode() + np.asarray(material.colour).tobytes())
+        found.update(np.asarray(material.roughness).tobytes())
+    return found.hexdigest()
+
+
+@pytest.mark.parametrize("effect", ON_STREET, ids=lambda effect: effect.name)
+def test_an_effect_follows_from_its_seed_and_leaves_the_street_as_it_was(
+    effect: object, street: World
+) -> None:
+    settings = load_effect(effect)()  # type: ignore[arg-type]
+    before = digest(street)
+    one, other = (digest(settings.change(street, rng())) for _ in range(2))
+    assert one == other != before
+    assert digest(street) == before
+
+
+def test_parked_vehicles_stand_in_their_bays(street: World) -> None:
+    parked = added(ParkedVehicles(occupied=1.0).change(street, rng()), street)
+    points = np.concatenate([mesh.vertices for mesh in parked])
+    assert np.abs(points[:, 1]).min() > 3.9, "the lanes are free"
+    assert np.abs(points[:, 1]).max() < 6.9
+    assert abs(points[:, 2].min()) < 1e-3
+    painted = [mesh for mesh in parked if mesh.material.startswith("paint")]
+    assert len(painted) == len(street.layout.bays)
+
+
+def test_the_share_of_occupied_bays_is_the_declared_one(street: World) -> None:
+    counts = [
+        len([m for m in added(ParkedVehicles(share).change(street, rng()), street) if is_paint(m)])
+        for share in (0.0, 0.5, 1.0)
+    ]
+    assert counts[0] == 0
+    assert counts[0] < counts[1] < counts[2]
+
+
+def test_traffic_keeps_right_and_its_speed(street: World) -> None:
+    busy = Traffic(along_m=(-20.0,), oncoming_m=(10.0,), speed_mps=8.0).change(street, rng())
+    assert busy.meshes == street.meshes
+    along, oncoming = busy.movers
+    for mover, direction, start in ((along, 1, -20.0), (oncoming, -1, 10.0)):
+        for time_s in (0.0, 1.5):
+            pose = mover.world_from_mover(time_s)
+            assert pose[0, 3] == pytest.approx(start + direction * 8.0 * time_s)
+            assert pose[1, 3] == pytest.approx(-2.1 * direction)
+            assert pose[0, 0] == pytest.approx(direction), "it looks where it drives"
+
+
+def test_traffic_comes_again(street: World) -> None:
+    mover = Traffic(along_m=(0.0,), oncoming_m=()).change(street, rng()).movers[0]
+    reach_m = street.layout.end_m + 40.0
+    lap_s = 2 * reach_m / 9.0
+    np.testing.assert_allclose(mover.world_from_mover(lap_s), mover.world_from_mover(0), atol=1e-9)
+    places = [mover.world_from_mover(t)[0, 3] for t in np.linspace(0, 2 * lap_s, 50)]
+    assert np.abs(places).max() <= reach_m
+
+
+@pytest.mark.parametrize("split", [Split.DRIVE, Split.EVAL])
+def test_no_camera_of_the_ready_made_traffic_is_inside_a_vehicle(
+    split: Split, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    scene = load_scene("street-traffic")
+    empty = World(Layout(scene.geometry), Sky(np.full((16, 32, 3), 0.5, np.float32)))
+    movers = scene.effects["traffic"].change(empty, rng()).movers
+    for shot in shots_of(scene, split)[::6]:
+        eye = np.append(np.array(shot.camera.world_from_cam.translation_m), 1.0)
+        for mover in movers:
+            x, y, _, _ = np.linalg.inv(mover.world_from_mover(shot.time_s)) @ eye
+            assert abs(x) > 4.0 or abs(y) > 1.6
+
+
+def test_dusk_and_overcast_change_only_the_light(street: World) -> None:
+    for effect in (Dusk(cover=0.0), Overcast()):
+        changed = effect.change(street, rng())
+        assert changed.meshes is street.meshes
+        assert changed.materials is street.materials
+        assert changed.sky is not street.sky
+    assert Dusk(elevation_deg=7.0, cover=0.0).change(street, rng()).sky.sun_towards[
+        2
+    ] == pytest.approx(np.sin(np.radians(7.0)))
+
+
+def test_water_darkens_the_ground_to_half_and_makes_it_smooth(street: World) -> None:
+    """A texture is darkened on its sRGB curve, of which 1 / 2.2 is close: within 5 %."""
+    wet = WetRoad(water=0.6).change(street, rng())
+    dry_kerb, wet_kerb = street.materials["kerb"].colour, wet.materials["kerb"].colour
+    np.testing.assert_allclose(np.array(wet_kerb), 0.5 * np.array(dry_kerb))
+    for name in ("asphalt", "slabs"):
+        dry, after = linear(street.materials[name].colour), linear(wet.materials[name].colour)
+        assert after.mean() / dry.mean() == pytest.approx(0.5, rel=0.08)
+    rough = np.asarray(wet.materials["asphalt"].roughness)
+    assert rough.min() < 0.08
+    assert rough.max() > 0.4
+
+
+def test_more_water_makes_more_puddles(street: World) -> None:
+    shares = [
+        (np.asarray(WetRoad(w).change(street, rng()).materials["asphalt"].roughness) < 0.15).mean()
+        for w in (0.0, 0.5, 1.0)
+    ]
+    assert shares[0] < shares[1] < shares[2]
+
+
+def test_a_scene_has_one_light(tmp_path: Path) -> None:
+    text = 'name = "x"\nfield = "x"\n[effects.dusk]\n[effects.overcast]\n'
+    (tmp_path / "s.toml").write_text(text)
+    with pytest.raises(InvalidInput, match=r"line 4: effects.overcast: is a second light beside"):
+        load_scene(str(tmp_path / "s.toml"))
+
+
+def test_the_stages_follow_one_another() -> None:
+    stages = [list(Stage).index(effect.stage) for effect in EFFECTS]
+    assert stages == sorted(stages)
+
+
+BUILD = """
+import hashlib, sys
+from pathlib import Path
+from rfedge.street import load_scene
+from rfedge.street.build.studio import Order, Studio
+from rfedge.street.render.backend import chosen_backend
+from rfedge.street.render.renderer import Quality
+from rfedge.street.shots import Split, shots_of
+scene = load_scene(sys.argv[1])
+studio = Studio(Order(scene, Path(sys.argv[2]), Quality(1), chosen_backend(), 2))
+studio.take(shots_of(scene, Split.DRIVE, (64, 36))[0])
+files = sorted(path for path in Path(sys.argv[2]).rglob("*") if path.is_file())
+print(*(hashlib.sha256(path.read_bytes()).hexdigest() for path in files))
+print(*sorted(n for n in sys.modules if n.startswith("rfedge.street.effects.")))
+"""
+SMALL = 'name = "x"\nfield = "x"\n[geometry]\nlength_m = 40\ntrees = false\n'
+HALVES = (
+    ("parked", "overcast", "haze", "lens", "exposure"),
+    ("traffic", "dusk", "wet_road", "rain", "rolling_shutter", "noise"),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("declared", HALVES, ids="-".join)
+def test_a_build_neither_imports_nor_needs_what_is_not_declared(
+    tmp_path: Path, declared: tuple[str, ...]
+) -> None:
+    """Each effect is undeclared in one half; there its file is deleted, and no byte changes."""
+    assert sorted(HALVES[0] + HALVES[1]) == sorted(effect.name for effect in EFFECTS)
+    text = SMALL + "".join(f"[effects.{name}]\n" for name in declared)
+    (tmp_path / "s.toml").write_text(text)
+    whole = built(ROOT, tmp_path / "s.toml", tmp_path / "whole")
+    for package in ("rfedge", "rfcore"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("csrc"))
+    for effect in EFFECTS:
+        if effect.name not in declared:
+            (tmp_path / "rfedge" / "street" / "effects" / f"{effect.name}.py").unlink()
+    assert built(tmp_path, tmp_path / "s.toml", tmp_path / "cut") == whole
+    assert whole[1].split() == sorted(f"rfedge.street.effects.{name}" for name in declared)
+
+
+def built(root: Path, scene_file: Path, out: Path) -> list[str]:
+    """Return the digests of a picture's files, and the effects that were imported."""
+    done = subprocess.run(
+        [sys.executable, "-c", BUILD, str(scene_file), str(out)],
+        capture_output=True,
+        text=True,
+        cwd=root,
+        env={"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin"},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def added(changed: World, before: World) -> list[Mesh]:
+    meshes = list(changed.meshes[len(before.meshes) :])
+    assert {mesh.label for mesh in meshes} <= {Label.VEHICLE}
+    return meshes
+
+
+def is_paint(mesh: Mesh) -> bool:
+    return mesh.material.startswith("paint")
+
+
+def linear(colour: object) -> np.ndarray:
+    return (np.asarray(colour, float) / 255) ** 2.2
