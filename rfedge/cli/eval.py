@@ -9,6 +9,7 @@ from tyro.conf import subcommand
 
 from rfedge.cli.eval_compare import EvalCompare
 from rfedge.cli.eval_ladder import EvalLadder
+from rfedge.cli.eval_never_worse import EvalNeverWorse
 from rfedge.cli.eval_paper import EvalPaper
 from rfedge.cli.eval_stability import EvalStability
 
@@ -22,6 +23,7 @@ class Eval:
     verb: (
         Annotated[EvalCompare, subcommand("compare")]
         | Annotated[EvalLadder, subcommand("ladder")]
+        | Annotated[EvalNeverWorse, subcommand("never-worse")]
         | Annotated[EvalPaper, subcommand("paper")]
         | Annotated[EvalStability, subcommand("stability")]
     )

@@ -38,11 +38,11 @@ def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
     )
     return {
         **anchors,
-        "x264-stronger": [x264_for_psnr(p) for p in ("medium", "slower", "veryslow")],
+        "x264-stronger": [x264_for_psnr(p) for p in ("medium", "veryslow")],
         **{f"x264-keyint-{n}": [_with_key_frames(preset, n)] for n in KEYINTS},
         "x264-intra-refresh": [refresh],
         "x265-lowdelay": [
-            *(x265_lowdelay(p) for p in ("veryfast", "medium")),
+            x265_lowdelay("veryfast"),
             *(x265_for_psnr(p) for p in ("veryfast", "medium")),
         ],
         "svtav1-lowdelay": [svtav1_lowdelay(p) for p in (10, 8, 6, 4)],

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.metrics import ssim
 from rfedge.evaluate.clip import CodedClip, luma_mse, luma_sse
 from rfedge.evaluate.compare import STEADY, Contest
+from rfedge.evaluate.luma_ssim import luma_ssim
 from rfedge.evaluate.rate_curve import RateCurve, bd_rate_percent
 from rfedge.evaluate.rivals import Rival, x264_for_psnr
 
@@ -106,7 +106,7 @@ class ForegroundCoder:
             point,
             np.array(made.frame_bytes, np.int64) + np.array(mask_bytes, np.int64),
             np.array([luma_mse(*pair) for pair in pairs]),
-            np.array([ssim(ours.y, theirs.y) for ours, theirs in pairs]),
+            np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
             made.cpu_ms,
             {
                 "foreground_sse": tuple(

@@ -21,12 +21,12 @@ from rfcore.codec.references import References, is_temporal, references_name
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.field import RadianceField
 from rfcore.image import I420
-from rfcore.metrics import ssim
 from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Frame
 from rfedge.evaluate.clip import CodedClip, luma_mse, luma_sse
+from rfedge.evaluate.luma_ssim import luma_ssim
 
 __all__ = ["FieldCoder", "SeenClip", "see_clip"]
 
@@ -121,7 +121,7 @@ class FieldCoder:
             point,
             np.array([self._message_bytes(k, made) for k, made in enumerate(coded)]),
             np.array([luma_mse(*pair) for pair in pairs]),
-            np.array([ssim(ours.y, theirs.y) for ours, theirs in pairs]),
+            np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
             cpu_ms,
             notes,
         )

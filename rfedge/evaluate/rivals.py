@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
-from rfcore.metrics import ssim
 from rfedge.evaluate.clip import CodedClip, luma_mse
+from rfedge.evaluate.luma_ssim import luma_ssim
 
 __all__ = [
     "CodedPictures",
@@ -82,7 +82,7 @@ class Rival:
             point,
             np.array(made.frame_bytes),
             np.array([luma_mse(*pair) for pair in pairs]),
-            np.array([ssim(ours.y, theirs.y) for ours, theirs in pairs]),
+            np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
             made.cpu_ms,
         )
 
