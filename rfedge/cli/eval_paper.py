@@ -28,6 +28,8 @@ class EvalPaper:
     """Folder of the figures (SVG, and CSV with their numbers)."""
     cells: Path = Path("out/eval/paper")
     """Folder of finished pieces."""
+    every: int = 1
+    """Take each so many-th frame of a drive; neighbours at 10 Hz show almost the same."""
     quick: bool = False
     """Two frames of each drive: to see that it works, not for figures."""
 
@@ -35,14 +37,24 @@ class EvalPaper:
         """Run what is not there yet, write rows and figures, print the means."""
         from rich.console import Console
 
-        from rfedge.evaluate.paper_run import PaperJob, run_paper
+        from rfedge.evaluate.paper_run import PaperJob, run_paper, views_of
         from rfedge.report.paper import paper_table, write_paper_figures
+        from rfedge.report.paper_views import write_views
         from rfedge.sizes import parse_size
 
         sizes_px = [parse_size(size) for size in self.sizes]
-        job = PaperJob(self.fields, self.drives, sizes_px, self.out, self.cells, self.quick)
+        job = PaperJob(
+            fields=self.fields,
+            drives=self.drives,
+            sizes_px=sizes_px,
+            out=self.out,
+            cells=self.cells,
+            every=self.every,
+            quick=self.quick,
+        )
         console = Console()
         result = run_paper(job, console)
         console.print(paper_table(result["rows"]))
-        for path in write_paper_figures(result["rows"], self.figures):
+        written = write_paper_figures(result["rows"], self.figures)
+        for path in [*written, *write_views(views_of(job), self.figures)]:
             console.print(f"  {path}")

@@ -38,7 +38,7 @@ def luma_ssim(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
 
 
 def _windowed(plane: F32) -> F32:
-    filtered: F32 = cv2.sepFilter2D(
-        plane, cv2.CV_32F, WEIGHTS, WEIGHTS, borderType=cv2.BORDER_REFLECT_101
+    border = cv2.BORDER_REFLECT_101
+    return np.asarray(
+        cv2.sepFilter2D(plane, cv2.CV_32F, WEIGHTS, WEIGHTS, borderType=border), np.float32
     )
-    return filtered

@@ -38,9 +38,10 @@ from rfedge.evaluate.published import (
     published_rows,
     reduced,
 )
+from rfedge.evaluate.render_quality import BANDS, flip
 from rfedge.provenance import host, revision
 
-__all__ = ["CONTROLS", "PaperJob", "named_path", "run_paper"]
+__all__ = ["CONTROLS", "PaperJob", "named_path", "run_paper", "views_of"]
 
 CONTROLS = ("grey", "behind")
 CONTROL_PRESET, CONTROL_CRF = "medium", 23.0
@@ -58,6 +59,7 @@ class PaperJob:
     sizes_px: Sequence[Size]
     out: Path
     cells: Path
+    every: int = 1
     quick: bool = False
 
     def __post_init__(self) -> None:
@@ -65,6 +67,8 @@ class PaperJob:
             raise InvalidInput("out", f"{self.out} must end in .json")
         if not (self.fields and self.drives and self.sizes_px):
             raise InvalidInput("paper", "needs at least one field, one drive and one size")
+        if self.every < 1:
+            raise InvalidInput("every", f"{self.every} must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,8 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
         "revision": stamp,
         "quick": job.quick,
         "field_ids": {name: field.field_id for name, field in fields},
+        "lpips": "n/a: no weights",
+        "bands_cycles_per_px": [list(band) for band in BANDS],
         "rows": rows,
     }
     job.out.parent.mkdir(parents=True, exist_ok=True)
@@ -111,9 +117,21 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
     return result
 
 
+def views_of(job: PaperJob) -> list[tuple[str, Rgb]]:
+    """Return the first frame of each drive as the camera has it and as each field renders it."""
+    views = []
+    for scene, path in map(named_path, job.drives):
+        picture = read_dataset(path).pictures[0]
+        views.append((f"{scene}: camera", picture.read()))
+        for name, field_path in map(named_path, job.fields):
+            views.append((f"{scene}: {name}", _render(load_field(field_path), picture.camera)))
+    return views
+
+
 def _pieces(job: PaperJob, fields: Sequence[tuple[str, RadianceField]]) -> Iterator[Piece]:
     for scene, path in map(named_path, job.drives):
-        pictures = read_dataset(path).pictures[: QUICK_FRAMES if job.quick else None]
+        pictures = read_dataset(path).pictures[:: job.every]
+        pictures = pictures[: QUICK_FRAMES if job.quick else None]
         for name, field in fields:
             for picture in pictures:
                 for size_px in job.sizes_px:
@@ -146,7 +164,11 @@ def _rows(piece: Piece) -> Iterator[dict[str, Any]]:
         for preset in PUBLISHED_PRESETS
         for crf in PUBLISHED_CRFS
     ]
-    yield from _labelled(piece, piece.field_name, _seen(piece, piece.picture.camera), settings)
+    seen = _seen(piece, piece.picture.camera)
+    size_px = piece.size_px
+    difference = flip(seen.render(size_px, "downscaled"), reduced(seen.camera, size_px))
+    for row in _labelled(piece, piece.field_name, seen, settings):
+        yield row if row["render"] == "native" else {**row, "rf_flip": difference}
     control = [Setting(piece.size_px, "downscaled", CONTROL_PRESET, CONTROL_CRF)]
     camera = piece.picture.camera
     behind = Camera(camera.intrinsics, camera.world_from_cam.compose(TURNED_ROUND))

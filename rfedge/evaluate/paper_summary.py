@@ -20,7 +20,8 @@ class PaperMean:
 
     The savings of a frame are its mean over presets and rate factors; ``sd`` and ``ci95`` are over
     frames, the interval that of a normal mean. A P picture that x264 made an I picture counts as it
-    is; ``second_not_p`` is the share of such clips.
+    is; ``second_not_p`` is the share of such clips. FLIP is taken of neither controls nor native
+    renders.
     """
 
     field: str
@@ -33,6 +34,8 @@ class PaperMean:
     ci95_percent: float
     rf_psnr_db: float
     rf_ssim: float
+    rf_flip: float | None
+    bands: tuple[float, ...]
     second_not_p: float
 
 
@@ -76,6 +79,8 @@ def _mean(key: tuple[Any, ...], group: Sequence[Row]) -> PaperMean:
         ci95_percent=1.96 * sd / len(savings) ** 0.5,
         rf_psnr_db=float(np.mean(_per_frame(group, "rf_psnr_db"))),
         rf_ssim=float(np.mean(_per_frame(group, "rf_ssim"))),
+        rf_flip=float(np.mean(_per_frame(group, "rf_flip"))) if "rf_flip" in group[0] else None,
+        bands=tuple(np.mean([row["rf_residual_bands"] for row in group], axis=0).tolist()),
         second_not_p=float(np.mean([row["second_type"] != "P" for row in group])),
     )
 

@@ -23,8 +23,9 @@ from rfcore.codec.h264 import decode_clip
 from rfcore.codec.paper import intra_alone, published_clip, savings_of_clip, slice_nals
 from rfcore.errors import InvalidInput
 from rfcore.image import I420, Rgb
-from rfcore.metrics import psnr, ssim
+from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
+from rfedge.evaluate.render_quality import RenderQuality, colour_ssim, render_quality
 
 __all__ = [
     "PUBLISHED_CRFS",
@@ -62,9 +63,16 @@ class Setting:
 
 def published_rows(frame: PublishedFrame, settings: Sequence[Setting]) -> Iterator[dict[str, Any]]:
     """Yield a row per setting. Raises ``InvalidInput`` for a size larger than the frame."""
+    seen: dict[tuple[Size, Making], _Seen] = {}
+    alone: dict[tuple[Size, str, float], tuple[int, float]] = {}
     for setting in settings:
-        camera = reduced(frame.camera, setting.size_px)
-        render = frame.render(setting.size_px, setting.making)
+        look = (setting.size_px, setting.making)
+        if look not in seen:
+            seen[look] = _seen(frame, *look)
+        camera, render, quality = seen[look]
+        coding = (setting.size_px, setting.preset, setting.crf)
+        if coding not in alone:
+            alone[coding] = _alone(camera, setting)
         yield {
             "width": setting.size_px[0],
             "height": setting.size_px[1],
@@ -73,9 +81,27 @@ def published_rows(frame: PublishedFrame, settings: Sequence[Setting]) -> Iterat
             "crf": setting.crf,
             "frame": frame.name,
             **_coded(camera, render, setting),
-            "rf_psnr_db": psnr(render, camera),
-            "rf_ssim": ssim(render, camera),
+            "camera_i_bytes": alone[coding][0],
+            "camera_i_psnr_db": alone[coding][1],
+            "rf_psnr_db": quality.psnr_db,
+            "rf_ssim": quality.ssim,
+            "rf_residual_bands": list(quality.bands),
         }
+
+
+_Seen = tuple[Rgb, Rgb, RenderQuality]
+
+
+def _seen(frame: PublishedFrame, size_px: Size, making: Making) -> _Seen:
+    camera, render = reduced(frame.camera, size_px), frame.render(size_px, making)
+    return camera, render, render_quality(render, camera)
+
+
+def _alone(camera: Rgb, setting: Setting) -> tuple[int, float]:
+    """Return slice bytes and PSNR of the camera frame coded by itself."""
+    unit = intra_alone(i420_from_rgb(camera), setting.preset, setting.crf)
+    shown = rgb_from_i420(_decoded((unit,), setting)[0])
+    return sum(map(len, slice_nals(unit))), psnr(shown, camera)
 
 
 def reduced(picture: Rgb, size_px: Size) -> Rgb:
@@ -92,21 +118,17 @@ def reduced(picture: Rgb, size_px: Size) -> Rgb:
 def _coded(camera: Rgb, render: Rgb, setting: Setting) -> dict[str, Any]:
     frame, reference = i420_from_rgb(camera), i420_from_rgb(render)
     clip = published_clip(frame, reference, setting.preset, setting.crf)
-    alone = intra_alone(frame, setting.preset, setting.crf)
     sizes = savings_of_clip(clip)
     first, second = (rgb_from_i420(picture) for picture in _decoded(clip, setting))
-    camera_alone = rgb_from_i420(_decoded((alone,), setting)[0])
     return {
         "i_bytes": sizes.i_bytes,
         "p_bytes": sizes.p_bytes,
         "second_type": sizes.second_type,
         "header_bytes": sum(map(len, clip)) - sizes.i_bytes - sizes.p_bytes,
-        "camera_i_bytes": sum(map(len, slice_nals(alone))),
         "savings_percent": sizes.percent,
         "i_psnr_db": psnr(first, render),
         "psnr_db": psnr(second, camera),
-        "camera_i_psnr_db": psnr(camera_alone, camera),
-        "ssim": ssim(second, camera),
+        "ssim": colour_ssim(second, camera),
     }
 
 

@@ -1,4 +1,4 @@
-"""Sections of the results page about comparisons with other codecs, and about training runs."""
+"""The section of the results page about training runs."""
 
 from __future__ import annotations
 
@@ -6,25 +6,9 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from rfedge.report.markdown_parts import Row, heading, table
+from rfedge.report.markdown_parts import Row, table
 
-__all__ = ["compare_section", "training_section"]
-
-COMPARE_COLUMNS = (
-    "scene",
-    "Hz",
-    "method",
-    "rival",
-    "window dB",
-    "BD-rate %",
-    "95 %",
-    "saving at 31 / 33 / 35 dB, %",
-    "CPU ms",
-    "rival's",
-    "field dB",
-)
-SAVING_AT_DB = ("31", "33", "35")
-"""A quality that a curve does not reach has no saving."""
+__all__ = ["training_section"]
 
 RUN_COLUMNS = (
     "run",
@@ -39,12 +23,6 @@ RUN_COLUMNS = (
 )
 
 
-def compare_section(path: Path, result: Row) -> str:
-    """Return a comparison as a table; bytes count the whole message of a frame, header included."""
-    rows = [_compare_cells(row) for row in result["rows"]]
-    return "\n\n".join([heading(path, result), table(COMPARE_COLUMNS, rows), ""])
-
-
 def training_section(paths: Sequence[Path]) -> str:
     """Return a table of training runs, and the command of each."""
     runs = {path.stem: json.loads(path.read_text()) for path in paths}
@@ -53,26 +31,6 @@ def training_section(paths: Sequence[Path]) -> str:
         f"* {name}: `{run['command']}` at `{run['revision']}`" for name, run in runs.items()
     ]
     return "\n\n".join(["## training", table(RUN_COLUMNS, rows), "\n".join(commands), ""])
-
-
-def _compare_cells(row: Row) -> list[str]:
-    low, high = row["ci95"]
-    at_db = row["saving_percent_at_db"]
-    savings = " / ".join(f"{at_db[db]:.0f}" if db in at_db else "-" for db in SAVING_AT_DB)
-    quality_db = row["field_psnr_db"]
-    return [
-        row["scene"],
-        f"{row['hz']:g}",
-        row["method"].rsplit("-", 1)[0],
-        f"{row['rival']} ({row['rival_setting']})",
-        "{:g}..{:g}".format(*row["window_db"]),
-        f"{row['bd_rate_percent']:.1f}",
-        f"{low:.1f}..{high:.1f}",
-        savings,
-        f"{row['cpu_ms']:.0f}",
-        f"{row['rival_cpu_ms']:.0f}",
-        "-" if quality_db is None else f"{quality_db:.2f}",
-    ]
 
 
 def _run_cells(name: str, run: Row) -> list[str]:

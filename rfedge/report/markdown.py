@@ -12,7 +12,8 @@ from pathlib import Path
 
 from rfcore.errors import InvalidInput
 from rfedge.bench.rows import flattened
-from rfedge.report.evaluations import compare_section, training_section
+from rfedge.report.codec_evidence import compare_section, never_worse_section, paper_section
+from rfedge.report.evaluations import training_section
 from rfedge.report.markdown_parts import Row, cell, heading, table
 from rfedge.report.summary import METRIC, SUMMARY
 
@@ -23,6 +24,13 @@ INTRODUCTION = """# Measured figures
 Generated from `results/*.json` by `make figures`; each table names its command, revision and host.
 Machines are shared and noisy: compare within a table, not across hosts.
 """
+
+
+SECTIONS = {
+    "compare": compare_section,
+    "never-worse": never_worse_section,
+    "paper": paper_section,
+}
 
 
 def results_page(folder: Path) -> str:
@@ -46,8 +54,8 @@ def _section(path: Path) -> str:
         return f"{heading(path, result)}\n\n{len(result['cases'])} cases: `docs/stability.md`.\n"
     if result.get("case") == "ladder":
         return f"{heading(path, result)}\n\n{len(result['rows'])} rungs: `docs/ladder.md`.\n"
-    if result.get("case") == "compare":
-        return compare_section(path, result)
+    if result.get("case") in SECTIONS:
+        return SECTIONS[result["case"]](path, result)
     if "case" in result:
         return _bench(path, result)
     raise InvalidInput("results", f"{path} is neither a demo nor a bench result")

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from rfedge.evaluate.paper_summary import means_of, savings_by_frame
+from rfedge.evaluate.render_quality import BANDS
 from rfedge.report.figures import STYLE
 from rfedge.report.svg_file import write_figure
 
@@ -24,13 +25,21 @@ __all__ = ["paper_table", "write_paper_figures"]
 Row = dict[str, Any]
 LINES = ("#2563eb", "#d97706", "#0f766e", "#be185d")
 """One a size, told apart in grey as well by their markers."""
+PUBLISHED_FIGURES = {
+    (kind, field): 3 + 2 * row + column
+    for row, kinds in enumerate((("empty",), ("parked", "vehicles")))
+    for kind in kinds
+    for column, field in enumerate(("ingp", "3dgs"))
+}
+"""By kind of scene (what follows the last hyphen of its name) and field."""
 MARKERS = ("o", "s", "^", "D")
 
 
 def paper_table(rows: Sequence[Row]) -> Table:
     """Return the means with their spread, and the quality of the render itself."""
     table = Table(
-        "field", "scene", "size", "render", "100 I/(I+P) %", "sd", "95 %", "RF dB", "RF SSIM"
+        *("field", "scene", "size", "render", "100 I/(I+P) %", "sd", "95 %"),
+        *("RF dB", "RF SSIM", "RF FLIP"),
     )
     for mean in means_of(rows):
         table.add_row(
@@ -43,19 +52,56 @@ def paper_table(rows: Sequence[Row]) -> Table:
             f"±{mean.ci95_percent:.1f}",
             f"{mean.rf_psnr_db:.2f}",
             f"{mean.rf_ssim:.3f}",
+            "-" if mean.rf_flip is None else f"{mean.rf_flip:.3f}",
         )
     return table
 
 
 def write_paper_figures(rows: Sequence[Row], folder: Path) -> list[Path]:
-    """Write a plot of savings per image for each field and scene, and one by CRF and preset."""
+    """Write a plot of savings per image for each field and scene, one by CRF and preset, and one
+    of what the renders miss by spatial frequency."""
     folder.mkdir(parents=True, exist_ok=True)
     pairs = dict.fromkeys((row["field"], row["scene"]) for row in rows if ":" not in row["field"])
     written = []
     for field, scene in pairs:
         curves = savings_by_frame(rows, field, scene)
-        written += write_figure(folder / f"savings_{scene}_{field}", *_per_image(curves))
-    return written + write_figure(folder / "savings_by_crf_preset", *_by_setting(rows))
+        written += write_figure(folder / _savings_name(field, scene), *_per_image(curves))
+    written += write_figure(folder / "savings_by_crf_preset", *_by_setting(rows))
+    return written + write_figure(folder / "residual_by_frequency", *_by_band(rows))
+
+
+def _savings_name(field: str, scene: str) -> str:
+    """Return the name as published where the figure is one of theirs."""
+    kind = scene.rsplit("-", 1)[-1]
+    number = PUBLISHED_FIGURES.get((kind, field))
+    return f"savings_{scene}_{field}" if number is None else f"fig{number}_savings_{kind}_{field}"
+
+
+def _by_band(rows: Sequence[Row]) -> tuple[Figure, list[list[str]]]:
+    """Residual energy over the camera's by band, a line per size, mean over scenes, by field."""
+    means = [m for m in means_of(rows) if ":" not in m.field and m.making == "downscaled"]
+    names = [f"{low:.3g}..{high:.3g}" for low, high in BANDS]
+    lines = [["field", "scene", "size", *names]]
+    with mpl.rc_context({**STYLE, "axes.grid.axis": "both"}):
+        figure, axes = plt.subplots(figsize=(7.2, 3.0))
+        sizes = list(dict.fromkeys(mean.size_px for mean in means))
+        for mean in means:
+            size = "{}x{}".format(*mean.size_px)
+            lines.append([mean.field, mean.scene, size, *(f"{ratio:.4f}" for ratio in mean.bands)])
+            index = sizes.index(mean.size_px)
+            axes.plot(
+                names,
+                mean.bands,
+                color=LINES[index % len(LINES)],
+                marker=MARKERS[list(dict.fromkeys(m.field for m in means)).index(mean.field) % 4],
+                linestyle="-" if mean.scene == means[0].scene else "--",
+                markersize=4,
+                linewidth=1.5,
+                label=f"{mean.field}, {mean.scene}, {size}",
+            )
+        axes.set(xlabel="cycles a pixel", ylabel="residual / camera energy", yscale="log")
+        axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1), fontsize=7)
+    return figure, lines
 
 
 def _per_image(curves: dict[tuple[int, int], Any]) -> tuple[Figure, list[list[str]]]:

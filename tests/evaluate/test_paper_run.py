@@ -11,6 +11,7 @@ from rfcore.errors import InvalidInput
 from rfedge.evaluate.paper_run import PaperJob, named_path, run_paper
 from rfedge.evaluate.paper_summary import means_of, savings_by_frame
 from rfedge.report.paper import write_paper_figures
+from rfedge.report.paper_views import write_views
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 ROW_KEYS = {
@@ -33,6 +34,8 @@ def row(frame, crf, savings, **other):
         "savings_percent": savings,
         "rf_psnr_db": 27.0,
         "rf_ssim": 0.8,
+        "rf_flip": 0.2,
+        "rf_residual_bands": [0.1, 0.2, 0.4, 0.8],
         "second_type": "P",
         **other,
     }
@@ -62,12 +65,14 @@ def test_savings_by_frame_leave_out_what_was_rendered_natively():
 def test_every_figure_has_its_numbers_beside_it(tmp_path):
     paths = write_paper_figures(ROWS, tmp_path)
     assert {path.name for path in paths} == {
-        "savings_empty_3dgs.svg",
-        "savings_empty_3dgs.csv",
+        "fig4_savings_empty_3dgs.svg",
+        "fig4_savings_empty_3dgs.csv",
+        "residual_by_frequency.svg",
+        "residual_by_frequency.csv",
         "savings_by_crf_preset.svg",
         "savings_by_crf_preset.csv",
     }
-    assert (tmp_path / "savings_empty_3dgs.csv").read_text() == (
+    assert (tmp_path / "fig4_savings_empty_3dgs.csv").read_text() == (
         "image,300x168\n0,45.00\n1,65.00\n"
     )
     assert "medium,18,50.00" in (tmp_path / "savings_by_crf_preset.csv").read_text()
@@ -98,3 +103,16 @@ def test_a_quick_run_gives_the_published_rows_and_its_controls(tmp_path):
     field = means["3dgs", "downscaled"]
     assert field > means["3dgs:behind", "downscaled"] > 0
     assert field > means["3dgs:grey", "downscaled"]
+
+
+def test_views_stand_side_by_side(tmp_path):
+    pixels = np.zeros((18, 32, 3), np.uint8)
+    views = [(f"{scene}: {what}", pixels) for scene in "ab" for what in ("camera", "3dgs")]
+    drawing, numbers = write_views(views, tmp_path)
+    assert drawing.name == "fig2_views.svg"
+    assert "a: camera,32,18" in numbers.read_text()
+
+
+def test_a_scene_that_was_not_published_has_a_plain_name(tmp_path):
+    paths = write_paper_figures([{**r, "scene": "night"} for r in ROWS], tmp_path)
+    assert "savings_night_3dgs.svg" in {path.name for path in paths}

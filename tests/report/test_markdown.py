@@ -57,6 +57,12 @@ def test_a_comparison_names_field_quality_and_interval_beside_its_figure(tmp_pat
         "bd_rate_percent": -57.31,
         "ci95": [-60.04, -54.0],
         "saving_percent_at_db": {"31": 80.2, "33": 55.1, "35": 40.0},
+        "ssim": 0.91,
+        "rival_ssim": 0.902,
+        "psnr_deviation_db": 0.123,
+        "rival_psnr_deviation_db": 0.2,
+        "first_frame_bytes": 12_340,
+        "rival_first_frame_bytes": 40_000,
         "cpu_ms": 90.4,
         "rival_cpu_ms": 19.6,
         "field_psnr_db": 28.123,
@@ -66,7 +72,33 @@ def test_a_comparison_names_field_quality_and_interval_beside_its_figure(tmp_pat
     (tmp_path / "compare.json").write_text(json.dumps({**result, "host": host, "rows": [row]}))
     assert (
         "| yardstick-empty | 10 | rfedge-veryfast | x264-lowdelay (x264-lowdelay-veryfast) "
-        "| 32..35 | -57.3 | -60.0..-54.0 | 80 / 55 / 40 | 90 | 20 | 28.12 |"
+        "| 32..35 | -57.3 | -60.0..-54.0 | 80 / 55 / 40 | 0.910 | 0.902 | 0.12 | 0.20 "
+        "| 12.3 | 40.0 | 90 | 20 | 28.12 |"
+    ) in results_page(tmp_path)
+
+
+def test_a_field_that_made_it_worse_stands_out(tmp_path: Path) -> None:
+    row = {
+        "scene": "yardstick-empty",
+        "hz": 30.0,
+        "control": "black",
+        "at_db": 33.0,
+        "bytes": 1100.4,
+        "header_bytes": 75.0,
+        "rival_bytes": 1000.0,
+        "excess_percent": 2.54,
+        "excess_percent_psnr_tuned": 9.0,
+        "holds": False,
+        "references": "previous",
+        "cpu_ms": 40.0,
+        "rival_cpu_ms": 5.0,
+    }
+    host = {"cpu": "C", "cores": 2, "isa": "avx2"}
+    result = {"case": "never-worse", "command": "rfedge eval never-worse", "revision": "abc123"}
+    (tmp_path / "never-worse.json").write_text(json.dumps({**result, "host": host, "rows": [row]}))
+    assert (
+        "| yardstick-empty | 30 | black | 33 | 1100 | 75 | 1000 | +2.5 | +9.0 | **no** "
+        "| previous | 40 | 5 |"
     ) in results_page(tmp_path)
 
 
