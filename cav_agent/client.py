@@ -24,7 +24,7 @@ from cav_agent.pace import Pace
 from cav_agent.session import AgentSession, LinkState
 from rfcore.errors import ProtocolError, RfedgeError
 from rfcore.views import PosedPicture
-from rfcore.wire.conventions import STREAM_METHOD
+from rfcore.wire.conventions import RETRY_AFTER, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import Welcome
@@ -49,6 +49,9 @@ FINAL = frozenset(
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.02, 1.0
 """Between streams: short after one that was welcomed, doubling while none is."""
+
+LONGEST_ASKED_S = 30.0
+"""A server that is full says when to come again; nobody waits longer."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,7 @@ class Agent:
         self._stream: Stream | None = None
         self._stopping_until_s: float | None = None
         self._finished = False
+        self._asked_pause_s = 0.0
         self._streaming_at_s = time.monotonic()
         self._drive_wake = asyncio.Event()
         self._write_wake = asyncio.Event()
@@ -190,7 +194,7 @@ class Agent:
             self._drive_wake.set()
             log.warning("stream lost", reason=reason)
             pause_s = FIRST_PAUSE_S if welcomed else min(2 * pause_s, LONGEST_PAUSE_S)
-            await asyncio.sleep(pause_s)
+            await asyncio.sleep(max(pause_s, self._asked_pause_s))
 
     async def _wait_for_server(self) -> None:
         limit_s = self._limits.give_up_s
@@ -202,6 +206,7 @@ class Agent:
 
     async def _one_stream(self) -> str:
         """Open a stream and serve it to its end; return why it ended."""
+        self._asked_pause_s = 0.0
         stream: Stream = self._channel.stream_stream(STREAM_METHOD)()
         self._stream = stream
         self._session.connected(time.monotonic())
@@ -212,6 +217,7 @@ class Agent:
         except grpc.aio.AioRpcError as error:
             if error.code() in FINAL:
                 raise ProtocolError(f"{error.details()}") from error
+            self._asked_pause_s = _retry_after_s(error)
             return f"{error.code().name}: {error.details()}"
         except asyncio.CancelledError:
             if self._session.broken is None:
@@ -230,6 +236,7 @@ class Agent:
                 self._session.receive(message, time.monotonic())
                 if isinstance(message, Welcome):
                     self._equipment.connected(True)
+                    self._equipment.pace.limit(message.rate_hz)
             self._drive_wake.set()
 
     async def _write(self, stream: Stream) -> None:
@@ -249,3 +256,11 @@ class Agent:
             async with asyncio.timeout(self._limits.drain_s):
                 await self._stream.done_writing()
                 await asyncio.wait({connecting})
+
+
+def _retry_after_s(error: grpc.aio.AioRpcError) -> float:
+    """Return how long a server that refused us wants to be left alone."""
+    for key, value in error.trailing_metadata():
+        if key == RETRY_AFTER and isinstance(value, str) and value.isdecimal():
+            return min(int(value) / 1e3, LONGEST_ASKED_S)
+    return 0.0

@@ -14,6 +14,9 @@ from rfcore.errors import InvalidInput, RfedgeError
 
 __all__ = ["MAX_TRIES", "Lockstep", "Pace", "Realtime"]
 
+EARLY_S = 1e-6
+"""Sums of periods are rounded; a picture that is due this much early is not another one."""
+
 MAX_TRIES = 5
 """How often lockstep captures the same picture before it gives up."""
 
@@ -30,28 +33,43 @@ class Pace(Protocol):
     def get_timer(self) -> float | None:
         """Return when ``next_capture`` will have a picture by time alone, or None."""
 
+    def limit(self, rate_hz: float) -> None:
+        """Capture no more than ``rate_hz`` pictures per second; 0: as many as there are."""
+
     @property
     def finished(self) -> bool:
         """Whether no further picture will be captured."""
 
 
 class Realtime:
-    """Picture i at ``start + i / rate_hz``; a late driver catches up by skipping nothing."""
+    """Picture i at ``start + i / rate_hz``; a late driver catches up by skipping nothing.
+
+    Below a limit, pictures in between are not captured: the drive goes on at its own speed.
+    """
 
     def __init__(self, pictures: int, rate_hz: float, *, loop: bool = False) -> None:
         _check(pictures, rate_hz)
         self._pictures, self._rate_hz, self._loop = pictures, rate_hz, loop
         self._count = 0
         self._start_s: float | None = None
+        self._period_s = 0.0
+        self._open_s = float("-inf")
 
     def next_capture(self, now: float) -> int | None:
         """Return the next index once its time has come."""
         if self._start_s is None:
             self._start_s = now
-        if self.finished or now < self._due_s(self._start_s):
-            return None
-        self._count += 1
-        return (self._count - 1) % self._pictures
+        while not self.finished and now >= (due_s := self._due_s(self._start_s)):
+            self._count += 1
+            if due_s >= self._open_s - EARLY_S:
+                behind = self._open_s < due_s - self._period_s
+                self._open_s = (due_s if behind else self._open_s) + self._period_s
+                return (self._count - 1) % self._pictures
+        return None
+
+    def limit(self, rate_hz: float) -> None:
+        """Capture no more than ``rate_hz`` pictures per second on average."""
+        self._period_s = 1.0 / rate_hz if rate_hz else 0.0
 
     def ended(self, result: FrameResult) -> None:
         """Nothing follows from it."""
@@ -101,6 +119,9 @@ class Lockstep:
             raise RfedgeError(f"picture {name} could not be coded: {result.reason}")
         if self._tries >= MAX_TRIES:
             raise RfedgeError(f"picture {name} was lost {self._tries} times: {result.reason}")
+
+    def limit(self, rate_hz: float) -> None:
+        """Do nothing: the server's answers are the limit."""
 
     def get_timer(self) -> float | None:
         """Return None: time alone changes nothing."""

@@ -124,7 +124,8 @@ class Vehicle:
         pictures = tuple(map(_posed_for_the_wire, pictures))
         codec = CodecConfig(intrinsics.width_px, intrinsics.height_px, config.preset, config.crf)
         pipeline = Pipeline(field, codec, time.perf_counter_ns)
-        camera = CameraDescription(config.camera, intrinsics, pipeline.header)
+        rate_hz = config.rate if config.pace is PaceKind.REALTIME else 0.0
+        camera = CameraDescription(config.camera, intrinsics, pipeline.header, rate_hz)
         contract = RendererContract(RENDERER_CONTRACT, exact=True)
         hello = Hello(config.vehicle, (camera,), (field.field_id,), contract)
         field.prepare()

@@ -10,10 +10,18 @@ from typing import Annotated
 from tyro.conf import Suppress, arg
 
 from rfcore.errors import InvalidInput
+from rfcore.wire.checks import MAX_RATE_HZ
 from rfcore.wire.logs import LogForm
 from rfcore.wire.settings import MetricsSettings, RenderSettings, TransportSettings
 
-__all__ = ["ConsumerLimits", "DecoderKind", "ServerConfig", "SessionLimits", "VehicleQuota"]
+__all__ = [
+    "AdmissionLimits",
+    "ConsumerLimits",
+    "DecoderKind",
+    "ServerConfig",
+    "SessionLimits",
+    "VehicleQuota",
+]
 
 
 class DecoderKind(StrEnum):
@@ -68,6 +76,26 @@ class VehicleQuota:
 
 
 @dataclass(frozen=True)
+class AdmissionLimits:
+    """How much of the workers' time is promised to vehicles (see ``mec_server.admission``)."""
+
+    load: Annotated[float, arg(name="max-load")] = 0.8
+    """Share of the workers' time that vehicles are promised; beyond it they get a lower rate, or
+    are asked to come again. 0: whoever comes is let in."""
+    lowest_hz: Annotated[float, arg(name="lowest-rate")] = 2.0
+    """Pictures per second below which a vehicle is rather refused."""
+    retry_s: Annotated[float, Suppress] = 5.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.load <= 1:
+            raise InvalidInput("max-load", f"{self.load:g} is outside 0..1")
+        if not 0 < self.lowest_hz <= MAX_RATE_HZ:
+            raise InvalidInput("lowest-rate", f"{self.lowest_hz:g} is outside 0..{MAX_RATE_HZ:g}")
+        if not self.retry_s > 0:
+            raise InvalidInput("retry_s", f"{self.retry_s:g} must be above 0 s")
+
+
+@dataclass(frozen=True)
 class ConsumerLimits:
     """Those who watch the twin (`rfedge watch`); one that takes nothing for long is let go."""
 
@@ -109,6 +137,7 @@ class ServerConfig:
     max_streams: int = 256
     """How many streams of vehicles may be open at once."""
     quota: VehicleQuota = VehicleQuota()
+    admission: AdmissionLimits = AdmissionLimits()
     drain_s: Annotated[float, Suppress] = 5.0
     limits: Annotated[SessionLimits, Suppress] = SessionLimits()
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 import asyncio
 import time
 import uuid
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import grpc
 import structlog
 
+from mec_server.admission import Admission
 from mec_server.alarm import Alarm
 from mec_server.config import SessionLimits
 from mec_server.decoder_process import DecoderLost
@@ -27,7 +28,7 @@ from mec_server.recorder import Recorder, Recording
 from mec_server.session import ServerSession, SessionState
 from mec_server.twin import Twin, TwinView
 from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeError
-from rfcore.wire.conventions import STREAM_METHOD
+from rfcore.wire.conventions import RETRY_AFTER, STREAM_METHOD
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
 from rfcore.wire.identity import peer_identity
@@ -54,6 +55,7 @@ class Surroundings:
     metrics: ServerMetrics
     limits: SessionLimits
     quotas: Quotas
+    admission: Admission
     max_streams: int
     twin: Twin
     open_cameras: OpenCameras
@@ -85,7 +87,7 @@ class EdgeService:
     async def _handle(self, requests: AsyncIterator[bytes], context: Context) -> None:
         if len(self._streams) >= self._around.max_streams:
             await self._turn_away(context)
-        stream = _Stream(self._around, context)
+        stream = _Stream(self._around, context, self._deal_out)
         self._streams.add(stream)
         self._around.metrics.sessions.inc()
         try:
@@ -97,7 +99,14 @@ class EdgeService:
         if end.error is not None:
             if isinstance(end.error, LimitExceeded):
                 self._around.metrics.limited.labels(end.error.limit).inc()
-            await context.abort(status_of(end.error), str(end.error))
+            await context.abort(status_of(end.error), str(end.error), _retry_after(end.error))
+
+    def _deal_out(self) -> None:
+        """Tell vehicles whose rate changes."""
+        changed = self._around.admission.review(time.monotonic())
+        if changed:
+            for stream in self._streams:
+                stream.regrant(changed)
 
     async def _turn_away(self, context: Context) -> None:
         error = LimitExceeded(
@@ -112,8 +121,11 @@ class EdgeService:
 class _Stream:
     """Pumps one session: one reader, one writer, and tasks that wait for worker threads."""
 
-    def __init__(self, around: Surroundings, context: Context) -> None:
+    def __init__(
+        self, around: Surroundings, context: Context, deal_out: Callable[[], None]
+    ) -> None:
         self._around = around
+        self._deal_out = deal_out
         self._context = context
         self._wake = asyncio.Event()
         self._alarm = Alarm(self._wake)
@@ -142,6 +154,7 @@ class _Stream:
         """Let nothing remain of this stream, in the twin or in the metrics."""
         self._around.twin.leave(self._session.session_id)
         self._metrics.forget()
+        self._around.admission.leave(self._session.session_id)
         if self._allowance is not None:
             self._allowance.leave()
         if self._opening is not None:
@@ -188,8 +201,25 @@ class _Stream:
         named = self._identity.uris[0] if self._identity is not None else hello.vehicle_id
         try:
             self._allowance = self._around.quotas.enter(named, now)
+            rate_hz = self._around.admission.enter(session.session_id, hello)
         except LimitExceeded as error:
+            self._log.warning(
+                "vehicle refused",
+                vehicle=hello.vehicle_id,
+                reason=error.limit,
+                problem=str(error),
+            )
             session.end(error)
+        else:
+            session.grant(rate_hz)
+
+    def regrant(self, changed: Mapping[str, float]) -> None:
+        """Tell the vehicle its new rate, if it is among ``changed``."""
+        rate_hz = changed.get(self._session.session_id)
+        if rate_hz is not None:
+            self._log.info("rate granted", rate_hz=rate_hz)
+            self._session.grant(rate_hz)
+            self._wake.set()
 
     def _receive_frame(self, frame: Frame, message_bytes: int, now: float) -> None:
         self._metrics.received(frame, message_bytes)
@@ -299,12 +329,26 @@ class _Stream:
     async def _reconstruct(self, job: DecodeJob) -> Reconstruction:
         decoder = self._decoders[job.frame.camera_id]
         loop, executor = asyncio.get_running_loop(), self._around.executor
-        done = await loop.run_in_executor(executor, decoder.reconstruct, job)
+        done, seconds = await loop.run_in_executor(executor, _timed, decoder, job)
+        self._around.admission.worked(self._session.session_id, seconds)
+        self._deal_out()
         recorder, hello = self._around.recorder, self._session.hello
         if recorder is not None and hello is not None:
             kept = Recording(hello.vehicle_id, job.frame, done.picture)
             await loop.run_in_executor(executor, recorder.save, kept)
         return done
+
+
+def _timed(decoder: Decoder, job: DecodeJob) -> tuple[Reconstruction, float]:
+    """Reconstruct, and say how long that took a worker."""
+    started_s = time.perf_counter()
+    done = decoder.reconstruct(job)
+    return done, time.perf_counter() - started_s
+
+
+def _retry_after(error: RfedgeError) -> tuple[tuple[str, str], ...]:
+    after_s = error.retry_after_s if isinstance(error, LimitExceeded) else None
+    return () if after_s is None else ((RETRY_AFTER, str(round(1e3 * after_s))),)
 
 
 def _close_decoders(opening: asyncio.Future[dict[str, Decoder]]) -> None:

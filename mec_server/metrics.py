@@ -7,7 +7,7 @@ value is a time series for ever. With it, a vehicle's series leave when its last
 from __future__ import annotations
 
 from collections import Counter as Tally
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 
 from prometheus_client import CollectorRegistry
@@ -77,6 +77,14 @@ class ServerMetrics:
             "Streams refused or ended, and frames refused, because of a limit or quota.",
             ("limit",),
         )
+        self._promised = make.gauge(
+            "rfedge_server_promised_ratio",
+            "Worker time that vehicles were promised, of what may be; above 1: frames take longer.",
+        )
+        self._reduced = make.gauge(
+            "rfedge_server_reduced_vehicles",
+            "Vehicles that were granted a lower rate than they asked for.",
+        )
         self.decoders_lost = make.counter(
             "rfedge_server_decoders_lost",
             "Decoder processes that died in use: by a signal, by themselves, or for being slow.",
@@ -104,6 +112,13 @@ class ServerMetrics:
             self.limited.labels(limit)
         for cause in LossCause:
             self.decoders_lost.labels(cause)
+
+    def observe_admission(
+        self, promised: Callable[[], float], reduced: Callable[[], float]
+    ) -> None:
+        """Read what was promised to vehicles when a scrape asks for it."""
+        self._promised.set_function(promised)
+        self._reduced.set_function(reduced)
 
     def field_opened(self, field: RadianceField) -> None:
         """Tell which field was opened."""

@@ -24,6 +24,7 @@ class Limit(StrEnum):
     """What somebody had too much of; label of ``rfedge_server_limited_total``."""
 
     SERVER_STREAMS = "server_streams"
+    CAPACITY = "capacity"
     VEHICLE_STREAMS = "vehicle_streams"
     FRAME_RATE = "frame_rate"
     BYTE_RATE = "byte_rate"

@@ -13,6 +13,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_health.v1.health import aio as health_aio
 from prometheus_client import CollectorRegistry, start_http_server
 
+from mec_server.admission import Admission
 from mec_server.config import ServerConfig
 from mec_server.decoders import Decoders
 from mec_server.edge_service import EdgeService, Surroundings
@@ -55,6 +56,8 @@ class EdgeServer:
         self._metrics.workers.set(config.workers)
         load = field_loader(store, config.render, opened=self._metrics.field_opened)
         self._shelf = FieldShelf(store, load)
+        admission = Admission(config.admission, config.workers)
+        self._metrics.observe_admission(lambda: admission.promised_share, lambda: admission.reduced)
         twin = Twin()  # the metrics outlive the server in their thread, and shall not hold it
         watched = TwinMetrics(
             self._metrics.instruments,
@@ -76,6 +79,7 @@ class EdgeServer:
                 self._metrics,
                 config.limits,
                 Quotas(config.quota),
+                admission,
                 config.max_streams,
                 twin,
                 opened,

@@ -91,6 +91,8 @@ class ServerSession:
         self._outbox: deque[ServerMessage] = deque()
         self._deadline_s = now + self._limits.hello_s
         self._unusable = 0
+        self._exact = False
+        self._rate_hz = 0.0
 
     # --- what the vehicle said
 
@@ -224,10 +226,17 @@ class ServerSession:
         for field_id in job.hello.field_ids:
             self._fields[bytes.fromhex(field_id)[:FIELD_ID_PREFIX_BYTES]] = field_id
         self._fields[b""] = job.hello.field_ids[0]
-        self._outbox.append(Welcome(self.session_id, job.exact))
+        self._exact = job.exact
+        self._outbox.append(Welcome(self.session_id, job.exact, self._rate_hz))
         for camera_id, lane in self._lanes.items():
             self._outbox.append(Credit(camera_id, lane.granted))
         self._alive(now)
+
+    def grant(self, rate_hz: float) -> None:
+        """Let each camera send so many pictures per second; 0: as many as credits allow."""
+        self._rate_hz = rate_hz
+        if self.state is SessionState.OPEN:
+            self._outbox.append(Welcome(self.session_id, self._exact, rate_hz))
 
     def open_failed(self, error: RfedgeError, now: float) -> None:
         """Hello named something that cannot be opened; a bad value leaves room for another."""

@@ -112,11 +112,15 @@ class AccessDenied(RfedgeError):
 
 
 class LimitExceeded(RfedgeError):
-    """A peer asks for more than it may have; ``limit`` is a word that can be counted."""
+    """A peer asks for more than it may have; ``limit`` is a word that can be counted.
 
-    def __init__(self, limit: str, problem: str) -> None:
+    ``retry_after_s``: when it may ask again, if that can be said.
+    """
+
+    def __init__(self, limit: str, problem: str, retry_after_s: float | None = None) -> None:
         super().__init__(f"{limit}: {problem}")
         self.limit = limit
+        self.retry_after_s = retry_after_s
 
 
 class BackendUnavailable(RfedgeError):

@@ -12,12 +12,16 @@ __all__ = [
     "FRAME_BUDGET_BUCKETS_S",
     "MAX_MESSAGE_BYTES",
     "RENDERER_CONTRACT",
+    "RETRY_AFTER",
     "SERVER_OPTIONS",
     "STREAM_METHOD",
 ]
 
 MAX_MESSAGE_BYTES: Final = 1 << 20
 """Longest message either end accepts; a longer one ends its stream, not the connection."""
+
+RETRY_AFTER: Final = "retry-after-ms"
+"""Trailing metadata of a refused stream: after how many milliseconds it may be opened again."""
 
 STREAM_METHOD: Final = "/rfcore.wire.v1.EdgeService/Stream"
 

@@ -37,6 +37,8 @@ class LoadTest:
     """What a canned vehicle waits before sending, for the time a real one needs to encode."""
     live: Annotated[bool, FlagCreatePairsOff] = False
     """Vehicles that render and encode (cav-agent processes), instead of coded packets."""
+    admission: Annotated[bool, FlagCreatePairsOff] = False
+    """Let the server refuse vehicles or lower their rate; the verdict is about those let in."""
     find_limit: Annotated[bool, FlagCreatePairsOff] = False
     """Look for the largest number that holds."""
     field: Path = Path("samples/fields/street.rff")
@@ -70,6 +72,7 @@ class LoadTest:
             link=self.link,
             kind=Vehicles.LIVE if self.live else Vehicles.CANNED,
             vehicle_ms=self.vehicle_ms,
+            admission=self.admission,
             bounds=Bounds(deadline_ms=self.deadline_ms),
         )
         bed = TestBed(self.field, self.drive, self.workers, self.cache, self.out / "work")

@@ -20,11 +20,13 @@ __all__ = ["Brought", "VehicleReport", "links_busy", "measured"]
 @dataclass(frozen=True)
 class VehicleReport:
     """One vehicle: pictures due in the counted part, latencies of those acked, how many the server
-    refused; why it was kept out (``refused``) or fell out (``failed``)."""
+    refused; the rate it was granted (0: any); why it was kept out (``refused``) or fell out
+    (``failed``)."""
 
     due: int
     latency_ms: Sequence[float]
     nacked: int = 0
+    granted_hz: float = 0.0
     refused: str = ""
     failed: str = ""
 
@@ -40,6 +42,7 @@ class Brought:
     generator_lag_ms: float
     usage: Mapping[str, Usage]
     machine_busy: float
+    hz: float
 
     @property
     def others_cores(self) -> float:
@@ -53,6 +56,7 @@ class Brought:
         return {
             "refused": sum(bool(vehicle.refused) for vehicle in self.vehicles),
             "failed": sum(bool(vehicle.failed) for vehicle in self.vehicles),
+            "reduced": sum(0 < vehicle.granted_hz < self.hz for vehicle in self.vehicles),
             "nacked": sum(vehicle.nacked for vehicle in self.vehicles),
             "server_cores": cores["server"],
             "server_loop_cores": self.usage["server"].loop_cores,
@@ -85,7 +89,8 @@ def measured(load: Load, brought: Brought, link_busy: float, workers: int) -> Me
         others=brought.others_cores,
         generator_lag_ms=brought.generator_lag_ms,
     )
-    return Measured(counts, load.vehicles, server.growth_mb, server.minutes, resources)
+    wanted = len(counts) if load.admission else load.vehicles
+    return Measured(counts, wanted, server.growth_mb, server.minutes, resources)
 
 
 def links_busy(report: Path, load: Load) -> float:

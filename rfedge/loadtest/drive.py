@@ -59,7 +59,7 @@ def drive_canned(
         fleet.wait()
     result = json.loads(result_path.read_text())
     vehicles = [VehicleReport(**vehicle) for vehicle in result["vehicles"]]
-    return Brought(vehicles, result["lag_p99_ms"], usage, watcher.machine_busy)
+    return Brought(vehicles, result["lag_p99_ms"], usage, watcher.machine_busy, load.hz)
 
 
 def _await_start(

@@ -75,9 +75,10 @@ class CannedVehicle:
         self.name = f"canned-{number}"
         self.refused = ""
         self.failed = ""
+        self.granted_hz = 0.0
         self._number = number
         self._address = spec.addresses[number]
-        self._hello = _hello(drive, self.name, spec.cameras)
+        self._hello = _hello(drive, self.name, spec.cameras, spec.hz)
         cameras = [camera.camera_id for camera in self._hello.cameras]
         self.replays = [Replay(name, drive, _wall_ns) for name in cameras]
         self._met = asyncio.Event()
@@ -100,6 +101,8 @@ class CannedVehicle:
                 with suppress(grpc.aio.AioRpcError, asyncio.InvalidStateError):
                     await stream.write(client_message_to_bytes(self._hello))
                 schedule = (await departure).schedule(self._number)
+                if 0 < self.granted_hz < schedule.hz:
+                    schedule = replace(schedule, hz=self.granted_hz)
                 if not self.refused:
                     for replay in self.replays:
                         replay.begin(schedule)
@@ -117,6 +120,7 @@ class CannedVehicle:
                     for replay in self.replays:
                         replay.receive(message, now)
                     if isinstance(message, Welcome):
+                        self.granted_hz = message.rate_hz
                         self._met.set()
                 self._wake.set()
             self.failed = "the server ended the stream"
@@ -154,9 +158,11 @@ class CannedVehicle:
                     await stream.write(client_message_to_bytes(frame))
 
 
-def _hello(drive: CannedDrive, name: str, cameras: int) -> Hello:
+def _hello(drive: CannedDrive, name: str, cameras: int, hz: float) -> Hello:
     camera = drive.hello.cameras[0]
-    several = (replace(camera, camera_id=f"{camera.camera_id}-{i}") for i in range(cameras))
+    several = (
+        replace(camera, camera_id=f"{camera.camera_id}-{i}", rate_hz=hz) for i in range(cameras)
+    )
     return replace(drive.hello, vehicle_id=name, cameras=tuple(several))
 
 
@@ -218,6 +224,7 @@ def _vehicle_result(vehicle: CannedVehicle, counted_s: float) -> dict[str, Any]:
     return {
         "refused": vehicle.refused,
         "failed": vehicle.failed,
+        "granted_hz": vehicle.granted_hz,
         "due": len(shots),
         "nacked": sum(shot.end is End.NACKED for shot in shots),
         "latency_ms": [1e3 * latency_s for latency_s in latencies_s if latency_s is not None],

@@ -58,7 +58,7 @@ def drive_live(
     vehicles = [vehicle_report(report, since_ns, until_ns) for report in reports]
     together = _together([usage[name] for name in names])
     kept = {name: usage[name] for name in pids}
-    return Brought(vehicles, 0.0, {**kept, "vehicles": together}, watcher.machine_busy)
+    return Brought(vehicles, 0.0, {**kept, "vehicles": together}, watcher.machine_busy, load.hz)
 
 
 def vehicle_report(report: Path, since_ns: int, until_ns: int) -> VehicleReport:

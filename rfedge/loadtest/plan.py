@@ -65,6 +65,8 @@ class Load:
     of which each vehicle gets a link of its own; None: loopback. ``size_bytes``: payload of a frame
     in transport mode; other modes send what the encoder made of the drive. ``vehicle_ms``: what a
     canned vehicle waits before it sends a picture, for the time a real one needs to encode it.
+    ``admission``: let the server refuse vehicles or lower their rate, which it otherwise does not,
+    so that its limit can be seen.
     """
 
     mode: Mode
@@ -77,6 +79,7 @@ class Load:
     link: Path | None = None
     kind: Vehicles = Vehicles.CANNED
     vehicle_ms: float = 0.0
+    admission: bool = False
     bounds: Bounds = Bounds()
 
     def __post_init__(self) -> None:
@@ -97,6 +100,8 @@ class Load:
         self._check_kind()
 
     def _check_kind(self) -> None:
+        if self.admission and self.mode is not Mode.FULL:
+            raise InvalidInput("admission", f"needs mode full, not {self.mode}")
         if self.kind is Vehicles.CANNED:
             return
         if self.mode is not Mode.FULL:

@@ -20,7 +20,18 @@ from rfedge.provenance import host, revision
 
 __all__ = ["LoadResult", "record", "write_result"]
 
-KEY = ("mode", "kind", "vehicles", "cameras", "hz", "width", "height", "link", "vehicle_ms")
+KEY = (
+    "mode",
+    "kind",
+    "vehicles",
+    "cameras",
+    "hz",
+    "width",
+    "height",
+    "link",
+    "vehicle_ms",
+    "admission",
+)
 """What tells one row of a committed result from another."""
 
 

@@ -87,7 +87,8 @@ def _server(load: Load, bed: TestBed) -> Any:
     fields, workers = str(bed.field.parent), str(bed.workers)
     if load.mode is Mode.FULL:
         command = [*command_of("mec-server"), "--fields", fields, "--workers", workers]
-        return service("mec-server", [*command, "--listen", "127.0.0.1:0"], bed.work)
+        let_in = () if load.admission else ("--max-load", "0")
+        return service("mec-server", [*command, "--listen", "127.0.0.1:0", *let_in], bed.work)
     module = [sys.executable, "-m", "rfedge.loadtest.server"]
     return service("mec-server", [*module, load.mode, fields, workers], bed.work)
 
@@ -127,5 +128,6 @@ def _row(load: Load, drive: CannedDrive, brought: Brought, verdict: Verdict) -> 
         "link": None if load.link is None else load.link.stem,
         "duration_s": load.duration_s,
         "vehicle_ms": load.vehicle_ms,
+        "admission": load.admission,
         **brought.row(),
     }

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mec_server.__main__ import serve
-from mec_server.config import ServerConfig
+from mec_server.config import AdmissionLimits, ServerConfig
 from mec_server.handlers import (
     Decoder,
     FieldSource,
@@ -120,6 +120,7 @@ def main(arguments: list[str]) -> None:
         fields=Path(fields),
         listen="127.0.0.1:0",
         workers=int(workers),
+        admission=AdmissionLimits(load=0.0),
         ready_file=Path(ready_file),
     )
     configure_logs(sys.stderr)

@@ -83,3 +83,24 @@ def test_an_empty_drive_and_a_senseless_rate_are_refused() -> None:
         Lockstep(0)
     with pytest.raises(InvalidInput, match=r"rate: 0.0 Hz"):
         Realtime(1, 0.0)
+
+
+@pytest.mark.parametrize(("limit_hz", "captured"), [(0.0, 20), (10.0, 20), (5.0, 10), (4.0, 8)])
+def test_a_granted_rate_is_kept_on_average_and_the_drive_goes_on_at_its_own_speed(
+    limit_hz: float, captured: int
+) -> None:
+    pace = Realtime(20, 10.0)
+    pace.limit(limit_hz)
+    seen = [(k, index) for k in range(200) if (index := pace.next_capture(k / 100)) is not None]
+    assert len(seen) == captured
+    assert all(abs(index / 10 - k / 100) <= 0.0101 for k, index in seen)
+    assert pace.finished
+
+
+def test_a_rate_that_is_granted_later_is_kept_from_then_on() -> None:
+    pace = Realtime(40, 10.0)
+    first = [pace.next_capture(k / 10) for k in range(10)]
+    pace.limit(2.0)
+    then = [pace.next_capture(k / 10) for k in range(10, 40)]
+    assert first == list(range(10))
+    assert [i for i in then if i is not None] == [10, 14, 19, 24, 29, 34, 39]

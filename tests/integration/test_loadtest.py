@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from mec_server.config import AdmissionLimits
 from rfcore.codec import DeltaDecoder
 from rfcore.field.quality import FULL
 from rfcore.native.warp import PosedDepth
@@ -75,7 +76,8 @@ async def test_a_fleet_counts_every_picture_and_the_server_refuses_none(
     elif mode is Mode.RECEIVER:
         opened = with_kept_renders()
     started: list[bool] = []
-    async with serve(**({"opened": opened} if opened else {})) as server:
+    everybody = AdmissionLimits(load=0.0)
+    async with serve(admission=everybody, **({"opened": opened} if opened else {})) as server:
         spec = spec_of(server.address, drive)
         result = await run_fleet(spec, lambda: started.append(True))
     assert started == [True]
@@ -144,7 +146,7 @@ def test_the_command_leaves_a_page_and_rows(
 def test_a_committed_row_is_replaced_by_the_same_load_and_kept_beside_others(
     tmp_path: Path,
 ) -> None:
-    row = dict.fromkeys(("kind", "cameras", "width", "height", "link", "vehicle_ms"), 1)
+    row = dict.fromkeys(("cameras", "width", "height", "link", "vehicle_ms", "admission"), 1)
     row = {**row, "mode": "full", "kind": "canned", "vehicles": 4, "hz": 5.0, "held": False}
     path = tmp_path / "loadtest.json"
 
