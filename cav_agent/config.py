@@ -22,7 +22,8 @@ __all__ = ["AgentConfig", "AgentLimits", "PaceKind"]
 class AgentLimits:
     """Deadlines in seconds, and how many pictures may wait for the encoder.
 
-    ``answer_s``: from encoding to Ack or Nack; then the stream is given up. ``give_up_s``: without
+    ``answer_s``: longest from encoding to Ack or Nack, before the stream is given up; less once it
+    is known what is usual (``cav_agent.patience``). ``give_up_s``: without
     any connection; 0 means never.
     """
 

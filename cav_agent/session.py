@@ -20,6 +20,7 @@ from enum import StrEnum
 
 from cav_agent.config import AgentLimits
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
+from cav_agent.patience import Patience
 from cav_agent.rate_control import ByteBudget, RateControl
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
@@ -50,11 +51,15 @@ class LinkState(StrEnum):
 
 @dataclass(frozen=True)
 class Pending:
-    """An encoded frame that has not been answered; ``base`` is the frame it was predicted from."""
+    """An encoded frame that has not been answered, and how long that may last.
+
+    ``base`` is the frame it was predicted from.
+    """
 
     result: FrameResult
     encoded_s: float
     base: FrameAddress | None
+    patience_s: float
     sent_s: float | None = None
 
 
@@ -77,6 +82,7 @@ class AgentSession:
         self._camera_id = hello.cameras[0].camera_id
         self._limits = limits or AgentLimits()
         self._rate_control = rate_control
+        self._patience = Patience(self._limits.answer_s)
         self._epoch = 0
         self._epoch_used = False
         self._connection = 0
@@ -105,6 +111,7 @@ class AgentSession:
         self._connection += 1
         self._granted = self._used = 0
         self._greeting_until_s = now + self._limits.greeting_s
+        self._patience.begin()
         self._outbox.append(self._hello)
 
     def connection_lost(self, reason: str, now: float) -> None:
@@ -136,6 +143,7 @@ class AgentSession:
         if pending is None:
             return
         since_s = pending.encoded_s if pending.sent_s is None else pending.sent_s
+        self._patience.answered(now - pending.encoded_s)
         link_s = max(0.0, now - since_s - ack.times.total_ns / 1e9)
         answered = replace(
             pending.result,
@@ -233,7 +241,9 @@ class AgentSession:
         if self._rate_control is not None:
             payload_bytes = len(encoded.packet.payload)
             self._rate_control.coded(encoded.stage_s, payload_bytes, result.packet_bytes)
-        self._pending[frame.address] = Pending(result, now, job.base)
+        under_way = sum(p.result.packet_bytes for p in self._pending.values())
+        patience_s = self._patience.limit_s(under_way + result.packet_bytes)
+        self._pending[frame.address] = Pending(result, now, job.base, patience_s)
         if len(encoded.packet.payload) > MAX_PAYLOAD_BYTES:
             problem = (
                 f"{len(encoded.packet.payload)} bytes of payload exceed {MAX_PAYLOAD_BYTES} "
@@ -311,8 +321,7 @@ class AgentSession:
         if self.state is LinkState.GREETING:
             return self._greeting_until_s
         if self.state is LinkState.STREAMING and self._pending:
-            oldest_s = min(pending.encoded_s for pending in self._pending.values())
-            return oldest_s + self._limits.answer_s
+            return min(p.encoded_s + p.patience_s for p in self._pending.values())
         return None
 
     def handle_timer(self, now: float) -> None:
@@ -323,7 +332,8 @@ class AgentSession:
         if self.state is LinkState.GREETING:
             self.broken = f"no Welcome within {self._limits.greeting_s:g} s"
         else:
-            self.broken = f"no answer to a frame within {self._limits.answer_s:g} s"
+            waited_s = now - min(p.encoded_s for p in self._pending.values())
+            self.broken = f"no answer to a frame within {waited_s:.2g} s"
 
 
 def _covers(nack: Nack, address: FrameAddress) -> bool:

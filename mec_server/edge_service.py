@@ -46,11 +46,16 @@ UNKNOWN_VEHICLE = ""
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What the sessions of one server share."""
+    """What the sessions of one server share.
+
+    ``executor`` decodes, ``opener`` makes ready for new vehicles: a crowd of them, or a decoder
+    process that takes its time, shall not hold up frames.
+    """
 
     fields: FieldSource
     held_field_ids: Callable[[], tuple[str, ...]]
     executor: Executor
+    opener: Executor
     tools: Tools
     metrics: ServerMetrics
     limits: SessionLimits
@@ -152,6 +157,7 @@ class _Stream:
 
     def leave(self) -> None:
         """Let nothing remain of this stream, in the twin or in the metrics."""
+        self._alarm.cancel()
         self._around.twin.leave(self._session.session_id)
         self._metrics.forget()
         self._around.admission.leave(self._session.session_id)
@@ -163,6 +169,17 @@ class _Stream:
     async def run(self, requests: AsyncIterator[bytes]) -> End:
         """Serve until the session is closed; return how it ended."""
         self._log.info("stream opened")
+        try:
+            await self._serve(requests)
+        except asyncio.CancelledError:
+            self._log.warning("stream closed", error="the vehicle is gone")
+            raise
+        end = self._session.closed
+        assert end is not None
+        self._log.info("stream closed", error=str(end.error) if end.error else None)
+        return end
+
+    async def _serve(self, requests: AsyncIterator[bytes]) -> None:
         async with asyncio.TaskGroup() as tasks:
             reader = tasks.create_task(self._read(requests))
             while self._session.closed is None:
@@ -172,10 +189,6 @@ class _Stream:
                 await self._rest()
             await self._write()
             reader.cancel()
-        self._alarm.cancel()
-        end = self._session.closed
-        self._log.info("stream closed", error=str(end.error) if end.error else None)
-        return end
 
     async def _read(self, requests: AsyncIterator[bytes]) -> None:
         async for data in requests:
@@ -260,9 +273,8 @@ class _Stream:
 
     async def _open(self, job: OpenJob) -> None:
         around = self._around
-        # Not on the workers: a decoder process may take a while to start, and others have frames.
         self._opening = asyncio.get_running_loop().run_in_executor(
-            None, around.open_cameras, job, around.fields, around.tools
+            around.opener, around.open_cameras, job, around.fields, around.tools
         )
         try:
             self._decoders = await asyncio.shield(self._opening)

@@ -66,6 +66,7 @@ class EdgeServer:
             per_vehicle=config.metrics.per_vehicle,
         )
         self._twin_service = TwinService(twin, watched, config.consumers)
+        self._opener = ThreadPoolExecutor(1, "opener")
         self._executor = ThreadPoolExecutor(config.workers, "worker")
         self._decoders = Decoders(config.decoder, not self.address.is_loopback, self._metrics)
         self._recorder = self._open_recorder(config.save)
@@ -75,6 +76,7 @@ class EdgeServer:
                 self._shelf,
                 store.ids,
                 self._executor,
+                self._opener,
                 Tools(time.perf_counter_ns, self._decoders.open),
                 self._metrics,
                 config.limits,
@@ -125,6 +127,7 @@ class EdgeServer:
         self._edge.drain()
         self._twin_service.drain()
         await self._server.stop(self._config.drain_s)
+        await asyncio.to_thread(self._opener.shutdown)
         await asyncio.to_thread(self._executor.shutdown)
         await asyncio.to_thread(self._decoders.close)
         self._twin_service.close()
