@@ -9,7 +9,7 @@ TORCH_INDEX ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo sample-field test test-slow test-prometheus test-netns test-compose \
+.PHONY: help demo sample-field test test-slow test-prometheus test-netns test-fault test-compose \
 	test-system-packages check build bench proto figures images up down operations-figures
 
 help:  ## show the targets
@@ -22,15 +22,16 @@ test: build  ## run the test suite
 	$(BIN)/python -m pytest -m "not slow"
 
 test-slow: build test-system-packages  ## run the tests that take more than ten seconds each
-	$(BIN)/python -m pytest -m "slow and not compose" --timeout 600
+	$(BIN)/python -m pytest -m "slow and not compose and not fault" --timeout 600
 
 # Debian packages that slow tests use beside Python: cross compiler and emulator for
 # tests/native/test_aarch64.py, promtool and prometheus for tests/deploy, ip and tc for tests/link,
-# OpenH264 for tests/codec/test_second_decoder.py.
+# OpenH264 for tests/codec/test_second_decoder.py, bwrap for tests/server, nft for tests/fault.
 # A test fails without its program, and says so.
 SYSTEM_PACKAGES := g++-aarch64-linux-gnu qemu-user prometheus iproute2 \
-	gstreamer1.0-tools gstreamer1.0-plugins-bad
-SYSTEM_PROGRAMS := aarch64-linux-gnu-g++ qemu-aarch64 promtool prometheus ip tc gst-inspect-1.0
+	gstreamer1.0-tools gstreamer1.0-plugins-bad bubblewrap nftables
+SYSTEM_PROGRAMS := aarch64-linux-gnu-g++ qemu-aarch64 promtool prometheus ip tc gst-inspect-1.0 \
+	bwrap nft
 test-system-packages:  ## install the programs that test-slow uses (root, Debian)
 	@if (for name in $(SYSTEM_PROGRAMS); do command -v $$name >/dev/null || exit 1; done); then :; \
 	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
@@ -43,6 +44,11 @@ test-prometheus: build test-system-packages  ## test rules with promtool, and da
 
 test-netns: build test-system-packages  ## compare the link with the kernel's own shaper (root)
 	$(BIN)/python -m pytest -m netns --timeout 600
+
+test-fault: build test-system-packages  ## break servers, vehicles and links; writes results/faults.json (root)
+	$(BIN)/python -m pytest tests/fault -m fault --timeout 120 --faults-json results/faults.json
+	$(BIN)/python -m rfedge.report.faults_page results/faults.json > docs/reliability.md.part
+	mv docs/reliability.md.part docs/reliability.md
 
 test-compose: images  ## start docker-compose.yml and look at it (root, docker, docker-compose)
 	$(BIN)/python -m pytest -m compose --timeout 1200
@@ -90,6 +96,8 @@ figures: build  ## regenerate docs/results.md, docs/ladder.md, docs/metrics.md a
 	$(BIN)/python -m rfedge.report.markdown results > docs/results.md.part
 	mv docs/results.md.part docs/results.md
 	$(BIN)/python -m rfedge.report.ladder results docs
+	$(BIN)/python -m rfedge.report.faults_page results/faults.json > docs/reliability.md.part
+	mv docs/reliability.md.part docs/reliability.md
 	$(BIN)/python -m rfedge.report.metrics_page > docs/metrics.md.part
 	mv docs/metrics.md.part docs/metrics.md
 	$(BIN)/python -m rfedge.dashboards deploy/grafana/dashboards

@@ -54,6 +54,8 @@ def _section(path: Path) -> str:
         return f"{heading(path, result)}\n\n{len(result['cases'])} cases: `docs/stability.md`.\n"
     if result.get("case") == "ladder":
         return f"{heading(path, result)}\n\n{len(result['rows'])} rungs: `docs/ladder.md`.\n"
+    if result.get("format") == "rfedge-faults-1":
+        return f"{heading(path, result)}\n\n{len(result['rows'])} faults: `docs/reliability.md`.\n"
     if result.get("case") in SECTIONS:
         return SECTIONS[result["case"]](path, result)
     if "case" in result:

@@ -25,7 +25,9 @@ def processes_of_decoders() -> list[int]:
     ]
 
 
-@pytest.mark.parametrize("kind", [DecoderKind.CHILD, DecoderKind.BUBBLEWRAP])
+@pytest.mark.parametrize(
+    "kind", [DecoderKind.CHILD, pytest.param(DecoderKind.BUBBLEWRAP, marks=pytest.mark.slow)]
+)
 async def test_where_it_is_decoded_changes_no_byte(kind: Any, serve: Any, travel: Any) -> None:
     async with serve(decoder=DecoderKind.IN_PROCESS) as server:
         here = await travel(server.address)

@@ -47,9 +47,13 @@ def units() -> list[bytes]:
     return clip(SIZE_PX, 4)
 
 
-@pytest.fixture(scope="module", params=list(WRAPPERS))
+KINDS = ["child", pytest.param("bubblewrap", marks=pytest.mark.slow)]
+"""The sandbox takes a program that ``make test-slow`` installs."""
+
+
+@pytest.fixture(scope="module", params=KINDS)
 def pool(request: pytest.FixtureRequest) -> Iterator[DecoderPool]:
-    """Processes with limits, and the same in a sandbox (Debian: bubblewrap)."""
+    """Processes with limits, and the same in a sandbox."""
     made = DecoderPool(WRAPPERS[request.param](), lambda lost: LOST.append(lost))
     made.wait_until_ready()
     yield made
@@ -147,6 +151,7 @@ def test_a_process_ends_when_its_decoder_is_closed(pool: DecoderPool) -> None:
         decoder.decode(b"\x00\x00\x00\x01\x65")
 
 
+@pytest.mark.slow
 def test_bubblewrap_shows_no_network_no_process_and_no_file_of_ours(units: Sequence[bytes]) -> None:
     pool = DecoderPool(WRAPPERS["bubblewrap"](), lambda _: None)
     decoder = pool.open(SIZE_PX)
@@ -173,6 +178,7 @@ def decoders() -> Callable[[DecoderKind, bool], Decoders]:
     return lambda kind, reachable: Decoders(kind, reachable, ServerMetrics(CollectorRegistry()))
 
 
+@pytest.mark.slow
 def test_auto_decodes_in_the_server_only_where_no_other_machine_can_reach_it(
     decoders: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

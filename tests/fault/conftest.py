@@ -1,0 +1,412 @@
+"""Real processes, something done to them, and a scoreboard of what followed.
+
+The street, its coded frames and the raw vehicle are those of ``tests/integration``. Time is part of
+what is tested here: bounds are in seconds of this machine, so run it on one that is quiet
+(``make test-fault``; it writes ``results/faults.json``, and ``docs/reliability.md`` from it).
+"""
+
+import asyncio
+import importlib.util
+import itertools
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cav_agent.frames import Capture, EncodeJob
+from cav_agent.pipeline import Pipeline
+from rfcore.codec import CodecConfig
+from rfcore.dataset import read_dataset
+from rfcore.wire.messages import FrameAddress
+from rfedge.provenance import host, revision
+
+_spec = importlib.util.spec_from_file_location(
+    "integration_street", Path(__file__).parents[1] / "integration/conftest.py"
+)
+assert _spec is not None
+assert _spec.loader is not None
+_street = importlib.util.module_from_spec(_spec)
+sys.modules[_spec.name] = _street  # dataclasses look their module up
+_spec.loader.exec_module(_street)
+street, coded, raw_vehicle = _street.street, _street.coded, _street.raw_vehicle
+
+RATE_HZ = 20
+CALM_S = 3.0
+ALLOWANCE_MS = 10.0
+"""A tenth of the frame budget: the 99th of a few dozen latencies is the largest, and one late
+wake-up of a shared machine shall not count as harm done by a neighbour."""
+
+ROWS: list[dict[str, Any]] = []
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--faults-json", type=Path, help="write the scoreboard of the faults here")
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    path = session.config.getoption("--faults-json")
+    if path is None or not ROWS:
+        return
+    result = {
+        "format": "rfedge-faults-1",
+        "command": "make test-fault",
+        "host": host(),
+        "revision": revision(),
+        "rows": ROWS,
+    }
+    path.write_text(json.dumps(result, indent=1) + "\n")
+
+
+async def appears(condition: Callable[[], Any], within_s: float = 30.0) -> Any:
+    """Return the first true value of ``condition``."""
+    until_s = time.monotonic() + within_s
+    while not (value := condition()):
+        assert time.monotonic() < until_s, f"not within {within_s} s"
+        await asyncio.sleep(0.005)
+    return value
+
+
+@pytest.fixture(name="appears")
+def appears_fixture() -> Callable[..., Any]:
+    return appears
+
+
+@dataclass
+class Program:
+    """A process of ours and its log."""
+
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    def entries(self, event: str) -> list[dict[str, Any]]:
+        """Return the log lines of ``event``."""
+        lines = [line for line in self.log.read_text().splitlines() if line.startswith("{")]
+        return [entry for entry in map(json.loads, lines) if entry.get("event") == event]
+
+    def send(self, number: signal.Signals) -> float:
+        """Send a signal; return when."""
+        self.process.send_signal(number)
+        return time.time()
+
+    def rss_bytes(self, name: str = "VmRSS") -> int:
+        """Return resident memory; ``VmHWM`` is the most it ever was."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        return 1024 * int(re.search(rf"{name}:\s+(\d+) kB", status)[1])  # type: ignore[index]
+
+    def descendants(self) -> list[int]:
+        """Return the processes it started, and those they did."""
+        found, left = [], [self.process.pid]
+        while left:
+            pid = left.pop()
+            for children in Path(f"/proc/{pid}/task").glob("*/children"):
+                left += [int(child) for child in children.read_text().split()]
+            found.append(pid)
+        return found[1:]
+
+
+@dataclass
+class Server(Program):
+    """``mec-server``."""
+
+    address: str = ""
+
+    def value(self, name: str, **labels: str) -> float:
+        """Return a sample of its metrics, 0 where there is none."""
+        port = self.entries("metrics")[-1]["port"]
+        url = f"http://127.0.0.1:{port}/metrics"
+        with urllib.request.urlopen(url, timeout=10) as answer:
+            lines = answer.read().decode().splitlines()
+        wanted = {f'{key}="{value}"' for key, value in labels.items()}
+        for line in lines:
+            metric, _, value = line.rpartition(" ")
+            found, _, rest = metric.partition("{")
+            if found == name and wanted <= set(rest.rstrip("}").split(",")):
+                return float(value)
+        return 0.0
+
+    def decoders(self) -> list[int]:
+        """Return its decoder processes, the one that stands ready included."""
+        return [p for p in self.descendants() if b"decoder_child" in _command(p)]
+
+
+@dataclass
+class Vehicle(Program):
+    """``cav-agent``."""
+
+    report: Path = Path()
+
+    def lines(self) -> list[dict[str, Any]]:
+        """Return what is in its report, whole lines only."""
+        if not self.report.exists():
+            return []
+        return [json.loads(line) for line in self.report.read_text().split("\n")[:-1]]
+
+    def acked(self, after_s: float = 0.0) -> list[dict[str, Any]]:
+        """Return the pictures that were acknowledged, and captured after a moment."""
+        lines = self.lines()
+        return [x for x in lines if x["result"] == "acked" and x["capture_time_ns"] / 1e9 > after_s]
+
+    def acked_at_s(self, after_s: float) -> list[float]:
+        """Return when pictures were acknowledged after a moment."""
+        ends = [x["capture_time_ns"] / 1e9 + x["latency_ms"] / 1e3 for x in self.acked()]
+        return sorted(end for end in ends if end > after_s)
+
+
+def _command(pid: int) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
+class Site:
+    """Starts servers and vehicles; ends them all."""
+
+    def __init__(self, folder: Path, street: Any) -> None:
+        self.street = street
+        self._folder = folder
+        self._numbers = itertools.count()
+        self._programs: list[Program] = []
+
+    async def server(
+        self, *options: str, listen: str = "127.0.0.1:0", within: Sequence[str] = ()
+    ) -> Server:
+        """Return a server that accepts vehicles."""
+        number = next(self._numbers)
+        ready = self._folder / f"ready{number}"
+        given = ("--listen", listen, "--ready-file", str(ready), "--metrics-port", "0")
+        fields = () if "--fields" in options else ("--fields", str(self.street.store))
+        process, log = self._start(within, "mec_server", *fields, *given, *options)
+        server = Server(process, log)
+        self._programs.append(server)
+        await appears(lambda: ready.exists() or process.poll() is not None)
+        assert process.poll() is None, log.read_text()
+        server.address = ready.read_text().strip()
+        return server
+
+    async def vehicle(
+        self, address: str, name: str, *options: str, within: Sequence[str] = (), frames: int = 3
+    ) -> Vehicle:
+        """Return a vehicle that had so many frames acknowledged."""
+        vehicle = self.start_vehicle(address, name, *options, within=within)
+        await appears(lambda: len(vehicle.acked()) >= frames or vehicle.process.poll() is not None)
+        assert vehicle.process.poll() is None, vehicle.log.read_text()
+        return vehicle
+
+    def start_vehicle(
+        self, address: str, name: str, *options: str, within: Sequence[str] = ()
+    ) -> Vehicle:
+        """Return a vehicle that was only just started."""
+        report = self._folder / f"{name}-{next(self._numbers)}.jsonl"
+        given = {
+            "--server": address,
+            "--drive": self.street.drive,
+            "--fields": self.street.store,
+            "--vehicle": name,
+            "--rate": RATE_HZ,
+            "--field": self.street.field_id,
+            "--preset": "ultrafast",
+            "--report": report,
+        }
+        own = [name for name in options if name.startswith("--")]
+        arguments = [str(x) for pair in given.items() if pair[0] not in own for x in pair]
+        process, log = self._start(within, "cav_agent", *arguments, "--loop", *options)
+        vehicle = Vehicle(process, log, report)
+        self._programs.append(vehicle)
+        return vehicle
+
+    def _start(
+        self, within: Sequence[str], module: str, *arguments: str
+    ) -> tuple[subprocess.Popen[bytes], Path]:
+        log = self._folder / f"{module}-{next(self._numbers)}.log"
+        with log.open("wb") as file:
+            command = [*within, sys.executable, "-m", module, *arguments]
+            return subprocess.Popen(command, stderr=file, stdout=file), log
+
+    def close(self) -> None:
+        """Kill what is left."""
+        for program in self._programs:
+            program.process.kill()
+        for program in self._programs:
+            program.process.wait()
+
+
+@pytest.fixture
+def site(tmp_path: Path, street: Any) -> Iterator[Site]:
+    made = Site(tmp_path, street)
+    yield made
+    made.close()
+
+
+@dataclass
+class Case:
+    """One row of the scoreboard in the making."""
+
+    street: Any
+    control: Vehicle
+    fault: str = ""
+    injected_with: str = ""
+    bounds: list[str] = field(default_factory=list)
+    measured: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    finished: bool = False
+    _started_s: float = field(default_factory=time.time)
+    _calm_until_s: float = 0.0
+    _fault_until_s: float = 0.0
+
+    def about(self, fault: str, injected_with: str) -> None:
+        """Say what is done, and with what."""
+        self.fault, self.injected_with = fault, injected_with
+
+    async def calm(self) -> None:
+        """Let things run undisturbed for 3 s, to compare with."""
+        self._started_s = time.time()
+        await asyncio.sleep(CALM_S)
+        self._calm_until_s = time.time()
+
+    def over(self) -> None:
+        """The fault is over; what follows is calm again."""
+        self._fault_until_s = time.time()
+
+    def at_most(self, what: str, value: float, limit: float, unit: str = "s") -> None:
+        """Note a figure and its bound."""
+        self._note(f"{what} <= {limit:g} {unit}", f"{value:.3g} {unit}", value <= limit)
+
+    def holds(self, what: str, value: object) -> None:
+        """Note something that must be so."""
+        self._note(what, "yes" if value else "no", bool(value))
+
+    async def spares(self, bystander: Vehicle) -> None:
+        """Note what the fault did to a vehicle that it was not meant for."""
+        await asyncio.sleep(CALM_S / 2)
+        lines = bystander.lines()
+        disturbed = [x for x in lines if self._in_fault(x)]
+        quiet = [
+            x
+            for x in lines
+            if x["capture_time_ns"] / 1e9 > self._started_s and not self._in_fault(x)
+        ]
+        before, during = p99_ms(quiet), p99_ms(disturbed)
+        elsewhere = p99_ms([x for x in self.control.lines() if self._in_fault(x)])
+        limit = 1.2 * max(before, elsewhere) + ALLOWANCE_MS
+        self._note(
+            f"bystander's p99 <= 1.2 x the larger of calm and control + {ALLOWANCE_MS:g} ms",
+            f"{before:.1f} -> {during:.1f} ms, control {elsewhere:.1f} ms",
+            during <= limit,
+        )
+        ended = {x["result"] for x in lines if x["capture_time_ns"] / 1e9 > self._started_s}
+        self.holds("none of its frames lost or refused", ended <= {"acked", "dropped"})
+        self.holds("its pictures exact", all(map(is_exact, bystander.acked())))
+
+    def recovers_exactly(self, vehicle: Vehicle, since_s: float) -> None:
+        """Note that a new stream's first pictures are those of a run that begins there."""
+        epoch = vehicle.acked(since_s)[0]["epoch"]
+        lines = [x for x in vehicle.acked() if x["epoch"] == epoch][:6]
+        got = [(x["sequence"], x["server_digest"]) for x in lines]
+        fresh = fault_free(self.street, [x["index"] for x in lines])
+        self.holds("frames after it byte-equal to a fault-free run", got == list(enumerate(fresh)))
+
+    def finish(self) -> None:
+        """Every figure is in."""
+        self.finished = True
+        assert self.failed == []
+
+    def row(self) -> dict[str, Any]:
+        """Return the row of the scoreboard."""
+        return {
+            "fault": self.fault,
+            "injected_with": self.injected_with,
+            "bound": "; ".join(self.bounds),
+            "measured": "; ".join(self.measured),
+            "passed": self.finished and not self.failed,
+        }
+
+    def _in_fault(self, line: dict[str, Any]) -> bool:
+        captured_s = line["capture_time_ns"] / 1e9
+        return self._calm_until_s <= captured_s <= self._fault_until_s
+
+    def _note(self, bound: str, measured: str, good: bool) -> None:
+        self.bounds.append(bound)
+        self.measured.append(measured)
+        if not good:
+            self.failed.append(f"{bound}: {measured}")
+
+
+def is_exact(line: dict[str, Any]) -> bool:
+    """Tell whether the server's picture is the vehicle's."""
+    return bool(line["server_digest"] == line["reconstruction_digest"])
+
+
+def p99_ms(lines: Sequence[dict[str, Any]]) -> float:
+    """Return the 99th percentile of the latencies of those that were answered."""
+    latencies = sorted(x["latency_ms"] for x in lines if x["result"] == "acked")
+    assert latencies, "the bystander was answered nothing"
+    return float(latencies[min(len(latencies) - 1, int(0.99 * len(latencies)))])
+
+
+def fault_free(street: Any, indices: Sequence[int]) -> list[str]:
+    """Return the digests of a stream that begins with these pictures of the drive."""
+    pictures = read_dataset(street.drive).pictures
+    pipeline = Pipeline(street.field, CodecConfig(76, 52, "ultrafast"), time.perf_counter_ns)
+    digests = []
+    for sequence, index in enumerate(indices):
+        picture = pictures[index]
+        camera = picture.camera
+        rounded = type(camera)(camera.intrinsics, camera.world_from_cam.rounded())
+        picture = type(picture)(picture.name, rounded, picture.read)
+        base = FrameAddress("front", 0, sequence - 1) if sequence else None
+        job = EncodeJob(Capture(index, picture, 0.0, 0), 0, 1, base)
+        digests.append(pipeline.encode(job).packet.reconstruction_digest.hex())
+    return digests
+
+
+@pytest.fixture(scope="session")
+def control(street: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Vehicle]:
+    """A vehicle on a server of its own: what it suffers is the machine's doing."""
+    site = Site(tmp_path_factory.mktemp("control"), street)
+
+    async def start() -> Vehicle:
+        server = await site.server()
+        return await site.vehicle(server.address, "control")
+
+    yield asyncio.run(start())
+    site.close()
+
+
+@pytest.fixture
+def case(street: Any, control: Vehicle) -> Iterator[Case]:
+    made = Case(street, control)
+    yield made
+    ROWS.append(made.row())
+    print(json.dumps(made.row(), indent=1))
+
+
+@pytest.fixture
+async def streaming(site: Site) -> tuple[Server, Vehicle]:
+    """A server and a vehicle that nothing is to happen to."""
+    server = await site.server()
+    return server, await site.vehicle(server.address, "bystander")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    here = Path(__file__).parent
+    for item in items:
+        if here in item.path.parents:
+            item.add_marker(pytest.mark.fault)
+            item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture
+def as_root() -> None:
+    if os.geteuid() != 0:
+        pytest.skip("network namespaces and mounts need root")
