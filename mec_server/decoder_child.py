@@ -12,6 +12,7 @@ import mmap
 import resource
 import socket
 import sys
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -19,10 +20,11 @@ from mec_server.decoder_wire import (
     DONE,
     FAILED,
     MAX_ANSWER_BYTES,
+    MAX_REQUEST_BYTES,
     MEMORY_BYTES,
     OUTPUT_AT,
-    REQUEST,
     Command,
+    request_from_bytes,
 )
 from rfcore.codec.h264 import H264Decoder
 from rfcore.errors import CodecError
@@ -46,25 +48,35 @@ class DecoderChild:
 
     def answer(self, request: bytes) -> bytes:
         """Do what ``request`` asks for; return what to say."""
-        command, first, second = REQUEST.unpack(request)
+        command, numbers = request_from_bytes(request)
         try:
-            self._obey(Command(command), first, second)
+            self._obey(command, numbers)
         except CodecError as error:
             return FAILED + str(error).encode()[: MAX_ANSWER_BYTES - 1]
         return DONE
 
-    def _obey(self, command: Command, first: int, second: int) -> None:
+    def _obey(self, command: Command, numbers: Sequence[int]) -> None:
         if command is Command.OPEN:
-            self._decoder = H264Decoder((first, second))
+            width_px, height_px = numbers
+            self._decoder = H264Decoder((width_px, height_px))
             return
         if self._decoder is None:
             raise CodecError("decoder process: nothing is open")
         if command is Command.RESET:
             self._decoder.reset()
-        elif command is Command.FEED:
-            self._decoder.feed(self._memory[:first])
-        else:
-            self._put(self._decoder.decode(self._memory[:first]))
+            return
+        units = list(self._units(numbers))
+        wanted = units.pop() if command is Command.DECODE else None
+        for unit in units:
+            self._decoder.feed(unit)
+        if wanted is not None:
+            self._put(self._decoder.decode(wanted))
+
+    def _units(self, lengths: Sequence[int]) -> Iterator[bytes]:
+        start = 0
+        for length in lengths:
+            yield self._memory[start : start + length]
+            start += length
 
     def _put(self, picture: I420) -> None:
         offset = OUTPUT_AT
@@ -99,7 +111,7 @@ def main() -> None:
     child = DecoderChild(mmap.mmap(int(sys.argv[2]), MEMORY_BYTES))
     confine()
     control.send(DONE)
-    while request := control.recv(REQUEST.size):
+    while request := control.recv(MAX_REQUEST_BYTES):
         _allow_cpu()
         control.send(child.answer(request))
 

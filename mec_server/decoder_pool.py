@@ -12,11 +12,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 
 from mec_server.decoder_process import DecoderLost, DecoderProcess
-from mec_server.decoder_wire import Command
+from mec_server.decoder_wire import INPUT_BYTES, Command
 from rfcore.errors import CodecError, RfedgeError
 from rfcore.image import I420
 
 __all__ = ["ChildDecoder", "DecoderPool"]
+
+
+MAX_WAITING = 15
+"""Access units that are fed with the one that is decoded; a frame has at most three references."""
 
 
 class DecoderPool:
@@ -71,8 +75,9 @@ class DecoderPool:
 class ChildDecoder:
     """``rfcore.codec.h264.H264Decoder`` in another process: the same pictures and the same errors.
 
-    A process that dies costs the picture it was asked for; the next request has the next process.
-    One caller at a time, but ``close`` may come from any thread.
+    What is fed waits in the shared memory for what comes next, so that a frame is one request. A
+    process that dies costs the picture it was asked for; the next request has the next process. One
+    caller at a time, but ``close`` may come from any thread.
     """
 
     def __init__(self, pool: DecoderPool, size_px: tuple[int, int]) -> None:
@@ -80,23 +85,26 @@ class ChildDecoder:
         self._size_px = size_px
         self._lock = threading.Lock()
         self._closed = False
+        self._waiting: list[int] = []
         self._process: DecoderProcess | None = self._open()
 
     def decode(self, access_unit: bytes) -> I420:
         """Decode one access unit of one whole picture, or raise ``CodecError``."""
         with self._lock:
-            process = self._ask(Command.DECODE, access_unit)
+            process = self._lay_down(access_unit)
+            self._request(process, Command.DECODE, *self._laid_down())
             width, height = self._size_px
             return I420.unpacked(self._size_px, process.take(width * height * 3 // 2))
 
     def feed(self, access_unit: bytes) -> None:
-        """Decode like ``decode``, for the sake of what comes after."""
+        """Decode for the sake of what comes after, and with it: errors may wait until then."""
         with self._lock:
-            self._ask(Command.FEED, access_unit)
+            self._lay_down(access_unit)
 
     def reset(self) -> None:
         """Forget everything; a process that died has nothing to forget."""
         with self._lock:
+            self._waiting.clear()
             if self._process is not None:
                 self._request(self._process, Command.RESET)
 
@@ -108,17 +116,28 @@ class ChildDecoder:
                 self._process.close()
                 self._process = None
 
-    def _ask(self, command: Command, access_unit: bytes) -> DecoderProcess:
+    def _lay_down(self, access_unit: bytes) -> DecoderProcess:
+        """Put an access unit behind those that wait, or after them where there is no room."""
         if self._process is None:
             self._process = self._open()
-        process = self._process
-        process.put(access_unit)
-        self._request(process, command, len(access_unit))
+        process, size = self._process, len(access_unit)
+        if size > INPUT_BYTES:
+            raise CodecError(f"access unit of {size} bytes exceeds {INPUT_BYTES}")
+        if len(self._waiting) == MAX_WAITING or sum(self._waiting) + size > INPUT_BYTES:
+            self._request(process, Command.FEED, *self._laid_down())
+        process.put(access_unit, sum(self._waiting))
+        self._waiting.append(size)
         return process
+
+    def _laid_down(self) -> list[int]:
+        """Return the lengths of what waits, which the next request is about."""
+        lengths, self._waiting = self._waiting, []
+        return lengths
 
     def _open(self) -> DecoderProcess:
         if self._closed:
             raise CodecError("decoder is closed: its stream is over")
+        self._waiting.clear()
         try:
             process = self._pool.take()
         except RfedgeError as error:

@@ -20,12 +20,11 @@ from enum import StrEnum
 
 from mec_server.decoder_wire import (
     DONE,
-    INPUT_BYTES,
     MAX_ANSWER_BYTES,
     MEMORY_BYTES,
     OUTPUT_AT,
-    REQUEST,
     Command,
+    request_to_bytes,
 )
 from rfcore.errors import CodecError, RfedgeError
 
@@ -112,19 +111,17 @@ class DecoderProcess:
         """Whether it runs."""
         return self._process.poll() is None
 
-    def ask(self, command: Command, first: int = 0, second: int = 0) -> None:
+    def ask(self, command: Command, *numbers: int) -> None:
         """Have one thing done; raise ``DecoderLost``, or ``CodecError`` if FFmpeg refuses."""
         with suppress(OSError):  # how it ended is for the answer to say
-            self._control.send(REQUEST.pack(command, first, second))
+            self._control.send(request_to_bytes(command, *numbers))
         answer = self._hear(ANSWER_S)
         if answer != DONE:
             raise CodecError(answer[1:].decode(errors="replace"))
 
-    def put(self, access_unit: bytes) -> None:
-        """Lay down what the next request is about."""
-        if len(access_unit) > INPUT_BYTES:
-            raise CodecError(f"access unit of {len(access_unit)} bytes exceeds {INPUT_BYTES}")
-        self._memory[: len(access_unit)] = access_unit
+    def put(self, access_unit: bytes, start: int) -> None:
+        """Lay down what the next request is about; the caller knows that there is room."""
+        self._memory[start : start + len(access_unit)] = access_unit
 
     def take(self, size_bytes: int) -> bytes:
         """Return a copy of the picture decoded last; the process may change its own at any time."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from prometheus_client import CollectorRegistry
 
-from mec_server import bubblewrap, decoder_process
+from mec_server import bubblewrap, decoder_pool, decoder_process
 from mec_server.bubblewrap import bubblewrap_command
 from mec_server.config import DecoderKind
 from mec_server.decoder_child import ADDRESS_SPACE_BYTES
@@ -86,7 +86,34 @@ def test_pictures_are_those_of_a_decoder_in_this_process(
     here = H264Decoder(SIZE_PX)
     for unit in units[:-1]:
         assert decoder.decode(unit).digest() == here.decode(unit).digest()
-    decoder.feed(units[-1])
+
+
+def test_what_is_fed_is_decoded_with_what_comes_next_however_much_it_is(
+    decoder: ChildDecoder, units: Sequence[bytes]
+) -> None:
+    here = H264Decoder(SIZE_PX)
+    for unit in [*units[:3]] * 10:  # more than one request holds
+        decoder.feed(unit)
+        here.feed(unit)
+    assert decoder.decode(units[3]).digest() == here.decode(units[3]).digest()
+    decoder.feed(b"\x00\x00\x00\x01\x65garbage")
+    with pytest.raises(CodecError):
+        decoder.decode(units[0])
+    decoder.reset()
+    assert decoder.decode(units[0]).digest() == H264Decoder(SIZE_PX).decode(units[0]).digest()
+
+
+def test_what_does_not_fit_into_the_memory_is_handed_over_before(
+    decoder: ChildDecoder, units: Sequence[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = H264Decoder(SIZE_PX)
+    monkeypatch.setattr(decoder_pool, "INPUT_BYTES", max(map(len, units)) + 1)
+    for unit in units[:3]:
+        decoder.feed(unit)
+        here.feed(unit)
+    assert decoder.decode(units[3]).digest() == here.decode(units[3]).digest()
+    with pytest.raises(CodecError, match="exceeds"):
+        decoder.feed(bytes(max(map(len, units)) + 2))
 
 
 def test_what_ffmpeg_refuses_is_the_same_error_and_the_process_lives_on(
