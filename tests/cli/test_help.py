@@ -9,10 +9,11 @@ import pytest
 VERBS = ("demo", "train", "render", "encode", "decode", "link", "loadtest", "watch", "bench")
 EVAL_VERBS = ("eval compare", "eval never-worse", "eval paper", "eval stability")
 CERTS_VERBS = ("certs init", "certs show")
-SCENE_VERBS = ("scene convert", "scene poses", "scene record-carla")
+SCENE_VERBS = ("scene build", "scene convert", "scene poses", "scene record-carla")
 FIELD_VERBS = tuple(
     f"field {verb}" for verb in ("import", "info", "check", "slim", "rungs", "export")
 )
+EMPTY_STREET = str(Path(__file__).parents[2] / "samples/scenes/street-empty.toml")
 HEAVY = ("torch", "cv2", "matplotlib", "av", "grpc", "cryptography")
 
 
@@ -53,6 +54,8 @@ def test_the_help_loads_nothing_heavy() -> None:
         (("loadtest", "--hz", "0"), "0.1..1000 Hz"),
         (("loadtest", "--live", "--mode", "receiver"), "live vehicles need mode full"),
         (("loadtest", "--field", "missing.rff"), "missing.rff"),
+        (("scene", "build", "nowhere", "--out", "o"), "'nowhere' is no ready-made scene"),
+        (("scene", "build", EMPTY_STREET, "--out", "o", "--spp", "15"), "not a square number"),
         (("watch", "nonsense"), "nonsense"),
         (("watch", "127.0.0.1:1", "--tls-cert", "c.pem"), "belong together"),
         (("certs", "show", "nowhere"), "nowhere"),

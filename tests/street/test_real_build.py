@@ -1,6 +1,8 @@
 """The street itself, rendered: two workers, a static pose, a real kill."""
 
 import io
+import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,14 +15,17 @@ from rich.console import Console
 from rfcore.dataset import read_dataset, verify_manifest
 from rfcore.image import read_rgb
 from rfcore.metrics import psnr
+from rfcore.native import _native
 from rfedge.street import load_scene
 from rfedge.street.build.run import Settings, build_scene
 from rfedge.street.build.selection import Selection
 from rfedge.street.build.studio import Order, Studio
+from rfedge.street.effects import EFFECTS
 from rfedge.street.render.backend import chosen_backend
 from rfedge.street.render.renderer import Quality
 from rfedge.street.scene_file import Scene
 
+ROOT = Path(__file__).parents[2]
 SHORT = """
 name = "short"
 field = "short"
@@ -89,3 +94,50 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     scene = load_scene(str(file))
     build(scene, tmp_path / "s", (64, 36), 1, "0:4")
     assert len(read_dataset(tmp_path / "s").pictures) == 4
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+sys.meta_path[:] = [f for f in sys.meta_path if not type(f).__module__.startswith("_editable")]
+import rfedge
+from rfedge.street import load_scene
+from rfedge.street.build.studio import Order, Studio
+from rfedge.street.render.backend import chosen_backend
+from rfedge.street.render.renderer import Quality
+from rfedge.street.shots import Split, shots_of
+scene, out = load_scene(sys.argv[1]), Path(sys.argv[2])
+studio = Studio(Order(scene, out, Quality(4), chosen_backend(), 1))
+studio.take(shots_of(scene, Split.DRIVE, (64, 36))[0])
+loaded = [name for name in sys.modules if name.startswith("rfedge.street.effects.")]
+picture = (out / "drive" / "images" / "000000.png").read_bytes()
+print(Path(rfedge.__file__).parents[1], picture.hex(), *sorted(loaded))
+"""
+
+
+@pytest.mark.slow
+def test_pictures_are_the_same_without_the_files_of_other_effects(tmp_path: Path) -> None:
+    """Nor are those effects imported while a frame is made, from the world to the file.
+
+    An editable install would lead both programs to the checkout: they do without its finder.
+    """
+    file = tmp_path / "hazy.toml"
+    file.write_text(SHORT.format(speed_mps=5.0) + "[effects.haze]\n")
+    for root in (tmp_path / "whole", tmp_path / "bare"):
+        for package in ("rfedge", "rfcore"):
+            shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("csrc"))
+        shutil.copy(str(_native.__file__), root / "rfcore" / "native")
+    for effect in EFFECTS:
+        if effect.name != "haze":
+            (tmp_path / "bare" / "rfedge/street/effects" / f"{effect.name}.py").unlink()
+    seen = []
+    for root in (tmp_path / "whole", tmp_path / "bare"):
+        command = [sys.executable, "-c", PROGRAM, str(file), str(root / "s")]
+        environment = {**os.environ, "PYTHONPATH": str(root)}
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        assert done.returncode == 0, done.stderr
+        used, *made = done.stdout.split()
+        assert Path(used) == root
+        seen.append(made)
+    assert seen[0] == seen[1]
+    assert seen[0][1:] == ["rfedge.street.effects.haze"]

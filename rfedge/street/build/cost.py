@@ -1,6 +1,6 @@
 """What a build will take, from what frames took: processor time and room on the disk.
 
-Measured on a 2-core x86-64 machine (AVX-512, 2.2 GHz class) with Mitsuba 3.9.1 and LLVM 19; other
+Measured on a busy 2-core x86-64 machine (AVX-512, 2.5 GHz) with Mitsuba 3.9.1 and LLVM 19; other
 machines differ, which is why the progress bar's time left, not this, is to be believed later on.
 """
 
@@ -14,10 +14,10 @@ from rfedge.street.shots import Shot
 
 __all__ = ["cost_line", "time_text"]
 
-START_S = 15.0
+START_S = 12.0
 """Making the world and compiling kernels, in each worker."""
-SAMPLE_US = 1.4
-PIXEL_US = 3.0
+SAMPLE_US = 2.0
+PIXEL_US = 4.0
 """Guides, depth, denoising, writing."""
 SCALAR_TIMES = 3.5
 PIXEL_BYTES = 3.2

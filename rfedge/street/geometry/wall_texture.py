@@ -62,8 +62,9 @@ def roof_tiles(rng: np.random.Generator) -> Texture:
 def _plaster(colour: Colour, rng: np.random.Generator) -> F32:
     painted = tinted(SHAPE, colour) * (1 + 0.05 * fractal(SHAPE, 2.6, rng)[..., None])
     painted *= 1 + 0.035 * rng.standard_normal((*SHAPE, 1), dtype=np.float32)
-    streaks = enlarged(rng.standard_normal((8, 256), dtype=np.float32), SHAPE)
-    painted *= 1 - 0.07 * np.clip(streaks, 0, 3)[..., None]
+    streaks = enlarged(rng.standard_normal((4, 256), dtype=np.float32), SHAPE)
+    soiled = np.clip(fractal(SHAPE, 3.0, rng), 0, 2)
+    painted *= 1 - 0.04 * (soiled * (1 + np.clip(streaks, -1, 2)))[..., None]
     dark = tuple(0.65 * value for value in colour)
     for _ in range(10):
         steps = rng.normal(0, 9, (30, 2)) + np.array([3, 5])
