@@ -6,13 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.compare import Contest, Performance
+from rfedge.evaluate.compare import STEADY, Contest, Performance
 
 __all__ = ["PASSES", "break_even_row", "curve_rows"]
 
 PASSES = (1, 10, 100)
 BREAK_EVEN_DB = 33.0
+PEAK = 255.0
 Row = dict[str, Any]
 
 
@@ -25,8 +28,7 @@ def curve_rows(
 
 
 def _curve(contest: Contest, family: str, who: Performance) -> Row:
-    curve = who.steady
-    clips = sorted(who.clips, key=lambda clip: float(clip.luma_mse[1:].mean()), reverse=True)
+    clips = sorted(who.clips, key=lambda clip: float(clip.luma_mse[STEADY].mean()), reverse=True)
     return {
         "scene": contest.scene,
         "hz": contest.rate_hz,
@@ -34,9 +36,9 @@ def _curve(contest: Contest, family: str, who: Performance) -> Row:
         "setting": who.name,
         "cpu_ms": who.cpu_ms_per_frame,
         "point": [clip.point for clip in clips],
-        "psnr_db": curve.psnr_db.tolist(),
-        "bytes_per_frame": curve.bytes_per_frame.tolist(),
-        "ssim": [float(clip.ssim[1:].mean()) for clip in clips],
+        "psnr_db": [float(10 * np.log10(PEAK**2 / clip.luma_mse[STEADY].mean())) for clip in clips],
+        "bytes_per_frame": [float(clip.frame_bytes[STEADY].mean()) for clip in clips],
+        "ssim": [float(clip.ssim[STEADY].mean()) for clip in clips],
     }
 
 

@@ -76,14 +76,16 @@ class RateCurve:
 def rate_curve(clips: Sequence[CodedClip], frames: NDArray[np.intp] | slice) -> RateCurve:
     """Return the curve of one clip coded at several points, over the chosen ``frames``.
 
-    Raises ``InvalidInput`` when there are too few points.
+    Points of one quality, as of a good field at rates where nothing is sent, count once, at the
+    fewest bytes. Raises ``InvalidInput`` when there are too few points.
     """
     mse = np.array([clip.luma_mse[frames].mean() for clip in clips])
     rates = np.array([clip.frame_bytes[frames].mean() for clip in clips])
     with np.errstate(divide="ignore"):
         psnr_db = 10 * np.log10(PEAK * PEAK / mse)
-    order = np.argsort(psnr_db)
-    return RateCurve(psnr_db[order], rates[order])
+    order = np.lexsort((rates, psnr_db))
+    qualities, first = np.unique(psnr_db[order], return_index=True)
+    return RateCurve(qualities, rates[order][first])
 
 
 def bd_rate_percent(anchor: RateCurve, test: RateCurve, window_db: Window) -> float:

@@ -107,3 +107,13 @@ def test_the_interval_holds_the_figure_and_repeats_with_its_seed():
     curves = rate_curve(anchor, slice(1, None)), rate_curve(test, slice(1, None))
     assert low < bd_rate_percent(*curves, window) < high
     assert (low, high) == bd_rate_interval(anchor, test, window, np.random.default_rng(1))
+
+
+def test_points_of_one_quality_count_once_at_the_fewest_bytes():
+    several = clips(1.0)
+    dearer = CodedClip(9, several[0].frame_bytes * 2, several[0].luma_mse, np.ones(12), 1.0)
+    curve = rate_curve([dearer, *several], slice(None))
+    np.testing.assert_array_equal(curve.psnr_db, rate_curve(several, slice(None)).psnr_db)
+    np.testing.assert_array_equal(
+        curve.bytes_per_frame, rate_curve(several, slice(None)).bytes_per_frame
+    )
