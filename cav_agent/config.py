@@ -81,6 +81,11 @@ class AgentConfig:
     max_delay_ms: float | None = None
     """From capture to Ack, at most; quality falls to keep it, from --crf on, and pictures are
     dropped when the lowest cannot. Without it every frame has --crf."""
+    deadline_ms: float | None = None
+    """Milliseconds a frame may take here, from the picture to the packet: the best rung of the
+    ladder that keeps it is used, a lower one under load, in place of the preset."""
+    ladder: Path = Path("results/ladder.json")
+    """What rungs take and cost, as `rfedge eval ladder` measured it."""
     log: LogForm = LogForm.AUTO
     """console lines, json lines, or auto: console on a terminal."""
     report: Path | None = None
@@ -103,3 +108,5 @@ class AgentConfig:
             raise InvalidInput("preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
         if self.max_delay_ms is not None and not 10 <= self.max_delay_ms <= 60_000:
             raise InvalidInput("max_delay_ms", f"{self.max_delay_ms} ms is outside 10..60000 ms")
+        if self.deadline_ms is not None and not 1 <= self.deadline_ms <= 60_000:
+            raise InvalidInput("deadline_ms", f"{self.deadline_ms} ms is outside 1..60000 ms")

@@ -72,7 +72,7 @@ class DeadlineController:
         self._room_since_s: float | None = None
         self._climbed_s = -math.inf
         self.slowness: float | None = None
-        self.missed = 0
+        self.late = False
         self.current = self._best(1.0)
 
     @property
@@ -91,8 +91,7 @@ class DeadlineController:
         first = self.slowness is None
         before = ratio if self.slowness is None else self.slowness
         self.slowness = before + self._limits.memory * (ratio - before)
-        late = sender_ms > self._deadline_ms
-        self.missed += late
+        self.late = late = sender_ms > self._deadline_ms
         if first:
             return self._move(self._best(1 / self._limits.room))
         if rung is not self.current:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from prometheus_client import CollectorRegistry
 
+from cav_agent.deadline import Step
 from cav_agent.frames import FrameResult
 from rfcore.codec import references_name
 from rfcore.wire.instruments import Instruments
@@ -54,6 +55,19 @@ class AgentMetrics:
             "Throughput that the last answers prove, base delay counted as transmission; "
             "0 without --max-delay-ms.",
         )
+        self._rung = make.gauge(
+            "rfedge_agent_rung",
+            "Rungs of the ladder above the present one: 0 is the best; without a deadline 0.",
+        )
+        self._steps = make.counter(
+            "rfedge_agent_rung_steps",
+            "Changes of rung, down to a faster one or up to a better one.",
+            ("direction",),
+        )
+        self._late = make.counter(
+            "rfedge_agent_deadline_missed_frames",
+            "Frames that took longer than --deadline-ms from the picture to the packet.",
+        )
         self._stages = make.seconds(
             "rfedge_agent_stage_seconds",
             "Time of a frame by stage; link is from sending to Ack without the server's own time.",
@@ -79,6 +93,14 @@ class AgentMetrics:
             "1; the radiance field in use: the first 16 digits of its id, and its kind.",
             {"field": field_id[:16], "kind": kind},
         )
+
+    def coded(self, position: int, step: Step | None, late: bool) -> None:
+        """Note the rung after a frame under a deadline, and whether the frame kept it."""
+        self._rung.set(position)
+        if step is not None:
+            self._steps.labels("down" if step.down else "up").inc()
+        if late:
+            self._late.inc()
 
     def connected(self, is_connected: bool) -> None:
         """Note that the server welcomed us, or was lost."""

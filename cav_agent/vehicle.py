@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry, start_http_server
 
 from cav_agent.client import Agent, Equipment
 from cav_agent.config import AgentConfig, PaceKind
+from cav_agent.deadline import DeadlineController, Step
 from cav_agent.field_fetch import choose_field, fetch_field
 from cav_agent.frames import FrameResult, Outcome
 from cav_agent.metrics import AgentMetrics
@@ -23,8 +24,10 @@ from cav_agent.pipeline import Pipeline
 from cav_agent.rate_control import QualitySteps, RateControl
 from cav_agent.reach import ServerEnd
 from cav_agent.report import Report
+from cav_agent.rungs import DeadlineRungs, FixedRung, Rungs
 from cav_agent.session import AgentSession
 from rfcore.codec import CodecConfig
+from rfcore.codec.ladder import Rung, read_ladder
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import FieldStore, RadianceField
@@ -123,7 +126,8 @@ class Vehicle:
                 )
         pictures = tuple(map(_posed_for_the_wire, pictures))
         codec = CodecConfig(intrinsics.width_px, intrinsics.height_px, config.preset, config.crf)
-        pipeline = Pipeline(field, codec, time.perf_counter_ns)
+        rungs = self._rungs(field)
+        pipeline = Pipeline(field, codec, time.perf_counter_ns, rungs=rungs)
         rate_hz = config.rate if config.pace is PaceKind.REALTIME else 0.0
         camera = CameraDescription(config.camera, intrinsics, pipeline.header, rate_hz)
         contract = RendererContract(RENDERER_CONTRACT, exact=True)
@@ -132,6 +136,33 @@ class Vehicle:
         self._metrics.field(field.field_id, field.metadata.kind)
         log.info("ready", pictures=len(pictures), field=field.field_id, isa=field.isa)
         return Journey(pictures, pipeline, hello)
+
+    def _rungs(self, field: RadianceField) -> Rungs:
+        """Return how frames are coded; under a deadline make every renderer it may ask for."""
+        config = self._config
+        if config.deadline_ms is None:
+            return FixedRung(Rung(preset=config.preset))
+        ladder = read_ladder(config.ladder, field.metadata.kind, config.crf)
+        for measured in ladder:
+            field.prepare(measured.rung.quality)
+        controller = DeadlineController(ladder, config.deadline_ms)
+        log.info(
+            "deadline",
+            deadline_ms=config.deadline_ms,
+            rungs=len(ladder),
+            rung=controller.current.rung.name,
+        )
+        return DeadlineRungs(controller, self._coded)
+
+    def _coded(self, controller: DeadlineController, step: Step | None) -> None:
+        self._metrics.coded(controller.position, step, controller.late)
+        if step is not None:
+            log.info(
+                "stepped down" if step.down else "stepped up",
+                before=step.before.rung.name,
+                rung=step.after.rung.name,
+                slowness=round(step.slowness, 2),
+            )
 
     async def _drive(
         self, channel: grpc.aio.Channel, journey: Journey, executor: ThreadPoolExecutor

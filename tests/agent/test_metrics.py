@@ -6,8 +6,10 @@ from dataclasses import replace
 import pytest
 from prometheus_client import CollectorRegistry
 
+from cav_agent.deadline import Step
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
 from cav_agent.metrics import AgentMetrics
+from rfcore.codec.ladder import MeasuredRung, Rung
 from rfcore.wire.messages import StageTimes
 
 
@@ -86,3 +88,19 @@ def test_a_picture_coded_again_to_fit_is_counted(
     metrics.ended(acked)
     metrics.ended(replace(acked, tries=3))
     assert registry.get_sample_value("rfedge_agent_recoded_frames_total") == 1
+
+
+def test_a_vehicle_under_a_deadline_shows_its_rung_its_steps_and_what_was_late(
+    metrics: AgentMetrics, registry: CollectorRegistry
+) -> None:
+    good = MeasuredRung(Rung(), 80.0, 30.0, 0.0)
+    quick = MeasuredRung(Rung(references=0), 20.0, 12.0, 60.0)
+    metrics.coded(1, Step(good, quick, 2.0), late=True)
+    metrics.coded(1, None, late=False)
+    assert registry.get_sample_value("rfedge_agent_rung") == 1
+    metrics.coded(0, Step(quick, good, 1.0), late=False)
+    assert registry.get_sample_value("rfedge_agent_rung") == 0
+    for direction in ("down", "up"):
+        labels = {"direction": direction}
+        assert registry.get_sample_value("rfedge_agent_rung_steps_total", labels) == 1
+    assert registry.get_sample_value("rfedge_agent_deadline_missed_frames_total") == 1

@@ -1,0 +1,94 @@
+"""A vehicle with a deadline and a server, as processes: a small one means a lower rung, and the
+server's pictures are still the vehicle's to the byte."""
+
+import asyncio
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rfcore.errors import InvalidData
+
+FULL, LOW = "100% 3ref ultrafast", "10% sh0 render-only ultrafast"
+
+
+def write_ladder(path: Path, full_ms: float, low_ms: float) -> Path:
+    """Write a ladder of two rungs that take so long by what it says."""
+
+    def row(ms: float, rate: float, **knobs: Any) -> dict[str, Any]:
+        settings = {
+            "kind": "splats", "detail": 1.0, "sh_degree": None, "samples_per_ray": None,
+            "scale": 1.0, "references": 3, "photometric": True, "preset": "ultrafast",
+            "crf": 23.0, **knobs,
+        }  # fmt: skip
+        return {"settings": settings, "sender_ms": ms, "receiver_ms": 1.0, "rate_percent": rate}
+
+    rows = [row(full_ms, 0.0), row(low_ms, 90.0, detail=0.1, sh_degree=0, references=0)]
+    path.write_text(json.dumps({"case": "ladder", "rows": rows}))
+    return path
+
+
+async def drive(street: Any, tmp_path: Path, *more: str) -> list[dict[str, Any]]:
+    """Run server and vehicle as processes; return the vehicle's report."""
+    ready, report = tmp_path / "ready", tmp_path / "report.jsonl"
+    start = asyncio.create_subprocess_exec
+    listening = ("--listen", "127.0.0.1:0", "--ready-file", str(ready))
+    server = await start(
+        sys.executable, "-m", "mec_server", "--fields", str(street.store), *listening
+    )
+    try:
+        while not ready.exists():
+            assert server.returncode is None
+            await asyncio.sleep(0.005)
+        given = {"server": ready.read_text().strip(), "drive": street.drive}
+        given |= {"fields": street.store, "field": street.field_id, "pace": "lockstep"}
+        given |= {"preset": "ultrafast", "report": report}
+        arguments = [part for name, value in given.items() for part in (f"--{name}", str(value))]
+        agent = await start(sys.executable, "-m", "cav_agent", *arguments, *more)
+        assert await agent.wait() == 0
+    finally:
+        server.kill()
+        await server.wait()
+    return [json.loads(line) for line in report.read_text().splitlines()]
+
+
+@pytest.mark.parametrize(("deadline_ms", "first"), [(1, LOW), (60_000, FULL)])
+async def test_a_small_deadline_chooses_a_lower_rung_and_the_pictures_stay_equal(
+    street: Any, tmp_path: Path, deadline_ms: int, first: str
+) -> None:
+    ladder = write_ladder(tmp_path / "ladder.json", 1e3, 1e-3)
+    lines = await drive(
+        street, tmp_path, "--deadline-ms", str(deadline_ms), "--ladder", str(ladder)
+    )
+    assert lines
+    assert lines[0]["rung"] == first
+    if first == LOW:
+        assert {line["rung"] for line in lines} == {LOW}
+        assert {tuple(line["references"]) for line in lines} == {("render",)}
+    for line in lines:
+        assert line["result"] == "acked", line["reason"]
+        assert line["server_digest"] == line["reconstruction_digest"]
+
+
+async def test_frames_on_different_rungs_follow_each_other_in_one_stream(
+    serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    """A ladder of a machine a million times slower: its low rung is all that seems to fit, until
+    the first frame shows how quick this one is."""
+    ladder = write_ladder(tmp_path / "ladder.json", 1e9, 9e8)
+    async with serve() as server:
+        trip = await travel(server.address, deadline_ms=60_000.0, ladder=ladder)
+    assert trip.counts == {"acked": len(trip.lines)}
+    assert [line["rung"] for line in trip.lines[:2]] == [LOW, FULL]
+    for line in trip.lines:
+        assert line["server_digest"] == line["reconstruction_digest"]
+
+
+async def test_a_deadline_without_a_ladder_says_how_to_make_one(
+    serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    async with serve() as server:
+        with pytest.raises(InvalidData, match=r"nowhere\.json.*rfedge eval ladder"):
+            await travel(server.address, deadline_ms=33.0, ladder=tmp_path / "nowhere.json")
