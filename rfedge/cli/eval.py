@@ -9,8 +9,10 @@ from tyro.conf import subcommand
 
 from rfedge.cli.eval_compare import EvalCompare
 from rfedge.cli.eval_ladder import EvalLadder
+from rfedge.cli.eval_latency import EvalLatency
 from rfedge.cli.eval_never_worse import EvalNeverWorse
 from rfedge.cli.eval_paper import EvalPaper
+from rfedge.cli.eval_robust import EvalRobust
 from rfedge.cli.eval_stability import EvalStability
 
 __all__ = ["Eval"]
@@ -24,7 +26,9 @@ class Eval:
         Annotated[EvalCompare, subcommand("compare")]
         | Annotated[EvalLadder, subcommand("ladder")]
         | Annotated[EvalNeverWorse, subcommand("never-worse")]
+        | Annotated[EvalLatency, subcommand("latency")]
         | Annotated[EvalPaper, subcommand("paper")]
+        | Annotated[EvalRobust, subcommand("robust")]
         | Annotated[EvalStability, subcommand("stability")]
     )
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, FrameChoice
 from rfcore.codec.encoder import Encoded
+from rfcore.codec.photometric import Photometric
 from rfcore.codec.references import References, is_temporal, references_name
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.field import RadianceField
@@ -78,6 +79,7 @@ class FieldCoder:
         *,
         preset: str,
         references: References | None = None,
+        photometric: Photometric | None = None,
         points: Sequence[float] = CRFS,
         foregrounds: Sequence[NDArray[np.bool_]] = (),
     ) -> None:
@@ -87,10 +89,10 @@ class FieldCoder:
         self._seen = seen
         self._preset = preset
         self._foregrounds = foregrounds
-        self._choice = FrameChoice(references=references)
+        self._choice = FrameChoice(references=references, photometric=photometric)
         # Temporal references exist from the second frame on.
         temporal = references is not None and is_temporal(references)
-        self._first_choice = FrameChoice() if temporal else self._choice
+        self._first_choice = FrameChoice(photometric=photometric) if temporal else self._choice
 
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` at CRF ``point``; ``rate_hz`` changes nothing here.

@@ -14,7 +14,9 @@ from rfcore.errors import InvalidInput
 from rfedge.bench.rows import flattened
 from rfedge.report.codec_evidence import compare_section, never_worse_section, paper_section
 from rfedge.report.evaluations import training_section
+from rfedge.report.latency import latency_section
 from rfedge.report.markdown_parts import Row, cell, heading, table
+from rfedge.report.robust import robust_section
 from rfedge.report.summary import METRIC, SUMMARY
 
 __all__ = ["results_page"]
@@ -28,8 +30,10 @@ Machines are shared and noisy: compare within a table, not across hosts.
 
 SECTIONS = {
     "compare": compare_section,
+    "latency": latency_section,
     "never-worse": never_worse_section,
     "paper": paper_section,
+    "robust": robust_section,
 }
 
 

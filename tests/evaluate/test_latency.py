@@ -1,0 +1,124 @@
+"""``rfedge eval latency``: tau, waiting and dropping by arithmetic, and a run from files."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rfcore.errors import InvalidInput
+from rfcore.link import DirectionPlan, LinkProfile
+from rfedge.evaluate.latency import (
+    FRAMES_FOR_REQUIREMENT,
+    REQUIREMENT,
+    needed_rate_bps,
+    play,
+    repeated,
+)
+from rfedge.evaluate.latency_run import LatencyJob, run_latency
+from rfedge.report.latency import latency_section, write_latency_figures
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+
+
+def constant(rate_bps, delay_s=0.0):
+    return DirectionPlan(LinkProfile(rate_bps, delay_s))
+
+
+def test_tau_is_bits_over_rate_and_propagation_comes_after_it():
+    played = play([1000, 2000], 10, constant(1e6, 0.02))
+    np.testing.assert_allclose(played.tau_ms, [8, 16])
+    np.testing.assert_allclose(played.network_ms, [28, 36])
+
+
+def test_a_frame_waits_for_the_one_before_and_a_third_is_dropped():
+    played = play([2500] * 4, 100, constant(1e6))  # 20 ms each, one every 10 ms
+    np.testing.assert_allclose(played.network_ms, [20, 30, 40])
+    assert played.dropped == 1
+    assert played.frames == 4
+
+
+def test_dropped_frames_are_late_in_shares_and_quantiles():
+    played = play([2500] * 4, 100, constant(1e6))
+    assert played.share_within(25) == 0.25
+    assert played.quantile_ms(0.5) == pytest.approx(40)
+    assert played.quantile_ms(1.0) == np.inf
+
+
+@pytest.mark.parametrize("budget_ms", [5.0, 10.0])
+def test_the_needed_rate_sends_the_largest_frame_within_the_budget(budget_ms):
+    sizes = [1000] * 90 + [4000] * 10
+    needed = needed_rate_bps(sizes, 10, budget_ms)
+    exact = 8 * 4000 / (budget_ms / 1e3)
+    assert exact <= needed <= 1.006 * exact
+    assert play(sizes, 10, constant(needed)).quantile_ms(0.99) <= budget_ms
+
+
+def test_one_large_frame_in_a_thousand_does_not_count_for_99_percent():
+    sizes = [1000] * 999 + [100_000]
+    assert needed_rate_bps(sizes, 10, 10) < 1.01 * 8 * 1000 / 0.01
+
+
+def test_a_budget_that_nothing_meets_is_an_error():
+    with pytest.raises(InvalidInput, match="not even 1e\\+10 bit/s"):
+        needed_rate_bps([10**9], 10, 1e-3)
+
+
+def test_a_clip_is_repeated_without_the_frame_that_is_sent_once():
+    assert repeated([9, 1, 2], 5) == [1, 2, 1, 2, 1]
+    with pytest.raises(InvalidInput, match="at least two frames"):
+        repeated([9], 5)
+
+
+def test_the_requirement_takes_three_hundred_thousand_frames():
+    """So many in a row without a late one have a chance of 5 % where the true share is 99.999 %."""
+    assert REQUIREMENT**FRAMES_FOR_REQUIREMENT <= 0.05 < REQUIREMENT ** (FRAMES_FOR_REQUIREMENT - 1)
+    assert 299_000 < FRAMES_FOR_REQUIREMENT < 300_000
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_quick_run_writes_rows_figures_and_a_section(tmp_path):
+    drive = SAMPLES / "street/transforms_drive_empty.json"
+    job = LatencyJob(
+        SAMPLES / "fields/street.rff",
+        [f"empty@10={drive}"],
+        [SAMPLES / "links/drive.up"],
+        "ultrafast",
+        32.0,
+        tmp_path / "latency.json",
+        tmp_path / "cells",
+        quick=True,
+    )
+    result = run_latency(job, Console(quiet=True))
+    assert json.loads(job.out.read_text()) == result
+    ours, theirs = result["needed"]
+    assert ours["method"].startswith("rfedge")
+    for row in (ours, theirs):
+        assert 32.0 <= row["psnr_db"] < 33.0
+    assert ours["kbit_per_frame"] < theirs["kbit_per_frame"]
+    assert ours["uplink_bps_p99_within"]["10"] < theirs["uplink_bps_p99_within"]["10"]
+    paths = write_latency_figures(result, tmp_path / "figures")
+    assert len(paths) == 6
+    assert all(path.stat().st_size for path in paths)
+    section = latency_section(job.out, result)
+    assert "299,572" in section or "299,571" in section or "299,573" in section
+    assert "| drive |" in section
+
+
+@pytest.mark.parametrize(
+    ("change", "named"), [({"out": Path("x.txt")}, "out"), ({"quality_db": 10.0}, "quality_db")]
+)
+def test_a_job_that_cannot_be_done_is_refused_by_name(change, named):
+    given = {
+        "field": Path("a"),
+        "drives": [],
+        "traces": [],
+        "preset": "medium",
+        "quality_db": 33.0,
+        "out": Path("c.json"),
+        "cells": Path("d"),
+    }
+    with pytest.raises(InvalidInput, match=named):
+        LatencyJob(**(given | change))
