@@ -24,7 +24,8 @@ BLUE, GREY = LINES[0], "#aab4bf"
 def write_figure(stem: Path, figure: Figure, lines: Sequence[Sequence[str]]) -> list[Path]:
     """Write ``stem.svg`` and ``stem.csv`` and close the figure; return their paths."""
     drawing, numbers = io.StringIO(), io.StringIO()
-    figure.savefig(drawing, format="svg", bbox_inches="tight", metadata={"Date": None})
+    with plt.rc_context(STYLE):  # the salt of the file's ids is in it: equal figures, equal files
+        figure.savefig(drawing, format="svg", bbox_inches="tight", metadata={"Date": None})
     plt.close(figure)
     csv.writer(numbers, lineterminator="\n").writerows(lines)
     stem.parent.mkdir(parents=True, exist_ok=True)

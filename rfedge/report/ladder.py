@@ -28,7 +28,8 @@ one that fits, and steps down and up while it drives.
 * **Times** are milliseconds of processor time a frame with one thread, lower quartiles over the
   drive without its first frame: what one core needs when nothing disturbs it. The sender's hold
   conversion, render, choice of references, x264 and the closed loop; the receiver's render,
-  references, splice and decoding.
+  references, splice and decoding. Renders are timed once per quality. Where other programs ran
+  beside it, rungs that do the same work (with and without `no-light`) show how far a time is off.
 * **Bits** are those of the whole message. **Rate** is bits at equal quality against the first rung
   of the first field (the mean over the qualities both reach): what a rung costs the link. A cheaper
   rung is not worse in quality at the same CRF, it needs more bits for it.

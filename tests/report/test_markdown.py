@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from rfcore.errors import InvalidInput
+from rfedge.report.ladder import ladder_page
 from rfedge.report.markdown import results_page
 
 ROOT = Path(__file__).parents[2]
@@ -13,6 +14,12 @@ ROOT = Path(__file__).parents[2]
 
 def test_the_page_is_generated_from_the_result_files() -> None:
     assert (ROOT / "docs" / "results.md").read_text() == results_page(ROOT / "results")
+
+
+def test_the_ladders_page_is_generated_from_the_result_files() -> None:
+    result = json.loads((ROOT / "results" / "ladder.json").read_text())
+    runs = {p.stem: json.loads(p.read_text()) for p in sorted(ROOT.glob("results/train/*.json"))}
+    assert (ROOT / "docs" / "ladder.md").read_text() == ladder_page(result, runs)
 
 
 def test_a_bench_result_becomes_a_table_with_its_provenance(tmp_path: Path) -> None:
