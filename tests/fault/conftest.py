@@ -67,7 +67,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     path.write_text(json.dumps(result, indent=1) + "\n")
 
 
-async def appears(condition: Callable[[], Any], within_s: float = 30.0) -> Any:
+async def appears(condition: Callable[[], Any], within_s: float = 60.0) -> Any:
     """Return the first true value of ``condition``."""
     until_s = time.monotonic() + within_s
     while not (value := condition()):
