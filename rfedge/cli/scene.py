@@ -12,6 +12,7 @@ from rfedge.cli.scene_convert import SceneConvert
 from rfedge.cli.scene_plan import ScenePlan
 from rfedge.cli.scene_poses import ScenePoses
 from rfedge.cli.scene_record_carla import SceneRecordCarla
+from rfedge.cli.scene_sheet import SceneSheet
 
 __all__ = ["Scene"]
 
@@ -25,6 +26,7 @@ class Scene:
         | Annotated[SceneConvert, subcommand("convert")]
         | Annotated[ScenePoses, subcommand("poses")]
         | Annotated[ScenePlan, subcommand("plan")]
+        | Annotated[SceneSheet, subcommand("sheet")]
         | Annotated[SceneRecordCarla, subcommand("record-carla")]
     )
 

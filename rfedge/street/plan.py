@@ -17,7 +17,7 @@ from rfedge.street.effects import EFFECTS, Effect, Stage, rng_of
 from rfedge.street.frame import LinearFrame
 from rfedge.street.scene_file import Scene
 
-__all__ = ["PlannedEffect", "plain_frame", "planned_effects"]
+__all__ = ["PlannedEffect", "RenderCost", "plain_frame", "planned_effects"]
 
 REPETITIONS = 5
 
@@ -35,6 +35,19 @@ class PlannedEffect:
     settings: object
     cost_ms: float
     each_frame: bool = True
+
+
+@dataclass(frozen=True)
+class RenderCost:
+    """Processor milliseconds a frame of the drive: the plain street, and what each effect adds."""
+
+    plain_ms: float
+    added_ms: dict[str, float]
+
+    def share_percent(self, cost_ms: float, frame_effects_ms: float) -> float:
+        """Return a cost's share of a whole frame with all effects."""
+        whole_ms = self.plain_ms + sum(self.added_ms.values()) + frame_effects_ms
+        return 100.0 * cost_ms / whole_ms
 
 
 def planned_effects(scene: Scene, cpu_s: Callable[[], float]) -> tuple[PlannedEffect, ...]:

@@ -1,0 +1,70 @@
+"""A plan says what runs, why, and each effect's share of a frame as it was measured."""
+
+import numpy as np
+import pytest
+
+from rfedge.street.effects.noise import SensorNoise
+from rfedge.street.effects.overcast import Overcast
+from rfedge.street.effects.wet_road import WetRoad
+from rfedge.street.geometry.layout import Layout
+from rfedge.street.geometry.road import road
+from rfedge.street.geometry.world import Sky, World
+from rfedge.street.plan import PlannedEffect, RenderCost, Stage
+from rfedge.street.plan_render import measured_render
+from rfedge.street.plan_text import effect_lines, scene_lines
+from rfedge.street.scene_file import Geometry, Scene
+
+SMALL = Geometry(length_m=20.0)
+
+
+@pytest.fixture(autouse=True)
+def bare_road(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A street that is made at once."""
+    layout = Layout(SMALL)
+    sky = Sky(np.full((16, 32, 3), 0.5, np.float32))
+    world = World(layout, sky).plus(road(layout, np.random.default_rng(1)))
+    monkeypatch.setattr("rfedge.street.plan_render.plain_world", lambda _scene: world)
+
+
+def test_an_effect_costs_what_the_next_render_takes_more() -> None:
+    seen: list[World] = []
+
+    def frame_ms(world: World) -> float:
+        seen.append(world)
+        return (100.0, 90.0, 130.0)[len(seen) - 1]
+
+    effects = {"overcast": Overcast(), "wet_road": WetRoad(), "noise": SensorNoise()}
+    cost = measured_render(Scene("x", "x", geometry=SMALL, effects=effects), frame_ms)
+    assert cost == RenderCost(100.0, {"overcast": -10.0, "wet_road": 40.0})
+    assert seen[1].sky is not seen[0].sky
+    assert seen[1].materials is seen[0].materials
+    assert seen[2].materials["asphalt"] is not seen[0].materials["asphalt"]
+
+
+def test_without_effects_the_street_is_rendered_once() -> None:
+    calls = []
+    cost = measured_render(Scene("x", "x", geometry=SMALL), lambda w: calls.append(w) or 7.0)
+    assert cost == RenderCost(7.0, {})
+    assert len(calls) == 1
+
+
+def test_shares_are_of_the_whole_frame() -> None:
+    cost = RenderCost(60.0, {"wet_road": 20.0})
+    shares = [cost.share_percent(part, 20.0) for part in (60.0, 20.0, 20.0)]
+    assert sum(shares) == pytest.approx(100.0)
+    planned = (
+        PlannedEffect("wet_road", Stage.SURFACE, "it is wet", None, 300.0, each_frame=False),
+        PlannedEffect("noise", Stage.SENSOR, "it is dark", None, 20.0),
+    )
+    plain, wet, noise = effect_lines(planned, cost)
+    assert "60 ms a frame without effects, 60 % of it" in plain
+    assert "wet_road: it is wet; 300 ms once, before the first frame; +20 ms a frame, 20.0" in wet
+    assert "noise: it is dark; 20.0 ms a frame, 20.0 % of it" in noise
+    assert "100 % of all effects on frames" in effect_lines(planned, None)[1]
+
+
+def test_a_scene_without_effects_says_so() -> None:
+    scene = Scene("street-x", "street-y")
+    assert scene_lines(scene)[0] == "street-x: field of street-y"
+    assert "144 views of 640x360 px (18 cameras, 8 stations)" in scene_lines(scene)[2]
+    assert effect_lines((), None) == ["  effects     none: pictures are as rendered"]
