@@ -17,7 +17,7 @@ from rfedge.street.scene_file import Scene
 
 __all__ = ["measured_render", "small_render_ms"]
 
-SIZE_PX = (160, 90)
+SIZE_PX = (320, 180)
 SAMPLES = 4
 FRAMES = 3
 
@@ -38,7 +38,7 @@ def measured_render(scene: Scene, frame_ms: Callable[[World], float]) -> RenderC
 
 
 def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> Callable[[World], float]:
-    """Return a measure of a world: the median of 3 frames of 160x90, 4 samples a pixel.
+    """Return a measure of a world: the median of 3 frames of 320x180, 4 samples a pixel.
 
     It is scaled to the pixels of the drive's frames; samples are not scaled.
     """

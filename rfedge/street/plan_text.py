@@ -31,7 +31,7 @@ def effect_lines(planned: Sequence[PlannedEffect], cost: RenderCost | None) -> l
         share = cost.share_percent(cost.plain_ms, on_frames_ms)
         lines.append(
             f"  render      {cost.plain_ms:.0f} ms a frame without effects, {share:.0f} % of it "
-            "(4 samples a pixel, 160x90 scaled to the drive's pixels, one core)"
+            "(4 samples a pixel, 320x180 scaled to the drive's pixels, one core)"
         )
     if not planned:
         lines.append("  effects     none: pictures are as rendered")
