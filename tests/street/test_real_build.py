@@ -83,7 +83,8 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     file = tmp_path / "driving.toml"
     file.write_text(SHORT.format(speed_mps=5.0))
     command = [sys.executable, "-c", "from rfedge.cli import main; main()", "scene", "build"]
-    command += [str(file), "--out", str(tmp_path / "s"), "--size", "64x36", "--workers", "2"]
+    command += [str(file), "--out", str(tmp_path / "s"), "--size", "64x36"]
+    command += ["--split", "drive", "--workers", "2"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
         said = [parent.stdout.readline() for _ in range(2)]
