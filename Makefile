@@ -10,7 +10,8 @@ NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
 .PHONY: help demo sample-field test test-slow test-prometheus test-netns test-fault test-compose \
-	test-system-packages check build bench proto figures images up down operations-figures
+	test-system-packages check build bench proto figures images up down operations-figures \
+	load load-transport load-receiver load-full soak soak-short
 
 help:  ## show the targets
 	@awk -F':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -75,6 +76,22 @@ down:  ## stop them and remove their volumes
 
 operations-figures: build  ## plot every panel of what `make up` started, into docs/operations.md
 	$(BIN)/python deploy/compose/show.py
+
+LOADTEST = $(BIN)/rfedge loadtest --record results/loadtest.json
+load: load-transport load-receiver load-full  ## what two cores carry (`make -k load`; three minutes)
+load-transport: build  ## 100 streams at 30 Hz, pictures not looked at
+	$(LOADTEST) --mode transport --vehicles 100 --hz 30 --out out/loadtest/transport
+load-receiver: build  ## 8 vehicles at 10 Hz, decoded against kept renders
+	$(LOADTEST) --mode receiver --vehicles 8 --hz 10 --out out/loadtest/receiver
+load-full: build  ## 4 vehicles at 5 Hz, rendered and decoded
+	$(LOADTEST) --mode full --vehicles 4 --hz 5 --out out/loadtest/full
+
+MINUTES ?= 30
+soak: build  ## half load for MINUTES (30): memory, descriptors and threads must not grow
+	$(BIN)/python -m rfedge.loadtest.soak --minutes $(MINUTES) $(ARGS)
+
+soak-short: build  ## five minutes of it
+	$(BIN)/python -m rfedge.loadtest.soak --minutes 5
 
 check: build  ## lint, types, layers, generated files
 	$(BIN)/ruff format --check .

@@ -30,7 +30,8 @@ def latency_chart(latency_ms: Mapping[str, Sequence[float]], deadline_ms: float)
             color=RENDER,
         )
         axes.set(xlabel="ms from due to acknowledged", ylabel="% of frames", xscale="log")
-        axes.xaxis.set_major_formatter(mpl.ticker.FormatStrFormatter("%g"))
+        for set_formatter in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+            set_formatter(mpl.ticker.FormatStrFormatter("%g"))
         axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1), fontsize=9)
         return svg(figure)
 
@@ -57,14 +58,16 @@ def uplink_chart(
             axes.axhline(server_vehicles, color=RENDER, linewidth=1.5, linestyle="--")
             axes.annotate(
                 f"held by the server in this test: {server_vehicles}",
-                (rates[0], server_vehicles),
-                xytext=(0, 5),
+                (rates[-1], server_vehicles),
+                xytext=(0, -12),
                 textcoords="offset points",
+                ha="right",
                 color=RENDER,
             )
         axes.set(xlabel="throughput of the shared uplink, Mbit/s", ylabel="vehicles", xscale="log")
         axes.set_xticks(rates, [f"{rate:g}" for rate in rates])
         axes.minorticks_off()
+        axes.yaxis.get_major_locator().set_params(integer=True)
         axes.tick_params(colors=MUTED)
         axes.spines["bottom"].set_color(GRID)
         axes.margins(y=0.15)

@@ -51,9 +51,9 @@ class LoadResult:
         load, row = self.runs[0].load, self.runs[0].row
         what = f"{load.mode}, {row['width']}x{row['height']}, {load.hz:g} Hz"
         if len(self.runs) > 1:
-            return f"{self.most_held} vehicles held ({what})"
+            return f"{_vehicles(self.most_held)} held ({what})"
         held = "held" if self.most_held else "not held"
-        return f"{load.vehicles} vehicles {held} ({what})"
+        return f"{_vehicles(load.vehicles)} {held} ({what})"
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of ``result.json``."""
@@ -107,6 +107,10 @@ def _finite(row: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _vehicles(count: int) -> str:
+    return "1 vehicle" if count == 1 else f"{count} vehicles"
+
+
 def _uplink(result: LoadResult) -> str:
     run = result.runs[-1]
     sizes = [size for size in run.payload_bytes for _ in range(run.load.cameras)]
@@ -122,7 +126,7 @@ def _page(result: LoadResult, content: Mapping[str, Any], figure: str) -> str:
     )
     environment.filters["ms"] = lambda value: "-" if value is None else f"{value:.1f}"
     last = result.runs[-1]
-    latency_ms = {f"{run.load.vehicles} vehicles": run.latency_ms for run in result.runs}
+    latency_ms = {_vehicles(run.load.vehicles): run.latency_ms for run in result.runs}
     return environment.get_template("loadtest.html.j2").render(
         headline=result.headline(),
         what=_what(last),
@@ -155,6 +159,6 @@ def _what(run: Run) -> str:
         else "Live vehicles render and encode on this machine"
     )
     return (
-        f"{does} {vehicles}. {load.cameras} camera(s) a vehicle, each vehicle over {link}; "
+        f"{does} {vehicles}. Cameras a vehicle: {load.cameras}; each vehicle over {link}; "
         f"{load.duration_s:g} s counted after {load.warm_up_s:g} s of warm-up."
     )

@@ -16,6 +16,7 @@ from rfedge.loadtest.canned import CannedDrive, canned_drive, payload_drive
 from rfedge.loadtest.drive import drive_canned
 from rfedge.loadtest.live import drive_live
 from rfedge.loadtest.plan import Load, Mode, Vehicles
+from rfedge.loadtest.usage import Usage
 from rfedge.loadtest.verdict import Verdict, judge
 
 __all__ = ["Run", "TestBed", "run_load"]
@@ -47,6 +48,7 @@ class Run:
     row: Mapping[str, Any]
     latency_ms: Sequence[float]
     payload_bytes: Sequence[int]
+    usage: Mapping[str, Usage]
 
 
 def run_load(load: Load, bed: TestBed) -> Run:
@@ -71,7 +73,8 @@ def run_load(load: Load, bed: TestBed) -> Run:
     verdict = judge(found, load.bounds)
     row = _row(load, drive, brought, verdict)
     latency_ms = [ms for vehicle in found.vehicles for ms in vehicle.latency_ms]
-    return Run(load, verdict, row, latency_ms, [len(f.packet.payload) for f in drive.chain])
+    payload_bytes = [len(frame.packet.payload) for frame in drive.chain]
+    return Run(load, verdict, row, latency_ms, payload_bytes, brought.usage)
 
 
 def _canned(load: Load, bed: TestBed) -> Path:

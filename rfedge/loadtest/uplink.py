@@ -17,7 +17,7 @@ from rfedge.loadtest.search import largest_held
 
 __all__ = ["RATES_MBPS", "Traffic", "on_time_share", "vehicles_carried"]
 
-RATES_MBPS = (0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
+RATES_MBPS = (0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 32.0, 64.0, 128.0)
 MOST = 64
 PERIODS = 50
 

@@ -15,6 +15,7 @@ from rfedge.bench.rows import flattened
 from rfedge.report.codec_evidence import compare_section, never_worse_section, paper_section
 from rfedge.report.evaluations import training_section
 from rfedge.report.latency import latency_section
+from rfedge.report.load import load_section
 from rfedge.report.markdown_parts import Row, cell, heading, table
 from rfedge.report.robust import robust_section
 from rfedge.report.summary import METRIC, SUMMARY
@@ -62,6 +63,8 @@ def _section(path: Path) -> str:
         return f"{heading(path, result)}\n\n{len(result['rows'])} faults: `docs/reliability.md`.\n"
     if result.get("case") in SECTIONS:
         return SECTIONS[result["case"]](path, result)
+    if result.get("case") == "loadtest":
+        return load_section(path, result)
     if "case" in result:
         return _bench(path, result)
     raise InvalidInput("results", f"{path} is neither a demo nor a bench result")

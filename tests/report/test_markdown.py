@@ -113,3 +113,38 @@ def test_a_foreign_file_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "notes.json").write_text("{}")
     with pytest.raises(InvalidInput, match=r"notes\.json is neither"):
         results_page(tmp_path)
+
+
+def test_a_load_test_names_what_was_not_kept_and_its_command(tmp_path: Path) -> None:
+    row = {
+        "mode": "receiver",
+        "vehicles": 8,
+        "hz": 10.0,
+        "width": 640,
+        "height": 360,
+        "held": False,
+        "p50_ms": 20.5,
+        "p99_ms": None,
+        "on_time_percent": 97.25,
+        "on_time_at_least_percent": 96.1,
+        "fairness": 0.9,
+        "limited_by": "server's workers",
+        "broken": ["97.25 % on time, below 99 %"],
+        "kind": "canned",
+        "cameras": 1,
+        "payload_bytes": 4123.4,
+        "link": None,
+        "server_cores": 1.5,
+        "server_loop_cores": 0.25,
+        "vehicles_cores": 0.1,
+        "others_cores": 0.0,
+        "command": "rfedge loadtest --mode receiver",
+        "revision": "abc123",
+    }
+    host = {"cpu": "C", "cores": 2, "isa": "avx2"}
+    result = {"case": "loadtest", "command": "rfedge loadtest", "revision": "abc123"}
+    (tmp_path / "loadtest.json").write_text(json.dumps({**result, "host": host, "rows": [row]}))
+    page = results_page(tmp_path)
+    assert "| receiver | 8 | 1 | 10.00 | loopback | no | 20.50 | not run | 97.25 |" in page
+    assert "* `rfedge loadtest --mode receiver` at `abc123` (canned vehicles, 640x360" in page
+    assert "Not kept: 97.25 % on time, below 99 %." in page

@@ -1,0 +1,152 @@
+"""A long run at half load: nothing may grow. ``python -m rfedge.loadtest.soak --minutes 30``
+
+Two canned vehicles at 5 Hz keep a server, as it is, half as busy as the load it must hold on two
+cores. Its memory must climb by less than 1 MB a minute (least squares over the counted part), it
+may end with no more descriptors, threads or processes than it began with, and no vehicle may fall
+out. Latency is not judged: others may use the machine.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.files import write_whole
+from rfedge.loadtest.plan import Load, Mode
+from rfedge.loadtest.run import Run, TestBed, run_load
+from rfedge.loadtest.usage import Sample, slope_per_minute
+from rfedge.provenance import host, revision
+
+__all__ = ["MAX_SLOPE_MB", "SoakSettings", "soak", "what_grew"]
+
+MAX_SLOPE_MB = 1.0
+"""Per minute."""
+
+LEAST_SHARE = 0.5
+"""Of the frames; a machine with less to give says nothing about half load."""
+
+QUARTER = 4
+"""Counts of the last quarter are compared with those of the first."""
+
+
+@dataclass(frozen=True)
+class SoakSettings:
+    """Let a server work for long, and see that nothing grows."""
+
+    minutes: float = 30.0
+    """How long, after a warm-up."""
+    vehicles: int = 2
+    """How many send pictures."""
+    hz: float = 5.0
+    """Pictures per second of each."""
+    warm_up: float = 60.0
+    """Seconds before it counts: caches fill, allocators find their size."""
+    field: Path = Path("samples/fields/street.rff")
+    """Field archive, the only one in its folder."""
+    drive: Path = Path("samples/street/transforms_drive_vehicles.json")
+    """Drive whose pictures the vehicles send."""
+    out: Path = Path("out/soak/soak.json")
+    """File for the result; beside it, the processes' logs."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.minutes <= 24 * 60:
+            raise InvalidInput("minutes", f"{self.minutes:g} is outside 0..1440")
+
+
+def soak(settings: SoakSettings) -> dict[str, Any]:
+    """Run, write the result, return it; raise ``RfedgeError`` if anything grew."""
+    load = Load(Mode.FULL, settings.vehicles, settings.hz, 60 * settings.minutes, settings.warm_up)
+    folder = settings.out.parent
+    bed = TestBed(settings.field, settings.drive, 2, Path("out/cache/loadtest"), folder / "work")
+    run = run_load(load, bed)
+    samples = run.usage["server"].samples
+    problems = [*what_grew(samples), *_fallen_out(run)]
+    result = {
+        "case": "soak",
+        "command": " ".join(["python -m rfedge.loadtest.soak", *sys.argv[1:]]),
+        "revision": revision(),
+        "host": host(),
+        "rows": [_row(settings, run, samples, held=not problems)],
+    }
+    write_whole(settings.out, json.dumps(result, indent=1) + "\n")
+    if problems:
+        raise RfedgeError(f"soak: {'; '.join(problems)} (see {settings.out})")
+    return result
+
+
+def what_grew(samples: Sequence[Sample]) -> list[str]:
+    """Return what grew, in words; nothing if nothing did."""
+    slope_mb = slope_per_minute(samples)
+    problems = []
+    if slope_mb >= MAX_SLOPE_MB:
+        problems.append(f"memory grows {slope_mb:.2f} MB a minute, {MAX_SLOPE_MB:g} is too much")
+    for name, count in COUNTED:
+        first, last = _quarters(samples, count)
+        if last > first:
+            problems.append(f"{name} grew from {first} to {last}")
+    return problems
+
+
+COUNTED: tuple[tuple[str, Callable[[Sample], int]], ...] = (
+    ("descriptors", lambda sample: sample.descriptors),
+    ("threads", lambda sample: sample.threads),
+    ("processes", lambda sample: sample.children),
+)
+
+
+def _quarters(samples: Sequence[Sample], count: Callable[[Sample], int]) -> tuple[int, int]:
+    """Return the most there was in the first quarter, and in the last."""
+    length = max(1, len(samples) // QUARTER)
+    return max(map(count, samples[:length])), max(map(count, samples[-length:]))
+
+
+def _fallen_out(run: Run) -> list[str]:
+    wanted = run.load.vehicles * run.load.hz * run.load.duration_s
+    idle = len(run.latency_ms) < LEAST_SHARE * wanted
+    said = f"{len(run.latency_ms)} of {wanted:.0f} frames were reconstructed: that was no load"
+    return [said] * idle + [
+        f"{run.row[what]} {text}"
+        for what, text in (("failed", "vehicles fell out"), ("nacked", "frames were refused"))
+        if run.row[what]
+    ]
+
+
+def _row(
+    settings: SoakSettings, run: Run, samples: Sequence[Sample], *, held: bool
+) -> dict[str, Any]:
+    counts = {name: _quarters(samples, count) for name, count in COUNTED}
+    return {
+        "minutes": settings.minutes,
+        "vehicles": settings.vehicles,
+        "hz": settings.hz,
+        "held": held,
+        "frames": len(run.latency_ms),
+        "slope_mb_per_minute": slope_per_minute(samples),
+        "memory_mb": samples[-1].rss_mb,
+        **{f"{name}_first": first for name, (first, _) in counts.items()},
+        **{f"{name}_last": last for name, (_, last) in counts.items()},
+        "server_cores": run.row["server_cores"],
+        "p50_ms": run.verdict.p50_ms,
+        "p99_ms": run.verdict.p99_ms,
+    }
+
+
+def main() -> None:
+    """Run from the command line; exit 2 if anything grew."""
+    settings = tyro.cli(SoakSettings, prog="python -m rfedge.loadtest.soak")
+    try:
+        print(json.dumps(soak(settings)["rows"][0], indent=1))
+    except (RfedgeError, OSError) as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

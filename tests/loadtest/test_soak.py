@@ -1,0 +1,44 @@
+"""What a soak calls growth."""
+
+import pytest
+
+from rfedge.loadtest.soak import what_grew
+from rfedge.loadtest.usage import Sample
+
+
+def looks(slope_mb: float = 0.0, **late: int) -> list[Sample]:
+    """Ten minutes of samples; ``late`` are counts of the last two."""
+    counts = {"descriptors": 40, "threads": 9, "children": 2}
+    return [
+        Sample(
+            60.0 * i, 0.0, 0.0, 200.0 + slope_mb * i, **(counts if i < 8 else {**counts, **late})
+        )
+        for i in range(10)
+    ]
+
+
+def test_nothing_grows_when_nothing_does() -> None:
+    assert what_grew(looks()) == []
+    assert what_grew(looks(slope_mb=0.9)) == []
+    assert what_grew(looks(descriptors=30, threads=8)) == []
+
+
+@pytest.mark.parametrize(
+    ("samples", "said"),
+    [
+        (looks(slope_mb=1.5), "memory grows 1.50 MB a minute"),
+        (looks(descriptors=41), "descriptors grew from 40 to 41"),
+        (looks(threads=10), "threads grew from 9 to 10"),
+        (looks(children=3), "processes grew from 2 to 3"),
+    ],
+)
+def test_what_grows_is_named(samples: list[Sample], said: str) -> None:
+    (problem,) = what_grew(samples)
+    assert said in problem
+
+
+def test_a_thing_that_comes_and_goes_is_no_growth() -> None:
+    """A connection at the start and one at the end, of a scrape or a check of health."""
+    samples = looks(descriptors=41)
+    samples[1] = Sample(60.0, 0.0, 0.0, 200.0, 41, 9, 2)
+    assert what_grew(samples) == []
