@@ -135,7 +135,7 @@ def test_pictures_are_the_same_without_the_files_of_other_effects(tmp_path: Path
     for root in (tmp_path / "whole", tmp_path / "bare"):
         command = [sys.executable, "-c", PROGRAM, str(file), str(root / "s")]
         environment = {**os.environ, "PYTHONPATH": str(root)}
-        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        done = subprocess.run(command, capture_output=True, text=True, cwd=root, env=environment)
         assert done.returncode == 0, done.stderr
         used, *made = done.stdout.split()
         assert Path(used) == root
