@@ -27,7 +27,7 @@ from rfcore.views import PosedPicture
 from rfcore.wire.conventions import RETRY_AFTER, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.convert_answers import server_messages_from_bytes
-from rfcore.wire.messages import Welcome
+from rfcore.wire.messages import FieldNotice, Welcome
 
 __all__ = ["Agent", "Equipment"]
 
@@ -59,7 +59,8 @@ class Equipment:
     """What the agent works with: a drive, a way to encode, and who wants to know.
 
     ``reached`` waits so many seconds for the server (None: for ever) or raises ``TimeoutError``.
-    ``ended`` is told of every picture's end, ``connected`` when the server welcomed us or was lost.
+    ``ended`` is told of every picture's end, ``connected`` when the server welcomed us or was lost,
+    ``noticed`` when it says that it publishes something else.
     """
 
     pictures: tuple[PosedPicture, ...]
@@ -69,6 +70,7 @@ class Equipment:
     reached: Callable[[float | None], Awaitable[None]]
     ended: Callable[[FrameResult], None]
     connected: Callable[[bool], None]
+    noticed: Callable[[], None]
 
 
 class Agent:
@@ -93,6 +95,20 @@ class Agent:
         self._drive_wake = asyncio.Event()
         self._write_wake = asyncio.Event()
         self.counts: Counter[str] = Counter()
+
+    @property
+    def state(self) -> LinkState:
+        """Where the conversation with the server is."""
+        return self._session.state
+
+    def wake(self) -> None:
+        """Look at the pace again."""
+        self._drive_wake.set()
+
+    def withdraw(self) -> None:
+        """Let the picture go that waits for the encoder: another server takes the vehicle over."""
+        self._session.withdraw()
+        self._drive_wake.set()
 
     def stop(self) -> None:
         """Capture no more; ``run`` ends when the frame in flight was answered."""
@@ -237,6 +253,8 @@ class Agent:
                 if isinstance(message, Welcome):
                     self._equipment.connected(True)
                     self._equipment.pace.limit(message.rate_hz)
+                elif isinstance(message, FieldNotice):
+                    self._equipment.noticed()
             self._drive_wake.set()
 
     async def _write(self, stream: Stream) -> None:

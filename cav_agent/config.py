@@ -61,6 +61,9 @@ class AgentConfig:
     """Dataset in time order: a transforms.json, or the folder of the only one."""
     fields: Path = Path("~/.cache/rfedge/fields")
     """Directory of field archives; a field the server has is fetched into it."""
+    neighbours: tuple[str, ...] = ()
+    """HOST:PORT of further servers along the drive: the vehicle moves on from tile to tile, and to
+    a neighbour in reach when a server is lost."""
     camera: str = "front"
     """Name of the camera on the wire."""
     rate: float = 10.0
@@ -71,7 +74,7 @@ class AgentConfig:
     """realtime: capture at the rate, drop what the link cannot take. lockstep: capture the next
     picture when the previous was answered."""
     field: str | None = None
-    """Field id (sha256); the server's only field without it."""
+    """Field id (sha256); without it, what servers publish or the only field they have."""
     vehicle: str = "cav-1"
     """Name of the vehicle on the wire."""
     crf: float = 23.0

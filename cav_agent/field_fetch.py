@@ -10,20 +10,24 @@ from typing import TYPE_CHECKING, Protocol
 import grpc
 import structlog
 
-from rfcore.errors import FieldFormatError, RfedgeError, UnknownField
+from rfcore.errors import FieldFormatError, InvalidInput, RfedgeError, UnknownField
 from rfcore.wire.checks import check_field_id
+from rfcore.wire.tiles import MAX_TILES, Tile, tile_of
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 
 if TYPE_CHECKING:
     from rfcore.wire.v1.field_pb2_grpc import FieldServiceAsyncStub
 
-__all__ = ["MAX_FIELD_BYTES", "Store", "choose_field", "fetch_field"]
+__all__ = ["MAX_FIELD_BYTES", "WHOLE_STREET", "Store", "fetch_field", "published_tiles"]
 
 log = structlog.get_logger()
 
 MAX_FIELD_BYTES = 4 << 30
 """Longest archive the agent takes; more than any vehicle renders in time."""
+
+WHOLE_STREET = "street"
+"""What the only tile of a server without tiles is called."""
 
 MAX_RESUMES = 5
 RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL, grpc.StatusCode.CANCELLED)
@@ -39,19 +43,24 @@ class Store(Protocol):
         """Add an archive, checked against ``field_id`` before it is parsed."""
 
 
-async def choose_field(channel: grpc.aio.Channel, wanted: str | None) -> str:
-    """Return ``wanted``, or the server's only field; raise ``UnknownField`` if it has several."""
-    if wanted is not None:
-        return wanted
+async def published_tiles(channel: grpc.aio.Channel) -> tuple[Tile, ...]:
+    """Return the tiles a server publishes; of one that publishes none, its only field, everywhere.
+
+    Raises ``UnknownField`` for several fields without tiles, ``InvalidInput`` for a wrong tile.
+    """
     stub = FieldServiceStub(channel)
     try:
         listed = await stub.ListFields(pb.ListFieldsRequest(), wait_for_ready=True)
     except grpc.aio.AioRpcError as error:
         raise RfedgeError(f"the server does not list its fields: {error.details()}") from error
+    if len(listed.tiles) > MAX_TILES:
+        raise InvalidInput("tiles", f"the server lists {len(listed.tiles)}, above {MAX_TILES}")
+    if listed.tiles:
+        return tuple(map(tile_of, listed.tiles))
     if len(listed.field_ids) != 1:
         here = ", ".join(listed.field_ids) or "none"
         raise UnknownField(f"the server holds several fields or none ({here}); choose with --field")
-    return check_field_id("field", listed.field_ids[0])
+    return (Tile(WHOLE_STREET, check_field_id("field", listed.field_ids[0])),)
 
 
 async def fetch_field(channel: grpc.aio.Channel, store: Store, field_id: str, folder: Path) -> None:

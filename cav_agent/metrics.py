@@ -78,6 +78,17 @@ class AgentMetrics:
             "From the picture in the camera to its Ack.",
         )
 
+        self._fields = make.gauge(
+            "rfedge_agent_field_info",
+            "1; a radiance field that is ready: the first 16 digits of its id, and its kind.",
+            ("field", "kind"),
+        )
+        self._handovers = make.counter(
+            "rfedge_agent_handovers",
+            "Moves to another server or tile: tile (by position or version), server_lost.",
+            ("cause",),
+        )
+
     def travelling(self, vehicle_id: str, camera_id: str) -> None:
         """Tell who this is; for operators who want names."""
         self.instruments.info(
@@ -87,12 +98,12 @@ class AgentMetrics:
         )
 
     def field(self, field_id: str, kind: str) -> None:
-        """Tell which field frames are coded against."""
-        self.instruments.info(
-            "rfedge_agent_field_info",
-            "1; the radiance field in use: the first 16 digits of its id, and its kind.",
-            {"field": field_id[:16], "kind": kind},
-        )
+        """Tell which field was made ready to code frames against."""
+        self._fields.labels(field_id[:16], kind).set(1)
+
+    def moved(self, cause: str) -> None:
+        """Count a handover."""
+        self._handovers.labels(cause).inc()
 
     def coded(self, position: int, step: Step | None, late: bool) -> None:
         """Note the rung after a frame under a deadline, and whether the frame kept it."""

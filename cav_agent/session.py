@@ -72,6 +72,8 @@ class AgentSession:
         hello: Hello,
         limits: AgentLimits | None = None,
         rate_control: RateControl | None = None,
+        *,
+        first_epoch: int = 0,
     ) -> None:
         self.state = LinkState.DISCONNECTED
         self.session_id = ""
@@ -83,7 +85,7 @@ class AgentSession:
         self._limits = limits or AgentLimits()
         self._rate_control = rate_control
         self._patience = Patience(self._limits.answer_s)
-        self._epoch = 0
+        self._epoch = first_epoch
         self._epoch_used = False
         self._connection = 0
         self._granted = 0
@@ -96,6 +98,11 @@ class AgentSession:
         self._greeting_until_s = 0.0
         self._sent: FrameAddress | None = None
         self._decoded: FrameAddress | None = None
+
+    @property
+    def epoch(self) -> int:
+        """The epoch of the next packet."""
+        return self._epoch
 
     @property
     def is_idle(self) -> bool:
@@ -190,6 +197,11 @@ class AgentSession:
         self._slot.append(capture)
         if self._rate_control is not None:
             self._rate_control.captured(capture.captured_s)
+
+    def withdraw(self) -> None:
+        """Let go what waits for the encoder, to be captured again for another server."""
+        while self._slot:
+            self._results.append(FrameResult(self._slot.popleft(), Outcome.LOST, "handed over"))
 
     def stop(self) -> None:
         """Drop what waits for the encoder; what is being encoded or unanswered goes on."""

@@ -1,13 +1,15 @@
-"""One vehicle: gets its field, opens its drive, and streams it to the server."""
+"""One vehicle: opens its drive, gets fields as it comes by, and streams to the servers there."""
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections import Counter
+from collections import Counter, OrderedDict, deque
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import grpc
 import structlog
@@ -16,16 +18,21 @@ from prometheus_client import CollectorRegistry, start_http_server
 from cav_agent.client import Agent, Equipment
 from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.deadline import DeadlineController, Step
-from cav_agent.field_fetch import choose_field, fetch_field
+from cav_agent.field_fetch import WHOLE_STREET, fetch_field, published_tiles
 from cav_agent.frames import FrameResult, Outcome
+from cav_agent.handover import Cause
+from cav_agent.leg import Ready
 from cav_agent.metrics import AgentMetrics
-from cav_agent.pace import Lockstep, Pace, Realtime
+from cav_agent.pace import Pace
 from cav_agent.pipeline import Pipeline
 from cav_agent.rate_control import QualitySteps, RateControl
 from cav_agent.reach import ServerEnd
 from cav_agent.report import Report
+from cav_agent.route import Stop
 from cav_agent.rungs import DeadlineRungs, FixedRung, Rungs
 from cav_agent.session import AgentSession
+from cav_agent.trip import Hooks, Trip
+from rfcore.camera import TileOrigin
 from rfcore.codec import CodecConfig
 from rfcore.codec.ladder import Rung, read_ladder
 from rfcore.dataset import read_dataset
@@ -35,19 +42,27 @@ from rfcore.views import PosedPicture
 from rfcore.wire.address import Address
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.messages import CameraDescription, Hello, RendererContract
+from rfcore.wire.tiles import Tile
 
 __all__ = ["Vehicle"]
 
 log = structlog.get_logger()
 
+MAX_JOURNEYS = 3
+"""Fields kept ready: the last, the present and the next."""
+
+RETRY_S = 2.0
+"""Between questions to a server that does not answer them."""
+
 
 @dataclass(frozen=True)
 class Journey:
-    """What was made ready before the first frame."""
+    """What was made ready for one field before the first frame."""
 
+    field: RadianceField
     pictures: tuple[PosedPicture, ...]
-    pipeline: Pipeline
-    hello: Hello
+    codec: CodecConfig
+    rungs: Rungs
 
 
 class Vehicle:
@@ -55,13 +70,21 @@ class Vehicle:
 
     def __init__(self, config: AgentConfig) -> None:
         self.registry = CollectorRegistry()
-        address = Address.parse("server", config.server)
-        tls = config.transport.tls()
-        if tls is None:
-            address.require_private("server", config.transport.allow_insecure)
-        self._server = ServerEnd(address, tls)
+        self._servers = tuple(
+            _server_end(name, text, config)
+            for name, text in (
+                ("server", config.server),
+                *(("neighbours", text) for text in config.neighbours),
+            )
+        )
         self._config = config
         self._metrics = AgentMetrics(self.registry)
+        self._report: Report | None = None
+        self._executor = ThreadPoolExecutor(1, "encoder")
+        self._channels: list[grpc.aio.Channel] = []
+        self._noticed: list[asyncio.Event] = []
+        self._journeys: OrderedDict[str, asyncio.Task[Journey]] = OrderedDict()
+        self._sessions: deque[AgentSession] = deque(maxlen=4)
         self._stopped = asyncio.Event()
 
     def stop(self) -> None:
@@ -77,15 +100,43 @@ class Vehicle:
             return await self._travel()
 
     async def _travel(self) -> Counter[str]:
-        executor = ThreadPoolExecutor(1, "encoder")
+        config = self._config
+        pictures = await asyncio.to_thread(_read_drive, config, TileOrigin())
         try:
-            async with self._server.open() as channel:
-                field = await self._field(channel)
-                loop = asyncio.get_running_loop()
-                journey = await loop.run_in_executor(executor, self._prepare, field)
-                return await self._drive(channel, journey, executor)
+            async with AsyncExitStack() as stack:
+                for server in self._servers:
+                    self._channels.append(await stack.enter_async_context(server.open()))
+                    self._noticed.append(asyncio.Event())
+                if config.report is not None:
+                    self._report = Report(config.report)
+                    stack.callback(self._report.close)
+                positions = [
+                    picture.camera.world_from_cam.translation_m[:2] for picture in pictures
+                ]
+                hooks = Hooks(self._make_ready, self._ended, self._moved)
+                return await self._drive(Trip(config, positions, hooks))
         finally:
-            executor.shutdown()
+            self._executor.shutdown()
+
+    async def _drive(self, trip: Trip) -> Counter[str]:
+        """Drive while learning what servers publish, until the end or ``stop``."""
+        driving = asyncio.create_task(trip.run())
+        learning = [asyncio.create_task(self._learn(trip, i)) for i in range(len(self._servers))]
+        stopping = asyncio.create_task(self._stopped.wait())
+        try:
+            waiting: set[asyncio.Task[Any]] = {driving, stopping, *learning}
+            while not driving.done():
+                done, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()
+                if stopping in done:
+                    trip.stop()
+            return trip.counts
+        finally:
+            everything = [driving, stopping, *learning, *self._journeys.values()]
+            for task in everything:
+                task.cancel()
+            await asyncio.gather(*everything, return_exceptions=True)
 
     def _serve_metrics(self) -> None:
         port = self._config.metrics.port
@@ -93,49 +144,82 @@ class Vehicle:
             server, _ = start_http_server(port, self._config.metrics.host, self.registry)
             log.info("metrics", port=server.server_port)
 
-    async def _field(self, channel: grpc.aio.Channel) -> RadianceField:
-        """Load the field, fetched from the server if it is not here."""
-        config = self._config
-        fields = config.fields.expanduser()
-        store = FieldStore(fields)
+    # --- what servers publish
+
+    async def _learn(self, trip: Trip, server: int) -> None:
+        """Tell the trip what a server publishes, and again whenever that changes."""
+        is_known = False
+        while True:
+            try:
+                tiles = await self._tiles(server)
+            except RfedgeError as error:
+                if len(self._servers) == 1 and not is_known:
+                    raise
+                log.warning("tiles not learnt", server=server, problem=str(error))
+                await asyncio.sleep(RETRY_S)
+                continue
+            trip.found(server, [Stop(server, tile) for tile in tiles])
+            is_known = True
+            await self._noticed[server].wait()
+            self._noticed[server].clear()
+
+    async def _tiles(self, server: int) -> tuple[Tile, ...]:
+        config, end, channel = self._config, self._servers[server], self._channels[server]
+        if config.field is not None:
+            return (Tile(WHOLE_STREET, config.field),)
         within_s = config.limits.give_up_s or None
         try:
-            if config.field not in store.ids():
-                await self._server.reached(channel, within_s)
+            await end.reached(channel, within_s)
             async with asyncio.timeout(within_s):
-                field_id = await choose_field(channel, config.field)
+                return await published_tiles(channel)
         except TimeoutError as error:
-            raise RfedgeError(
-                f"no server at {self._server.address} within {within_s:g} s"
-            ) from error
+            raise RfedgeError(f"no server at {end.address} within {within_s:g} s") from error
+
+    # --- legs
+
+    async def _make_ready(self, stop: Stop) -> Ready:
+        journey = await self._journey(stop)
+        return Ready(journey.pictures, partial(self._agent, stop, journey))
+
+    async def _journey(self, stop: Stop) -> Journey:
+        """Return what was made ready for the stop's field; tiles of one field share it."""
+        journeys, field_id = self._journeys, stop.tile.field_id
+        task = journeys.get(field_id)
+        if task is None or (task.done() and (task.cancelled() or task.exception())):
+            task = journeys[field_id] = asyncio.create_task(self._load(stop))
+        journeys.move_to_end(field_id)
+        while len(journeys) > MAX_JOURNEYS and next(iter(journeys.values())).done():
+            journeys.popitem(last=False)
+        return await asyncio.shield(task)
+
+    async def _load(self, stop: Stop) -> Journey:
+        return await asyncio.to_thread(self._prepare, await self._field(stop))
+
+    async def _field(self, stop: Stop) -> RadianceField:
+        """Load the stop's field, fetched from its server if it is not here."""
+        config, field_id = self._config, stop.tile.field_id
+        fields, render = config.fields.expanduser(), config.render
+        store = FieldStore(fields)
         if field_id not in store.ids():
+            end, channel = self._servers[stop.server], self._channels[stop.server]
+            within_s = config.limits.give_up_s or None
+            try:
+                await end.reached(channel, within_s)
+            except TimeoutError as error:
+                raise RfedgeError(f"no server at {end.address} within {within_s:g} s") from error
             await fetch_field(channel, store, field_id, fields)
-        render = config.render
         return await asyncio.to_thread(store.load, field_id, threads=render.threads, isa=render.isa)
 
     def _prepare(self, field: RadianceField) -> Journey:
         config = self._config
-        pictures = read_dataset(config.drive, tile_origin=field.metadata.tile_origin).pictures
-        intrinsics = pictures[0].camera.intrinsics
-        for picture in pictures:
-            if picture.camera.intrinsics != intrinsics:
-                raise InvalidInput(
-                    "drive",
-                    f"{picture.name} has other intrinsics than {pictures[0].name}; "
-                    "one stream is one camera",
-                )
-        pictures = tuple(map(_posed_for_the_wire, pictures))
-        codec = CodecConfig(intrinsics.width_px, intrinsics.height_px, config.preset, config.crf)
+        pictures = _read_drive(config, field.metadata.tile_origin)
+        k = pictures[0].camera.intrinsics
+        codec = CodecConfig(k.width_px, k.height_px, config.preset, config.crf)
         rungs = self._rungs(field)
-        pipeline = Pipeline(field, codec, time.perf_counter_ns, rungs=rungs)
-        rate_hz = config.rate if config.pace is PaceKind.REALTIME else 0.0
-        camera = CameraDescription(config.camera, intrinsics, pipeline.header, rate_hz)
-        contract = RendererContract(RENDERER_CONTRACT, exact=True)
-        hello = Hello(config.vehicle, (camera,), (field.field_id,), contract)
         field.prepare()
         self._metrics.field(field.field_id, field.metadata.kind)
         log.info("ready", pictures=len(pictures), field=field.field_id, isa=field.isa)
-        return Journey(pictures, pipeline, hello)
+        return Journey(field, pictures, codec, rungs)
 
     def _rungs(self, field: RadianceField) -> Rungs:
         """Return how frames are coded; under a deadline make every renderer it may ask for."""
@@ -164,45 +248,67 @@ class Vehicle:
                 slowness=round(step.slowness, 2),
             )
 
-    async def _drive(
-        self, channel: grpc.aio.Channel, journey: Journey, executor: ThreadPoolExecutor
-    ) -> Counter[str]:
-        config = self._config
-        report = Report(config.report) if config.report is not None else None
-
+    def _agent(self, stop: Stop, journey: Journey, pace: Pace) -> Agent:
+        """Return an agent for a new stream to ``stop``; none of its packets has a number twice."""
+        config, channel = self._config, self._channels[stop.server]
+        pipeline = Pipeline(journey.field, journey.codec, time.perf_counter_ns, rungs=journey.rungs)
+        intrinsics = journey.pictures[0].camera.intrinsics
+        rate_hz = config.rate if config.pace is PaceKind.REALTIME else 0.0
+        camera = CameraDescription(config.camera, intrinsics, pipeline.header, rate_hz)
+        contract = RendererContract(RENDERER_CONTRACT, exact=True)
+        hello = Hello(config.vehicle, (camera,), (journey.field.field_id,), contract)
+        first_epoch = max((session.epoch for session in self._sessions), default=-1) + 1
+        session = AgentSession(hello, config.limits, _rate_control(config), first_epoch=first_epoch)
+        self._sessions.append(session)
         steps = QualitySteps()
 
         def ended(result: FrameResult) -> None:
-            self._metrics.ended(result)
             _log_failure(session.session_id, result)
             _log_quality(session.session_id, result, steps)
-            if report is not None:
-                report.ended(result)
 
-        pace = _pace(config, len(journey.pictures))
         equipment = Equipment(
             journey.pictures,
             pace,
-            journey.pipeline.encode,
-            executor,
-            partial(self._server.reached, channel),
+            pipeline.encode,
+            self._executor,
+            partial(self._servers[stop.server].reached, channel),
             ended,
             self._metrics.connected,
+            self._noticed[stop.server].set,
         )
-        session = AgentSession(journey.hello, config.limits, _rate_control(config))
-        agent = Agent(channel, session, equipment, config.limits)
-        stopping = asyncio.create_task(self._pass_on_stop(agent))
-        try:
-            await agent.run()
-        finally:
-            stopping.cancel()
-            if report is not None:
-                report.close()
-        return agent.counts
+        return Agent(channel, session, equipment, config.limits)
 
-    async def _pass_on_stop(self, agent: Agent) -> None:
-        await self._stopped.wait()
-        agent.stop()
+    def _ended(self, result: FrameResult) -> None:
+        self._metrics.ended(result)
+        if self._report is not None:
+            self._report.ended(result)
+
+    def _moved(self, stop: Stop, cause: Cause) -> None:
+        self._metrics.moved(cause)
+        server = str(self._servers[stop.server].address)
+        log.info("handed over", server=server, tile=stop.tile.name, cause=str(cause))
+
+
+def _server_end(name: str, text: str, config: AgentConfig) -> ServerEnd:
+    address = Address.parse(name, text)
+    tls = config.transport.tls()
+    if tls is None:
+        address.require_private(name, config.transport.allow_insecure)
+    return ServerEnd(address, tls)
+
+
+def _read_drive(config: AgentConfig, origin: TileOrigin) -> tuple[PosedPicture, ...]:
+    """Return the drive's pictures posed relative to ``origin``, all of one camera."""
+    pictures = read_dataset(config.drive, tile_origin=origin).pictures
+    intrinsics = pictures[0].camera.intrinsics
+    for picture in pictures:
+        if picture.camera.intrinsics != intrinsics:
+            raise InvalidInput(
+                "drive",
+                f"{picture.name} has other intrinsics than {pictures[0].name}; "
+                "one stream is one camera",
+            )
+    return tuple(map(_posed_for_the_wire, pictures))
 
 
 def _posed_for_the_wire(picture: PosedPicture) -> PosedPicture:
@@ -256,9 +362,3 @@ def _log_quality(session_id: str, result: FrameResult, steps: QualitySteps) -> N
 
 def _rate_control(config: AgentConfig) -> RateControl | None:
     return None if config.max_delay_ms is None else RateControl(config.max_delay_ms / 1e3)
-
-
-def _pace(config: AgentConfig, pictures: int) -> Pace:
-    if config.pace is PaceKind.LOCKSTEP:
-        return Lockstep(pictures, loop=config.loop)
-    return Realtime(pictures, config.rate, loop=config.loop)

@@ -89,6 +89,11 @@ class EdgeService:
         for stream in self._streams:
             stream.drain()
 
+    def fields_changed(self, current_field_ids: tuple[str, ...]) -> None:
+        """Tell every vehicle which fields are current now."""
+        for stream in self._streams:
+            stream.fields_changed(current_field_ids)
+
     async def _handle(self, requests: AsyncIterator[bytes], context: Context) -> None:
         if len(self._streams) >= self._around.max_streams:
             await self._turn_away(context)
@@ -153,6 +158,11 @@ class _Stream:
     def drain(self) -> None:
         """Take no more frames and end when those taken are answered."""
         self._session.drain()
+        self._wake.set()
+
+    def fields_changed(self, current_field_ids: tuple[str, ...]) -> None:
+        """Pass on which fields are current now."""
+        self._session.fields_changed(current_field_ids)
         self._wake.set()
 
     def leave(self) -> None:

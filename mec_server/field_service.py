@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import NoReturn
 
 import grpc
@@ -12,6 +12,7 @@ from mec_server.fields import Store, read_chunks
 from rfcore.errors import RfedgeError
 from rfcore.wire.checks import check_field_id
 from rfcore.wire.status import status_of
+from rfcore.wire.tiles import Tile, tile_message
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1 import field_pb2_grpc
 
@@ -19,10 +20,11 @@ __all__ = ["FieldService"]
 
 
 class FieldService(field_pb2_grpc.FieldServiceServicer):
-    """Hands out the archives of ``store``."""
+    """Hands out the archives of ``store``, and says which ``tiles`` they are for now."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, tiles: Callable[[], tuple[Tile, ...]]) -> None:
         self._store = store
+        self._tiles = tiles
 
     def register(self, server: grpc.aio.Server) -> None:
         """Add the service to a server that has not started."""
@@ -33,8 +35,11 @@ class FieldService(field_pb2_grpc.FieldServiceServicer):
         request: pb.ListFieldsRequest,  # noqa: ARG002
         context: grpc.aio.ServicerContext[pb.ListFieldsRequest, pb.ListFieldsResponse],  # noqa: ARG002
     ) -> pb.ListFieldsResponse:
-        """List the ids of the fields here."""
-        return pb.ListFieldsResponse(field_ids=await asyncio.to_thread(self._store.ids))
+        """List the ids of the fields here, and the tiles."""
+        return pb.ListFieldsResponse(
+            field_ids=await asyncio.to_thread(self._store.ids),
+            tiles=map(tile_message, self._tiles()),
+        )
 
     async def GetManifest(  # noqa: N802
         self,

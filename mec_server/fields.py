@@ -58,8 +58,11 @@ class FieldShelf:
             return self._open[field_id]
 
     def warm_up(self) -> int:
-        """Open as many fields as stay open, so that the first vehicle waits for none."""
-        ids = list(self._store.ids())[:MAX_OPEN_FIELDS]
+        """Open as many fields as stay open, so that the first vehicle waits for none.
+
+        Where fields are open already they are what is asked for, and others wait for their vehicle.
+        """
+        ids = list(self._open or self._store.ids())[:MAX_OPEN_FIELDS]
         for field_id in ids:
             self.open(field_id)
         return len(ids)

@@ -19,6 +19,7 @@ from mec_server.decoders import Decoders
 from mec_server.edge_service import EdgeService, Surroundings
 from mec_server.field_service import FieldService
 from mec_server.fields import FieldShelf, field_loader
+from mec_server.fields_published import PublishedFields
 from mec_server.handlers import OpenCameras, Tools, open_cameras
 from mec_server.metrics import ServerMetrics
 from mec_server.quotas import Quotas
@@ -35,6 +36,10 @@ from rfcore.wire.conventions import SERVER_OPTIONS
 __all__ = ["EdgeServer"]
 
 log = structlog.get_logger()
+
+PUBLICATIONS_EVERY_S = 1.0
+"""How often the manifest of the folder of fields is looked at: one stat()."""
+
 SERVICES = ("", *(f"rfcore.wire.v1.{name}Service" for name in ("Edge", "Field", "Twin")))
 
 
@@ -90,7 +95,9 @@ class EdgeServer:
         )
         self._server = grpc.aio.server(options=SERVER_OPTIONS)
         self._edge.register(self._server)
-        FieldService(store).register(self._server)
+        self._published = PublishedFields(config.fields, self._shelf.open)
+        FieldService(store, lambda: self._published.tiles).register(self._server)
+        self._following: asyncio.Task[None] | None = None
         self._twin_service.register(self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
 
@@ -99,6 +106,7 @@ class EdgeServer:
 
         Raises ``RfedgeError`` for a damaged field or a port that cannot be had.
         """
+        await asyncio.to_thread(self._published.start)
         count = await asyncio.to_thread(self._shelf.warm_up)
         await asyncio.to_thread(self._decoders.start)
         try:
@@ -107,6 +115,7 @@ class EdgeServer:
             raise RfedgeError(f"cannot listen on {self.address}: {error}") from error
         self.address = Address(self.address.host, port)
         await self._server.start()
+        self._following = asyncio.create_task(self._follow_publications())
         self._serve_metrics()
         await self._set_health(health_pb2.HealthCheckResponse.SERVING)
         if self._config.ready_file is not None:
@@ -124,6 +133,8 @@ class EdgeServer:
         """Take no more frames, finish those taken within ``drain_s``, then close."""
         log.info("draining", within_s=self._config.drain_s)
         await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
+        if self._following is not None:
+            self._following.cancel()
         self._edge.drain()
         self._twin_service.drain()
         await self._server.stop(self._config.drain_s)
@@ -134,6 +145,16 @@ class EdgeServer:
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
         log.info("stopped")
+
+    async def take_up_fields(self) -> None:
+        """Serve what is published now, and tell the vehicles if it is something else."""
+        if await asyncio.to_thread(self._published.refresh):
+            self._edge.fields_changed(tuple(tile.field_id for tile in self._published.tiles))
+
+    async def _follow_publications(self) -> None:
+        while True:
+            await asyncio.sleep(PUBLICATIONS_EVERY_S)
+            await self.take_up_fields()
 
     def _open_port(self) -> int:
         if self._tls is None:

@@ -30,7 +30,7 @@ from rfcore.errors import (
     RfedgeError,
     UnknownField,
 )
-from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, shown
+from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, MAX_FIELDS, shown
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import FrameRefused
 from rfcore.wire.identity import PeerIdentity
@@ -151,7 +151,7 @@ class ServerSession:
                 return
         unknown = [field_id for field_id in hello.field_ids if field_id not in self._held]
         if unknown:
-            self._outbox.append(FieldNotice(self._held))
+            self._outbox.append(FieldNotice(self._held[:MAX_FIELDS]))
             self._close(_unknown_field(unknown[0], self._held))
             return
         exact = hello.renderer.exact and hello.renderer.name == RENDERER_CONTRACT
@@ -294,6 +294,11 @@ class ServerSession:
             self._finish_draining()
         elif self.state is not SessionState.CLOSED:
             self._close(None)
+
+    def fields_changed(self, current_field_ids: Sequence[str]) -> None:
+        """Tell a vehicle that streams which fields are current now; its own goes on being good."""
+        if self.state is SessionState.OPEN:
+            self._outbox.append(FieldNotice(tuple(current_field_ids)))
 
     def disconnected(self) -> None:
         """The vehicle ended the stream, or vanished."""

@@ -20,6 +20,7 @@ import signal
 import sys
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,14 +47,16 @@ SCHEDULERS = {os.SCHED_OTHER: "other", os.SCHED_FIFO: "fifo", os.SCHED_RR: "rr"}
 class ProxySettings:
     """Where the link begins (``listen``) and ends (``to``), HOST:PORT, and what it is like.
 
-    ``profile`` is a link profile in a file; without it a constant rate and ``delay_ms`` one way, in
-    either direction. ``report`` receives JSON after each connection and at the end; ``ready_file``
-    receives HOST:PORT once connections are accepted. ``metrics_port``: port 0 takes a free one;
-    no metrics are served without it. ``spin_s``: see ``rfedge.link_direction``.
+    ``also`` has further paths over the same link, LISTEN=TO each. ``profile`` is a link profile in
+    a file; without it a constant rate and ``delay_ms`` one way, in either direction. ``report``
+    receives JSON after each connection and at the end; ``ready_file`` receives HOST:PORT (of the
+    first path) once connections are accepted. ``metrics_port``: port 0 takes a free one; no metrics
+    are served without it. ``spin_s``: see ``rfedge.link_direction``.
     """
 
     to: str
     listen: str = "127.0.0.1:0"
+    also: tuple[str, ...] = ()
     uplink_bps: float | None = None
     downlink_bps: float | None = None
     delay_ms: float | None = None
@@ -66,9 +69,9 @@ class ProxySettings:
     spin_s: float = SPIN_S
 
     def __post_init__(self) -> None:
-        for field in ("listen", "to"):
-            address = Address.parse(field, getattr(self, field))
-            address.require_private(field, self.allow_insecure)
+        for listen, to in self.paths():
+            listen.require_private("listen", self.allow_insecure)
+            to.require_private("to", self.allow_insecure)
         if self.metrics_port is not None and not 0 <= self.metrics_port <= 65535:
             raise InvalidInput("metrics_port", f"{self.metrics_port} is outside 0..65535")
         if self.profile is None:
@@ -76,6 +79,14 @@ class ProxySettings:
         for name in ("uplink_bps", "downlink_bps", "delay_ms"):
             if self.profile is not None and getattr(self, name) is not None:
                 raise InvalidInput(name, f"is given beside the profile {self.profile}; give one")
+
+    def paths(self) -> list[tuple[Address, Address]]:
+        """Return where to listen for what, the path of ``listen`` and ``to`` first."""
+        paths = [(Address.parse("listen", self.listen), Address.parse("to", self.to))]
+        for text in self.also:
+            listen, _, to = text.partition("=")
+            paths.append((Address.parse("also", listen), Address.parse("also", to)))
+        return paths
 
     def plan(self) -> LinkPlan:
         """Return what the link is made of; raise what reading ``profile`` raises."""
@@ -93,8 +104,7 @@ class LinkProxy:
     """The proxy; ``start``, then ``stop``."""
 
     def __init__(self, settings: ProxySettings) -> None:
-        self.address = Address.parse("listen", settings.listen)
-        self._server_address = Address.parse("to", settings.to)
+        self.addresses = [listen for listen, _ in settings.paths()]
         self._settings = settings
         plan = settings.plan()
         self._lives = plan.connection_lives()
@@ -106,19 +116,17 @@ class LinkProxy:
         self._connections = 0
         self._connections_cut = 0
         self._tasks: set[asyncio.Task[None]] = set()
-        self._listener: asyncio.Server | None = None
+        self._listeners: list[asyncio.Server] = []
+
+    @property
+    def address(self) -> Address:
+        """Where the first path begins."""
+        return self.addresses[0]
 
     async def start(self) -> Address:
         """Accept connections; return the address, with the port that was taken."""
-        loop = asyncio.get_running_loop()
-        try:
-            self._listener = await loop.create_server(
-                self._accept, self.address.host, self.address.port
-            )
-        except OSError as error:
-            raise RfedgeError(f"cannot listen on {self.address}: {error}") from error
-        sock = self._listener.sockets[0]
-        self.address = Address(self.address.host, sock.getsockname()[1])
+        for number, (listen, to) in enumerate(self._settings.paths()):
+            self.addresses[number] = await self._listen(listen, to)
         for direction in (self._up, self._down):
             self._keep(asyncio.create_task(direction.pump()))
         self._serve_metrics()
@@ -126,10 +134,21 @@ class LinkProxy:
             write_whole(self._settings.ready_file, f"{self.address}\n")
         return self.address
 
+    async def _listen(self, address: Address, to: Address) -> Address:
+        loop = asyncio.get_running_loop()
+        try:
+            listener = await loop.create_server(
+                partial(self._accept, to), address.host, address.port
+            )
+        except OSError as error:
+            raise RfedgeError(f"cannot listen on {address}: {error}") from error
+        self._listeners.append(listener)
+        return Address(address.host, listener.sockets[0].getsockname()[1])
+
     async def stop(self) -> None:
         """Close everything and write the report."""
-        if self._listener is not None:
-            self._listener.close()
+        for listener in self._listeners:
+            listener.close()
         for sender in (*self._up.senders, *self._down.senders):
             sender.abort()
         for task in self._tasks:
@@ -158,17 +177,16 @@ class LinkProxy:
             server, _ = start_http_server(port, self._settings.metrics_host, self.registry)
             print(f"rfedge link: metrics on port {server.server_port}", file=sys.stderr)
 
-    def _accept(self) -> Side:
+    def _accept(self, to: Address) -> Side:
         side = Side(self._up, self._ended)
-        self._keep(asyncio.create_task(self._connect(side)))
+        self._keep(asyncio.create_task(self._connect(side, to)))
         return side
 
-    async def _connect(self, near: Side) -> None:
+    async def _connect(self, near: Side, address: Address) -> None:
         """Open the far half of a new connection, or refuse the near one."""
         self._connections += 1
         self._metrics.connections.inc()
         loop = asyncio.get_running_loop()
-        address = self._server_address
         try:
             _, far = await loop.create_connection(
                 lambda: Side(self._down, _ignore), address.host, address.port

@@ -11,6 +11,9 @@ from rfedge.cli.field_check import FieldCheck
 from rfedge.cli.field_export import FieldExport
 from rfedge.cli.field_import import FieldImport
 from rfedge.cli.field_info import FieldInfo
+from rfedge.cli.field_list import FieldList
+from rfedge.cli.field_publish import FieldPublish
+from rfedge.cli.field_rollback import FieldRollback
 from rfedge.cli.field_rungs import FieldRungs
 from rfedge.cli.field_slim import FieldSlim
 
@@ -23,12 +26,15 @@ SubVerb = (
     | Annotated[FieldSlim, subcommand("slim")]
     | Annotated[FieldRungs, subcommand("rungs")]
     | Annotated[FieldExport, subcommand("export")]
+    | Annotated[FieldPublish, subcommand("publish")]
+    | Annotated[FieldList, subcommand("list")]
+    | Annotated[FieldRollback, subcommand("rollback")]
 )
 
 
 @dataclass(frozen=True)
 class Field:
-    """Import, inspect, check, slim, refine and export radiance fields."""
+    """Import, inspect, check, slim, refine, export and publish radiance fields."""
 
     verb: SubVerb
 

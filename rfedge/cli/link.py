@@ -19,6 +19,8 @@ class Link:
     """Where to connect for each accepted connection, HOST:PORT."""
     listen: str = "127.0.0.1:0"
     """Where to accept connections, HOST:PORT; port 0 takes a free one."""
+    also: tuple[str, ...] = ()
+    """Further servers over the same link, each LISTEN=TO: a radio link shared by several paths."""
     profile: Path | None = None
     """Link profile (TOML, see samples/links): traces, jitter, outages, lost connections."""
     uplink_bps: float | None = None
@@ -47,6 +49,7 @@ class Link:
             ProxySettings(
                 listen=self.listen,
                 to=self.to,
+                also=self.also,
                 uplink_bps=self.uplink_bps,
                 downlink_bps=self.downlink_bps,
                 delay_ms=self.delay_ms,

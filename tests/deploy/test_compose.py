@@ -21,6 +21,8 @@ from rfcore.link.profile_file import read_link
 from rfcore.wire.tls import TlsFiles
 from rfedge.cli import Verb
 from rfedge.cli.certs_init import CertsInit
+from rfedge.cli.field_publish import FieldPublish
+from rfedge.link_proxy import ProxySettings
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
@@ -88,8 +90,8 @@ def test_a_server_takes_its_command_line(
     name: str, certificates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = config_of(name, server_command, certificates, tmp_path, monkeypatch)
-    assert isinstance(config.tls, TlsFiles)
-    assert config.metrics_port == 9100
+    assert isinstance(config.transport.tls(), TlsFiles)
+    assert config.metrics.port == 9100
 
 
 @pytest.mark.parametrize("name", running("cav-agent"))
@@ -98,7 +100,7 @@ def test_a_vehicle_takes_its_command_line_and_is_whom_its_certificate_names(
 ) -> None:
     config = config_of(name, agent_command, certificates, tmp_path, monkeypatch)
     assert config.vehicle == name
-    assert config.tls.certificate.name == f"vehicle-{name}.pem"
+    assert config.transport.tls().certificate.name == f"vehicle-{name}.pem"
     assert config.loop, "a demo goes on"
 
 
@@ -111,17 +113,34 @@ def test_a_verb_takes_its_command_line(name: str) -> None:
 def test_every_link_leads_from_a_vehicle_to_a_server_that_its_certificate_names() -> None:
     init: Any = tyro.cli(Verb, args=command("certificates")[1:], config=(OmitSubcommandPrefixes,))
     made: CertsInit = init.verb
-    servers, links = running("mec-server"), running("rfedge")
-    links.remove("certificates")
+    servers = running("mec-server")
+    links = [name for name in running("rfedge") if command(name)[1] == "link"]
     assert set(made.vehicles) == set(running("cav-agent"))
     assert set(made.hosts) == {*servers, *links, "localhost", "127.0.0.1"}
     for name in links:
         link: Any = tyro.cli(Verb, args=command(name)[1:], config=(OmitSubcommandPrefixes,))
-        assert link.to.partition(":")[0] in servers
+        paths = ProxySettings(link.to, listen=link.listen, also=link.also, allow_insecure=True)
+        assert [str(to) for _, to in paths.paths()] == [f"{server}:50051" for server in servers]
         read_link(host_path(name, str(link.profile)))
     for name in running("cav-agent"):
-        (server,) = (word for word in command(name) if word.startswith("--server="))
-        assert server.removeprefix("--server=") == f"link-{name.removeprefix('cav-')}:50051"
+        words, link = command(name), f"link-{name.removeprefix('cav-')}"
+        assert f"--server={link}:50051" in words
+        assert words[words.index("--neighbours") + 1] == f"{link}:50052"
+
+
+def test_the_tiles_of_the_servers_meet_and_each_reaches_over_the_whole_drive() -> None:
+    tiles: list[FieldPublish] = []
+    for name in ("field-a", "field-b"):
+        verb: Any = tyro.cli(Verb, args=command(name)[1:], config=(OmitSubcommandPrefixes,))
+        tiles.append(verb.verb)
+        assert host_path(name, str(verb.verb.field)).is_file()
+    (west, east) = (tile.area for tile in tiles)
+    assert west is not None
+    assert east is not None
+    assert west[2] == east[0]
+    margins_m = [tile.margin_m or 0.0 for tile in tiles]
+    assert east[0] - margins_m[1] <= -30.0, "where the sample's drive begins"
+    assert west[2] + margins_m[0] >= -9.3, "where it ends"
 
 
 def test_every_vehicle_has_a_link_of_its_own_kind_and_a_drive_of_its_own() -> None:

@@ -1,5 +1,6 @@
 """A small street on disk, a server on a free port, and vehicles that drive past it."""
 
+import asyncio
 import itertools
 import json
 import math
@@ -248,3 +249,74 @@ def raw_vehicle() -> Callable[..., Any]:
             yield RawVehicle(channel.stream_stream(STREAM_METHOD)())
 
     return run
+
+
+class Driving:
+    """A vehicle under way in this process, and what is known of it so far."""
+
+    def __init__(self, vehicle: Vehicle, config: AgentConfig) -> None:
+        self._vehicle = vehicle
+        self._config = config
+        self.task: asyncio.Task[Counter[str]] | None = None
+
+    def lines(self) -> list[dict[str, Any]]:
+        """Return the report: a line a picture that ended."""
+        assert self._config.report is not None
+        if not self._config.report.exists():
+            return []
+        return [json.loads(line) for line in self._config.report.read_text().splitlines()]
+
+    def acked(self) -> int:
+        """Return how many pictures were answered."""
+        return sum(line["result"] == "acked" for line in self.lines())
+
+    def fields(self) -> set[str]:
+        """Return the names of the archives it holds."""
+        return {path.name for path in self._config.fields.iterdir()}
+
+    def handovers(self, cause: str) -> int:
+        """Return how often it moved for that reason."""
+        name = "rfedge_agent_handovers_total"
+        return int(self._vehicle.registry.get_sample_value(name, {"cause": cause}) or 0)
+
+    async def until(self, holds: Callable[[], bool]) -> None:
+        """Wait until something holds, while the vehicle drives."""
+        async with asyncio.timeout(60):
+            while not holds():
+                assert self.task is not None
+                assert not self.task.done(), self.task.exception()
+                await asyncio.sleep(0.02)
+
+    async def end(self) -> Counter[str]:
+        """Return what it brought home."""
+        assert self.task is not None
+        return await self.task
+
+
+@pytest.fixture
+def vehicle(street: Street, tmp_path: Path) -> Callable[..., Any]:
+    """Return a context manager that drives the street, in lockstep, until it is left."""
+
+    @asynccontextmanager
+    async def drive(address: object, **changes: Any) -> AsyncIterator[Driving]:
+        config = AgentConfig(
+            str(address),
+            street.drive,
+            street.store,
+            pace=PaceKind.LOCKSTEP,
+            preset="ultrafast",
+            report=tmp_path / "driving.jsonl",
+        )
+        config = replace(config, **changes)
+        vehicle = Vehicle(config)
+        driving = Driving(vehicle, config)
+        driving.task = asyncio.create_task(vehicle.run())
+        try:
+            yield driving
+            vehicle.stop()
+            await driving.task
+        finally:
+            driving.task.cancel()
+            await asyncio.gather(driving.task, return_exceptions=True)
+
+    return drive

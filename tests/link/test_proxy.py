@@ -195,3 +195,25 @@ async def test_the_metrics_of_the_link_are_what_its_report_says() -> None:
 def test_a_rate_beside_a_profile_is_refused(profile: Callable[..., Path]) -> None:
     with pytest.raises(InvalidInput, match="uplink_bps: is given beside the profile"):
         ProxySettings("127.0.0.1:1", uplink_bps=1e6, profile=profile())
+
+
+async def test_two_paths_share_one_link() -> None:
+    """What goes to two servers goes through one radio: both count as one uplink."""
+    other = await asyncio.start_server(echo, "127.0.0.1", 0)
+    port = other.sockets[0].getsockname()[1]
+    async with linked(echo, also=(f"127.0.0.1:0=127.0.0.1:{port}",)) as proxy:
+        assert await exchange(proxy, b"first") == b"first"
+        second = proxy.addresses[1]
+        reader, writer = await asyncio.open_connection(second.host, second.port)
+        writer.write(b"second")
+        writer.write_eof()
+        assert await reader.read(-1) == b"second"
+        writer.close()
+        await writer.wait_closed()
+        assert proxy.report()["uplink"]["bytes"] == len(b"firstsecond")
+    other.close()
+
+
+def test_a_path_needs_both_its_ends() -> None:
+    with pytest.raises(InvalidInput, match="HOST:PORT"):
+        ProxySettings("127.0.0.1:1", also=("127.0.0.1:2",))

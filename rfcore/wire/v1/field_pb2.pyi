@@ -38,20 +38,96 @@ class ListFieldsResponse(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
     FIELD_IDS_FIELD_NUMBER: _builtins.int
+    TILES_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def field_ids(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
+    @_builtins.property
+    def tiles(self) -> _containers.RepeatedCompositeFieldContainer[Global___Tile]:
+        """Which of them is good for which ground now; empty where the fields serve everywhere. It may
+        change while vehicles drive: a FieldNotice says so.
+        """
+
     def __init__(
         self,
         *,
         field_ids: _abc.Iterable[_builtins.str] | None = ...,
+        tiles: _abc.Iterable[Global___Tile] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["field_ids", b"field_ids"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["field_ids", b"field_ids", "tiles", b"tiles"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___ListFieldsResponse: _TypeAlias = ListFieldsResponse  # noqa: Y015
+
+@_typing.final
+class Tile(_message.Message):
+    """A version of a tile: the field for an area, and for margin_m around it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    FIELD_ID_FIELD_NUMBER: _builtins.int
+    VERSION_FIELD_NUMBER: _builtins.int
+    AREA_FIELD_NUMBER: _builtins.int
+    MARGIN_M_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    field_id: _builtins.str
+    version: _builtins.int
+    margin_m: _builtins.float
+    @_builtins.property
+    def area(self) -> Global___Area:
+        """Absent: everywhere."""
+
+    def __init__(
+        self,
+        *,
+        name: _builtins.str = ...,
+        field_id: _builtins.str = ...,
+        version: _builtins.int = ...,
+        area: Global___Area | None = ...,
+        margin_m: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["area", b"area"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["area", b"area", "field_id", b"field_id", "margin_m", b"margin_m", "name", b"name", "version", b"version"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Tile: _TypeAlias = Tile  # noqa: Y015
+
+@_typing.final
+class Area(_message.Message):
+    """A rectangle on the ground in the global metric frame of the drives, in which tiles have their
+    origins.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    WEST_M_FIELD_NUMBER: _builtins.int
+    SOUTH_M_FIELD_NUMBER: _builtins.int
+    EAST_M_FIELD_NUMBER: _builtins.int
+    NORTH_M_FIELD_NUMBER: _builtins.int
+    west_m: _builtins.float
+    south_m: _builtins.float
+    east_m: _builtins.float
+    north_m: _builtins.float
+    def __init__(
+        self,
+        *,
+        west_m: _builtins.float = ...,
+        south_m: _builtins.float = ...,
+        east_m: _builtins.float = ...,
+        north_m: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["east_m", b"east_m", "north_m", b"north_m", "south_m", b"south_m", "west_m", b"west_m"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Area: _TypeAlias = Area  # noqa: Y015
 
 @_typing.final
 class GetManifestRequest(_message.Message):

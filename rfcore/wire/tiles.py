@@ -1,0 +1,96 @@
+"""Tiles of a street: which field is good for which ground, as servers tell vehicles.
+
+An area is a rectangle on the ground in the drives' own global frame (east, north, metres, float64);
+its field serves for ``margin_m`` beyond it, so that a neighbour can step in. A server that
+publishes no tiles serves its fields everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from rfcore.errors import InvalidInput
+from rfcore.wire.checks import check_field_id, check_name
+from rfcore.wire.v1 import field_pb2 as pb
+
+__all__ = ["MAX_TILES", "Area", "Tile", "tile_message", "tile_of"]
+
+MAX_TILES = 64
+"""Tiles one server publishes."""
+
+
+@dataclass(frozen=True)
+class Area:
+    """Ground from the south-west to the north-east corner, (east, north) in metres."""
+
+    low_m: tuple[float, float]
+    high_m: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (*self.low_m, *self.high_m))):
+            raise InvalidInput("tile.area", f"{self.low_m} to {self.high_m} must be finite")
+        if not (self.low_m[0] < self.high_m[0] and self.low_m[1] < self.high_m[1]):
+            raise InvalidInput(
+                "tile.area", f"{self.low_m} is not south-west of {self.high_m} (east, north)"
+            )
+
+    def distance_m(self, east_m: float, north_m: float) -> float:
+        """Return how far outside a point is; 0 inside."""
+        (west, south), (east, north) = self.low_m, self.high_m
+        return math.hypot(
+            max(west - east_m, 0.0, east_m - east), max(south - north_m, 0.0, north_m - north)
+        )
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Version ``version`` of tile ``name`` is field ``field_id``; ``area`` None: everywhere."""
+
+    name: str
+    field_id: str
+    version: int = 1
+    area: Area | None = None
+    margin_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_name("tile.name", self.name)
+        check_field_id("tile.field_id", self.field_id)
+        if self.version < 1:
+            raise InvalidInput("tile.version", f"{self.version} is below 1")
+        if not 0 <= self.margin_m < math.inf:
+            raise InvalidInput("tile.margin_m", f"{self.margin_m} must be finite and not negative")
+
+    def distance_m(self, east_m: float, north_m: float) -> float:
+        """Return how far outside the tile's area a point is; 0 inside, and 0 everywhere without."""
+        return 0.0 if self.area is None else self.area.distance_m(east_m, north_m)
+
+    def reaches(self, east_m: float, north_m: float) -> bool:
+        """Whether the field may be used there: in the area or in the margin around it."""
+        return self.distance_m(east_m, north_m) <= self.margin_m
+
+
+def tile_message(tile: Tile) -> pb.Tile:
+    """Return a tile as it travels."""
+    message = pb.Tile(
+        name=tile.name, field_id=tile.field_id, version=tile.version, margin_m=tile.margin_m
+    )
+    if tile.area is not None:
+        message.area.CopyFrom(
+            pb.Area(
+                west_m=tile.area.low_m[0],
+                south_m=tile.area.low_m[1],
+                east_m=tile.area.high_m[0],
+                north_m=tile.area.high_m[1],
+            )
+        )
+    return message
+
+
+def tile_of(message: pb.Tile) -> Tile:
+    """Return a tile that arrived; raise ``InvalidInput`` naming what is wrong with it."""
+    area = None
+    if message.HasField("area"):
+        sides = message.area
+        area = Area((sides.west_m, sides.south_m), (sides.east_m, sides.north_m))
+    return Tile(message.name, message.field_id, message.version, area, message.margin_m)

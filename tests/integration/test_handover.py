@@ -1,0 +1,203 @@
+"""A vehicle passes from one roadside server to the next: two server processes, one vehicle.
+
+The two hold the same street as two archives whose tiles have different origins, so the poses on
+the wire are not the same numbers. Late is a picture that was dropped or lost, or sent in vain.
+"""
+
+import asyncio
+import itertools
+import json
+import subprocess
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+
+from cav_agent.config import PaceKind
+from rfcore.camera import TileOrigin
+from rfcore.field import FieldMetadata, SplatField, save_field
+from rfcore.wire.conventions import CHANNEL_OPTIONS
+from rfcore.wire.tiles import Area
+from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, Wish, watch_request, watched
+from rfcore.wire.v1 import twin_pb2_grpc
+from rfedge.demo.processes import command_of
+from rfedge.fields.publish import Ground, publish
+
+BORDER_M = 0.25
+"""The drive is at 0.0, 0.1 ... 0.5 m east: pictures 0 to 2 belong to the west."""
+
+WEST = Ground(Area((-5.0, -5.0), (BORDER_M, 5.0)), 0.1)
+EAST = Ground(Area((BORDER_M, -5.0), (5.0, 5.0)), 0.1)
+EVERYWHERE = Ground(Area((-5.0, -5.0), (5.0, 5.0)), 0.0)
+
+
+@dataclass
+class Roadside:
+    """A server process, where it listens and where its pictures go."""
+
+    process: asyncio.subprocess.Process
+    address: str
+    saved: Path
+
+    def pictures(self) -> list[dict[str, Any]]:
+        """Return what was reconstructed, in order."""
+        files = sorted(self.saved.rglob("*.jsonl"))
+        return [json.loads(line) for file in files for line in file.read_text().splitlines()]
+
+
+def moved(field: SplatField, origin: TileOrigin) -> SplatField:
+    """Return the field as the tile with this origin holds it."""
+    offset_m = np.array([origin.east_m, origin.north_m, origin.up_m])
+    means = (field.gaussians.means - offset_m).astype(np.float32)
+    metadata = FieldMetadata("tile", tile_origin=origin)
+    return SplatField(replace(field.gaussians, means=means), metadata)
+
+
+@pytest.fixture
+async def roadside(street: Any, tmp_path: Path) -> AsyncIterator[Any]:
+    """Return a coroutine that starts a server for one tile, as a process."""
+    async with AsyncExitStack() as stack:
+
+        @asynccontextmanager
+        async def run(name: str, ground: Ground, origin: TileOrigin) -> AsyncIterator[Roadside]:
+            folder = tmp_path / name
+            folder.mkdir()
+            save_field(moved(street.field, origin), tmp_path / f"{name}.rff")
+            publish(
+                folder, name, tmp_path / f"{name}.rff", ground, datetime(2026, 1, 1, tzinfo=UTC)
+            )
+            ready, saved = tmp_path / f"{name}.ready", tmp_path / f"{name}-saved"
+            process = await asyncio.create_subprocess_exec(
+                *command_of("mec-server"), "--fields", str(folder), "--listen", "127.0.0.1:0",
+                "--ready-file", str(ready), "--save", str(saved), stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+            try:
+                async with asyncio.timeout(60):
+                    while not ready.exists():
+                        assert process.returncode is None
+                        await asyncio.sleep(0.05)
+                yield Roadside(process, ready.read_text().strip(), saved)
+            finally:
+                if process.returncode is None:
+                    process.kill()
+                await process.wait()
+
+        async def start(name: str, ground: Ground, *origin_m: float) -> Roadside:
+            return await stack.enter_async_context(run(name, ground, TileOrigin(*origin_m)))
+
+        yield start
+
+
+async def seen_at(address: str, seen: list[TwinPicture | Departure]) -> None:
+    """Collect what a consumer of one server's twin sees."""
+    async with grpc.aio.insecure_channel(address, options=CHANNEL_OPTIONS) as channel:
+        stub = twin_pb2_grpc.TwinServiceStub(channel)
+        responses = stub.Watch(watch_request(Wish(encoding=PictureEncoding.NONE)))
+        while (response := await responses.read()) is not grpc.aio.EOF:
+            seen.append(watched(response))
+
+
+def stays_ns(seen: list[TwinPicture | Departure]) -> list[tuple[int, int]]:
+    """Return the capture times of the first and the last picture that each stream brought."""
+    streams: dict[str, list[int]] = {}
+    for entry in seen:
+        if isinstance(entry, TwinPicture):
+            streams.setdefault(entry.session_id, []).append(entry.capture_time_ns)
+    return [(min(times), max(times)) for times in streams.values()]
+
+
+async def test_a_vehicle_crosses_without_a_late_picture_or_a_keyframe(
+    roadside: Any, vehicle: Any, tmp_path: Path
+) -> None:
+    a = await roadside("west", WEST, 0.0)
+    b = await roadside("east", EAST, 2.0, -1.0, 0.5)
+    at_a: list[TwinPicture | Departure] = []
+    at_b: list[TwinPicture | Departure] = []
+    watching = [
+        asyncio.create_task(seen_at(a.address, at_a)),
+        asyncio.create_task(seen_at(b.address, at_b)),
+    ]
+    async with vehicle(
+        a.address, neighbours=(b.address,), fields=tmp_path / "mine", loop=True
+    ) as trip:
+        await trip.until(lambda: trip.handovers("tile") >= 5)
+    lines = trip.lines()
+    late = [line for line in lines if line["result"] != "acked"]
+    assert late == [], "dropped, lost or sent in vain"
+    for line in lines:
+        assert line["server_digest"] == line["reconstruction_digest"], "the same bytes at both ends"
+        assert "render" in line["references"], "never a keyframe"
+    indices = [line["index"] for line in lines]
+    assert indices == [i % 6 for i in range(len(lines))], "none missing, none twice"
+    async with asyncio.timeout(30):
+        while len(a.pictures()) + len(b.pictures()) < len(lines):
+            await asyncio.sleep(0.05)
+        while not all(seen and isinstance(seen[-1], Departure) for seen in (at_a, at_b)):
+            await asyncio.sleep(0.05)
+    for task in watching:
+        task.cancel()
+    stays = sorted([*stays_ns(at_a), *stays_ns(at_b)])
+    assert len(stays) >= 2, "a consumer may miss pictures, not servers"
+    for (_, left_ns), (came_ns, _) in itertools.pairwise(stays):
+        assert left_ns < came_ns, "one vehicle: it is brought by one stream at a time"
+
+
+async def test_a_vehicle_goes_to_the_neighbour_when_its_server_is_killed(
+    roadside: Any, vehicle: Any, tmp_path: Path
+) -> None:
+    a = await roadside("west", EVERYWHERE, 0.0)
+    b = await roadside("east", replace(EAST, margin_m=5.0), 2.0)
+    async with vehicle(
+        a.address, neighbours=(b.address,), fields=tmp_path / "mine",
+        pace=PaceKind.REALTIME, rate=10.0, loop=True,
+    ) as trip:  # fmt: skip
+        await trip.until(lambda: len(a.pictures()) >= 3)
+        a.process.kill()
+        await trip.until(lambda: len(b.pictures()) >= 12)
+        assert trip.handovers("server_lost") == 1
+    for line in trip.lines():
+        if line["result"] == "acked":
+            assert line["server_digest"] == line["reconstruction_digest"]
+
+
+async def test_without_a_neighbour_in_reach_the_newest_picture_waits_for_the_server(
+    roadside: Any, vehicle: Any, tmp_path: Path
+) -> None:
+    """The server of the east is not there: pictures of the west arrive, those of the east wait."""
+    a = await roadside("west", replace(WEST, margin_m=0.0), 0.0)
+    b = await roadside("east", EAST, 2.0)
+    async with vehicle(
+        a.address, neighbours=(b.address,), fields=tmp_path / "mine",
+        pace=PaceKind.REALTIME, rate=10.0, loop=True,
+    ) as trip:  # fmt: skip
+        await trip.until(lambda: len(b.pictures()) >= 3)
+        b.process.kill()
+        there = len(a.pictures())
+        await trip.until(lambda: len(a.pictures()) >= there + 6)
+    late = [line["reason"] for line in trip.lines() if line["result"] != "acked"]
+    assert late, "what belongs to the east ends somehow, and is counted"
+
+
+async def test_two_tiles_of_one_field_fetch_it_once(
+    street: Any, serve: Any, vehicle: Any, tmp_path: Path
+) -> None:
+    archive = street.store / "street.rff"
+    for name, ground in (("west", WEST), ("east", EAST)):
+        (tmp_path / name).mkdir()
+        publish(tmp_path / name, name, archive, ground, datetime(2026, 1, 1, tzinfo=UTC))
+    async with (
+        serve(fields=tmp_path / "west") as a,
+        serve(fields=tmp_path / "east") as b,
+        vehicle(
+            a.address, neighbours=(str(b.address),), fields=tmp_path / "mine", loop=True
+        ) as trip,
+    ):
+        await trip.until(lambda: trip.handovers("tile") >= 2)
+    assert {line["result"] for line in trip.lines()} == {"acked"}
+    assert trip.fields() == {f"{street.field_id}.rff"}
