@@ -124,6 +124,7 @@ class Trip:
             self._hooks.moved(stop, cause)
             if before in self._legs and before is not None:
                 self._legs[before].withdraw()
+                self._legs[before].close()  # or its server would go on showing the vehicle
         leg = self._leg(stop)
         self._pace.limit(leg.pace.limit_hz)
         leg.give(index)
