@@ -1,9 +1,9 @@
 """What the demo of docker-compose.yml does, while it runs: into docs/operations.md and two files.
 
 ``python deploy/compose/show.py`` asks docker and Prometheus of the running demo. It writes
-``results/compose.json`` (images, states of the services, targets, the series and the newest values
-of every dashboard's panel), a plot of each dashboard, and the part of docs/operations.md between
-its two marks. Nothing in these is typed by hand.
+``deploy/compose/measured.json`` (images, states of the services, targets, the series and the newest
+values of every dashboard's panel), a plot of each dashboard, and the part of docs/operations.md
+between its two marks. Nothing in these is typed by hand.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ def ended_frames() -> dict[str, float]:
 
 
 def measured(shown: list[Shown]) -> dict[str, Any]:
-    """Return the content of results/compose.json."""
+    """Return the content of deploy/compose/measured.json."""
     sizes = {
         image: int(said("docker", "image", "inspect", image, "--format", "{{.Size}}"))
         for image in IMAGES
@@ -214,7 +214,7 @@ def section(result: dict[str, Any]) -> str:
     lines = [
         f"Measured by `make operations-figures` on {result['host']['cores']} cores of "
         f"{result['host']['cpu']}, docker {result['docker']}; everything is in "
-        "[results/compose.json](../results/compose.json).",
+        "[deploy/compose/measured.json](../deploy/compose/measured.json).",
         "",
         "| image | MB |",
         "|---|---|",
@@ -249,7 +249,7 @@ def main() -> None:
         plot(one, ROOT / f"docs/figures/{dashboard.uid}.svg")
         shown.append(one)
     result = measured(shown)
-    (ROOT / "results/compose.json").write_text(json.dumps(result, indent=1) + "\n")
+    (ROOT / "deploy/compose/measured.json").write_text(json.dumps(result, indent=1) + "\n")
     page = ROOT / "docs/operations.md"
     before, _, rest = page.read_text().partition(BEGIN)
     _, _, after = rest.partition(END)
