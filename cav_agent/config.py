@@ -9,6 +9,7 @@ from typing import Annotated
 
 from tyro.conf import Suppress
 
+from rfcore.codec import SteeringSettings
 from rfcore.codec.config import CRF_RANGE, PRESETS
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import check_field_id, check_name
@@ -89,6 +90,7 @@ class AgentConfig:
     ladder that keeps it is used, a lower one under load, in place of the preset."""
     ladder: Path = Path("results/ladder.json")
     """What rungs take and cost, as `rfedge eval ladder` measured it."""
+    steering: SteeringSettings = SteeringSettings()
     log: LogForm = LogForm.AUTO
     """console lines, json lines, or auto: console on a terminal."""
     report: Path | None = None

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from cav_agent.rate_control import ByteBudget
+from rfcore.camera import Pose
 from rfcore.codec import DeltaPacket
 from rfcore.codec.ladder import FULL_RUNG, Rung
 from rfcore.views import PosedPicture
@@ -50,13 +51,15 @@ class EncodeJob:
 class EncodedFrame:
     """A coded picture; ``stage_s`` has read, convert, render, references, encode and
     closed_loop; ``tries`` is how often it was coded, to fit the payload's limit; ``rung`` is the
-    setting it was coded with, ``crf`` its quality."""
+    setting it was coded with, ``crf`` its quality, ``pose`` the one it was coded at, if that is not
+    the measured one."""
 
     packet: DeltaPacket
     stage_s: Mapping[str, float]
     tries: int = 1
     rung: Rung = FULL_RUNG
     crf: float | None = None
+    pose: Pose | None = None
 
 
 class Outcome(StrEnum):

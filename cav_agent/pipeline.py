@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Protocol
 
 from cav_agent.frames import EncodedFrame, EncodeJob
@@ -15,6 +16,7 @@ from cav_agent.rungs import FixedRung, Rungs
 from rfcore.camera import Camera, Intrinsics
 from rfcore.codec import (
     KEPT_FRAMES,
+    NO_STEERING,
     RENDER_ONLY,
     CodecConfig,
     DeltaEncoder,
@@ -24,12 +26,15 @@ from rfcore.codec import (
     Past,
     RateModel,
     RateTarget,
+    Steering,
     StreamHeader,
 )
+from rfcore.codec.align import Look
 from rfcore.codec.ladder import Rung
+from rfcore.codec.pose_search import PoseSearch
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality
-from rfcore.image import Rgb
+from rfcore.image import I420, Rgb
 from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb
 from rfcore.views import PosedPicture, View
@@ -52,6 +57,7 @@ class Pipeline:
 
     A slice above ``limit_bytes`` is coded again at a higher CRF, as long as there is one. ``rungs``
     says how each frame is coded; without it all are at the configured preset, with all there is.
+    ``steering`` applies to every frame.
     """
 
     def __init__(
@@ -61,6 +67,7 @@ class Pipeline:
         clock_ns: ClockNs,
         limit_bytes: int = MAX_PAYLOAD_BYTES,
         rungs: Rungs | None = None,
+        steering: Steering = NO_STEERING,
     ) -> None:
         self._renderer = renderer
         self._config = config
@@ -70,6 +77,9 @@ class Pipeline:
         self._encoder = DeltaEncoder(config, clock_ns)
         self._state: EncoderState | None = None
         self._rate = RateModel()
+        self._steering = steering
+        refine_ms = steering.refine_pose_ms
+        self._search = None if refine_ms is None else PoseSearch(refine_ms, clock_ns)
         self._pasts: dict[tuple[int, int] | None, Past] = {}
 
     @property
@@ -90,21 +100,35 @@ class Pipeline:
         frame = i420_from_rgb(rgb)
         converted_ns = self._clock_ns()
         camera = job.capture.picture.camera
-        view = self._renderer.render(camera, rung.quality)
-        render = i420_from_colour(view.colour)
+        look = self._look(rung.quality, camera)
         rendered_ns = self._clock_ns()
-        seen = PosedDepth(camera, view.depth)
+        look = self._refined(frame, look, rung.quality)
+        refined_ns = self._clock_ns()
         choice = self._choice(job, rung)
-        encoded = self._encoder.encode(self._state_for(job), frame, render, seen, choice)
+        state = self._state_for(job)
+        encoded = self._encoder.encode(state, frame, look.render, look.seen, choice)
         self._remember(encoded)
         stage_s = {
             "read": (read_ns - started_ns) / 1e9,
             "convert": (converted_ns - read_ns) / 1e9,
             "render": (rendered_ns - converted_ns) / 1e9,
+            **({"refine": (refined_ns - rendered_ns) / 1e9} if self._search else {}),
             **{stage: ns / 1e9 for stage, ns in encoded.stage_ns.items()},
         }
         self._rungs.coded(stage_s, self._clock_ns() / 1e9)
-        return EncodedFrame(encoded.packet, stage_s, encoded.tries, rung, encoded.crf)
+        pose = look.seen.camera.world_from_cam
+        return EncodedFrame(encoded.packet, stage_s, encoded.tries, rung, encoded.crf, pose)
+
+    def _look(self, quality: Quality, camera: Camera) -> Look:
+        view = self._renderer.render(camera, quality)
+        return Look(i420_from_colour(view.colour), PosedDepth(camera, view.depth), view.opacity)
+
+    def _refined(self, frame: I420, measured: Look, quality: Quality) -> Look:
+        """Return what the field shows at the pose to send."""
+        if self._search is None:
+            return measured
+        crf = self._config.crf if self._rate.crf is None else self._rate.crf
+        return self._search.refine(frame, measured, partial(self._look, quality), crf).look
 
     def _choice(self, job: EncodeJob, rung: Rung) -> FrameChoice:
         budget, limit_bytes = job.budget, self._limit_bytes
@@ -117,6 +141,7 @@ class Pipeline:
             coarse=not job.exact,
             limit_bytes=limit_bytes,
             preset=rung.preset,
+            qp_map=self._steering.qp_map,
             target=None if budget is None else RateTarget(budget.target_bytes, self._rate),
         )
 

@@ -288,7 +288,7 @@ class AgentSession:
         return Frame(
             self._camera_id,
             capture.capture_time_ns,
-            capture.picture.camera.world_from_cam,
+            encoded.pose or capture.picture.camera.world_from_cam,
             b"",  # the field of Hello; an agent has one
             encoded.packet,
             encoded.rung.quality,

@@ -33,7 +33,7 @@ from cav_agent.rungs import DeadlineRungs, FixedRung, Rungs
 from cav_agent.session import AgentSession
 from cav_agent.trip import Hooks, Trip
 from rfcore.camera import TileOrigin
-from rfcore.codec import CodecConfig
+from rfcore.codec import CodecConfig, Steering
 from rfcore.codec.ladder import Rung, read_ladder
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput, RfedgeError
@@ -63,6 +63,7 @@ class Journey:
     pictures: tuple[PosedPicture, ...]
     codec: CodecConfig
     rungs: Rungs
+    steering: Steering
 
 
 class Vehicle:
@@ -219,7 +220,8 @@ class Vehicle:
         field.prepare()
         self._metrics.field(field.field_id, field.metadata.kind)
         log.info("ready", pictures=len(pictures), field=field.field_id, isa=field.isa)
-        return Journey(field, pictures, codec, rungs)
+        steering = config.steering.steering(codec.size_px)
+        return Journey(field, pictures, codec, rungs, steering)
 
     def _rungs(self, field: RadianceField) -> Rungs:
         """Return how frames are coded; under a deadline make every renderer it may ask for."""
@@ -251,7 +253,13 @@ class Vehicle:
     def _agent(self, stop: Stop, journey: Journey, pace: Pace) -> Agent:
         """Return an agent for a new stream to ``stop``; none of its packets has a number twice."""
         config, channel = self._config, self._channels[stop.server]
-        pipeline = Pipeline(journey.field, journey.codec, time.perf_counter_ns, rungs=journey.rungs)
+        pipeline = Pipeline(
+            journey.field,
+            journey.codec,
+            time.perf_counter_ns,
+            rungs=journey.rungs,
+            steering=journey.steering,
+        )
         intrinsics = journey.pictures[0].camera.intrinsics
         rate_hz = config.rate if config.pace is PaceKind.REALTIME else 0.0
         camera = CameraDescription(config.camera, intrinsics, pipeline.header, rate_hz)

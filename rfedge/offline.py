@@ -5,11 +5,22 @@ The file holds the very messages a vehicle would send, so its size is the packet
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 from rfcore.camera import Camera
-from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, Encoded, FrameChoice
+from rfcore.codec import (
+    NO_STEERING,
+    CodecConfig,
+    DeltaDecoder,
+    DeltaEncoder,
+    Encoded,
+    FrameChoice,
+    Steering,
+)
+from rfcore.codec.align import Look
+from rfcore.codec.pose_search import PoseSearch
 from rfcore.dataset import Dataset
 from rfcore.errors import CodecError, DatasetError, InvalidData
 from rfcore.field import FULL, Quality, RadianceField
@@ -31,10 +42,12 @@ FITTING = FrameChoice(limit_bytes=MAX_PAYLOAD_BYTES)
 
 @dataclass(frozen=True)
 class CodingSettings:
-    """How the P pictures are coded: an x264 preset and a constant rate factor (1..51)."""
+    """How the P pictures are coded: an x264 preset, a constant rate factor (1..51), and where and
+    from which pose."""
 
     preset: str = "medium"
     crf: float = 23.0
+    steering: Steering = NO_STEERING
 
 
 @dataclass(frozen=True)
@@ -55,27 +68,43 @@ def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSetting
     config = CodecConfig(intrinsics.width_px, intrinsics.height_px, settings.preset, settings.crf)
     encoder = DeltaEncoder(config)
     state = encoder.start(1)
+    choice = replace(FITTING, qp_map=settings.steering.qp_map)
+    place = _place(field, settings)
     frames = []
     for picture in dataset.pictures:
         if picture.camera.intrinsics != intrinsics:
             raise DatasetError(f"{picture.name}: its camera differs from the first picture's")
         frame = i420_from_rgb(picture.read())
-        pose = picture.camera.world_from_cam.rounded()
-        seen = rendered(field, Camera(intrinsics, pose))
-        encoded = encoder.encode(state, frame, *seen, FITTING)
+        measured = Camera(intrinsics, picture.camera.world_from_cam.rounded())
+        look = place(frame, measured)
+        encoded = encoder.encode(state, frame, look.render, look.seen, choice)
         _require_fit(picture.name, encoded)
         state = encoded.state
         frames.append(
             Frame(
                 CAMERA_ID,
                 picture.time_ns,
-                pose,
+                look.seen.camera.world_from_cam,
                 b"",
                 encoded.packet,
             )
         )
     camera = CameraDescription(CAMERA_ID, intrinsics, encoder.header)
     return CodedDrive(Hello(OFFLINE_VEHICLE, (camera,), (field.field_id,), RENDERER), tuple(frames))
+
+
+def _place(field: RadianceField, settings: CodingSettings) -> Callable[[I420, Camera], Look]:
+    """Return what finds the pose a frame is coded at, and renders the field there."""
+
+    def look_at(camera: Camera) -> Look:
+        view = field.render(camera)
+        return Look(i420_from_colour(view.colour), PosedDepth(camera, view.depth), view.opacity)
+
+    refine_ms = settings.steering.refine_pose_ms
+    if refine_ms is None:
+        return lambda _, camera: look_at(camera)
+    search = PoseSearch(refine_ms, time.perf_counter_ns)
+    return lambda frame, camera: search.refine(frame, look_at(camera), look_at, settings.crf).look
 
 
 def _require_fit(name: str, encoded: Encoded) -> None:

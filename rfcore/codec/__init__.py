@@ -9,12 +9,14 @@ from rfcore.codec.qp_map import QpMap, qp_map_of_mask
 from rfcore.codec.rate import RateModel, RateTarget
 from rfcore.codec.references import INTRA, RENDER_ONLY, Reference, References, references_name
 from rfcore.codec.state import KEPT_FRAMES, DecoderState, EncoderState, Past
+from rfcore.codec.steering import NO_STEERING, Steering, SteeringSettings
 from rfcore.codec.throughput import PathEstimator
 
 __all__ = [
     "INTRA",
     "KEPT_FRAMES",
     "NEEDED_BYTES",
+    "NO_STEERING",
     "RENDER_ONLY",
     "CodecConfig",
     "Decoded",
@@ -32,6 +34,8 @@ __all__ = [
     "RateTarget",
     "Reference",
     "References",
+    "Steering",
+    "SteeringSettings",
     "StreamHeader",
     "qp_map_of_mask",
     "references_name",

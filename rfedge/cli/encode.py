@@ -25,11 +25,18 @@ class Encode:
     """x264 preset of the P pictures."""
     crf: float = 23.0
     """x264 constant rate factor, 1 (best) to 51."""
+    mask: Path | None = None
+    """Picture of the camera's size, white where frames are to be coded finer."""
+    mask_qp: int = -6
+    """Added to H.264's quantiser in the mask, -24..24; -6 halves its step."""
+    refine_pose_ms: float | None = None
+    """Time a frame to look for a pose of fewer bits near the measured one; from about 100 on."""
     threads: int = 2
     """Threads of the rasterizer."""
 
     def run(self) -> None:
         """Code the drive and print its size."""
+        from rfcore.codec import SteeringSettings
         from rfcore.dataset import read_dataset
         from rfcore.field import load_field
         from rfcore.wire.drive_file import write_drive
@@ -37,7 +44,10 @@ class Encode:
 
         field = load_field(self.field, threads=self.threads)
         dataset = read_dataset(self.drive, tile_origin=field.metadata.tile_origin)
-        coded = encode_drive(dataset, field, CodingSettings(self.preset, self.crf))
+        asked = SteeringSettings(self.mask, self.mask_qp, self.refine_pose_ms)
+        k = dataset.pictures[0].camera.intrinsics
+        steering = asked.steering((k.width_px, k.height_px))
+        coded = encode_drive(dataset, field, CodingSettings(self.preset, self.crf, steering))
         write_drive(self.out, coded)
         payload_bytes = sum(len(frame.packet.payload) for frame in coded.frames)
         print(

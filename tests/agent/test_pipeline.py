@@ -8,8 +8,9 @@ import pytest
 
 from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
+from cav_agent.rate_control import ByteBudget
 from rfcore.camera import Camera
-from rfcore.codec import CodecConfig
+from rfcore.codec import CodecConfig, QpMap, Steering
 from rfcore.field import Quality
 from rfcore.views import View
 
@@ -49,3 +50,33 @@ def test_block_means_are_sent_only_where_the_server_is_not_exact(noisy: Capture)
         for exact in (True, False)
     ]
     assert lengths == [0, 64]
+
+
+def test_a_budget_of_bytes_is_aimed_at_and_costs_quality(noisy: Capture) -> None:
+    config = CodecConfig(32, 16, preset="ultrafast", crf=10)
+    pipeline = Pipeline(Grey(), config, lambda: 0)
+    crfs, lengths = [], []
+    for target in (1e6, 150.0, 150.0):
+        made = pipeline.encode(EncodeJob(noisy, 0, 1, budget=ByteBudget(target, 10_000)))
+        crfs.append(made.crf)
+        lengths.append(len(made.packet.payload))
+    assert crfs[0] == 10
+    assert crfs[1] > 20
+    assert lengths[2] < 0.5 * lengths[0]
+
+
+def test_a_map_reaches_the_encoder(noisy: Capture) -> None:
+    config = CodecConfig(32, 16, preset="ultrafast", crf=30)
+    coarser = Steering(QpMap(np.full((1, 2), 12, np.int8)))
+    plain = Pipeline(Grey(), config, lambda: 0).encode(EncodeJob(noisy, 0, 1))
+    made = Pipeline(Grey(), config, lambda: 0, steering=coarser).encode(EncodeJob(noisy, 0, 1))
+    assert len(made.packet.payload) < 0.7 * len(plain.packet.payload)
+
+
+def test_the_pose_sent_is_the_one_that_was_rendered(noisy: Capture) -> None:
+    """A grey field says nothing of the pose, so the measured one stays, and time is told."""
+    config = CodecConfig(32, 16, preset="ultrafast")
+    pipeline = Pipeline(Grey(), config, lambda: 0, steering=Steering(refine_pose_ms=50))
+    made = pipeline.encode(EncodeJob(noisy, 0, 1))
+    assert made.pose == noisy.picture.camera.world_from_cam
+    assert "refine" in made.stage_s

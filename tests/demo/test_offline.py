@@ -1,13 +1,16 @@
 """The codec without a network: what is decoded is the vehicle's closed loop, or an error."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from rfcore.codec import CodecConfig, DeltaEncoder
+from rfcore.codec import CodecConfig, DeltaEncoder, SteeringSettings
 from rfcore.dataset import Dataset, read_dataset
 from rfcore.errors import InvalidData
 from rfcore.field import SplatField
+from rfcore.image import write_png
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.drive_file import read_drive, write_drive
@@ -39,6 +42,20 @@ def test_a_decoded_file_is_the_senders_closed_loop(
         own = encoder.encode(state, i420_from_rgb(picture.read()), *rendered(field, picture.camera))
         state = own.state
         assert frame.frame.digest() == own.reconstruction.digest()
+
+
+def test_a_drive_coded_with_a_mask_and_refined_poses_decodes(
+    drive: Dataset, field: SplatField, tmp_path: Path
+) -> None:
+    mask = np.zeros((64, 96, 3), np.uint8)
+    mask[:32] = 255
+    write_png(tmp_path / "mask.png", mask)
+    asked = SteeringSettings(tmp_path / "mask.png", -8, refine_pose_ms=5000.0)
+    settings = replace(SETTINGS, steering=asked.steering((96, 64)))
+    plain, coded = (encode_drive(drive, field, how) for how in (SETTINGS, settings))
+    bits = [sum(len(frame.packet.payload) for frame in made.frames) for made in (plain, coded)]
+    assert bits[1] > bits[0]
+    assert len(list(decode_drive(coded, field))) == 4
 
 
 def test_another_field_is_refused_with_both_ids_named(drive: Dataset, field: SplatField) -> None:

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from cav_agent.config import PaceKind
+from rfcore.codec import SteeringSettings
 from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable
-from rfcore.image import read_rgb
+from rfcore.image import read_rgb, write_png
 from rfcore.raster.native import available_isas
 from rfcore.wire.settings import RenderSettings
 from rfedge.link_proxy import LinkProxy, ProxySettings
@@ -117,6 +118,35 @@ async def test_in_realtime_what_the_link_cannot_take_is_dropped_before_it_is_enc
     for line in trip.lines:
         if line["result"] == "dropped":
             assert (line["reason"], line["packet_bytes"]) == ("superseded", None)
+
+
+async def test_over_a_narrow_link_a_bound_on_delay_costs_quality(serve: Any, travel: Any) -> None:
+    """100 kbit/s carry 1 kB in the 80 ms that 0.1 s leave at most; free frames here have 3."""
+    async with serve() as server:
+        proxy = LinkProxy(ProxySettings(str(server.address), uplink_bps=100e3, delay_ms=1.0))
+        await proxy.start()
+        free, bound = [
+            (await travel(proxy.address, crf=10.0, max_delay_ms=max_delay_ms)).lines
+            for max_delay_ms in (None, 100.0)
+        ]
+        await proxy.stop()
+    assert [line["crf"] for line in free] == [10.0] * 6
+    assert [line["target_bytes"] for line in free] == [None] * 6
+    assert [line["result"] for line in bound] == ["acked"] * 6
+    for before, after in zip(free[1:], bound[1:], strict=True):
+        assert after["crf"] > 10
+        assert after["payload_bytes"] < 0.6 * before["payload_bytes"]
+
+
+async def test_a_drive_with_a_mask_and_refined_poses_is_reconstructed(
+    serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    write_png(tmp_path / "mask.png", np.full((52, 76, 3), 255, np.uint8))
+    steering = SteeringSettings(tmp_path / "mask.png", -3, refine_pose_ms=1000.0)
+    async with serve() as server:
+        trip = await travel(server.address, steering=steering)
+    assert trip.counts == {"acked": 6}
+    assert all("refine" in line["stage_ms"] for line in trip.lines)
 
 
 async def test_the_server_counts_frames_bytes_and_seconds(
