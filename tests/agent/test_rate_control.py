@@ -15,12 +15,23 @@ from hypothesis import strategies as st
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
 from cav_agent.rate_control import ByteBudget, QualitySteps, RateControl
 from cav_agent.session import AgentSession
-from rfcore.codec import DeltaPacket
+from rfcore.codec import (
+    RENDER_ONLY,
+    CodecConfig,
+    DeltaEncoder,
+    DeltaPacket,
+    FrameChoice,
+    RateModel,
+    RateTarget,
+)
+from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
+from rfcore.field import load_field
 from rfcore.link import LinkProfile
 from rfcore.link.profile_file import read_link
 from rfcore.link.shaper import Link
 from rfcore.link.trace import TraceTransmission, read_mahimahi
+from rfcore.native.yuv import i420_from_colour, i420_from_rgb
 from rfcore.wire.messages import (
     Ack,
     Credit,
@@ -32,6 +43,7 @@ from rfcore.wire.messages import (
     Welcome,
 )
 
+RATE_HZ = 10
 CODING_S = 0.04
 ANSWERING_S = 0.02
 LOWEST_CRF = 23.0
@@ -69,13 +81,59 @@ class Picture:
 
 
 @dataclass
+class ModelCoder:
+    """A coder whose rate halves every 6 CRF and strays by a fifth."""
+
+    random: Random
+    sequence: int = 0
+
+    def __call__(self, job: EncodeJob) -> EncodedFrame:
+        budget = job.budget or ByteBudget(BYTES_AT_LOWEST, BYTES_AT_LOWEST)
+        crf = LOWEST_CRF + 6 * np.log2(BYTES_AT_LOWEST / budget.target_bytes)
+        crf = min(51.0, max(LOWEST_CRF, crf))
+        size_bytes = BYTES_AT_LOWEST * 2 ** ((LOWEST_CRF - crf) / 6)
+        size_bytes = int(size_bytes * 2 ** self.random.uniform(-0.3, 0.3))
+        digest, payload = b"d" * 16, bytes(size_bytes)
+        packet = DeltaPacket(job.epoch, self.sequence, digest, b"", digest, payload, 0)
+        self.sequence += 1
+        return EncodedFrame(packet, {"read": 0.0, "encode": CODING_S}, crf=crf)
+
+
+class StreetCoder:
+    """x264 on the sample street, every picture against the field's render; keeps PSNR by index."""
+
+    def __init__(self) -> None:
+        field = load_field(Path("samples/fields/street.rff"), threads=2)
+        pictures = read_dataset(Path("samples/street/transforms_drive_vehicles.json")).pictures
+        self._frames = [i420_from_rgb(picture.read()) for picture in pictures]
+        self._renders = [
+            i420_from_colour(field.render(picture.camera).colour) for picture in pictures
+        ]
+        self._encoder = DeltaEncoder(CodecConfig(640, 360, "ultrafast", LOWEST_CRF))
+        self._state = self._encoder.start(0)
+        self._model = RateModel()
+        self.psnr_db: dict[int, float] = {}
+
+    def __call__(self, job: EncodeJob) -> EncodedFrame:
+        assert job.budget is not None
+        target = RateTarget(job.budget.target_bytes, self._model)
+        choice = FrameChoice(RENDER_ONLY, limit_bytes=job.budget.limit_bytes, target=target)
+        at = job.capture.index % len(self._frames)
+        frame = self._frames[at]
+        made = self._encoder.encode(self._state, frame, self._renders[at], choice=choice)
+        self._state, self._model = made.state, made.rate or self._model
+        squares = np.mean((made.reconstruction.y.astype(float) - frame.y) ** 2)
+        self.psnr_db[job.capture.index] = float(10 * np.log10(255**2 / squares))
+        return EncodedFrame(made.packet, {"encode": CODING_S}, made.tries, crf=made.crf)
+
+
+@dataclass
 class World:
-    """A session, a coder whose rate halves every 6 CRF and strays by a fifth, and an uplink."""
+    """A session, a coder and an uplink; coding takes ``CODING_S``, whatever it took."""
 
     session: AgentSession
     uplink: Link[FrameAddress]
-    random: Random
-    sequence: int = 0
+    code: Callable[[EncodeJob], EncodedFrame]
 
     def drive(self, captures: list[Capture]) -> list[Picture]:
         """Return what became of the pictures, in the order of their ends."""
@@ -99,17 +157,6 @@ class World:
                 heapq.heappush(events, (at_s, next(order), answer))
             ended += self.session.take_results()
         return [_picture(result) for result in ended]
-
-    def code(self, job: EncodeJob) -> EncodedFrame:
-        budget = job.budget or ByteBudget(BYTES_AT_LOWEST, BYTES_AT_LOWEST)
-        crf = LOWEST_CRF + 6 * np.log2(BYTES_AT_LOWEST / budget.target_bytes)
-        crf = min(51.0, max(LOWEST_CRF, crf))
-        size_bytes = BYTES_AT_LOWEST * 2 ** ((LOWEST_CRF - crf) / 6)
-        size_bytes = int(size_bytes * 2 ** self.random.uniform(-0.3, 0.3))
-        digest, payload = b"d" * 16, bytes(size_bytes)
-        packet = DeltaPacket(job.epoch, self.sequence, digest, b"", digest, payload, 0)
-        self.sequence += 1
-        return EncodedFrame(packet, {"read": 0.0, "encode": CODING_S}, crf=crf)
 
     def send(self, now: float) -> list[tuple[float, ServerMessage]]:
         answers: list[tuple[float, ServerMessage]] = []
@@ -139,7 +186,7 @@ def drive_over(
         uplink: Link[FrameAddress],
         max_delay_s: float | None = 0.2,
         seconds: float = 40.0,
-        rate_hz: float = 10.0,
+        code: Callable[[EncodeJob], EncodedFrame] | None = None,
     ) -> list[Picture]:
         control = None if max_delay_s is None else RateControl(max_delay_s)
         session = AgentSession(hello, rate_control=control)
@@ -147,8 +194,8 @@ def drive_over(
         session.messages_to_send(0.0)
         session.receive(Welcome("s", True), 0.0)
         session.receive(Credit("front", 2), 0.0)
-        captures = [make_capture(i, i / rate_hz) for i in range(int(seconds * rate_hz))]
-        return World(session, uplink, Random(5)).drive(captures)
+        captures = [make_capture(i, i / RATE_HZ) for i in range(int(seconds * RATE_HZ))]
+        return World(session, uplink, code or ModelCoder(Random(5))).drive(captures)
 
     return run
 
@@ -191,6 +238,22 @@ def test_a_rate_that_collapses_costs_quality_and_not_time(
     assert crf_of(between(pictures, 25 + 3, 40)) == LOWEST_CRF
     dropped = [picture for picture in pictures if picture.delay_s is None]
     assert all(picture.payload_bytes == 0 for picture in dropped), "only before encoding"
+
+
+@pytest.mark.slow
+def test_on_a_street_a_collapse_costs_decibels_and_not_time(
+    drive_over: Callable[..., list[Picture]],
+) -> None:
+    street = StreetCoder()
+    pictures = drive_over(link((0, 10e6), (4, 0.3e6), (8, 10e6)), seconds=12, code=street)
+    for from_s, to_s in ((SETTLING_S, 4), (4 + SETTLING_S, 8), (8 + SETTLING_S, 12)):
+        assert kept(between(pictures, from_s, to_s), 0.2) == 1.0
+    psnr_db = [
+        np.mean([db for index, db in street.psnr_db.items() if a <= index / RATE_HZ < b])
+        for a, b in ((3, 4), (4 + SETTLING_S, 8), (11, 12))
+    ]
+    assert psnr_db[1] < psnr_db[0] - 1
+    assert psnr_db[2] > psnr_db[1] + 1
 
 
 def test_without_control_the_same_collapse_is_seconds_of_delay(
