@@ -35,6 +35,8 @@ __all__ = ["PRIOR_M", "PRIOR_RAD", "Look", "align"]
 COARSEST_PX = 60
 """Shortest side of the coarsest level; 0.2 m at 5 m are then less than 3 px."""
 MOST_PIXELS = 12_000
+"""Half of them leave 0.60 cm and 0.025 degrees where these leave 0.49 and 0.017 (10 and 20 cm, 0.1
+and 0.5 degrees of noise on the sample street with vehicles), and save a quarter of the time."""
 ROUNDS = 12
 """Steps of a level, at most."""
 ENOUGH_PX = 0.01
@@ -83,7 +85,7 @@ class _Level:
             _half(self.frame),
             _half(self.render),
             _half(self.depth),
-            _quarters(self.trusted).min(axis=(1, 3)) > 0,
+            _half_all(self.trusted),
             Intrinsics(width, height, k.fx_px / 2, k.fy_px / 2, k.cx_px / 2, k.cy_px / 2),
         )
 
@@ -241,11 +243,19 @@ def _pixels(step: F64, level: _Level, template: _Template) -> float:
     return moved * level.intrinsics.fx_px
 
 
-def _quarters(plane: Array) -> Array:
-    height, width = (side // 2 for side in plane.shape)
-    return plane[: 2 * height, : 2 * width].reshape(height, 2, width, 2)
+def _quarters(plane: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the four samples of each whole 2x2 block: five times as fast as reducing an axis."""
+    even = plane[: plane.shape[0] // 2 * 2, : plane.shape[1] // 2 * 2]
+    return even[0::2, 0::2], even[0::2, 1::2], even[1::2, 0::2], even[1::2, 1::2]
 
 
 def _half(plane: F64) -> F64:
-    halved: F64 = _quarters(plane).mean(axis=(1, 3))
+    a, b, c, d = _quarters(plane)
+    halved: F64 = (a + b + c + d) / 4
     return halved
+
+
+def _half_all(trusted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    a, b, c, d = _quarters(trusted)
+    every: NDArray[np.bool_] = a & b & c & d
+    return every

@@ -4,6 +4,10 @@ A pose is sent with every frame, so the sender may choose it: the receiver rende
 told. Alignment (``rfcore.codec.align``) proposes one, the field is rendered there, and the
 estimated bits of the frame against both renders decide. Time is bounded by a clock that is an
 argument; whatever was found by then is taken.
+
+Five frames of the sample street with vehicles, veryfast, BD-rate against true poses (30 to 36 dB):
+noise of 5 cm and 0.05 degrees costs 54 %, of 10 cm and 0.1 degrees 167 %, of 20 cm and 0.5 degrees
+218 %; after refinement 0.7, 1.7 and 1.4 % are left, and 4 mm and 0.02 degrees of noise.
 """
 
 from __future__ import annotations
@@ -21,8 +25,8 @@ from rfcore.image import I420
 __all__ = ["PoseSearch", "Refined"]
 
 MOST_LOOKS = 2
-"""Renders beside that of the measured pose: the first ends 10 cm within a few mm, and what a
-second finds is from parallax that the first render did not show."""
+"""Renders beside that of the measured pose; the second finds what the first, seen from elsewhere,
+could not show. A look takes about 100 ms of one core at 640x360: aligning 70, rendering 30."""
 WORTH = 0.01
 """Of the estimated bits, that another pose must save: less is noise of the estimate."""
 FURTHEST_M, FURTHEST_RAD = 1.0, math.radians(3.0)
