@@ -17,7 +17,7 @@ from rfcore.codec.ladder import FULL_RUNG, Rung
 from rfcore.views import PosedPicture
 from rfcore.wire.messages import FrameAddress, StageTimes
 
-__all__ = ["Capture", "EncodeJob", "EncodedFrame", "FrameResult", "Outcome"]
+__all__ = ["TOO_LATE", "Capture", "EncodeJob", "EncodedFrame", "FrameResult", "Outcome"]
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,10 @@ class EncodedFrame:
     rung: Rung = FULL_RUNG
     crf: float | None = None
     pose: Pose | None = None
+
+
+TOO_LATE = "too late"
+"""Why a picture was dropped that had waited longer than its delay; a fresh one may be in time."""
 
 
 class Outcome(StrEnum):

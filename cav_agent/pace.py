@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from cav_agent.frames import FrameResult, Outcome
+from cav_agent.frames import TOO_LATE, FrameResult, Outcome
 from rfcore.errors import InvalidInput, RfedgeError
 
 __all__ = ["MAX_TRIES", "Lockstep", "Pace", "Realtime"]
@@ -115,7 +115,7 @@ class Lockstep:
             self._tries = 0
             return
         name = result.capture.picture.name
-        if result.outcome is Outcome.DROPPED:
+        if result.outcome is Outcome.DROPPED and result.reason != TOO_LATE:
             raise RfedgeError(f"picture {name} could not be coded: {result.reason}")
         if self._tries >= MAX_TRIES:
             raise RfedgeError(f"picture {name} was lost {self._tries} times: {result.reason}")

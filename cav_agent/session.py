@@ -19,7 +19,14 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from cav_agent.config import AgentLimits
-from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
+from cav_agent.frames import (
+    TOO_LATE,
+    Capture,
+    EncodedFrame,
+    EncodeJob,
+    FrameResult,
+    Outcome,
+)
 from cav_agent.patience import Patience
 from cav_agent.rate_control import ByteBudget, RateControl
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
@@ -233,7 +240,7 @@ class AgentSession:
     def _drop_late(self, now: float) -> None:
         control = self._rate_control
         while control is not None and self._slot and control.is_late(self._slot[0].captured_s, now):
-            self._drop("too late")
+            self._drop(TOO_LATE)
 
     def encoded(self, encoded: EncodedFrame, now: float) -> None:
         """The picture of the running job became ``encoded``: send it, if its stream still is."""

@@ -121,18 +121,19 @@ async def test_in_realtime_what_the_link_cannot_take_is_dropped_before_it_is_enc
 
 
 async def test_over_a_narrow_link_a_bound_on_delay_costs_quality(serve: Any, travel: Any) -> None:
-    """100 kbit/s carry 1 kB in the 80 ms that 0.1 s leave at most; free frames here have 3."""
+    """50 kbit/s carry 1.2 kB in the 190 ms that 0.25 s leave at most; free frames here have 3."""
     async with serve() as server:
-        proxy = LinkProxy(ProxySettings(str(server.address), uplink_bps=100e3, delay_ms=1.0))
+        proxy = LinkProxy(ProxySettings(str(server.address), uplink_bps=50e3, delay_ms=1.0))
         await proxy.start()
         free, bound = [
             (await travel(proxy.address, crf=10.0, max_delay_ms=max_delay_ms)).lines
-            for max_delay_ms in (None, 100.0)
+            for max_delay_ms in (None, 250.0)
         ]
         await proxy.stop()
     assert [line["crf"] for line in free] == [10.0] * 6
     assert [line["target_bytes"] for line in free] == [None] * 6
-    assert [line["result"] for line in bound] == ["acked"] * 6
+    bound = [line for line in bound if line["result"] == "acked"]
+    assert len(bound) == 6, "one that waited too long is captured again"
     for before, after in zip(free[1:], bound[1:], strict=True):
         assert after["crf"] > 10
         assert after["payload_bytes"] < 0.6 * before["payload_bytes"]
