@@ -23,6 +23,7 @@ from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfedge.evaluate.clip import CodedClip, luma_mse
 from rfedge.evaluate.luma_ssim import luma_ssim
+from rfedge.evaluate.scheduling import ordinary_scheduling
 
 __all__ = [
     "CodedPictures",
@@ -118,7 +119,8 @@ class Rival:
         encoder.time_base, encoder.framerate = 1 / rate, rate
         encoder.thread_count = 1
         encoder.options = {**self.options, "crf": f"{point:g}"}
-        encoder.open()
+        with ordinary_scheduling():
+            encoder.open()
         return encoder
 
     def _decoded(self, packets: Sequence[bytes]) -> list[I420]:
