@@ -81,6 +81,7 @@ async def test_a_damaged_field(
             await vehicle.say(replace(coded.hello, field_ids=(street.other_id,)))
             statuses.append(await vehicle.end())
             told.append(await vehicle.stream.details())
+    await asyncio.sleep(1.0)  # long enough for the bystander to send some pictures
     case.over()
     case.holds("DATA_LOSS, naming the sum", set(statuses) == {grpc.StatusCode.DATA_LOSS})
     case.holds("and the file's", all(street.other_id in text for text in told))
