@@ -9,10 +9,10 @@ import asyncio
 import ctypes
 import itertools
 import json
+import math
 import os
 import shutil
 import socket
-import statistics
 import struct
 import subprocess
 import threading
@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
+import numpy as np
 import pytest
 
 from rfcore.link import Arrival, LinkProfile, delivery_times
@@ -128,47 +129,61 @@ def stamp_s(sock: socket.socket) -> float:
 
 
 def test_datagrams_leave_the_kernels_bucket_when_the_machine_says(wire: Wire) -> None:
-    """Three bursts with rests between; the bucket's head start is the only difference allowed.
+    """Bursts with rests between; the bucket's head start is the only difference allowed.
 
-    A token bucket lets burst bytes through at once, so the kernel may lead by burst / rate. The
-    kernel stamps what it receives, so a busy machine that hears of it late changes nothing.
+    A token bucket lets burst bytes through at once, so the kernel may lead by burst / rate, and
+    never by more. A busy machine can only make it later (a sender put aside between reading the
+    clock and sending delays its whole burst), so the least disturbed burst is the one to compare.
     """
+    bursts = 10
+    heard_s, sent = _send_bursts(wire, bursts, every_s=0.3)
+    predicted_s = delivery_times(LinkProfile(RATE_BPS), sent)
+    lead_s = BURST_BYTES * 8 / RATE_BPS
+    late_s = np.subtract(heard_s, predicted_s).reshape(bursts, -1)
+    assert late_s.min() >= -lead_s - 0.001
+    quietest = int(np.argmin(np.median(late_s, axis=1)))
+    assert np.median(late_s[quietest]) <= 0.002
+    heard, predicted = (
+        np.reshape(times, (bursts, -1))[quietest] for times in (heard_s, predicted_s)
+    )
+    slope = (heard[-1] - heard[4]) / (predicted[-1] - predicted[4])
+    assert slope == pytest.approx(1.0, abs=0.02)
+
+
+def _send_bursts(wire: Wire, count: int, every_s: float) -> tuple[list[float], list[Arrival]]:
+    """Send ``count`` bursts of 40 datagrams; return when each was heard, and what was sent when."""
     near = within(wire.near, lambda: udp(wire.near_address))
     far = within(wire.far, lambda: udp(wire.far_address))
     near.connect(far.getsockname())
     heard_s: list[float] = []
-    count = 3 * 40
 
     def hear() -> None:
-        while len(heard_s) < count:
+        while len(heard_s) < count * 40:
             heard_s.append(stamp_s(far))
 
     listener = threading.Thread(target=hear)
     listener.start()
-    begin_s, schedule = time.time(), []
-    for burst in range(3):
-        time.sleep(max(0.0, begin_s + 0.6 * burst - time.time()))
+    begin_s, sent = time.time(), []
+    for burst in range(count):
+        time.sleep(max(0.0, begin_s + every_s * burst - time.time()))
         for size_bytes in (200, 1000, 1400, 600) * 10:
-            schedule.append(Arrival(time.time() - begin_s, size_bytes + OVERHEAD_BYTES))
+            sent.append(Arrival(time.time() - begin_s, size_bytes + OVERHEAD_BYTES))
             near.send(bytes(size_bytes))
     listener.join()
     near.close()
     far.close()
-    predicted_s = delivery_times(LinkProfile(RATE_BPS), schedule)
-    lead_s = BURST_BYTES * 8 / RATE_BPS
-    late_s = [h - begin_s - p for h, p in zip(heard_s, predicted_s, strict=True)]
-    assert min(late_s) >= -lead_s - 0.001
-    assert -lead_s - 0.001 <= statistics.median(late_s) <= 0.002
-    slope = (heard_s[39] - heard_s[4]) / (predicted_s[39] - predicted_s[4])
-    assert slope == pytest.approx(1.0, abs=0.02)
+    return [heard - begin_s for heard in heard_s], sent
 
 
 async def test_the_proxy_takes_as_long_as_the_kernel_for_the_same_bytes(wire: Wire) -> None:
-    """Seconds a byte on the wire, of one TCP transfer through each."""
-    size_bytes = 400_000
-    kernel_s = await asyncio.to_thread(_transfer, wire, size_bytes)
-    kernel_s_per_byte = kernel_s / wire.sent_bytes()
-    proxy_s_per_byte = await _through_proxy(size_bytes) / size_bytes
+    """Seconds a byte on the wire, of TCP transfers through each; the least disturbed of three."""
+    size_bytes = 200_000
+    kernel_s_per_byte = proxy_s_per_byte = math.inf
+    for _ in range(3):
+        before_bytes = wire.sent_bytes()
+        kernel_s = await asyncio.to_thread(_transfer, wire, size_bytes)
+        kernel_s_per_byte = min(kernel_s_per_byte, kernel_s / (wire.sent_bytes() - before_bytes))
+        proxy_s_per_byte = min(proxy_s_per_byte, await _through_proxy(size_bytes) / size_bytes)
     assert kernel_s_per_byte == pytest.approx(8 / RATE_BPS, rel=0.03)
     assert proxy_s_per_byte == pytest.approx(kernel_s_per_byte, rel=0.05)
 
