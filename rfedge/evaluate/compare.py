@@ -6,9 +6,10 @@ best of all rivals whose sender takes no more processor time than the method's: 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -25,13 +26,23 @@ from rfedge.evaluate.rate_curve import (
     rate_curve,
 )
 
-__all__ = ["BEST", "MIDDLE_DB", "WINDOWS_DB", "Contest", "Performance", "compare_rows", "perform"]
+__all__ = [
+    "BEST",
+    "MIDDLE_DB",
+    "WINDOWS_DB",
+    "Contest",
+    "Performance",
+    "compare_rows",
+    "perform",
+    "seconds_left",
+]
 
 WINDOWS_DB: tuple[Window, ...] = ((32.0, 35.0), (30.0, 35.0))
 """The headline window first."""
 MIDDLE_DB = sum(WINDOWS_DB[0]) / 2
 SAVING_AT_DB = (31.0, 33.0, 35.0)
 BEST = "best-comparable"
+PROBE_FRAMES = 2
 TIMED_FRAMES, TIMED_REPEATS = 12, 3
 STEADY = slice(1, None)
 """Every frame but the first, which a stream sends once and a clip of 24 frames counts too much."""
@@ -80,6 +91,19 @@ class Performance:
     def nearest(self, psnr_db: float) -> CodedClip:
         """Return the clip whose quality is nearest to ``psnr_db``."""
         return min(self.clips, key=lambda clip: abs(_psnr_db(clip.luma_mse.mean()) - psnr_db))
+
+
+def seconds_left(contest: Contest, coders: Iterable[ClipCoder], store: CellStore) -> float:
+    """Estimate what is still to code, from two frames of each coder that has something to do."""
+    total_s = 0.0
+    for coder in coders:
+        left = sum(not store.has(contest.cell_key(coder, p)) for p in coder.points)
+        if left:
+            began_s = monotonic()
+            middle = coder.points[len(coder.points) // 2]
+            coder.code(contest.frames[:PROBE_FRAMES], contest.rate_hz, middle)
+            total_s += left * (monotonic() - began_s) * len(contest.frames) / PROBE_FRAMES
+    return total_s
 
 
 def perform(

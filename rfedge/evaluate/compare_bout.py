@@ -19,6 +19,7 @@ from rfedge.evaluate.compare_rivals import foreign_coder, rival_families
 from rfedge.evaluate.drives import DriveFrames, DriveName, read_drive
 from rfedge.evaluate.foreground import ForegroundCoder, foreground_mask
 from rfedge.evaluate.own import FieldCoder, SeenClip, see_clip
+from rfedge.evaluate.result_file import check_result_path
 from rfedge.provenance import revision
 
 __all__ = ["Bout", "CompareJob", "read_bouts"]
@@ -41,8 +42,7 @@ class CompareJob:
     retime: bool = False
 
     def __post_init__(self) -> None:
-        if self.out.suffix != ".json":
-            raise InvalidInput("out", f"{self.out} must end in .json")
+        check_result_path(self.out)
 
 
 @dataclass(frozen=True)

@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
-import json
-import shlex
-import sys
 from collections.abc import Sequence
-from time import monotonic
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
 from rfcore.field import load_field
-from rfcore.files import write_whole
 from rfedge.evaluate.bit_split import SplitClip, split_rows
 from rfedge.evaluate.cells import CellStore
 from rfedge.evaluate.clip import ClipCoder
-from rfedge.evaluate.compare import BEST, MIDDLE_DB, Performance, compare_rows, perform
+from rfedge.evaluate.compare import (
+    BEST,
+    MIDDLE_DB,
+    Performance,
+    compare_rows,
+    perform,
+    seconds_left,
+)
 from rfedge.evaluate.compare_bout import Bout, CompareJob, read_bouts
 from rfedge.evaluate.compare_tables import break_even_row, curve_rows
 from rfedge.evaluate.drives import DriveName
 from rfedge.evaluate.foreground import foreground_row
-from rfedge.provenance import host, revision
+from rfedge.evaluate.result_file import provenance, write_result
+from rfedge.provenance import revision
 
 __all__ = ["run_compare"]
 
-PROBE_FRAMES = 2
 ANCHOR = "x264-lowdelay"
 Row = dict[str, Any]
 
@@ -41,7 +43,7 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
     field = load_field(job.field)
     bouts = read_bouts(job, field)
     store = CellStore(job.cells)
-    left_s = sum(_seconds_left(bout, store) for bout in bouts)
+    left_s = sum(seconds_left(bout.contest, bout.coders, store) for bout in bouts)
     cells = sum(len(coder.points) for bout in bouts for coder in bout.coders)
     console.print(f"{cells} clips to code, about {left_s / 60:.1f} minutes of them left to do")
     tables: dict[str, list[Row]] = {}
@@ -50,32 +52,16 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
             tables.setdefault(name, []).extend(rows)
     result = {
         "case": "compare",
-        "command": shlex.join(["rfedge", *sys.argv[1:]]),
-        "host": host(),
-        "revision": revision(),
+        **provenance(revision()),
         "quick": job.quick,
         "field_id": field.field_id,
         "field_bytes": job.field.stat().st_size,
         "frames": {f"{b.contest.scene}@{b.contest.rate_hz:g}": _frames(b) for b in bouts},
         **tables,
     }
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(job.out, json.dumps(result, indent=1) + "\n")
+    write_result(job.out, result)
     _print(tables["rows"], console)
     return result
-
-
-def _seconds_left(bout: Bout, store: CellStore) -> float:
-    """Time two frames of each coder that still has something to do."""
-    contest, total_s = bout.contest, 0.0
-    for coder in bout.coders:
-        left = sum(not store.has(contest.cell_key(coder, p)) for p in coder.points)
-        if left:
-            began_s = monotonic()
-            middle = coder.points[len(coder.points) // 2]
-            coder.code(contest.frames[:PROBE_FRAMES], contest.rate_hz, middle)
-            total_s += left * (monotonic() - began_s) * len(contest.frames) / PROBE_FRAMES
-    return total_s
 
 
 def _tables(

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,11 +16,11 @@ from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.field.quality import Quality
-from rfcore.files import write_whole
 from rfedge.evaluate.cells import CellKey, CellStore
 from rfedge.evaluate.ladder import LadderClip, Rendered, measure_rung, render_clip
 from rfedge.evaluate.ladder_rungs import CRFS, fronts, rate_percents, rungs_for
-from rfedge.provenance import host, revision
+from rfedge.evaluate.result_file import check_result_path, provenance, write_result
+from rfedge.provenance import revision
 
 __all__ = ["LadderJob", "run_ladder"]
 
@@ -46,8 +43,7 @@ class LadderJob:
     def __post_init__(self) -> None:
         if not self.fields:
             raise InvalidInput("fields", "name at least one field")
-        if self.out.suffix != ".json":
-            raise InvalidInput("out", f"{self.out} must end in .json")
+        check_result_path(self.out)
         if self.frames < PROBE_FRAMES:
             raise InvalidInput("frames", f"{self.frames} must be at least {PROBE_FRAMES}")
 
@@ -127,9 +123,7 @@ def run_ladder(job: LadderJob, console: Console) -> Row:
     rows = _judged(curves)
     result = {
         "case": "ladder",
-        "command": shlex.join(["rfedge", *sys.argv[1:]]),
-        "host": host(),
-        "revision": at,
+        **provenance(at),
         "quick": job.quick,
         "threads": 1,
         "size_px": list(clip.frames[0].size_px),
@@ -145,8 +139,7 @@ def run_ladder(job: LadderJob, console: Console) -> Row:
         "frames": {"drive": str(job.drive), "count": len(clip.frames), "sha256": clip.digest},
         "rows": rows,
     }
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(job.out, json.dumps(result, indent=1) + "\n")
+    write_result(job.out, result)
     return result
 
 

@@ -7,9 +7,6 @@ steps of a half), then played over constant rates and over recorded links.
 from __future__ import annotations
 
 import hashlib
-import json
-import shlex
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +20,6 @@ from rfcore.codec.ladder import Rung
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
-from rfcore.files import write_whole
 from rfcore.link import DirectionPlan, LinkProfile
 from rfcore.link.trace import read_mahimahi
 from rfedge.evaluate.cells import CellStore
@@ -40,8 +36,9 @@ from rfedge.evaluate.latency import (
     repeated,
 )
 from rfedge.evaluate.own import FieldCoder, see_clip
+from rfedge.evaluate.result_file import check_result_path, provenance, write_result
 from rfedge.evaluate.rivals import x264_lowdelay
-from rfedge.provenance import host, revision
+from rfedge.provenance import revision
 
 __all__ = ["LatencyJob", "run_latency"]
 
@@ -67,8 +64,7 @@ class LatencyJob:
     quick: bool = False
 
     def __post_init__(self) -> None:
-        if self.out.suffix != ".json":
-            raise InvalidInput("out", f"{self.out} must end in .json")
+        check_result_path(self.out)
         if not 20 <= self.quality_db <= 50:
             raise InvalidInput("quality_db", f"{self.quality_db} dB is outside 20..50 dB")
 
@@ -109,9 +105,7 @@ def run_latency(job: LatencyJob, console: Console) -> Row:
     rows = [_row(sender, name, plan) for sender in senders for name, plan in links]
     result = {
         "case": "latency",
-        "command": shlex.join(["rfedge", *sys.argv[1:]]),
-        "host": host(),
-        "revision": revision(),
+        **provenance(revision()),
         "quick": job.quick,
         "field_id": field.field_id,
         "field_psnr_db": {s.contest.scene: s.contest.field_psnr_db for s in senders},
@@ -122,8 +116,7 @@ def run_latency(job: LatencyJob, console: Console) -> Row:
         "needed": [_needed(sender) for sender in senders],
         "rows": rows,
     }
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(job.out, json.dumps(result, indent=1) + "\n")
+    write_result(job.out, result)
     return result
 
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic
 from typing import Any
 
 from rich.console import Console
@@ -16,17 +12,17 @@ from rich.table import Table
 
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field
-from rfcore.files import write_whole
 from rfedge.evaluate.cells import CellStore
+from rfedge.evaluate.compare import seconds_left
 from rfedge.evaluate.drives import DriveFrames, DriveName, read_drive
 from rfedge.evaluate.never_worse import NeverWorse, controls_of
-from rfedge.provenance import host, revision
+from rfedge.evaluate.result_file import check_result_path, provenance, write_result
+from rfedge.provenance import revision
 
 __all__ = ["NeverWorseJob", "run_never_worse"]
 
 DECIMATION = 5
 QUICK_FRAMES = 6
-PROBE_FRAMES = 2
 Row = dict[str, Any]
 
 
@@ -44,8 +40,7 @@ class NeverWorseJob:
     retime: bool = False
 
     def __post_init__(self) -> None:
-        if self.out.suffix != ".json":
-            raise InvalidInput("out", f"{self.out} must end in .json")
+        check_result_path(self.out)
         if not (self.drives or self.decimated):
             raise InvalidInput("drives", "there is none")
 
@@ -62,20 +57,17 @@ def run_never_worse(job: NeverWorseJob, console: Console) -> dict[str, Any]:
     tables = [
         NeverWorse(drive, controls_of(field, drive), job.preset, stamp) for drive in _drives(job)
     ]
-    left_s = sum(_seconds_left(table, store) for table in tables)
+    left_s = sum(seconds_left(table.contest, table.coders.values(), store) for table in tables)
     console.print(f"{len(tables)} drives, about {left_s / 60:.1f} minutes left to do")
     rows = [row for table in tables for row in table.rows(store, retime=job.retime)]
     result = {
         "case": "never-worse",
-        "command": shlex.join(["rfedge", *sys.argv[1:]]),
-        "host": host(),
-        "revision": stamp,
+        **provenance(stamp),
         "quick": job.quick,
         "field_id": field.field_id,
         "rows": rows,
     }
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(job.out, json.dumps(result, indent=1) + "\n")
+    write_result(job.out, result)
     _print(rows, console)
     return result
 
@@ -84,19 +76,6 @@ def _drives(job: NeverWorseJob) -> list[DriveFrames]:
     limit = QUICK_FRAMES if job.quick else None
     slow = [read_drive(text).every(DECIMATION) for text in job.decimated]
     return [*slow, *(read_drive(text, limit) for text in job.drives)]
-
-
-def _seconds_left(table: NeverWorse, store: CellStore) -> float:
-    """Time two frames of each coder that still has something to do."""
-    contest, total_s = table.contest, 0.0
-    for coder in table.coders.values():
-        left = sum(not store.has(contest.cell_key(coder, p)) for p in coder.points)
-        if left:
-            began_s = monotonic()
-            middle = coder.points[len(coder.points) // 2]
-            coder.code(contest.frames[:PROBE_FRAMES], contest.rate_hz, middle)
-            total_s += left * (monotonic() - began_s) * len(contest.frames) / PROBE_FRAMES
-    return total_s
 
 
 def _print(rows: Sequence[Row], console: Console) -> None:

@@ -8,9 +8,6 @@ opposite direction, the right kind of picture of the wrong place.
 from __future__ import annotations
 
 import hashlib
-import json
-import shlex
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +21,6 @@ from rfcore.camera import Camera, Pose
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
-from rfcore.files import write_whole
 from rfcore.image import Rgb
 from rfcore.views import PosedPicture
 from rfedge.evaluate.cells import CellStore, Rows
@@ -39,7 +35,8 @@ from rfedge.evaluate.published import (
     reduced,
 )
 from rfedge.evaluate.render_quality import BANDS, flip
-from rfedge.provenance import host, revision
+from rfedge.evaluate.result_file import check_result_path, provenance, write_result
+from rfedge.provenance import revision
 
 __all__ = ["CONTROLS", "PaperJob", "named_path", "run_paper", "views_of"]
 
@@ -63,8 +60,7 @@ class PaperJob:
     quick: bool = False
 
     def __post_init__(self) -> None:
-        if self.out.suffix != ".json":
-            raise InvalidInput("out", f"{self.out} must end in .json")
+        check_result_path(self.out)
         if not (self.fields and self.drives and self.sizes_px):
             raise InvalidInput("paper", "needs at least one field, one drive and one size")
         if self.every < 1:
@@ -103,17 +99,14 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
     rows = [row for piece in pieces for row in store.rows(_key(piece, stamp), _maker(piece))]
     result = {
         "case": "paper",
-        "command": shlex.join(["rfedge", *sys.argv[1:]]),
-        "host": host(),
-        "revision": stamp,
+        **provenance(stamp),
         "quick": job.quick,
         "field_ids": {name: field.field_id for name, field in fields},
         "lpips": "n/a: no weights",
         "bands_cycles_per_px": [list(band) for band in BANDS],
         "rows": rows,
     }
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(job.out, json.dumps(result, indent=1) + "\n")
+    write_result(job.out, result)
     return result
 
 

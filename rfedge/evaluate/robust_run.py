@@ -7,9 +7,6 @@ x264, which no pose disturbs.
 
 from __future__ import annotations
 
-import json
-import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,7 +22,6 @@ from rfcore.codec.photometric import Photometric
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
-from rfcore.files import write_whole
 from rfedge.evaluate.cells import CellStore
 from rfedge.evaluate.clip import ClipCoder
 from rfedge.evaluate.compare import Contest, perform
@@ -35,8 +31,9 @@ from rfedge.evaluate.ladder import LadderClip
 from rfedge.evaluate.loss import Bursts, Policy
 from rfedge.evaluate.loss_clips import Crossing, FrameCoder, own_crossing, x264_crossing
 from rfedge.evaluate.own import FieldCoder, see_clip
+from rfedge.evaluate.result_file import check_result_path, provenance, write_result
 from rfedge.evaluate.rivals import x264_lowdelay
-from rfedge.provenance import host, revision
+from rfedge.provenance import revision
 
 __all__ = ["RobustJob", "run_robust"]
 
@@ -65,8 +62,7 @@ class RobustJob:
     quick: bool = False
 
     def __post_init__(self) -> None:
-        if self.out.suffix != ".json":
-            raise InvalidInput("out", f"{self.out} must end in .json")
+        check_result_path(self.out)
         if self.frames < 4:
             raise InvalidInput("frames", f"{self.frames} must be at least 4")
 
@@ -104,9 +100,7 @@ def run_robust(job: RobustJob, console: Console) -> Row:
     disturbed = [*bench.pose_rows(), bench.lane_row(), *bench.light_rows()]
     result = {
         "case": "robust",
-        "command": shlex.join(["rfedge", *sys.argv[1:]]),
-        "host": host(),
-        "revision": bench.revision,
+        **provenance(bench.revision),
         "quick": job.quick,
         "seed": SEED,
         "field_id": field.field_id,
@@ -116,8 +110,7 @@ def run_robust(job: RobustJob, console: Console) -> Row:
         **_at_equal_rate(crossed),
         "disturbances": disturbed,
     }
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(job.out, json.dumps(result, indent=1) + "\n")
+    write_result(job.out, result)
     return result
 
 
