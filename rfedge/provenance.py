@@ -10,20 +10,27 @@ from typing import Any
 
 __all__ = ["host", "revision"]
 
+CHECKOUT = Path(__file__).parents[1]
+CODE = (".", ":!results", ":!docs")
+"""What decides about a figure, as git pathspecs."""
 
-def revision() -> str:
-    """Return the checkout's commit, with ``-dirty`` if it has changes; ``unknown`` outside one."""
-    here = Path(__file__).parent
+
+def revision(checkout: Path = CHECKOUT) -> str:
+    """Return the checkout's commit, with ``-dirty`` if it has changes; ``unknown`` outside one.
+
+    Results and the pages made of them do not count: figures are taken one after another.
+    """
     try:
-        done = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=12"],
-            cwd=here,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        commit = _git(checkout, "describe", "--always", "--abbrev=12")
+        changed = _git(checkout, "status", "--porcelain", "--untracked-files=no", "--", *CODE)
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
+    return f"{commit}-dirty" if changed else commit
+
+
+def _git(checkout: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(checkout), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
 
