@@ -7,6 +7,7 @@ A user's mistake ends in one line on stderr and exit status 2, never in a traceb
 
 from __future__ import annotations
 
+import io
 import sys
 from typing import Annotated
 
@@ -52,6 +53,8 @@ from vehicle to roadside server. Start with `rfedge demo`."""
 
 def main() -> int:
     """Parse the command line, run one verb, and return its exit status."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a log file gets cost and progress as they come
+        sys.stdout.reconfigure(line_buffering=True)
     verb = tyro.cli(Verb, prog="rfedge", description=DESCRIPTION, config=(OmitSubcommandPrefixes,))
     try:
         verb.run()

@@ -77,3 +77,22 @@ def test_a_users_mistake_is_one_line_and_exit_status_2(
     assert said in done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
     assert list(tmp_path.iterdir()) == [], "a refused command leaves nothing behind"
+
+
+def test_a_log_file_gets_each_line_as_it_comes(tmp_path: Path) -> None:
+    """The first line of a long training arrives in a pipe while it goes on."""
+    code = "import sys; from rfedge.cli import main; sys.exit(main())"
+    street = Path(__file__).parents[2] / "samples/street/transforms_train.json"
+    options = f"--iterations 1000000 --gaussians 500 --out {tmp_path / 'field.rff'}"
+    training = subprocess.Popen(
+        [sys.executable, "-c", code, "train", str(street), *options.split()],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert training.stdout is not None
+        assert training.stdout.readline().startswith("Training 500 Gaussians")
+        assert training.poll() is None
+    finally:
+        training.kill()
+        training.communicate()
