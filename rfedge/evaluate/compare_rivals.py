@@ -33,14 +33,11 @@ def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
     }
     if quick:
         return {**anchors, "svtav1-lowdelay": [svtav1_lowdelay(8)]}
-    refresh = x264_lowdelay(
-        preset, f"x264-intra-refresh-{preset}", **{"intra-refresh": "1", "keyint": "30"}
-    )
     return {
         **anchors,
         "x264-stronger": [x264_for_psnr(p) for p in ("medium", "veryslow")],
         **{f"x264-keyint-{n}": [_with_key_frames(preset, n)] for n in KEYINTS},
-        "x264-intra-refresh": [refresh],
+        "x264-intra-refresh": [_with_intra_refresh(preset)],
         "x265-lowdelay": [
             x265_lowdelay("veryfast"),
             *(x265_for_psnr(p) for p in ("veryfast", "medium")),
@@ -51,6 +48,12 @@ def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
 
 def _with_key_frames(preset: str, keyint: int) -> Rival:
     return x264_lowdelay(preset, f"x264-keyint-{keyint}-{preset}", keyint=str(keyint))
+
+
+def _with_intra_refresh(preset: str) -> Rival:
+    """A column of intra blocks crosses the picture in ten frames; x264 waits as long before it."""
+    params = {"intra-refresh": "1", "keyint": "10"}
+    return x264_lowdelay(preset, f"x264-intra-refresh-10-{preset}", **params)
 
 
 def foreign_coder(text: str) -> ClipCoder:
