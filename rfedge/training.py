@@ -9,10 +9,9 @@ from time import monotonic
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from rfcore.dataset import Dataset
-from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
 from rfcore.image import Rgb
 from rfcore.metrics import psnr
@@ -27,13 +26,14 @@ from rfcore.train import (
 )
 from rfcore.train.start import random_points
 from rfcore.views import PosedPicture
-from rfedge.training_loop import LoopLimits, LoopStatus, TrainingLoop
+from rfedge.training_loop import LoopLimits, TrainingLoop
 from rfedge.training_memory import (
     available_bytes,
     check_memory,
     ngp_training_bytes,
     splat_training_bytes,
 )
+from rfedge.training_progress import run_showing
 
 __all__ = [
     "UNLIMITED_ITERATIONS",
@@ -46,8 +46,6 @@ __all__ = [
 
 UNLIMITED_ITERATIONS = 1_000_000
 """Of a run that ends by the clock."""
-STEPS = 1000
-"""Of the bar: progress is a share, of time or of iterations."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ def train(job: TrainingJob, console: Console) -> Trained:
     if job.resume:
         loop.resume()
         console.print(f"  going on after iteration {trainer.iteration:,}, {loop.seconds:.0f} s")
-    _run_with_bar(loop, console)
+    run_showing(loop, console, monotonic)
     seconds = loop.seconds
     quality = _quality(trainer, job)
     _announce_end(seconds, quality, console)
@@ -187,31 +185,3 @@ class _psnr_meter:  # noqa: N801 - a function that remembers the pictures it has
 def _psnr_db(field: RadianceField, picture: PosedPicture, rgb: Rgb) -> float:
     colour = np.clip(field.render_colour(picture.camera).astype(np.float64), 0.0, 1.0)
     return psnr(colour, rgb / 255.0, peak=1.0)
-
-
-def _run_with_bar(loop: TrainingLoop, console: Console) -> None:
-    columns = (
-        BarColumn(),
-        TextColumn("{task.fields[state]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("train", total=STEPS, state="")
-
-        def tell(status: LoopStatus) -> None:
-            bar.update(task, completed=STEPS * status.progress, state=_state(status))
-
-        try:
-            loop.run(tell)
-        except RfedgeError:
-            bar.stop()
-            raise
-
-
-def _state(status: LoopStatus) -> str:
-    quality = f", held out {status.psnr_db:.2f} dB" if status.psnr_db is not None else ""
-    return (
-        f"{status.iteration:,} iterations, {status.primitives:,} primitives, "
-        f"loss {status.loss:.4f}{quality}"
-    )

@@ -1,15 +1,18 @@
 """The loop around a trainer: time-limited runs, measurements, checkpoints, whatever is trained."""
 
+import io
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from rfcore.errors import InvalidInput, TrainingDiverged
 from rfcore.train import Checkpoint, TrainingProgress
 from rfedge.training_loop import LoopLimits, LoopStatus, TrainingLoop
+from rfedge.training_progress import run_showing
 
 
 class Steps:
@@ -144,3 +147,12 @@ def test_resuming_needs_a_checkpoint() -> None:
 def test_limits_that_make_no_sense_are_refused(change: Mapping[str, Any], named: str) -> None:
     with pytest.raises(InvalidInput, match=named):
         LoopLimits(**change)
+
+
+def test_a_log_gets_a_line_at_each_twentieth_with_the_time_left() -> None:
+    steps, log = Steps(200), io.StringIO()
+    run_showing(loop_of(steps, LoopLimits()), Console(file=log, width=200), lambda: steps.now_s)
+    lines = log.getvalue().splitlines()
+    assert len(lines) == 20
+    assert lines[9].startswith("  50%: 100 iterations, 7 primitives, loss 0.0100")
+    assert lines[9].endswith(", 3 min left")  # 100 steps of 2 s

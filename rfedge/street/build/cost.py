@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rfedge.durations import time_text
 from rfedge.street.render.backend import Backend
 from rfedge.street.render.renderer import Quality
 from rfedge.street.shots import Shot
 
-__all__ = ["cost_line", "time_text"]
+__all__ = ["cost_line"]
 
 START_S = 12.0
 """Making the world and compiling kernels, in each worker."""
@@ -38,10 +39,3 @@ def cost_line(
         f"{len(shots)} frames, {quality.samples} samples a pixel: about {time_text(core_s)} of one "
         f"core, {time_text(core_s / used)} on {used}, {room_mb:.0f} MB"
     )
-
-
-def time_text(seconds: float) -> str:
-    """Return a duration in the unit that fits it."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

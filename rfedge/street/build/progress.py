@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from rfedge.street.build.cost import time_text
+from rfedge.durations import time_text
 
 __all__ = ["show_progress"]
 
