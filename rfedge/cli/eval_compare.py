@@ -22,8 +22,10 @@ class EvalCompare:
 
     field: Annotated[Path, Positional]
     """The field archive (.rff) both ends hold."""
-    drives: Annotated[tuple[str, ...], Positional]
+    drives: Annotated[tuple[str, ...], Positional] = ()
     """NAME@HZ=DATASET for each drive, such as `yardstick-empty@10=street/transforms_drive.json`."""
+    decimated: tuple[str, ...] = ()
+    """The same for drives of which every fifth frame is taken, at a fifth of the rate."""
     background: tuple[str, ...] = ()
     """The same for the empty street of a drive, frame by frame at its poses: tells what is not in
     the field, for the split of the bits and for a rival that sends only the foreground."""
@@ -55,6 +57,7 @@ class EvalCompare:
             preset=self.preset,
             out=self.out,
             cells=self.cells,
+            decimated=self.decimated,
             backgrounds=self.background,
             methods=self.method,
             quick=self.quick,

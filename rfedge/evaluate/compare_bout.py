@@ -16,7 +16,7 @@ from rfcore.train import mean_psnr_db
 from rfedge.evaluate.clip import ClipCoder
 from rfedge.evaluate.compare import Contest
 from rfedge.evaluate.compare_rivals import foreign_coder, rival_families
-from rfedge.evaluate.drives import DriveFrames, DriveName, read_drive
+from rfedge.evaluate.drives import DECIMATION, DriveFrames, DriveName, read_drive
 from rfedge.evaluate.foreground import ForegroundCoder, foreground_mask
 from rfedge.evaluate.own import FieldCoder, SeenClip, see_clip
 from rfedge.evaluate.result_file import check_result_path
@@ -36,6 +36,7 @@ class CompareJob:
     preset: str
     out: Path
     cells: Path
+    decimated: Sequence[str] = ()
     backgrounds: Sequence[str] = ()
     methods: Sequence[str] = ()
     quick: bool = False
@@ -43,6 +44,8 @@ class CompareJob:
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
+        if not (self.drives or self.decimated):
+            raise InvalidInput("drives", "there is none")
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,8 @@ def read_bouts(job: CompareJob, field: RadianceField) -> list[Bout]:
     unknown = backgrounds.keys() - {_name(text) for text in job.drives}
     if unknown:
         raise InvalidInput("background", f"there is no drive {sorted(unknown)} to stand behind")
-    bouts = []
+    slow = [read_drive(text).every(DECIMATION) for text in job.decimated]
+    bouts = [_bout(job, drive, None, field) for drive in slow]
     for text in job.drives:
         behind = backgrounds.get(_name(text))
         background = None if behind is None else read_drive(behind, limit)

@@ -38,7 +38,7 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
 
     Raises ``InvalidInput`` or ``DatasetError`` before anything is coded if an input is wrong.
     """
-    for text in (*job.drives, *job.backgrounds):
+    for text in (*job.drives, *job.decimated, *job.backgrounds):
         DriveName.parse(text)
     field = load_field(job.field)
     bouts = read_bouts(job, field)

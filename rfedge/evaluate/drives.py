@@ -15,7 +15,10 @@ from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import PosedPicture
 
-__all__ = ["DriveFrames", "DriveName", "read_drive"]
+__all__ = ["DECIMATION", "DriveFrames", "DriveName", "read_drive"]
+
+DECIMATION = 5
+"""Of the frames of a drive that stands for a slow camera: 10 Hz to 2."""
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,13 @@ from rfcore.errors import InvalidInput
 from rfcore.field import load_field
 from rfedge.evaluate.cells import CellStore
 from rfedge.evaluate.compare import seconds_left
-from rfedge.evaluate.drives import DriveFrames, DriveName, read_drive
+from rfedge.evaluate.drives import DECIMATION, DriveFrames, DriveName, read_drive
 from rfedge.evaluate.never_worse import NeverWorse, controls_of
 from rfedge.evaluate.result_file import check_result_path, provenance, write_result
 from rfedge.provenance import revision
 
 __all__ = ["NeverWorseJob", "run_never_worse"]
 
-DECIMATION = 5
 QUICK_FRAMES = 6
 Row = dict[str, Any]
 

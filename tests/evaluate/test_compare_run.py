@@ -8,11 +8,12 @@ import pytest
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
+from rfcore.field import load_field
 from rfedge.evaluate.compare import BEST
-from rfedge.evaluate.compare_bout import CompareJob
+from rfedge.evaluate.compare_bout import CompareJob, read_bouts
 from rfedge.evaluate.compare_rivals import foreign_coder
 from rfedge.evaluate.compare_run import run_compare
-from rfedge.evaluate.drives import DriveName
+from rfedge.evaluate.drives import DriveName, read_drive
 from rfedge.evaluate.rivals import x264_lowdelay
 
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -54,6 +55,30 @@ def test_another_form_is_refused_by_an_example(text):
 def test_a_method_that_is_none_is_refused(text):
     with pytest.raises(InvalidInput, match="method"):
         foreign_coder(text)
+
+
+def test_a_decimated_drive_is_every_fifth_frame_at_a_fifth_of_the_rate(tmp_path):
+    job = CompareJob(
+        field=SAMPLES / "fields" / "street.rff",
+        drives=(),
+        decimated=(f"empty@10={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
+        preset="veryfast",
+        out=tmp_path / "compare.json",
+        cells=tmp_path / "cells",
+    )
+    field = load_field(job.field)
+    (bout,) = read_bouts(job, field)
+    assert bout.contest.rate_hz == 2.0
+    whole = read_drive(job.decimated[0])
+    assert [f.digest() for f in bout.contest.frames] == [f.digest() for f in whole.frames[::5]]
+    assert [c.world_from_cam for c in bout.seen.cameras] == [
+        c.world_from_cam.rounded() for c in whole.cameras[::5]
+    ]
+
+
+def test_a_comparison_of_nothing_is_refused(tmp_path):
+    with pytest.raises(InvalidInput, match="there is none"):
+        CompareJob(Path("field.rff"), (), "veryfast", tmp_path / "compare.json", tmp_path)
 
 
 @pytest.mark.slow
