@@ -96,7 +96,7 @@ class ChildDecoder:
             width, height = self._size_px
             return I420.unpacked(self._size_px, process.take(width * height * 3 // 2))
 
-    def feed(self, access_unit: bytes) -> None:
+    def feed(self, access_unit: bytes | memoryview) -> None:
         """Decode for the sake of what comes after, and with it: errors may wait until then."""
         with self._lock:
             self._lay_down(access_unit)
@@ -116,7 +116,7 @@ class ChildDecoder:
                 self._process.close()
                 self._process = None
 
-    def _lay_down(self, access_unit: bytes) -> DecoderProcess:
+    def _lay_down(self, access_unit: bytes | memoryview) -> DecoderProcess:
         """Put an access unit behind those that wait, or after them where there is no room."""
         if self._process is None:
             self._process = self._open()

@@ -119,7 +119,7 @@ class DecoderProcess:
         if answer != DONE:
             raise CodecError(answer[1:].decode(errors="replace"))
 
-    def put(self, access_unit: bytes, start: int) -> None:
+    def put(self, access_unit: bytes | memoryview, start: int) -> None:
         """Lay down what the next request is about; the caller knows that there is room."""
         self._memory[start : start + len(access_unit)] = access_unit
 

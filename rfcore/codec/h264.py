@@ -114,13 +114,14 @@ class H264Decoder:
         """
         return self._picture_of(self._frame(access_unit))
 
-    def feed(self, access_unit: bytes) -> None:
+    def feed(self, access_unit: bytes | memoryview) -> None:
         """Decode like ``decode``, for the sake of what comes after: the picture is not copied."""
         self._frame(access_unit)
 
-    def _frame(self, access_unit: bytes) -> av.VideoFrame:
+    def _frame(self, access_unit: bytes | memoryview) -> av.VideoFrame:
         try:
-            frames = self._context.decode(av.Packet(access_unit))
+            packet = av.Packet(access_unit)  # type: ignore[arg-type]  # takes any buffer
+            frames = self._context.decode(packet)
         except (FFmpegError, ValueError, MemoryError) as error:
             raise CodecError(f"H.264 decoder: {error}") from error
         if len(frames) != 1:

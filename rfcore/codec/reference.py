@@ -8,8 +8,9 @@ x264's (id 0), which the P slice names. The first of several pictures is an IDR 
 after it are not: an IDR picture would drop the ones before.
 
 In CAVLC each macroblock after the first begins byte-aligned with mb_type ue(25), nine bits, and
-seven zero bits: 0x0D 0x00. So the picture is one array of rows of 386 bytes. Samples are clamped to
-at least 1; then no two zero bytes meet and no emulation prevention is needed (7.4.1).
+seven zero bits: 0x0D 0x00. So the picture is one array of rows of 386 bytes
+(``rfcore.native.pcm``). Samples are clamped to at least 1; then no two zero bytes meet and no
+emulation prevention is needed (7.4.1).
 """
 
 from __future__ import annotations
@@ -17,20 +18,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rfcore.codec.bitstream import BitWriter, nal_of_rbsp
+from rfcore.codec.bitstream import BitWriter, join_nals, nal_of_rbsp
 from rfcore.codec.parameter_sets import NAL_IDR, NAL_P, NAL_PPS
 from rfcore.image import I420
+from rfcore.native.pcm import pcm_bytes, write_macroblocks
 
-__all__ = ["PCM_PPS_ID", "PcmPlace", "pcm_picture", "pcm_pps", "without_zeros"]
+__all__ = ["PCM_PPS_ID", "PcmPictures", "PcmPlace", "pcm_pps", "without_zeros"]
 
 PCM_PPS_ID = 1
 _NAL_REF_IDC = 3 << 5
 _I_SLICE_ONLY = 7
 _MB_TYPE_I_PCM = 25
-_MB_HEADER = (0x0D, 0x00)
-_MB_BYTES = 2 + 256 + 64 + 64
+_STOP = 0x80
+_MAX_BYTES_BEFORE = 512
+"""Three parameter sets of at most 64 bytes, with emulation prevention, and a slice header."""
 
 
 def pcm_pps() -> bytes:
@@ -57,18 +59,31 @@ class PcmPlace:
     idr_pic_id: int = 0
 
 
-def pcm_picture(picture: I420, place: PcmPlace) -> bytes:
-    """Return the NAL unit of a picture that decodes to ``picture``, samples raised to >= 1.
+class PcmPictures:
+    """Makes I_PCM pictures of one size (width, height), all of them in the same memory."""
 
-    The coded area is the size rounded up to whole macroblocks by repeating the last row and column.
-    The sequence must use picture order count type 2.
-    """
-    samples = _macroblocks(picture).reshape(-1)[len(_MB_HEADER) :]
-    return b"".join((_slice_header(place), samples.data, b"\x80"))
+    def __init__(self, size_px: tuple[int, int]) -> None:
+        self._samples_bytes = pcm_bytes(size_px)
+        self._memory = np.empty(self._samples_bytes + _MAX_BYTES_BEFORE, np.uint8)
+
+    def access_unit(self, picture: I420, place: PcmPlace, sets: bytes = b"") -> memoryview:
+        """Return the byte stream of a picture that decodes to ``picture``, samples raised to >= 1.
+
+        ``sets``: a byte stream to go before it. What is returned is overwritten by the next call.
+        The coded area is the size rounded up to whole macroblocks by repeating the last row and
+        column. The sequence must use picture order count type 2.
+        """
+        before = sets + join_nals([_slice_header(place)])
+        start, end = len(before), len(before) + self._samples_bytes
+        unit = self._memory[: end + 1]
+        unit[:start] = np.frombuffer(before, np.uint8)
+        write_macroblocks(picture, unit[start:end])
+        unit[end] = _STOP
+        return unit.data
 
 
 def without_zeros(picture: I420) -> I420:
-    """Return ``picture`` with its samples raised to at least 1: what ``pcm_picture`` decodes to."""
+    """Return ``picture`` with its samples raised to at least 1: what an I_PCM one decodes to."""
     y, u, v = (np.maximum(plane, 1) for plane in picture.planes)
     return I420(y, u, v)
 
@@ -91,25 +106,3 @@ def _slice_header(place: PcmPlace) -> bytes:
     # one bit stands in for what follows while emulation prevention is applied.
     nal_unit_type = NAL_IDR if is_idr else NAL_P
     return nal_of_rbsp(_NAL_REF_IDC | nal_unit_type, w.to_bytes() + b"\x01")[:-1]
-
-
-def _macroblocks(picture: I420) -> NDArray[np.uint8]:
-    """Return uint8 [MBs, 386]: two header bytes, then Y, Cb, Cr of each macroblock."""
-    width_px, height_px = picture.size_px
-    rows, columns = (height_px + 15) // 16, (width_px + 15) // 16
-    out = np.empty((rows, columns, _MB_BYTES), np.uint8)
-    out[..., :2] = _MB_HEADER
-    start = 2
-    for plane, side in zip(picture.planes, (16, 8, 8), strict=True):
-        area = out[..., start : start + side * side].reshape(rows, columns, side, side)
-        padded = _pad_to(np.maximum(plane, 1), rows * side, columns * side)
-        # A row of a macroblock is one element: four times as fast as samples one by one.
-        row = np.dtype((np.void, side))
-        area.view(row)[..., 0] = padded.view(row).reshape(rows, side, columns).transpose(0, 2, 1)
-        start += side * side
-    return out.reshape(rows * columns, _MB_BYTES)
-
-
-def _pad_to(plane: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    missing = ((0, height - plane.shape[0]), (0, width - plane.shape[1]))
-    return np.pad(plane, missing, mode="edge") if missing != ((0, 0), (0, 0)) else plane

@@ -21,7 +21,7 @@ from rfcore.codec.config import CodecConfig
 from rfcore.codec.h264 import H264Decoder
 from rfcore.codec.header import StreamHeader, check_header
 from rfcore.codec.parameter_sets import NAL_IDR, NAL_P, nal_type, parse_slice_start
-from rfcore.codec.reference import PcmPlace, pcm_picture, pcm_pps
+from rfcore.codec.reference import PcmPictures, PcmPlace, pcm_pps
 from rfcore.errors import BitstreamError, CodecError
 from rfcore.image import I420
 
@@ -36,8 +36,8 @@ class PictureDecoder(Protocol):
     def decode(self, access_unit: bytes) -> I420:
         """Return the picture of one access unit; raise ``CodecError``."""
 
-    def feed(self, access_unit: bytes) -> None:
-        """Decode for the sake of what comes after; raise ``CodecError``."""
+    def feed(self, access_unit: bytes | memoryview) -> None:
+        """Decode for the sake of what comes after; raise ``CodecError``. Nothing is held of it."""
 
     def reset(self) -> None:
         """Forget everything, parameter sets included."""
@@ -62,6 +62,7 @@ class SpliceDecoder:
         self._log2_max_frame_num = check_header(header).log2_max_frame_num
         self._parameter_sets = join_nals([header.sps, header.pps, pcm_pps()])
         self._decoder = open_decoder(header.config.coded_size_px)
+        self._pcm_pictures = PcmPictures(header.config.size_px)
         self._knows_parameter_sets = False
         self._idr_pic_id = 1
 
@@ -89,10 +90,10 @@ class SpliceDecoder:
         self._idr_pic_id ^= 3  # 1 and 2 by turns
         for frame_num, picture in enumerate(fed):
             place = PcmPlace(self._log2_max_frame_num, frame_num, self._idr_pic_id)
-            unit = join_nals([pcm_picture(picture, place)])
-            known = self._knows_parameter_sets
+            sets = b"" if self._knows_parameter_sets else self._parameter_sets
+            unit = self._pcm_pictures.access_unit(picture, place, sets)
             with self._fresh_after_errors():
-                self._decoder.feed(unit if known else self._parameter_sets + unit)
+                self._decoder.feed(unit)
             self._knows_parameter_sets = True
 
     def decode(self, payload: bytes) -> I420:

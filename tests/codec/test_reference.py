@@ -6,14 +6,20 @@ import numpy as np
 import pytest
 
 from rfcore.codec import CodecConfig, DeltaEncoder
-from rfcore.codec.bitstream import join_nals, rbsp_of_nal
+from rfcore.codec.bitstream import join_nals, rbsp_of_nal, split_nals
 from rfcore.codec.h264 import H264Decoder
 from rfcore.codec.parameter_sets import NAL_IDR, NAL_P, parse_pps, parse_slice_start
-from rfcore.codec.reference import PCM_PPS_ID, PcmPlace, pcm_picture, pcm_pps, without_zeros
-from rfcore.errors import CodecError
+from rfcore.codec.reference import PCM_PPS_ID, PcmPictures, PcmPlace, pcm_pps, without_zeros
+from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 
 PictureMaker = Callable[..., I420]
+
+
+def pcm_picture(picture: I420, place: PcmPlace) -> bytes:
+    """Return the NAL unit of one picture."""
+    (nal,) = split_nals(bytes(PcmPictures(picture.size_px).access_unit(picture, place)))
+    return nal
 
 
 @pytest.mark.parametrize("size_px", [(2, 2), (16, 16), (18, 34), (300, 168)])
@@ -50,6 +56,37 @@ def test_later_pictures_are_not_idr_and_come_back_bit_for_bit(noise: PictureMake
         assert parse_slice_start(nal, log2_max_frame_num=4).frame_num == frame_num
         shown = decoder.decode(join_nals([nal]))
         assert shown.digest() == without_zeros(noise(50, 34, frame_num)).digest()
+
+
+def test_macroblocks_hold_y_cb_cr_row_by_row_and_the_edge_again(noise: PictureMaker) -> None:
+    source = noise(35, 19, 5)
+    padded = [
+        np.pad(np.maximum(plane, 1), ((0, h - plane.shape[0]), (0, w - plane.shape[1])), "edge")
+        for plane, (h, w) in zip(source.planes, ((32, 48), (16, 24), (16, 24)), strict=True)
+    ]
+    rows = []
+    for row, column in np.ndindex(2, 3):
+        blocks = [
+            plane[row * side : (row + 1) * side, column * side : (column + 1) * side]
+            for plane, side in zip(padded, (16, 8, 8), strict=True)
+        ]
+        rows.append(b"\x0d\x00" + b"".join(block.tobytes() for block in blocks))
+    assert pcm_picture(source, PcmPlace(4)).endswith(b"".join(rows)[2:] + b"\x80")
+
+
+def test_the_next_picture_takes_the_place_of_the_one_before(noise: PictureMaker) -> None:
+    pictures = PcmPictures((32, 32))
+    sets = join_nals([pcm_pps()])
+    first = pictures.access_unit(noise(32, 32, 0), PcmPlace(4), sets)
+    assert bytes(first[: len(sets)]) == sets
+    second = pictures.access_unit(noise(32, 32, 1), PcmPlace(4))
+    assert np.shares_memory(np.asarray(first), np.asarray(second))
+    assert bytes(second) == join_nals([pcm_picture(noise(32, 32, 1), PcmPlace(4))])
+
+
+def test_a_picture_of_another_size_is_refused(noise: PictureMaker) -> None:
+    with pytest.raises(InvalidInput, match="out"):
+        PcmPictures((32, 32)).access_unit(noise(32, 16, 0), PcmPlace(4))
 
 
 def test_each_macroblock_takes_its_samples_and_two_bytes(flat: PictureMaker) -> None:
