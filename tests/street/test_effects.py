@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rfcore.camera import Pose
 from rfcore.dataset.undistort import pinhole_of, undistorted
 from rfcore.lens import LensCamera
 from rfedge.street.apply import apply_effects
@@ -65,12 +66,29 @@ def test_frames_and_effects_have_their_own_chance() -> None:
 
 
 def test_haze_leaves_a_twentieth_of_the_contrast_at_its_visibility(frame: LinearFrame) -> None:
-    depth_m = np.full((90, 160), 500.0, np.float32)
-    black = replace(frame, colour=np.zeros((90, 160, 3), np.float32), depth_m=depth_m)
-    seen = Haze(visibility_m=500.0, air=0.8).apply(black, rng()).colour
+    """Five hundred metres of distance, along each pixel's ray, before the layer ends."""
+    k = frame.camera.intrinsics
+    x, y = np.meshgrid(np.arange(160) + 0.5 - k.cx_px, np.arange(90) + 0.5 - k.cy_px)
+    depth_m = 500.0 / np.sqrt((x / k.fx_px) ** 2 + (y / k.fy_px) ** 2 + 1)
+    colour = np.zeros((90, 160, 3), np.float32)
+    black = replace(frame, colour=colour, depth_m=depth_m.astype(np.float32))
+    seen = Haze(visibility_m=500.0, layer_m=1e4, air=0.8).apply(black, rng()).colour
     np.testing.assert_allclose(seen, 0.8 * 0.95, rtol=1e-5)
-    sky = Haze().apply(replace(black, depth_m=depth_m * np.float32(np.inf)), rng()).colour
-    np.testing.assert_allclose(sky, 0.55)
+
+
+def test_haze_hides_the_horizon_and_not_the_sky_above_it(frame: LinearFrame) -> None:
+    """At elevation e a ray leaves the layer after layer_m / sin e; below the horizon, never."""
+    level = Pose.from_matrix([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5]])
+    camera = replace(frame.camera, world_from_cam=level)
+    endless = np.full((90, 160), np.inf, np.float32)
+    sky = replace(frame, colour=np.ones((90, 160, 3), np.float32), depth_m=endless, camera=camera)
+    seen = Haze(visibility_m=500.0, layer_m=100.0, air=0.0).apply(sky, rng()).colour[:, 80, 0]
+    assert (np.diff(seen[:45]) < 0).all()
+    assert (seen[45:] < 1e-6).all()
+    assert seen[44] < 1e-6
+    slope = 44.5 / camera.intrinsics.fy_px
+    sine = slope / np.hypot(slope, 1.0)
+    assert seen[0] == pytest.approx(20.0 ** (-100.0 / sine / 500.0), rel=1e-3)
 
 
 def test_rain_does_not_fall_behind_a_wall(frame: LinearFrame) -> None:

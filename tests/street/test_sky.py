@@ -99,10 +99,31 @@ def test_a_sky_with_clouds_is_not_blank_and_the_same_for_a_seed() -> None:
 
 
 def test_an_overcast_sky_has_no_sun_and_is_brighter_overhead() -> None:
-    sky = overcast_sky(9.0, rng(), height=64)
+    sky = overcast_sky(0.22, 0.8, rng(), height=64)
     assert max(sky.sun_radiance) == 0
     assert 2.0 < sky.radiance[:6].mean() / sky.radiance[28:31].mean() < 4.0
     assert sky.radiance[:20].std() > 0.1
+    white = horizontal_irradiance(sky.radiance).mean() / np.pi * sky.exposure
+    assert white == pytest.approx(0.8, rel=1e-6)
+
+
+def test_edges_of_clouds_are_wider_than_a_pixel_of_the_sky() -> None:
+    """A step from cloud to sky within one pixel would be a block in a picture that is finer.
+
+    The middle of an edge over three pixels, blurred over three, changes by a third of it at most.
+    """
+    sky = sunny_sky(NOON, rng(), height=256).radiance[40:120].mean(axis=2)
+    across = np.abs(np.diff(sky, axis=1, append=sky[:, :1])), np.abs(np.diff(sky, axis=0))
+    for steps in across:
+        assert steps.max() < 0.5 * (sky.max() - sky.min())
+
+
+def test_a_sky_has_no_seam_where_its_columns_meet() -> None:
+    for sky in (sunny_sky(NOON, rng(), height=128), overcast_sky(0.3, 1.0, rng(), height=128)):
+        upper = sky.radiance[:60]
+        seam = np.abs(upper[:, 0] - upper[:, -1]).mean()
+        beside = np.abs(np.diff(upper, axis=1)).mean(axis=(0, 2))
+        assert seam <= beside.max()
 
 
 @pytest.mark.parametrize(

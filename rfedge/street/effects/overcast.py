@@ -16,10 +16,13 @@ __all__ = ["Overcast"]
 
 @dataclass(frozen=True)
 class Overcast:
-    """``zenith_kcd``: luminance overhead, kcd/m^2; it matters beside lamps, not alone."""
+    """``unevenness``: deviation of the layer's brightness; ``white``: the exposure, by what a level
+    white sheet gets in the picture.
+    """
 
-    zenith_kcd: Annotated[float, Range(0.1, 50)] = 9.0
+    unevenness: Annotated[float, Range(0, 1)] = 0.22
+    white: Annotated[float, Range(0.05, 5)] = 1.0
 
     def change(self, world: World, rng: np.random.Generator) -> World:
         """Return the world under a grey sky."""
-        return replace(world, sky=overcast_sky(self.zenith_kcd, rng))
+        return replace(world, sky=overcast_sky(self.unevenness, self.white, rng))

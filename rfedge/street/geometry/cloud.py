@@ -11,9 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from rfedge.street.geometry.mesh import F32, F64
+from rfedge.street.geometry.periodic import dithered, margined, periodic_at, shifted
 
 __all__ = ["CloudLight", "Clouds", "cumulus", "over", "sunwards_depth", "with_sun_free"]
 
@@ -28,20 +30,40 @@ AIR_M = 22_000.0
 """Where a cloud keeps 1 / e of its contrast against the sky behind it."""
 LOWEST_UP = 0.03
 """Lower than that (2 degrees) the layer is hidden by the air."""
+STEPS = 40
+"""Heights at which a view ray looks: at fewer, clouds seen from the side are terraces."""
+BILLOW_CELLS, BILLOWS = 512, 4
+"""Cells of the billows' noise, which repeats so often within the block: 4.4 m each."""
+BILLOW, BILLOW_TURN_M = 1.0, 300.0
+"""How far billows move a cloud's edge, in units of the field, and over which height they change."""
+CRISP_TO_M = 4_000.0
+"""Billows fade beyond, where they would be finer than the sky picture's pixels."""
+ROWS_AT_ONCE = 32
 LOWEST_SUN_UP = 0.12
 """The sun's rays are not taken flatter than that through the layer, or all would be in shade."""
 
 
 @dataclass(frozen=True, eq=False)
 class Clouds:
-    """``field`` float32 [X, Y, Z], periodic along X and Y; density is its part within 0..1."""
+    """``field`` float32 [X, Y, Z], periodic along X and Y; density is its part within 0..1.
+
+    ``fine`` float32 [2, X', Y'] is noise of smaller cells; what is made of it moves the edges that
+    one sees, but no shadows.
+    """
 
     field: F32
+    fine: F32
 
     @property
     def density(self) -> F32:
         """The share of the full extinction, [X, Y, Z]."""
         return np.clip(self.field, 0.0, 1.0)
+
+    def billows(self, height_m: float) -> F32:
+        """What is added to the field at a height above the base: round lobes between creases."""
+        turn = 2 * np.pi * height_m / BILLOW_TURN_M
+        wave = np.float32(np.cos(turn)) * self.fine[0] + np.float32(np.sin(turn)) * self.fine[1]
+        return np.asarray(np.float32(BILLOW) * (np.abs(wave) - np.float32(0.8)), np.float32)
 
 
 @dataclass(frozen=True)
@@ -61,7 +83,8 @@ def cumulus(rng: np.random.Generator, cover: float) -> Clouds:
     hull = 1.9 * level**1.5 + 1.5 * np.exp(-level / 0.03)
     height = shape - hull
     threshold = np.quantile(height.max(axis=2), 1 - cover)
-    return Clouds(((height - threshold) * 5.0).astype(np.float32))
+    fine = np.stack([_fine_noise(rng) for _ in range(2)])
+    return Clouds(((height - threshold) * 5.0).astype(np.float32), fine)
 
 
 def sunwards_depth(clouds: Clouds, sun_towards: tuple[float, float, float]) -> F32:
@@ -70,11 +93,9 @@ def sunwards_depth(clouds: Clouds, sun_towards: tuple[float, float, float]) -> F
     step = np.array(sun_towards[:2]) / up * LAYER_M / CELL_M
     added = np.float32(EXTINCTION_PER_M * LAYER_M / up) * clouds.density
     depth = np.zeros_like(added)
-    x, y = np.meshgrid(np.arange(CELLS), np.arange(CELLS), indexing="ij")
-    place = np.stack([x.ravel() + step[0], y.ravel() + step[1]], axis=1)
     for layer in range(LAYERS - 2, -1, -1):
         above = depth[..., layer + 1] + added[..., layer + 1]
-        depth[..., layer] = _sampled(above, place).reshape(CELLS, CELLS)
+        depth[..., layer] = shifted(above, (step[0], step[1]))
     return depth
 
 
@@ -89,52 +110,88 @@ def with_sun_free(clouds: Clouds, sun_towards: tuple[float, float, float]) -> Cl
 
 
 def over(sky: F32, view: F32, clouds: Clouds, light: CloudLight) -> F32:
-    """Return a sky [N, 3] seen in directions [N, 3], with the clouds in front of it."""
-    depth = sunwards_depth(clouds, light.sun_towards)
-    seen = np.flatnonzero(view[:, 2] > LOWEST_UP)
-    rays = view[seen]
-    phases = _phases(rays @ np.array(light.sun_towards, np.float32))
-    passed = np.ones(len(rays), np.float32)
-    gathered = np.zeros((len(rays), 3), np.float32)
-    through = np.float32(EXTINCTION_PER_M * LAYER_M) / rays[:, 2]
-    for layer in range(LAYERS):
-        place = rays[:, :2] / rays[:, 2:] * np.float32((BASE_M + LAYER_M * layer) / CELL_M)
-        field = _sampled(clouds.field[..., layer], place)
-        hit = np.flatnonzero((field > 0) & (passed > 0.003))
-        if len(hit):
-            stopped = 1 - np.exp(-through[hit] * np.minimum(field[hit], 1))
-            sunwards = _sampled(depth[..., layer], place[hit])
-            shone = _shone(sunwards, phases[hit], layer / LAYERS, light)
+    """Return a sky [H, W, 3] seen in directions [H, W, 3], with the clouds in front of it."""
+    slices = _sliced(clouds, sunwards_depth(clouds, light.sun_towards))
+    cloudy = sky.copy()
+    for top in range(0, len(sky), ROWS_AT_ONCE):
+        rows = slice(top, top + ROWS_AT_ONCE)
+        if view[rows, :, 2].max() > LOWEST_UP:
+            cloudy[rows] = _rows_over(sky[rows], view[rows], slices, light)
+    around = np.pad(cloudy, ((0, 0), (1, 1), (0, 0)), mode="wrap")
+    smooth = cv2.blur(around, (3, 3), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(smooth[:, 1:-1], np.float32)
+
+
+def _sliced(clouds: Clouds, depth: F32) -> list[tuple[F32, F32, F32]]:
+    """Field, sunwards depth and billows at each of ``STEPS`` heights, linear between layers."""
+    slices = []
+    for level in _levels():
+        low = int(min(level * LAYERS, LAYERS - 2))
+        share = np.float32(min(level * LAYERS - low, 1.0))
+        field, sunwards = (
+            values[..., low] * (1 - share) + values[..., low + 1] * share
+            for values in (clouds.field, depth)
+        )
+        billows = clouds.billows(level * THICKNESS_M)
+        slices.append((margined(field), margined(sunwards), margined(billows)))
+    return slices
+
+
+def _levels() -> list[float]:
+    return ((np.arange(STEPS) + 0.5) / STEPS).tolist()  # type: ignore[no-any-return]
+
+
+def _rows_over(sky: F32, view: F32, slices: list[tuple[F32, F32, F32]], light: CloudLight) -> F32:
+    up = np.maximum(view[..., 2], np.float32(LOWEST_UP))
+    per_m = np.ascontiguousarray(np.moveaxis(view[..., :2], -1, 0) / up)
+    phases = _phases(view @ np.array(light.sun_towards, np.float32))
+    crisp = np.minimum(up * np.float32(CRISP_TO_M / BASE_M), 1)
+    passed, gathered = np.ones_like(up), np.zeros_like(sky)
+    within = dithered(up.shape) * np.float32(THICKNESS_M / STEPS)
+    for level, (field, sunwards, billows) in zip(_levels(), slices, strict=True):
+        place = per_m * ((np.float32(BASE_M + THICKNESS_M * level) + within) / np.float32(EXTENT_M))
+        seen = periodic_at(field, place)
+        if seen.max() > -BILLOW:
+            seen += crisp * periodic_at(billows, place * np.float32(BILLOWS))
+            hit = np.nonzero((seen > 0) & (passed > 0.003))
+            through = np.float32(EXTINCTION_PER_M * THICKNESS_M / STEPS) / up[hit]
+            soft = np.minimum(seen[hit], 1)
+            stopped = 1 - np.exp(-through * soft * soft)
+            to_sun = periodic_at(sunwards, place)[hit]
+            shone = _shone(to_sun, phases[hit], level, light)
             gathered[hit] += (passed[hit] * stopped)[:, None] * shone
             passed[hit] *= 1 - stopped
-    far = np.exp(np.float32(-BASE_M / AIR_M) / rays[:, 2:])
-    cloudy: F32 = sky.copy()
-    cloudy[seen] = sky[seen] * (1 - far * (1 - passed[:, None])) + gathered * far
-    return cloudy
+    far = np.exp(np.float32(-BASE_M / AIR_M) / up)[..., None]
+    far[view[..., 2] <= LOWEST_UP] = 0
+    return np.asarray(sky * (1 - far * (1 - passed[..., None])) + gathered * far, np.float32)
 
 
 def _shone(sunwards: F32, phases: F32, level: float, light: CloudLight) -> F32:
     """Light scattered into the view [N, 3]: the sun's by orders, and the sky's from above."""
-    thinned = THINNING ** np.arange(ORDERS, dtype=np.float32)
-    orders = np.exp(-sunwards[:, None] * thinned) * DIMMING ** np.arange(ORDERS, dtype=np.float32)
-    sun = (orders * phases).sum(axis=1, keepdims=True)
+    passed = np.exp(-sunwards)
+    sun = np.zeros_like(sunwards)
+    for order in range(ORDERS):
+        sun += DIMMING**order * passed * phases[:, order]
+        passed **= THINNING
     return np.asarray(
-        sun * light.sun_klux.astype(np.float32)
+        sun[:, None] * light.sun_klux.astype(np.float32)
         + light.ambient.astype(np.float32) * np.float32(0.55 + 0.45 * level),
         np.float32,
     )
 
 
 def _phases(cos_scattered: F32) -> F32:
-    """Henyey-Greenstein with a strong forward and a weak backward lobe, [N, ORDERS]."""
+    """Henyey-Greenstein with a strong forward and a weak backward lobe, [..., ORDERS]."""
     halved = THINNING ** np.arange(ORDERS, dtype=np.float32)
 
     def lobe(g: F32) -> F32:
-        return np.asarray(
-            (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cos_scattered[:, None]) ** 1.5)
-        )
+        squared = 1 + g * g - 2 * g * cos_scattered[..., None]
+        return np.asarray((1 - g * g) / np.float32(4 * np.pi) / (squared * np.sqrt(squared)))
 
-    return np.asarray(0.7 * lobe(0.8 * halved) + 0.3 * lobe(-0.2 * halved), np.float32)
+    return np.asarray(
+        np.float32(0.7) * lobe(np.float32(0.8) * halved)
+        + np.float32(0.3) * lobe(np.float32(-0.2) * halved)
+    )
 
 
 def _noise(rng: np.random.Generator, slope: float, least: float) -> F32:
@@ -148,19 +205,18 @@ def _noise(rng: np.random.Generator, slope: float, least: float) -> F32:
     return np.asarray(noise / noise.std(), np.float32)
 
 
+def _fine_noise(rng: np.random.Generator) -> F32:
+    """Noise [X', Y'] of deviation 1, of waves shorter than an eighth of its extent."""
+    f = np.hypot(np.fft.fftfreq(BILLOW_CELLS)[:, None], np.fft.rfftfreq(BILLOW_CELLS)[None])
+    f *= BILLOW_CELLS
+    weight = np.where(f >= 8, np.maximum(f, 1.0) ** -1.9, 0.0)
+    white = rng.standard_normal((BILLOW_CELLS, BILLOW_CELLS))
+    noise = np.fft.irfft2(np.fft.rfft2(white) * weight, s=white.shape)
+    return np.asarray(noise / noise.std(), np.float32)
+
+
 def _blurred(values: F32, cells: int) -> F64:
     """Periodic Gaussian blur of [X, Y]."""
     f = np.fft.fftfreq(len(values))
     kernel = np.exp(-2 * (np.pi * cells) ** 2 * (f[:, None] ** 2 + f[None, :] ** 2))
     return np.asarray(np.fft.ifft2(np.fft.fft2(values) * kernel).real)
-
-
-def _sampled(values: F32, place: F32 | F64) -> F32:
-    """Sample a periodic [X, Y] bilinearly at [N, 2], in cells."""
-    low = np.floor(place)
-    x, y = (place - low).T.astype(np.float32)
-    i, j = (low.astype(np.int64) % CELLS).T
-    right, next_row = (i + 1) % CELLS, (j + 1) % CELLS
-    near = values[i, j] * (1 - x) + values[right, j] * x
-    far = values[i, next_row] * (1 - x) + values[right, next_row] * x
-    return np.asarray(near * (1 - y) + far * y, np.float32)

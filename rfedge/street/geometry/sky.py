@@ -13,6 +13,7 @@ import numpy as np
 from rfcore.errors import InvalidInput
 from rfedge.street.geometry.cloud import CloudLight, cumulus, over, with_sun_free
 from rfedge.street.geometry.mesh import F32, F64
+from rfedge.street.geometry.periodic import margined, periodic_at
 from rfedge.street.geometry.sky_clear import (
     SUN_DIAMETER_DEG,
     clear_radiance,
@@ -29,9 +30,9 @@ from rfedge.street.geometry.world import Sky
 
 __all__ = ["HEIGHT", "NOON", "Daylight", "clear_sky", "overcast_sky", "sunny_sky"]
 
-HEIGHT = 640
-"""Rows of a sky picture: 0.28 degrees each."""
-OVERCAST_WHITE = 1.0
+HEIGHT = 1024
+"""Rows of a sky picture: 0.18 degrees each, three pixels of a 1920x1080 picture 90 degrees wide."""
+OVERCAST_ZENITH_KCD = 9.0
 OVERCAST_TINT = np.array([0.97, 1.0, 1.05])
 
 
@@ -71,14 +72,12 @@ def sunny_sky(day: Daylight, rng: np.random.Generator, height: int = HEIGHT) -> 
     sun = towards(day.azimuth_deg, day.elevation_deg)
     disc = sun_radiance(day.elevation_deg, day.turbidity)
     sun_klux = np.array(disc) * sun_disc_sr(SUN_DIAMETER_DEG)
-    view = directions(height)
-    radiance = clear_radiance(view, sun, day.turbidity)
+    upper = directions(height)[: height // 2]
+    above = clear_radiance(upper, sun, day.turbidity)
     if day.cover > 0:
-        light = CloudLight(sun_klux, sun, radiance[: height // 2].mean(axis=(0, 1)))
-        clouds = with_sun_free(cumulus(rng, day.cover), sun)
-        upper = np.s_[: height // 2]
-        seen = over(radiance[upper].reshape(-1, 3), view[upper].reshape(-1, 3), clouds, light)
-        radiance[upper] = seen.reshape(height // 2, 2 * height, 3)
+        light = CloudLight(sun_klux, sun, above.mean(axis=(0, 1)))
+        above = over(above, upper, with_sun_free(cumulus(rng, day.cover), sun), light)
+    radiance = np.concatenate([above, np.zeros_like(above)])
     return Sky(
         radiance=with_ground(radiance, sun_klux * sun[2]),
         sun_towards=sun,
@@ -88,19 +87,22 @@ def sunny_sky(day: Daylight, rng: np.random.Generator, height: int = HEIGHT) -> 
     )
 
 
-def overcast_sky(zenith: float, rng: np.random.Generator, height: int = HEIGHT) -> Sky:
-    """Return a closed layer of cloud, ``zenith`` kcd/m^2 bright overhead, without a sun.
+def overcast_sky(
+    unevenness: float, white: float, rng: np.random.Generator, height: int = HEIGHT
+) -> Sky:
+    """Return a closed layer of cloud without a sun, its underside ``unevenness`` bright or dark.
 
     Moon and Spencer's gradient (CIE standard overcast sky): the horizon is a third of the zenith.
+    ``white`` is the linear light of a level white sheet in the picture.
     """
     view = directions(height)
     up = np.maximum(view[..., 2], 0.0)
-    layer = np.clip(1 + 0.22 * _ceiling(rng, view), 0.3, 2.0)
-    grey = (zenith * (1 + 2 * up) / 3 * layer).astype(np.float32)
+    layer = np.clip(1 + unevenness * _ceiling(rng, view), 0.3, 2.0)
+    grey = (OVERCAST_ZENITH_KCD * (1 + 2 * up) / 3 * layer).astype(np.float32)
     radiance = (grey[..., None] * OVERCAST_TINT).astype(np.float32)
     return Sky(
         radiance=with_ground(radiance, np.zeros(3)),
-        exposure=_exposure(radiance, np.zeros(3), OVERCAST_WHITE),
+        exposure=_exposure(radiance, np.zeros(3), white),
     )
 
 
@@ -116,6 +118,7 @@ def _ceiling(rng: np.random.Generator, view: F32) -> F32:
     white = np.fft.rfft2(rng.standard_normal((cells, cells)))
     noise = np.fft.irfft2(white * np.maximum(f, 3.0) ** -1.35, s=(cells, cells))
     up = np.maximum(view[..., 2], 0.08)
-    place = (view[..., :2] / up[..., None] * 70).astype(int) % cells
+    place = np.moveaxis(view[..., :2] / up[..., None], -1, 0) * (70 / cells)
+    seen = periodic_at(margined(noise.astype(np.float32)), place.astype(np.float32))
     far = np.exp(-0.12 / np.maximum(view[..., 2], 1e-3))
-    return np.asarray(noise[place[..., 0], place[..., 1]] / noise.std() * far, np.float32)
+    return np.asarray(seen / noise.std() * far, np.float32)
