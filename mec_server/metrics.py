@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections import Counter as Tally
 from collections.abc import Callable, Iterable
 from dataclasses import fields
+from functools import cached_property
 
-from prometheus_client import CollectorRegistry
+from prometheus_client import CollectorRegistry, Counter, Histogram
 
 from mec_server.decoder_process import LossCause
 from mec_server.quotas import Limit
-from rfcore.codec import references_name
+from rfcore.codec import References, references_name
 from rfcore.errors import RejectReason
 from rfcore.field import RadianceField
 from rfcore.wire.instruments import Instruments
@@ -60,6 +61,7 @@ class ServerMetrics:
             "Time of a frame by stage: queue (waiting), render, splice, decode.",
             ("stage",),
         )
+        self._stages = [(f"{stage}_ns", self.stages.labels(stage)) for stage in STAGES]
         self.answer = make.seconds(
             "rfedge_server_frame_seconds", "From a frame's arrival to its Ack."
         )
@@ -113,6 +115,12 @@ class ServerMetrics:
         for cause in LossCause:
             self.decoders_lost.labels(cause)
 
+    def took(self, times: StageTimes) -> None:
+        """Note where the time of a frame went."""
+        for name, stage in self._stages:
+            stage.observe(getattr(times, name) / 1e9)
+        self.answer.observe(times.total_ns / 1e9)
+
     def observe_admission(
         self, promised: Callable[[], float], reduced: Callable[[], float]
     ) -> None:
@@ -141,43 +149,64 @@ class ServerMetrics:
 
 
 class VehicleMetrics:
-    """The server's metrics as one stream counts on them."""
+    """The server's metrics as one stream counts on them.
+
+    What a label's value leads to is looked up once: a frame counts on a dozen of them, and looking
+    up takes as long as counting.
+    """
 
     def __init__(self, metrics: ServerMetrics, vehicle_id: str) -> None:
         self._metrics = metrics
         self._vehicle_id = vehicle_id
         self._label = (vehicle_id,) if metrics.per_vehicle else ()
+        self._references: dict[References, tuple[Counter, Counter]] = {}
+        self._frames: dict[tuple[str, str], Counter] = {}
 
     def received(self, frame: Frame, packet_bytes: int) -> None:
         """Count a frame that could be parsed."""
-        metrics, label = self._metrics, self._label
-        references = references_name(frame.packet.references)
-        received = metrics.received.labels(*label) if label else metrics.received
-        received.inc(packet_bytes)
-        metrics.payload.labels(*label, references).inc(len(frame.packet.payload))
-        metrics.coded.labels(*label, references).inc()
+        packet = frame.packet
+        counters = self._references.get(packet.references)
+        if counters is None:
+            counters = self._references[packet.references] = self._by(packet.references)
+        payload, coded = counters
+        self._received.inc(packet_bytes)
+        payload.inc(len(packet.payload))
+        coded.inc()
 
     def answered(self, messages: Iterable[ServerMessage]) -> None:
         """Count the frames that ``messages`` answer."""
-        metrics, label = self._metrics, self._label
         for message in messages:
             if isinstance(message, Ack):
-                metrics.frames.labels(*label, "acked", "").inc()
-                for stage in STAGES:
-                    metrics.stages.labels(stage).observe(_seconds(message.times, stage))
-                metrics.answer.observe(_seconds(message.times, "total"))
+                self._ended("acked", "").inc()
+                self._metrics.took(message.times)
             elif isinstance(message, Nack):
-                metrics.frames.labels(*label, "nacked", str(message.reason)).inc(message.count)
+                self._ended("nacked", str(message.reason)).inc(message.count)
 
     def reconstructed(self, latency_s: float) -> None:
         """Note how old a picture was when it became one."""
-        latency = self._metrics.latency
-        (latency.labels(*self._label) if self._label else latency).observe(latency_s)
+        self._latency.observe(latency_s)
 
     def forget(self) -> None:
         """The stream is over."""
         self._metrics.forget(self._vehicle_id)
 
+    @cached_property
+    def _received(self) -> Counter:
+        received = self._metrics.received
+        return received.labels(*self._label) if self._label else received
 
-def _seconds(times: StageTimes, stage: str) -> float:
-    return float(getattr(times, f"{stage}_ns")) / 1e9
+    @cached_property
+    def _latency(self) -> Histogram:
+        latency = self._metrics.latency
+        return latency.labels(*self._label) if self._label else latency
+
+    def _by(self, references: References) -> tuple[Counter, Counter]:
+        labels = (*self._label, references_name(references))
+        return self._metrics.payload.labels(*labels), self._metrics.coded.labels(*labels)
+
+    def _ended(self, result: str, reason: str) -> Counter:
+        counter = self._frames.get((result, reason))
+        if counter is None:
+            counter = self._metrics.frames.labels(*self._label, result, reason)
+            self._frames[result, reason] = counter
+        return counter

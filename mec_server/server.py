@@ -16,7 +16,7 @@ from prometheus_client import CollectorRegistry, start_http_server
 from mec_server.admission import Admission
 from mec_server.config import ServerConfig
 from mec_server.decoders import Decoders
-from mec_server.edge_service import EdgeService, Surroundings
+from mec_server.edge_service import EdgeService
 from mec_server.field_service import FieldService
 from mec_server.fields import FieldShelf, field_loader
 from mec_server.fields_published import PublishedFields
@@ -24,9 +24,11 @@ from mec_server.handlers import OpenCameras, Tools, open_cameras
 from mec_server.metrics import ServerMetrics
 from mec_server.quotas import Quotas
 from mec_server.recorder import Recorder
+from mec_server.surroundings import Surroundings
 from mec_server.twin import Twin
 from mec_server.twin_metrics import TwinMetrics
 from mec_server.twin_service import TwinService
+from mec_server.workers import Workers
 from rfcore.errors import RfedgeError
 from rfcore.field import FieldStore
 from rfcore.files import write_whole
@@ -72,7 +74,7 @@ class EdgeServer:
         )
         self._twin_service = TwinService(twin, watched, config.consumers)
         self._opener = ThreadPoolExecutor(1, "opener")
-        self._executor = ThreadPoolExecutor(config.workers, "worker")
+        self._workers = Workers(config.workers)
         self._decoders = Decoders(config.decoder, not self.address.is_loopback, self._metrics)
         self._recorder = self._open_recorder(config.save)
         self._health = health_aio.HealthServicer()
@@ -80,7 +82,7 @@ class EdgeServer:
             Surroundings(
                 self._shelf,
                 store.ids,
-                self._executor,
+                self._workers,
                 self._opener,
                 Tools(time.perf_counter_ns, self._decoders.open),
                 self._metrics,
@@ -139,7 +141,7 @@ class EdgeServer:
         self._twin_service.drain()
         await self._server.stop(self._config.drain_s)
         await asyncio.to_thread(self._opener.shutdown)
-        await asyncio.to_thread(self._executor.shutdown)
+        await asyncio.to_thread(self._workers.close)
         await asyncio.to_thread(self._decoders.close)
         self._twin_service.close()
         if self._recorder is not None:

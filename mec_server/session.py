@@ -277,6 +277,11 @@ class ServerSession:
 
     # --- answers and time
 
+    @property
+    def has_news(self) -> bool:
+        """Whether there is something to send, or the stream is over."""
+        return bool(self._outbox) or self.closed is not None
+
     def messages_to_send(self, now: float) -> list[ServerMessage]:  # noqa: ARG002
         """Return, once, what the vehicle is to be told; credits that grew come last."""
         messages = list(self._outbox)
