@@ -100,11 +100,8 @@ class Lane:
     def succeed(self, lost: int) -> list[Gap]:
         """The running frame was reconstructed; return the gaps nobody was told of yet."""
         packet = self._finish().packet
-        missing = [
-            sequence
-            for sequence in range(packet.sequence - lost, packet.sequence)
-            if (packet.epoch, sequence) not in self._refused
-        ]
+        before = range(packet.sequence - lost, packet.sequence)
+        missing = [n for n in before if (packet.epoch, n) not in self._refused]
         self.epoch, self.last_good = packet.epoch, packet.sequence
         self._refused.clear()
         self.answered += 1 + len(missing)

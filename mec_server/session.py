@@ -44,6 +44,7 @@ from rfcore.wire.messages import (
     Hello,
     Nack,
     ServerMessage,
+    StageTimes,
     Welcome,
 )
 
@@ -253,15 +254,18 @@ class ServerSession:
         """The frame of ``job`` was reconstructed."""
         self._unusable = 0
         lane = self._lanes[job.frame.camera_id]
+        address, times = job.frame.address, outcome.times
         for gap in lane.succeed(outcome.lost):
-            address = replace(job.frame.address, sequence=gap.first)
-            self._nack(address, RejectReason.SEQUENCE_GAP, "never arrived", gap.count)
-        times = replace(
-            outcome.times,
+            first = replace(address, sequence=gap.first)
+            self._nack(first, RejectReason.SEQUENCE_GAP, "never arrived", gap.count)
+        times = StageTimes(
             queue_ns=_ns(job.started_s - job.received_s),
+            render_ns=times.render_ns,
+            splice_ns=times.splice_ns,
+            decode_ns=times.decode_ns,
             total_ns=_ns(now - job.received_s),
         )
-        self._outbox.append(Ack(job.frame.address, times, outcome.reconstruction_digest))
+        self._outbox.append(Ack(address, times, outcome.reconstruction_digest))
         self._answered(now)
 
     def rejected(self, job: DecodeJob, error: PacketRejected, now: float) -> None:
@@ -286,9 +290,9 @@ class ServerSession:
         """Return, once, what the vehicle is to be told; credits that grew come last."""
         messages = list(self._outbox)
         self._outbox.clear()
-        answered = {m.address.camera_id for m in messages if isinstance(m, Ack | Nack)}
+        answered = {m.address.camera_id for m in messages if isinstance(m, (Ack, Nack))}
         for camera_id, lane in self._lanes.items():
-            if answered & {camera_id, ""}:
+            if camera_id in answered or "" in answered:
                 messages.append(Credit(camera_id, lane.granted))
         return messages
 
@@ -331,8 +335,9 @@ class ServerSession:
             self._deadline_s = now + self._limits.idle_s
 
     def _finish_draining(self) -> None:
-        idle = not any(lane.outstanding for lane in self._lanes.values())
-        if self.state is SessionState.DRAINING and idle:
+        if self.state is not SessionState.DRAINING:
+            return
+        if not any(lane.outstanding for lane in self._lanes.values()):
             self._close(None)
 
     def _close(self, error: RfedgeError | None) -> None:

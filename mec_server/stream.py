@@ -25,6 +25,7 @@ from mec_server.recorder import Recording
 from mec_server.session import ServerSession, SessionState
 from mec_server.surroundings import Surroundings
 from mec_server.twin import TwinView
+from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeError
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
@@ -59,6 +60,7 @@ class Stream:
         self._overrunning = False
         self._opening: asyncio.Future[dict[str, Decoder]] | None = None
         self._decoders: dict[str, Decoder] = {}
+        self._intrinsics: dict[str, Intrinsics] = {}
         self._fault: Exception | None = None
         self._left = False
         self._metrics = around.metrics.of(UNKNOWN_VEHICLE)
@@ -217,6 +219,7 @@ class Stream:
         except RfedgeError as error:
             self._session.open_failed(error, time.monotonic())
         else:
+            self._intrinsics = {c.camera_id: c.intrinsics for c in job.hello.cameras}
             self._log = self._log.bind(vehicle=job.hello.vehicle_id)
             self._metrics.forget()
             self._metrics = around.metrics.of(job.hello.vehicle_id)
@@ -287,14 +290,12 @@ class Stream:
         hello, session = self._session.hello, self._session
         if hello is None or session.closed is not None:
             return
-        camera_id = job.frame.camera_id
-        camera = next(camera for camera in hello.cameras if camera.camera_id == camera_id)
         self._around.twin.show(
             TwinView(
                 vehicle_id=hello.vehicle_id,
                 session_id=session.session_id,
                 frame=job.frame,
-                intrinsics=camera.intrinsics,
+                intrinsics=self._intrinsics[job.frame.camera_id],
                 field_id=job.field_id,
                 picture=done.picture,
                 digest=done.outcome.reconstruction_digest,

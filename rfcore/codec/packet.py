@@ -20,6 +20,8 @@ NEEDED_BYTES = 4
 digest, not in a wrong picture."""
 
 _UINT32, _UINT64 = 1 << 32, 1 << 64
+_DIGEST, _COARSE, _NOTHING = (DIGEST_BYTES,), (0, COARSE_BYTES), (0,)
+_NEEDED = range(NEEDED_BYTES, DIGEST_BYTES + 1)
 
 
 @dataclass(frozen=True)
@@ -50,41 +52,45 @@ class DeltaPacket:
     photometric: Photometric = ()
 
     def __post_init__(self) -> None:
-        for name, limit in (("epoch", _UINT64), ("sequence", _UINT64), ("crc32", _UINT32)):
-            value = getattr(self, name)
-            if not 0 <= value < limit:
-                raise InvalidInput(f"packet.{name}", f"{value} is outside 0..{limit - 1}")
+        _require_number("epoch", self.epoch, _UINT64)
+        _require_number("sequence", self.sequence, _UINT64)
+        _require_number("crc32", self.crc32, _UINT32)
         check_references(self.references)
-        check_photometric(self.photometric)
-        needed = range(NEEDED_BYTES, DIGEST_BYTES + 1) if is_temporal(self.references) else (0,)
-        for name, lengths in (
-            ("reference_digest", (DIGEST_BYTES,)),
-            ("reference_coarse", (0, COARSE_BYTES)),
-            ("reconstruction_digest", (DIGEST_BYTES,)),
-            ("needed_digest", needed),
-        ):
-            _require_length(name, getattr(self, name), lengths)
+        if self.photometric:
+            check_photometric(self.photometric)
+        needed = _NEEDED if is_temporal(self.references) else _NOTHING
+        _require_length("reference_digest", self.reference_digest, _DIGEST)
+        _require_length("reference_coarse", self.reference_coarse, _COARSE)
+        _require_length("reconstruction_digest", self.reconstruction_digest, _DIGEST)
+        _require_length("needed_digest", self.needed_digest, needed)
 
     def expected_crc32(self) -> int:
         """Return zlib.crc32 of epoch and sequence (8 bytes each, big-endian), the digests in the
         order of the fields, the payload, a byte for each reference, the needed digest, and the
         photometric numbers (2 bytes each)."""
-        crc = zlib.crc32(self.epoch.to_bytes(8, "big") + self.sequence.to_bytes(8, "big"))
-        for part in (
+        head = (
+            self.epoch.to_bytes(8, "big"),
+            self.sequence.to_bytes(8, "big"),
             self.reference_digest,
             self.reference_coarse,
             self.reconstruction_digest,
-            self.payload,
+        )
+        tail = (
             bytes(self.references),
             self.needed_digest,
-            b"".join(number.to_bytes(2, "big", signed=True) for number in self.photometric),
-        ):
-            crc = zlib.crc32(part, crc)
-        return crc
+            *(number.to_bytes(2, "big", signed=True) for number in self.photometric),
+        )
+        crc = zlib.crc32(self.payload, zlib.crc32(b"".join(head)))
+        return zlib.crc32(b"".join(tail), crc)
 
     def sealed(self) -> DeltaPacket:
         """Return the packet with the CRC its other fields call for."""
         return replace(self, crc32=self.expected_crc32())
+
+
+def _require_number(name: str, value: int, limit: int) -> None:
+    if not 0 <= value < limit:
+        raise InvalidInput(f"packet.{name}", f"{value} is outside 0..{limit - 1}")
 
 
 def _require_length(name: str, value: bytes, lengths: Sequence[int]) -> None:

@@ -44,12 +44,13 @@ RENDER_ONLY: References = (Reference.RENDER,)
 
 def is_temporal(references: References) -> bool:
     """Tell whether the receiver must hold an earlier frame."""
-    return any(reference is not Reference.RENDER for reference in references)
+    return references != RENDER_ONLY and any(r is not Reference.RENDER for r in references)
 
 
 def check_references(references: References) -> References:
     """Return ``references``; raise ``InvalidInput`` for more than 3 or repeated ones."""
-    if len(set(references)) != len(references) or len(references) > REFERENCE_FRAMES:
+    count = len(references)
+    if count > 1 and (count > REFERENCE_FRAMES or len(set(references)) != count):
         names = ", ".join(reference.name for reference in references)
         raise InvalidInput(
             "references", f"{names}: a frame has at most {REFERENCE_FRAMES} different references"

@@ -8,6 +8,8 @@ one that spoils a single frame raises ``FrameRefused``, which also says which fr
 from __future__ import annotations
 
 from array import array
+from functools import lru_cache
+from typing import cast
 
 from google.protobuf.message import DecodeError
 
@@ -197,12 +199,12 @@ def _pose_from_wire(frame: pb.Frame) -> Pose:
         numbers = [p.x_m, p.y_m, p.z_m, p.rotation_w, p.rotation_x, p.rotation_y, p.rotation_z]
     else:
         check_range("frame.pose_f32", len(frame.pose_f32), 7, 7)
-        numbers = list(frame.pose_f32)
-    x_m, y_m, z_m, *turn = numbers
-    w, x, y, z = turn
+        numbers = frame.pose_f32[:]
+    x_m, y_m, z_m, w, x, y, z = numbers
     checked = Pose((x_m, y_m, z_m), (w, x, y, z))
-    for axis, value in zip("xyz", checked.translation_m, strict=True):
-        check_range(f"pose.{axis}_m", value, -MAX_TRANSLATION_M, MAX_TRANSLATION_M)
+    check_range("pose.x_m", x_m, -MAX_TRANSLATION_M, MAX_TRANSLATION_M)
+    check_range("pose.y_m", y_m, -MAX_TRANSLATION_M, MAX_TRANSLATION_M)
+    check_range("pose.z_m", z_m, -MAX_TRANSLATION_M, MAX_TRANSLATION_M)
     return checked
 
 
@@ -218,15 +220,16 @@ def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
         ),
         payload=check_bytes("frame.payload", frame.payload, 0, MAX_PAYLOAD_BYTES),
         crc32=frame.crc32,
-        references=_references_from_wire(frame),
+        references=_references_from_wire(tuple(frame.references)),
         needed_digest=frame.needed_digest,
         photometric=tuple(frame.photometric),
     )
 
 
-def _references_from_wire(frame: pb.Frame) -> References:
+@lru_cache(maxsize=64)
+def _references_from_wire(numbers: tuple[int, ...]) -> References:
     try:
-        return tuple(Reference(number) for number in frame.references)
+        return tuple(Reference(number) for number in numbers)
     except ValueError as error:
         raise InvalidInput("frame.references", f"{error}; update this end") from error
 
@@ -239,7 +242,7 @@ def _frame_to_wire(frame: Frame) -> pb.Frame:
         sequence=packet.sequence,
         capture_time_ns=frame.capture_time_ns,
         field_id_prefix=frame.field_id_prefix,
-        references=[pb.Reference.Value(f"REFERENCE_{r.name}") for r in packet.references],
+        references=[cast(pb.Reference.ValueType, int(r)) for r in packet.references],
         reference_digest=packet.reference_digest,
         reference_coarse=packet.reference_coarse,
         reconstruction_digest=packet.reconstruction_digest,

@@ -122,7 +122,8 @@ class CannedVehicle:
                     if isinstance(message, Welcome):
                         self.granted_hz = message.rate_hz
                         self._met.set()
-                self._wake.set()
+                if any(replay.is_ready or replay.is_idle for replay in self.replays):
+                    self._wake.set()
             self.failed = "the server ended the stream"
         except grpc.aio.AioRpcError as error:
             self._lost(error)
@@ -143,10 +144,10 @@ class CannedVehicle:
                 return
             timers = [replay.get_timer() for replay in self.replays]
             due_s = min((timer for timer in timers if timer is not None), default=until_s)
-            with suppress(TimeoutError):
-                async with asyncio.timeout(max(0.0, due_s - time.monotonic())):
-                    await self._wake.wait()
+            alarm = asyncio.get_running_loop().call_at(due_s, self._wake.set)
+            await self._wake.wait()
             self._wake.clear()
+            alarm.cancel()
         for replay in self.replays:
             replay.give_up()
 

@@ -79,6 +79,11 @@ class Replay:
         """Whether every picture was sent or dropped, and answered."""
         return self._waiting is None and not self._pending and self.get_timer() is None
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether a picture waits and has credit."""
+        return self._waiting is not None and self._used < self._granted
+
     def begin(self, schedule: Schedule) -> None:
         """Follow ``schedule`` from now on; before, nothing is due."""
         self._schedule = schedule
