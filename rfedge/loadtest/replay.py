@@ -9,9 +9,10 @@ until the drive begins again.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
+from rfcore.codec import DeltaPacket
 from rfcore.wire.messages import Ack, Credit, Frame, FrameAddress, Nack, ServerMessage
 from rfedge.loadtest.canned import CannedDrive
 
@@ -141,13 +142,34 @@ class Replay:
             self._sequence = 0
             self._chained = position == 0
         canned = (self._drive.chain if self._chained else self._drive.alone)[position]
-        packet = replace(canned.packet, epoch=self._epoch, sequence=self._sequence).sealed()
-        self._sequence += 1
-        frame = replace(
-            canned,
-            camera_id=self._camera_id,
-            capture_time_ns=self._wall_ns(shot.due_s),
-            packet=packet,
+        frame = Frame(
+            self._camera_id,
+            self._wall_ns(shot.due_s),
+            canned.pose,
+            canned.field_id_prefix,
+            _numbered(canned.packet, self._epoch, self._sequence),
+            canned.quality,
         )
+        self._sequence += 1
         self._pending[frame.address] = shot
         return frame
+
+
+def _numbered(packet: DeltaPacket, epoch: int, sequence: int) -> DeltaPacket:
+    """Return the packet under other numbers, sealed; written out, as ``replace`` takes twice."""
+
+    def numbered(crc32: int) -> DeltaPacket:
+        return DeltaPacket(
+            epoch,
+            sequence,
+            packet.reference_digest,
+            packet.reference_coarse,
+            packet.reconstruction_digest,
+            packet.payload,
+            crc32,
+            packet.references,
+            packet.needed_digest,
+            packet.photometric,
+        )
+
+    return numbered(numbered(0).expected_crc32())

@@ -1,0 +1,190 @@
+"""One canned vehicle on a connection of its own: replays pictures on time, counts the answers.
+
+Everything happens in calls of the event loop (bytes came, a picture is due): no task and no future
+a frame, so that one process plays a hundred vehicles in a small part of a core.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from dataclasses import replace
+
+import grpc
+
+from rfcore.errors import ProtocolError
+from rfcore.wire.conventions import STREAM_METHOD
+from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert_answers import server_messages_from_bytes
+from rfcore.wire.messages import Hello, Welcome
+from rfedge.loadtest.canned import CannedDrive
+from rfedge.loadtest.grpc_call import GrpcCall, Status
+from rfedge.loadtest.replay import Replay, Schedule
+
+__all__ = ["CannedVehicle"]
+
+_EPOCH_NS = time.time_ns() - time.monotonic_ns()
+CODES = {code.value[0]: code.name for code in grpc.StatusCode}
+
+
+class CannedVehicle(asyncio.Protocol):
+    """``met`` is set when the server has answered Hello, ``over`` when nothing more will happen."""
+
+    def __init__(self, name: str, address: str, hello: Hello, drive: CannedDrive) -> None:
+        self.refused = ""
+        self.failed = ""
+        self.granted_hz = 0.0
+        self.met = asyncio.Event()
+        self.over = asyncio.Event()
+        self._address = address
+        self._hello = replace(hello, vehicle_id=name)
+        self.replays = [Replay(c.camera_id, drive, _wall_ns) for c in hello.cameras]
+        self._call = GrpcCall(address, STREAM_METHOD)
+        self._transport: asyncio.Transport | None = None
+        self._alarm: asyncio.TimerHandle | None = None
+        self._is_full = False
+        self._departed = False
+
+    async def connect(self, within_s: float) -> None:
+        """Say Hello and wait for the answer; what goes wrong is in ``refused`` or ``failed``."""
+        host, port = self._address.rsplit(":", 1)
+        try:
+            async with asyncio.timeout(within_s):
+                await asyncio.get_running_loop().create_connection(lambda: self, host, int(port))
+                await self.met.wait()
+        except TimeoutError:
+            self._fail(f"no Welcome within {within_s:g} s")
+        except OSError as error:
+            self._fail(f"{self._address}: {error}")
+
+    def depart(self, schedule: Schedule, give_up_s: float) -> None:
+        """Send pictures by ``schedule``; what is not answered by ``give_up_s`` never will be."""
+        if 0 < self.granted_hz < schedule.hz:
+            schedule = replace(schedule, hz=self.granted_hz)
+        if self.refused:
+            self.over.set()
+            return
+        self._departed = True
+        for replay in self.replays:
+            replay.begin(schedule)
+        if self.failed:
+            self.leave()
+            return
+        asyncio.get_running_loop().call_at(give_up_s, self.leave)
+        self._go_on()
+
+    def leave(self) -> None:
+        """Close the connection; pictures that were still to come are dropped."""
+        if self.over.is_set():
+            return
+        for replay in self.replays:
+            replay.give_up()
+        self.over.set()
+        if self._alarm is not None:
+            self._alarm.cancel()
+        if self._transport is not None:
+            self._transport.abort()
+
+    # --- asyncio.Protocol
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Say Hello."""
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        self._call.send(client_message_to_bytes(self._hello))
+        self._flush()
+
+    def data_received(self, data: bytes) -> None:
+        """Take answers, and send what waited for them."""
+        now, was_blocked = time.monotonic(), self._call.is_blocked
+        try:
+            for part in self._call.receive(data):
+                self._take(part, now)
+        except ProtocolError as error:
+            self._fail(str(error))
+        if self._call.status is not None:
+            self._end(self._call.status)
+        if was_blocked or any(replay.is_ready or replay.is_idle for replay in self.replays):
+            self._go_on()
+        else:
+            self._flush()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The server, or the way to it, is gone."""
+        if not self.over.is_set() and not self.refused:
+            self._fail(f"connection lost: {exc or 'closed by the server'}")
+
+    def pause_writing(self) -> None:
+        """The socket takes no more."""
+        self._is_full = True
+
+    def resume_writing(self) -> None:
+        """The socket takes more."""
+        self._is_full = False
+        self._go_on()
+
+    # --- what happens
+
+    def _take(self, data: bytes, now: float) -> None:
+        for message in server_messages_from_bytes(data):
+            for replay in self.replays:
+                replay.receive(message, now)
+            if isinstance(message, Welcome):
+                self.granted_hz = message.rate_hz
+                self.met.set()
+
+    def _go_on(self) -> None:
+        """Send what is due and may be sent, and come back when the next picture is due."""
+        if self.over.is_set():
+            return
+        now = time.monotonic()
+        for replay in self.replays if self._departed else ():
+            if self._is_full or self._call.is_blocked:
+                break
+            frame = replay.frame_to_send(now)
+            if frame is not None:
+                self._call.send(client_message_to_bytes(frame))
+        self._flush()
+        if self._departed:
+            self._set_alarm()
+
+    def _set_alarm(self) -> None:
+        """Come back when the next picture is due, unless the server has to read first."""
+        if self._alarm is not None:
+            self._alarm.cancel()
+            self._alarm = None
+        if self._is_full or self._call.is_blocked:
+            return
+        timers = [timer for replay in self.replays if (timer := replay.get_timer()) is not None]
+        if timers:
+            self._alarm = asyncio.get_running_loop().call_at(min(timers), self._due)
+        elif all(replay.is_idle for replay in self.replays):
+            self.leave()
+
+    def _due(self) -> None:
+        self._alarm = None
+        self._go_on()
+
+    def _flush(self) -> None:
+        data = self._call.data_to_send()
+        if data and self._transport is not None:
+            self._transport.write(data)
+
+    def _end(self, status: Status) -> None:
+        problem = f"{CODES.get(status.code, status.code)}: {status.details}"
+        if status.code == grpc.StatusCode.RESOURCE_EXHAUSTED.value[0] and not self.met.is_set():
+            self.refused = problem
+            self.met.set()
+        else:
+            self._fail(problem if status.code else "the server ended the stream")
+
+    def _fail(self, problem: str) -> None:
+        self.failed = self.failed or problem
+        self.met.set()
+        if self._departed:
+            self.leave()
+
+
+def _wall_ns(moment_s: float) -> int:
+    """Return the Unix time of a moment on the monotonic clock."""
+    return _EPOCH_NS + round(moment_s * 1e9)
