@@ -28,6 +28,7 @@ from rfcore.codec.splice import SpliceDecoder, grey
 from rfcore.codec.state import EncoderState, Past
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
+from rfcore.native.digest import picture_digest
 from rfcore.native.warp import PosedDepth
 
 __all__ = ["DeltaEncoder", "Encoded", "FrameChoice"]
@@ -156,12 +157,13 @@ class DeltaEncoder:
         encoded_ns = self._clock_ns()
         reconstruction = self._reconstruct(pictures, made.payload)
         past = state.past
+        shown = Past(reconstruction, seen, prediction.render)
         packet = DeltaPacket(
             epoch=state.epoch,
             sequence=state.next_sequence,
-            reference_digest=render.digest(),
+            reference_digest=picture_digest(render),
             reference_coarse=coarse_digest(render) if choice.coarse else b"",
-            reconstruction_digest=reconstruction.digest(),
+            reconstruction_digest=shown.digest,
             payload=made.payload,
             crc32=0,
             references=references,
@@ -173,7 +175,6 @@ class DeltaEncoder:
             "encode": encoded_ns - chosen_ns,
             "closed_loop": self._clock_ns() - encoded_ns,
         }
-        shown = Past(reconstruction, seen, prediction.render)
         following = EncoderState(state.epoch, state.next_sequence + 1, shown)
         return Encoded(packet, reconstruction, following, stage_ns, made.tries, made.crf, rate)
 
