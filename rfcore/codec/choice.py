@@ -21,6 +21,7 @@ previous frame does not, and x264 looks for it; it is taken along whenever there
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +120,7 @@ class _Costs:
         bits = BLOCK_BITS + np.maximum(0, found.satd / self._step - SWALLOWED)
         return np.minimum(ssd, distortion + self._lambda * bits)
 
-    @property
+    @cached_property
     def intra(self) -> float:
         """The cost of the frame without any reference."""
         return _total(self.of(_block_means(self._frame)))
@@ -146,10 +147,11 @@ def _total(costs: Costs) -> float:
 def _block_means(picture: I420) -> I420:
     """Return the picture with each whole 8x8 luma block at its mean."""
     height, width = (side // BLOCK_PX * BLOCK_PX for side in picture.y.shape)
-    shape = (height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)
-    means = picture.y[:height, :width].reshape(shape).mean(axis=(1, 3))
+    blocks = picture.y[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width)
+    down = blocks.sum(axis=1, dtype=np.uint16).reshape(height // BLOCK_PX, -1, BLOCK_PX)
+    means = np.rint(down.sum(axis=2, dtype=np.uint16) / BLOCK_PX**2).astype(np.uint8)
     flat = picture.y.copy()
-    flat[:height, :width] = np.rint(means).astype(np.uint8).repeat(8, axis=0).repeat(8, axis=1)
+    flat[:height, :width] = means.repeat(BLOCK_PX, axis=1).repeat(BLOCK_PX, axis=0)
     return I420(flat, picture.u, picture.v)
 
 

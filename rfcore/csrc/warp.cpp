@@ -4,7 +4,12 @@
 #include <cstddef>
 #include <cstdlib>
 #include <cstring>
+#include <memory>
 #include <vector>
+
+#if defined(__SSE2__)
+#include <emmintrin.h>
+#endif
 
 // Separate multiplications and additions in float32 (no contraction, see CMakeLists.txt) and
 // integers: every instruction set gives the same bytes, so the compiler may use AVX2.
@@ -29,6 +34,54 @@ constexpr std::int16_t kFilter[kSteps][kLanes] = {
 #include "warp_filter.inc"
 };
 
+// A vector in the compilers' own notation (GCC, Clang), for any instruction set. Taps are 6 bits
+// so that a column's sum fits: no row of the filter has absolute values of more than 100 in all.
+using Lanes = std::int16_t __attribute__((vector_size(2 * kLanes)));
+using Sums = std::int32_t __attribute__((vector_size(2 * kLanes)));
+
+inline Lanes lanes_at(const std::int16_t* from) {
+    Lanes lanes;
+    std::memcpy(&lanes, from, sizeof lanes);
+    return lanes;
+}
+
+// Four sums of products that add up to the product of two vectors; which four depends on the machine.
+inline Sums products(Lanes a, Lanes b) {
+#if defined(__SSE2__)
+    return reinterpret_cast<Sums>(
+        _mm_madd_epi16(reinterpret_cast<__m128i>(a), reinterpret_cast<__m128i>(b)));
+#else
+    Sums sums{};
+    for (int i = 0; i < kLanes; ++i) sums[i / 2] += a[i] * b[i];
+    return sums;
+#endif
+}
+
+// Eight samples as 16-bit numbers.
+inline Lanes widened(const std::uint8_t* from) {
+    using Bytes = std::uint8_t __attribute__((vector_size(kLanes)));
+    Bytes bytes;
+    std::memcpy(&bytes, from, sizeof bytes);
+    return __builtin_convertvector(bytes, Lanes);
+}
+
+inline std::int32_t total(Sums sums) {
+    sums += __builtin_shufflevector(sums, sums, 2, 3, 0, 1);
+    return sums[0] + sums[1];
+}
+
+// Every tap of the filter in all lanes.
+struct Taps {
+    Taps() {
+        for (int at = 0; at < kSteps; ++at) {
+            for (int j = 0; j < kTaps; ++j) each[at][j] = Lanes{} + kFilter[at][j];
+        }
+    }
+    Lanes each[kSteps][kTaps];
+};
+const Taps kDown;
+
+// Positions of a row's samples and how far they are.
 struct Row {
     explicit Row(int width) : u(width), v(width), z(width) {}
     std::vector<std::int32_t> u, v;
@@ -66,19 +119,17 @@ void locate_row(const float* __restrict depth, const WarpGeometry& g, PictureSiz
 }
 
 // Marks kNowhere what another surface hid in the previous picture.
-void drop_hidden(const float* previous_depth, int width_px, Row& row) {
+RFCORE_PER_ISA
+void drop_hidden(const float* __restrict previous_depth, int width_px, std::int32_t* __restrict u,
+                 const std::int32_t* __restrict v, const float* __restrict z) {
     for (int x = 0; x < width_px; ++x) {
-        if (row.u[x] == kNowhere) continue;
-        const int column = (row.u[x] + kSteps / 2) / kSteps;
-        const int line = (row.v[x] + kSteps / 2) / kSteps;
-        const float seen = previous_depth[static_cast<std::size_t>(line) * width_px + column];
-        if (!(std::abs(seen - row.z[x]) < kRelative * row.z[x] + kAbsolute)) row.u[x] = kNowhere;
+        const std::int32_t column = (std::max(u[x], 0) + kSteps / 2) >> 6;
+        const std::int32_t line = (v[x] + kSteps / 2) >> 6;
+        const float seen = previous_depth[line * width_px + column];
+        const bool same = std::abs(seen - z[x]) < kRelative * z[x] + kAbsolute;
+        u[x] = same ? u[x] : kNowhere;
     }
 }
-
-// A vector in the compilers' own notation (GCC, Clang), for any instruction set. Taps are 6 bits
-// so that a column's sum fits: no row of the filter has absolute values of more than 100 in all.
-using Lanes = std::int16_t __attribute__((vector_size(2 * kLanes)));
 
 // A plane, or the difference of two, with its edge repeated, as 16-bit numbers (GCC 12 widens eight
 // bytes one by one).
@@ -86,10 +137,10 @@ class Plane {
 public:
     Plane(const std::uint8_t* samples, const std::uint8_t* minus, int width, int height)
         : is_difference_(minus != nullptr), pitch_(width + kBefore + kAfter),
-          samples_(pitch_ * (height + kBefore + kAfter)) {
+          samples_(new std::int16_t[pitch_ * (height + kBefore + kAfter)]) {
         for (int y = -kBefore; y < height + kAfter; ++y) {
             const std::size_t from = static_cast<std::size_t>(std::clamp(y, 0, height - 1)) * width;
-            std::int16_t* to = samples_.data() + (y + kBefore) * pitch_ + kBefore;
+            std::int16_t* to = samples_.get() + (y + kBefore) * pitch_ + kBefore;
             std::copy_n(samples + from, width, to);
             for (int x = 0; minus != nullptr && x < width; ++x) to[x] -= minus[from + x];
             std::fill_n(to - kBefore, kBefore, to[0]);
@@ -98,42 +149,99 @@ public:
     }
     std::size_t pitch() const { return pitch_; }
     bool is_difference() const { return is_difference_; }
-    // The first sample under the filter for positions from (x, y) to (x + 1, y + 1); x, y >= -1.
-    const std::int16_t* under(int x, int y) const { return samples_.data() + (y + 1) * pitch_ + x + 1; }
+    // What Reach::begin counts from. Positions from (x, y) to (x + 1, y + 1) begin at
+    // (y + 1) * pitch + x + 1; x, y >= -1.
+    const std::int16_t* samples() const { return samples_.get(); }
 
 private:
     static constexpr int kBefore = 3, kAfter = 6;
     bool is_difference_;
     std::size_t pitch_;
-    std::vector<std::int16_t> samples_;
+    std::unique_ptr<std::int16_t[]> samples_;  // not filled with zeros first
 };
 
-// Writes the plane's value at each known (u, v), in 1/64 sample, on top of the render if the plane is
-// a difference, and the render elsewhere. Eight columns are summed although six have taps, so that a
-// row of them is one vector.
+// What a row of positions asks of planes of one pitch: where the filter begins (below 0: nowhere), and
+// which rows of the filter are taken in both directions.
+struct Reach {
+    explicit Reach(int width) : begin(width), across(width), down(width) {}
+    std::vector<std::int32_t> begin, across, down;
+};
+
 RFCORE_PER_ISA
-void interpolate_row(const Plane& plane, const Row& at, int count, std::int32_t doubt,
-                     const std::uint8_t* render, std::uint8_t* out) {
-    const std::int32_t *u = at.u.data(), *v = at.v.data();
-    const std::int32_t with_render = plane.is_difference() ? 1 : 0;
+void reach_row(const std::int32_t* __restrict u, const std::int32_t* __restrict v, int count,
+               std::int32_t pitch, std::int32_t* __restrict begin, std::int32_t* __restrict across,
+               std::int32_t* __restrict down) {
     for (int n = 0; n < count; ++n) {
-        if (u[n] == kNowhere) {
-            out[n] = std::max<std::uint8_t>(render[n], 1);
-            continue;
-        }
-        const std::int16_t* line = plane.under(u[n] >> 6, v[n] >> 6);
-        const std::int16_t* across = kFilter[u[n] & (kSteps - 1)];
-        const std::int16_t* down = kFilter[v[n] & (kSteps - 1)];
-        Lanes columns{}, row;
-        for (int j = 0; j < kTaps; ++j, line += plane.pitch()) {
-            std::memcpy(&row, line, sizeof row);
-            columns += row * down[j];
-        }
-        std::int32_t sum = 0;
-        for (int i = 0; i < kTaps; ++i) sum += columns[i] * across[i];
-        sum -= std::min(std::max(sum >> 2, -(doubt << 12)), doubt << 12);
-        const std::int32_t value = ((sum + (1 << 11)) >> 12) + with_render * render[n];
+        begin[n] = u[n] == kNowhere ? -1 : ((v[n] >> 6) + 1) * pitch + (u[n] >> 6) + 1;
+        across[n] = u[n] & (kSteps - 1);
+        down[n] = v[n] & (kSteps - 1);
+    }
+}
+
+// Interpolates at each known position: four sums a sample, which add up to 2^12 samples. Eight columns
+// are summed although six have taps, so that a row of them is one vector.
+RFCORE_PER_ISA
+void filter_row(const std::int16_t* samples, std::size_t pitch, const Reach& reach, int count,
+                Sums* sums) {
+    const std::int32_t *begin = reach.begin.data(), *across = reach.across.data();
+    const std::int32_t* down = reach.down.data();
+    for (int n = 0; n < count; ++n) {
+        if (begin[n] < 0) continue;
+        const std::int16_t* line = samples + begin[n];
+        const Lanes* taps = kDown.each[down[n]];
+        Lanes columns = lanes_at(line) * taps[0];
+        for (int j = 1; j < kTaps; ++j) columns += lanes_at(line + j * pitch) * taps[j];
+        sums[n] = products(columns, lanes_at(kFilter[across[n]]));
+    }
+}
+
+// Adds up the four sums of each sample, for four samples at a time: [count, 4] -> [count], both up to
+// the next multiple of four.
+RFCORE_PER_ISA
+void total_row(const Sums* sums, int count, std::int32_t* totals) {
+    for (int n = 0; n < count; n += 4) {
+        const Sums a = sums[n], b = sums[n + 1], c = sums[n + 2], d = sums[n + 3];
+        const Sums ab = __builtin_shufflevector(a, b, 0, 4, 1, 5) + __builtin_shufflevector(a, b, 2, 6, 3, 7);
+        const Sums cd = __builtin_shufflevector(c, d, 0, 4, 1, 5) + __builtin_shufflevector(c, d, 2, 6, 3, 7);
+        const Sums all = __builtin_shufflevector(ab, cd, 0, 1, 4, 5) + __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
+        std::memcpy(totals + n, &all, sizeof all);
+    }
+}
+
+// Rounds sums to samples, on top of the render if they are differences; unknown ones are the render's.
+RFCORE_PER_ISA
+void round_row(const std::int32_t* __restrict sums, const std::int32_t* __restrict u, int count,
+               bool on_top, std::int32_t doubt, const std::uint8_t* __restrict render,
+               std::uint8_t* __restrict out) {
+    const std::int32_t most = doubt << 12, with_render = on_top ? -1 : 0;
+    for (int n = 0; n < count; ++n) {
+        const std::int32_t sum = sums[n] - std::min(std::max(sums[n] >> 2, -most), most);
+        const std::int32_t carried = ((sum + (1 << 11)) >> 12) + (render[n] & with_render);
+        const std::int32_t value = u[n] == kNowhere ? render[n] : carried;
         out[n] = static_cast<std::uint8_t>(std::min(std::max(value, 1), 255));
+    }
+}
+
+// Four luma positions to the chroma sample in their middle: (mean - 1/2) / 2 where they are two apart
+// (`pair` is 2 * kSteps), mean / 2 on the last of an odd number, which stands for both (`pair` is 0).
+inline std::int32_t centre(std::int32_t sum, int pair) { return (sum - pair + 4) >> 3; }
+
+// Where the chroma samples lie between two rows of luma, those that are known in all four; the
+// second row may be the first again.
+RFCORE_PER_ISA
+void centre_row(const std::int32_t* top_u, const std::int32_t* bottom_u, const std::int32_t* top_v,
+                const std::int32_t* bottom_v, int pairs, int tall, std::int32_t* __restrict u,
+                std::int32_t* __restrict v) {
+    for (int c = 0; c < pairs; ++c) {
+        const int a = 2 * c, b = a + 1;
+        const bool known = (top_u[a] != kNowhere) & (top_u[b] != kNowhere) &
+                           (bottom_u[a] != kNowhere) & (bottom_u[b] != kNowhere);
+        // Unsigned, for kNowhere may not be added to itself.
+        const auto sum = static_cast<std::uint32_t>(top_u[a]) + static_cast<std::uint32_t>(top_u[b]) +
+                         static_cast<std::uint32_t>(bottom_u[a]) +
+                         static_cast<std::uint32_t>(bottom_u[b]);
+        u[c] = known ? centre(static_cast<std::int32_t>(sum), 2 * kSteps) : kNowhere;
+        v[c] = centre(top_v[a] + top_v[b] + bottom_v[a] + bottom_v[b], tall);
     }
 }
 
@@ -144,7 +252,8 @@ public:
           y_(in.previous.y, in.previous_render.y, size.width_px, size.height_px),
           u_(in.previous.u, in.previous_render.u, half_width_, (size.height_px + 1) / 2),
           v_(in.previous.v, in.previous_render.v, half_width_, (size.height_px + 1) / 2),
-          rows_{Row(size.width_px), Row(size.width_px)}, middle_(half_width_) {}
+          rows_{Row(size.width_px), Row(size.width_px)}, middle_(half_width_),
+          reach_(size.width_px), sums_(size.width_px + 3), totals_(size.width_px + 3) {}
 
     std::int64_t run() {
         std::int64_t taken = 0;
@@ -161,30 +270,41 @@ private:
         const std::size_t start = static_cast<std::size_t>(y) * size_.width_px;
         locate_row(in_.depth + start, geometry_, size_, y, row.u.data(), row.v.data(),
                    row.z.data());
-        drop_hidden(in_.previous_depth, size_.width_px, row);
-        interpolate_row(y_, row, size_.width_px, in_.doubt, in_.render.y + start, out_.y + start);
+        drop_hidden(in_.previous_depth, size_.width_px, row.u.data(), row.v.data(), row.z.data());
+        reach(y_, row, size_.width_px);
+        interpolate(y_, row, size_.width_px, in_.render.y + start, out_.y + start);
         return size_.width_px - std::count(row.u.begin(), row.u.end(), kNowhere);
     }
 
     void chroma(int line, const Row& top, const Row& bottom) {
-        const auto known = [](const Row& row, int x) { return row.u[x] != kNowhere; };
-        for (int c = 0; c < half_width_; ++c) {
-            const int a = 2 * c, b = std::min(2 * c + 1, size_.width_px - 1);
-            const bool all = known(top, a) && known(top, b) && known(bottom, a) && known(bottom, b);
-            const std::int32_t u = top.u[a] + top.u[b] + bottom.u[a] + bottom.u[b];
-            const std::int32_t v = top.v[a] + top.v[b] + bottom.v[a] + bottom.v[b];
-            middle_.u[c] = all ? centre(u, a != b) : kNowhere;
-            middle_.v[c] = all ? centre(v, &top != &bottom) : 0;
-        }
+        const int pairs = size_.width_px / 2, tall = &top == &bottom ? 0 : 2 * kSteps;
+        centre_row(top.u.data(), bottom.u.data(), top.v.data(), bottom.v.data(), pairs, tall,
+                   middle_.u.data(), middle_.v.data());
+        if (pairs < half_width_) centre_last(top, bottom, tall);
         const std::size_t start = static_cast<std::size_t>(line) * half_width_;
-        interpolate_row(u_, middle_, half_width_, in_.doubt, in_.render.u + start, out_.u + start);
-        interpolate_row(v_, middle_, half_width_, in_.doubt, in_.render.v + start, out_.v + start);
+        reach(u_, middle_, half_width_);
+        interpolate(u_, middle_, half_width_, in_.render.u + start, out_.u + start);
+        interpolate(v_, middle_, half_width_, in_.render.v + start, out_.v + start);
     }
 
-    // Four luma positions to the chroma sample in their middle: (mean - 1/2) / 2 between a pair,
-    // mean / 2 on the last of an odd number, which stands for both.
-    static std::int32_t centre(std::int32_t sum, bool pair) {
-        return (sum - (pair ? 2 * kSteps : 0) + 4) >> 3;
+    void reach(const Plane& plane, const Row& at, int count) {
+        reach_row(at.u.data(), at.v.data(), count, static_cast<std::int32_t>(plane.pitch()),
+                  reach_.begin.data(), reach_.across.data(), reach_.down.data());
+    }
+
+    void interpolate(const Plane& plane, const Row& at, int count, const std::uint8_t* render,
+                     std::uint8_t* out) {
+        filter_row(plane.samples(), plane.pitch(), reach_, count, sums_.data());
+        total_row(sums_.data(), count, totals_.data());
+        round_row(totals_.data(), at.u.data(), count, plane.is_difference(), in_.doubt, render, out);
+    }
+
+    // The last of an odd number of columns stands for two.
+    void centre_last(const Row& top, const Row& bottom, int tall) {
+        const int x = size_.width_px - 1, c = half_width_ - 1;
+        const bool known = top.u[x] != kNowhere && bottom.u[x] != kNowhere;
+        middle_.u[c] = known ? centre(2 * (top.u[x] + bottom.u[x]), 0) : kNowhere;
+        middle_.v[c] = centre(2 * (top.v[x] + bottom.v[x]), tall);
     }
 
     const WarpInputs& in_;
@@ -195,46 +315,60 @@ private:
     Plane y_, u_, v_;
     Row rows_[2];
     Row middle_;
+    Reach reach_;
+    std::vector<Sums> sums_;
+    std::vector<std::int32_t> totals_;
 };
 
-// One 8-point Hadamard transform over eight values `stride` apart.
-inline void hadamard8(std::int32_t* d, int stride) {
+// Eight rows of differences, transformed in the direction across the vectors.
+inline void hadamard_down(Lanes* d) {
     for (int half = 4; half >= 1; half /= 2) {
-        for (int i = 0; i < 8; ++i) {
-            if ((i & half) != 0) continue;
-            const std::int32_t a = d[i * stride], b = d[(i + half) * stride];
-            d[i * stride] = a + b;
-            d[(i + half) * stride] = a - b;
+        for (int j = 0; j < 8; ++j) {
+            if ((j & half) != 0) continue;
+            const Lanes a = d[j], b = d[j + half];
+            d[j] = a + b;
+            d[j + half] = a - b;
         }
     }
 }
 
-RFCORE_PER_ISA
-void costs_of_block(const std::uint8_t* frame, const std::uint8_t* reference, int stride,
-                    std::int32_t* satd, std::int32_t* ssd) {
-    std::int32_t d[64];
-    std::int32_t squares = 0, sum = 0;
+// Three rounds of interleaving rows that are four apart.
+inline void transpose(Lanes* d) {
+    for (int round = 0; round < 3; ++round) {
+        Lanes mixed[8];
+        for (int j = 0; j < 4; ++j) {
+            const Lanes a = d[j], b = d[j + 4];
+            mixed[2 * j] = __builtin_shufflevector(a, b, 0, 8, 1, 9, 2, 10, 3, 11);
+            mixed[2 * j + 1] = __builtin_shufflevector(a, b, 4, 12, 5, 13, 6, 14, 7, 15);
+        }
+        std::copy_n(mixed, 8, d);
+    }
+}
+
+// A coefficient is at most 64 * 255, so 16 bits hold it.
+inline void costs_of_block(const std::uint8_t* frame, const std::uint8_t* reference,
+                           std::size_t stride, std::int32_t* satd, std::int32_t* ssd) {
+    constexpr Lanes one{1, 1, 1, 1, 1, 1, 1, 1};
+    Lanes d[8];
+    Sums squares{}, sum{};
     for (int j = 0; j < 8; ++j) {
-        for (int i = 0; i < 8; ++i) {
-            const std::int32_t difference = frame[j * stride + i] - reference[j * stride + i];
-            d[8 * j + i] = difference;
-            squares += difference * difference;
-        }
+        d[j] = widened(frame + j * stride) - widened(reference + j * stride);
+        squares += products(d[j], d[j]);
     }
-    for (int half = 4; half >= 1; half /= 2) {  // down the columns, eight at a time
-        for (int j = 0; j < 8; ++j) {
-            if ((j & half) != 0) continue;
-            for (int i = 0; i < 8; ++i) {
-                const std::int32_t a = d[8 * j + i], b = d[8 * (j + half) + i];
-                d[8 * j + i] = a + b;
-                d[8 * (j + half) + i] = a - b;
-            }
-        }
+    hadamard_down(d);
+    transpose(d);
+    hadamard_down(d);
+    for (int j = 0; j < 8; ++j) sum += products(d[j] < 0 ? -d[j] : d[j], one);
+    *satd = (total(sum) + 4) / 8;
+    *ssd = total(squares);
+}
+
+RFCORE_PER_ISA
+void costs_of_row(const std::uint8_t* frame, const std::uint8_t* reference, int columns,
+                  std::size_t stride, std::int32_t* satd, std::int32_t* ssd) {
+    for (int i = 0; i < columns; ++i) {
+        costs_of_block(frame + 8 * i, reference + 8 * i, stride, satd + i, ssd + i);
     }
-    for (int j = 0; j < 8; ++j) hadamard8(d + 8 * j, 1);
-    for (int i = 0; i < 64; ++i) sum += std::abs(d[i]);
-    *satd = (sum + 4) / 8;
-    *ssd = squares;
 }
 
 }  // namespace
@@ -247,13 +381,10 @@ std::int64_t warp_i420(const WarpInputs& in, const WarpGeometry& geometry, Pictu
 void block_costs(const std::uint8_t* frame, const std::uint8_t* reference, PictureSize size,
                  std::int32_t* satd, std::int32_t* ssd) {
     const int columns = size.width_px / 8, rows = size.height_px / 8;
+    const std::size_t stride = size.width_px;
     for (int j = 0; j < rows; ++j) {
-        for (int i = 0; i < columns; ++i) {
-            const std::size_t start = static_cast<std::size_t>(8 * j) * size.width_px + 8 * i;
-            const std::size_t block = static_cast<std::size_t>(j) * columns + i;
-            costs_of_block(frame + start, reference + start, size.width_px, satd + block,
-                           ssd + block);
-        }
+        const std::size_t start = 8 * j * stride, block = static_cast<std::size_t>(j) * columns;
+        costs_of_row(frame + start, reference + start, columns, stride, satd + block, ssd + block);
     }
 }
 
