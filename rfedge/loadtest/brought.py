@@ -10,9 +10,10 @@ from typing import Any
 
 import psutil
 
+from rfedge.loadtest.limit import Resources
 from rfedge.loadtest.plan import Load, Vehicles
 from rfedge.loadtest.usage import Usage
-from rfedge.loadtest.verdict import Measured, Resources, VehicleCount
+from rfedge.loadtest.verdict import Measured, VehicleCount
 
 __all__ = ["Brought", "VehicleReport", "links_busy", "measured"]
 

@@ -51,7 +51,7 @@ class Command:
 def _outcome(run: Run) -> str:
     verdict = run.verdict
     found = "held" if verdict.held else "not held: " + "; ".join(verdict.broken)
-    return f"{found}; at its limit: {verdict.limited_by}"
+    return f"{found}; limit: {verdict.limited_by}"
 
 
 def _print(console: Console, result: LoadResult, out: Path) -> None:

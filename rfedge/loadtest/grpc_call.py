@@ -1,8 +1,8 @@
 """One gRPC call over an HTTP/2 connection of its own, as bytes: what a canned vehicle needs.
 
 Sans-IO: ``receive`` takes what the socket brought and returns whole messages, ``data_to_send`` has
-what the socket is to be given. A vehicle on grpc.aio takes 0.35 ms of CPU for a frame and its
-answer, this one a third of it; vehicles of a load test share the machine with the server they
+what the socket is to be given. 100 vehicles at 30 Hz took 0.36 ms of CPU for a frame and its answer
+on grpc.aio and take 0.24 ms here; vehicles of a load test share the machine with the server they
 test. The server at the other end is gRPC's, unchanged. RFC 9113 and gRPC's PROTOCOL-HTTP2; no TLS,
 no compression, one call.
 """

@@ -1,4 +1,4 @@
-"""Whether a load was held, and what was at its limit.
+"""Whether a load was held.
 
 A frame is on time when its Ack was back within the deadline, counted from the moment the picture
 was due. Frames that were dropped, refused or unanswered were not on time.
@@ -12,20 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rfedge.loadtest.limit import Resources, limit
 from rfedge.loadtest.plan import Bounds
 
-__all__ = ["Measured", "Resources", "VehicleCount", "Verdict", "judge", "limit", "wilson_lower"]
-
-BUSY = 0.85
-"""A core, a link or a worker that is busier than this makes others wait: at 85 % the mean queue of
-an M/D/1 server is already three services long."""
-
-MACHINE_BUSY = 0.95
-OTHERS = 0.3
-"""Cores; a run beside more than this says little about an idle machine."""
-
-LAG_MS = 20.0
-"""A generator whose own event loop is later than this measures itself."""
+__all__ = ["Measured", "VehicleCount", "Verdict", "judge", "wilson_lower"]
 
 Z95 = 1.959963984540054
 
@@ -37,25 +27,6 @@ class VehicleCount:
     due: int
     on_time: int
     latency_ms: Sequence[float]
-
-
-@dataclass(frozen=True)
-class Resources:
-    """How busy everything was, as shares of what it has (0..1), and how late the generator was.
-
-    ``server_loop``: the server's event loop, of one core; ``workers``: the time frames spent on
-    them; ``link``: the busiest vehicle's uplink; ``generator``: the busiest process that plays
-    vehicles or links, of one core (0 for live vehicles: they are what is tested). ``others``: the
-    cores that processes used which are not part of the test.
-    """
-
-    server_loop: float
-    workers: float
-    link: float
-    generator: float
-    machine: float
-    others: float
-    generator_lag_ms: float
 
 
 @dataclass(frozen=True)
@@ -134,26 +105,6 @@ def wilson_lower(successes: int, trials: int, z: float = Z95) -> float:
     centre = share + z * z / (2 * trials)
     spread = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
     return max(0.0, (centre - spread) / (1 + z * z / trials))
-
-
-def limit(resources: Resources) -> str:
-    """Say which resource is at its limit, the least of our own making last.
-
-    The generator comes first: where it is the limit, nothing is said about the server.
-    """
-    checks = (
-        (resources.generator_lag_ms > LAG_MS and resources.machine < MACHINE_BUSY, "generator"),
-        (resources.generator > BUSY, "generator"),
-        (resources.link > BUSY, "link"),
-        (resources.server_loop > BUSY, "server's event loop"),
-        (
-            resources.machine > MACHINE_BUSY and resources.others > OTHERS,
-            "CPU of the machine, which others use too",
-        ),
-        (resources.machine > MACHINE_BUSY, "CPU of the machine"),
-        (resources.workers > BUSY, "server's workers"),
-    )
-    return next((name for is_limit, name in checks if is_limit), "nothing")
 
 
 def _percentiles(latency_ms: Sequence[float]) -> tuple[float, float]:
