@@ -14,8 +14,12 @@ __all__ = ["Rain"]
 
 FALL_MPS = 9.0
 """Terminal velocity of drops of 5 mm (Gunn and Kinzer 1949)."""
-DROP_WIDTH_M = 0.004
-NEAR_M, FAR_M = 2.0, 25.0
+DROP_WIDTH_M = 0.0025
+NEAR_M, FAR_M = 1.5, 25.0
+OPACITY = 0.5
+"""Of a streak as wide as a pixel: a drop passes each place in a part of the shutter's time, and is
+brighter than its surroundings, since it gathers the sky.
+"""
 
 
 @dataclass(frozen=True)
@@ -28,12 +32,16 @@ class Rain:
     brightness: Annotated[float, Range(0, 2)] = 0.6
 
     def apply(self, frame: LinearFrame, rng: np.random.Generator) -> LinearFrame:
-        """Draw the drops over the frame; farther ones first does not matter, they add up."""
+        """Draw the drops over the frame; farther ones first does not matter, they add up.
+
+        As many are at each distance as there is room in the picture: by its square.
+        """
         height, width = frame.depth_m.shape
         cover = np.zeros((height, width), np.float32)
         focal_px = frame.camera.intrinsics.fy_px
         x, y = rng.uniform(0, width, self.drops), rng.uniform(0, height, self.drops)
-        for u, v, z in zip(x, y, rng.uniform(NEAR_M, FAR_M, self.drops), strict=True):
+        far_m = np.cbrt(rng.uniform(NEAR_M**3, FAR_M**3, self.drops))
+        for u, v, z in zip(x, y, far_m, strict=True):
             self._draw(cover, frame.depth_m, (u, v, z), focal_px)
         share = np.minimum(cover, 0.6)[..., None]
         colour = frame.colour * (1 - share) + np.float32(self.brightness) * share
@@ -42,13 +50,16 @@ class Rain:
     def _draw(
         self, cover: F32, depth_m: F32, drop: tuple[float, float, float], focal_px: float
     ) -> None:
+        """Add a streak, each row of it shared by two columns, fading at both ends."""
         u, v, z = drop
         length_px = max(FALL_MPS * self.shutter_s * focal_px / z, 1.0)
-        slant = self.wind_mps / FALL_MPS
         rows = np.arange(int(v), min(int(v + length_px) + 1, cover.shape[0]))
-        columns = (u + slant * (rows - v)).astype(int)
-        inside = (columns >= 0) & (columns < cover.shape[1])
-        rows, columns = rows[inside], columns[inside]
-        seen = depth_m[rows, columns] > z
-        opacity = min(DROP_WIDTH_M * focal_px / z, 1.0) * min(10.0 / length_px, 1.0)
-        np.add.at(cover, (rows[seen], columns[seen]), np.float32(opacity))
+        ends = np.sin(np.pi * (rows - int(v) + 0.5) / (int(length_px) + 1))
+        opacity = OPACITY * min(DROP_WIDTH_M * focal_px / z, 1.0) * np.clip(ends, 0, 1)
+        place = u + self.wind_mps / FALL_MPS * (rows - v) - 0.5
+        left = np.floor(place).astype(int)
+        for columns, share in ((left, 1 - (place - left)), (left + 1, place - left)):
+            inside = (columns >= 0) & (columns < cover.shape[1])
+            at = rows[inside], columns[inside]
+            drawn = np.where(depth_m[at] > z, opacity[inside] * share[inside], 0.0)
+            np.add.at(cover, at, drawn.astype(np.float32))

@@ -116,16 +116,15 @@ def _frames(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two directions across a path at each of its points; they turn smoothly where it does."""
     along = np.gradient(points, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
-    pairs = [_frame(direction) for direction in along]
-    return np.array([pair[0] for pair in pairs]), np.array([pair[1] for pair in pairs])
+    return _frame(along)
 
 
 def _frame(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two directions that make a right-handed system with the third, ``direction``."""
-    upright = abs(direction[2]) > 0.9
-    seen = np.array([1.0, 0.0, 0.0]) if upright else np.array([0.0, 0.0, 1.0])
+    """Two directions [..., 3] that make right-handed systems with the third, ``direction``."""
+    upright = np.abs(direction[..., 2:]) > 0.9
+    seen = np.where(upright, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     across = np.cross(seen, direction)
-    across /= np.linalg.norm(across)
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
     return across, np.cross(direction, across)
 
 

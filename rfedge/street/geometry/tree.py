@@ -130,7 +130,7 @@ def _leaves(kind: Kind, twigs: list[tuple[F64, F64]], rng: np.random.Generator) 
     count = kind.leaves
     twig = ends[rng.integers(0, len(ends), count)]
     along = rng.uniform(0.1, 1.1, (count, 1))
-    spread = rng.normal(0, 0.2, (count, 3))
+    spread = np.clip(rng.normal(0, 0.2, (count, 3)), -0.35, 0.35)
     centre = twig[:, 0] + (twig[:, 1] - twig[:, 0]) * along + spread
     outwards = centre - ends.mean(axis=(0, 1))
     tip = _unit(rng.normal(0, 1, (count, 3)) + 0.8 * _unit(outwards) - np.array([0, 0, 0.35]))
