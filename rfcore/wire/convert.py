@@ -210,20 +210,21 @@ def _pose_from_wire(frame: pb.Frame) -> Pose:
 
 def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
     check_range("frame.sequence", frame.sequence, 0, 2**63 - 1)
-    return DeltaPacket(
-        epoch=frame.epoch,
-        sequence=frame.sequence,
-        reference_digest=check_bytes("frame.reference_digest", frame.reference_digest, 16, 16),
-        reference_coarse=check_absent_or("frame.reference_coarse", frame.reference_coarse, 64),
-        reconstruction_digest=check_bytes(
-            "frame.reconstruction_digest", frame.reconstruction_digest, 16, 16
-        ),
-        payload=check_bytes("frame.payload", frame.payload, 0, MAX_PAYLOAD_BYTES),
-        crc32=frame.crc32,
-        references=_references_from_wire(tuple(frame.references)),
-        needed_digest=frame.needed_digest,
-        photometric=tuple(frame.photometric),
-    )
+    try:
+        return DeltaPacket(  # checks lengths and unsigned numbers itself
+            epoch=frame.epoch,
+            sequence=frame.sequence,
+            reference_digest=frame.reference_digest,
+            reference_coarse=frame.reference_coarse,
+            reconstruction_digest=frame.reconstruction_digest,
+            payload=check_bytes("frame.payload", frame.payload, 0, MAX_PAYLOAD_BYTES),
+            crc32=frame.crc32,
+            references=_references_from_wire(tuple(frame.references)),
+            needed_digest=frame.needed_digest,
+            photometric=tuple(frame.photometric),
+        )
+    except InvalidInput as error:
+        raise InvalidInput(error.field.replace("packet.", "frame.", 1), error.problem) from error
 
 
 @lru_cache(maxsize=64)
