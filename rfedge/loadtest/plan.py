@@ -16,8 +16,8 @@ class Mode(StrEnum):
     """How much of its work the server does for each frame.
 
     ``transport``: everything but the numerical work; frames are parsed, checked (order, CRC),
-    queued to a worker, acknowledged, counted. ``receiver``: all of it, with renders that were kept
-    from the first time a pose was seen. ``full``: ``mec-server`` as it is.
+    queued to a worker (there is one), acknowledged, counted. ``receiver``: all of it, with renders
+    that were kept from the first time a pose was seen. ``full``: ``mec-server`` as it is.
     """
 
     TRANSPORT = "transport"
