@@ -13,6 +13,7 @@ from rfedge.cli.scene_plan import ScenePlan
 from rfedge.cli.scene_poses import ScenePoses
 from rfedge.cli.scene_record_carla import SceneRecordCarla
 from rfedge.cli.scene_sheet import SceneSheet
+from rfedge.cli.scene_sizes import SceneSizes
 
 __all__ = ["Scene"]
 
@@ -27,6 +28,7 @@ class Scene:
         | Annotated[ScenePoses, subcommand("poses")]
         | Annotated[ScenePlan, subcommand("plan")]
         | Annotated[SceneSheet, subcommand("sheet")]
+        | Annotated[SceneSizes, subcommand("sizes")]
         | Annotated[SceneRecordCarla, subcommand("record-carla")]
     )
 
