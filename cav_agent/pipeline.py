@@ -57,7 +57,7 @@ class Pipeline:
 
     A slice above ``limit_bytes`` is coded again at a higher CRF, as long as there is one. ``rungs``
     says how each frame is coded; without it all are at the configured preset, with all there is.
-    ``steering`` applies to every frame.
+    ``steering`` applies to every frame. ``threads`` are the encoder's; the renderer has its own.
     """
 
     def __init__(
@@ -68,13 +68,14 @@ class Pipeline:
         limit_bytes: int = MAX_PAYLOAD_BYTES,
         rungs: Rungs | None = None,
         steering: Steering = NO_STEERING,
+        threads: int = 1,
     ) -> None:
         self._renderer = renderer
         self._config = config
         self._clock_ns = clock_ns
         self._limit_bytes = limit_bytes
         self._rungs = rungs or FixedRung(Rung(preset=config.preset))
-        self._encoder = DeltaEncoder(config, clock_ns)
+        self._encoder = DeltaEncoder(config, clock_ns, threads)
         self._state: EncoderState | None = None
         self._rate = RateModel()
         self._steering = steering
@@ -141,6 +142,7 @@ class Pipeline:
             coarse=not job.exact,
             limit_bytes=limit_bytes,
             preset=rung.preset,
+            rough=rung.rough,
             qp_map=self._steering.qp_map,
             target=None if budget is None else RateTarget(budget.target_bytes, self._rate),
         )

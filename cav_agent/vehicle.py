@@ -259,6 +259,7 @@ class Vehicle:
             time.perf_counter_ns,
             rungs=journey.rungs,
             steering=journey.steering,
+            threads=config.render.threads,
         )
         intrinsics = journey.pictures[0].camera.intrinsics
         rate_hz = config.rate if config.pace is PaceKind.REALTIME else 0.0

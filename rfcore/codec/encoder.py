@@ -23,7 +23,7 @@ from rfcore.codec.qp_map import QpMap, check_qp_map
 from rfcore.codec.rate import RateModel, RateTarget, bits_curve
 from rfcore.codec.reference import without_zeros
 from rfcore.codec.references import References, check_references, is_temporal
-from rfcore.codec.slices import encode_slice
+from rfcore.codec.slices import SliceCoding, encode_slice
 from rfcore.codec.splice import SpliceDecoder, grey
 from rfcore.codec.state import EncoderState, Past
 from rfcore.errors import CodecError, InvalidInput
@@ -66,6 +66,7 @@ class FrameChoice:
     preset: str | None = None
     target: RateTarget | None = None
     qp_map: QpMap | None = None
+    rough: bool = False
 
     def __post_init__(self) -> None:
         if self.preset is not None and self.preset not in PRESETS:
@@ -104,11 +105,20 @@ class Encoded:
 
 
 class DeltaEncoder:
-    """The sender. Raises ``CodecError`` if x264 does not make the stream the config promises."""
+    """The sender. Raises ``CodecError`` if x264 does not make the stream the config promises.
 
-    def __init__(self, config: CodecConfig, clock_ns: Clock = _stopped_clock) -> None:
+    ``threads`` are for making references and coding. References are the same with any number;
+    slices may differ by a few bytes between one and more.
+    """
+
+    def __init__(
+        self, config: CodecConfig, clock_ns: Clock = _stopped_clock, threads: int = 1
+    ) -> None:
+        if threads < 1:
+            raise InvalidInput("threads", f"{threads} must be at least 1")
         self._config = config
         self._clock_ns = clock_ns
+        self._threads = threads
         self._header = encode_slice(config, [grey(config)], grey(config)).header
         try:
             self._splice = SpliceDecoder(self._header)
@@ -147,7 +157,7 @@ class DeltaEncoder:
         photometric = choice.photometric
         if photometric is None:
             photometric = choose_photometric(frame, render, crf)
-        prediction = Prediction(adapt(render, photometric), seen, state.past)
+        prediction = Prediction(adapt(render, photometric), seen, state.past, self._threads)
         references = choice.references
         if references is None:
             references = choose_references(frame, prediction, crf, choice.most)
@@ -216,7 +226,8 @@ class DeltaEncoder:
         self, pictures: tuple[I420, ...], frame: I420, choice: FrameChoice, crf: float
     ) -> bytes:
         config = replace(self._config, preset=choice.preset or self._config.preset)
-        coded = encode_slice(config, pictures, frame, crf, choice.qp_map)
+        coding = SliceCoding(crf, choice.qp_map, choice.rough, self._threads)
+        coded = encode_slice(config, pictures, frame, coding)
         if (coded.header.sps, coded.header.pps) != (self._header.sps, self._header.pps):
             raise CodecError("x264 changed its parameter sets within a stream")
         return coded.payload

@@ -1,7 +1,7 @@
 """libx264 and FFmpeg's H.264 decoder behind two small doors; the only codec module that knows av.
 
-Everything that changes x264's output is said here or comes in as options; one thread, so that one
-picture is one slice and equal input gives equal bytes.
+Everything that changes x264's output is said here or comes in as options. Threads work on pictures,
+never on parts of one: one picture is one slice.
 """
 
 from __future__ import annotations
@@ -37,6 +37,9 @@ SIGNAL = MappingProxyType(
 """What every stream says about its colours: ``rfcore.native.yuv`` in the words of annex E."""
 
 
+WHOLE_PICTURES = MappingProxyType({"sliced-threads": "0"})
+"""Zerolatency would divide pictures among threads, and make slices of them."""
+
 QP_RANGE = 51
 
 
@@ -50,7 +53,10 @@ class PictureKind(Enum):
 
 @dataclass(frozen=True)
 class EncoderOptions:
-    """One x264 encoder. ``params`` are x264's own option names; nothing here checks them."""
+    """One x264 encoder. ``params`` are x264's own option names; nothing here checks them.
+
+    With more than one of ``threads`` a picture is begun while the one before it is still coded.
+    """
 
     size_px: tuple[int, int]
     preset: str
@@ -58,6 +64,7 @@ class EncoderOptions:
     params: Mapping[str, str] = field(default_factory=dict)
     tune: str | None = "zerolatency"
     rate_hz: int = 25
+    threads: int = 1
 
 
 def encode_pictures(
@@ -178,8 +185,8 @@ def _open_encoder(options: EncoderOptions) -> av.VideoCodecContext:
     encoder.pix_fmt = "yuv420p"
     encoder.time_base = Fraction(1, options.rate_hz)
     encoder.framerate = Fraction(options.rate_hz)
-    encoder.thread_count = 1
-    params = {**SIGNAL, **options.params}
+    encoder.thread_count = options.threads
+    params = {**SIGNAL, **options.params, **({} if options.threads == 1 else WHOLE_PICTURES)}
     encoder.options = {
         "preset": options.preset,
         "crf": repr(float(options.crf)),

@@ -28,13 +28,15 @@ class Rung:
 
     ``quality``: how the field is rendered, on both ends. ``references``: at most so many pictures
     are predicted from; 0: the render alone, as the paper has it. ``photometric``: whether a change
-    of light is looked for. ``preset``: x264's.
+    of light is looked for. ``preset``: x264's. ``rough``: x264 predicts from cheaper copies of the
+    references (``FrameChoice``).
     """
 
     quality: Quality = FULL
     references: int = REFERENCE_FRAMES
     photometric: bool = True
     preset: str = "medium"
+    rough: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.references <= REFERENCE_FRAMES:
@@ -58,6 +60,8 @@ class Rung:
         parts.append(f"{self.references}ref" if self.references else "render-only")
         if not self.photometric:
             parts.append("no-light")
+        if self.rough:
+            parts.append("rough")
         return " ".join([*parts, self.preset])
 
 
@@ -120,5 +124,6 @@ def read_ladder(path: Path, kind: str, crf: float) -> tuple[MeasuredRung, ...]:
 def _measured(row: Mapping[str, Any]) -> MeasuredRung:
     knobs = row["settings"]
     quality = Quality(knobs["detail"], knobs["sh_degree"], knobs["samples_per_ray"], knobs["scale"])
-    rung = Rung(quality, knobs["references"], knobs["photometric"], knobs["preset"])
+    rough = knobs.get("rough", False)  # ladders measured before there was a choice have none
+    rung = Rung(quality, knobs["references"], knobs["photometric"], knobs["preset"], rough)
     return MeasuredRung(rung, row["sender_ms"], row["receiver_ms"], row["rate_percent"])

@@ -24,11 +24,13 @@ class Prediction:
     """What both ends hold of a frame before a bit of it is sent.
 
     ``seen`` is the field's depth at the frame's pose, ``past`` the earlier frame to predict from.
+    ``threads`` changes no picture.
     """
 
     render: I420
     seen: PosedDepth | None = None
     past: Past | None = None
+    threads: int = 1
 
     @property
     def available(self) -> frozenset[Reference]:
@@ -51,12 +53,12 @@ class Prediction:
     def warp(self) -> I420:
         """The earlier frame at the present pose, holes filled from the render."""
         before, seen = self._carried()
-        return warp_i420(before.picture, before.at, seen, self.render)
+        return warp_i420(before.picture, before.at, seen, self.render, self.threads)
 
     @cached_property
     def correction(self) -> I420:
         """The render, with most of what the earlier frame differed by from its own."""
-        return correct_i420(*self._carried(), self.render)
+        return correct_i420(*self._carried(), self.render, self.threads)
 
     def _carried(self) -> tuple[Seen, PosedDepth]:
         before, seen = self._before, self.seen

@@ -5,7 +5,10 @@
 #include <cstdlib>
 #include <cstring>
 #include <memory>
+#include <numeric>
 #include <vector>
+
+#include "raster/thread_pool.h"
 
 #if defined(__SSE2__)
 #include <emmintrin.h>
@@ -245,19 +248,34 @@ void centre_row(const std::int32_t* top_u, const std::int32_t* bottom_u, const s
     }
 }
 
-class Warp {
-public:
-    Warp(const WarpInputs& in, const WarpGeometry& geometry, PictureSize size, I420Planes out)
-        : in_(in), geometry_(geometry), size_(size), out_(out), half_width_((size.width_px + 1) / 2),
-          y_(in.previous.y, in.previous_render.y, size.width_px, size.height_px),
-          u_(in.previous.u, in.previous_render.u, half_width_, (size.height_px + 1) / 2),
-          v_(in.previous.v, in.previous_render.v, half_width_, (size.height_px + 1) / 2),
-          rows_{Row(size.width_px), Row(size.width_px)}, middle_(half_width_),
-          reach_(size.width_px), sums_(size.width_px + 3), totals_(size.width_px + 3) {}
+// What all rows of one warp share.
+struct Job {
+    Job(const WarpInputs& in, const WarpGeometry& geometry, PictureSize size, I420Planes out)
+        : in(in), geometry(geometry), size(size), out(out), half_width((size.width_px + 1) / 2),
+          y(in.previous.y, in.previous_render.y, size.width_px, size.height_px),
+          u(in.previous.u, in.previous_render.u, half_width, (size.height_px + 1) / 2),
+          v(in.previous.v, in.previous_render.v, half_width, (size.height_px + 1) / 2) {}
 
-    std::int64_t run() {
+    const WarpInputs& in;
+    const WarpGeometry& geometry;
+    PictureSize size;
+    I420Planes out;
+    int half_width;
+    Plane y, u, v;
+};
+
+// Carries neighbouring rows, two of luma and one of chroma at a time.
+class Band {
+public:
+    explicit Band(const Job& job)
+        : job_(job), size_(job.size), rows_{Row(size_.width_px), Row(size_.width_px)},
+          middle_(job.half_width), reach_(size_.width_px), sums_(size_.width_px + 3),
+          totals_(size_.width_px + 3) {}
+
+    // Rows of chroma; those of luma are twice as many. Returns how many luma samples were known.
+    std::int64_t run(int begin, int end) {
         std::int64_t taken = 0;
-        for (int y = 0; y < size_.height_px; y += 2) {
+        for (int y = 2 * begin; y < std::min(2 * end, size_.height_px); y += 2) {
             const int count = std::min(2, size_.height_px - y);
             for (int r = 0; r < count; ++r) taken += luma(y + r, rows_[r]);
             chroma(y / 2, rows_[0], rows_[count - 1]);
@@ -267,12 +285,12 @@ public:
 
 private:
     std::int64_t luma(int y, Row& row) {
+        const WarpInputs& in = job_.in;
         const std::size_t start = static_cast<std::size_t>(y) * size_.width_px;
-        locate_row(in_.depth + start, geometry_, size_, y, row.u.data(), row.v.data(),
-                   row.z.data());
-        drop_hidden(in_.previous_depth, size_.width_px, row.u.data(), row.v.data(), row.z.data());
-        reach(y_, row, size_.width_px);
-        interpolate(y_, row, size_.width_px, in_.render.y + start, out_.y + start);
+        locate_row(in.depth + start, job_.geometry, size_, y, row.u.data(), row.v.data(), row.z.data());
+        drop_hidden(in.previous_depth, size_.width_px, row.u.data(), row.v.data(), row.z.data());
+        reach(job_.y, row, size_.width_px);
+        interpolate(job_.y, row, size_.width_px, in.render.y + start, job_.out.y + start);
         return size_.width_px - std::count(row.u.begin(), row.u.end(), kNowhere);
     }
 
@@ -280,11 +298,21 @@ private:
         const int pairs = size_.width_px / 2, tall = &top == &bottom ? 0 : 2 * kSteps;
         centre_row(top.u.data(), bottom.u.data(), top.v.data(), bottom.v.data(), pairs, tall,
                    middle_.u.data(), middle_.v.data());
-        if (pairs < half_width_) centre_last(top, bottom, tall);
-        const std::size_t start = static_cast<std::size_t>(line) * half_width_;
-        reach(u_, middle_, half_width_);
-        interpolate(u_, middle_, half_width_, in_.render.u + start, out_.u + start);
-        interpolate(v_, middle_, half_width_, in_.render.v + start, out_.v + start);
+        const int count = job_.half_width;
+        if (pairs < count) centre_last(top, bottom, tall);
+        const std::size_t start = static_cast<std::size_t>(line) * count;
+        const ConstI420Planes& render = job_.in.render;
+        reach(job_.u, middle_, count);
+        interpolate(job_.u, middle_, count, render.u + start, job_.out.u + start);
+        interpolate(job_.v, middle_, count, render.v + start, job_.out.v + start);
+    }
+
+    // The last of an odd number of columns stands for two.
+    void centre_last(const Row& top, const Row& bottom, int tall) {
+        const int x = size_.width_px - 1, c = job_.half_width - 1;
+        const bool known = top.u[x] != kNowhere && bottom.u[x] != kNowhere;
+        middle_.u[c] = known ? centre(2 * (top.u[x] + bottom.u[x]), 0) : kNowhere;
+        middle_.v[c] = centre(2 * (top.v[x] + bottom.v[x]), tall);
     }
 
     void reach(const Plane& plane, const Row& at, int count) {
@@ -296,23 +324,11 @@ private:
                      std::uint8_t* out) {
         filter_row(plane.samples(), plane.pitch(), reach_, count, sums_.data());
         total_row(sums_.data(), count, totals_.data());
-        round_row(totals_.data(), at.u.data(), count, plane.is_difference(), in_.doubt, render, out);
+        round_row(totals_.data(), at.u.data(), count, plane.is_difference(), job_.in.doubt, render, out);
     }
 
-    // The last of an odd number of columns stands for two.
-    void centre_last(const Row& top, const Row& bottom, int tall) {
-        const int x = size_.width_px - 1, c = half_width_ - 1;
-        const bool known = top.u[x] != kNowhere && bottom.u[x] != kNowhere;
-        middle_.u[c] = known ? centre(2 * (top.u[x] + bottom.u[x]), 0) : kNowhere;
-        middle_.v[c] = centre(2 * (top.v[x] + bottom.v[x]), tall);
-    }
-
-    const WarpInputs& in_;
-    const WarpGeometry& geometry_;
+    const Job& job_;
     PictureSize size_;
-    I420Planes out_;
-    int half_width_;
-    Plane y_, u_, v_;
     Row rows_[2];
     Row middle_;
     Reach reach_;
@@ -374,8 +390,14 @@ void costs_of_row(const std::uint8_t* frame, const std::uint8_t* reference, int 
 }  // namespace
 
 std::int64_t warp_i420(const WarpInputs& in, const WarpGeometry& geometry, PictureSize size,
-                       I420Planes out) {
-    return Warp(in, geometry, size, out).run();
+                       I420Planes out, int threads) {
+    const Job job(in, geometry, size, out);
+    const int rows = (size.height_px + 1) / 2;
+    std::vector<std::int64_t> taken(threads);
+    ThreadPool(threads).run(threads, [&](int i) {
+        taken[i] = Band(job).run(share_begin(rows, i, threads), share_begin(rows, i + 1, threads));
+    });
+    return std::accumulate(taken.begin(), taken.end(), std::int64_t{0});
 }
 
 void block_costs(const std::uint8_t* frame, const std::uint8_t* reference, PictureSize size,

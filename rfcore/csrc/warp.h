@@ -29,9 +29,10 @@ struct WarpInputs {
     std::int32_t doubt;
 };
 
-// Returns how many luma samples came from the previous picture; the others are the render's.
+// Returns how many luma samples came from the previous picture; the others are the render's. The
+// number of threads (1 or more) changes nothing else.
 std::int64_t warp_i420(const WarpInputs& in, const WarpGeometry& geometry, PictureSize size,
-                       I420Planes out);
+                       I420Planes out, int threads = 1);
 
 // For every whole 8x8 block: the sums of absolute Hadamard coefficients (DC included, divided by
 // 8) and of squared differences between frame and reference.

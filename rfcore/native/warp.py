@@ -108,23 +108,31 @@ class Seen:
     render: I420
 
 
-def warp_i420(previous: I420, seen_before: PosedDepth, seen: PosedDepth, render: I420) -> I420:
+def warp_i420(
+    previous: I420, seen_before: PosedDepth, seen: PosedDepth, render: I420, threads: int = 1
+) -> I420:
     """Return ``previous`` as it would look from ``seen.camera``, holes filled from ``render``.
 
-    Raises ``InvalidInput`` for pictures of another size or cameras of different intrinsics.
+    Raises ``InvalidInput`` for pictures of another size, cameras of different intrinsics, or no
+    threads.
     """
-    return _carried(Seen(previous, seen_before, render), None, seen, render)
+    return _carried(Seen(previous, seen_before, render), None, seen, render, threads)
 
 
-def correct_i420(before: Seen, seen: PosedDepth, render: I420) -> I420:
+def correct_i420(before: Seen, seen: PosedDepth, render: I420, threads: int = 1) -> I420:
     """Return ``render`` plus most of the carried difference of ``before`` from its own render.
 
-    Raises ``InvalidInput`` for pictures of another size or cameras of different intrinsics.
+    Raises ``InvalidInput`` for pictures of another size, cameras of different intrinsics, or no
+    threads.
     """
-    return _carried(before, before.render, seen, render)
+    return _carried(before, before.render, seen, render, threads)
 
 
-def _carried(before: Seen, minus: I420 | None, seen: PosedDepth, render: I420) -> I420:
+def _carried(
+    before: Seen, minus: I420 | None, seen: PosedDepth, render: I420, threads: int
+) -> I420:
+    if threads < 1:
+        raise InvalidInput("threads", f"{threads} must be at least 1")
     if before.at.camera.intrinsics != seen.camera.intrinsics:
         raise InvalidInput("warp", "the two cameras have different intrinsics")
     k = seen.camera.intrinsics
@@ -142,6 +150,7 @@ def _carried(before: Seen, minus: I420 | None, seen: PosedDepth, render: I420) -
         0 if minus is None else CORRECTION_DOUBT,
         warp_numbers(before.at.camera, seen.camera),
         *out.planes,
+        threads,
     )
     return out
 

@@ -1,9 +1,10 @@
 """Time the delta codec on both ends: 640x360 and 1280x720, 200k Gaussians, medium, CRF 23.
 
-The camera frame is the street's own render from the true pose plus seeded texture and boxes the
-field has never seen, so the P picture has something to code; the camera drives 20 cm a frame. Each
-size is coded against one reference (the render) and against three (previous frame, render,
-correction). On every frame the receiver's picture must equal the sender's closed loop.
+With one thread, which is what the receiver's times are for, and with two. The camera frame is the
+street's own render from the true pose plus seeded texture and boxes the field has never seen, so
+the P picture has something to code; the camera drives 20 cm a frame. Each size is coded against one
+reference (the render) and against three (previous frame, render, correction). On every frame the
+receiver's picture must equal the sender's closed loop.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ T = TypeVar("T")
 SIZES_PX = ((640, 360), (1280, 720))
 ONE: References = (Reference.RENDER,)
 THREE: References = (Reference.PREVIOUS, Reference.RENDER, Reference.CORRECTION)
+THREADS = (1, 2)
 STEP_M = 0.2
 REPETITIONS = 20
 WARM_UP = 3
@@ -65,20 +67,22 @@ class Ends:
         return i420_from_colour(view.colour), PosedDepth(camera, view.depth)
 
 
-def codec_rows(threads: int = 1) -> list[dict[str, Any]]:
-    """Return a row for each size and number of references: medians in ms of both ends' stages."""
+def codec_rows() -> list[dict[str, Any]]:
+    """Return a row for each number of threads, size and number of references: medians in ms of both
+    ends' stages."""
     gaussians = street_gaussians()
-    rasterizer = Rasterizer(gaussians, threads=threads)
     return [
-        _row(_ends(rasterizer, *size), references)
+        {"threads": threads, **_row(_ends(rasterizer, threads, *size), references)}
+        for threads, rasterizer in ((n, Rasterizer(gaussians, threads=n)) for n in THREADS)
         for size in SIZES_PX
         for references in (ONE, THREE)
     ]
 
 
-def _ends(rasterizer: Rasterizer, width_px: int, height_px: int) -> Ends:
+def _ends(rasterizer: Rasterizer, threads: int, width_px: int, height_px: int) -> Ends:
     camera = street_camera(width_px, height_px)
-    encoder = DeltaEncoder(CodecConfig(width_px, height_px), clock_ns=perf_counter_ns)
+    config = CodecConfig(width_px, height_px)
+    encoder = DeltaEncoder(config, clock_ns=perf_counter_ns, threads=threads)
     decoder = DeltaDecoder(encoder.header, clock_ns=perf_counter_ns)
     return Ends(rasterizer, camera, encoder, decoder)
 

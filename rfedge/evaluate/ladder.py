@@ -183,6 +183,7 @@ def _choice(rung: Rung) -> FrameChoice:
         references=None if rung.references else RENDER_ONLY,
         photometric=None if rung.photometric else (),
         most=max(1, rung.references),
+        rough=rung.rough,
     )
 
 

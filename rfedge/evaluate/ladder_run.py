@@ -98,6 +98,7 @@ class Contender:
                 "references": rung.references,
                 "photometric": rung.photometric,
                 "preset": rung.preset,
+                "rough": rung.rough,
                 "crf": crf,
             },
             **measure_rung(self.clip, self.seen(quality), rung, crf),

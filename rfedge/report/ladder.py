@@ -36,7 +36,8 @@ one that fits, and steps down and up while it drives.
 * **Front**: no other rung at this CRF takes less time without more bits at equal quality.
 * Names: share of the splats drawn (or samples along a ray), `shN` harmonics of at most that degree,
   `half-size` rendered at half the width and height, `Nref` at most N references, `render-only` the
-  paper's single one, `no-light` without looking for a change of light, x264's preset.
+  paper's single one, `no-light` without looking for a change of light, `rough` with cheaper copies
+  of the references for x264 to predict from, x264's preset.
 """
 
 STAGES = (

@@ -11,7 +11,7 @@ from rfcore.codec.config import PRESETS
 from rfcore.codec.header import check_header
 from rfcore.codec.parameter_sets import parse_pps, parse_sps
 from rfcore.codec.reference import pcm_pps
-from rfcore.codec.slices import encode_slice
+from rfcore.codec.slices import SliceCoding, encode_slice
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 
@@ -35,6 +35,29 @@ def test_every_preset_crf_and_number_of_references_writes_the_same_parameter_set
             made = coded.header
             assert (made.sps, made.pps) == (header.sps, header.pps), (preset, crf)
             assert coded.payload
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_threads_and_rough_references_change_no_parameter_set(
+    header: StreamHeader, pair: PairMaker, preset: str
+) -> None:
+    frame, render = pair(300, 168)
+    pictures = [pair(300, 168, 2.0)[0], pair(300, 168, 1.0)[1], render]
+    config = CodecConfig(300, 168, preset, 28)
+    alone, shared, again, rough = (
+        encode_slice(config, pictures, frame, coding)
+        for coding in (
+            SliceCoding(),
+            SliceCoding(threads=2),
+            SliceCoding(threads=2),
+            SliceCoding(rough=True),
+        )
+    )
+    for coded in (alone, shared, rough):
+        assert (coded.header.sps, coded.header.pps) == (header.sps, header.pps)
+    assert shared == again
+    assert len(shared.payload) == pytest.approx(len(alone.payload), rel=0.02)
+    assert rough.payload != alone.payload
 
 
 def test_a_better_preset_or_crf_changes_the_slice(pair: PairMaker) -> None:

@@ -10,6 +10,7 @@ from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder
 from rfcore.codec.bitstream import join_nals
 from rfcore.codec.h264 import H264Decoder, PictureKind, encode_pictures
 from rfcore.codec.slices import slice_options
+from rfcore.errors import InvalidInput
 from rfcore.image import I420
 
 PictureMaker = Callable[..., I420]
@@ -116,6 +117,20 @@ def test_the_same_frames_give_the_same_packets(pair: PairMaker) -> None:
         return [encoder.header, *packets]
 
     assert run() == run()
+
+
+def test_any_receiver_takes_the_packets_of_an_encoder_of_two_threads(pair: PairMaker) -> None:
+    encoder = DeltaEncoder(CodecConfig(160, 90), threads=2)
+    decoder = DeltaDecoder(encoder.header)
+    sending, receiving = encoder.start(1), decoder.start(1)
+    for index in range(3):
+        frame, render = pair(160, 90, index)
+        encoded = encoder.encode(sending, frame, render)
+        decoded = decoder.decode(receiving, encoded.packet, render)
+        sending, receiving = encoded.state, decoded.state
+        assert decoded.frame.digest() == encoded.packet.reconstruction_digest
+    with pytest.raises(InvalidInput, match="threads: 0"):
+        DeltaEncoder(CodecConfig(160, 90), threads=0)
 
 
 def test_a_packet_does_not_depend_on_the_frames_before_it(pair: PairMaker) -> None:

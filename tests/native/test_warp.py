@@ -232,10 +232,22 @@ def test_values_that_cannot_be_are_refused_by_name() -> None:
         ("warp.previous", lambda: warp_i420(noise((8, 8), 1), before, seen, render)),
         ("different intrinsics", lambda: warp_i420(previous, scene((8, 8), 1)[1], seen, render)),
         ("reference", lambda: block_costs(render.y, render.y[:8])),
+        ("threads", lambda: warp_i420(previous, before, seen, render, 0)),
     ]  # fmt: skip
     for words, call in bad:
         with pytest.raises(InvalidInput, match=words):
             call()
+
+
+@pytest.mark.parametrize("threads", [2, 3, 40])
+def test_any_number_of_threads_gives_the_same_bytes(threads: int) -> None:
+    for size_px in ((64, 48), (35, 19)):
+        previous, before, seen, render = scene(size_px, 7)
+        once = warp_i420(previous, before, seen, render)
+        assert equal(warp_i420(previous, before, seen, render, threads), once)
+        seen_before = Seen(previous, before, render)
+        again = correct_i420(seen_before, seen, render, threads)
+        assert equal(again, correct_i420(seen_before, seen, render))
 
 
 def test_block_costs_are_hadamard_sums_and_squares() -> None:

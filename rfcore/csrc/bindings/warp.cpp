@@ -72,7 +72,8 @@ void bind_warp(nb::module_& m) {
         "warp_i420",
         [](const Picture& previous, InDepth previous_depth, InDepth depth, const Picture& render,
            const std::optional<Picture>& previous_render, std::int32_t doubt, const std::vector<double>& numbers,
-           OutPlane y, OutPlane u, OutPlane v) {
+           OutPlane y, OutPlane u, OutPlane v, int threads) {
+            if (threads < 1) throw nb::value_error("threads must be at least 1");
             const PictureSize size = size_of(y);
             require_i420(size, y, u, v);
             require_picture(size, previous);
@@ -88,11 +89,11 @@ void bind_warp(nb::module_& m) {
                                 previous_render ? planes_of(*previous_render) : ConstI420Planes{},
                                 doubt};
             const nb::gil_scoped_release released;
-            return warp_i420(in, geometry, size, {y.data(), u.data(), v.data()});
+            return warp_i420(in, geometry, size, {y.data(), u.data(), v.data()}, threads);
         },
         nb::arg("previous"), nb::arg("previous_depth"), nb::arg("depth"), nb::arg("render"),
         nb::arg("previous_render").none(), nb::arg("doubt"), nb::arg("numbers"), nb::arg("y"),
-        nb::arg("u"), nb::arg("v"));
+        nb::arg("u"), nb::arg("v"), nb::arg("threads"));
     m.def(
         "block_costs",
         [](InPlane frame, InPlane reference, OutCosts satd, OutCosts ssd) {
