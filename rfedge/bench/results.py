@@ -14,7 +14,7 @@ from rfedge.provenance import host, revision
 
 __all__ = ["CASES", "print_rows", "run_case", "write_json"]
 
-CASES = ("raster", "train", "codec", "ngp")
+CASES = ("raster", "train", "codec", "ngp", "decoders")
 
 
 def run_case(case: str, *, rows: Rows = "all", field: Path | None = None) -> dict[str, Any]:
@@ -49,6 +49,10 @@ def _rows_of(case: str, rows: Rows, field: Path | None) -> list[Row]:
         from rfedge.bench.ngp import ngp_rows
 
         return ngp_rows(field)
+    if case == "decoders":
+        from rfedge.bench.decoders import decoder_rows
+
+        return decoder_rows()
     raise InvalidInput("case", f"{case!r} is not one of {', '.join(CASES)}")
 
 

@@ -15,7 +15,7 @@ __all__ = ["Bench"]
 class Bench:
     """Check a part against its definition, then time it: medians of at least 20 repetitions."""
 
-    case: Annotated[Literal["raster", "train", "codec", "ngp"], Positional]
+    case: Annotated[Literal["raster", "train", "codec", "ngp", "decoders"], Positional]
     """What to measure."""
     rows: Literal["all", "native", "modes"] = "all"
     """`native` leaves out the timing of the slow torch reference; `modes` shows what SH degree,

@@ -1,0 +1,94 @@
+"""What a decoder in a process of its own costs a frame: the sample drive, decoded side by side.
+
+Every frame (640x360, the references the encoder chose) is decoded by each kind in turn against the
+same render, so that a difference is of two pictures decoded in the same moments; the decoder itself
+refuses a picture that is not the sender's. Times are of ``DeltaDecoder.decode``, renders apart.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from time import perf_counter_ns
+from typing import Any
+
+from prometheus_client import CollectorRegistry
+
+from mec_server.config import DecoderKind
+from mec_server.decoders import Decoders
+from mec_server.metrics import ServerMetrics
+from rfcore.codec import DecoderState, DeltaDecoder
+from rfcore.field import RadianceField, load_field
+from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
+from rfcore.native.yuv import i420_from_colour
+from rfcore.wire.messages import Frame
+from rfedge.loadtest.canned import CannedDrive, canned_drive
+
+__all__ = ["decoder_rows"]
+
+FIELD = Path("samples/fields/street.rff")
+DRIVE = Path("samples/street/transforms_drive_vehicles.json")
+KINDS = (DecoderKind.IN_PROCESS, DecoderKind.CHILD, DecoderKind.BUBBLEWRAP)
+LAPS = 5
+"""How often the drive is decoded, after once to warm up."""
+
+
+def decoder_rows() -> list[dict[str, Any]]:
+    """Return a row for each place to decode: median ms, and the median difference to here."""
+    field = load_field(FIELD)
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
+        drive = CannedDrive.read(canned_drive(DRIVE, field, Path(folder)))
+        decoders = {kind: _decoder(kind, drive, opened) for kind in KINDS}
+        times_ms = _times(drive, field, decoders)
+    here_ms = times_ms[DecoderKind.IN_PROCESS]
+    return [
+        {
+            "decoder": str(kind),
+            "frames": len(ms),
+            "median_ms": statistics.median(ms),
+            "more_ms": statistics.median(a - b for a, b in zip(ms, here_ms, strict=True)),
+        }
+        for kind, ms in times_ms.items()
+    ]
+
+
+def _decoder(kind: DecoderKind, drive: CannedDrive, opened: ExitStack) -> DeltaDecoder:
+    decoders = Decoders(kind, True, ServerMetrics(CollectorRegistry()))
+    decoders.start()
+    opened.callback(decoders.close)
+    header = drive.hello.cameras[0].codec
+    decoder = DeltaDecoder(header, True, perf_counter_ns, decoders.open)
+    opened.callback(decoder.close)
+    return decoder
+
+
+def _times(
+    drive: CannedDrive, field: RadianceField, decoders: dict[DecoderKind, DeltaDecoder]
+) -> dict[DecoderKind, list[float]]:
+    renders = [_rendered(field, frame, drive) for frame in drive.chain]
+    times_ms: dict[DecoderKind, list[float]] = {kind: [] for kind in decoders}
+    for lap in range(1 + LAPS):
+        states = {kind: decoder.start(0) for kind, decoder in decoders.items()}
+        for frame, (render, seen) in zip(drive.chain, renders, strict=True):
+            for kind, decoder in decoders.items():
+                ms, states[kind] = _timed(decoder, states[kind], frame, render, seen)
+                if lap:
+                    times_ms[kind].append(ms)
+    return times_ms
+
+
+def _rendered(field: RadianceField, frame: Frame, drive: CannedDrive) -> tuple[I420, PosedDepth]:
+    camera = frame.camera(drive.intrinsics)
+    view = field.render(camera, frame.quality)
+    return i420_from_colour(view.colour), PosedDepth(camera, view.depth)
+
+
+def _timed(
+    decoder: DeltaDecoder, state: DecoderState, frame: Frame, render: I420, seen: PosedDepth
+) -> tuple[float, DecoderState]:
+    started_ns = perf_counter_ns()
+    decoded = decoder.decode(state, frame.packet, render, seen)
+    return (perf_counter_ns() - started_ns) / 1e6, decoded.state
