@@ -1,7 +1,7 @@
 """Mutual TLS: three PEM files a process, checked once, and the gRPC credentials made of them.
 
-Both ends prove who they are to the same certificate authority. Files are read at the start; a new
-certificate needs a new start.
+Both ends prove who they are to the same certificate authority. A server looks at its files at every
+handshake and takes up new ones; streams that are open go on. A client reads its own at the start.
 """
 
 from __future__ import annotations
@@ -11,10 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import grpc
+import structlog
 
 from rfcore.errors import InvalidInput
 
 __all__ = ["TlsFiles"]
+
+log = structlog.get_logger()
 
 
 @dataclass(frozen=True)
@@ -73,11 +76,26 @@ class TlsFiles:
         )
 
     def server_credentials(self) -> grpc.ServerCredentials:
-        """Return what a server shows; a client without a certificate is not let in."""
-        return grpc.ssl_server_credentials(
+        """Return what a server shows; a client without a certificate is not let in.
+
+        Files that were replaced count from the next handshake on. As long as they cannot be read,
+        or the key is not the certificate's (one is there and the other to come), the old ones do.
+        """
+        return grpc.dynamic_ssl_server_credentials(
+            self.shown_by_server(),
+            Renewal(self).newer,  # type: ignore[arg-type] # stubs leave out None, "no change"
+            require_client_authentication=True,
+        )
+
+    def changed_ns(self) -> tuple[int, ...]:
+        """Return when each file was changed last; raise ``OSError`` if one is not there."""
+        return tuple(path.stat().st_mtime_ns for _, path in self._options())
+
+    def shown_by_server(self) -> grpc.ServerCertificateConfiguration:
+        """Return what the files hold now, for gRPC."""
+        return grpc.ssl_server_certificate_configuration(
             [(self.key.read_bytes(), self.certificate.read_bytes())],
             root_certificates=self.authority.read_bytes(),
-            require_client_auth=True,
         )
 
     def _options(self) -> tuple[tuple[str, Path], ...]:
@@ -86,3 +104,27 @@ class TlsFiles:
             ("tls_key", self.key),
             ("tls_ca", self.authority),
         )
+
+
+class Renewal:
+    """Looks whether a server's files were replaced; gRPC asks at every handshake."""
+
+    def __init__(self, files: TlsFiles) -> None:
+        self._files = files
+        self._taken_ns = files.changed_ns()
+
+    def newer(self) -> grpc.ServerCertificateConfiguration | None:
+        """Return what the files hold if they were replaced by good ones, else None."""
+        files = self._files
+        try:
+            changed_ns = files.changed_ns()
+            if changed_ns == self._taken_ns:
+                return None
+            files.client_context()
+            shown = files.shown_by_server()
+        except (OSError, InvalidInput) as error:
+            log.warning("certificate not taken up, the old one is shown", problem=str(error))
+            return None
+        self._taken_ns = changed_ns
+        log.info("certificate taken up", file=str(files.certificate))
+        return shown

@@ -1,5 +1,6 @@
 """Mutual TLS between the real services: who is let in as whom, and what the others are told."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -196,6 +197,37 @@ async def test_no_service_answers_without_a_certificate(
             else:
                 call = channel.stream_stream(STREAM_METHOD)()
             assert await call.code() is grpc.StatusCode.UNAVAILABLE
+
+
+async def test_a_server_takes_up_new_certificates_and_open_connections_go_on(
+    certs: Files, serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    shutil.copytree(tmp_path / "certs", tmp_path / "before")
+    before = TlsFiles(
+        *(tmp_path / "before" / n for n in ("vehicle-cav-1.pem", "vehicle-cav-1.key", "ca.pem"))
+    )
+    health = health_pb2.HealthCheckRequest()
+    async with serve(tls=certs("server")) as server, channel_to(server.address, before) as channel:
+        await health_pb2_grpc.HealthStub(channel).Check(health)
+        issued = certify(Members(("cav-1",)), datetime.now(UTC), days=30)
+        write_certificates(tmp_path / "certs", issued, replace=True)
+        assert (await travel(server.address, tls=certs("vehicle-cav-1"))).counts == {"acked": 6}
+        with pytest.raises(RfedgeError):
+            await travel(server.address, tls=before, limits=SOON_S)
+        answer = await health_pb2_grpc.HealthStub(channel).Check(health)
+        assert answer.status == health_pb2.HealthCheckResponse.SERVING
+
+
+async def test_half_of_a_new_certificate_is_not_taken_up(
+    certs: Files, serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    async with serve(tls=certs("server")) as server:
+        other = certify(Members(("cav-1",)), datetime.now(UTC), days=30)
+        (tmp_path / "certs" / "server.pem").write_bytes(
+            next(one.certificate for one in other if one.name == "server")
+        )
+        trip = await travel(server.address, tls=certs("vehicle-cav-1"))
+    assert trip.counts == {"acked": 6}
 
 
 async def test_a_consumer_asks_for_health_and_sees_the_drive(
