@@ -26,7 +26,6 @@ from rfcore.codec.splice import PictureDecoder, SpliceDecoder
 from rfcore.codec.state import DecoderState, Past
 from rfcore.errors import BitstreamError, CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
-from rfcore.native.digest import picture_digest
 from rfcore.native.warp import PosedDepth
 
 __all__ = ["Decoded", "DeltaDecoder"]
@@ -133,7 +132,7 @@ class DeltaDecoder:
 
     def _check_render(self, packet: DeltaPacket, render: I420) -> bool:
         """Tell whether the renders are identical; raise if they may not be used together."""
-        if picture_digest(render) == packet.reference_digest:
+        if render.digest() == packet.reference_digest:
             return True
         if not packet.reference_coarse:
             raise PacketRejected(

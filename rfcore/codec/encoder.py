@@ -28,7 +28,6 @@ from rfcore.codec.splice import SpliceDecoder, grey
 from rfcore.codec.state import EncoderState, Past
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
-from rfcore.native.digest import picture_digest
 from rfcore.native.warp import PosedDepth
 
 __all__ = ["DeltaEncoder", "Encoded", "FrameChoice"]
@@ -171,7 +170,7 @@ class DeltaEncoder:
         packet = DeltaPacket(
             epoch=state.epoch,
             sequence=state.next_sequence,
-            reference_digest=picture_digest(render),
+            reference_digest=render.digest(),
             reference_coarse=coarse_digest(render) if choice.coarse else b"",
             reconstruction_digest=shown.digest,
             payload=made.payload,

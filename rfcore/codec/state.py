@@ -14,7 +14,6 @@ from functools import cached_property
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.native.digest import picture_digest
 from rfcore.native.warp import PosedDepth
 
 __all__ = ["KEPT_FRAMES", "DecoderState", "EncoderState", "Past"]
@@ -38,7 +37,7 @@ class Past:
     @cached_property
     def digest(self) -> bytes:
         """Name the state: the digest of the picture."""
-        return picture_digest(self.picture)
+        return self.picture.digest()
 
 
 @dataclass(frozen=True)

@@ -170,10 +170,6 @@ def warp_i420(
     threads: int,
 ) -> int: ...
 
-# --- blake2b ----------------------------------------------------------------
-
-def blake2b_128(first: bytes, pieces: Sequence[_U8]) -> bytes: ...
-
 # --- pcm --------------------------------------------------------------------
 
 def pcm_macroblocks(y: _U8, u: _U8, v: _U8, out: _U8) -> None: ...
