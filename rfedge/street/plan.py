@@ -15,6 +15,7 @@ import numpy as np
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfedge.street.effects import EFFECTS, Effect, Stage, rng_of
 from rfedge.street.frame import LinearFrame
+from rfedge.street.geometry.world import World
 from rfedge.street.scene_file import Scene
 
 __all__ = ["PlannedEffect", "RenderCost", "plain_frame", "planned_effects"]
@@ -50,14 +51,18 @@ class RenderCost:
         return 100.0 * cost_ms / whole_ms
 
 
-def planned_effects(scene: Scene, cpu_s: Callable[[], float]) -> tuple[PlannedEffect, ...]:
-    """Run each declared effect; ``cpu_s`` reads processor time."""
+def planned_effects(
+    scene: Scene, cpu_s: Callable[[], float], world_of: Callable[[Scene], World] | None = None
+) -> tuple[PlannedEffect, ...]:
+    """Run each declared effect; ``cpu_s`` reads processor time.
+
+    ``world_of`` gives a scene's street without effects, where the caller has it.
+    """
     declared = [effect for effect in EFFECTS if effect.name in scene.effects]
     changes = [effect for effect in declared if not effect.on_frames]
     frame = plain_frame(*scene.drive.size_px, scene.rig.fov_deg)
-    planned = [
-        _planned(scene, effect, cost_ms) for effect, cost_ms in _changed(scene, changes, cpu_s)
-    ]
+    changed = _changed(scene, changes, cpu_s, world_of)
+    planned = [_planned(scene, effect, cost_ms) for effect, cost_ms in changed]
     for effect in declared:
         if effect.on_frames:
             apply = scene.effects[effect.name].apply
@@ -71,14 +76,17 @@ def planned_effects(scene: Scene, cpu_s: Callable[[], float]) -> tuple[PlannedEf
 
 
 def _changed(
-    scene: Scene, changes: Sequence[Effect], cpu_s: Callable[[], float]
+    scene: Scene,
+    changes: Sequence[Effect],
+    cpu_s: Callable[[], float],
+    world_of: Callable[[Scene], World] | None,
 ) -> Iterator[tuple[Effect, float]]:
     """Change the scene's street by one effect after the other, in milliseconds each."""
     if not changes:
         return
     from rfedge.street.assembly import plain_world
 
-    world = plain_world(scene)
+    world = (world_of or plain_world)(scene)
     for effect in changes:
         start_s = cpu_s()
         world = scene.effects[effect.name].change(world, rng_of(effect, scene.geometry.seed, 0))

@@ -1,7 +1,8 @@
 """What rendering costs, with and without each effect on the street, by small renders in one run.
 
 The street is rendered plain, then again after each effect is added; what a frame then takes more is
-that effect's. It may be less than nothing: a sky without a sun takes fewer decisions.
+that effect's. It may be less than nothing: a sky without a sun takes fewer decisions. Scenes of the
+same street share its plain render.
 """
 
 from __future__ import annotations
@@ -13,19 +14,42 @@ from rfedge.street.assembly import plain_world
 from rfedge.street.effects import EFFECTS, rng_of
 from rfedge.street.geometry.world import World
 from rfedge.street.plan import RenderCost
-from rfedge.street.scene_file import Scene
+from rfedge.street.scene_file import Drive, Geometry, Rig, Scene
 
-__all__ = ["measured_render", "small_render_ms"]
+__all__ = ["PlainStreets", "measured_render", "small_render_ms"]
 
 SIZE_PX = (320, 180)
 SAMPLES = 4
 FRAMES = 3
 
 
-def measured_render(scene: Scene, frame_ms: Callable[[World], float]) -> RenderCost:
+class PlainStreets:
+    """Streets without effects and what a frame of them takes, each made once."""
+
+    def __init__(self) -> None:
+        self._worlds: dict[Geometry, World] = {}
+        self._ms: dict[tuple[Geometry, Rig, Drive], float] = {}
+
+    def world(self, scene: Scene) -> World:
+        """Return the scene's street."""
+        if scene.geometry not in self._worlds:
+            self._worlds[scene.geometry] = plain_world(scene)
+        return self._worlds[scene.geometry]
+
+    def frame_ms(self, scene: Scene, measure: Callable[[World], float]) -> float:
+        """Return what a frame of it takes, measured when it is first asked for."""
+        key = (scene.geometry, scene.rig, scene.drive)
+        if key not in self._ms:
+            self._ms[key] = measure(self.world(scene))
+        return self._ms[key]
+
+
+def measured_render(
+    scene: Scene, frame_ms: Callable[[World], float], streets: PlainStreets
+) -> RenderCost:
     """Render the scene's street plain and after each of its effects; ``frame_ms`` does it."""
-    world = plain_world(scene)
-    plain_ms = before_ms = frame_ms(world)
+    plain_ms = before_ms = streets.frame_ms(scene, frame_ms)
+    world = streets.world(scene)
     added_ms = {}
     for effect in EFFECTS:
         if effect.name in scene.effects and not effect.on_frames:
@@ -40,7 +64,8 @@ def measured_render(scene: Scene, frame_ms: Callable[[World], float]) -> RenderC
 def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> Callable[[World], float]:
     """Return a measure of a world: the median of 3 frames of 320x180, 4 samples a pixel.
 
-    It is scaled to the pixels of the drive's frames; samples are not scaled.
+    It is scaled to the pixels of the drive's frames, but for what moving vehicles take; samples are
+    not scaled.
     """
     from rfedge.street.render.backend import chosen_backend
     from rfedge.street.render.renderer import Quality, Renderer
@@ -56,8 +81,10 @@ def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> Callable[[World
         times_s = []
         for shot in shots:
             start_s = cpu_s()
+            renderer.at(shot.time_s)
+            placed_s = cpu_s()
             renderer.render(shot.camera, shot.time_s)
-            times_s.append(cpu_s() - start_s)
-        return 1e3 * scale * statistics.median(times_s[1:] or times_s)
+            times_s.append(placed_s - start_s + scale * (cpu_s() - placed_s))
+        return 1e3 * statistics.median(times_s[1:] or times_s)
 
     return frame_ms

@@ -1,8 +1,12 @@
 """A plan says what runs, why, and each effect's share of a frame as it was measured."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from rfcore.errors import InvalidInput
 from rfedge.street.effects.noise import SensorNoise
 from rfedge.street.effects.overcast import Overcast
 from rfedge.street.effects.wet_road import WetRoad
@@ -10,7 +14,8 @@ from rfedge.street.geometry.layout import Layout
 from rfedge.street.geometry.road import road
 from rfedge.street.geometry.world import Sky, World
 from rfedge.street.plan import PlannedEffect, RenderCost, Stage
-from rfedge.street.plan_render import measured_render
+from rfedge.street.plan_render import PlainStreets, measured_render
+from rfedge.street.plan_table import MeasuredPlan, plan_table, write_page, write_rows
 from rfedge.street.plan_text import effect_lines, scene_lines
 from rfedge.street.scene_file import Geometry, Scene
 
@@ -34,7 +39,9 @@ def test_an_effect_costs_what_the_next_render_takes_more() -> None:
         return (100.0, 90.0, 130.0)[len(seen) - 1]
 
     effects = {"overcast": Overcast(), "wet_road": WetRoad(), "noise": SensorNoise()}
-    cost = measured_render(Scene("x", "x", geometry=SMALL, effects=effects), frame_ms)
+    cost = measured_render(
+        Scene("x", "x", geometry=SMALL, effects=effects), frame_ms, PlainStreets()
+    )
     assert cost == RenderCost(100.0, {"overcast": -10.0, "wet_road": 40.0})
     assert seen[1].sky is not seen[0].sky
     assert seen[1].materials is seen[0].materials
@@ -43,9 +50,12 @@ def test_an_effect_costs_what_the_next_render_takes_more() -> None:
 
 def test_without_effects_the_street_is_rendered_once() -> None:
     calls = []
-    cost = measured_render(Scene("x", "x", geometry=SMALL), lambda w: calls.append(w) or 7.0)
-    assert cost == RenderCost(7.0, {})
-    assert len(calls) == 1
+    streets = PlainStreets()
+    for name in ("x", "y"):
+        scene = Scene(name, "x", geometry=SMALL)
+        cost = measured_render(scene, lambda w: calls.append(w) or 7.0, streets)
+        assert cost == RenderCost(7.0, {})
+    assert len(calls) == 1, "scenes of the same street share it"
 
 
 def test_shares_are_of_the_whole_frame() -> None:
@@ -68,3 +78,45 @@ def test_a_scene_without_effects_says_so() -> None:
     assert scene_lines(scene)[0] == "street-x: field of street-y"
     assert "144 views of 640x360 px (18 cameras, 8 stations)" in scene_lines(scene)[2]
     assert effect_lines((), None) == ["  effects     none: pictures are as rendered"]
+
+
+@pytest.fixture
+def plan() -> MeasuredPlan:
+    """A wet street, seen by a noisy sensor."""
+    planned = (
+        PlannedEffect("wet_road", Stage.SURFACE, "it is wet", None, 300.0, each_frame=False),
+        PlannedEffect("noise", Stage.SENSOR, "it is dark", None, 20.0),
+    )
+    return MeasuredPlan(Scene("wet", "x"), planned, RenderCost(60.0, {"wet_road": 20.0}))
+
+
+def test_rows_of_a_plan_share_a_frame(plan: MeasuredPlan) -> None:
+    rows = plan.rows()
+    assert [row["effect"] for row in rows] == ["", "wet_road", "noise"]
+    assert sum(row["share_percent"] for row in rows) == pytest.approx(100.0)
+    assert rows[1]["once_ms"] == 300.0
+    assert "| `wet` | wet_road | 300 | 20 | 20.0 % |" in plan_table(rows)
+
+
+def test_a_table_replaces_the_one_before_in_its_page(plan: MeasuredPlan, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "above\n<!-- scene plan: generated -->\nold\n<!-- end of scene plan -->\nbelow\n"
+    )
+    for _ in range(2):
+        write_page(page, plan.rows())
+    text = page.read_text()
+    assert text.startswith("above\n")
+    assert text.endswith("below\n")
+    assert "old" not in text
+    assert text.count("| `wet` |") == 3
+    page.write_text("no marks")
+    with pytest.raises(InvalidInput, match=r"page\.md has no '<!-- scene plan"):
+        write_page(page, plan.rows())
+
+
+def test_a_result_says_where_it_came_from(plan: MeasuredPlan, tmp_path: Path) -> None:
+    write_rows(tmp_path / "new" / "plan.json", plan.rows())
+    result = json.loads((tmp_path / "new" / "plan.json").read_text())
+    assert result["rows"] == plan.rows()
+    assert {"command", "revision", "host"} <= result.keys()

@@ -16,7 +16,7 @@ FALL_MPS = 9.0
 """Terminal velocity of drops of 5 mm (Gunn and Kinzer 1949)."""
 DROP_WIDTH_M = 0.0025
 NEAR_M, FAR_M = 1.5, 25.0
-OPACITY = 0.5
+OPACITY = 0.9
 """Of a streak as wide as a pixel: a drop passes each place in a part of the shutter's time, and is
 brighter than its surroundings, since it gathers the sky.
 """
