@@ -87,6 +87,7 @@ def measured(load: Load, brought: Brought, link_busy: float, workers: int) -> Me
         link=link_busy,
         generator=generator,
         machine=brought.machine_busy,
+        test=brought.machine_busy - brought.others_cores / (psutil.cpu_count() or 1),
         others=brought.others_cores,
         generator_lag_ms=brought.generator_lag_ms,
     )

@@ -1,4 +1,4 @@
-"""Which resource was at its limit in a run, or nearest to it: what breaks first, how near it is.
+"""Which resource broke first in a run that was not held, or would in one that was, and its use.
 
 Each resource has a share that it can be used to before others wait for it. The generator comes
 first among those beyond it: where the test's own vehicles are the limit, nothing is said about the
@@ -7,9 +7,10 @@ server.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-__all__ = ["Resources", "limit"]
+__all__ = ["Resources", "limit", "nearest"]
 
 BUSY = 0.85
 """A core, a link or a worker that is busier than this makes others wait: at 85 % the mean queue of
@@ -30,7 +31,8 @@ class Resources:
     ``server_loop``: the server's event loop, of one core; ``workers``: the server's other threads,
     of the cores they can have; ``link``: the busiest vehicle's uplink; ``generator``: the busiest
     process that plays vehicles or links, of one core (0 for live vehicles: they are what is
-    tested). ``others``: the cores that processes used which are not part of the test.
+    tested). ``machine``: all cores, of which the test's own processes used the share ``test``, and
+    others ``others`` cores.
     """
 
     server_loop: float
@@ -38,6 +40,7 @@ class Resources:
     link: float
     generator: float
     machine: float
+    test: float
     others: float
     generator_lag_ms: float
 
@@ -58,24 +61,39 @@ class Use:
 
 def limit(resources: Resources) -> str:
     """Name the first resource that was at its limit and its use, else the one nearest to it."""
-    uses = _uses(resources)
-    over = next((use for use in uses if use.is_over), None)
-    if over is not None:
-        return over.said
-    return "nearest: " + max(uses, key=lambda use: use.share / use.bearable).said
-
-
-def _uses(resources: Resources) -> tuple[Use, ...]:
-    """Return every resource, those of our own making first."""
     r = resources
+    machine = Use(
+        f"CPU of the machine, at {_percent(r.machine)}{_beside(r)}", r.machine, MACHINE_BUSY
+    )
+    uses = (_lag(r), *_on_one_core(r), machine, _workers(r))
+    over = next((use for use in uses if use.is_over), None)
+    return over.said if over is not None else f"nearest: {_fullest(uses)}"
+
+
+def nearest(resources: Resources) -> str:
+    """Name the resource that a load which was held would break first, and its use.
+
+    What others use of the machine is left out: where they run behind the test, they fill it.
+    """
+    r = resources
+    machine = Use(f"CPU of the machine, at {_percent(r.test)}", r.test, MACHINE_BUSY)
+    return f"nearest: {_fullest((*_on_one_core(r), machine, _workers(r)))}"
+
+
+def _fullest(uses: Sequence[Use]) -> str:
+    return max(uses, key=lambda use: use.share / use.bearable).said
+
+
+def _on_one_core(r: Resources) -> tuple[Use, ...]:
     return (
-        _lag(r),
         Use(f"vehicles of the test, at {_percent(r.generator)} of a core", r.generator, BUSY),
         Use(f"link of the busiest vehicle, at {_percent(r.link)}", r.link, BUSY),
         Use(f"server's event loop, at {_percent(r.server_loop)} of a core", r.server_loop, BUSY),
-        Use(f"CPU of the machine, at {_percent(r.machine)}{_beside(r)}", r.machine, MACHINE_BUSY),
-        Use(f"server's workers, at {_percent(r.workers)}", r.workers, BUSY),
     )
+
+
+def _workers(r: Resources) -> Use:
+    return Use(f"server's workers, at {_percent(r.workers)}", r.workers, BUSY)
 
 
 def _lag(r: Resources) -> Use:

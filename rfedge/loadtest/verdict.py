@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rfedge.loadtest.limit import Resources, limit
+from rfedge.loadtest.limit import Resources, limit, nearest
 from rfedge.loadtest.plan import Bounds
 
 __all__ = ["Measured", "VehicleCount", "Verdict", "judge", "wilson_lower"]
@@ -83,14 +83,15 @@ def judge(measured: Measured, bounds: Bounds) -> Verdict:
             f"memory grew {measured.growth_mb:.1f} MB, {allowed_mb:.1f} may be",
         ),
     )
+    broken = tuple(problem for is_broken, problem in checks if is_broken)
     return Verdict(
-        broken=tuple(problem for is_broken, problem in checks if is_broken),
+        broken=broken,
         p50_ms=p50_ms,
         p99_ms=p99_ms,
         on_time_percent=percent,
         on_time_at_least_percent=100.0 * wilson_lower(on_time, due),
         fairness=fairness,
-        limited_by=limit(measured.resources),
+        limited_by=(limit if broken else nearest)(measured.resources),
     )
 
 

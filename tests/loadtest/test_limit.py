@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from rfedge.loadtest.limit import Resources, limit
+from rfedge.loadtest.limit import Resources, limit, nearest
 
-IDLE = Resources(0.1, 0.1, 0.1, 0.1, 0.2, 0.0, 1.0)
+IDLE = Resources(0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -41,3 +41,17 @@ def test_without_one_at_its_limit_the_nearest_is_named(
     change: dict[str, float], named: str
 ) -> None:
     assert limit(replace(IDLE, **change)) == named
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"machine": 1.0, "others": 1.6}, "nearest: CPU of the machine, at 20 %"),
+        ({"machine": 1.0, "test": 0.8}, "nearest: CPU of the machine, at 80 %"),
+        ({"machine": 1.0, "workers": 0.5}, "nearest: server's workers, at 50 %"),
+    ],
+)
+def test_a_held_load_is_nearest_to_a_limit_by_its_own_use(
+    change: dict[str, float], named: str
+) -> None:
+    assert nearest(replace(IDLE, **change)) == named

@@ -9,7 +9,7 @@ from rfedge.loadtest.limit import Resources
 from rfedge.loadtest.plan import Bounds
 from rfedge.loadtest.verdict import Measured, VehicleCount, judge, wilson_lower
 
-IDLE = Resources(0.1, 0.1, 0.1, 0.1, 0.2, 0.0, 1.0)
+IDLE = Resources(0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.0, 1.0)
 
 
 def vehicle(on_time: int, due: int = 100, ms: float = 20.0) -> VehicleCount:
@@ -61,3 +61,12 @@ def test_pictures_that_never_came_count_against_the_share() -> None:
     verdict = judge(run_of(VehicleCount(100, 90, [5.0] * 90)), Bounds())
     assert verdict.on_time_percent == 90.0
     assert verdict.p99_ms == 5.0, "of those acknowledged"
+
+
+def test_what_others_use_is_the_limit_only_where_a_bound_was_broken() -> None:
+    crowded = replace(IDLE, machine=1.0, test=0.3, server_loop=0.6, others=1.4)
+    held = replace(run_of(vehicle(100)), resources=crowded)
+    broken = replace(run_of(vehicle(90)), resources=crowded)
+    assert judge(held, Bounds()).limited_by == "nearest: server's event loop, at 60 % of a core"
+    said = "CPU of the machine, at 100 %, 1.4 cores of it by others"
+    assert judge(broken, Bounds()).limited_by == said
