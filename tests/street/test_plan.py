@@ -19,6 +19,7 @@ from rfedge.street.plan_table import MeasuredPlan, plan_table, write_page, write
 from rfedge.street.plan_text import effect_lines, scene_lines
 from rfedge.street.scene_file import Geometry, Scene
 
+ROOT = Path(__file__).parents[2]
 SMALL = Geometry(length_m=20.0)
 
 
@@ -113,6 +114,13 @@ def test_a_table_replaces_the_one_before_in_its_page(plan: MeasuredPlan, tmp_pat
     page.write_text("no marks")
     with pytest.raises(InvalidInput, match=r"page\.md has no '<!-- scene plan"):
         write_page(page, plan.rows())
+
+
+def test_the_committed_page_shows_the_committed_plans() -> None:
+    rows = json.loads((ROOT / "results" / "scenes" / "plan.json").read_text())["rows"]
+    assert plan_table(rows) in (ROOT / "docs" / "scenes.md").read_text()
+    ready_made = {path.stem for path in (ROOT / "samples" / "scenes").glob("*.toml")}
+    assert {row["scene"] for row in rows} == ready_made
 
 
 def test_a_result_says_where_it_came_from(plan: MeasuredPlan, tmp_path: Path) -> None:
