@@ -46,7 +46,7 @@ class LoadTest:
     drive: Path = Path("samples/street/transforms_drive_vehicles.json")
     """Drive whose pictures the vehicles send."""
     workers: int = 2
-    """Frames the server reconstructs at once."""
+    """Frames the server reconstructs at once, and threads of a render."""
     out: Path = Path("out/loadtest")
     """Folder for report.html, result.json and vehicles_vs_uplink.svg."""
     cache: Path = Path("out/cache/loadtest")
