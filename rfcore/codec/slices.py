@@ -36,7 +36,6 @@ from rfcore.codec.h264 import EncoderOptions, PictureKind, encode_pictures
 from rfcore.codec.header import StreamHeader
 from rfcore.codec.parameter_sets import NAL_IDR, NAL_P, NAL_PPS, NAL_SPS, nal_type
 from rfcore.codec.qp_map import QpMap
-from rfcore.codec.reference import without_zeros
 from rfcore.errors import CodecError
 from rfcore.image import I420
 
@@ -120,17 +119,16 @@ def encode_slice(
     Raises ``CodecError`` if x264 makes anything but one slice of the frame. The caller checks
     sizes, and the header.
     """
-    unsent = [without_zeros(picture) for picture in references]
-    kinds = [PictureKind.I, *[PictureKind.P] * len(unsent)]
+    kinds = [PictureKind.I, *[PictureKind.P] * len(references)]
     regions = () if coding.qp_map is None else coding.qp_map.regions()
-    options = slice_options(config, len(unsent), coding)
+    options = slice_options(config, len(references), coding)
     if regions:
         options = replace(options, params={**options.params, **_HEED_REGIONS})
-    units = encode_pictures(options, list(zip([*unsent, frame], kinds, strict=True)), regions)
+    units = encode_pictures(options, list(zip([*references, frame], kinds, strict=True)), regions)
     first = {nal_type(nal): nal for nal in split_nals(units[0])}
     if not {NAL_SPS, NAL_PPS} <= first.keys():
         raise CodecError(f"x264 made NAL units {sorted(first)} without parameter sets")
-    wanted = NAL_P if unsent else NAL_IDR
+    wanted = NAL_P if references else NAL_IDR
     slices = [nal for nal in split_nals(units[-1]) if nal_type(nal) in (NAL_P, NAL_IDR)]
     if [nal_type(nal) for nal in slices] != [wanted]:
         raise CodecError(f"x264 made slices {[nal_type(n) for n in slices]} of one picture")
