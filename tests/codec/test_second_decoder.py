@@ -35,7 +35,7 @@ class Recording:
 
     def decode(self, unit: bytes) -> I420:
         picture: I420 = self._decoder.decode(unit)
-        self.units.append(unit)
+        self.units.append(bytes(unit))  # what is fed may be overwritten afterwards
         self.pictures.append(picture)
         return picture
 
