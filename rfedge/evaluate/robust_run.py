@@ -39,7 +39,7 @@ __all__ = ["RobustJob", "run_robust"]
 
 RTTS_S = (0.02, 0.05, 0.1)
 LOSSES = (0.0, 0.01, 0.05)
-OWN_CRFS, X264_CRFS = (20.0, 27.0), (27.0, 33.0, 39.0, 45.0)
+OWN_CRFS, X264_CRFS = (20.0, 27.0), (22.0, 27.0, 33.0, 39.0, 45.0)
 DISTURBED_CRFS, RIVAL_CRFS = (23.0, 28.0, 33.0), (20.0, 25.0, 30.0, 35.0)
 QUICK_FRAMES = 8
 SEED = 5

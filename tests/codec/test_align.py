@@ -78,13 +78,13 @@ def clock_of(step_ns: int) -> Callable[[], int]:
 def test_a_pose_off_by_up_to_20_cm_and_half_a_degree_is_found(
     metres: float, degrees: float, seed: int
 ) -> None:
-    """To 1/10 px: a 320 px picture of f = 200 px sees 0.03 degrees, or 6 mm at 12 m, so."""
+    """To 1/4 px: a 320 px picture of f = 200 px sees 0.07 degrees, or 15 mm at 12 m, so."""
     refined = PoseSearch(1e3, clock_of(0)).refine(
         FRAME, look_at(off_by(metres, degrees, seed)), look_at, 23
     )
     left_m, left_degrees = distance(refined.look.seen.camera)
-    assert left_m < 0.01
-    assert left_degrees < 0.03
+    assert left_m < 0.015
+    assert left_degrees < 0.07
 
 
 def test_a_true_pose_stays() -> None:
