@@ -179,7 +179,11 @@ def test_a_process_ends_when_its_decoder_is_closed(pool: DecoderPool) -> None:
 
 
 @pytest.mark.slow
-def test_bubblewrap_shows_no_network_no_process_and_no_file_of_ours(units: Sequence[bytes]) -> None:
+def test_bubblewrap_shows_no_network_no_process_and_no_file_of_ours(
+    units: Sequence[bytes], tmp_path: Path
+) -> None:
+    ours = tmp_path / "ours"
+    ours.write_text("seen")
     pool = DecoderPool(WRAPPERS["bubblewrap"](), lambda _: None)
     decoder = pool.open(SIZE_PX)
     try:
@@ -190,8 +194,8 @@ def test_bubblewrap_shows_no_network_no_process_and_no_file_of_ours(units: Seque
             assert there.readlink() != here.readlink(), namespace
         root = proc / "root"
         assert not (root / "etc/passwd").exists()
-        assert not (root / "tmp").exists()
-        assert not (root / str(Path(__file__)).lstrip("/")).exists()
+        for file in (ours, Path(__file__)):
+            assert not (root / str(file).lstrip("/")).exists()
         mounts = (proc / "mounts").read_text().splitlines()
         writable = [m.split()[1] for m in mounts if "rw" in m.split()[3].split(",")]
         assert all(place.startswith(("/dev", "/proc")) for place in writable), writable
