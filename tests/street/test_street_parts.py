@@ -11,7 +11,7 @@ from rfedge.street.geometry.facade import Look, facade
 from rfedge.street.geometry.grain import fractal
 from rfedge.street.geometry.ground_texture import slabs
 from rfedge.street.geometry.lamp import lamps, railings, wires
-from rfedge.street.geometry.layout import FACADE_M, FASCIA_M, Layout
+from rfedge.street.geometry.layout import BAY_LENGTH_M, FACADE_M, FASCIA_M, Layout
 from rfedge.street.geometry.mesh import Label, Mesh, joined
 from rfedge.street.geometry.opening import wall_around
 from rfedge.street.geometry.road import road
@@ -69,6 +69,17 @@ def test_the_ground_is_where_the_plan_says(built: dict[str, Part]) -> None:
             assert np.abs(mesh.vertices[:, 2]).max() < 0.01
     markings = [mesh for mesh in built["road"].meshes if mesh.label == Label.MARKING]
     assert np.abs(np.concatenate([m.vertices for m in markings])[:, 1]).max() < 6.61
+
+
+def test_the_lines_of_the_bays_are_where_vehicles_park_and_off_the_crossings() -> None:
+    layout = Layout(Geometry(length_m=200.0))
+    meshes = road(layout, np.random.default_rng(1)).meshes
+    painted = np.concatenate([mesh.vertices for mesh in meshes if mesh.label == Label.MARKING])
+    at_kerb_x_m = painted[np.abs(painted[:, 1]) > 6.5][:, 0]
+    assert not any(layout.at_crossing(float(x), 1.0) for x in at_kerb_x_m)
+    middles = np.array([bay.x_m for bay in layout.bays])
+    from_middle_m = np.abs(at_kerb_x_m[:, None] - middles).min(axis=1)
+    np.testing.assert_allclose(from_middle_m, BAY_LENGTH_M / 2, atol=0.06)
 
 
 def test_wires_are_thin_and_hang_over_the_cars(built: dict[str, Part]) -> None:

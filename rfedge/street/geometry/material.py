@@ -27,8 +27,7 @@ class Material:
     ``colour``: linear reflectance 0..1, or a texture uint8 [H, W, 3]. ``roughness`` 0.02..1, or a
     map float32 [H, W] of it on the same uv; at 0.85 and more a dielectric is simply matt.
     ``metallic`` 0..1. ``gloss``: whether a clear layer lies over the colour; ``roughness`` is then
-    not used. ``transmission`` 0..1: the share of light that passes unbent. ``emission``: radiance
-    that it gives off, in the sky's units.
+    not used. ``transmission`` 0..1: the share of light that passes unbent.
     """
 
     name: str
@@ -37,7 +36,6 @@ class Material:
     metallic: float = 0.0
     gloss: bool = False
     transmission: float = 0.0
-    emission: Colour = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if isinstance(self.colour, np.ndarray):
@@ -53,8 +51,6 @@ class Material:
             )
         self._require_share("metallic", np.array(self.metallic))
         self._require_share("transmission", np.array(self.transmission))
-        if not (np.isfinite(self.emission).all() and min(self.emission) >= 0):
-            raise InvalidInput(f"material.{self.name}.emission", f"is {self.emission}")
 
     def _require_texture(self, texture: Texture) -> None:
         if texture.dtype != np.uint8 or texture.ndim != 3 or texture.shape[2] != 3:

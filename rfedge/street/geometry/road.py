@@ -76,15 +76,25 @@ def _markings(layout: Layout) -> list[Mesh]:
     kept = dashes[[not layout.at_crossing(x + 1.5, 2.0) for x in dashes]]
     areas = [_strips(kept, 3.0, -0.07, 0.07)]
     for side in SIDES:
-        line, kerb = side * BAY_LINE_M, side * ROAD_HALF_M
-        areas.append(np.array([[start, line - 0.06, end, line + 0.06]]))
-        bays = np.arange(start, end, BAY_LENGTH_M)
-        areas.append(_strips(bays, 0.1, min(line, kerb), max(line, kerb)))
+        areas += _bay_lines(layout, side)
     for crossing in layout.crossings_x_m:
         across = np.arange(-6.0, 6.0, 1.0)
         left = np.full_like(across, crossing - CROSSING_M / 2)
         areas.append(np.stack([left, across + 0.25, left + CROSSING_M, across + 0.75], axis=1))
     return [_flat(PAINT, np.concatenate(areas), PAINT_UP_M)]
+
+
+def _bay_lines(layout: Layout, side: int) -> list[F64]:
+    """A line along the bays of a side, which a crossing interrupts, and one between any two."""
+    middles = np.array([bay.x_m for bay in layout.bays if bay.side == side])
+    starts = middles - BAY_LENGTH_M / 2
+    edges = np.unique(np.round(np.concatenate([starts, starts + BAY_LENGTH_M]), 3))
+    line = side * BAY_LINE_M
+    low, high = sorted((line, side * ROAD_HALF_M))
+    return [
+        _strips(starts, BAY_LENGTH_M, line - 0.06, line + 0.06),
+        _strips(edges - 0.05, 0.1, low, high),
+    ]
 
 
 def _manholes(layout: Layout, rng: np.random.Generator) -> list[Mesh]:

@@ -54,15 +54,8 @@ class Stage:
 
     def _shapes(self, meshes: Sequence[Mesh]) -> list[tuple[Any, int]]:
         return [
-            (
-                _shape(self._mi, mesh, self._surfaces[mesh.material], self._emission(mesh)),
-                mesh.label,
-            )
-            for mesh in meshes
+            (_shape(self._mi, mesh, self._surfaces[mesh.material]), mesh.label) for mesh in meshes
         ]
-
-    def _emission(self, mesh: Mesh) -> tuple[float, float, float]:
-        return self._world.materials[mesh.material].emission
 
 
 def _used(world: World) -> Mapping[str, Material]:
@@ -72,12 +65,9 @@ def _used(world: World) -> Mapping[str, Material]:
     return {name: m for name, m in world.materials.items() if name in names}
 
 
-def _shape(mi: Any, mesh: Mesh, bsdf: Any, emission: tuple[float, float, float]) -> Any:
+def _shape(mi: Any, mesh: Mesh, bsdf: Any) -> Any:
     properties = mi.Properties()
     properties["mesh_bsdf"] = bsdf
-    if max(emission) > 0:
-        radiance = {"type": "rgb", "value": list(emission)}
-        properties["mesh_emitter"] = mi.load_dict({"type": "area", "radiance": radiance})
     shape = mi.Mesh(
         f"{mesh.material}-{mesh.label.name}",
         len(mesh.vertices),
