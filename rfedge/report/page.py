@@ -8,20 +8,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from rfcore.errors import RfedgeError
 from rfcore.files import write_whole
-from rfcore.image import Rgb
+from rfcore.image import Rgb, jpeg_bytes
 from rfedge.demo.measure import Pictures
 from rfedge.report.figures import bytes_chart, quality_chart, stages_chart
 from rfedge.report.summary import METRIC, SUMMARY
 
 __all__ = ["write_report"]
 
-JPEG_QUALITY = 88
 DIFFERENCE_GAIN = 4
 
 
@@ -97,7 +94,4 @@ def _strip(frame: Mapping[str, Any], pictures: Pictures) -> dict[str, Any]:
 
 
 def _jpeg(rgb: Rgb) -> str:
-    done, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    if not done:
-        raise RfedgeError(f"a report picture of shape {rgb.shape} could not be coded as JPEG")
-    return base64.b64encode(data.tobytes()).decode()
+    return base64.b64encode(jpeg_bytes(rgb)).decode()

@@ -8,22 +8,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rfcore.dataset import Dataset
-from rfcore.errors import RfedgeError
 from rfcore.field import RadianceField
 from rfcore.files import write_whole
-from rfcore.image import Rgb
+from rfcore.image import Rgb, jpeg_bytes
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
 from rfedge.report.figures import curve_chart
 
 __all__ = ["write_training_report"]
 
-JPEG_QUALITY = 88
 DIFFERENCE_GAIN = 4
 
 
@@ -93,7 +90,4 @@ def _strip(which: str, picture: PosedPicture, render: Rgb, quality_db: float) ->
 
 
 def _jpeg(rgb: Rgb) -> str:
-    done, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    if not done:
-        raise RfedgeError(f"a report picture of shape {rgb.shape} could not be coded as JPEG")
-    return base64.b64encode(data.tobytes()).decode()
+    return base64.b64encode(jpeg_bytes(rgb)).decode()

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import DatasetError, InvalidInput
+from rfcore.files import write_whole
 
 __all__ = ["contact_sheet", "write_contact_sheet"]
 
@@ -33,9 +34,7 @@ def write_contact_sheet(
     for quality in QUALITIES:
         done, coded = cv2.imencode(".jpg", sheet, [cv2.IMWRITE_JPEG_QUALITY, quality])
         if done and len(coded) <= max_bytes:
-            partial = out.with_name(out.name + ".partial")
-            partial.write_bytes(coded.tobytes())
-            partial.replace(out)
+            write_whole(out, coded.tobytes())
             return len(coded)
     raise InvalidInput("max_bytes", f"{max_bytes} is too few for {sheet.shape[1]} px; take less")
 
