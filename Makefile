@@ -9,7 +9,7 @@ TORCH_INDEX ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo sample-field test test-slow test-prometheus test-netns test-fault test-compose \
+.PHONY: help demo sample sample-field test test-slow test-prometheus test-netns test-fault test-compose \
 	test-system-packages check build bench proto figures images up down operations-figures \
 	load load-transport load-receiver load-full soak soak-short
 
@@ -100,6 +100,11 @@ check: build  ## lint, types, layers, generated files
 	$(BIN)/lint-imports
 	@if npx --yes @bufbuild/buf --version >/dev/null 2>&1; then npx --yes @bufbuild/buf lint proto; \
 		else echo "buf lint was not run: it needs node and its registry"; fi
+
+sample: build  ## render the street in samples/street anew (half an hour; pip install 'rfedge[scene]')
+	$(BIN)/rfedge scene build samples/street/empty.toml --split drive,train --out out/sample/empty
+	$(BIN)/rfedge scene build samples/street/vehicles.toml --split drive --out out/sample/vehicles
+	$(BIN)/python -m rfedge.demo.make_sample out/sample samples/street
 
 sample-field: build  ## train the field that ships in samples/fields (some minutes)
 	$(BIN)/python -m rfedge.demo.make_sample_field samples/street $(ARGS)

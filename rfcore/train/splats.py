@@ -46,7 +46,7 @@ class SplatTrainingConfig:
 
     gaussians: int = 150_000
     """At most as many points are drawn from those given."""
-    iterations: int = 1500
+    iterations: int = 2000
     initial_scale: float = 0.6
     """Standard deviation at the start, in units of the distance to the three nearest points."""
     rates: RateSchedule = field(default_factory=RateSchedule)

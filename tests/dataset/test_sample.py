@@ -24,7 +24,7 @@ def test_the_training_views_come_with_points() -> None:
     train = read_dataset(SAMPLE / "transforms_train.json")
     assert len(train.pictures) == 120
     assert train.points is not None
-    assert len(train.points.xyz_m) == 150_000
+    assert len(train.points.xyz_m) == 120_000
 
 
 @pytest.mark.parametrize("name", ["empty", "vehicles"])
