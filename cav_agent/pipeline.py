@@ -35,8 +35,7 @@ from rfcore.codec.pose_search import PoseSearch
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality
 from rfcore.image import I420, Rgb
-from rfcore.native.warp import PosedDepth
-from rfcore.native.yuv import i420_from_colour, i420_from_rgb
+from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import PosedPicture, View
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 
@@ -121,8 +120,7 @@ class Pipeline:
         return EncodedFrame(encoded.packet, stage_s, encoded.tries, rung, encoded.crf, pose)
 
     def _look(self, quality: Quality, camera: Camera) -> Look:
-        view = self._renderer.render(camera, quality)
-        return Look(i420_from_colour(view.colour), PosedDepth(camera, view.depth), view.opacity)
+        return Look.of(self._renderer.render(camera, quality), camera)
 
     def _refined(self, frame: I420, measured: Look, quality: Quality) -> Look:
         """Return what the field shows at the pose to send."""

@@ -97,8 +97,7 @@ def _place(field: RadianceField, settings: CodingSettings) -> Callable[[I420, Ca
     """Return what finds the pose a frame is coded at, and renders the field there."""
 
     def look_at(camera: Camera) -> Look:
-        view = field.render(camera)
-        return Look(i420_from_colour(view.colour), PosedDepth(camera, view.depth), view.opacity)
+        return Look.of(field.render(camera), camera)
 
     refine_ms = settings.steering.refine_pose_ms
     if refine_ms is None:

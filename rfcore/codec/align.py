@@ -25,10 +25,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Intrinsics, Pose
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.confidence import confidence
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth
+from rfcore.native.yuv import i420_from_colour
+from rfcore.views import View
 
 __all__ = ["PRIOR_M", "PRIOR_RAD", "Look", "align"]
 
@@ -61,6 +63,11 @@ class Look:
     render: I420
     seen: PosedDepth
     opacity: NDArray[np.float32]
+
+    @staticmethod
+    def of(view: View, camera: Camera) -> Look:
+        """Return a rendered view from ``camera`` as both ends hold it."""
+        return Look(i420_from_colour(view.colour), PosedDepth(camera, view.depth), view.opacity)
 
     @property
     def confidence(self) -> NDArray[np.float32]:

@@ -1,7 +1,8 @@
 """What a wrong pose or another light costs: bits at equal quality, with and without it.
 
 Pose noise is independent from frame to frame, normal in each axis of translation and rotation, in
-the camera's own axes; both ends render at the noisy pose, for it is the one that is sent.
+the camera's own axes; both ends render at the noisy pose, for it is the one that is sent. Unless it
+is refined first, as a sender that may take its time would.
 """
 
 from __future__ import annotations
@@ -13,10 +14,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from rfcore.camera import Camera, Pose
+from rfcore.codec.align import Look
+from rfcore.codec.pose_search import PoseSearch
 from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField
+from rfcore.image import I420
 from rfedge.evaluate.clip import CodedClip
 
-__all__ = ["NOISES", "PoseNoise", "kbit_at", "noisy_cameras"]
+__all__ = ["NOISES", "PoseNoise", "kbit_at", "noisy_cameras", "refined_cameras"]
+
+UNHURRIED_MS = 1000.0
+"""Of a clock that stands still: the search ends by itself, the same on every machine."""
+REFINE_CRF = 26.0
+"""At which poses are compared; about that of the quality asked for."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +63,21 @@ def noisy_cameras(cameras: Sequence[Camera], noise: PoseNoise, seed: int) -> lis
         step = Pose((x, y, z), (math.cos(angle), a, b, c))
         disturbed.append(Camera(camera.intrinsics, camera.world_from_cam.compose(step)))
     return disturbed
+
+
+def refined_cameras(
+    field: RadianceField, frames: Sequence[I420], measured: Sequence[Camera]
+) -> list[Camera]:
+    """Return the cameras that the search for the pose of fewest bits finds for ``frames``."""
+    search = PoseSearch(UNHURRIED_MS, lambda: 0)
+
+    def look_at(camera: Camera) -> Look:
+        return Look.of(field.render(camera), camera)
+
+    return [
+        search.refine(frame, look_at(camera), look_at, REFINE_CRF).look.seen.camera
+        for frame, camera in zip(frames, measured, strict=True)
+    ]
 
 
 def kbit_at(clips: Sequence[CodedClip], quality_db: float) -> float:

@@ -25,7 +25,7 @@ from rfcore.field import RadianceField, load_field
 from rfedge.evaluate.cells import CellStore
 from rfedge.evaluate.clip import ClipCoder
 from rfedge.evaluate.compare import Contest, perform
-from rfedge.evaluate.disturbed import NOISES, PoseNoise, kbit_at, noisy_cameras
+from rfedge.evaluate.disturbed import NOISES, PoseNoise, kbit_at, noisy_cameras, refined_cameras
 from rfedge.evaluate.drives import DriveName
 from rfedge.evaluate.ladder import LadderClip
 from rfedge.evaluate.loss import Bursts, Policy
@@ -93,9 +93,8 @@ def run_robust(job: RobustJob, console: Console) -> Row:
     field = load_field(job.field)
     bench = Bench(job, field, drive, CellStore(job.cells), console, revision())
     scenarios = bench.scenarios()
-    console.print(
-        f"{len(scenarios)} crossings and {len(bench.noises()) + 3} disturbances of {count} frames"
-    )
+    disturbances = 2 * len(bench.noises()) + 2
+    console.print(f"{len(scenarios)} crossings and {disturbances} disturbances of {count} frames")
     crossed = [bench.crossed(*scenario) for scenario in scenarios]
     disturbed = [*bench.pose_rows(), bench.lane_row(), *bench.light_rows()]
     result = {
@@ -192,13 +191,19 @@ class Bench:
         return (NOISES[0], NOISES[-2]) if self.job.quick else NOISES
 
     def pose_rows(self) -> list[Row]:
-        """Return what noise of each size costs."""
-        rival = self._rival(self.drive)
-        rows: list[Row] = []
-        for noise in self.noises():
-            cameras = noisy_cameras(self.drive.clip.cameras, noise, SEED)
-            kbit = self._own(self.drive, f"pose noise {noise}", cameras)
-            rows.append(self._row("pose noise", str(noise), kbit, rows[0] if rows else None, rival))
+        """Return what noise of each size costs, and what is left of it after refinement."""
+        drive, rival = self.drive, self._rival(self.drive)
+        still, *noises = self.noises()
+        kbit = self._own(
+            drive, f"pose noise {still}", noisy_cameras(drive.clip.cameras, still, SEED)
+        )
+        rows = [self._row("pose noise", str(still), kbit, None, rival)]
+        for noise in noises:
+            measured = noisy_cameras(drive.clip.cameras, noise, SEED)
+            refined = refined_cameras(self.field, drive.clip.frames, measured)
+            for condition, cameras in (("pose noise", measured), ("refined pose noise", refined)):
+                kbit = self._own(drive, f"{condition} {noise}", cameras)
+                rows.append(self._row(condition, str(noise), kbit, rows[0], rival))
         return rows
 
     def lane_row(self) -> Row:

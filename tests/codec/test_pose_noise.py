@@ -15,8 +15,7 @@ from rfcore.codec.pose_search import PoseSearch
 from rfcore.dataset import read_dataset
 from rfcore.field import load_field
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
-from rfcore.native.yuv import i420_from_colour, i420_from_rgb
+from rfcore.native.yuv import i420_from_rgb
 
 FRAMES = 5
 CRFS = (24.0, 32.0)
@@ -64,8 +63,7 @@ def test_refined_poses_cost_as_few_bits_as_true_ones(metres: float, degrees: flo
     rng = np.random.default_rng(3)
 
     def look_at(camera: Camera) -> Look:
-        view = field.render(camera)
-        return Look(i420_from_colour(view.colour), PosedDepth(camera, view.depth), view.opacity)
+        return Look.of(field.render(camera), camera)
 
     true = [look_at(picture.camera) for picture in pictures]
     noisy = [look_at(shaken(picture.camera, metres, degrees, rng)) for picture in pictures]

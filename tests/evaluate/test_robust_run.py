@@ -38,6 +38,9 @@ def test_a_quick_run_writes_rows_a_figure_and_a_section_and_goes_on(tmp_path):
     noise = [r for r in result["disturbances"] if r["condition"] == "pose noise"]
     assert noise[0]["more_percent"] == 0
     assert noise[-1]["more_percent"] > 5, "10 cm and 0.1 degrees cost bits"
+    (refined,) = (r for r in result["disturbances"] if r["condition"] == "refined pose noise")
+    assert refined["level"] == noise[-1]["level"]
+    assert refined["more_percent"] < noise[-1]["more_percent"] / 2
     reasons = [r["reason"] for r in result["disturbances"] if "reason" in r]
     assert ["--lane" in reasons[0], "--dusk" in reasons[1]] == [True, True]
     assert len(write_robust_figure(result, tmp_path / "figures")) == 2
