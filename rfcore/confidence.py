@@ -24,7 +24,7 @@ __all__ = ["BEND_LIMIT", "confidence"]
 BEND_LIMIT = np.float32(0.1)
 """A break of a tenth of the nearer side's inverse depth leaves no confidence.
 
-Measured on the held-out drive of the sample street (27.1 dB): the error of pixels with confidence
+Measured on the held-out drive of the first sample (27.1 dB): the error of pixels with confidence
 below 0.001 / 0.25 / 0.5 / 0.75 / 0.9 / above is 0.082 / 0.065 / 0.062 / 0.061 / 0.048 / 0.032 RMS.
 """
 

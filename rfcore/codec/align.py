@@ -38,7 +38,7 @@ COARSEST_PX = 60
 """Shortest side of the coarsest level; 0.2 m at 5 m are then less than 3 px."""
 MOST_PIXELS = 12_000
 """Half of them leave 0.60 cm and 0.025 degrees where these leave 0.49 and 0.017 (10 and 20 cm, 0.1
-and 0.5 degrees of noise on the sample street with vehicles), and save a quarter of the time."""
+and 0.5 degrees of noise on the first sample with vehicles), and save a quarter of the time."""
 ROUNDS = 12
 """Steps of a level, at most."""
 ENOUGH_PX = 0.01

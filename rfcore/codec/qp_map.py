@@ -5,7 +5,7 @@ A map is int8 [rows, columns] of macroblocks of 16x16 px, added to the quantiser
 map, and the parameter sets stay as they are. x264 is told in rectangles, so a map has to be taken
 apart into those of one offset.
 
-On five frames of the sample street with vehicles, -6 in a mask of a tenth of the picture raises its
+On five frames of the first sample with vehicles, -6 in a mask of a tenth of the picture raises its
 PSNR by 2.8 dB at equal bits of the whole, which loses 0.3 dB. Where the field's confidence is low,
 or its error large, neither finer nor coarser pays (-2 and +2: 0.05 to 0.1 dB less at equal bits),
 so nothing is steered by them.

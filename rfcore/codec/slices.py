@@ -71,7 +71,7 @@ _PARTITIONS = {
 _UNSENT_MARGIN = 17
 _ROUGH_MARGIN = 8
 """CRF less the quantiser of unsent pictures, normally and where time is dearer than bits. On the
-sample street with three references, CRF 20 to 32, bits at equal PSNR against quantisers of 3 to 8:
+first sample with three references, CRF 20 to 32, bits at equal PSNR against quantisers of 3 to 8:
 18, 17, 12, 8 and 4 take 0.4, 0.3, 1, 3 and 7 % more; of the time at CRF 29 they leave 85, 80, 75,
 67 and 65 %."""
 

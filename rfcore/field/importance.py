@@ -5,7 +5,7 @@ It is exactly the derivative of the picture's sum with respect to the splat's co
 trainer's backward pass counts it. Without cameras: opacity times the area it could cover, seen
 from the middle of the field; a guess, for fields that come without any.
 
-Measured on the sample street (150k splats, 27.1 dB), half / a quarter / a tenth of the splats, with
+Measured on the first sample (150k splats, 27.1 dB), half / a quarter / a tenth of the splats, with
 no compensation: contributions 24.2 / 18.5 / 13.5 dB, the guess 23.2 / 16.9 / 11.8 dB, opacity times
 area alone 18.8 / 11.0 / 7.4 dB, random 17.7 / 12.6 / 9.4 dB.
 """

@@ -3,7 +3,7 @@
 A matrix [N, C] becomes, column by column, its numbers less the column's lowest, split into bytes,
 lowest bytes first, as many as the largest needs; all planes together are one raw LZMA2 stream
 (Python's ``lzma``: a range coder with adaptive contexts, which numbers of uneven frequency need;
-deflate's Huffman codes took 12 % more on the sample street's field). The raw format has
+deflate's Huffman codes took 12 % more on the first sample's field). The raw format has
 no header: nothing in the stream chooses how much memory it takes.
 """
 

@@ -4,7 +4,7 @@ The splats are put in order of what they contribute to the cameras given. A rung
 of them, and to fill the gaps its scales and opacities are optimised against the full field's own
 renders; means, rotations and colours stay, so a rung costs four numbers a splat and no more.
 
-Measured on the held-out drive of the sample street (150k splats, 27.14 dB), half of the splats:
+Measured on the held-out drive of the first sample (150k splats, 27.14 dB), half of the splats:
 prefix alone 24.22 dB; all wider by e^0.1, 25.48 dB; opacities and scales fitted for 240 / 360
 iterations, 26.46 / 26.51 dB; colours fitted as well, 26.56 dB; everything fitted, 26.70 dB.
 """

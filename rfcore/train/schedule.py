@@ -20,7 +20,7 @@ __all__ = ["Bands", "RateSchedule", "Regularisation", "view_order"]
 class RateSchedule:
     """Adam's step sizes: constant for a while, then falling exponentially.
 
-    Measured on an earlier sample street with 150k Gaussians and 1500 iterations: 27.1 dB held out.
+    Measured on the first sample with 150k Gaussians and 1500 iterations: 27.1 dB held out.
     Means at 0.2 and scales at 1e-2 gave 26.5 dB; rates that suit 30,000 iterations about 25 dB.
     """
 

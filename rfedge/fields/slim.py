@@ -33,7 +33,7 @@ __all__ = ["slimmed"]
 WIDENINGS = (0.0, 0.5, 1.0)
 """Shares of ``FULL_WIDENING`` tried."""
 FULL_WIDENING = 0.22
-"""Times ln(N / kept) on the log scales. Best of its kind on the sample street at a half, a quarter
+"""Times ln(N / kept) on the log scales. Best of its kind on the first sample at a half, a quarter
 and a tenth: 0.1, 0.3 and 0.55 (25.5, 22.5 and 19.2 dB; none: 24.2, 18.5 and 13.5 dB)."""
 
 
