@@ -1,8 +1,9 @@
 """The twin: the newest picture of every camera, and a mailbox for each who watches.
 
 Without asyncio or clock. ``show`` costs the same whether anybody reads or not: a mailbox holds at
-most one entry a camera, the newest, so whoever reads slowly misses pictures and delays nobody. One
-vehicle is one entry whatever number of streams it has: the newest capture wins.
+most the newest picture of a camera, and its departure, so whoever reads slowly misses pictures, but
+never the last, and delays nobody. One vehicle is one entry whatever number of streams it has: the
+newest capture wins.
 """
 
 from __future__ import annotations
@@ -53,19 +54,22 @@ class Mailbox:
         self.wish = wish
         self.skipped: Counter[CameraKey] = Counter()
         self._arrived = arrived
-        self._entries: OrderedDict[CameraKey, TwinView | Departure] = OrderedDict()
+        self._entries: OrderedDict[tuple[CameraKey, type], TwinView | Departure] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._entries)
 
     def put(self, key: CameraKey, entry: TwinView | Departure) -> bool:
-        """Keep ``entry`` in place of an older one of its camera; return whether one was missed."""
+        """Keep ``entry``: a picture in place of an older one of its camera, or of its departure; a
+        departure behind its last picture. Return whether a picture was missed."""
         if not self.wish.includes(key[0]):
             return False
-        missed = isinstance(self._entries.get(key), TwinView)
+        missed = isinstance(entry, TwinView) and (key, TwinView) in self._entries
+        if isinstance(entry, TwinView):
+            self._entries.pop((key, Departure), None)
         if missed:
             self.skipped[key] += 1
-        self._entries[key] = entry
+        self._entries[key, type(entry)] = entry
         self._arrived()
         return missed
 
@@ -73,7 +77,7 @@ class Mailbox:
         """Return what waits longest, or None."""
         if not self._entries:
             return None
-        key, entry = self._entries.popitem(last=False)
+        (key, _), entry = self._entries.popitem(last=False)
         if isinstance(entry, Departure):
             self.skipped.pop(key, None)
         return entry

@@ -102,7 +102,7 @@ async def test_a_consumer_that_never_reads_slows_no_vehicle_and_is_let_go(
     serve: Any, travel: Any
 ) -> None:
     """Its window is full after a few pictures; what it misses is counted, and patience ends."""
-    limits = ConsumerLimits(patience_s=0.3)
+    limits = ConsumerLimits(patience_s=3.0)
     async with serve(consumers=limits) as server:
         value = server.registry.get_sample_value
         async with consumer(server.address, Wish(encoding=PictureEncoding.I420)):

@@ -12,7 +12,7 @@ from mec_server.twin import Mailbox, Twin, TwinView
 from rfcore.camera import Intrinsics
 from rfcore.image import I420
 from rfcore.wire.messages import Frame
-from rfcore.wire.twin import Departure, Wish
+from rfcore.wire.twin import Wish
 
 PICTURE = I420(*(np.zeros(size, np.uint8) for size in ((2, 2), (1, 1), (1, 1))))
 INTRINSICS = Intrinsics(2, 2, 1.0, 1.0, 1.0, 1.0)
@@ -77,7 +77,7 @@ def test_a_consumer_gets_only_the_vehicles_it_named(view: MakeView) -> None:
     for vehicle in ("cav-1", "cav-2"):
         twin.show(view(vehicle))
     twin.leave("s-1")
-    assert taken(mailbox) == [("cav-2", None)]
+    assert taken(mailbox) == [("cav-2", 0), ("cav-2", None)]
 
 
 def test_a_vehicle_with_two_streams_is_one_vehicle_and_the_newest_capture_wins(
@@ -135,10 +135,20 @@ def test_what_was_shown_is_taken_or_missed_and_never_both(steps: list[tuple[str,
     assert shown == got + sum(mailbox.skipped.values()) + len(mailbox)
 
 
-def test_a_departure_replaces_the_picture_that_was_not_taken(view: MakeView) -> None:
+def test_the_last_picture_is_seen_before_the_departure(view: MakeView) -> None:
     twin = Twin()
     mailbox = twin.watch(Wish(), lambda: None)
-    twin.show(view())
+    for sequence in (0, 1):
+        twin.show(view(sequence=sequence))
     twin.leave("s-1")
-    assert mailbox.take() == Departure("cav-1", "front")
-    assert mailbox.take() is None
+    assert mailbox.skipped[("cav-1", "front")] == twin.missed == 1
+    assert taken(mailbox) == [("cav-1", 1), ("cav-1", None)]
+
+
+def test_who_is_back_has_not_departed(view: MakeView) -> None:
+    twin = Twin()
+    mailbox = twin.watch(Wish(), lambda: None)
+    twin.show(view(sequence=0))
+    twin.leave("s-1")
+    twin.show(view(session="s-2", sequence=7))
+    assert taken(mailbox) == [("cav-1", 7)]
