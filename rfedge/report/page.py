@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rfcore.files import write_whole
-from rfcore.image import Rgb, jpeg_bytes
 from rfedge.demo.measure import Pictures
 from rfedge.report.figures import bytes_chart, quality_chart, stages_chart
+from rfedge.report.strip import DIFFERENCE_GAIN, amplified_difference, embedded
 from rfedge.report.summary import METRIC, SUMMARY
 
 __all__ = ["write_report"]
-
-DIFFERENCE_GAIN = 4
 
 
 def write_report(
@@ -76,8 +72,7 @@ def _shown(frames: Sequence[Mapping[str, Any]]) -> list[int]:
 
 
 def _strip(frame: Mapping[str, Any], pictures: Pictures) -> dict[str, Any]:
-    difference = np.abs(pictures.reconstruction.astype(np.int16) - pictures.camera)
-    amplified = np.minimum(difference * DIFFERENCE_GAIN, 255).astype(np.uint8)
+    difference = amplified_difference(pictures.reconstruction, pictures.camera)
     captions = (
         (f"camera, frame {pictures.name}", pictures.camera),
         (f"render, {frame['rf_psnr_db']:.1f} dB", pictures.render),
@@ -85,13 +80,9 @@ def _strip(frame: Mapping[str, Any], pictures: Pictures) -> dict[str, Any]:
             f"reconstruction, {frame['psnr_db']:.1f} dB, {frame['packet_bytes']:,} bytes",
             pictures.reconstruction,
         ),
-        (f"difference to the camera × {DIFFERENCE_GAIN}", amplified),
+        (f"difference to the camera × {DIFFERENCE_GAIN}", difference),
     )
     return {
         "frame": pictures.name,
-        "pictures": [{"caption": caption, "data": _jpeg(rgb)} for caption, rgb in captions],
+        "pictures": embedded(captions),
     }
-
-
-def _jpeg(rgb: Rgb) -> str:
-    return base64.b64encode(jpeg_bytes(rgb)).decode()

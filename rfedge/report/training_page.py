@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,14 +13,13 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from rfcore.dataset import Dataset
 from rfcore.field import RadianceField
 from rfcore.files import write_whole
-from rfcore.image import Rgb, jpeg_bytes
+from rfcore.image import Rgb
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
 from rfedge.report.figures import curve_chart
+from rfedge.report.strip import DIFFERENCE_GAIN, amplified_difference, embedded
 
 __all__ = ["write_training_report"]
-
-DIFFERENCE_GAIN = 4
 
 
 def write_training_report(
@@ -76,18 +74,12 @@ def _render(field: RadianceField, picture: PosedPicture) -> Rgb:
 
 def _strip(which: str, picture: PosedPicture, render: Rgb, quality_db: float) -> dict[str, Any]:
     camera = picture.read()
-    difference = np.abs(render.astype(np.int16) - camera)
-    amplified = np.minimum(difference * DIFFERENCE_GAIN, 255).astype(np.uint8)
     captions = (
         (f"camera, {picture.name}", camera),
         (f"render, {quality_db:.1f} dB", render),
-        (f"difference × {DIFFERENCE_GAIN}", amplified),
+        (f"difference × {DIFFERENCE_GAIN}", amplified_difference(render, camera)),
     )
     return {
         "which": which,
-        "pictures": [{"caption": caption, "data": _jpeg(rgb)} for caption, rgb in captions],
+        "pictures": embedded(captions),
     }
-
-
-def _jpeg(rgb: Rgb) -> str:
-    return base64.b64encode(jpeg_bytes(rgb)).decode()
