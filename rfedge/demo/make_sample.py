@@ -16,16 +16,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
-import tyro
 from tyro.conf import Positional
 
 from rfcore.dataset import write_manifest
 from rfcore.dataset.read import read_source
-from rfcore.dataset.source import Source, SourcePicture
+from rfcore.dataset.source import Source
 from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, write_points
-from rfcore.errors import DatasetError, RfedgeError
+from rfcore.errors import DatasetError
 from rfcore.files import write_whole
 from rfcore.image import Rgb
+from rfedge.demo.maker import run_maker
 
 __all__ = ["MakeSample", "main", "pack_sample"]
 
@@ -74,12 +74,44 @@ PARTS = (
 )
 
 
+@dataclass(frozen=True)
+class Packed:
+    """What a part writes: coded pictures by their path in the sample, and its transforms file."""
+
+    part: Part
+    pictures: Mapping[str, bytes]
+    transforms: str
+
+    @staticmethod
+    def of(part: Part, source: Source) -> Packed:
+        """Read and code the part's pictures; raise ``DatasetError`` for one that is damaged."""
+        paths = [f"{part.name}/{i:03d}{part.coding.suffix}" for i in range(len(source.pictures))]
+        written = [
+            WrittenPicture(path, picture.camera, picture.world_from_cam, picture.time_ns)
+            for path, picture in zip(paths, source.pictures, strict=True)
+        ]
+        points_name = POINTS_NAME if part.split == "train" else None
+        content = json.dumps(transforms_of(written, points_name), indent=1) + "\n"
+        coded = [part.coding.coded(picture.read()) for picture in source.pictures]
+        return Packed(part, dict(zip(paths, coded, strict=True)), content)
+
+    def write(self, sample: Path) -> None:
+        """Replace the part's files."""
+        folder = sample / self.part.name
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        for path, data in self.pictures.items():
+            write_whole(sample / path, data)
+        write_whole(sample / _transforms(self.part.name), self.transforms)
+
+
 def pack_sample(built: Path, sample: Path) -> None:
     """Write pictures, transforms, points and manifest of ``sample`` from the scenes in ``built``.
 
     ``built`` has a folder for each scene, ``empty`` and ``vehicles``, as ``rfedge scene build``
     leaves it. Other files of the sample stay and are listed with the rest. Raises ``DatasetError``
-    for a scene that is missing or incomplete; the sample is then untouched.
+    for a scene that is missing or incomplete, or has a picture that cannot be read; the sample is
+    then untouched.
     """
     made_by = {scene: _made_by(built / scene) for scene in ("empty", "vehicles")}
     found = {part: read_source(built / part.scene / _transforms(part.split)) for part in PARTS}
@@ -89,8 +121,9 @@ def pack_sample(built: Path, sample: Path) -> None:
     points = found[PARTS[0]].points
     if points is None:
         raise DatasetError(f"{built}: the training views have no points")
-    for part, source in found.items():
-        _pack(part, source, sample)
+    packed = [Packed.of(part, source) for part, source in found.items()]
+    for part in packed:
+        part.write(sample)
     write_points(sample / POINTS_NAME, points)
     write_manifest(sample, {"command": COMMAND, "scenes": made_by})
 
@@ -102,21 +135,6 @@ def _made_by(folder: Path) -> Mapping[str, Any]:
     except (OSError, ValueError) as error:
         raise DatasetError(f"{folder}: no built scene ({error}); run {COMMAND}") from error
     return {name: value for name, value in about.items() if name != "sha256"}
-
-
-def _pack(part: Part, source: Source, sample: Path) -> None:
-    shutil.rmtree(sample / part.name, ignore_errors=True)
-    (sample / part.name).mkdir(parents=True)
-    written = [_picture(part, i, picture, sample) for i, picture in enumerate(source.pictures)]
-    points_name = POINTS_NAME if part.split == "train" else None
-    content = json.dumps(transforms_of(written, points_name), indent=1) + "\n"
-    write_whole(sample / _transforms(part.name), content)
-
-
-def _picture(part: Part, index: int, picture: SourcePicture, sample: Path) -> WrittenPicture:
-    path = f"{part.name}/{index:03d}{part.coding.suffix}"
-    write_whole(sample / path, part.coding.coded(picture.read()))
-    return WrittenPicture(path, picture.camera, picture.world_from_cam, picture.time_ns)
 
 
 def _transforms(name: str) -> str:
@@ -142,12 +160,7 @@ class MakeSample:
 
 def main() -> int:
     """Parse the command line and pack; return the exit status."""
-    try:
-        tyro.cli(MakeSample, prog="sample").run()
-    except (RfedgeError, OSError) as error:
-        print(f"sample: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_maker(MakeSample, "sample")
 
 
 if __name__ == "__main__":

@@ -9,14 +9,13 @@ from pathlib import Path
 from time import monotonic
 from typing import Annotated
 
-import tyro
 from rich.console import Console
 from tyro.conf import Positional
 
 from rfcore.dataset import verify_manifest
-from rfcore.errors import RfedgeError
 from rfcore.train import DensityControl, SplatTrainingConfig
 from rfedge.demo.field import trained_field
+from rfedge.demo.maker import run_maker
 from rfedge.demo.sample_field import Making, sample_field_path, write_sample_field
 from rfedge.provenance import revision
 from rfedge.training import training_config
@@ -67,12 +66,7 @@ class MakeSampleField:
 
 def main() -> int:
     """Parse the command line and make the field; return the exit status."""
-    try:
-        tyro.cli(MakeSampleField, prog="sample-field").run()
-    except (RfedgeError, OSError) as error:
-        print(f"sample-field: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_maker(MakeSampleField, "sample-field")
 
 
 if __name__ == "__main__":

@@ -102,6 +102,17 @@ def test_an_unfinished_build_leaves_the_sample_as_it_was(
     assert [path.name for path in sample.iterdir()] == ["README.md"]
 
 
+def test_a_picture_that_cannot_be_read_leaves_the_sample_as_it_was(
+    built: Path, sample: Path
+) -> None:
+    pack_sample(built, sample)
+    before = {path: path.read_bytes() for path in sample.rglob("*") if path.is_file()}
+    (built / "vehicles" / "drive" / "000001.png").write_bytes(b"no picture")
+    with pytest.raises(DatasetError, match="not a readable picture"):
+        pack_sample(built, sample)
+    assert {path: path.read_bytes() for path in sample.rglob("*") if path.is_file()} == before
+
+
 def test_both_scenes_of_the_sample_are_one_street_and_one_drive() -> None:
     empty, vehicles = (load_scene(str(SAMPLE / f"{name}.toml")) for name in ("empty", "vehicles"))
     assert (vehicles.geometry, vehicles.rig, vehicles.drive) == (
@@ -111,3 +122,4 @@ def test_both_scenes_of_the_sample_are_one_street_and_one_drive() -> None:
     )
     assert vehicles.field == empty.name
     assert not empty.effects
+    assert load_scene(str(SAMPLE / "drive_2hz.toml")).geometry == empty.geometry
