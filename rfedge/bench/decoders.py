@@ -23,9 +23,9 @@ from rfcore.codec import DecoderState, DeltaDecoder
 from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth
-from rfcore.native.yuv import i420_from_colour
 from rfcore.wire.messages import Frame
 from rfedge.loadtest.canned import CannedDrive, canned_drive
+from rfedge.offline import rendered
 
 __all__ = ["decoder_rows"]
 
@@ -68,7 +68,7 @@ def _decoder(kind: DecoderKind, drive: CannedDrive, opened: ExitStack) -> DeltaD
 def _times(
     drive: CannedDrive, field: RadianceField, decoders: dict[DecoderKind, DeltaDecoder]
 ) -> dict[DecoderKind, list[float]]:
-    renders = [_rendered(field, frame, drive) for frame in drive.chain]
+    renders = [rendered(field, f.camera(drive.intrinsics), f.quality) for f in drive.chain]
     times_ms: dict[DecoderKind, list[float]] = {kind: [] for kind in decoders}
     for lap in range(1 + LAPS):
         states = {kind: decoder.start(0) for kind, decoder in decoders.items()}
@@ -78,12 +78,6 @@ def _times(
                 if lap:
                     times_ms[kind].append(ms)
     return times_ms
-
-
-def _rendered(field: RadianceField, frame: Frame, drive: CannedDrive) -> tuple[I420, PosedDepth]:
-    camera = frame.camera(drive.intrinsics)
-    view = field.render(camera, frame.quality)
-    return i420_from_colour(view.colour), PosedDepth(camera, view.depth)
 
 
 def _timed(

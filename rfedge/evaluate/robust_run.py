@@ -194,9 +194,7 @@ class Bench:
         """Return what noise of each size costs, and what is left of it after refinement."""
         drive, rival = self.drive, self._rival(self.drive)
         still, *noises = self.noises()
-        kbit = self._own(
-            drive, f"pose noise {still}", noisy_cameras(drive.clip.cameras, still, SEED)
-        )
+        kbit = self._own(drive, f"pose noise {still}", drive.clip.cameras)
         rows = [self._row("pose noise", str(still), kbit, None, rival)]
         for noise in noises:
             measured = noisy_cameras(drive.clip.cameras, noise, SEED)
