@@ -48,7 +48,7 @@ test-netns: build test-system-packages  ## compare the link with the kernel's ow
 
 test-fault: build test-system-packages  ## break servers, vehicles and links; writes results/faults.json (root)
 	$(BIN)/python -m pytest tests/fault -m fault --timeout 120 --faults-json results/faults.json
-	$(BIN)/python -m rfedge.report.faults_page results/faults.json > docs/reliability.md.part
+	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
 	mv docs/reliability.md.part docs/reliability.md
 
 test-compose: images  ## start docker-compose.yml and look at it (root, docker, docker-compose)
@@ -107,7 +107,7 @@ sample: build  ## render the street in samples/street anew (half an hour; pip in
 	$(BIN)/python -m rfedge.demo.make_sample out/sample samples/street
 
 sample-field: build  ## train the field that ships in samples/fields (some minutes)
-	$(BIN)/python -m rfedge.demo.make_sample_field samples/street $(ARGS)
+	$(BIN)/python -m rfedge.demo.field samples/street $(ARGS)
 
 bench: build  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench raster
@@ -115,12 +115,12 @@ bench: build  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench codec
 
 figures: build  ## regenerate docs/results.md, docs/ladder.md, docs/metrics.md and the dashboards
-	$(BIN)/python -m rfedge.report.markdown results > docs/results.md.part
+	$(BIN)/python -m rfedge.pages.results results > docs/results.md.part
 	mv docs/results.md.part docs/results.md
-	$(BIN)/python -m rfedge.report.ladder results docs
-	$(BIN)/python -m rfedge.report.faults_page results/faults.json > docs/reliability.md.part
+	$(BIN)/python -m rfedge.experiments.ladder.page results docs
+	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
 	mv docs/reliability.md.part docs/reliability.md
-	$(BIN)/python -m rfedge.report.metrics_page > docs/metrics.md.part
+	$(BIN)/python -m rfedge.pages.metrics > docs/metrics.md.part
 	mv docs/metrics.md.part docs/metrics.md
 	$(BIN)/python -m rfedge.dashboards deploy/grafana/dashboards
 

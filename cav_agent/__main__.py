@@ -12,8 +12,7 @@ import tyro
 from cav_agent.config import AgentConfig
 from cav_agent.vehicle import Vehicle
 from rfcore.errors import RfedgeError
-from rfcore.wire.logs import configure_logs
-from rfcore.wire.settings import OPTIONS
+from rfcore.wire.settings import OPTIONS, configure_logs
 
 __all__ = ["main"]
 

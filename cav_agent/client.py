@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import grpc
 import structlog
 
+from cav_agent.capture_schedule import CaptureSchedule
 from cav_agent.config import AgentLimits
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult
-from cav_agent.pace import Pace
 from cav_agent.session import AgentSession, LinkState
 from rfcore.errors import ProtocolError, RfedgeError
 from rfcore.views import PosedPicture
@@ -64,7 +64,7 @@ class Equipment:
     """
 
     pictures: tuple[PosedPicture, ...]
-    pace: Pace
+    pace: CaptureSchedule
     encode: Callable[[EncodeJob], EncodedFrame]
     executor: Executor
     reached: Callable[[float | None], Awaitable[None]]

@@ -9,12 +9,11 @@ from typing import Annotated
 
 from tyro.conf import Suppress
 
-from rfcore.codec import SteeringSettings
-from rfcore.codec.config import CRF_RANGE, PRESETS
+from rfcore.codec.h264.config import CRF_RANGE, PRESETS
+from rfcore.codec.sender.steering import SteeringSettings
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import check_field_id, check_name
-from rfcore.wire.logs import LogForm
-from rfcore.wire.settings import MetricsSettings, RenderSettings, TransportSettings
+from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
 
 __all__ = ["AgentConfig", "AgentLimits", "PaceKind"]
 
@@ -24,7 +23,7 @@ class AgentLimits:
     """Deadlines in seconds, and how many pictures may wait for the encoder.
 
     ``answer_s``: longest from encoding to Ack or Nack, before the stream is given up; less once it
-    is known what is usual (``cav_agent.patience``). ``give_up_s``: without
+    is known what is usual (``cav_agent.answer_timeout``). ``give_up_s``: without
     any connection; 0 means never.
     """
 

@@ -12,8 +12,8 @@ from enum import StrEnum
 
 from cav_agent.rate_control import ByteBudget
 from rfcore.camera import Pose
-from rfcore.codec import DeltaPacket
-from rfcore.codec.ladder import FULL_RUNG, Rung
+from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.sender.ladder import FULL_RUNG, Rung
 from rfcore.views import PosedPicture
 from rfcore.wire.messages import FrameAddress, StageTimes
 

@@ -10,7 +10,7 @@ from prometheus_client import CollectorRegistry
 
 from cav_agent.deadline import Step
 from cav_agent.frames import FrameResult
-from rfcore.codec import references_name
+from rfcore.codec.references import references_name
 from rfcore.wire.instruments import Instruments
 
 __all__ = ["AgentMetrics"]

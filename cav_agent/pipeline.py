@@ -11,27 +11,19 @@ from dataclasses import replace
 from functools import partial
 from typing import Protocol
 
+from cav_agent.deadline import FixedRung, Rungs
 from cav_agent.frames import EncodedFrame, EncodeJob
-from cav_agent.rungs import FixedRung, Rungs
 from rfcore.camera import Camera, Intrinsics
-from rfcore.codec import (
-    KEPT_FRAMES,
-    NO_STEERING,
-    RENDER_ONLY,
-    CodecConfig,
-    DeltaEncoder,
-    Encoded,
-    EncoderState,
-    FrameChoice,
-    Past,
-    RateModel,
-    RateTarget,
-    Steering,
-    StreamHeader,
-)
-from rfcore.codec.align import Look
-from rfcore.codec.ladder import Rung
-from rfcore.codec.pose_search import PoseSearch
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.references import RENDER_ONLY
+from rfcore.codec.sender.align import Look
+from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
+from rfcore.codec.sender.ladder import Rung
+from rfcore.codec.sender.pose_search import PoseSearch
+from rfcore.codec.sender.rate import RateModel, RateTarget
+from rfcore.codec.sender.steering import NO_STEERING, Steering
+from rfcore.codec.state import KEPT_FRAMES, EncoderState, Past
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality
 from rfcore.image import I420, Rgb

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rfcore.codec import PathEstimator
+from cav_agent.path_estimator import PathEstimator
 from rfcore.errors import InvalidInput
 from rfcore.wire.messages import FrameAddress
 

@@ -18,6 +18,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from cav_agent.answer_timeout import AnswerTimeout
 from cav_agent.config import AgentLimits
 from cav_agent.frames import (
     TOO_LATE,
@@ -27,7 +28,6 @@ from cav_agent.frames import (
     FrameResult,
     Outcome,
 )
-from cav_agent.patience import Patience
 from cav_agent.rate_control import ByteBudget, RateControl
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
@@ -91,7 +91,7 @@ class AgentSession:
         self._camera_id = hello.cameras[0].camera_id
         self._limits = limits or AgentLimits()
         self._rate_control = rate_control
-        self._patience = Patience(self._limits.answer_s)
+        self._patience = AnswerTimeout(self._limits.answer_s)
         self._epoch = first_epoch
         self._epoch_used = False
         self._connection = 0

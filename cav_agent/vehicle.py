@@ -15,26 +15,25 @@ import grpc
 import structlog
 from prometheus_client import CollectorRegistry, start_http_server
 
+from cav_agent.capture_schedule import CaptureSchedule
 from cav_agent.client import Agent, Equipment
 from cav_agent.config import AgentConfig, PaceKind
-from cav_agent.deadline import DeadlineController, Step
+from cav_agent.deadline import DeadlineController, DeadlineRungs, FixedRung, Rungs, Step
 from cav_agent.field_fetch import WHOLE_STREET, fetch_field, published_tiles
+from cav_agent.frame_log import FrameLog
 from cav_agent.frames import FrameResult, Outcome
-from cav_agent.handover import Cause
-from cav_agent.leg import Ready
+from cav_agent.handover import Cause, Stop
+from cav_agent.handover_controller import HandoverController, Hooks
 from cav_agent.metrics import AgentMetrics
-from cav_agent.pace import Pace
 from cav_agent.pipeline import Pipeline
 from cav_agent.rate_control import QualitySteps, RateControl
-from cav_agent.reach import ServerEnd
-from cav_agent.report import Report
-from cav_agent.route import Stop
-from cav_agent.rungs import DeadlineRungs, FixedRung, Rungs
+from cav_agent.server_connection import ServerConnection
 from cav_agent.session import AgentSession
-from cav_agent.trip import Hooks, Trip
+from cav_agent.tile_stream import Ready
 from rfcore.camera import TileOrigin
-from rfcore.codec import CodecConfig, Steering
-from rfcore.codec.ladder import Rung, read_ladder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.sender.ladder import Rung, read_ladder
+from rfcore.codec.sender.steering import Steering
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import FieldStore, RadianceField
@@ -56,7 +55,7 @@ RETRY_S = 2.0
 
 
 @dataclass(frozen=True)
-class Journey:
+class PreparedField:
     """What was made ready for one field before the first frame."""
 
     field: RadianceField
@@ -80,11 +79,11 @@ class Vehicle:
         )
         self._config = config
         self._metrics = AgentMetrics(self.registry)
-        self._report: Report | None = None
+        self._report: FrameLog | None = None
         self._executor = ThreadPoolExecutor(1, "encoder")
         self._channels: list[grpc.aio.Channel] = []
         self._noticed: list[asyncio.Event] = []
-        self._journeys: OrderedDict[str, asyncio.Task[Journey]] = OrderedDict()
+        self._journeys: OrderedDict[str, asyncio.Task[PreparedField]] = OrderedDict()
         self._sessions: deque[AgentSession] = deque(maxlen=4)
         self._stopped = asyncio.Event()
 
@@ -109,17 +108,17 @@ class Vehicle:
                     self._channels.append(await stack.enter_async_context(server.open()))
                     self._noticed.append(asyncio.Event())
                 if config.report is not None:
-                    self._report = Report(config.report)
+                    self._report = FrameLog(config.report)
                     stack.callback(self._report.close)
                 positions = [
                     picture.camera.world_from_cam.translation_m[:2] for picture in pictures
                 ]
                 hooks = Hooks(self._make_ready, self._ended, self._moved)
-                return await self._drive(Trip(config, positions, hooks))
+                return await self._drive(HandoverController(config, positions, hooks))
         finally:
             self._executor.shutdown()
 
-    async def _drive(self, trip: Trip) -> Counter[str]:
+    async def _drive(self, trip: HandoverController) -> Counter[str]:
         """Drive while learning what servers publish, until the end or ``stop``."""
         driving = asyncio.create_task(trip.run())
         learning = [asyncio.create_task(self._learn(trip, i)) for i in range(len(self._servers))]
@@ -147,7 +146,7 @@ class Vehicle:
 
     # --- what servers publish
 
-    async def _learn(self, trip: Trip, server: int) -> None:
+    async def _learn(self, trip: HandoverController, server: int) -> None:
         """Tell the trip what a server publishes, and again whenever that changes."""
         is_known = False
         while True:
@@ -182,7 +181,7 @@ class Vehicle:
         journey = await self._journey(stop)
         return Ready(journey.pictures, partial(self._agent, stop, journey))
 
-    async def _journey(self, stop: Stop) -> Journey:
+    async def _journey(self, stop: Stop) -> PreparedField:
         """Return what was made ready for the stop's field; tiles of one field share it."""
         journeys, field_id = self._journeys, stop.tile.field_id
         task = journeys.get(field_id)
@@ -193,7 +192,7 @@ class Vehicle:
             journeys.popitem(last=False)
         return await asyncio.shield(task)
 
-    async def _load(self, stop: Stop) -> Journey:
+    async def _load(self, stop: Stop) -> PreparedField:
         return await asyncio.to_thread(self._prepare, await self._field(stop))
 
     async def _field(self, stop: Stop) -> RadianceField:
@@ -211,7 +210,7 @@ class Vehicle:
             await fetch_field(channel, store, field_id, fields)
         return await asyncio.to_thread(store.load, field_id, threads=render.threads, isa=render.isa)
 
-    def _prepare(self, field: RadianceField) -> Journey:
+    def _prepare(self, field: RadianceField) -> PreparedField:
         config = self._config
         pictures = _read_drive(config, field.metadata.tile_origin)
         k = pictures[0].camera.intrinsics
@@ -221,7 +220,7 @@ class Vehicle:
         self._metrics.field(field.field_id, field.metadata.kind)
         log.info("ready", pictures=len(pictures), field=field.field_id, isa=field.isa)
         steering = config.steering.steering(codec.size_px)
-        return Journey(field, pictures, codec, rungs, steering)
+        return PreparedField(field, pictures, codec, rungs, steering)
 
     def _rungs(self, field: RadianceField) -> Rungs:
         """Return how frames are coded; under a deadline make every renderer it may ask for."""
@@ -250,7 +249,7 @@ class Vehicle:
                 slowness=round(step.slowness, 2),
             )
 
-    def _agent(self, stop: Stop, journey: Journey, pace: Pace) -> Agent:
+    def _agent(self, stop: Stop, journey: PreparedField, pace: CaptureSchedule) -> Agent:
         """Return an agent for a new stream to ``stop``; none of its packets has a number twice."""
         config, channel = self._config, self._channels[stop.server]
         pipeline = Pipeline(
@@ -298,12 +297,12 @@ class Vehicle:
         log.info("handed over", server=server, tile=stop.tile.name, cause=str(cause))
 
 
-def _server_end(name: str, text: str, config: AgentConfig) -> ServerEnd:
+def _server_end(name: str, text: str, config: AgentConfig) -> ServerConnection:
     address = Address.parse(name, text)
     tls = config.transport.tls()
     if tls is None:
         address.require_private(name, config.transport.allow_insecure)
-    return ServerEnd(address, tls)
+    return ServerConnection(address, tls)
 
 
 def _read_drive(config: AgentConfig, origin: TileOrigin) -> tuple[PosedPicture, ...]:

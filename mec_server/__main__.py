@@ -9,11 +9,10 @@ import sys
 import tyro
 
 from mec_server.config import ServerConfig
-from mec_server.handlers import OpenCameras, open_cameras
+from mec_server.reconstruction import OpenCameras, open_cameras
 from mec_server.server import EdgeServer
 from rfcore.errors import RfedgeError
-from rfcore.wire.logs import configure_logs
-from rfcore.wire.settings import OPTIONS
+from rfcore.wire.settings import OPTIONS, configure_logs
 
 __all__ = ["main"]
 

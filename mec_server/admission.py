@@ -38,7 +38,7 @@ NOTICEABLE = 0.1
 
 
 @dataclass
-class Guest:
+class AdmittedStream:
     """A vehicle that is in. ``cost_s``: worker time for each of its frames."""
 
     pixels: int
@@ -60,7 +60,7 @@ class Admission:
     def __init__(self, limits: AdmissionLimits, workers: int) -> None:
         self._limits = limits
         self._capacity = limits.load * workers
-        self._guests: dict[str, Guest] = {}
+        self._guests: dict[str, AdmittedStream] = {}
         self._s_per_pixel = FIRST_S_PER_PIXEL
         self._reviewed_s = float("-inf")
 
@@ -119,15 +119,15 @@ class Admission:
             free -= guest.promised
         return changed
 
-    def _newcomer(self, hello: Hello) -> Guest:
+    def _newcomer(self, hello: Hello) -> AdmittedStream:
         pixels = max(k.intrinsics.width_px * k.intrinsics.height_px for k in hello.cameras)
         asked_hz = max(camera.rate_hz for camera in hello.cameras)
         cost_s = pixels * self._s_per_pixel
         says_rate = asked_hz > 0
         asked_hz = asked_hz or ASSUMED_HZ
-        return Guest(pixels, len(hello.cameras), asked_hz, cost_s, asked_hz, says_rate)
+        return AdmittedStream(pixels, len(hello.cameras), asked_hz, cost_s, asked_hz, says_rate)
 
-    def _full(self, guest: Guest, free: float) -> LimitExceeded:
+    def _full(self, guest: AdmittedStream, free: float) -> LimitExceeded:
         limits = self._limits
         return LimitExceeded(
             Limit.CAPACITY,
@@ -137,15 +137,15 @@ class Admission:
             limits.retry_s,
         )
 
-    def _rate(self, guest: Guest, free: float) -> float:
+    def _rate(self, guest: AdmittedStream, free: float) -> float:
         """Return the rate that ``free`` workers allow, up to the one that was asked for."""
         return min(guest.asked_hz, max(0.0, free) / (guest.cameras * guest.cost_s))
 
-    def _lowest_hz(self, guest: Guest) -> float:
+    def _lowest_hz(self, guest: AdmittedStream) -> float:
         return min(self._limits.lowest_hz, guest.asked_hz)
 
     @staticmethod
-    def _said(guest: Guest) -> float:
+    def _said(guest: AdmittedStream) -> float:
         """A vehicle that never said its rate is not held to one, unless it must be lower."""
         full = guest.granted_hz >= guest.asked_hz
         return 0.0 if full and not guest.says_rate else guest.granted_hz

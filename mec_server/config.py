@@ -11,8 +11,7 @@ from tyro.conf import Suppress, arg
 
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import MAX_RATE_HZ
-from rfcore.wire.logs import LogForm
-from rfcore.wire.settings import MetricsSettings, RenderSettings, TransportSettings
+from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
 
 __all__ = [
     "AdmissionLimits",

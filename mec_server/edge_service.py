@@ -13,8 +13,8 @@ import grpc
 import structlog
 
 from mec_server.quotas import Limit
+from mec_server.server_context import ServerContext
 from mec_server.stream import Context, Stream
-from mec_server.surroundings import Surroundings
 from rfcore.errors import LimitExceeded, RfedgeError
 from rfcore.wire.conventions import RETRY_AFTER, STREAM_METHOD
 from rfcore.wire.status import status_of
@@ -27,7 +27,7 @@ log = structlog.get_logger()
 class EdgeService:
     """Accepts streams and lets them go when the server drains."""
 
-    def __init__(self, around: Surroundings) -> None:
+    def __init__(self, around: ServerContext) -> None:
         self._around = around
         self._streams: set[Stream] = set()
 

@@ -13,9 +13,9 @@ from functools import cached_property
 
 from prometheus_client import CollectorRegistry, Counter, Histogram
 
-from mec_server.decoder_process import LossCause
+from mec_server.decoding.process import LossCause
 from mec_server.quotas import Limit
-from rfcore.codec import References, references_name
+from rfcore.codec.references import References, references_name
 from rfcore.errors import RejectReason
 from rfcore.field import RadianceField
 from rfcore.wire.instruments import Instruments

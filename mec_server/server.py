@@ -15,19 +15,19 @@ from prometheus_client import CollectorRegistry, start_http_server
 
 from mec_server.admission import Admission
 from mec_server.config import ServerConfig
-from mec_server.decoders import Decoders
+from mec_server.decoding.decoders import Decoders
 from mec_server.edge_service import EdgeService
-from mec_server.field_service import FieldService
-from mec_server.fields import FieldShelf, field_loader
-from mec_server.fields_published import PublishedFields
-from mec_server.handlers import OpenCameras, Tools, open_cameras
+from mec_server.fields.published import PublishedFields
+from mec_server.fields.service import FieldService
+from mec_server.fields.shelf import FieldShelf, field_loader
 from mec_server.metrics import ServerMetrics
 from mec_server.quotas import Quotas
+from mec_server.reconstruction import OpenCameras, Tools, open_cameras
 from mec_server.recorder import Recorder
-from mec_server.surroundings import Surroundings
-from mec_server.twin import Twin
-from mec_server.twin_metrics import TwinMetrics
-from mec_server.twin_service import TwinService
+from mec_server.server_context import ServerContext
+from mec_server.twin.metrics import TwinMetrics
+from mec_server.twin.service import TwinService
+from mec_server.twin.state import Twin
 from mec_server.workers import Workers
 from rfcore.errors import RfedgeError
 from rfcore.field import FieldStore
@@ -79,7 +79,7 @@ class EdgeServer:
         self._recorder = self._open_recorder(config.save)
         self._health = health_aio.HealthServicer()
         self._edge = EdgeService(
-            Surroundings(
+            ServerContext(
                 self._shelf,
                 store.ids,
                 self._workers,

@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 
+from mec_server.camera_queue import CameraQueue, Waiting
 from mec_server.config import SessionLimits
-from mec_server.jobs import DecodeJob, DecodeOutcome, End, OpenJob
-from mec_server.lane import Lane, Waiting
+from mec_server.decode_jobs import DecodeJob, DecodeOutcome, End, OpenJob
 from mec_server.quotas import Limit
 from rfcore.errors import (
     AccessDenied,
@@ -86,7 +86,7 @@ class ServerSession:
         self._limits = limits or SessionLimits()
         self._held = tuple(held_field_ids)
         self._identity = identity
-        self._lanes: dict[str, Lane] = {}
+        self._lanes: dict[str, CameraQueue] = {}
         self._fields: dict[bytes, str] = {}
         self._opening: OpenJob | None = None
         self._outbox: deque[ServerMessage] = deque()
@@ -176,7 +176,7 @@ class ServerSession:
             self._nack(frame.address, error.reason, error.problem)
             self._unusable_frame()
 
-    def _lane_of(self, frame: Frame) -> Lane:
+    def _lane_of(self, frame: Frame) -> CameraQueue:
         if frame.camera_id not in self._lanes:
             raise InvalidInput(
                 "frame.camera_id", f"{shown(frame.camera_id)} is not a camera of this Hello"
@@ -206,7 +206,7 @@ class ServerSession:
         self._finish_draining()
         return jobs
 
-    def _job(self, lane: Lane, waiting: Waiting, now: float) -> DecodeJob | None:
+    def _job(self, lane: CameraQueue, waiting: Waiting, now: float) -> DecodeJob | None:
         frame = waiting.frame
         try:
             lane.check_order(frame)
@@ -223,7 +223,7 @@ class ServerSession:
         self.state = SessionState.OPEN
         self.hello = job.hello
         for camera in job.hello.cameras:
-            self._lanes[camera.camera_id] = Lane(camera, self._limits.window_frames)
+            self._lanes[camera.camera_id] = CameraQueue(camera, self._limits.window_frames)
         for field_id in job.hello.field_ids:
             self._fields[bytes.fromhex(field_id)[:FIELD_ID_PREFIX_BYTES]] = field_id
         self._fields[b""] = job.hello.field_ids[0]

@@ -16,15 +16,15 @@ from functools import partial
 import grpc
 import structlog
 
-from mec_server.alarm import Alarm
-from mec_server.decoder_process import DecoderLost
-from mec_server.handlers import Decoder, Reconstruction
-from mec_server.jobs import DecodeJob, End, OpenJob
+from mec_server.decode_jobs import DecodeJob, End, OpenJob
+from mec_server.decoding.process import DecoderLost
+from mec_server.lazy_timer import LazyTimer
 from mec_server.quotas import Allowance
+from mec_server.reconstruction import Decoder, Reconstruction
 from mec_server.recorder import Recording
+from mec_server.server_context import ServerContext
 from mec_server.session import ServerSession, SessionState
-from mec_server.surroundings import Surroundings
-from mec_server.twin import TwinView
+from mec_server.twin.state import TwinView
 from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeError
 from rfcore.wire.convert import client_message_from_bytes
@@ -47,13 +47,13 @@ class Stream:
     """Pumps one session; ``deal_out`` is called when frames' costs may have changed."""
 
     def __init__(
-        self, around: Surroundings, context: Context, deal_out: Callable[[], None]
+        self, around: ServerContext, context: Context, deal_out: Callable[[], None]
     ) -> None:
         self._around = around
         self._deal_out = deal_out
         self._context = context
         self._wake = asyncio.Event()
-        self._alarm = Alarm(self._wake)
+        self._alarm = LazyTimer(self._wake)
         self._tasks = asyncio.TaskGroup()
         self._identity = peer_identity(context.auth_context())
         self._allowance: Allowance | None = None

@@ -10,17 +10,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from rfcore.camera import Camera
-from rfcore.codec import (
-    NO_STEERING,
-    CodecConfig,
-    DeltaDecoder,
-    DeltaEncoder,
-    Encoded,
-    FrameChoice,
-    Steering,
-)
-from rfcore.codec.align import Look
-from rfcore.codec.pose_search import PoseSearch
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.sender.align import Look
+from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
+from rfcore.codec.sender.pose_search import PoseSearch
+from rfcore.codec.sender.steering import NO_STEERING, Steering
 from rfcore.dataset import Dataset
 from rfcore.errors import CodecError, DatasetError, InvalidData
 from rfcore.field import FULL, Quality, RadianceField

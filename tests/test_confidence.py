@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from rfcore.confidence import BEND_LIMIT, confidence
-from rfcore.views import View
+from rfcore.views import BEND_LIMIT, View, confidence
 
 SIZES = st.tuples(st.integers(1, 9), st.integers(1, 9))
 

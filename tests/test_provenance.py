@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rfedge.provenance import revision
+from rfedge.results import revision
 
 
 @pytest.fixture

@@ -25,8 +25,8 @@ sys.path.insert(0, str(ROOT))
 
 from rfcore.errors import RfedgeError  # noqa: E402
 from rfedge.dashboards.catalogue import DASHBOARDS  # noqa: E402
-from rfedge.dashboards.panel import Dashboard, Panel, Unit  # noqa: E402
-from rfedge.provenance import host, revision  # noqa: E402
+from rfedge.dashboards.grafana import Dashboard, Panel, Unit  # noqa: E402
+from rfedge.results import host, revision  # noqa: E402
 
 __all__ = ["filled", "main", "section"]
 

@@ -14,15 +14,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from rfcore.codec.coarse import COARSE_TOLERANCE, coarse_difference, coarse_digest
-from rfcore.codec.h264 import H264Decoder
-from rfcore.codec.header import StreamHeader
+from rfcore.codec.block_means import BLOCK_MEANS_TOLERANCE, block_mean_difference, block_mean_digest
+from rfcore.codec.h264.ffmpeg import H264Decoder
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.h264.pcm_picture import without_zeros
+from rfcore.codec.h264.splice import PictureDecoder, SpliceDecoder
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.photometric import adapt
 from rfcore.codec.prediction import Prediction
-from rfcore.codec.reference import without_zeros
 from rfcore.codec.references import is_temporal
-from rfcore.codec.splice import PictureDecoder, SpliceDecoder
 from rfcore.codec.state import DecoderState, Past
 from rfcore.errors import BitstreamError, CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
@@ -140,8 +140,8 @@ class DeltaDecoder:
                 "our render is not the sender's, and the packet has no block means to say by how "
                 f"much: {'another pose, field or camera' if self._exact else _COARSE_NEEDED}",
             )
-        difference = coarse_difference(coarse_digest(render), packet.reference_coarse)
-        rounding_sized = difference <= COARSE_TOLERANCE
+        difference = block_mean_difference(block_mean_digest(render), packet.reference_coarse)
+        rounding_sized = difference <= BLOCK_MEANS_TOLERANCE
         if rounding_sized and not self._exact:
             return False
         kind = (
@@ -152,7 +152,7 @@ class DeltaDecoder:
         raise PacketRejected(
             RejectReason.REFERENCE_MISMATCH,
             f"our render is not the sender's; block means differ by up to {difference} "
-            f"levels (tolerance {COARSE_TOLERANCE}): {kind}",
+            f"levels (tolerance {BLOCK_MEANS_TOLERANCE}): {kind}",
         )
 
     def _past(self, state: DecoderState, packet: DeltaPacket) -> Past | None:

@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from rfcore.codec.coarse import COARSE_BYTES
+from rfcore.codec.block_means import BLOCK_MEANS_BYTES
 from rfcore.codec.photometric import Photometric, check_photometric
 from rfcore.codec.references import RENDER_ONLY, References, check_references, is_temporal
 from rfcore.errors import InvalidInput
@@ -20,7 +20,7 @@ NEEDED_BYTES = 4
 digest, not in a wrong picture."""
 
 _UINT32, _UINT64 = 1 << 32, 1 << 64
-_DIGEST, _COARSE, _NOTHING = (DIGEST_BYTES,), (0, COARSE_BYTES), (0,)
+_DIGEST, _COARSE, _NOTHING = (DIGEST_BYTES,), (0, BLOCK_MEANS_BYTES), (0,)
 _NEEDED = range(NEEDED_BYTES, DIGEST_BYTES + 1)
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from rfcore.codec.config import REFERENCE_FRAMES
+from rfcore.codec.h264.config import REFERENCE_FRAMES
 from rfcore.errors import InvalidInput
 
 __all__ = [

@@ -1,22 +1,279 @@
-"""Posed pictures from a COLMAP model and the folder ``images`` it was made from.
+r"""Posed pictures from a COLMAP model and the folder ``images`` it was made from.
 
 The model lies in ``sparse/0``, ``sparse`` or the folder itself, in text or binary form (binary goes
 first, as in COLMAP). Pictures come out in the order of their names.
+
+A COLMAP model as tables: cameras, posed images, points.
+
+Poses are cam_from_world with OpenCV camera axes, quaternions w, x, y, z; pixel centres are at +0.5
+as here. Described in COLMAP's documentation, "Output Format"; the parsers of its two encodings are
+``rfcore.dataset.colmap`` and ``rfcore.dataset.colmap``.
+
+COLMAP's binary model: ``cameras.bin``, ``images.bin``, ``points3D.bin``, little-endian.
+
+::
+
+    cameras   uint64 n;  n times  uint32 id, int32 model, uint64 width, uint64 height, float64 ...
+    images    uint64 n;  n times  uint32 id, float64 qw qx qy qz tx ty tz, uint32 camera, name\0,
+                                  uint64 m, m times (float64 x, float64 y, uint64 point)
+    points3D  uint64 n;  n times  uint64 id, float64 x y z, uint8 r g b, float64 error,
+                                  uint64 m, m times (uint32 image, uint32 index)
+
+COLMAP's text model: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
+
+Lines that start with ``#`` are comments. An image takes two lines; the second, its 2D points, may
+be empty and is skipped.
 """
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from rfcore.dataset.colmap_binary import read_binary_model
-from rfcore.dataset.colmap_model import ColmapImage, ColmapModel
-from rfcore.dataset.colmap_text import read_text_model
+import numpy as np
+
+from rfcore.camera import Intrinsics, Pose
+from rfcore.dataset.keys import (
+    LENS_KEYS,
+    finite_numbers,
+    lens_of,
+    pose_of_quaternion,
+    read_file,
+    shortened,
+    text_lines,
+)
 from rfcore.dataset.picture_file import check_size, find_picture, read_picture
-from rfcore.dataset.source import Source, SourcePicture
-from rfcore.errors import DatasetError
+from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
+from rfcore.errors import DatasetError, InvalidInput
 
-__all__ = ["colmap_model_folder", "read_colmap_source"]
+__all__ = [
+    "MODEL_IDS",
+    "ColmapImage",
+    "ColmapModel",
+    "camera_of",
+    "colmap_model_folder",
+    "image_of",
+    "parameter_count",
+    "read_binary_model",
+    "read_colmap_source",
+    "read_text_model",
+]
+
+
+MODEL_IDS = {
+    0: "SIMPLE_PINHOLE",
+    1: "PINHOLE",
+    2: "SIMPLE_RADIAL",
+    3: "RADIAL",
+    4: "OPENCV",
+    5: "OPENCV_FISHEYE",
+}
+MAX_NAME = 60
+ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+COLMAP_LENS_KEYS = {**LENS_KEYS, "OPENCV": ("k1", "k2", "p1", "p2")}
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """One registered image; ``where`` is its place in the file."""
+
+    where: str
+    name: str
+    camera_id: int
+    cam_from_world: Pose
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """Cameras by id, images in the order of the file, points if there are any."""
+
+    cameras: dict[int, SourceCamera]
+    images: tuple[ColmapImage, ...]
+    points: SourcePoints | None
+
+
+def parameter_count(where: str, model: object) -> int:
+    """Return how many parameters a camera model has; ``DatasetError`` for an unknown one."""
+    if not isinstance(model, str) or model not in COLMAP_LENS_KEYS:
+        raise DatasetError(f"{where}: camera model {model} is none of {', '.join(LENS_KEYS)}")
+    return (3 if model in ONE_FOCAL else 4) + len(COLMAP_LENS_KEYS[model])
+
+
+def camera_of(
+    where: str, model: str, size_px: tuple[int, int], parameters: Sequence[float]
+) -> SourceCamera:
+    """Return a camera from its parameters, which are f or fx, fy, then cx, cy, then the lens."""
+    needed = parameter_count(where, model)
+    if len(parameters) != needed:
+        raise DatasetError(f"{where}: {model} has {needed} parameters, not {len(parameters)}")
+    focal = 1 if model in ONE_FOCAL else 2
+    fx_px, fy_px = parameters[0], parameters[focal - 1]
+    cx_px, cy_px = parameters[focal : focal + 2]
+    lens = dict(zip(COLMAP_LENS_KEYS[model], parameters[focal + 2 :], strict=True))
+    try:
+        intrinsics = Intrinsics(*size_px, fx_px, fy_px, cx_px, cy_px)
+    except InvalidInput as error:
+        raise DatasetError(f"{where}: {error}") from error
+    return SourceCamera(intrinsics, lens_of(where, model, lens))
+
+
+def image_of(where: str, name: str, camera_id: int, numbers: Sequence[float]) -> ColmapImage:
+    """Return an image from qw, qx, qy, qz, tx, ty, tz."""
+    if not name.isprintable() or not name:
+        raise DatasetError(f"{where}: name {shortened(name)} is empty or not printable")
+    where = f"{where} ({name[:MAX_NAME]})"
+    pose = pose_of_quaternion(where, numbers[4:7], numbers[:4])
+    return ColmapImage(where, name, camera_id, pose)
+
+
+MAX_NAME_BYTES = 4096
+POINT2D_BYTES = 24
+TRACK_BYTES = 8
+
+
+def read_binary_model(folder: Path) -> ColmapModel:
+    """Read a binary model. Raises ``DatasetError`` naming the file and the place in it."""
+    return ColmapModel(
+        cameras=dict(_cameras(_Bytes(folder / "cameras.bin"))),
+        images=tuple(_images(_Bytes(folder / "images.bin"))),
+        points=_points(folder / "points3D.bin"),
+    )
+
+
+class _Bytes:
+    """A file's bytes, taken from the front; running out of them is a ``DatasetError``."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self._content = read_file(file)
+        self._at = 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        """Return the values of a struct layout."""
+        start = self._at
+        self.skip(struct.calcsize(layout))
+        return struct.unpack_from(layout, self._content, start)
+
+    def skip(self, count: int) -> None:
+        left = len(self._content) - self._at
+        if count > left:
+            raise DatasetError(f"{self.file}: byte {self._at}: {count} bytes needed, {left} left")
+        self._at += count
+
+    def take_name(self) -> str:
+        end = self._content.find(b"\0", self._at, self._at + MAX_NAME_BYTES)
+        if end < 0:
+            raise DatasetError(f"{self.file}: byte {self._at}: a name has no end")
+        name = self._content[self._at : end]
+        self._at = end + 1
+        try:
+            return name.decode()
+        except UnicodeDecodeError as error:
+            raise DatasetError(f"{self.file}: name {name!r} is not UTF-8") from error
+
+
+def _cameras(content: _Bytes) -> Iterator[tuple[int, SourceCamera]]:
+    (count,) = content.take("<Q")
+    for i in range(count):
+        camera_id, model_id, width_px, height_px = content.take("<IiQQ")
+        where = f"{content.file}: camera {i}"
+        model = MODEL_IDS.get(model_id, f"number {model_id}")
+        parameters = content.take(f"<{parameter_count(where, model)}d")
+        yield camera_id, camera_of(where, model, (width_px, height_px), parameters)
+
+
+def _images(content: _Bytes) -> Iterator[ColmapImage]:
+    (count,) = content.take("<Q")
+    for i in range(count):
+        _, *numbers, camera_id = content.take("<I7dI")
+        name = content.take_name()
+        (points,) = content.take("<Q")
+        content.skip(points * POINT2D_BYTES)
+        yield image_of(f"{content.file}: image {i}", name, camera_id, numbers)
+
+
+def _points(file: Path) -> SourcePoints | None:
+    if not file.is_file():
+        return None
+    content = _Bytes(file)
+    (count,) = content.take("<Q")
+    rows = [_point(content) for _ in range(count)]
+    if not rows:
+        return None
+    xyz_m, rgb = np.array([row[:3] for row in rows]), np.array([row[3:] for row in rows], np.uint8)
+    try:
+        return SourcePoints(xyz_m, rgb)
+    except InvalidInput as error:
+        raise DatasetError(f"{file}: {error}") from error
+
+
+def _point(content: _Bytes) -> tuple[float, float, float, int, int, int]:
+    _, x, y, z, red, green, blue, _, track = content.take("<Q3d3BdQ")
+    content.skip(track * TRACK_BYTES)
+    return (x, y, z, red, green, blue)
+
+
+def read_text_model(folder: Path) -> ColmapModel:
+    """Read a text model. Raises ``DatasetError`` naming the file and the line."""
+    return ColmapModel(
+        cameras=dict(_cameras_of_text(folder / "cameras.txt")),
+        images=tuple(_images_of_text(folder / "images.txt")),
+        points=_points_of_text(folder / "points3D.txt"),
+    )
+
+
+def _rows(file: Path, at_least: int) -> Iterator[tuple[str, list[str]]]:
+    """Yield the place and the words of every line that is not a comment."""
+    for i, line in enumerate(text_lines(file), start=1):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            yield _checked(f"{file}: line {i}", words, at_least)
+
+
+def _checked(where: str, words: list[str], at_least: int) -> tuple[str, list[str]]:
+    if len(words) < at_least:
+        raise DatasetError(f"{where}: has {len(words)} values, at least {at_least} are needed")
+    return where, words
+
+
+def _cameras_of_text(file: Path) -> Iterator[tuple[int, SourceCamera]]:
+    for where, words in _rows(file, 4):
+        size_px = (_whole(where, words[2]), _whole(where, words[3]))
+        parameters = finite_numbers(where, words[4:])
+        yield _whole(where, words[0]), camera_of(where, words[1], size_px, parameters)
+
+
+def _images_of_text(file: Path) -> Iterator[ColmapImage]:
+    lines = iter(enumerate(text_lines(file), start=1))
+    for i, line in lines:
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        where, words = _checked(f"{file}: line {i}", line.split(maxsplit=9), 10)
+        numbers = finite_numbers(where, words[1:8])
+        yield image_of(where, words[9].strip(), _whole(where, words[8]), numbers)
+        next(lines, None)
+
+
+def _points_of_text(file: Path) -> SourcePoints | None:
+    if not file.is_file():
+        return None
+    rows = [finite_numbers(where, words[1:7]) for where, words in _rows(file, 8)]
+    if not rows:
+        return None
+    table = np.array(rows)
+    if (table[:, 3:] < 0).any() or (table[:, 3:] > 255).any():
+        raise DatasetError(f"{file}: a point's colour is outside 0..255")
+    return SourcePoints(np.ascontiguousarray(table[:, :3]), table[:, 3:].astype(np.uint8))
+
+
+def _whole(where: str, word: str) -> int:
+    if not word.isascii() or not word.isdigit():
+        raise DatasetError(f"{where}: '{word}' is not a whole number")
+    return int(word[:20])
 
 
 def colmap_model_folder(folder: Path) -> Path | None:

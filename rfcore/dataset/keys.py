@@ -1,6 +1,12 @@
 """Values of a JSON or TOML table or of a line of text, checked one by one.
 
 ``where`` is the file and the place in it; every error starts with it and names the key.
+
+The lens of a camera as tables name it: a camera model and coefficients k1, k2, p1, ...
+
+Models are COLMAP's names, which nerfstudio shares. Coefficients of zero are no lens,
+except of a fisheye, which is one even then. A coefficient that the model does not have, and a model
+that is not known, raise ``DatasetError``.
 """
 
 from __future__ import annotations
@@ -13,10 +19,13 @@ from typing import Any
 
 from rfcore.camera import Pose
 from rfcore.errors import DatasetError, InvalidInput
+from rfcore.lens import BrownLens, FisheyeLens, Lens
 
 __all__ = [
+    "LENS_KEYS",
     "Table",
     "finite_numbers",
+    "lens_of",
     "load_json",
     "matrix_rows",
     "number",
@@ -29,11 +38,10 @@ __all__ = [
     "text_lines",
 ]
 
+
 FILE_NORM_TOLERANCE = 1e-3
 """Trajectories are printed with as few as four decimals."""
-
 MAX_SHOWN = 60
-
 Table = Mapping[str, Any]
 
 
@@ -158,3 +166,35 @@ def _float(value: float) -> float:
         return float(value)
     except OverflowError:
         return math.inf
+
+
+LENS_KEYS = {
+    "PINHOLE": (),
+    "SIMPLE_PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+def lens_of(where: str, model: object, keys: Table) -> Lens | None:
+    """Return the lens, ``None`` for a pinhole."""
+    if not isinstance(model, str) or model not in LENS_KEYS:
+        raise DatasetError(f"{where}: camera_model {model!r} is none of {', '.join(LENS_KEYS)}")
+    given = {key: number(where, keys, key) for key in DISTORTION_KEYS if key in keys}
+    known = LENS_KEYS[model]
+    for key, value in given.items():
+        if value != 0.0 and key not in known:
+            raise DatasetError(
+                f"{where}: lens distortion {key} = {value:g} does not belong to camera_model "
+                f"{model}, which has {', '.join(known) or 'none'}"
+            )
+    return _lens(model, {key: given.get(key, 0.0) for key in known})
+
+
+def _lens(model: str, coefficients: dict[str, float]) -> Lens | None:
+    if model == "OPENCV_FISHEYE":
+        return FisheyeLens(**coefficients)
+    return BrownLens(**coefficients) if any(coefficients.values()) else None

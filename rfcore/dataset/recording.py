@@ -42,6 +42,7 @@ from typing import Any
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.dataset.keys import (
+    lens_of,
     matrix_rows,
     number,
     pose_of_rows,
@@ -50,7 +51,6 @@ from rfcore.dataset.keys import (
     text,
     text_lines,
 )
-from rfcore.dataset.lens_keys import lens_of
 from rfcore.dataset.picture_file import SUFFIXES, check_size, inside, read_picture
 from rfcore.dataset.points import read_points
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints

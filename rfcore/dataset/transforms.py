@@ -24,8 +24,16 @@ from typing import Any
 import numpy as np
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.dataset.keys import Table, load_json, matrix_rows, number, pose_of_rows, side_px, text
-from rfcore.dataset.lens_keys import lens_of
+from rfcore.dataset.keys import (
+    Table,
+    lens_of,
+    load_json,
+    matrix_rows,
+    number,
+    pose_of_rows,
+    side_px,
+    text,
+)
 from rfcore.dataset.picture_file import check_size, find_picture, inside, picture_file, read_picture
 from rfcore.dataset.points import read_points
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints

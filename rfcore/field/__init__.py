@@ -1,12 +1,11 @@
 """Radiance fields as data: what they are made of, and the files that hold them."""
 
 from rfcore.field.interface import Bounds, FieldMetadata, RadianceField
-from rfcore.field.load import load_field, save_field
 from rfcore.field.ngp import NgpField
 from rfcore.field.ply import read_ply, write_ply
 from rfcore.field.quality import FULL, Quality
 from rfcore.field.splats import SplatField
-from rfcore.field.store import FieldStore
+from rfcore.field.store import FieldStore, load_field, save_field
 
 __all__ = [
     "FULL",

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import TrainableRasterizer
+from rfcore.raster.trainable import TrainableRasterizer
 
 __all__ = ["contributions", "most_important_first", "reordered", "visible_area"]
 

@@ -3,21 +3,29 @@
 ``p_dst = scale * rotation @ p_src + translation_m``. Everything of a Gaussian follows: its mean,
 its widths, its rotation, and its colour, because spherical harmonics are functions of the
 direction in the field's frame. Done once, when a field is imported, in float64.
+
+``dataparser_transforms.json``: how nerfstudio normalised the scene a ``.ply`` was trained in.
+
+``{"transform": 3x4, "scale": s}`` with p_field = s * (transform @ (p_world, 1)). In the world,
+not in that frame, are the dataset's poses and everything else of ours.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Pose, TileOrigin
-from rfcore.errors import InvalidInput
+from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.harmonics import CONSTANT, higher_harmonics
 from rfcore.raster.gaussians import F32, Gaussians
 
-__all__ = ["Similarity", "moved", "spherical_harmonics"]
+__all__ = ["Similarity", "moved", "read_field_from_world", "spherical_harmonics"]
+
 
 F64 = NDArray[np.float64]
 DIRECTIONS = 64
@@ -106,3 +114,19 @@ def _turned_sh(sh: F32, rotation: F64) -> F32:
         matrix = np.linalg.lstsq(here[:, band], there[:, band], rcond=None)[0]
         turned[:, band] = np.einsum("ij,njc->nic", matrix, sh[:, band].astype(np.float64))
     return np.ascontiguousarray(turned, np.float32)
+
+
+def read_field_from_world(path: Path) -> Similarity:
+    """Return ``field_from_world``; raise ``FieldFormatError`` naming the file and the fault."""
+    try:
+        content = json.loads(path.read_bytes())
+        scale = float(content["scale"])
+        pose = Pose.from_matrix(content["transform"])
+        x, y, z = (scale * value for value in pose.translation_m)
+        return Similarity(Pose((x, y, z), pose.rotation), scale)
+    except OSError as error:
+        raise FieldFormatError(f"{path}: cannot be read ({error.strerror})") from error
+    except (KeyError, TypeError, ValueError, InvalidInput) as error:
+        raise FieldFormatError(
+            f'{path}: not {{"transform": 3x4, "scale": s}} of nerfstudio ({error})'
+        ) from error

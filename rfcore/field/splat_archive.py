@@ -2,23 +2,174 @@
 
 Raw float32 arrays by the names of ``Gaussians``; what a lower rung has of its own follows as
 ``detail_50.log_scales`` and ``detail_50.opacity_logits``, likewise for 25 and 10. Where the header
-has an ``encoding``, ``rfcore.field.splat_codec`` says what the arrays are.
+has an ``encoding``, ``rfcore.field.splat_archive`` says what the arrays are.
+
+Compressed splats: a smaller archive of the same kind, decoded to the same bytes everywhere.
+
+The header's ``encoding`` is {"name": "grid-1", "count", "sh_degree", "steps", "streams"}; each
+array of the archive is one stream of ``rfcore.field.integers``, holding the numbers of
+``rfcore.field.splat_grid``. The field id is of the archive, so both ends decode one set of splats.
+
+Splats are stored along a Morton curve within each band of detail (the first tenth, up to a
+quarter, up to half, the rest), so every rung keeps its splats and neighbours share a block.
+
+Measured on the first sample (150k splats, SH 3, three rungs): 3.03 MB, 20.2 bytes a splat, 8.1 %
+of the raw 37.4 MB, at a loss of 0.05 dB on the held-out drive.
 """
 
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive, Array
-from rfcore.field.detail import Rung, Rungs
-from rfcore.field.interface import SPLATS, Bounds, FieldMetadata
-from rfcore.field.metadata import stored_metadata
-from rfcore.field.quality import DETAILS
-from rfcore.field.splat_codec import splats_of_compressed
-from rfcore.raster.gaussians import Gaussians
+from rfcore.field.importance import reordered
+from rfcore.field.integers import Integers, decode_columns, encode_columns
+from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
+from rfcore.field.quality import DETAILS, Rung, Rungs, kept_of
+from rfcore.field.splat_grid import (
+    BLOCK,
+    SplatNumbers,
+    Steps,
+    gaussians_of,
+    numbers_of,
+    rung_numbers_of,
+    rung_of,
+)
+from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
 
-__all__ = ["splat_archive", "splats_of_archive"]
+__all__ = [
+    "ENCODING",
+    "compressed_archive",
+    "splat_archive",
+    "splats_of_archive",
+    "splats_of_compressed",
+]
+
+
+ENCODING = "grid-1"
+MORTON_BITS = 21
+SPREAD = (
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+"""Shifts and masks that put two zeros after each of 21 bits."""
+
+
+def compressed_archive(
+    gaussians: Gaussians, rungs: Rungs, metadata: FieldMetadata, steps: Steps | None = None
+) -> Archive:
+    """Return the archive of the nearest splats on the grid.
+
+    Raises ``InvalidInput`` for values no grid holds; such a field is saved uncompressed.
+    """
+    chosen = steps if steps is not None else Steps()
+    order = _local_order(gaussians)
+    numbers = numbers_of(reordered(gaussians, order), chosen)
+    parts: dict[str, Integers] = {f.name: getattr(numbers, f.name) for f in fields(numbers)}
+    for detail in DETAILS[1:]:
+        if detail in rungs:
+            own = _reordered_rung(rungs[detail], order)
+            parts[_name(detail)] = rung_numbers_of(own, numbers, chosen)
+    coded = {name: encode_columns(values) for name, values in parts.items()}
+    bounds = Bounds.around(gaussians_of(numbers, chosen).means)
+    encoding = {
+        "name": ENCODING,
+        "count": len(gaussians),
+        "sh_degree": gaussians.sh_degree,
+        "steps": asdict(chosen),
+        "streams": {name: header for name, (header, _) in coded.items()},
+    }
+    arrays: dict[str, Array] = {name: stream for name, (_, stream) in coded.items()}
+    return Archive(SPLATS, {**stored_metadata(metadata, bounds), "encoding": encoding}, arrays)
+
+
+def splats_of_compressed(archive: Archive) -> tuple[Gaussians, Rungs]:
+    """Return the splats of a compressed archive.
+
+    Raises ``InvalidInput``, ``KeyError`` or ``TypeError`` for one that holds none; every size is
+    checked before it is allocated.
+    """
+    encoding = archive.metadata["encoding"]
+    if encoding["name"] != ENCODING:
+        raise InvalidInput("encoding", f"{encoding['name']!r} is not '{ENCODING}'")
+    count = _whole(encoding, "count", MAX_GAUSSIANS)
+    shapes = _shapes(count, _whole(encoding, "sh_degree", 3), archive)
+    if set(shapes) != set(archive.arrays):
+        raise InvalidInput("encoding", f"arrays {', '.join(archive.arrays)} are not its streams")
+    steps, streams = Steps(**encoding["steps"]), encoding["streams"]
+    parts = {
+        name: decode_columns(streams[name], archive.arrays[name], shape)
+        for name, shape in shapes.items()
+    }
+    numbers = SplatNumbers(**{f.name: parts[f.name] for f in fields(SplatNumbers)})
+    rungs = {
+        detail: rung_of(parts[_name(detail)], numbers, steps)
+        for detail in DETAILS[1:]
+        if _name(detail) in parts
+    }
+    return gaussians_of(numbers, steps), rungs
+
+
+def _shapes(count: int, sh_degree: int, archive: Archive) -> dict[str, tuple[int, int]]:
+    """Return rows and columns of every stream there has to be."""
+    shapes = {
+        "blocks": (-(-count // BLOCK), 4),
+        "means": (count, 3),
+        "rotations": (count, 4),
+        "log_scales": (count, 3),
+        "opacity_logits": (count, 1),
+        "sh": (count, 3 * (sh_degree + 1) ** 2),
+    }
+    own = {_name(detail): (kept_of(count, detail), 4) for detail in DETAILS[1:]}
+    return shapes | {name: shape for name, shape in own.items() if name in archive.arrays}
+
+
+def _whole(encoding: Mapping[str, Any], key: str, highest: int) -> int:
+    value = encoding[key]
+    if type(value) is not int or not 0 <= value <= highest:
+        raise InvalidInput(f"encoding.{key}", f"{value!r} is not a whole number 0..{highest}")
+    return value
+
+
+def _name(detail: float) -> str:
+    return f"detail_{round(detail * 100)}"
+
+
+def _reordered_rung(rung: Rung, order: NDArray[np.intp]) -> Rung:
+    """Return the rung in the field's new order, which keeps every band together."""
+    own = order[: len(rung.opacity_logits)]
+    return replace(rung, log_scales=rung.log_scales[own], opacity_logits=rung.opacity_logits[own])
+
+
+def _local_order(gaussians: Gaussians) -> NDArray[np.intp]:
+    """Return the order [N] along the curve within each band."""
+    n = len(gaussians)
+    band = np.zeros(n, np.int8)
+    for detail in DETAILS[1:]:
+        band[kept_of(n, detail) :] += 1
+    return np.lexsort((_morton(gaussians.means.astype(np.float64)), band))
+
+
+def _morton(means: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """Return where points [N, 3] lie on the curve through the cube around them."""
+    if not len(means):
+        return np.zeros(0, np.uint64)
+    low = means.min(axis=0)
+    side = max(float((means.max(axis=0) - low).max()), np.finfo(np.float64).tiny)
+    cells = ((means - low) / side * (2**MORTON_BITS - 1)).astype(np.uint64)
+    for shift, mask in SPREAD:
+        cells = (cells | (cells << np.uint64(shift))) & np.uint64(mask)
+    return np.asarray(cells[:, 0] | (cells[:, 1] << np.uint64(1)) | (cells[:, 2] << np.uint64(2)))
+
 
 NAMES = tuple(f.name for f in fields(Gaussians))
 RUNG_NAMES = tuple(f.name for f in fields(Rung))

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
-from rfcore.field.detail import Rung
 from rfcore.field.integers import LIMIT, Integers
+from rfcore.field.quality import Rung
 from rfcore.raster.gaussians import F32, Gaussians
 
 __all__ = [

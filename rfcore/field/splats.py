@@ -1,7 +1,7 @@
 """A radiance field made of 3D Gaussians (Kerbl et al. 2023).
 
 What its archive holds is in ``rfcore.field.splat_archive``, which splats a quality draws in
-``rfcore.field.detail``.
+``rfcore.field.quality``.
 """
 
 from __future__ import annotations
@@ -16,14 +16,11 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive, encode_archive
-from rfcore.field.detail import Rungs, check_rungs, splats_of_rung
-from rfcore.field.interface import SPLATS, Bounds, FieldMetadata
-from rfcore.field.metadata import stored_metadata
-from rfcore.field.quality import FULL, Quality
+from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
+from rfcore.field.quality import FULL, Quality, Rungs, check_rungs, splats_of_rung
 from rfcore.field.scale import colour_at_scale, view_at_scale
-from rfcore.field.splat_archive import splat_archive
-from rfcore.field.splat_codec import compressed_archive, splats_of_compressed
-from rfcore.native.raster import check_backend
+from rfcore.field.splat_archive import compressed_archive, splat_archive, splats_of_compressed
+from rfcore.native.backend import check_backend
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.views import View
@@ -34,7 +31,7 @@ __all__ = ["SplatField"]
 class SplatField:
     """Gaussians with metadata, ready to render.
 
-    ``rungs`` is what the lower rungs have of their own (``rfcore.field.detail``). ``archive`` is
+    ``rungs`` is what the lower rungs have of their own (``rfcore.field.quality``). ``archive`` is
     the one the field came from, ``None`` for one that was just made: saving it is up to it.
     ``threads`` and ``isa`` choose how it renders, never what: every choice gives the same bytes.
     Raises ``BackendUnavailable`` if this machine lacks ``isa``. Safe to share between threads.

@@ -2,7 +2,7 @@
 
 ``profile`` and ``plan`` say what a link is, ``shaper`` is the machine, ``virtual`` drives it on a
 virtual clock, ``profile_file`` reads a link from a file. The driver on real sockets is
-``rfedge.link_proxy``. Impairments are separate modules that only a profile naming them imports.
+``rfedge.link.proxy``. Impairments are separate modules that only a profile naming them imports.
 """
 
 from rfcore.link.plan import DirectionPlan, LinkPlan

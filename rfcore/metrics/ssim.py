@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.metrics.comparison import Picture, check_comparable, resolve_peak
+from rfcore.metrics.psnr import Picture, check_comparable, resolve_peak
 
 __all__ = ["ssim"]
 

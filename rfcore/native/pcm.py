@@ -1,8 +1,8 @@
 """The samples of an I_PCM picture, macroblock by macroblock (ITU-T H.264, 7.3.5).
 
-What they are for, and the definition, is in ``rfcore.codec.reference``: 256 Y, 64 Cb and 64 Cr a
-macroblock, the two bytes 0x0D 0x00 before each but the first, samples raised to at least 1, and the
-last row and column repeated up to whole macroblocks.
+What they are for, and the definition, is in ``rfcore.codec.h264.pcm_picture``: 256 Y, 64 Cb and 64
+Cr a macroblock, the two bytes 0x0D 0x00 before each but the first, samples raised to at least 1,
+and the last row and column repeated up to whole macroblocks.
 """
 
 from __future__ import annotations

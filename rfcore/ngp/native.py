@@ -1,6 +1,7 @@
 """The native hash grid renderer: what everything but tests renders with.
 
-The same function as ``rfcore.ngp.reference``, whose docstrings define it.
+The same function as ``rfcore.ngp.reference``, whose docstrings define it, in float32 and bit-exact:
+the same field and camera give the same bytes on every instruction set and thread count.
 """
 
 from __future__ import annotations
@@ -10,13 +11,23 @@ from threading import Lock
 import numpy as np
 
 from rfcore.camera import Camera
-from rfcore.native.ngp import NativeNgpRenderer, ngp_camera
-from rfcore.native.raster import check_backend
-from rfcore.ngp.parameters import F32, NgpParameters
-from rfcore.ngp.shape import NgpShape
+from rfcore.errors import InvalidInput
+from rfcore.native import _native
+from rfcore.native.backend import FLOAT32_MAX, check_backend
+from rfcore.ngp.shape import F32, NgpParameters, NgpShape
 from rfcore.views import View
 
-__all__ = ["NgpRenderer", "native_shape"]
+__all__ = ["NgpRenderer", "native_shape", "ngp_camera"]
+
+
+def ngp_camera(camera: Camera) -> _native.NgpCamera:
+    """Return the camera as the kernels take it: float32, rounded once from float64."""
+    k, pose = camera.intrinsics, camera.world_from_cam
+    rotation = [value for row in pose.rotation_matrix() for value in row]
+    numbers = [*rotation, *pose.translation_m, k.fx_px, k.fy_px, k.cx_px, k.cy_px]
+    if not all(abs(number) <= FLOAT32_MAX for number in numbers):
+        raise InvalidInput("camera", "a value is beyond the range of float32; move the tile origin")
+    return _native.NgpCamera(numbers, k.width_px, k.height_px)
 
 
 class NgpRenderer:
@@ -32,7 +43,7 @@ class NgpRenderer:
         self.threads = threads
         p, shape = parameters, parameters.shape
         box, grid = native_shape(shape)
-        self._native = NativeNgpRenderer(
+        self._native = _native.NgpRenderer(
             box,
             grid,
             shape.grid.array,

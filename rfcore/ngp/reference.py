@@ -19,8 +19,7 @@ from torch import Tensor
 
 from rfcore.camera import Camera
 from rfcore.harmonics import CONSTANT, higher_harmonics
-from rfcore.ngp.parameters import NgpParameters
-from rfcore.ngp.shape import HashGrid, NgpShape, Space
+from rfcore.ngp.shape import HashGrid, NgpParameters, NgpShape, Space
 
 __all__ = [
     "Rays",

@@ -3,6 +3,12 @@
 Names as in Mueller et al., "Instant Neural Graphics Primitives with a Multiresolution Hash
 Encoding", ACM TOG 41(4), 2022 (below: NGP): L levels of at most T entries of F features, N_l cells
 on level l. Positions are metres relative to the tile's origin until ``Space`` maps them to 0..1.
+
+The numbers of a hash grid field: the table, five matrices, one bit per cell.
+
+``matrices`` holds W0 [H, E], W1 [16, H] (density: encoding in, log density and 15 more out) and
+W2 [H, 32], W3 [H, H], W4 [3, H] (colour: 16 harmonics of the direction and the 16 outputs of the
+density network in), row-major, one after the other. No biases (NGP, section 4).
 """
 
 from __future__ import annotations
@@ -15,8 +21,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
+from rfcore.native import _native
 
-__all__ = ["FEATURES", "MAX_LEVELS", "HashGrid", "Marching", "NgpShape", "Space", "grid_levels"]
+__all__ = [
+    "FEATURES",
+    "MAX_LEVELS",
+    "HashGrid",
+    "Marching",
+    "NgpParameters",
+    "NgpShape",
+    "Space",
+    "grid_levels",
+    "initial_parameters",
+    "matrix_shapes",
+    "table_entries",
+]
+
 
 FEATURES = 2
 """F: features an entry; the kernels are written for the two of NGP, section 4."""
@@ -27,7 +47,6 @@ MAX_OCCUPANCY_CELLS = 1 << 28
 HIDDEN = (16, 32, 48, 64)
 MAX_STEPS = 8192
 MAX_FAR_M = 1e9
-
 Vec3 = tuple[float, float, float]
 Cells = tuple[int, int, int]
 
@@ -179,3 +198,77 @@ class NgpShape:
     def occupancy_words(self) -> int:
         """Length of the occupancy's bits in uint32."""
         return -(-math.prod(self.occupancy_cells) // 32)
+
+
+OUTPUTS = 16
+"""Of the density network."""
+HARMONICS = 16
+TABLE_RANGE = 1e-4
+"""Entries of a new table are uniform in +- this (NGP, section 4)."""
+F32 = NDArray[np.float32]
+U32 = NDArray[np.uint32]
+
+
+def table_entries(grid: HashGrid) -> int:
+    """Return the entries of all levels: the vertices of one that fits T, filled up to 16; or T."""
+    return _native.ngp_table_entries(grid.array, grid.T)
+
+
+@dataclass(frozen=True)
+class NgpParameters:
+    """``table`` [entries, 2], ``matrices`` [weights], float32; ``occupancy`` uint32 words.
+
+    Raises ``InvalidInput`` on a shape or dtype that does not fit ``shape``, or values that are not
+    finite. Cell (x, y, z) is bit i % 32 of word i // 32, i = x + X (y + Y z).
+    """
+
+    shape: NgpShape
+    table: F32
+    matrices: F32
+    occupancy: U32
+
+    def __post_init__(self) -> None:
+        weights = sum(math.prod(s) for s in matrix_shapes(self.shape))
+        grid = self.shape.grid
+        entries = table_entries(grid)
+        expected = {
+            "table": ((entries, FEATURES), np.float32),
+            "matrices": ((weights,), np.float32),
+            "occupancy": ((self.shape.occupancy_words,), np.uint32),
+        }
+        for name, (size, dtype) in expected.items():
+            array = getattr(self, name)
+            if array.shape != size or array.dtype != dtype or not array.flags.c_contiguous:
+                raise InvalidInput(
+                    f"ngp.{name}",
+                    f"{array.dtype} {array.shape} must be contiguous {np.dtype(dtype)} {size}",
+                )
+        for name in ("table", "matrices"):
+            bad = int(np.count_nonzero(~np.isfinite(getattr(self, name))))
+            if bad:
+                raise InvalidInput(f"ngp.{name}", f"{bad} numbers are not finite")
+
+    def split_matrices(self) -> tuple[F32, ...]:
+        """Return the five matrices as views [outputs, inputs]."""
+        shapes = matrix_shapes(self.shape)
+        ends = np.cumsum([math.prod(shape) for shape in shapes])
+        parts = np.split(self.matrices, ends[:-1])
+        return tuple(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
+
+
+def matrix_shapes(shape: NgpShape) -> tuple[tuple[int, int], ...]:
+    """Return [outputs, inputs] of the five matrices."""
+    h = shape.hidden
+    return ((h, shape.encoded), (OUTPUTS, h), (h, HARMONICS + OUTPUTS), (h, h), (3, h))
+
+
+def initial_parameters(shape: NgpShape, occupancy: U32, rng: np.random.Generator) -> NgpParameters:
+    """Return what training starts from: a small uniform table, matrices after He et al. 2015."""
+    grid = shape.grid
+    entries = table_entries(grid)
+    table = (rng.random((entries, FEATURES), dtype=np.float32) * 2 - 1) * np.float32(TABLE_RANGE)
+    parts = []
+    for outputs, inputs in matrix_shapes(shape):
+        limit = np.float32(math.sqrt(6.0 / inputs))
+        parts.append((rng.random(outputs * inputs, dtype=np.float32) * 2 - 1) * limit)
+    return NgpParameters(shape, table, np.concatenate(parts), occupancy)

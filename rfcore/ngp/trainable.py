@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
-from rfcore.native.ngp import NativeNgpTrainer
-from rfcore.native.raster import check_backend
+from rfcore.native import _native
+from rfcore.native.backend import check_backend
 from rfcore.ngp.native import native_shape
-from rfcore.ngp.parameters import F32, NgpParameters
+from rfcore.ngp.shape import F32, NgpParameters
 
 __all__ = ["MAX_BLOCK_RAYS", "NgpRates", "RayBatch", "TrainableNgp"]
 
@@ -115,7 +115,7 @@ class TrainableNgp:
         box, grid = native_shape(shape)
         table, matrices = p.table.size, p.matrices.size
         self._sizes = (table, matrices, table, table, matrices, matrices, cells)
-        self._native = NativeNgpTrainer(
+        self._native = _native.NgpTrainer(
             box,
             grid,
             shape.grid.array,

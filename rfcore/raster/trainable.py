@@ -16,14 +16,10 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
-from rfcore.native.raster import (
-    NativeTrainable,
-    bands_to_use,
-    check_backend,
-    native_camera,
-    overlaps_limited,
-)
+from rfcore.native import _native
+from rfcore.native.backend import check_backend
 from rfcore.raster.gaussians import F32, MAX_GAUSSIANS, Gaussians
+from rfcore.raster.native import bands_to_use, native_camera, overlaps_limited
 from rfcore.views import View
 
 __all__ = [
@@ -161,7 +157,7 @@ class TrainableRasterizer:
         self.sh_degree = gaussians.sh_degree
         g = gaussians
         arrays = (g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh)
-        self._native = NativeTrainable(*arrays, threads, self.isa, antialiased)
+        self._native = _native.TrainableRasterizer(*arrays, threads, self.isa, antialiased)
         self._lock = Lock()
         self._colour: F32 | None = None
         self._has_colour_gradient = False

@@ -14,7 +14,7 @@ import numpy as np
 
 from rfcore.errors import InvalidInput
 from rfcore.raster.gaussians import MAX_GAUSSIANS
-from rfcore.raster.native import DensityStep, TrainableRasterizer
+from rfcore.raster.trainable import DensityStep, TrainableRasterizer
 
 __all__ = ["DensityControl", "control_density"]
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.raster.native import Exposure
+from rfcore.raster.trainable import Exposure
 
 __all__ = ["ExposureModel"]
 

@@ -20,15 +20,21 @@ from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.field import FieldMetadata, NgpField
 from rfcore.field.interface import NGP
-from rfcore.ngp.parameters import NgpParameters, initial_parameters
-from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space, grid_levels
+from rfcore.ngp.shape import (
+    HashGrid,
+    Marching,
+    NgpParameters,
+    NgpShape,
+    Space,
+    grid_levels,
+    initial_parameters,
+)
 from rfcore.ngp.trainable import MAX_BLOCK_RAYS, NgpRates, TrainableNgp
 from rfcore.train.checkpoint import Checkpoint
 from rfcore.train.divergence import DivergenceWatch
 from rfcore.train.ngp_space import cells_near, occupancy_cells, space_around
 from rfcore.train.protocol import HeldOut, TrainingProgress
-from rfcore.train.ray_sampler import RaySampler
-from rfcore.train.targets import load_targets
+from rfcore.train.targets import RaySampler, load_targets
 from rfcore.views import PointCloud, PosedPicture
 
 __all__ = ["NgpModel", "NgpSchedule", "NgpTrainer", "NgpTrainingConfig"]

@@ -18,12 +18,12 @@ import numpy as np
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
-from rfcore.field.detail import Rung, Rungs, kept_of
 from rfcore.field.importance import contributions, most_important_first, reordered
-from rfcore.field.quality import DETAILS
+from rfcore.field.quality import DETAILS, Rung, Rungs, kept_of
 from rfcore.field.splats import SplatField
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import LearningRates, Rasterizer, TrainableRasterizer
+from rfcore.raster.native import Rasterizer
+from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfcore.train.schedule import view_order
 
 __all__ = ["Progress", "RungConfig", "fitted", "with_rungs"]

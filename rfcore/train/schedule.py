@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rfcore.errors import InvalidInput
-from rfcore.raster.native import LearningRates
+from rfcore.raster.trainable import LearningRates
 
 __all__ = ["Bands", "RateSchedule", "Regularisation", "view_order"]
 

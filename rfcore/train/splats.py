@@ -23,14 +23,14 @@ from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput, TrainingDiverged
 from rfcore.field import FieldMetadata, SplatField
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
-from rfcore.raster.native import TrainableRasterizer, TrainingState
+from rfcore.raster.trainable import TrainableRasterizer, TrainingState
 from rfcore.train.checkpoint import Checkpoint
 from rfcore.train.density import DensityControl, control_density
 from rfcore.train.divergence import DivergenceWatch
 from rfcore.train.exposure import ExposureModel
-from rfcore.train.initialise import gaussians_from_points
 from rfcore.train.protocol import HeldOut, TrainingProgress
 from rfcore.train.schedule import Bands, RateSchedule, Regularisation, view_order
+from rfcore.train.start import gaussians_from_points
 from rfcore.train.targets import load_targets
 from rfcore.views import PointCloud, PosedPicture
 

@@ -1,14 +1,25 @@
-"""Network addresses, and the rule that plaintext stays on this machine unless allowed out."""
+"""Network addresses, and the rule that plaintext stays on this machine unless allowed out.
+
+Why a server cannot be reached: one handshake with the standard library, which says so.
+
+gRPC keeps trying in silence. In TLS 1.3 a server judges a client's certificate after the client has
+finished, so what counts is the first byte that comes back (RFC 8446, section 4.4.2.4): HTTP/2's
+settings, or the end of the connection.
+"""
 
 from __future__ import annotations
 
 import ipaddress
+import socket
+import ssl
+from contextlib import suppress
 from dataclasses import dataclass
 
-from rfcore.errors import InvalidInput
+from rfcore.errors import AccessDenied, InvalidInput
 from rfcore.wire.checks import shown
+from rfcore.wire.tls import TlsFiles
 
-__all__ = ["Address"]
+__all__ = ["Address", "check_handshake", "own_problem"]
 
 
 @dataclass(frozen=True)
@@ -50,3 +61,79 @@ class Address:
                 f"{self} is not a loopback address and the stream is not encrypted; "
                 "give --allow-insecure if the network is trusted",
             )
+
+
+PATIENCE_S = 2.0
+NOT_TLS = frozenset({"WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "PACKET_LENGTH_TOO_LONG"})
+"""How OpenSSL calls an answer that is not a TLS record."""
+
+
+def check_handshake(address: Address, tls: TlsFiles | None) -> None:
+    """Raise ``AccessDenied`` if the two ends refuse each other; nobody there is no refusal."""
+    try:
+        with socket.create_connection((address.host, address.port), PATIENCE_S) as plain:
+            if tls is None:
+                _check_plaintext(address, plain)
+            else:
+                _check_tls(address, plain, tls)
+    except OSError:
+        return  # not there, not yet, or not answering: whoever waits goes on waiting
+
+
+def _check_tls(address: Address, plain: socket.socket, tls: TlsFiles) -> None:
+    try:
+        with tls.client_context().wrap_socket(plain, server_hostname=address.host) as secure:
+            welcome = secure.recv(1)
+    except ssl.SSLCertVerificationError as error:
+        raise AccessDenied(
+            f"the certificate of {address} is refused: {error.verify_message} "
+            f"(trusted: {tls.authority})"
+        ) from error
+    except ssl.SSLError as error:
+        if error.reason in NOT_TLS:
+            raise AccessDenied(
+                f"{address} speaks plaintext; start mec-server with --tls-cert, or leave it out"
+            ) from error
+        if "ALERT" not in (error.reason or ""):
+            raise
+        welcome = b""
+    if not welcome:
+        problem = own_problem(tls) or "it does not know its authority, or other clocks are wrong"
+        raise AccessDenied(f"{address} refuses {tls.certificate}: {problem}")
+
+
+def own_problem(tls: TlsFiles) -> str:
+    """Return what is wrong with our own certificate by our own clock and authority, or nothing.
+
+    gRPC's server closes the connection without an alert, so we do to ourselves, in memory, what it
+    did to us.
+    """
+    judge = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    judge.load_cert_chain(tls.certificate, tls.key)
+    judge.load_verify_locations(tls.authority)
+    judge.verify_mode = ssl.CERT_REQUIRED
+    shown = tls.client_context()
+    shown.check_hostname = False
+    shown.verify_mode = ssl.CERT_NONE
+    to_judge, to_shown = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ends = (
+        shown.wrap_bio(to_shown, to_judge),
+        judge.wrap_bio(to_judge, to_shown, server_side=True),
+    )
+    try:
+        for end in ends * 2:  # two flights each way are a whole handshake
+            with suppress(ssl.SSLWantReadError):
+                end.do_handshake()
+    except ssl.SSLCertVerificationError as error:
+        return error.verify_message
+    return ""
+
+
+def _check_plaintext(address: Address, plain: socket.socket) -> None:
+    """A server that answers a TLS greeting with TLS does not take plaintext."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.set_alpn_protocols(["h2"])
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    with context.wrap_socket(plain):
+        raise AccessDenied(f"{address} wants TLS; give --tls-cert, --tls-key and --tls-ca")

@@ -14,7 +14,10 @@ from typing import cast
 from google.protobuf.message import DecodeError
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.codec import CodecConfig, DeltaPacket, Reference, References, StreamHeader
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.references import Reference, References
 from rfcore.errors import InvalidInput
 from rfcore.field.quality import FULL, Quality
 from rfcore.wire.checks import (

@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.codec import DeltaPacket, StreamHeader
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import RejectReason
 from rfcore.field.quality import FULL, Quality
 

@@ -2,25 +2,40 @@
 
 Each group is one box of ``--help``. Option names are flat (``--metrics-port``, ``--tls-cert``), as
 operators write them in unit files; the group is only how the program holds them.
+
+Logs of the services: readable on a terminal, one JSON object a line anywhere else.
+
+Keys are the same in both: ``vehicle``, ``session``, ``camera``, ``epoch`` and ``seq`` say what a
+line is about, ``event`` what happened, and ``reason`` is a word that can be counted.
 """
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TextIO
 
+import structlog
 from tyro.conf import EnumChoicesFromValues, FlagCreatePairsOff, OmitArgPrefixes, arg
 
 from rfcore.errors import InvalidInput
 from rfcore.wire.tls import TlsFiles
 
-__all__ = ["OPTIONS", "MetricsSettings", "RenderSettings", "TransportSettings"]
+__all__ = [
+    "OPTIONS",
+    "LogForm",
+    "MetricsSettings",
+    "RenderSettings",
+    "TransportSettings",
+    "configure_logs",
+]
+
 
 # How a service's configuration becomes options: flat names, words of enumerations as they
 # are in logs, and flags without a --no- twin.
 OPTIONS = (OmitArgPrefixes, EnumChoicesFromValues, FlagCreatePairsOff)
-
 PORT_MAX = 65535
 
 
@@ -76,3 +91,33 @@ class TransportSettings:
         Raises ``InvalidInput`` when only some of the three are given, or one cannot be used.
         """
         return TlsFiles.of(self.certificate, self.key, self.authority)
+
+
+class LogForm(StrEnum):
+    """How log lines look; ``auto`` is console on a terminal and json elsewhere."""
+
+    AUTO = "auto"
+    CONSOLE = "console"
+    JSON = "json"
+
+
+def configure_logs(stream: TextIO, form: LogForm = LogForm.AUTO, level: int = logging.INFO) -> None:
+    """Send structlog's events to ``stream``; called once, by a command's ``main``."""
+    renderer: structlog.types.Processor
+    on_console = stream.isatty() if form is LogForm.AUTO else form is LogForm.CONSOLE
+    if on_console:
+        renderer = structlog.dev.ConsoleRenderer(colors=stream.isatty())
+    else:
+        renderer = structlog.processors.JSONRenderer()
+    structlog.configure(
+        processors=[
+            structlog.contextvars.merge_contextvars,
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.format_exc_info,
+            renderer,
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(level),
+        logger_factory=structlog.PrintLoggerFactory(stream),
+        cache_logger_on_first_use=False,
+    )

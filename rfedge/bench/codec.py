@@ -18,14 +18,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rfcore.camera import Camera
-from rfcore.codec import (
-    CodecConfig,
-    DeltaDecoder,
-    DeltaEncoder,
-    FrameChoice,
-    Reference,
-    References,
-)
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.references import Reference, References
+from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.errors import CodecError
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth

@@ -17,14 +17,15 @@ from typing import Any
 from prometheus_client import CollectorRegistry
 
 from mec_server.config import DecoderKind
-from mec_server.decoders import Decoders
+from mec_server.decoding.decoders import Decoders
 from mec_server.metrics import ServerMetrics
-from rfcore.codec import DecoderState, DeltaDecoder
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.state import DecoderState
 from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth
 from rfcore.wire.messages import Frame
-from rfedge.loadtest.canned import CannedDrive, canned_drive
+from rfedge.loadtest.prerecorded import PrerecordedDrive, prerecorded_drive
 from rfedge.offline import rendered
 
 __all__ = ["decoder_rows"]
@@ -40,7 +41,7 @@ def decoder_rows() -> list[dict[str, Any]]:
     """Return a row for each place to decode: median ms, and the median difference to here."""
     field = load_field(FIELD)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
-        drive = CannedDrive.read(canned_drive(DRIVE, field, Path(folder)))
+        drive = PrerecordedDrive.read(prerecorded_drive(DRIVE, field, Path(folder)))
         decoders = {kind: _decoder(kind, drive, opened) for kind in KINDS}
         times_ms = _times(drive, field, decoders)
     here_ms = times_ms[DecoderKind.IN_PROCESS]
@@ -55,7 +56,7 @@ def decoder_rows() -> list[dict[str, Any]]:
     ]
 
 
-def _decoder(kind: DecoderKind, drive: CannedDrive, opened: ExitStack) -> DeltaDecoder:
+def _decoder(kind: DecoderKind, drive: PrerecordedDrive, opened: ExitStack) -> DeltaDecoder:
     decoders = Decoders(kind, True, ServerMetrics(CollectorRegistry()))
     decoders.start()
     opened.callback(decoders.close)
@@ -66,7 +67,7 @@ def _decoder(kind: DecoderKind, drive: CannedDrive, opened: ExitStack) -> DeltaD
 
 
 def _times(
-    drive: CannedDrive, field: RadianceField, decoders: dict[DecoderKind, DeltaDecoder]
+    drive: PrerecordedDrive, field: RadianceField, decoders: dict[DecoderKind, DeltaDecoder]
 ) -> dict[DecoderKind, list[float]]:
     renders = [rendered(field, f.camera(drive.intrinsics), f.quality) for f in drive.chain]
     times_ms: dict[DecoderKind, list[float]] = {kind: [] for kind in decoders}

@@ -19,18 +19,13 @@ from typing import Any
 import numpy as np
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.codec import (
-    INTRA,
-    NEEDED_BYTES,
-    CodecConfig,
-    DecoderState,
-    DeltaDecoder,
-    DeltaEncoder,
-    DeltaPacket,
-    FrameChoice,
-    Reference,
-    StreamHeader,
-)
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
+from rfcore.codec.references import INTRA, Reference
+from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
+from rfcore.codec.state import DecoderState
 from rfcore.errors import CodecError, PacketRejected
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth

@@ -26,7 +26,7 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import NgpField, load_field
 from rfcore.metrics import psnr
 from rfcore.ngp.native import NgpRenderer
-from rfcore.ngp.parameters import NgpParameters
+from rfcore.ngp.shape import NgpParameters
 from rfcore.train import NgpTrainer, NgpTrainingConfig
 from rfcore.views import PosedPicture
 from rfedge.bench.timing import median_ms

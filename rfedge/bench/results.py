@@ -1,18 +1,38 @@
-"""One benchmark run as one JSON object: case, host, revision, rows."""
+"""One benchmark run as one JSON object: case, host, revision, rows.
+
+What a benchmark row is: a flat or once nested mapping, ready for JSON or a table.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
-from rfedge.bench.rows import Row, Rows, flattened
-from rfedge.provenance import host, revision
+from rfedge.results import host, revision
 
-__all__ = ["CASES", "print_rows", "run_case", "write_json"]
+__all__ = ["CASES", "Row", "Rows", "flattened", "print_rows", "run_case", "write_json"]
+
+
+Row = dict[str, Any]
+Rows = Literal["all", "native", "modes"]
+"""Which rows to run: ``native`` leaves out what only the slow reference fills in, ``modes`` are
+the specialisations of the renderer instead."""
+
+
+def flattened(row: Row) -> Row:
+    """Return a row whose nested values stand beside the others, as ``outer.inner``."""
+    flat: Row = {}
+    for name, value in row.items():
+        if isinstance(value, dict):
+            flat.update({f"{name}.{inner}": ms for inner, ms in value.items()})
+        else:
+            flat[name] = value
+    return flat
+
 
 CASES = ("raster", "train", "codec", "ngp", "decoders")
 

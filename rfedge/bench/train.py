@@ -8,7 +8,7 @@ import numpy as np
 
 from rfcore.errors import RfedgeError
 from rfcore.raster.gaussians import F32, Gaussians
-from rfcore.raster.native import LearningRates, TrainableRasterizer
+from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.bench.timing import median_ms
 

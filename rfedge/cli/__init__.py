@@ -17,9 +17,8 @@ from tyro.conf import OmitSubcommandPrefixes, subcommand
 from rfcore.errors import RfedgeError
 from rfedge.cli.bench import Bench
 from rfedge.cli.certs import Certs
-from rfedge.cli.decode import Decode
+from rfedge.cli.codec import Decode, Encode
 from rfedge.cli.demo import Demo
-from rfedge.cli.encode import Encode
 from rfedge.cli.eval import Eval
 from rfedge.cli.field import Field
 from rfedge.cli.link import Link

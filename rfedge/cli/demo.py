@@ -43,8 +43,8 @@ class Demo:
         from rich.console import Console
 
         from rfedge.demo import DemoSettings, run_demo
-        from rfedge.report import print_table, write_report
-        from rfedge.training import training_config
+        from rfedge.demo.report import print_table, write_report
+        from rfedge.training.run import training_config
 
         console = Console()
         settings = DemoSettings(

@@ -7,13 +7,13 @@ from typing import Annotated
 
 from tyro.conf import subcommand
 
-from rfedge.cli.eval_compare import EvalCompare
-from rfedge.cli.eval_ladder import EvalLadder
-from rfedge.cli.eval_latency import EvalLatency
-from rfedge.cli.eval_never_worse import EvalNeverWorse
-from rfedge.cli.eval_paper import EvalPaper
-from rfedge.cli.eval_robust import EvalRobust
 from rfedge.cli.eval_stability import EvalStability
+from rfedge.experiments.compare import EvalCompare
+from rfedge.experiments.ladder import EvalLadder
+from rfedge.experiments.latency import EvalLatency
+from rfedge.experiments.never_worse import EvalNeverWorse
+from rfedge.experiments.paper import EvalPaper
+from rfedge.experiments.robust import EvalRobust
 
 __all__ = ["Eval"]
 

@@ -43,7 +43,7 @@ class Link:
 
     def run(self) -> None:
         """Forward until SIGTERM or SIGINT."""
-        from rfedge.link_proxy import ProxySettings, run_proxy
+        from rfedge.link.proxy import ProxySettings, run_proxy
 
         run_proxy(
             ProxySettings(

@@ -48,8 +48,13 @@ class Render:
         from rfcore.errors import InvalidInput
         from rfcore.field import Quality
         from rfedge.fields.find import open_field
-        from rfedge.fields.path import drive_stops, orbit_stops, pictures_along, write_pictures
-        from rfedge.fields.viewpoints import OrbitSettings
+        from rfedge.fields.viewpoints import (
+            OrbitSettings,
+            drive_stops,
+            orbit_stops,
+            pictures_along,
+            write_pictures,
+        )
         from rfedge.video import write_mp4
 
         quality = Quality(self.detail, self.sh_degree)

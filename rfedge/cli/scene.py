@@ -1,21 +1,165 @@
-"""``rfedge scene``: datasets made from what users own, one module a verb."""
+"""``rfedge scene``: datasets made from what users own, one module a verb.
+
+``rfedge scene convert``: any dataset into plain pictures with a transforms.json.
+
+``rfedge scene poses``: a folder of pictures into a dataset, by structure from motion.
+
+``rfedge scene record-carla``: the rig of 18 cameras in a running CARLA server.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
-from tyro.conf import subcommand
+from tyro.conf import Positional, subcommand
 
-from rfedge.cli.scene_build import SceneBuild
-from rfedge.cli.scene_convert import SceneConvert
-from rfedge.cli.scene_plan import ScenePlan
-from rfedge.cli.scene_poses import ScenePoses
-from rfedge.cli.scene_record_carla import SceneRecordCarla
-from rfedge.cli.scene_sheet import SceneSheet
-from rfedge.cli.scene_sizes import SceneSizes
+from rfedge.cli.scene_street import SceneBuild, ScenePlan, SceneSheet, SceneSizes
 
-__all__ = ["Scene"]
+__all__ = ["Scene", "SceneConvert", "ScenePoses", "SceneRecordCarla"]
+
+
+@dataclass(frozen=True)
+class SceneConvert:
+    """Write a dataset of any format as undistorted PNG pictures and a transforms.json, once."""
+
+    dataset: Annotated[Path, Positional]
+    """A folder with transforms.json, a COLMAP model, a KITTI sequence, INRIA's cameras.json or a
+    recording's camera.toml; or that file itself."""
+    out: Path
+    """The folder to make."""
+    size: str | None = None
+    """Reduce pictures to WIDTHxHEIGHT px by averaging areas; default: as they are."""
+    every: int = 1
+    """Take each n-th picture."""
+    offset: int = 0
+    """Leave out the first pictures, so many."""
+
+    def run(self) -> None:
+        """Convert; the folder appears when all of it is there."""
+        from rfedge.datasets.convert import convert_dataset
+        from rfedge.units import parse_size
+
+        size_px = parse_size(self.size) if self.size is not None else None
+        chosen = slice(self.offset, None, self.every)
+        print(convert_dataset(self.dataset, self.out, size_px, chosen))
+
+
+@dataclass(frozen=True)
+class ScenePoses:
+    """Find the poses of pictures with COLMAP, in a new world or in a dataset's own."""
+
+    images: Annotated[Path, Positional]
+    """Folder of pictures (PNG, JPEG, WebP), in order of their names."""
+    out: Path
+    """The folder to make: pictures, points and transforms.json."""
+    register_to: Path | None = None
+    """A dataset whose world the poses shall be in; its poses and cameras are held."""
+    camera: Literal["dataset", "estimate"] = "dataset"
+    """With --register-to: take the dataset's camera, or estimate the intrinsics."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP camera model of the new pictures, where it is not the dataset's camera."""
+    parameters: tuple[float, ...] = ()
+    """Its known parameters in COLMAP's order, which are held; default: estimated."""
+    matching: Literal["exhaustive", "sequential"] = "exhaustive"
+    """Match all pairs, or neighbours in a long drive."""
+    max_side_px: int = 1600
+    """Longest side at which features are looked for."""
+    features: int = 8192
+    """At most so many features a picture."""
+    threads: int = 2
+    """Threads."""
+    seed: int = 1
+    """Seed of the robust estimators."""
+
+    def run(self) -> None:
+        """Place the pictures and write the dataset; say which ones could not be placed."""
+        from rfcore.errors import BackendUnavailable
+
+        try:
+            import pycolmap  # noqa: F401
+        except ImportError as error:
+            raise BackendUnavailable("pycolmap is missing: pip install 'rfedge[colmap]'") from error
+        from rfedge.datasets.colmap_features import Matching, PoseSettings, SharedCamera
+        from rfedge.datasets.poses import pose_dataset
+
+        settings = PoseSettings(
+            matching=Matching(self.matching),
+            camera=SharedCamera(self.camera),
+            model=self.camera_model,
+            parameters=self.parameters,
+            max_side_px=self.max_side_px,
+            features=self.features,
+            threads=self.threads,
+            seed=self.seed,
+        )
+        print(pose_dataset(self.images, self.out, self.register_to, settings))
+
+
+@dataclass(frozen=True)
+class SceneRecordCarla:
+    """Drive 18 cameras along a street of a running CARLA server, both ways, into a dataset."""
+
+    out: Path
+    """The folder to make: pictures and transforms.json."""
+    host: str = "127.0.0.1"
+    """Where the server runs."""
+    port: int = 2000
+    """Its RPC port."""
+    town: str | None = None
+    """Load this map first, such as Town10HD; default: the one that is running."""
+    spawn: int = 0
+    """Start at this spawn point of the map."""
+    stations: int = 20
+    """Places along the lane where all cameras take a picture, each way."""
+    spacing_m: float = 4.0
+    """Metres between them."""
+    both_ways: bool = True
+    """Drive back on the lane of the other direction."""
+    keep_parked: bool = False
+    """Keep the map's own parked vehicles in the pictures."""
+    cameras: str = "all"
+    """`all`, or names from the rig, separated by commas; a drive is `mid_front`."""
+    size: str = "1920x1080"
+    """Size of the pictures, WIDTHxHEIGHT px."""
+    fov_deg: float = 90.0
+    """Horizontal field of view, degrees."""
+    timeout_s: float = 30.0
+    """Give up when the server does not answer for so long, seconds."""
+
+    def run(self) -> None:
+        """Connect, record, and write the dataset."""
+        from rfcore.errors import BackendUnavailable, RfedgeError
+        from rfcore.files import whole_folder
+        from rfedge.datasets.carla import Recorder, RecordSettings
+        from rfedge.datasets.rig import mounts_named
+        from rfedge.units import parse_size
+
+        settings = RecordSettings(
+            spawn=self.spawn,
+            stations=self.stations,
+            spacing_m=self.spacing_m,
+            both_ways=self.both_ways,
+            keep_parked=self.keep_parked,
+            mounts=mounts_named(self.cameras),
+            size_px=parse_size(self.size),
+            fov_deg=self.fov_deg,
+            timeout_s=self.timeout_s,
+        )
+        try:
+            import carla
+        except ImportError as error:
+            raise BackendUnavailable("carla is missing: pip install 'rfedge[carla]'") from error
+        with whole_folder(self.out) as folder:
+            try:
+                client = carla.Client(self.host, self.port)
+                client.set_timeout(self.timeout_s)
+                world = client.load_world(self.town) if self.town else client.get_world()
+                count = Recorder(carla, world, settings).record(folder)
+            except RuntimeError as error:
+                raise RfedgeError(f"CARLA at {self.host}:{self.port}: {error}") from error
+        print(f"{self.out}: {count} pictures")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rfcore.dataset import Dataset
     from rfcore.field import RadianceField
     from rfcore.train import NgpTrainingConfig, SplatTrainingConfig
-    from rfedge.training import TrainingJob
+    from rfedge.training.run import TrainingJob
 
 __all__ = ["Train"]
 
@@ -90,8 +90,8 @@ class Train:
         from rfcore.errors import InvalidInput
         from rfcore.field import save_field
         from rfedge.bench.results import write_json
-        from rfedge.training import train
-        from rfedge.training_result import training_result
+        from rfedge.training.finish import training_result
+        from rfedge.training.run import train
 
         if self.out.suffix != ".rff":
             raise InvalidInput("out", f"{self.out} must end in .rff")
@@ -106,14 +106,14 @@ class Train:
         if self.json is not None:
             write_json(result, self.json)
         if self.report is not None:
-            from rfedge.report.training_page import write_training_report
+            from rfedge.training.report import write_training_report
 
             write_training_report(self.report, result, field, job.held_out)
             console.print(f"{self.report}: held-out pictures and the curve over time")
 
     def _job(self) -> TrainingJob:
-        from rfedge.training import TrainingJob
-        from rfedge.training_loop import LoopLimits
+        from rfedge.training.loop import LoopLimits
+        from rfedge.training.run import TrainingJob
 
         dataset, held_out = self._views()
         writes_checkpoints = self.resume or self.checkpoint_every > 0
@@ -127,8 +127,8 @@ class Train:
         return TrainingJob(self.name, dataset, held_out, config, self.seed, limits, self.resume)
 
     def _views(self) -> tuple[Dataset, Dataset | None]:
-        from rfedge.sizes import parse_size
-        from rfedge.training_views import ViewChoice, read_views
+        from rfedge.training.views import ViewChoice, read_views
+        from rfedge.units import parse_size
 
         choice = ViewChoice(
             dataset=self.dataset,
@@ -146,7 +146,7 @@ class Train:
         from dataclasses import replace
 
         from rfcore.train import Bands, DensityControl, NgpTrainingConfig
-        from rfedge.training import UNLIMITED_ITERATIONS, training_config
+        from rfedge.training.run import UNLIMITED_ITERATIONS, training_config
 
         iterations = UNLIMITED_ITERATIONS if self.minutes is not None else self.iterations
         if self.kind == "ngp":
@@ -166,7 +166,7 @@ class Train:
     ) -> RadianceField:
         from rfcore.field import SplatField
         from rfcore.train.rungs import RungConfig
-        from rfedge.finishing import finish_field
+        from rfedge.training.finish import finish_field
 
         if self.plain or not isinstance(trained, SplatField):
             return trained

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rfedge.dashboards.catalogue_link import CODEC, LINK
 from rfedge.dashboards.catalogue_server import CAPACITY
-from rfedge.dashboards.panel import Dashboard, Look, Panel, Query, Unit, stages_of
+from rfedge.dashboards.grafana import Dashboard, Look, Panel, Query, Unit, stages_of
 
 __all__ = ["DASHBOARDS"]
 

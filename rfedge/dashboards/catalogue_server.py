@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rfedge.dashboards.panel import Dashboard, Look, Panel, Query, Unit, stages_of
+from rfedge.dashboards.grafana import Dashboard, Look, Panel, Query, Unit, stages_of
 
 __all__ = ["CAPACITY"]
 

@@ -1,28 +1,169 @@
-"""The demo's field: the one that ships with the sample, or one trained anew and kept.
+"""The trained field that ships beside a sample, and how it is made: ``make sample-field``.
+
+Beside ``samples/street`` lie ``samples/fields/street.rff``, ``street.json``, the record of what
+made it from what, and ``manifest.json``, the digests of both.
+
+``make sample-field``: train the field of a sample and put it beside the sample.
+
+The demo's field: the one that ships with the sample, or one trained anew and kept.
 
 A sample ``samples/street`` may have a field ``samples/fields/street.rff``, with a manifest and a
-record of how it was made (``rfedge.demo.sample_field``). It is used unless the user asks for
+record of how it was made (``rfedge.demo.field``). It is used unless the user asks for
 training or for settings of their own.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields
+import json
+import os
+import sys
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from time import monotonic
+from typing import Annotated, Any
 
 from rich.console import Console
+from tyro.conf import Positional
 
-from rfcore.dataset import read_dataset
-from rfcore.errors import FieldFormatError
+from rfcore.dataset import read_dataset, verify_manifest, write_manifest
+from rfcore.errors import DatasetError, FieldFormatError, InvalidData
 from rfcore.field import SplatField, load_field, save_field
-from rfcore.train import SplatTrainingConfig
+from rfcore.field.store import encode_field
+from rfcore.files import write_whole
+from rfcore.train import DensityControl, SplatTrainingConfig
 from rfcore.train.rungs import RungConfig
-from rfedge.demo.sample_field import check_sample_field, sample_field_path
-from rfedge.finishing import finish_field
-from rfedge.training import TrainingJob, train_field
+from rfedge.demo.make_sample import run_maker
+from rfedge.results import host, revision
+from rfedge.training.finish import finish_field
+from rfedge.training.run import TrainingJob, train_field, training_config
 
-__all__ = ["FieldChoice", "cache_path", "choose_field", "trained_field"]
+__all__ = [
+    "FieldChoice",
+    "MakeSampleField",
+    "Making",
+    "cache_path",
+    "check_sample_field",
+    "choose_field",
+    "main",
+    "sample_field_path",
+    "trained_field",
+    "write_sample_field",
+]
+
+
+COMMAND = "make sample-field"
+MAX_BYTES = 8_000_000
+"""More would weigh down every checkout."""
+
+
+def sample_field_path(sample: Path) -> Path:
+    """Return where the field of a sample is, if it has one."""
+    return sample.parent / "fields" / f"{sample.name}.rff"
+
+
+def check_sample_field(sample: Path) -> None:
+    """Raise ``DatasetError`` unless the shipped field is whole and was made from this sample."""
+    path = sample_field_path(sample)
+    try:
+        verify_manifest(path.parent)
+        record = json.loads(path.with_suffix(".json").read_bytes())
+        made_from = record["sample_manifest_sha256"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{path}: has no readable record beside it; run {COMMAND}") from error
+    except DatasetError as error:
+        raise DatasetError(f"{error}; or run with --train") from error
+    if made_from != _manifest_digest(sample):
+        raise DatasetError(f"{path}: made from another {sample}; run {COMMAND}, or use --train")
+
+
+@dataclass(frozen=True)
+class Making:
+    """How a field was made: by which command, at which revision, in how long."""
+
+    command: str
+    revision: str
+    seconds: int
+
+
+def write_sample_field(sample: Path, field: SplatField, making: Making) -> int:
+    """Write the field, its record and the manifest; return the field's size in bytes.
+
+    Raises ``InvalidData`` for one too large to ship, and leaves what was there.
+    """
+    path, data = sample_field_path(sample), encode_field(field)
+    if len(data) > MAX_BYTES:
+        raise InvalidData(f"{path}: {len(data)} bytes are over the {MAX_BYTES} a sample may take")
+    path.parent.mkdir(exist_ok=True)
+    write_whole(path, data)
+    record = _record(sample, field, making) | {"bytes": len(data)}
+    write_whole(path.with_suffix(".json"), json.dumps(record, indent=1) + "\n")
+    write_manifest(path.parent)
+    return len(data)
+
+
+def _record(sample: Path, field: SplatField, making: Making) -> dict[str, Any]:
+    metadata = field.metadata
+    return {
+        "field": f"splats {field.field_id}",
+        **asdict(making),
+        "host": host(),
+        "sample_manifest_sha256": _manifest_digest(sample),
+        "training_digest": metadata.training_digest,
+        "held_out": {"psnr_db": metadata.held_out_psnr_db, "ssim": metadata.held_out_ssim},
+        "primitives": field.primitives,
+    }
+
+
+def _manifest_digest(sample: Path) -> str:
+    return hashlib.sha256((sample / "manifest.json").read_bytes()).hexdigest()
+
+
+@dataclass(frozen=True)
+class MakeSampleField:
+    """Train a sample's field, fit its rungs, compress it, and write it with its record."""
+
+    sample: Annotated[Path, Positional] = Path("samples/street")
+    """Dataset folder with a manifest: training views, points and the drive `empty`."""
+    gaussians: int | None = None
+    """At most how many Gaussians to start with; default: the trainer's own."""
+    iterations: int | None = None
+    """Training iterations; default: the trainer's own."""
+    limit: int | None = None
+    """Density control: let the set grow to so many Gaussians."""
+    antialiased: bool = False
+    """Draw splats smaller than a pixel fainter; the field says so."""
+
+    def run(self) -> None:
+        """Make it; raise ``RfedgeError`` when the sample is damaged or the field too large."""
+        verify_manifest(self.sample)
+        console, started_s, made_by = Console(), monotonic(), revision()
+        field = trained_field(self.sample, self._config(), console)
+        making = Making(self._command(), made_by, round(monotonic() - started_s))
+        size_bytes = write_sample_field(self.sample, field, making)
+        path = sample_field_path(self.sample)
+        print(f"{path}: {size_bytes / 1e6:.2f} MB, field {field.field_id}")
+
+    def _config(self) -> SplatTrainingConfig:
+        threads = len(os.sched_getaffinity(0))
+        config = training_config(self.gaussians, self.iterations, threads)
+        config = replace(config, antialiased=self.antialiased)
+        if self.limit is None:
+            return config
+        return replace(config, density=DensityControl(limit=self.limit))
+
+    def _command(self) -> str:
+        given = {n: getattr(self, n) for n in ("gaussians", "iterations", "limit")}
+        options = " ".join(f"--{n} {v}" for n, v in given.items() if v is not None)
+        options += " --antialiased" if self.antialiased else ""
+        options = options.strip()
+        return f'make sample-field ARGS="{options}"' if options else "make sample-field"
+
+
+def main() -> int:
+    """Parse the command line and make the field; return the exit status."""
+    return run_maker(MakeSampleField, "sample-field")
+
 
 SEED = 1
 
@@ -99,3 +240,7 @@ def _settings(config: SplatTrainingConfig) -> list[tuple[str, object]]:
     """Return what changes the field: not the threads, nor the instruction set."""
     names = [f.name for f in fields(config) if f.name not in ("threads", "isa")]
     return [(name, getattr(config, name)) for name in names]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -3,6 +3,8 @@
 The training views become JPEG files, whose loss a trainer does not notice; the drives stay lossless
 (WebP), because a lossily coded "camera" would flatter every coding figure. The manifest says which
 commands and revision rendered the pictures.
+
+The commands behind ``make sample`` and ``make sample-field``.
 """
 
 from __future__ import annotations
@@ -13,21 +15,39 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import cv2
+import tyro
 from tyro.conf import Positional
 
 from rfcore.dataset import write_manifest
 from rfcore.dataset.read import read_source
 from rfcore.dataset.source import Source
 from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, write_points
-from rfcore.errors import DatasetError
+from rfcore.errors import DatasetError, RfedgeError
 from rfcore.files import write_whole
 from rfcore.image import Rgb
-from rfedge.demo.maker import run_maker
 
-__all__ = ["MakeSample", "main", "pack_sample"]
+__all__ = ["MakeSample", "Maker", "main", "pack_sample", "run_maker"]
+
+
+class Maker(Protocol):
+    """A command: its fields are options."""
+
+    def run(self) -> None:
+        """Do it; raise ``RfedgeError`` or ``OSError``."""
+
+
+def run_maker(kind: type[Maker], prog: str) -> int:
+    """Parse the command line and run the command; return the exit status, 2 after an error."""
+    try:
+        tyro.cli(kind, prog=prog).run()
+    except (RfedgeError, OSError) as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 2
+    return 0
+
 
 COMMAND = "make sample"
 

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from rfcore.camera import Camera
@@ -23,9 +24,9 @@ from rfcore.train import SplatTrainingConfig
 from rfedge.demo.field import FieldChoice, choose_field
 from rfedge.demo.measure import DriveOutcome, FrameAddress, Pictures, measure_drive
 from rfedge.demo.processes import command_of, run_to_end, service
-from rfedge.demo.video import write_video
 from rfedge.offline import rendered
-from rfedge.provenance import host, revision
+from rfedge.results import host, revision
+from rfedge.video import write_mp4
 
 __all__ = ["DRIVES", "DemoRun", "DemoSettings", "run_demo"]
 
@@ -97,7 +98,9 @@ def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
         sequences[drive] = measure_drive(outcome)
         pictures[drive] = list(outcome.pictures)
     result = _result(settings, field, sequences)
-    write_video(settings.out / "reconstructed.mp4", pictures, settings.rate_hz)
+    # Camera on the left, the server's reconstruction on the right.
+    pairs = (np.hstack([p.camera, p.reconstruction]) for drive in pictures.values() for p in drive)
+    write_mp4(settings.out / "reconstructed.mp4", pairs, settings.rate_hz)
     write_whole(settings.out / "result.json", json.dumps(result, indent=2) + "\n")
     return DemoRun(result, pictures)
 

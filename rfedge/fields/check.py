@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
-from rfcore.field.detail import Rung
+from rfcore.field.quality import Rung
 from rfcore.field.similarity import Similarity, moved
 from rfcore.image import Rgb
 from rfcore.metrics import psnr

@@ -1,7 +1,11 @@
-"""A field in words and figures, as ``rfedge field info`` prints it."""
+"""A field in words and figures, as ``rfedge field info`` prints it.
+
+What a frame of a field takes on this machine.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,16 +13,26 @@ from rich.console import Console
 from rich.table import Table
 
 from rfcore.camera import Camera
-from rfcore.field import Quality, RadianceField, SplatField
-from rfcore.field.detail import kept_of
-from rfcore.field.load import encode_field
-from rfcore.field.quality import DETAILS
+from rfcore.field import FULL, Quality, RadianceField, SplatField
+from rfcore.field.quality import DETAILS, kept_of
+from rfcore.field.store import encode_field
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
+from rfedge.bench.timing import median_ms
 from rfedge.fields.check import to_rgb
-from rfedge.fields.speed import frame_ms
 
-__all__ = ["describe_field", "print_rungs", "size_mb"]
+__all__ = ["describe_field", "frame_ms", "print_rungs", "size_mb"]
+
+
+def frame_ms(
+    field: RadianceField, cameras: Sequence[Camera], quality: Quality = FULL, rounds: int = 3
+) -> float:
+    """Return the median time of a frame over ``rounds`` turns through ``cameras``."""
+    field.prepare(quality)
+    turns = itertools.cycle(cameras)
+    return median_ms(
+        lambda: field.render_colour(next(turns), quality), repetitions=rounds * len(cameras)
+    )
 
 
 def size_mb(field: RadianceField) -> float:

@@ -13,14 +13,9 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from mec_server.fields_manifest import (
-    Publication,
-    TileVersions,
-    read_publication,
-    write_publication,
-)
 from rfcore.errors import InvalidInput, UnknownField
 from rfcore.field import FieldStore
+from rfcore.wire.tile_manifest import Publication, TileVersions, read_publication, write_publication
 from rfcore.wire.tiles import Area, Tile
 
 __all__ = ["Ground", "publish", "roll_back"]

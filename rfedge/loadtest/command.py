@@ -11,7 +11,7 @@ from rich.table import Table
 from rfedge.loadtest.plan import Load
 from rfedge.loadtest.result import LoadResult, record, write_result
 from rfedge.loadtest.run import Run, TestBed, run_load
-from rfedge.loadtest.search import largest_held
+from rfedge.loadtest.uplink import largest_held
 
 __all__ = ["Command"]
 

@@ -1,4 +1,10 @@
-"""Runs the fleet of canned vehicles as a process, and watches everybody meanwhile."""
+"""Runs the fleet of canned vehicles as a process, and watches everybody meanwhile.
+
+Live vehicles: ``cav-agent`` processes that read, render, encode and send in real time.
+
+A picture counts from its capture; an agent whose event loop is late captures late, which the canned
+fleet would not.
+"""
 
 from __future__ import annotations
 
@@ -7,26 +13,27 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
 from rfcore.errors import RfedgeError
-from rfedge.loadtest.brought import Brought, VehicleReport
 from rfedge.loadtest.fleet import CONNECT_S, DRAIN_S, SETTLE_S, FleetSpec
 from rfedge.loadtest.plan import Load
-from rfedge.loadtest.usage import Watcher
+from rfedge.loadtest.run_measurements import RunMeasurements, VehicleReport
+from rfedge.loadtest.usage import Usage, Watcher
 
-__all__ = ["drive_canned"]
+__all__ = ["drive_canned", "drive_live", "vehicle_report"]
+
 
 START_S = 60.0
 """How long the fleet may take to start, and to write what it brought, on a busy machine."""
-
 POLL_S = 0.02
 
 
 def drive_canned(
     load: Load, addresses: Sequence[str], pids: Mapping[str, int], work: Path, folder: Path
-) -> Brought:
+) -> RunMeasurements:
     """Drive canned vehicles to ``addresses``; raise ``RfedgeError`` if the fleet fails."""
     spec = FleetSpec(
         addresses=tuple(addresses),
@@ -59,7 +66,7 @@ def drive_canned(
         fleet.wait()
     result = json.loads(result_path.read_text())
     vehicles = [VehicleReport(**vehicle) for vehicle in result["vehicles"]]
-    return Brought(vehicles, result["lag_p99_ms"], usage, watcher.machine_busy, load.hz)
+    return RunMeasurements(vehicles, result["lag_p99_ms"], usage, watcher.machine_busy, load.hz)
 
 
 def _await_start(
@@ -71,3 +78,88 @@ def _await_start(
             tail = (work / "fleet.log").read_text(errors="replace").splitlines()[-3:]
             raise RfedgeError("the fleet did not start: " + " / ".join(tail))
         time.sleep(POLL_S)
+
+
+LIVE_START_S = 60.0
+LIVE_STOP_S = 20.0
+LIVE_POLL_S = 0.1
+
+
+def drive_live(
+    load: Load,
+    addresses: Sequence[str],
+    pids: Mapping[str, int],
+    work: Path,
+    agent: Sequence[str],
+) -> RunMeasurements:
+    """Drive agents to ``addresses``; raise ``RfedgeError`` if one ends early."""
+    reports = [work / f"agent{i}.jsonl" for i in range(load.vehicles)]
+    for report in reports:
+        report.unlink(missing_ok=True)
+    with ExitStack() as running:
+        agents = [
+            _start(running, work, i, [*agent, *_of(load, i, address, reports[i])])
+            for i, address in enumerate(addresses)
+        ]
+        _await_first_pictures(agents, reports, work)
+        time.sleep(load.warm_up_s)
+        since_ns = time.time_ns()
+        names = {f"vehicle{i}": process.pid for i, process in enumerate(agents)}
+        watcher = Watcher({**pids, **names})
+        watcher.start()
+        time.sleep(load.duration_s)
+        usage = watcher.stop()
+        until_ns = time.time_ns()
+        for process in agents:
+            process.terminate()
+        for i, process in enumerate(agents):
+            if process.wait(LIVE_STOP_S) != 0:
+                raise RfedgeError(f"vehicle {i} failed; see {work / f'agent{i}.log'}")
+    vehicles = [vehicle_report(report, since_ns, until_ns) for report in reports]
+    together = _together([usage[name] for name in names])
+    kept = {name: usage[name] for name in pids}
+    return RunMeasurements(
+        vehicles, 0.0, {**kept, "vehicles": together}, watcher.machine_busy, load.hz
+    )
+
+
+def vehicle_report(report: Path, since_ns: int, until_ns: int) -> VehicleReport:
+    """Return the pictures captured between two moments (Unix time) from an agent's report."""
+    lines = [json.loads(line) for line in report.read_text().splitlines()]
+    counted = [line for line in lines if since_ns <= line["capture_time_ns"] < until_ns]
+    acked = [line["latency_ms"] for line in counted if line["result"] == "acked"]
+    return VehicleReport(len(counted), acked)
+
+
+def _of(load: Load, number: int, address: str, report: Path) -> Sequence[str]:
+    return [
+        *("--server", address, "--vehicle", f"live-{number}"),
+        *("--rate", str(load.hz), "--report", str(report)),
+    ]
+
+
+def _start(
+    running: ExitStack, work: Path, number: int, command: Sequence[str]
+) -> subprocess.Popen[bytes]:
+    with (work / f"agent{number}.log").open("wb") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+    running.callback(process.wait)
+    running.callback(process.kill)
+    return process
+
+
+def _await_first_pictures(
+    agents: Sequence[subprocess.Popen[bytes]], reports: Sequence[Path], work: Path
+) -> None:
+    deadline_s = time.monotonic() + LIVE_START_S
+    while not all(report.exists() and report.stat().st_size for report in reports):
+        ended = [i for i, process in enumerate(agents) if process.poll() is not None]
+        if ended or time.monotonic() > deadline_s:
+            raise RfedgeError(f"vehicles {ended or 'that started too late'}: see {work}/agent*.log")
+        time.sleep(LIVE_POLL_S)
+
+
+def _together(usages: Sequence[Usage]) -> Usage:
+    """Return the vehicles as one: what they use, summed look by look."""
+    looks = zip(*(usage.samples for usage in usages), strict=False)
+    return Usage([sum(look[1:], look[0]) for look in looks])

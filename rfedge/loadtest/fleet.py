@@ -18,9 +18,9 @@ from typing import Any
 
 from rfcore.files import write_whole
 from rfcore.wire.messages import Hello
-from rfedge.loadtest.canned import CannedDrive
+from rfedge.loadtest.prerecorded import PrerecordedDrive
 from rfedge.loadtest.replay import End, Schedule
-from rfedge.loadtest.vehicle import CannedVehicle
+from rfedge.loadtest.vehicle import PrerecordedVehicle
 
 __all__ = ["FleetSpec", "main", "run_fleet"]
 
@@ -61,7 +61,7 @@ class Departure:
         return Schedule(start_s, end_s, spec.hz, spec.ready_s)
 
 
-def _hello(spec: FleetSpec, drive: CannedDrive) -> Hello:
+def _hello(spec: FleetSpec, drive: PrerecordedDrive) -> Hello:
     camera = drive.hello.cameras[0]
     several = (
         replace(camera, camera_id=f"{camera.camera_id}-{i}", rate_hz=spec.hz)
@@ -93,10 +93,10 @@ class LagProbe:
 
 async def run_fleet(spec: FleetSpec, started: Callable[[], None]) -> dict[str, Any]:
     """Drive all vehicles; ``started`` is called when the counted part begins."""
-    drive = CannedDrive.read(Path(spec.drive))
+    drive = PrerecordedDrive.read(Path(spec.drive))
     hello = _hello(spec, drive)
     vehicles = [
-        CannedVehicle(f"canned-{i}", address, hello, drive)
+        PrerecordedVehicle(f"canned-{i}", address, hello, drive)
         for i, address in enumerate(spec.addresses)
     ]
     await asyncio.gather(*(vehicle.connect(CONNECT_S) for vehicle in vehicles))
@@ -117,7 +117,7 @@ async def run_fleet(spec: FleetSpec, started: Callable[[], None]) -> dict[str, A
     }
 
 
-def _vehicle_result(vehicle: CannedVehicle, counted_s: float) -> dict[str, Any]:
+def _vehicle_result(vehicle: PrerecordedVehicle, counted_s: float) -> dict[str, Any]:
     shots = [shot for r in vehicle.replays for shot in r.shots if shot.due_s >= counted_s]
     latencies_s = [shot.latency_s for shot in shots]
     return {

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rfcore.files import write_whole
-from rfedge.link_proxy import LinkProxy, ProxySettings
+from rfedge.link.proxy import LinkProxy, ProxySettings
 
 __all__ = ["main", "run_links"]
 
@@ -38,7 +38,7 @@ async def run_links(profile: Path, count: int, server: str, report: Path, ready:
 def main(arguments: Sequence[str]) -> None:
     """Run from the command line."""
     profile, count, server, report, _, ready = arguments
-    loop = asyncio.SelectorEventLoop(selectors.SelectSelector())  # see rfedge.link_proxy
+    loop = asyncio.SelectorEventLoop(selectors.SelectSelector())  # see rfedge.link.proxy
     with asyncio.Runner(loop_factory=lambda: loop) as runner:
         runner.run(run_links(Path(profile), int(count), server, Path(report), Path(ready)))
 

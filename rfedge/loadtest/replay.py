@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
-from rfcore.codec import DeltaPacket
+from rfcore.codec.packet import DeltaPacket
 from rfcore.wire.messages import Ack, Credit, Frame, FrameAddress, Nack, ServerMessage
-from rfedge.loadtest.canned import CannedDrive
+from rfedge.loadtest.prerecorded import PrerecordedDrive
 
 __all__ = ["End", "Replay", "Schedule", "Shot"]
 
@@ -61,7 +61,9 @@ NEVER = Schedule(float("inf"), float("inf"), 1.0)
 class Replay:
     """Replays ``drive`` as camera ``camera_id``; ``wall_ns`` is the Unix time of a moment."""
 
-    def __init__(self, camera_id: str, drive: CannedDrive, wall_ns: Callable[[float], int]) -> None:
+    def __init__(
+        self, camera_id: str, drive: PrerecordedDrive, wall_ns: Callable[[float], int]
+    ) -> None:
         self.shots: list[Shot] = []
         self._camera_id = camera_id
         self._drive = drive

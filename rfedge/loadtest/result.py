@@ -1,4 +1,9 @@
-"""The result of a load test as files: JSON, a page, a figure; and rows of a committed result."""
+"""The result of a load test as files: JSON, a page, a figure; and rows of a committed result.
+
+The load report's charts, as inline SVG.
+
+The load test's section of the generated figures.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +15,81 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rfcore.files import write_whole
-from rfedge.loadtest.figures import latency_chart, uplink_chart
 from rfedge.loadtest.run import Run
 from rfedge.loadtest.uplink import MOST, RATES_MBPS, Traffic, vehicles_carried
-from rfedge.provenance import host, revision
+from rfedge.report.charts import GRID, INK, MUTED, PAYLOAD, RENDER, STYLE, new_axes, svg
+from rfedge.report.markdown_parts import Row, cell, heading, table
+from rfedge.results import host, revision
 
-__all__ = ["LoadResult", "record", "write_result"]
+__all__ = ["LoadResult", "latency_chart", "load_section", "record", "uplink_chart", "write_result"]
+
+
+def latency_chart(latency_ms: Mapping[str, Sequence[float]], deadline_ms: float) -> str:
+    """Return the share of acknowledged frames over their latency, a curve for each run."""
+    with mpl.rc_context(STYLE):
+        figure, axes = new_axes()
+        colours = mpl.colormaps["viridis"](np.linspace(0.1, 0.85, max(1, len(latency_ms))))
+        for (name, values), colour in zip(latency_ms.items(), colours, strict=True):
+            ordered = np.sort(np.array(values))
+            share = 100.0 * np.arange(1, len(ordered) + 1) / len(ordered)
+            axes.plot(ordered, share, color=colour, linewidth=2, label=name)
+        axes.axvline(deadline_ms, color=RENDER, linewidth=1.5, linestyle="--")
+        axes.annotate(
+            "deadline",
+            (deadline_ms, 4),
+            xytext=(5, 0),
+            textcoords="offset points",
+            color=RENDER,
+        )
+        axes.set(xlabel="ms from due to acknowledged", ylabel="% of frames", xscale="log")
+        for set_formatter in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+            set_formatter(mpl.ticker.FormatStrFormatter("%g"))
+        axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1), fontsize=9)
+        return svg(figure)
+
+
+def uplink_chart(
+    carried: Sequence[tuple[float, int]], server_vehicles: int | None, most: int
+) -> str:
+    """Return vehicles over the uplink they share (Mbit/s), and what the server carried."""
+    with mpl.rc_context(STYLE):
+        figure, axes = new_axes()
+        rates, vehicles = zip(*carried, strict=True)
+        axes.plot(rates, vehicles, color=PAYLOAD, linewidth=2, marker="o", markersize=4)
+        for rate, count in carried:
+            label = f"{count}+" if count >= most else str(count)
+            axes.annotate(
+                label,
+                (rate, count),
+                xytext=(0, 7),
+                textcoords="offset points",
+                ha="center",
+                color=INK,
+            )
+        if server_vehicles:
+            axes.axhline(server_vehicles, color=RENDER, linewidth=1.5, linestyle="--")
+            axes.annotate(
+                f"held by the server in this test: {server_vehicles}",
+                (rates[-1], server_vehicles),
+                xytext=(0, -12),
+                textcoords="offset points",
+                ha="right",
+                color=RENDER,
+            )
+        axes.set(xlabel="throughput of the shared uplink, Mbit/s", ylabel="vehicles", xscale="log")
+        axes.set_xticks(rates, [f"{rate:g}" for rate in rates])
+        axes.minorticks_off()
+        axes.yaxis.get_major_locator().set_params(integer=True)
+        axes.tick_params(colors=MUTED)
+        axes.spines["bottom"].set_color(GRID)
+        axes.margins(y=0.15)
+        return svg(figure)
+
 
 KEY = (
     "mode",
@@ -162,3 +233,44 @@ def _what(run: Run) -> str:
         f"{does} {vehicles}. Cameras a vehicle: {load.cameras}; each vehicle over {link}; "
         f"{load.duration_s:g} s counted after {load.warm_up_s:g} s of warm-up."
     )
+
+
+COLUMNS = (
+    "mode",
+    "vehicles",
+    "cameras",
+    "hz",
+    "link",
+    "held",
+    "p50_ms",
+    "p99_ms",
+    "on_time_percent",
+    "on_time_at_least_percent",
+    "fairness",
+    "server_cores",
+    "server_loop_cores",
+    "vehicles_cores",
+    "others_cores",
+    "limited_by",
+)
+
+
+def load_section(path: Path, result: Row) -> str:
+    """Return a table of the runs, with what was not kept and the commands below it."""
+    rows = [[_shown(row, column) for column in COLUMNS] for row in result["rows"]]
+    notes = [_note(row) for row in result["rows"]]
+    return "\n\n".join([heading(path, result), table(COLUMNS, rows), "\n".join(notes), ""])
+
+
+def _shown(row: Row, column: str) -> str:
+    if column == "link":
+        return row["link"] or "loopback"
+    if column == "held":
+        return "yes" if row["held"] else "no"
+    return cell(row[column])
+
+
+def _note(row: Row) -> str:
+    broken = f" Not kept: {'; '.join(row['broken'])}." if row["broken"] else ""
+    size = f"{row['width']}x{row['height']}, {row['payload_bytes']:.0f} bytes of payload a frame"
+    return f"* `{row['command']}` at `{row['revision']}` ({row['kind']} vehicles, {size}).{broken}"

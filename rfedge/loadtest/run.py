@@ -11,11 +11,10 @@ from typing import Any
 
 from rfcore.field import load_field
 from rfedge.demo.processes import Service, command_of, service
-from rfedge.loadtest.brought import Brought, links_busy, measured
-from rfedge.loadtest.canned import CannedDrive, canned_drive, payload_drive
-from rfedge.loadtest.drive import drive_canned
-from rfedge.loadtest.live import drive_live
+from rfedge.loadtest.drive import drive_canned, drive_live
 from rfedge.loadtest.plan import Load, Mode, Vehicles
+from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
+from rfedge.loadtest.run_measurements import RunMeasurements, links_busy, measured
 from rfedge.loadtest.usage import Usage
 from rfedge.loadtest.verdict import Verdict, judge
 
@@ -54,7 +53,7 @@ class Run:
 def run_load(load: Load, bed: TestBed) -> Run:
     """Run one load to its end; raise ``RfedgeError`` naming the process that failed."""
     folder = _canned(load, bed)
-    drive = CannedDrive.read(folder)
+    drive = PrerecordedDrive.read(folder)
     bed.work.mkdir(parents=True, exist_ok=True)
     with ExitStack() as processes:
         server = processes.enter_context(_server(load, bed))
@@ -80,7 +79,7 @@ def run_load(load: Load, bed: TestBed) -> Run:
 def _canned(load: Load, bed: TestBed) -> Path:
     field = load_field(bed.field)
     if load.mode is not Mode.TRANSPORT:
-        return canned_drive(bed.drive, field, bed.cache, bed.preset, bed.crf)
+        return prerecorded_drive(bed.drive, field, bed.cache, bed.preset, bed.crf)
     folder = bed.cache / f"payload-{load.size_bytes}"
     payload_drive(field.field_id, load.size_bytes).write(folder)
     return folder
@@ -117,7 +116,9 @@ def _agent(bed: TestBed) -> Sequence[str]:
     ]
 
 
-def _row(load: Load, drive: CannedDrive, brought: Brought, verdict: Verdict) -> dict[str, Any]:
+def _row(
+    load: Load, drive: PrerecordedDrive, brought: RunMeasurements, verdict: Verdict
+) -> dict[str, Any]:
     k = drive.intrinsics
     return {
         "mode": str(load.mode),

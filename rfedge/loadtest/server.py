@@ -18,7 +18,8 @@ import numpy as np
 
 from mec_server.__main__ import serve
 from mec_server.config import AdmissionLimits, ServerConfig
-from mec_server.handlers import (
+from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
+from mec_server.reconstruction import (
     Decoder,
     FieldSource,
     OpenCameras,
@@ -27,14 +28,13 @@ from mec_server.handlers import (
     Tools,
     open_cameras,
 )
-from mec_server.jobs import DecodeJob, DecodeOutcome, OpenJob
 from rfcore.camera import Camera
 from rfcore.errors import PacketRejected, RejectReason
 from rfcore.field import Quality
 from rfcore.image import I420
 from rfcore.views import View
-from rfcore.wire.logs import configure_logs
 from rfcore.wire.messages import CameraDescription, StageTimes
+from rfcore.wire.settings import configure_logs
 from rfedge.loadtest.plan import Mode
 
 __all__ = ["KeptFields", "KeptRenders", "PassingDecoder", "passing", "with_kept_renders"]
@@ -96,7 +96,7 @@ class KeptFields:
 
 
 def passing(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
-    """Return decoders that do nothing, for ``mec_server.handlers.open_cameras``."""
+    """Return decoders that do nothing, for ``mec_server.reconstruction.open_cameras``."""
     del fields, tools
     return {camera.camera_id: PassingDecoder(camera) for camera in job.hello.cameras}
 

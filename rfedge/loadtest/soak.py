@@ -22,7 +22,7 @@ from rfcore.files import write_whole
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.run import Run, TestBed, run_load
 from rfedge.loadtest.usage import Sample, slope_per_minute
-from rfedge.provenance import host, revision
+from rfedge.results import host, revision
 
 __all__ = ["MAX_SLOPE_MB", "SoakSettings", "soak", "what_grew"]
 

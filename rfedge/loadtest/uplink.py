@@ -8,14 +8,32 @@ off.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from rfcore.link import LinkProfile
 from rfcore.link.virtual import Arrival, delivery_times
-from rfedge.loadtest.search import largest_held
 
-__all__ = ["RATES_MBPS", "Traffic", "on_time_share", "vehicles_carried"]
+__all__ = ["CLOSE", "RATES_MBPS", "Traffic", "largest_held", "on_time_share", "vehicles_carried"]
+
+CLOSE = 1.1
+"""Runs are short and machines noisy: within a tenth is as near as a repetition comes."""
+
+
+def largest_held(first: int, held: Callable[[int], bool], most: int = 1000) -> int:
+    """Return the largest count for which ``held`` was true, 0 if it is for none up to ``first``.
+
+    ``held`` is asked once for each count. Found exactly below ten, and within a tenth above.
+    """
+    low, high = 0, first
+    while high <= most and held(high):
+        low, high = high, 2 * high
+    high = min(high, most + 1)
+    while high - low > 1 and high > CLOSE * low:
+        middle = (low + high) // 2
+        low, high = (middle, high) if held(middle) else (low, middle)
+    return low
+
 
 RATES_MBPS = (0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 32.0, 64.0, 128.0)
 MOST = 64

@@ -17,20 +17,20 @@ from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import Hello, Welcome
-from rfedge.loadtest.canned import CannedDrive
 from rfedge.loadtest.grpc_call import GrpcCall, Status
+from rfedge.loadtest.prerecorded import PrerecordedDrive
 from rfedge.loadtest.replay import Replay, Schedule
 
-__all__ = ["CannedVehicle"]
+__all__ = ["PrerecordedVehicle"]
 
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
 CODES = {code.value[0]: code.name for code in grpc.StatusCode}
 
 
-class CannedVehicle(asyncio.Protocol):
+class PrerecordedVehicle(asyncio.Protocol):
     """``met`` is set when the server has answered Hello, ``over`` when nothing more will happen."""
 
-    def __init__(self, name: str, address: str, hello: Hello, drive: CannedDrive) -> None:
+    def __init__(self, name: str, address: str, hello: Hello, drive: PrerecordedDrive) -> None:
         self.refused = ""
         self.failed = ""
         self.granted_hz = 0.0

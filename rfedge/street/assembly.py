@@ -1,6 +1,8 @@
 """A scene's world: the parts that its geometry asks for, then the effects that change the street.
 
 Each part and each effect has random numbers of its own, so that leaving one out moves no other.
+
+Running a scene's effects on a rendered frame, in the registry's order.
 """
 
 from __future__ import annotations
@@ -10,17 +12,17 @@ import zlib
 import numpy as np
 
 from rfedge.street.effects import EFFECTS, rng_of
+from rfedge.street.frame import LinearFrame
 from rfedge.street.geometry.building import buildings
-from rfedge.street.geometry.lamp import lamps, railings, wires
+from rfedge.street.geometry.furniture import lamps, railings, signs, wires
 from rfedge.street.geometry.layout import Layout
 from rfedge.street.geometry.road import road
-from rfedge.street.geometry.sign import signs
 from rfedge.street.geometry.sky import clear_sky
 from rfedge.street.geometry.tree import trees
 from rfedge.street.geometry.world import World
 from rfedge.street.scene_file import Scene
 
-__all__ = ["plain_world", "world_of"]
+__all__ = ["apply_effects", "plain_world", "world_of"]
 
 
 def world_of(scene: Scene) -> World:
@@ -52,3 +54,12 @@ def plain_world(scene: Scene) -> World:
 
 def _rng(seed: int, name: str) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def apply_effects(scene: Scene, frame: LinearFrame, index: int) -> LinearFrame:
+    """Return frame ``index`` as the scene's air and sensor make it; without effects, unchanged."""
+    for effect in EFFECTS:
+        if effect.on_frames and effect.name in scene.effects:
+            rng = rng_of(effect, scene.geometry.seed, index)
+            frame = scene.effects[effect.name].apply(frame, rng)
+    return frame

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rfcore.codec.h264 import EncoderOptions, PictureKind, encode_pictures
-from rfcore.codec.paper import slice_nals
+from rfcore.codec.h264.ffmpeg import EncoderOptions, PictureKind, encode_pictures
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.files import write_whole
 from rfcore.image import Rgb, read_rgb
 from rfcore.native.yuv import i420_from_rgb
-from rfedge.provenance import host, revision
+from rfedge.experiments.paper.published import slice_nals
+from rfedge.results import host, revision
 
 __all__ = ["IntraCoding", "SceneSizes", "intra_bytes", "sizes_of", "write_sizes"]
 

@@ -4,10 +4,13 @@
 * ``train``: cars with the rig go through the street, alternately in both directions; at each of
   ``views`` places another of its cameras takes a picture.
 * ``eval``: ``stations`` of the whole rig between the places of ``train``.
+
+Which of a scene's shots a command asks for.
 """
 
 from __future__ import annotations
 
+import re
 import zlib
 from dataclasses import dataclass
 from enum import StrEnum
@@ -15,12 +18,14 @@ from enum import StrEnum
 import numpy as np
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfedge.carla_recorder.rig import RIG
+from rfcore.errors import InvalidInput
+from rfedge.datasets.rig import RIG
 from rfedge.street.geometry.layout import Layout
 from rfedge.street.scene_file import Scene
 from rfedge.street.trajectory import Motion, drive_motion, drive_pose, mounted, on_lane
 
-__all__ = ["Shot", "Split", "shots_of", "thinned_indices"]
+__all__ = ["Selection", "Shot", "Split", "shots_of", "thinned_indices"]
+
 
 ENDS_M = 14.0
 """Cars keep so far from where the facades end."""
@@ -128,3 +133,47 @@ def _directions(scene: Scene) -> int:
 
 def _direction(scene: Scene, index: int) -> int:
     return -1 if _directions(scene) == 2 and index % 2 else 1
+
+
+@dataclass(frozen=True)
+class Selection:
+    """``splits`` and ``frames`` as the command line has them; raises ``InvalidInput``."""
+
+    scene: Scene
+    splits: str = "default"
+    frames: str | None = None
+    size_px: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        self.shots()
+
+    def shots(self) -> list[Shot]:
+        """Return the chosen shots in the order in which they are taken."""
+        every = [
+            shot for split in self._splits() for shot in shots_of(self.scene, split, self.size_px)
+        ]
+        chosen = every[self._slice(len(every))]
+        if not chosen:
+            raise InvalidInput("frames", f"'{self.frames}' leaves none of {len(every)} frames")
+        return chosen
+
+    def _splits(self) -> list[Split]:
+        if self.splits == "all":
+            return list(Split)
+        if self.splits == "default":
+            own_field = self.scene.field == self.scene.name
+            return [split for split in Split if own_field or split is not Split.TRAIN]
+        names = self.splits.split(",")
+        for name in names:
+            if name not in list(Split):
+                known = ", ".join(Split)
+                raise InvalidInput("split", f"'{name}' is none of {known} and all")
+        return [split for split in Split if split in names]
+
+    def _slice(self, count: int) -> slice:
+        if self.frames is None:
+            return slice(None)
+        match = re.fullmatch(r"(\d{0,9}):(\d{0,9})", self.frames, re.ASCII)
+        if match is None:
+            raise InvalidInput("frames", f"'{self.frames}' is not a:b, such as 0:8")
+        return slice(int(match[1] or 0), int(match[2] or count))

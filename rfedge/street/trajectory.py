@@ -2,21 +2,25 @@
 
 A car's axes are x forward, y left, z up, its origin on the road. It keeps right: towards +x it
 drives at y < 0. Camera axes are OpenCV's.
+
+The pose as a vehicle's localisation gives it: the true one with normal deviates.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from rfcore.camera import Pose
-from rfedge.carla_recorder.rig import Mount
+from rfedge.datasets.rig import Mount
 from rfedge.street.geometry.layout import LANE_M
 from rfedge.street.geometry.mesh import F64
-from rfedge.street.scene_file import Drive
+from rfedge.street.scene_file import Drive, PoseNoise
 
-__all__ = ["Motion", "drive_motion", "drive_pose", "looking", "mounted", "on_lane"]
+__all__ = ["Motion", "drive_motion", "drive_pose", "looking", "measured_pose", "mounted", "on_lane"]
+
 
 EYE_UP_M = 1.62
 """The drive's camera is behind the windscreen."""
@@ -89,3 +93,19 @@ def drive_motion(drive: Drive, time_s: float) -> Motion:
 
 def _triple(values: F64) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
+
+
+def measured_pose(world_from_cam: Pose, noise: PoseNoise, frame: int) -> Pose:
+    """Return the pose measured in a frame: the same for the same seed and frame.
+
+    Each coordinate is off by ``position_m``, each angle about a camera axis by ``rotation_deg``
+    (standard deviations).
+    """
+    rng = np.random.default_rng([noise.seed, frame])
+    shift = rng.normal(0.0, 1.0, 3) * noise.position_m
+    turn = rng.normal(0.0, 1.0, 3) * math.radians(noise.rotation_deg)
+    x, y, z = (float(a + b) for a, b in zip(world_from_cam.translation_m, shift, strict=True))
+    angle = float(np.linalg.norm(turn))
+    a, b, c = (float(v) for v in turn * (math.sin(angle / 2) / angle if angle > 0 else 0.0))
+    off = Pose((0.0, 0.0, 0.0), (math.cos(angle / 2), a, b, c))
+    return Pose((x, y, z), world_from_cam.compose(off).rotation)

@@ -9,7 +9,9 @@ import pytest
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob
 from cav_agent.session import AgentSession
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.packet import DeltaPacket
 from rfcore.views import PosedPicture
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.messages import CameraDescription, Credit, Hello, RendererContract, Welcome

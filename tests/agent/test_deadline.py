@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cav_agent.deadline import DeadlineController, DeadlineLimits, Step
-from rfcore.codec.ladder import MeasuredRung, Rung
+from rfcore.codec.sender.ladder import MeasuredRung, Rung
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality
 

@@ -1,7 +1,6 @@
 """Who takes which picture when servers come, go and publish; ``ready`` is who streams."""
 
-from cav_agent.handover import LOST_AFTER_S, Cause, Handover
-from cav_agent.route import Route, Stop
+from cav_agent.handover import LOST_AFTER_S, Cause, Handover, Route, Stop
 from rfcore.wire.tiles import Area, Tile
 
 NEAR = 2

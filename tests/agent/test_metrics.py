@@ -9,7 +9,7 @@ from prometheus_client import CollectorRegistry
 from cav_agent.deadline import Step
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
 from cav_agent.metrics import AgentMetrics
-from rfcore.codec.ladder import MeasuredRung, Rung
+from rfcore.codec.sender.ladder import MeasuredRung, Rung
 from rfcore.wire.messages import StageTimes
 
 

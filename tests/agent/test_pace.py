@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cav_agent.capture_schedule import Lockstep, Realtime
 from cav_agent.frames import Capture, FrameResult, Outcome
-from cav_agent.pace import Lockstep, Realtime
 from rfcore.errors import InvalidInput, RfedgeError
 
 MakeCapture = Callable[..., Capture]

@@ -10,7 +10,9 @@ from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from cav_agent.rate_control import ByteBudget
 from rfcore.camera import Camera
-from rfcore.codec import CodecConfig, QpMap, Steering
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.qp_map import QpMap
+from rfcore.codec.sender.steering import Steering
 from rfcore.field import Quality
 from rfcore.views import View
 

@@ -15,15 +15,11 @@ from hypothesis import strategies as st
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
 from cav_agent.rate_control import ByteBudget, QualitySteps, RateControl
 from cav_agent.session import AgentSession
-from rfcore.codec import (
-    RENDER_ONLY,
-    CodecConfig,
-    DeltaEncoder,
-    DeltaPacket,
-    FrameChoice,
-    RateModel,
-    RateTarget,
-)
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.references import RENDER_ONLY
+from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
+from rfcore.codec.sender.rate import RateModel, RateTarget
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field

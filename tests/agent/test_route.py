@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cav_agent.route import LEAVE_SHARE, Route, Stop
+from cav_agent.handover import LEAVE_SHARE, Route, Stop
 from rfcore.errors import InvalidInput
 from rfcore.wire.tiles import Area, Tile
 

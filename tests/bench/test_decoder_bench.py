@@ -7,7 +7,7 @@ import pytest
 
 from mec_server.config import DecoderKind
 from rfedge.bench import decoders, run_case
-from rfedge.loadtest.canned import CannedDrive, canned_drive
+from rfedge.loadtest.prerecorded import PrerecordedDrive, prerecorded_drive
 
 KINDS = (DecoderKind.IN_PROCESS, DecoderKind.CHILD)
 
@@ -17,11 +17,11 @@ def short(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The first frames of the sample drive, coded fast."""
 
     def coded(drive: Path, field: Any, cache: Path) -> Path:
-        whole = CannedDrive.read(canned_drive(drive, field, cache, "ultrafast"))
-        CannedDrive(whole.hello, whole.chain[:5], whole.alone[:5]).write(tmp_path)
+        whole = PrerecordedDrive.read(prerecorded_drive(drive, field, cache, "ultrafast"))
+        PrerecordedDrive(whole.hello, whole.chain[:5], whole.alone[:5]).write(tmp_path)
         return tmp_path
 
-    monkeypatch.setattr(decoders, "canned_drive", coded)
+    monkeypatch.setattr(decoders, "prerecorded_drive", coded)
     monkeypatch.setattr(decoders, "LAPS", 1)
     monkeypatch.setattr(decoders, "KINDS", KINDS)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfcore.codec import Reference
+from rfcore.codec.references import Reference
 from rfcore.errors import CodecError, RejectReason
 from rfedge.bench.fuzz import MUTATIONS, FuzzStream, fuzz, make_stream
 

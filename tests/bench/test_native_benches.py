@@ -8,7 +8,7 @@ import pytest
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.native import Rasterizer
-from rfedge.bench import modes, print_rows, raster, results, run_case, timing, train, write_json
+from rfedge.bench import print_rows, raster, results, run_case, timing, train, write_json
 from rfedge.bench.street import street_camera, street_gaussians
 
 RASTER_KEYS = [
@@ -46,11 +46,11 @@ def test_raster_rows_have_the_published_keys_and_null_where_not_run() -> None:
 
 @pytest.mark.usefixtures("small")
 def test_modes_are_compared_with_the_whole_colour(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modes, "SIZES_PX", ((30, 20),))
+    monkeypatch.setattr(raster, "MODE_SIZES_PX", ((30, 20),))
     rows = run_case("raster", rows="modes")["rows"]
     assert [list(row) for row in rows] == [MODE_KEYS] * 6
     by_mode = {row["mode"]: row for row in rows}
-    assert by_mode[modes.BASELINE]["ratio"] == 1.0
+    assert by_mode[raster.BASELINE]["ratio"] == 1.0
     assert {"degree 0", "antialiased", "depth and opacity"} < set(by_mode)
     assert all(row["native_ms"] > 0 for row in rows)
 

@@ -8,8 +8,16 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.ngp.native import NgpRenderer
-from rfcore.ngp.parameters import F32, NgpParameters, initial_parameters
-from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space, grid_levels
+from rfcore.ngp.shape import (
+    F32,
+    HashGrid,
+    Marching,
+    NgpParameters,
+    NgpShape,
+    Space,
+    grid_levels,
+    initial_parameters,
+)
 from rfedge.bench import ngp
 
 KEYS = [

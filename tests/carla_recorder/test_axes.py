@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
-from rfedge.carla_recorder import intrinsics_of_fov, pose_from_carla
-from rfedge.carla_recorder.axes import point_from_carla
+from rfedge.datasets.carla import intrinsics_of_fov, point_from_carla, pose_from_carla
 
 K = intrinsics_of_fov(1920, 1080, 90.0)
 

@@ -13,8 +13,8 @@ import pytest
 
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput, RfedgeError
-from rfedge.carla_recorder import RIG, Recorder, RecordSettings
-from rfedge.carla_recorder.rig import mounts_named
+from rfedge.datasets.carla import Recorder, RecordSettings
+from rfedge.datasets.rig import RIG, mounts_named
 
 SMALL = RecordSettings(stations=3, spacing_m=5.0, size_px=(32, 18), timeout_s=0.2)
 

@@ -9,9 +9,7 @@ from cryptography import x509
 
 from rfcore.errors import AccessDenied, InvalidInput
 from rfcore.wire.identity import PeerIdentity, Role, identity_uri, peer_identity
-from rfedge.certs.folder import write_certificates
-from rfedge.certs.issue import Issued, Members, certify
-from rfedge.certs.show import read_certificates
+from rfedge.certs.authority import Issued, Members, certify, read_certificates, write_certificates
 
 NOW = datetime(2030, 1, 2, tzinfo=UTC)
 

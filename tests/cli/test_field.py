@@ -13,12 +13,8 @@ from rfcore.field import SplatField, load_field, read_ply, save_field, write_ply
 from rfcore.field.similarity import Similarity, moved
 from rfcore.image import read_rgb, write_png
 from rfcore.raster.gaussians import Gaussians
-from rfedge.cli.field_check import FieldCheck
-from rfedge.cli.field_export import FieldExport
-from rfedge.cli.field_import import FieldImport
-from rfedge.cli.field_info import FieldInfo
-from rfedge.cli.field_rungs import FieldRungs
-from rfedge.cli.field_slim import FieldSlim
+from rfedge.cli.field_files import FieldCheck, FieldExport, FieldImport, FieldInfo
+from rfedge.cli.field_reduce import FieldRungs, FieldSlim
 from rfedge.cli.render import Render
 
 HALF = float(np.sqrt(0.5))

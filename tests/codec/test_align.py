@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.codec.align import Look, align
-from rfcore.codec.pose_search import PoseSearch
+from rfcore.codec.sender.align import Look, align
+from rfcore.codec.sender.pose_search import PoseSearch
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth

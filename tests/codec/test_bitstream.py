@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfcore.codec.bitstream import (
+from rfcore.codec.h264.bitstream import (
     BitReader,
     BitWriter,
     join_nals,
@@ -12,7 +12,7 @@ from rfcore.codec.bitstream import (
     rbsp_of_nal,
     split_nals,
 )
-from rfcore.codec.parameter_sets import nal_type, parse_pps, parse_slice_start, parse_sps
+from rfcore.codec.h264.parameter_sets import nal_type, parse_pps, parse_slice_start, parse_sps
 from rfcore.errors import BitstreamError, InvalidInput
 
 # Few zero bytes occur in uniform bytes; these have runs of them.

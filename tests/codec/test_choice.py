@@ -7,19 +7,14 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.codec import (
-    INTRA,
-    RENDER_ONLY,
-    CodecConfig,
-    DeltaDecoder,
-    DeltaEncoder,
-    FrameChoice,
-    Past,
-    Reference,
-)
-from rfcore.codec.choice import choose_photometric, choose_references
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.photometric import adapt, check_photometric, solve
 from rfcore.codec.prediction import Prediction
+from rfcore.codec.references import INTRA, RENDER_ONLY, Reference
+from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
+from rfcore.codec.sender.reference_choice import choose_photometric, choose_references
+from rfcore.codec.state import Past
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth

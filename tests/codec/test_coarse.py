@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rfcore.codec.coarse import (
-    COARSE_BYTES,
-    COARSE_TOLERANCE,
-    coarse_difference,
-    coarse_digest,
+from rfcore.codec.block_means import (
+    BLOCK_MEANS_BYTES,
+    BLOCK_MEANS_TOLERANCE,
+    block_mean_difference,
+    block_mean_digest,
 )
 from rfcore.image import I420
 
@@ -40,7 +40,7 @@ def oracle(y: np.ndarray) -> bytes:
 @settings(max_examples=50)
 def test_it_is_the_rounded_mean_of_each_cell(height: int, width: int, seed: int) -> None:
     y = np.random.default_rng(seed).integers(0, 256, (height, width))
-    assert coarse_digest(luma_only(y)) == oracle(y)
+    assert block_mean_digest(luma_only(y)) == oracle(y)
 
 
 @given(side, side, st.integers(0, 2**32 - 1))
@@ -51,17 +51,19 @@ def test_one_level_per_sample_never_exceeds_the_tolerance(
     rng = np.random.default_rng(seed)
     y = rng.integers(1, 255, (height, width))
     moved = y + rng.choice([rng.integers(-1, 2, y.shape), np.ones_like(y), -np.ones_like(y)])
-    difference = coarse_difference(coarse_digest(luma_only(y)), coarse_digest(luma_only(moved)))
-    assert difference <= COARSE_TOLERANCE
+    difference = block_mean_difference(
+        block_mean_digest(luma_only(y)), block_mean_digest(luma_only(moved))
+    )
+    assert difference <= BLOCK_MEANS_TOLERANCE
 
 
 @pytest.mark.parametrize("level", [0, 1, 128, 255])
 def test_a_flat_picture_has_its_level_in_every_cell(flat: PictureMaker, level: int) -> None:
-    assert coarse_digest(flat(100, 50, level)) == bytes([level]) * COARSE_BYTES
+    assert block_mean_digest(flat(100, 50, level)) == bytes([level]) * BLOCK_MEANS_BYTES
 
 
 def test_the_difference_is_the_largest_in_either_direction() -> None:
     a, b = bytearray(64), bytearray(64)
     a[5], b[60] = 9, 255
-    assert coarse_difference(bytes(a), bytes(b)) == 255
-    assert coarse_difference(bytes(a), bytes(64)) == 9
+    assert block_mean_difference(bytes(a), bytes(b)) == 255
+    assert block_mean_difference(bytes(a), bytes(64)) == 9

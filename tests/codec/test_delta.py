@@ -6,14 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfcore.codec import (
-    RENDER_ONLY,
-    CodecConfig,
-    DeltaDecoder,
-    DeltaEncoder,
-    Encoded,
-    FrameChoice,
-)
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.references import RENDER_ONLY
+from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
 

@@ -7,10 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rfcore.codec.intra import IntraPoint, intra_curve, luma_psnr_db, saving_at_equal_psnr
-from rfcore.codec.paper import PaperSavings, paper_savings, paper_savings_percent
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfedge.demo.measure import IntraPoint, intra_curve, luma_psnr_db, saving_at_equal_psnr
+from rfedge.experiments.paper.published import PaperSavings, paper_savings, paper_savings_percent
 
 PictureMaker = Callable[..., I420]
 PairMaker = Callable[..., tuple[I420, I420]]

@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, FrameChoice
-from rfcore.codec.fit import MAX_TRIES, code_to_fit
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
+from rfcore.codec.sender.rate import MAX_TRIES, code_to_fit
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 

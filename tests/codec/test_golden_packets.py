@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rfcore.codec import DeltaDecoder, Reference
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.references import Reference
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth
 from rfcore.wire.convert import client_message_from_bytes

@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import pytest
 
-from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder, StreamHeader
-from rfcore.codec.bitstream import BitWriter, nal_of_rbsp
-from rfcore.codec.config import PRESETS
-from rfcore.codec.header import check_header
-from rfcore.codec.parameter_sets import parse_pps, parse_sps
-from rfcore.codec.reference import pcm_pps
-from rfcore.codec.slices import SliceCoding, encode_slice
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.bitstream import BitWriter, nal_of_rbsp
+from rfcore.codec.h264.config import PRESETS, CodecConfig
+from rfcore.codec.h264.header import StreamHeader, check_header
+from rfcore.codec.h264.parameter_sets import parse_pps, parse_sps
+from rfcore.codec.h264.pcm_picture import pcm_pps
+from rfcore.codec.h264.slices import SliceCoding, encode_slice
+from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 

@@ -6,7 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfcore.codec import RENDER_ONLY, CodecConfig, DeltaDecoder, DeltaEncoder, FrameChoice
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.references import RENDER_ONLY
+from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.image import I420
 
 PairMaker = Callable[..., tuple[I420, I420]]

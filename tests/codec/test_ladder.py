@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from rfcore.codec.ladder import MeasuredRung, Rung, front, read_ladder
+from rfcore.codec.sender.ladder import MeasuredRung, Rung, front, read_ladder
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.field import Quality
 

@@ -10,15 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from rfcore.codec import (
-    RENDER_ONLY,
-    CodecConfig,
-    DeltaDecoder,
-    DeltaEncoder,
-    DeltaPacket,
-    FrameChoice,
-    StreamHeader,
-)
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.references import RENDER_ONLY
+from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.errors import PacketRejected, RejectReason
 from rfcore.image import I420
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Pose
-from rfcore.codec import CodecConfig, DeltaEncoder
-from rfcore.codec.align import Look
-from rfcore.codec.pose_search import PoseSearch
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.sender.align import Look
+from rfcore.codec.sender.encoder import DeltaEncoder
+from rfcore.codec.sender.pose_search import PoseSearch
 from rfcore.dataset import read_dataset
 from rfcore.field import load_field
 from rfcore.image import I420

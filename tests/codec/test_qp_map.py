@@ -9,16 +9,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
-from rfcore.codec import (
-    RENDER_ONLY,
-    CodecConfig,
-    DeltaDecoder,
-    DeltaEncoder,
-    Encoded,
-    FrameChoice,
-    QpMap,
-    qp_map_of_mask,
-)
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.qp_map import QpMap, qp_map_of_mask
+from rfcore.codec.references import RENDER_ONLY
+from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 

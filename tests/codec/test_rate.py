@@ -8,16 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfcore.codec import (
-    INTRA,
-    RENDER_ONLY,
-    CodecConfig,
-    DeltaEncoder,
-    FrameChoice,
-    RateModel,
-    RateTarget,
-)
-from rfcore.codec.rate import CLIMB_CRF, BitsCurve, bits_curve
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.references import INTRA, RENDER_ONLY
+from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
+from rfcore.codec.sender.rate import CLIMB_CRF, BitsCurve, RateModel, RateTarget, bits_curve
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 

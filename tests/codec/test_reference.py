@@ -5,11 +5,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rfcore.codec import CodecConfig, DeltaEncoder
-from rfcore.codec.bitstream import join_nals, rbsp_of_nal, split_nals
-from rfcore.codec.h264 import H264Decoder
-from rfcore.codec.parameter_sets import NAL_IDR, NAL_P, parse_pps, parse_slice_start
-from rfcore.codec.reference import PCM_PPS_ID, PcmPictures, PcmPlace, pcm_pps, without_zeros
+from rfcore.codec.h264.bitstream import join_nals, rbsp_of_nal, split_nals
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.ffmpeg import H264Decoder
+from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, parse_pps, parse_slice_start
+from rfcore.codec.h264.pcm_picture import PCM_PPS_ID, PcmPictures, PcmPlace, pcm_pps, without_zeros
+from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 

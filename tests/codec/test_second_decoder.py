@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rfcore.codec import DeltaDecoder
+from rfcore.codec.decoder import DeltaDecoder
 from rfcore.image import I420
 from rfedge.bench.fuzz import make_stream
 

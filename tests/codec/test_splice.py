@@ -6,10 +6,12 @@ from itertools import product
 import numpy as np
 import pytest
 
-from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder
-from rfcore.codec.bitstream import join_nals
-from rfcore.codec.h264 import H264Decoder, PictureKind, encode_pictures
-from rfcore.codec.slices import slice_options
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.bitstream import join_nals
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.ffmpeg import H264Decoder, PictureKind, encode_pictures
+from rfcore.codec.h264.slices import slice_options
+from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 

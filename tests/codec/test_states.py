@@ -8,19 +8,11 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.codec import (
-    INTRA,
-    KEPT_FRAMES,
-    RENDER_ONLY,
-    CodecConfig,
-    DecoderState,
-    DeltaDecoder,
-    DeltaEncoder,
-    Encoded,
-    EncoderState,
-    FrameChoice,
-    Reference,
-)
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.references import INTRA, RENDER_ONLY, Reference
+from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
+from rfcore.codec.state import KEPT_FRAMES, DecoderState, EncoderState
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rfcore.codec import Steering, SteeringSettings
+from rfcore.codec.sender.steering import Steering, SteeringSettings
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import write_png
 

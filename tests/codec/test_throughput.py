@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from rfcore.codec import PathEstimator
+from cav_agent.path_estimator import PathEstimator
 from rfcore.errors import InvalidInput
 
 MS = 1_000_000

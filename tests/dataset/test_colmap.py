@@ -8,9 +8,7 @@ import pycolmap
 import pytest
 
 from rfcore.dataset import read_dataset
-from rfcore.dataset.colmap_binary import read_binary_model
-from rfcore.dataset.colmap_model import camera_of
-from rfcore.dataset.colmap_text import read_text_model
+from rfcore.dataset.colmap import camera_of, read_binary_model, read_text_model
 from rfcore.dataset.source import SourceCamera
 from rfcore.errors import DatasetError
 

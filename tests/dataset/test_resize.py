@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.dataset.resize import area_averaged, check_reduction
+from rfcore.dataset.assemble import area_averaged, check_reduction
 from rfcore.errors import InvalidInput
 
 

@@ -11,9 +11,16 @@ from rfcore.errors import DatasetError, FieldFormatError, InvalidData
 from rfcore.field import SplatField, load_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.train import SplatTrainingConfig
-from rfedge.demo import make_sample_field, sample_field
-from rfedge.demo.field import FieldChoice, cache_path, choose_field
-from rfedge.demo.sample_field import Making, sample_field_path, write_sample_field
+from rfedge.demo import field as make_sample_field
+from rfedge.demo import field as sample_field
+from rfedge.demo.field import (
+    FieldChoice,
+    Making,
+    cache_path,
+    choose_field,
+    sample_field_path,
+    write_sample_field,
+)
 
 CONFIG = SplatTrainingConfig(gaussians=100, iterations=3)
 SILENT = Console(quiet=True)

@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rfcore.codec import CodecConfig, DeltaEncoder, SteeringSettings
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.sender.encoder import DeltaEncoder
+from rfcore.codec.sender.steering import SteeringSettings
 from rfcore.dataset import Dataset, read_dataset
 from rfcore.errors import InvalidData
 from rfcore.field import SplatField

@@ -9,10 +9,10 @@ from rich.console import Console
 
 from rfcore.dataset import read_dataset
 from rfcore.field import Quality, SplatField, load_field
-from rfcore.field.load import encode_field
+from rfcore.field.store import encode_field
 from rfcore.train import DensityControl, SplatTrainingConfig, mean_psnr_db
-from rfedge.demo.sample_field import MAX_BYTES, check_sample_field, sample_field_path
-from rfedge.training import TrainingJob, train_field
+from rfedge.demo.field import MAX_BYTES, check_sample_field, sample_field_path
+from rfedge.training.run import TrainingJob, train_field
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "street"
 RAW_BYTES_A_SPLAT = 4 * (3 + 4 + 3 + 1 + 48)

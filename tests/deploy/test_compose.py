@@ -20,9 +20,9 @@ from rfcore.dataset import read_dataset
 from rfcore.link.profile_file import read_link
 from rfcore.wire.tls import TlsFiles
 from rfedge.cli import Verb
-from rfedge.cli.certs_init import CertsInit
-from rfedge.cli.field_publish import FieldPublish
-from rfedge.link_proxy import ProxySettings
+from rfedge.cli.certs import CertsInit
+from rfedge.cli.field import FieldPublish
+from rfedge.link.proxy import ProxySettings
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())

@@ -89,7 +89,7 @@ def test_the_runtime_image_has_neither_torch_nor_opencv() -> None:
 
 def test_the_full_image_trains() -> None:
     run("docker", "run", "--rm", "--read-only", "--tmpfs", "/tmp", "rfedge-full:local",
-        "python", "-c", "import torch, cv2, matplotlib, rfedge.training")  # fmt: skip
+        "python", "-c", "import torch, cv2, matplotlib, rfedge.training.run")  # fmt: skip
 
 
 def test_every_target_is_up_and_every_vehicle_is_seen(

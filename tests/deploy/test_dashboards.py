@@ -10,9 +10,8 @@ import pytest
 from rfcore.errors import InvalidInput
 from rfedge.dashboards.__main__ import write_dashboards
 from rfedge.dashboards.catalogue import DASHBOARDS
-from rfedge.dashboards.grafana import DATASOURCE
-from rfedge.dashboards.panel import Panel, Query, Unit
-from rfedge.report.metrics_page import families
+from rfedge.dashboards.grafana import DATASOURCE, Panel, Query, Unit
+from rfedge.pages.metrics import families
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 FILES = sorted((DEPLOY / "grafana/dashboards").glob("*.json"))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rfcore.errors import InvalidData, InvalidInput
-from rfedge.evaluate.cells import CellStore
-from rfedge.evaluate.clip import CodedClip
+from rfedge.experiments.cells import CellStore
+from rfedge.experiments.clips import CodedClip
 
 KEY = {"scene": "street", "hz": 10, "method": "x264", "point": 23.0}
 CLIP = CodedClip(

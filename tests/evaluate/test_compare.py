@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 
 from rfcore.image import I420
-from rfedge.evaluate.cells import CellStore
-from rfedge.evaluate.clip import CodedClip
-from rfedge.evaluate.compare import (
+from rfedge.experiments.cells import CellStore
+from rfedge.experiments.clips import CodedClip
+from rfedge.experiments.compare.measure import (
     BEST,
     TIMED_REPEATS,
-    Contest,
+    Clip,
     Performance,
     compare_rows,
     perform,
 )
 
 PLANE = np.zeros((2, 2), np.uint8)
-CONTEST = Contest("street", 10.0, [I420(PLANE, PLANE[:1, :1], PLANE[:1, :1])], "digest", 27.5)
+CONTEST = Clip("street", 10.0, [I420(PLANE, PLANE[:1, :1], PLANE[:1, :1])], "digest", 27.5)
 
 
 def performance(name, rate_factor, cpu_ms, frames=10):

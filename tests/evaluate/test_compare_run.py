@@ -9,12 +9,11 @@ from rich.console import Console
 
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field
-from rfedge.evaluate.compare import BEST
-from rfedge.evaluate.compare_bout import CompareJob, read_bouts
-from rfedge.evaluate.compare_rivals import foreign_coder
-from rfedge.evaluate.compare_run import run_compare
-from rfedge.evaluate.drives import DriveName, read_drive
-from rfedge.evaluate.rivals import x264_lowdelay
+from rfedge.experiments.clips import DriveName, read_drive
+from rfedge.experiments.compare.drives import CompareJob, foreign_coder, read_drive_comparisons
+from rfedge.experiments.compare.measure import BEST
+from rfedge.experiments.compare.run import run_compare
+from rfedge.experiments.rivals import x264_lowdelay
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 ROW_KEYS = {
@@ -67,7 +66,7 @@ def test_a_decimated_drive_is_every_fifth_frame_at_a_fifth_of_the_rate(tmp_path)
         cells=tmp_path / "cells",
     )
     field = load_field(job.field)
-    (bout,) = read_bouts(job, field)
+    (bout,) = read_drive_comparisons(job, field)
     assert bout.contest.rate_hz == 2.0
     whole = read_drive(job.decimated[0])
     assert [f.digest() for f in bout.contest.frames] == [f.digest() for f in whole.frames[::5]]

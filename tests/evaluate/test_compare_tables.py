@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from rfcore.image import I420
-from rfedge.evaluate.clip import CodedClip
-from rfedge.evaluate.compare import Contest, Performance
-from rfedge.evaluate.compare_tables import break_even_row, curve_rows
+from rfedge.experiments.clips import CodedClip
+from rfedge.experiments.compare.measure import Clip, Performance, break_even_row, curve_rows
 
 PLANE = np.zeros((2, 2), np.uint8)
 FRAME = I420(PLANE, PLANE[:1, :1], PLANE[:1, :1])
-CONTEST = Contest("street", 10.0, [FRAME] * 10, "digest", 27.5)
+CONTEST = Clip("street", 10.0, [FRAME] * 10, "digest", 27.5)
 
 
 def performance(name, frame_bytes):

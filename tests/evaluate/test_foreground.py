@@ -5,13 +5,13 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfedge.evaluate.compare import Contest, perform
-from rfedge.evaluate.foreground import (
+from rfedge.experiments.compare.foreground import (
     ForegroundCoder,
     by_macroblock,
     foreground_mask,
     foreground_row,
 )
+from rfedge.experiments.compare.measure import Clip, perform
 
 SIZE = (96, 64)
 CHROMA = np.full((SIZE[1] // 2, SIZE[0] // 2), 128, np.uint8)
@@ -62,7 +62,7 @@ def test_no_rate_lifts_the_whole_picture_above_its_background():
 
 def test_against_itself_the_foreground_costs_the_same_and_the_ceiling_is_said():
     coder = ForegroundCoder.of("veryfast", MASKS, [RENDER] * 3, "test")
-    contest = Contest("street", 10.0, FRAMES, "digest", None)
+    contest = Clip("street", 10.0, FRAMES, "digest", None)
     clips = perform(contest, coder, NoStore()).clips
     row = foreground_row(contest, clips, clips, MASKS)
     assert row["bd_rate_percent"] == pytest.approx(0)
@@ -73,7 +73,7 @@ def test_against_itself_the_foreground_costs_the_same_and_the_ceiling_is_said():
 
 def test_a_drive_without_foreground_is_refused():
     coder = ForegroundCoder.of("veryfast", MASKS, [RENDER] * 3, "test")
-    contest = Contest("street", 10.0, FRAMES, "digest", None)
+    contest = Clip("street", 10.0, FRAMES, "digest", None)
     clips = perform(contest, coder, NoStore()).clips
     with pytest.raises(InvalidInput, match="no frame differs"):
         foreground_row(contest, clips, clips, [np.zeros_like(MASKS[0])] * 3)

@@ -6,13 +6,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from rfcore.codec.ladder import Rung, read_ladder
+from rfcore.codec.sender.ladder import Rung, read_ladder
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality
-from rfedge.evaluate import ladder_run
-from rfedge.evaluate.ladder_run import LadderJob, run_ladder
-from rfedge.evaluate.ladder_rungs import fronts, rate_percents, rungs_for
-from rfedge.report.ladder import ladder_page, write_ladder_figure
+from rfedge.experiments.ladder import run
+from rfedge.experiments.ladder.page import ladder_page, write_ladder_figure
+from rfedge.experiments.ladder.run import LadderJob, fronts, rate_percents, run_ladder, rungs_for
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 ROW_KEYS = {
@@ -67,7 +66,7 @@ def test_every_rung_is_measured_once_and_the_full_one_first(kind, quick):
 @pytest.mark.sample
 def test_a_ladder_is_measured_written_drawn_and_read_by_an_agent(tmp_path, monkeypatch):
     rungs = [Rung(preset="veryfast"), Rung(Quality(0.1), 0, preset="ultrafast")]
-    monkeypatch.setattr(ladder_run, "rungs_for", lambda _kind, **_: rungs)
+    monkeypatch.setattr(run, "rungs_for", lambda _kind, **_: rungs)
     job = LadderJob(
         [SAMPLES / "fields/street.rff"],
         SAMPLES / "street/transforms_drive_empty.json",
@@ -89,7 +88,7 @@ def test_a_ladder_is_measured_written_drawn_and_read_by_an_agent(tmp_path, monke
         assert cheap["sender_stage_ms"]["render"] < full["sender_stage_ms"]["render"]
     assert low[0]["rate_percent"] > 30
     assert [r.rung for r in read_ladder(job.out, "splats", 28)] == rungs
-    monkeypatch.setattr(ladder_run, "measure_rung", lambda *_: pytest.fail("measured again"))
+    monkeypatch.setattr(run, "measure_rung", lambda *_: pytest.fail("measured again"))
     assert run_ladder(job, Console(quiet=True)) == result
     svg, numbers = write_ladder_figure(result, tmp_path / "figures")
     assert svg.read_text().startswith("<?xml")

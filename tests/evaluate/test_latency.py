@@ -9,15 +9,16 @@ from rich.console import Console
 
 from rfcore.errors import InvalidInput
 from rfcore.link import DirectionPlan, LinkProfile
-from rfedge.evaluate.latency import (
+from rfedge.experiments.latency.report import latency_section, write_latency_figures
+from rfedge.experiments.latency.run import (
     FRAMES_FOR_REQUIREMENT,
     REQUIREMENT,
+    LatencyJob,
     needed_rate_bps,
     play,
     repeated,
+    run_latency,
 )
-from rfedge.evaluate.latency_run import LatencyJob, run_latency
-from rfedge.report.latency import latency_section, write_latency_figures
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 

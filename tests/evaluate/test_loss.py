@@ -5,7 +5,7 @@ from random import Random
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.loss import DATAGRAM_BYTES, Bursts, Feedback, Lossy, Policy
+from rfedge.experiments.robust.lossy_link import DATAGRAM_BYTES, Bursts, Feedback, Lossy, Policy
 
 
 @pytest.mark.parametrize(("share", "length"), [(0.01, 1.0), (0.05, 2.0), (0.2, 4.0)])

@@ -13,10 +13,15 @@ from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_colour
 from rfcore.raster.gaussians import Gaussians
 from rfcore.views import PosedPicture
-from rfedge.evaluate.cells import CellStore
-from rfedge.evaluate.drives import DriveFrames, DriveName
-from rfedge.evaluate.never_worse import CONTROLS, NeverWorse, controls_of
-from rfedge.evaluate.never_worse_run import NeverWorseJob, run_never_worse
+from rfedge.experiments.cells import CellStore
+from rfedge.experiments.clips import DriveFrames, DriveName
+from rfedge.experiments.never_worse.measure import (
+    CONTROLS,
+    NeverWorse,
+    NeverWorseJob,
+    controls_of,
+    run_never_worse,
+)
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 INTRINSICS = Intrinsics(160, 96, 120.0, 120.0, 80.0, 48.0)

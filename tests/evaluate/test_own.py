@@ -11,7 +11,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_colour
 from rfcore.raster.gaussians import Gaussians
-from rfedge.evaluate.own import FieldCoder, see_clip
+from rfedge.experiments.field_coder import FieldCoder, see_clip
 
 INTRINSICS = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
 

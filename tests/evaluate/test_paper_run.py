@@ -8,10 +8,13 @@ import pytest
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.paper_run import PaperJob, named_path, run_paper
-from rfedge.evaluate.paper_summary import means_of, savings_by_frame
-from rfedge.report.paper import write_paper_figures
-from rfedge.report.paper_views import write_views
+from rfedge.experiments.paper.figures import (
+    means_of,
+    savings_by_frame,
+    write_paper_figures,
+    write_views,
+)
+from rfedge.experiments.paper.run import PaperJob, named_path, run_paper
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 ROW_KEYS = {

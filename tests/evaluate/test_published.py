@@ -3,10 +3,15 @@
 import numpy as np
 import pytest
 
-from rfcore.codec.paper import paper_savings_percent
 from rfcore.errors import InvalidInput
 from rfcore.native.yuv import i420_from_rgb
-from rfedge.evaluate.published import PublishedFrame, Setting, published_rows, reduced
+from rfedge.experiments.paper.published import (
+    PublishedFrame,
+    Setting,
+    paper_savings_percent,
+    published_rows,
+    reduced,
+)
 
 SMALL = Setting((64, 48), "downscaled", "medium", 23.0)
 

@@ -5,13 +5,8 @@ import numpy as np
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.clip import CodedClip
-from rfedge.evaluate.rate_curve import (
-    RateCurve,
-    bd_rate_interval,
-    bd_rate_percent,
-    rate_curve,
-)
+from rfedge.experiments.clips import CodedClip
+from rfedge.experiments.rate_curve import RateCurve, bd_rate_interval, bd_rate_percent, rate_curve
 
 DECIBELS = np.array([28.0, 29.5, 31.0, 33.0, 35.0, 37.0])
 BYTES = np.exp(np.array([7.0, 7.4, 7.9, 8.6, 9.2, 9.9]))

@@ -8,9 +8,8 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth
-from rfedge.evaluate.bit_split import SplitClip, split_rows
-from rfedge.evaluate.own import SeenClip
-from rfedge.evaluate.regions import KINDS, macroblock_kinds
+from rfedge.experiments.compare.bit_split import KINDS, SplitClip, macroblock_kinds, split_rows
+from rfedge.experiments.field_coder import SeenClip
 
 SIZE = (96, 64)
 INTRINSICS = Intrinsics(*SIZE, 64.0, 64.0, 48.0, 32.0)

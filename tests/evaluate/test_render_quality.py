@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from rfedge.evaluate.render_quality import BANDS, colour_ssim, flip, render_quality, residual_bands
+from rfedge.experiments.picture_quality import (
+    BANDS,
+    colour_ssim,
+    flip,
+    render_quality,
+    residual_bands,
+)
 
 RNG = np.random.default_rng(6)
 NOISE = RNG.integers(40, 200, (64, 96, 3)).astype(np.uint8)

@@ -5,7 +5,7 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfedge.evaluate.rivals import (
+from rfedge.experiments.rivals import (
     svtav1_lowdelay,
     x264_for_psnr,
     x264_lowdelay,

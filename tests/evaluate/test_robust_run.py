@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.robust_run import RobustJob, run_robust
-from rfedge.report.robust import robust_section, write_robust_figure
+from rfedge.experiments.robust.report import robust_section, write_robust_figure
+from rfedge.experiments.robust.run import RobustJob, run_robust
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from rfcore.image import I420
-from rfedge.evaluate.rivals import svtav1_lowdelay
-from rfedge.evaluate.scheduling import ordinary_scheduling
+from rfedge.experiments.rivals import ordinary_scheduling, svtav1_lowdelay
 
 
 def policies() -> set[int]:

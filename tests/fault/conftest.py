@@ -25,10 +25,10 @@ import pytest
 
 from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
-from rfcore.codec import CodecConfig
+from rfcore.codec.h264.config import CodecConfig
 from rfcore.dataset import read_dataset
 from rfcore.wire.messages import FrameAddress
-from rfedge.provenance import host, revision
+from rfedge.results import host, revision
 
 _spec = importlib.util.spec_from_file_location(
     "integration_street", Path(__file__).parents[1] / "integration/conftest.py"
@@ -136,7 +136,7 @@ class Server(Program):
 
     def decoders(self) -> list[int]:
         """Return its decoder processes, the one that stands ready included."""
-        return [p for p in self.descendants() if b"decoder_child" in _command(p)]
+        return [p for p in self.descendants() if b"mec_server.decoding.child" in _command(p)]
 
 
 @dataclass

@@ -14,7 +14,9 @@ from typing import Any
 import grpc
 import pytest
 
-from rfcore.codec import CodecConfig, DeltaEncoder, StreamHeader
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Ack, FieldNotice, Frame, Nack

@@ -15,11 +15,10 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.field import FieldMetadata, Quality, SplatField, load_field, save_field
 from rfcore.field.archive import Archive, decode_archive, encode_archive
-from rfcore.field.detail import Rung, kept_of
-from rfcore.field.load import decode_field, encode_field
-from rfcore.field.quality import DETAILS
-from rfcore.field.splat_codec import compressed_archive, splats_of_compressed
+from rfcore.field.quality import DETAILS, Rung, kept_of
+from rfcore.field.splat_archive import compressed_archive, splats_of_compressed
 from rfcore.field.splat_grid import BLOCK, Steps, gaussians_of, numbers_of
+from rfcore.field.store import decode_field, encode_field
 from rfcore.raster.gaussians import Gaussians
 
 GOLDEN = Path(__file__).parent / "golden" / "grid-1.rff"

@@ -10,9 +10,8 @@ from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.field import FieldMetadata, NgpField, Quality, load_field, save_field
 from rfcore.field.archive import Archive, decode_archive, encode_archive
-from rfcore.field.load import decode_field, encode_field
-from rfcore.ngp.parameters import initial_parameters
-from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space, grid_levels
+from rfcore.field.store import decode_field, encode_field
+from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space, grid_levels, initial_parameters
 
 METADATA = FieldMetadata("tile 7", TileOrigin(4e5, 5e6, 30.0), "ab" * 32, 25.5, 0.7, kind="ngp")
 

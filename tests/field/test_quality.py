@@ -8,8 +8,7 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import FULL, Quality, SplatField, load_field, save_field
-from rfcore.field.detail import Rung, kept_of, splats_of_rung
-from rfcore.field.quality import DETAILS
+from rfcore.field.quality import DETAILS, Rung, kept_of, splats_of_rung
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 

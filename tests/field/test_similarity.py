@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import FieldFormatError, InvalidInput
-from rfcore.field.nerfstudio import read_field_from_world
-from rfcore.field.similarity import Similarity, moved, spherical_harmonics
+from rfcore.field.similarity import Similarity, moved, read_field_from_world, spherical_harmonics
 from rfcore.raster import reference
 from rfcore.raster.native import Rasterizer
 

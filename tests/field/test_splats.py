@@ -10,7 +10,7 @@ from rfcore.errors import BackendUnavailable, FieldFormatError, InvalidInput
 from rfcore.field import FieldMetadata, SplatField, load_field, save_field
 from rfcore.field.archive import Archive, encode_archive
 from rfcore.field.interface import Bounds
-from rfcore.field.load import encode_field
+from rfcore.field.store import encode_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 

@@ -6,7 +6,7 @@ import pytest
 
 from rfcore.errors import FieldFormatError, UnknownField
 from rfcore.field import FieldStore, SplatField, save_field
-from rfcore.field.load import encode_field
+from rfcore.field.store import encode_field
 
 
 def test_an_added_field_is_listed_found_and_loaded(make_gaussians, tmp_path: Path) -> None:

@@ -7,14 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mec_server.fields_manifest import MANIFEST, read_publication
 from rfcore.errors import FieldFormatError, InvalidInput, UnknownField
 from rfcore.field import SplatField, save_field
 from rfcore.raster.gaussians import Gaussians
+from rfcore.wire.tile_manifest import MANIFEST, read_publication
 from rfcore.wire.tiles import Area
-from rfedge.cli.field_list import FieldList
-from rfedge.cli.field_publish import FieldPublish
-from rfedge.cli.field_rollback import FieldRollback
+from rfedge.cli.field import FieldList, FieldPublish, FieldRollback
 from rfedge.fields.publish import Ground, publish, roll_back
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)

@@ -21,10 +21,10 @@ from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from cav_agent.vehicle import Vehicle
 from mec_server.config import ServerConfig
-from mec_server.handlers import OpenCameras, open_cameras
+from mec_server.reconstruction import OpenCameras, open_cameras
 from mec_server.server import EdgeServer
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.codec import CodecConfig
+from rfcore.codec.h264.config import CodecConfig
 from rfcore.dataset import read_dataset
 from rfcore.field import SplatField, save_field
 from rfcore.image import write_png

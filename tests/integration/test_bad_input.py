@@ -7,7 +7,8 @@ from typing import Any
 import grpc
 import pytest
 
-from rfcore.codec import CodecConfig, StreamHeader
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import StreamHeader
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Ack, FieldNotice, Frame, Nack
 from rfcore.wire.v1 import edge_pb2 as pb

@@ -21,7 +21,7 @@ def processes_of_decoders() -> list[int]:
     return [
         int(pid)
         for pid in children
-        if b"decoder_child" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        if b"mec_server.decoding.child" in Path(f"/proc/{pid}/cmdline").read_bytes()
     ]
 
 

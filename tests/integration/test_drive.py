@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from cav_agent.config import PaceKind
-from rfcore.codec import SteeringSettings
+from rfcore.codec.sender.steering import SteeringSettings
 from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable
 from rfcore.image import read_rgb, write_png
-from rfcore.raster.native import available_isas
+from rfcore.native.backend import available_isas
 from rfcore.wire.settings import RenderSettings
-from rfedge.link_proxy import LinkProxy, ProxySettings
+from rfedge.link.proxy import LinkProxy, ProxySettings
 
 
 def index_of(saved: Path, vehicle: str = "cav-1") -> list[dict[str, Any]]:

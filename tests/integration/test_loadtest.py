@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 from mec_server.config import AdmissionLimits
-from rfcore.codec import DeltaDecoder
+from rfcore.codec.decoder import DeltaDecoder
 from rfcore.field.quality import FULL
 from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour
-from rfedge.loadtest.canned import CannedDrive, canned_drive, payload_drive
 from rfedge.loadtest.command import Command
 from rfedge.loadtest.fleet import FleetSpec, run_fleet
 from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
+from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
 from rfedge.loadtest.result import record
 from rfedge.loadtest.run import TestBed
 from rfedge.loadtest.server import KeptRenders, passing, with_kept_renders
@@ -26,11 +26,13 @@ PATIENT = Bounds(deadline_ms=60_000.0, on_time_percent=0.0, fairness=0.0, settli
 
 @pytest.fixture(scope="session")
 def canned(street: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return canned_drive(street.drive, street.field, tmp_path_factory.mktemp("canned"), "ultrafast")
+    return prerecorded_drive(
+        street.drive, street.field, tmp_path_factory.mktemp("canned"), "ultrafast"
+    )
 
 
 def test_canned_frames_decode_in_a_chain_and_alone(street: Any, canned: Path) -> None:
-    drive = CannedDrive.read(canned)
+    drive = PrerecordedDrive.read(canned)
     for frames in (drive.chain, drive.alone):
         decoder = DeltaDecoder(drive.hello.cameras[0].codec)
         state = decoder.start(frames[0].packet.epoch)
@@ -48,7 +50,7 @@ def test_canned_frames_decode_in_a_chain_and_alone(street: Any, canned: Path) ->
 
 def test_a_coded_drive_is_coded_once(street: Any, canned: Path) -> None:
     before = (canned / "chain.rfv").stat().st_mtime_ns
-    again = canned_drive(street.drive, street.field, canned.parent, "ultrafast")
+    again = prerecorded_drive(street.drive, street.field, canned.parent, "ultrafast")
     assert (again, (again / "chain.rfv").stat().st_mtime_ns) == (canned, before)
 
 

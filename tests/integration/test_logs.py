@@ -8,7 +8,7 @@ from typing import Any
 from structlog.testing import capture_logs
 
 from rfcore.wire.messages import Frame
-from rfedge.link_proxy import LinkProxy, ProxySettings
+from rfedge.link.proxy import LinkProxy, ProxySettings
 
 
 def damaged(frame: Frame) -> Frame:

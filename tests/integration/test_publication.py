@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from mec_server.fields_manifest import MANIFEST
 from rfcore.field import FieldStore
+from rfcore.wire.tile_manifest import MANIFEST
 from rfedge.fields.publish import Ground, publish, roll_back
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)

@@ -13,10 +13,12 @@ from hypothesis import strategies as st
 
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
 from cav_agent.session import AgentSession
-from mec_server.jobs import DecodeJob, DecodeOutcome, OpenJob
+from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
 from mec_server.session import ServerSession
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.views import PosedPicture
 from rfcore.wire.conventions import RENDERER_CONTRACT

@@ -13,14 +13,13 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from cav_agent.config import AgentLimits
 from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
+from rfcore.wire.address import own_problem
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.handshake import own_problem
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import PictureEncoding, TwinPicture, Wish, watch_request, watched
 from rfcore.wire.v1 import twin_pb2_grpc
-from rfedge.certs.folder import write_certificates
-from rfedge.certs.issue import Members, certify
+from rfedge.certs.authority import Members, certify, write_certificates
 from rfedge.watch import WatchSettings, watch
 
 Files = Callable[[str], TlsFiles]

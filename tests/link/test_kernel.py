@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 from rfcore.link import Arrival, LinkProfile, delivery_times
-from rfedge.link_proxy import LinkProxy, ProxySettings
+from rfedge.link.proxy import LinkProxy, ProxySettings
 
 pytestmark = [pytest.mark.slow, pytest.mark.netns]
 

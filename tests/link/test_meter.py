@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.link import Link, LinkProfile
-from rfcore.link.meter import BusyMeter
+from rfcore.link.shaper import BusyMeter
 
 
 def measure(profile: LinkProfile, pushes: list[tuple[float, int]], late_s: float) -> BusyMeter:

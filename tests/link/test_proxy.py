@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rfcore.errors import InvalidInput, RfedgeError
-from rfedge.link_proxy import LinkProxy, ProxySettings
+from rfedge.link.proxy import LinkProxy, ProxySettings
 
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 FAST: dict[str, float] = {"uplink_bps": 1e9, "downlink_bps": 1e9, "delay_ms": 0.0}

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from rfedge.loadtest.limit import Resources, limit, nearest
+from rfedge.loadtest.verdict import Resources, limit, nearest
 
 IDLE = Resources(0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.0, 1.0)
 

@@ -8,7 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.codec import CodecConfig, DeltaPacket, StreamHeader
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import RejectReason
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.messages import (
@@ -21,7 +23,7 @@ from rfcore.wire.messages import (
     RendererContract,
     StageTimes,
 )
-from rfedge.loadtest.canned import CannedDrive
+from rfedge.loadtest.prerecorded import PrerecordedDrive
 from rfedge.loadtest.replay import End, Replay, Schedule
 
 PICTURES = 4
@@ -34,16 +36,16 @@ def canned_frame(payload: bytes) -> Frame:
 
 
 @pytest.fixture(scope="module")
-def drive() -> CannedDrive:
+def drive() -> PrerecordedDrive:
     header = StreamHeader(CodecConfig(32, 16), b"\x67" * 20, b"\x68" * 5)
     camera = CameraDescription("front", Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0), header)
     hello = Hello("v", (camera,), ("ab" * 32,), RendererContract(RENDERER_CONTRACT, exact=True))
     chain = tuple(canned_frame(f"chain {i}".encode()) for i in range(PICTURES))
     alone = tuple(canned_frame(f"alone {i}".encode()) for i in range(PICTURES))
-    return CannedDrive(hello, chain, alone)
+    return PrerecordedDrive(hello, chain, alone)
 
 
-def replay_of(drive: CannedDrive, seconds: float = 2.0, hz: float = 10.0) -> Replay:
+def replay_of(drive: PrerecordedDrive, seconds: float = 2.0, hz: float = 10.0) -> Replay:
     replay = Replay("front", drive, lambda s: round(s * 1e9))
     replay.begin(Schedule(0.0, seconds, hz))
     return replay
@@ -53,14 +55,14 @@ def answer(frame: Frame) -> Ack:
     return Ack(frame.address, StageTimes(), frame.packet.reconstruction_digest)
 
 
-def test_nothing_is_due_before_the_departure(drive: CannedDrive) -> None:
+def test_nothing_is_due_before_the_departure(drive: PrerecordedDrive) -> None:
     replay = Replay("front", drive, round)
     replay.receive(Credit("front", 9), 0.0)
     assert replay.get_timer() is None
     assert replay.frame_to_send(1e9) is None
 
 
-def test_a_late_answer_does_not_move_what_is_due(drive: CannedDrive) -> None:
+def test_a_late_answer_does_not_move_what_is_due(drive: PrerecordedDrive) -> None:
     """The server stalls for half a second: the pictures of that time count, as dropped, and the
     one that waited counts from when it was due (no coordinated omission)."""
     replay = replay_of(drive)
@@ -76,7 +78,7 @@ def test_a_late_answer_does_not_move_what_is_due(drive: CannedDrive) -> None:
     assert late.capture_time_ns == 500_000_000
 
 
-def test_pictures_follow_each_other_as_a_vehicle_sends_them(drive: CannedDrive) -> None:
+def test_pictures_follow_each_other_as_a_vehicle_sends_them(drive: PrerecordedDrive) -> None:
     replay = replay_of(drive)
     replay.receive(Credit("front", 99), 0.0)
     sent = [replay.frame_to_send(i / 10) for i in range(PICTURES + 1)]
@@ -95,7 +97,7 @@ def test_pictures_follow_each_other_as_a_vehicle_sends_them(drive: CannedDrive) 
 
 
 def test_after_a_refusal_pictures_are_sent_alone_until_the_drive_begins_again(
-    drive: CannedDrive,
+    drive: PrerecordedDrive,
 ) -> None:
     replay = replay_of(drive)
     replay.receive(Credit("front", 99), 0.0)
@@ -115,7 +117,7 @@ def test_after_a_refusal_pictures_are_sent_alone_until_the_drive_begins_again(
     assert [f.packet.sequence for f in sent if f] == [0, 0, 0, 0, 1]
 
 
-def test_what_a_lost_stream_could_not_send_counts(drive: CannedDrive) -> None:
+def test_what_a_lost_stream_could_not_send_counts(drive: PrerecordedDrive) -> None:
     replay = replay_of(drive, seconds=1.0)
     replay.frame_to_send(0.3)
     replay.give_up()
@@ -123,7 +125,7 @@ def test_what_a_lost_stream_could_not_send_counts(drive: CannedDrive) -> None:
     assert replay.get_timer() is None
 
 
-def test_a_vehicle_that_needs_time_sends_later_and_counts_from_due(drive: CannedDrive) -> None:
+def test_a_vehicle_that_needs_time_sends_later_and_counts_from_due(drive: PrerecordedDrive) -> None:
     replay = Replay("front", drive, lambda s: round(s * 1e9))
     replay.begin(replace(Schedule(0.0, 1.0, 10.0), ready_s=0.06))
     replay.receive(Credit("front", 9), 0.0)
@@ -136,7 +138,7 @@ def test_a_vehicle_that_needs_time_sends_later_and_counts_from_due(drive: Canned
 
 @given(st.lists(st.floats(0, 3), max_size=40), st.integers(0, 30))
 def test_every_picture_that_was_due_is_accounted_for(
-    drive: CannedDrive, moments: list[float], credit: int
+    drive: PrerecordedDrive, moments: list[float], credit: int
 ) -> None:
     replay = replay_of(drive)
     replay.receive(Credit("front", credit), 0.0)

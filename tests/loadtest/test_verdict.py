@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from rfedge.loadtest.limit import Resources
 from rfedge.loadtest.plan import Bounds
-from rfedge.loadtest.verdict import Measured, VehicleCount, judge, wilson_lower
+from rfedge.loadtest.verdict import Measured, Resources, VehicleCount, judge, wilson_lower
 
 IDLE = Resources(0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.0, 1.0)
 

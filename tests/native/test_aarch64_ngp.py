@@ -10,8 +10,15 @@ import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.ngp.native import NgpRenderer
-from rfcore.ngp.parameters import NgpParameters, initial_parameters
-from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space, grid_levels
+from rfcore.ngp.shape import (
+    HashGrid,
+    Marching,
+    NgpParameters,
+    NgpShape,
+    Space,
+    grid_levels,
+    initial_parameters,
+)
 from rfcore.ngp.trainable import NgpRates, RayBatch, TrainableNgp
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]

@@ -14,7 +14,8 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.native.yuv import i420_from_colour, rgb_from_i420
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import LearningRates, Rasterizer, TrainableRasterizer
+from rfcore.raster.native import Rasterizer
+from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 

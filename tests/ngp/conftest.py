@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.ngp.parameters import NgpParameters, initial_parameters
-from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space, grid_levels
-from rfcore.raster.native import available_isas
+from rfcore.native.backend import available_isas
+from rfcore.ngp.shape import (
+    HashGrid,
+    Marching,
+    NgpParameters,
+    NgpShape,
+    Space,
+    grid_levels,
+    initial_parameters,
+)
 
 NumbersMaker = Callable[..., NgpParameters]
 CameraMaker = Callable[..., Camera]

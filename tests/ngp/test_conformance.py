@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from rfcore.camera import Camera
+from rfcore.native.backend import available_isas
 from rfcore.ngp import reference
 from rfcore.ngp.native import NgpRenderer
-from rfcore.ngp.parameters import NgpParameters
-from rfcore.raster.native import available_isas
+from rfcore.ngp.shape import NgpParameters
 from rfcore.views import View
 
 NumbersMaker = Callable[..., NgpParameters]
@@ -35,17 +35,13 @@ def by_definition(dtype: torch.dtype, device: str = "cpu") -> Draw:
     return draw
 
 
-@pytest.fixture(
-    params=["definition-float32", *(f"native-{isa}" for isa in available_isas()), "definition-cuda"]
-)
+@pytest.fixture(params=["definition-float32", *(f"native-{isa}" for isa in available_isas())])
 def draw(request: pytest.FixtureRequest) -> Draw:
     name = str(request.param)
     if name.startswith("native-"):
         isa = name.removeprefix("native-")
         return lambda field, camera: NgpRenderer(field, isa=isa).render(camera)
-    if name == "definition-cuda" and not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
-    return by_definition(torch.float32, "cuda" if name == "definition-cuda" else "cpu")
+    return by_definition(torch.float32)
 
 
 @pytest.mark.parametrize("unbounded", [False, True])

@@ -9,7 +9,7 @@ from rfcore.camera import Camera
 from rfcore.errors import BackendUnavailable, InvalidInput
 from rfcore.ngp import reference
 from rfcore.ngp.native import NgpRenderer
-from rfcore.ngp.parameters import NgpParameters
+from rfcore.ngp.shape import NgpParameters
 from rfcore.views import View
 
 NumbersMaker = Callable[..., NgpParameters]

@@ -10,12 +10,18 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.native.ngp import table_entries
+from rfcore.native.backend import available_isas
 from rfcore.ngp.native import NgpRenderer
-from rfcore.ngp.parameters import NgpParameters, matrix_shapes
-from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space
+from rfcore.ngp.shape import (
+    HashGrid,
+    Marching,
+    NgpParameters,
+    NgpShape,
+    Space,
+    matrix_shapes,
+    table_entries,
+)
 from rfcore.ngp.trainable import NgpRates, RayBatch, TrainableNgp
-from rfcore.raster.native import available_isas
 
 VIEW_DIGEST = "1eb19561b910760200843ed8e9ad4734"
 TRAINED_DIGEST = "973c0b6b3959073ce9457f89c5d4f7f2"
@@ -27,7 +33,7 @@ def numbers() -> NgpParameters:
     space = Space((0.0, 0.25, 3.0), (2.0, 1.5, 1.0), True)
     shape = NgpShape(grid, space, Marching(0.25, 1.0625, 80), 32, (20, 15, 10))
     rng = np.random.default_rng(2024)
-    table = rng.random((table_entries(grid.array, grid.T), 2), dtype=np.float32) * 2 - 1
+    table = rng.random((table_entries(grid), 2), dtype=np.float32) * 2 - 1
     weights = sum(rows * columns for rows, columns in matrix_shapes(shape))
     matrices = (rng.random(weights, dtype=np.float32) * 2 - 1) * np.float32(0.5)
     occupancy = rng.integers(0, 1 << 32, shape.occupancy_words, dtype=np.uint32)

@@ -10,9 +10,8 @@ import torch
 from rfcore.camera import Camera
 from rfcore.ngp import reference
 from rfcore.ngp.native import NgpRenderer
-from rfcore.ngp.parameters import NgpParameters
 from rfcore.ngp.reference import Rays
-from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space, grid_levels
+from rfcore.ngp.shape import HashGrid, Marching, NgpParameters, NgpShape, Space, grid_levels
 
 CameraMaker = Callable[..., Camera]
 

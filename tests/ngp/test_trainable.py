@@ -9,7 +9,7 @@ import torch
 
 from rfcore.errors import InvalidInput
 from rfcore.ngp import reference
-from rfcore.ngp.parameters import NgpParameters
+from rfcore.ngp.shape import NgpParameters
 from rfcore.ngp.trainable import NgpRates, RayBatch, TrainableNgp
 
 NumbersMaker = Callable[..., NgpParameters]

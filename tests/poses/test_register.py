@@ -15,7 +15,8 @@ from rfcore.dataset.source import SourcePicture
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import write_png
-from rfedge.poses import PoseSettings, pose_dataset
+from rfedge.datasets.colmap_features import PoseSettings
+from rfedge.datasets.poses import pose_dataset
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "street"
 SETTINGS = PoseSettings(max_side_px=640, features=1024, threads=1)

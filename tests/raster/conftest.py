@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.native.backend import available_isas
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import available_isas
 
 SceneMaker = Callable[..., Gaussians]
 CameraMaker = Callable[..., Camera]

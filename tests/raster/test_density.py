@@ -7,8 +7,9 @@ import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
+from rfcore.native.backend import available_isas
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import DensityStep, LearningRates, TrainableRasterizer, available_isas
+from rfcore.raster.trainable import DensityStep, LearningRates, TrainableRasterizer
 
 CAMERA = Camera(Intrinsics(48, 32, 40.0, 40.0, 24.0, 16.0), Pose((0, 0, 0), (1.0, 0, 0, 0)))
 RATES = LearningRates(means=1e-3)

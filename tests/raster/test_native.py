@@ -9,9 +9,10 @@ import torch
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import BackendUnavailable, InvalidInput
+from rfcore.native.backend import available_isas
 from rfcore.raster import reference
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import Rasterizer, available_isas
+from rfcore.raster.native import Rasterizer
 from rfcore.views import View
 
 SceneMaker = Callable[..., Gaussians]

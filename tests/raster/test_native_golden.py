@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.native.backend import available_isas
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import LearningRates, Rasterizer, TrainableRasterizer, available_isas
+from rfcore.raster.native import Rasterizer
+from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 
 VIEW_DIGESTS = {
     False: "67e28fc19aca424329f52c2213f5a0b6",

@@ -8,8 +8,10 @@ import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
+from rfcore.native.backend import available_isas
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import LearningRates, Rasterizer, TrainableRasterizer, available_isas
+from rfcore.raster.native import Rasterizer
+from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfcore.views import View
 
 SceneMaker = Callable[..., Gaussians]

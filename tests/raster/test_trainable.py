@@ -12,7 +12,8 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.raster import reference
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import LearningRates, Rasterizer, TrainableRasterizer
+from rfcore.raster.native import Rasterizer
+from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 
 SceneMaker = Callable[..., Gaussians]
 CameraMaker = Callable[..., Camera]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.report.faults_page import faults_page
+from rfedge.pages.faults import faults_page
 
 ROOT = Path(__file__).parents[2]
 

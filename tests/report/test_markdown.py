@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.report.ladder import ladder_page
-from rfedge.report.markdown import results_page
+from rfedge.experiments.ladder.page import ladder_page
+from rfedge.pages.results import results_page
 
 ROOT = Path(__file__).parents[2]
 

@@ -11,7 +11,8 @@ from mec_server.admission import ASSUMED_HZ, NOTICEABLE, REVIEW_S, Admission
 from mec_server.config import AdmissionLimits
 from mec_server.session import ServerSession
 from rfcore.camera import Intrinsics
-from rfcore.codec import CodecConfig, StreamHeader
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import StreamHeader
 from rfcore.errors import InvalidInput, LimitExceeded
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.messages import CameraDescription, Hello, RendererContract, Welcome

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from mec_server.alarm import Alarm
+from mec_server.lazy_timer import LazyTimer
 
 
 @pytest.fixture
@@ -13,7 +13,7 @@ def event() -> asyncio.Event:
 
 
 async def test_a_deadline_that_has_come_sets_the_event(event: asyncio.Event) -> None:
-    alarm = Alarm(event)
+    alarm = LazyTimer(event)
     alarm.by(asyncio.get_running_loop().time() + 3600.0)
     alarm.by(asyncio.get_running_loop().time() - 1.0)
     async with asyncio.timeout(10.0):
@@ -33,7 +33,7 @@ async def test_a_later_deadline_keeps_the_timer_and_an_earlier_one_replaces_it(
 
     monkeypatch.setattr(loop, "call_at", counting)
     now = loop.time()
-    alarm = Alarm(event)
+    alarm = LazyTimer(event)
     for later in range(100):
         alarm.by(now + 60.0 + later)
     alarm.by(now + 30.0)

@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 from prometheus_client import CollectorRegistry
 
-from mec_server import bubblewrap, decoder_pool, decoder_process
-from mec_server.bubblewrap import bubblewrap_command
 from mec_server.config import DecoderKind
-from mec_server.decoder_child import ADDRESS_SPACE_BYTES
-from mec_server.decoder_pool import ChildDecoder, DecoderPool
-from mec_server.decoder_process import DecoderLost, LossCause, child_environment
-from mec_server.decoders import Decoders
+from mec_server.decoding import decoders as bubblewrap
+from mec_server.decoding import pool as decoder_pool
+from mec_server.decoding import process
+from mec_server.decoding.child import ADDRESS_SPACE_BYTES
+from mec_server.decoding.decoders import Decoders, bubblewrap_command
+from mec_server.decoding.pool import ChildDecoder, DecoderPool
+from mec_server.decoding.process import DecoderLost, LossCause, child_environment
 from mec_server.metrics import ServerMetrics
-from rfcore.codec.h264 import EncoderOptions, H264Decoder, PictureKind, encode_pictures
+from rfcore.codec.h264.ffmpeg import EncoderOptions, H264Decoder, PictureKind, encode_pictures
 from rfcore.errors import BackendUnavailable, CodecError, RfedgeError
 from rfcore.image import I420
 
@@ -146,7 +147,7 @@ def test_a_process_that_hangs_is_killed(
     hung = python_of(decoder)
     os.kill(hung, signal.SIGSTOP)
     with monkeypatch.context() as patience:
-        patience.setattr(decoder_process, "ANSWER_S", 0.05)
+        patience.setattr(process, "ANSWER_S", 0.05)
         with pytest.raises(DecoderLost, match="did not answer"):
             decoder.decode(units[0])
     decoder.decode(units[0])

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from mec_server.config import SessionLimits
-from mec_server.jobs import DecodeJob, DecodeOutcome, OpenJob
+from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
 from mec_server.session import ServerSession, SessionState
 from rfcore.errors import (
     AccessDenied,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mec_server.twin import Mailbox, Twin, TwinView
+from mec_server.twin.state import Mailbox, Twin, TwinView
 from rfcore.camera import Intrinsics
 from rfcore.image import I420
 from rfcore.wire.messages import Frame

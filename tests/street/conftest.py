@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from rfedge.street.geometry.layout import Layout
-from rfedge.street.geometry.material import Material
-from rfedge.street.geometry.mesh import Label
+from rfedge.street.geometry.mesh import Label, Material
 from rfedge.street.geometry.solids import Stuff, boxes, quads
 from rfedge.street.geometry.world import Part, Sky, World
 from rfedge.street.scene_file import Geometry

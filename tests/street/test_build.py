@@ -17,16 +17,16 @@ from rich.console import Console
 from rfcore.dataset import read_dataset, verify_manifest
 from rfcore.dataset.points import read_points
 from rfcore.errors import InvalidInput, RfedgeError
-from rfedge.street.build import crew, run
+from rfedge.street.build import run
+from rfedge.street.build import run as workers
 from rfedge.street.build.run import Settings, build_scene
-from rfedge.street.build.selection import Selection
+from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
 from rfedge.street.build.shot_files import ShotFiles, depth_mm, read_depth_m
-from rfedge.street.build.studio import Order, Studio
 from rfedge.street.effects.lens import LensDistortion
 from rfedge.street.render.backend import Backend
 from rfedge.street.render.renderer import RenderedView
 from rfedge.street.scene_file import Drive, PoseNoise, Scene, Training
-from rfedge.street.shots import Shot
+from rfedge.street.shots import Selection, Shot
 
 SCENE = Scene("s", "s", drive=Drive(duration_s=0.5, thinned_hz=(10.0,)), train=Training(views=4))
 SIZE_PX = (32, 18)
@@ -46,17 +46,17 @@ class RoadRenderer:
         )
 
 
-class QuickStudio(Studio):
-    """A studio whose world need not be made."""
+class QuickRenderer(SceneRenderer):
+    """A renderer whose world need not be made."""
 
-    def __init__(self, order: Order) -> None:
+    def __init__(self, order: RenderJob) -> None:
         self._order = order
         self._renderer = RoadRenderer()  # type: ignore[assignment]
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew, "Studio", QuickStudio)
+    monkeypatch.setattr(workers, "SceneRenderer", QuickRenderer)
     monkeypatch.setattr(run, "chosen_backend", lambda: Backend("llvm_ad_rgb", "libLLVM.so"))
 
 
@@ -128,9 +128,9 @@ from importlib.util import module_from_spec, spec_from_file_location
 spec = spec_from_file_location("test_build", sys.argv[1])
 test = module_from_spec(spec)
 spec.loader.exec_module(test)
-from rfedge.street.build import crew, run, shot_files
+from rfedge.street.build import run, shot_files
 from rfedge.street.render.backend import Backend
-crew.Studio = test.QuickStudio
+run.SceneRenderer = test.QuickRenderer
 run.chosen_backend = lambda: Backend("llvm_ad_rgb", "libLLVM.so")
 write, seen = shot_files.write_points, []
 def killing(path, points):

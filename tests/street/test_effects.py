@@ -14,7 +14,7 @@ import pytest
 from rfcore.camera import Pose
 from rfcore.dataset.undistort import pinhole_of, undistorted
 from rfcore.lens import LensCamera
-from rfedge.street.apply import apply_effects
+from rfedge.street.assembly import apply_effects
 from rfedge.street.effects import EFFECTS, load_effect, rng_of
 from rfedge.street.effects.exposure import ExposureDrift
 from rfedge.street.effects.haze import Haze
@@ -186,7 +186,7 @@ import hashlib, sys
 sys.meta_path[:] = [f for f in sys.meta_path if not type(f).__module__.startswith("_editable")]
 import rfedge
 from rfedge.street import load_scene
-from rfedge.street.apply import apply_effects
+from rfedge.street.assembly import apply_effects
 from rfedge.street.plan import plain_frame
 scene = load_scene(sys.argv[1])
 frame = apply_effects(scene, plain_frame(64, 36, 90.0), 0)

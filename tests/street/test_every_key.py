@@ -13,12 +13,10 @@ from rfedge.street.assembly import plain_world
 from rfedge.street.effects import EFFECTS, load_effect, rng_of
 from rfedge.street.frame import LinearFrame
 from rfedge.street.geometry.layout import Layout
-from rfedge.street.geometry.material import Material
-from rfedge.street.geometry.mesh import Label
+from rfedge.street.geometry.mesh import Label, Material
 from rfedge.street.geometry.sky import Daylight, overcast_sky, sunny_sky
 from rfedge.street.geometry.solids import Stuff, boxes
 from rfedge.street.geometry.world import Part, Sky, World
-from rfedge.street.measured_pose import measured_pose
 from rfedge.street.plan import plain_frame
 from rfedge.street.scene_file import (
     Drive,
@@ -30,6 +28,7 @@ from rfedge.street.scene_file import (
     Training,
 )
 from rfedge.street.shots import Split, shots_of, thinned_indices
+from rfedge.street.trajectory import measured_pose
 
 SHORT = Scene("x", "x", Geometry(length_m=60.0), Rig(), Training(6), Evaluation(1), Drive(0.2))
 OTHER = {bool: lambda v: not v, int: lambda v: v + 1, float: lambda v: 0.5 * v + 0.0625}

@@ -13,10 +13,15 @@ from rfedge.street.effects.wet_road import WetRoad
 from rfedge.street.geometry.layout import Layout
 from rfedge.street.geometry.road import road
 from rfedge.street.geometry.world import Sky, World
-from rfedge.street.plan import PlannedEffect, RenderCost, Stage
-from rfedge.street.plan_render import PlainStreets, measured_render
-from rfedge.street.plan_table import MeasuredPlan, plan_table, write_page, write_rows
-from rfedge.street.plan_text import effect_lines, scene_lines
+from rfedge.street.plan import PlainStreets, PlannedEffect, RenderCost, Stage, measured_render
+from rfedge.street.plan_table import (
+    MeasuredPlan,
+    effect_lines,
+    plan_table,
+    scene_lines,
+    write_page,
+    write_rows,
+)
 from rfedge.street.scene_file import Geometry, Scene
 
 ROOT = Path(__file__).parents[2]
@@ -29,7 +34,7 @@ def bare_road(monkeypatch: pytest.MonkeyPatch) -> None:
     layout = Layout(SMALL)
     sky = Sky(np.full((16, 32, 3), 0.5, np.float32))
     world = World(layout, sky).plus(road(layout, np.random.default_rng(1)))
-    monkeypatch.setattr("rfedge.street.plan_render.plain_world", lambda _scene: world)
+    monkeypatch.setattr("rfedge.street.plan.plain_world", lambda _scene: world)
 
 
 def test_an_effect_costs_what_the_next_render_takes_more() -> None:

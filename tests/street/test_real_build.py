@@ -18,12 +18,12 @@ from rfcore.metrics import psnr
 from rfcore.native import _native
 from rfedge.street import load_scene
 from rfedge.street.build.run import Settings, build_scene
-from rfedge.street.build.selection import Selection
-from rfedge.street.build.studio import Order, Studio
+from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
 from rfedge.street.effects import EFFECTS
 from rfedge.street.render.backend import chosen_backend
 from rfedge.street.render.renderer import Quality
 from rfedge.street.scene_file import Scene
+from rfedge.street.shots import Selection
 
 ROOT = Path(__file__).parents[2]
 SHORT = """
@@ -55,11 +55,11 @@ def build(scene: Scene, out: Path, size_px: tuple[int, int], workers: int, frame
 @pytest.mark.slow
 def test_a_pose_looks_the_same_in_every_frame(standing: Scene, tmp_path: Path) -> None:
     """The same place in frames 0 and 7 of the drive, in full size: at least 42 dB apart."""
-    order = Order(standing, tmp_path / "s", Quality(16), chosen_backend(), 2, (640, 360))
-    studio = Studio(order)
+    order = RenderJob(standing, tmp_path / "s", Quality(16), chosen_backend(), 2, (640, 360))
+    renderer = SceneRenderer(order)
     shot = Selection(standing, "drive", "0:1", (640, 360)).shots()[0]
     for index in (0, 7):
-        studio.take(replace(shot, index=index, time_s=index / 20))
+        renderer.take(replace(shot, index=index, time_s=index / 20))
     first, later = (read_rgb(tmp_path / "s" / "drive" / "images" / f"00000{i}.png") for i in (0, 7))
     assert first.std() > 30, "a street is no grey card"
     assert psnr(first, later) >= 42.0
@@ -103,13 +103,13 @@ from pathlib import Path
 sys.meta_path[:] = [f for f in sys.meta_path if not type(f).__module__.startswith("_editable")]
 import rfedge
 from rfedge.street import load_scene
-from rfedge.street.build.studio import Order, Studio
+from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
 from rfedge.street.render.backend import chosen_backend
 from rfedge.street.render.renderer import Quality
 from rfedge.street.shots import Split, shots_of
 scene, out = load_scene(sys.argv[1]), Path(sys.argv[2])
-studio = Studio(Order(scene, out, Quality(4), chosen_backend(), 1))
-studio.take(shots_of(scene, Split.DRIVE, (64, 36))[0])
+renderer = SceneRenderer(RenderJob(scene, out, Quality(4), chosen_backend(), 1))
+renderer.take(shots_of(scene, Split.DRIVE, (64, 36))[0])
 loaded = [name for name in sys.modules if name.startswith("rfedge.street.effects.")]
 picture = (out / "drive" / "images" / "000000.png").read_bytes()
 print(Path(rfedge.__file__).parents[1], picture.hex(), *sorted(loaded))

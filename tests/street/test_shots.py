@@ -9,13 +9,18 @@ import pytest
 
 from rfcore.camera import Pose
 from rfcore.errors import InvalidInput
-from rfedge.carla_recorder.rig import RIG
+from rfedge.datasets.rig import RIG
 from rfedge.street import load_scene
-from rfedge.street.build.selection import Selection
-from rfedge.street.measured_pose import measured_pose
 from rfedge.street.scene_file import Drive, PoseNoise, Rig, Scene
-from rfedge.street.shots import Shot, Split, shots_of, thinned_indices
-from rfedge.street.trajectory import drive_motion, drive_pose, looking, mounted, on_lane
+from rfedge.street.shots import Selection, Shot, Split, shots_of, thinned_indices
+from rfedge.street.trajectory import (
+    drive_motion,
+    drive_pose,
+    looking,
+    measured_pose,
+    mounted,
+    on_lane,
+)
 
 SCENE = Scene("street", "street")
 

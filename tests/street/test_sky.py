@@ -7,9 +7,19 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfedge.street.geometry.cloud import cumulus, sunwards_depth, with_sun_free
-from rfedge.street.geometry.sky import NOON, Daylight, overcast_sky, sunny_sky
-from rfedge.street.geometry.sky_clear import clear_radiance, sun_disc_sr, sun_radiance
-from rfedge.street.geometry.sky_dome import directions, horizontal_irradiance, towards, with_ground
+from rfedge.street.geometry.sky import (
+    NOON,
+    Daylight,
+    clear_radiance,
+    directions,
+    horizontal_irradiance,
+    overcast_sky,
+    sun_disc_sr,
+    sun_radiance,
+    sunny_sky,
+    towards,
+    with_ground,
+)
 
 CLOUDLESS = Daylight(azimuth_deg=35.0, elevation_deg=52.0, turbidity=3.0, cover=0.0)
 

@@ -170,13 +170,13 @@ from pathlib import Path
 sys.meta_path[:] = [f for f in sys.meta_path if not type(f).__module__.startswith("_editable")]
 import rfedge
 from rfedge.street import load_scene
-from rfedge.street.build.studio import Order, Studio
+from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
 from rfedge.street.render.backend import chosen_backend
 from rfedge.street.render.renderer import Quality
 from rfedge.street.shots import Split, shots_of
 scene = load_scene(sys.argv[1])
-studio = Studio(Order(scene, Path(sys.argv[2]), Quality(1), chosen_backend(), 2))
-studio.take(shots_of(scene, Split.DRIVE, (64, 36))[0])
+renderer = SceneRenderer(RenderJob(scene, Path(sys.argv[2]), Quality(1), chosen_backend(), 2))
+renderer.take(shots_of(scene, Split.DRIVE, (64, 36))[0])
 files = sorted(path for path in Path(sys.argv[2]).rglob("*") if path.is_file())
 print(*(hashlib.sha256(path.read_bytes()).hexdigest() for path in files))
 print(*sorted(n for n in sys.modules if n.startswith("rfedge.street.effects.")))

@@ -6,17 +6,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rfedge.street.geometry.building import buildings
+from rfedge.street.geometry.building import bricks, buildings
 from rfedge.street.geometry.facade import Look, facade
+from rfedge.street.geometry.furniture import lamps, railings, wires
 from rfedge.street.geometry.grain import fractal
-from rfedge.street.geometry.ground_texture import slabs
-from rfedge.street.geometry.lamp import lamps, railings, wires
 from rfedge.street.geometry.layout import BAY_LENGTH_M, FACADE_M, FASCIA_M, Layout
 from rfedge.street.geometry.mesh import Label, Mesh, joined
 from rfedge.street.geometry.opening import wall_around
-from rfedge.street.geometry.road import road
+from rfedge.street.geometry.road import road, slabs
 from rfedge.street.geometry.solids import Stuff
-from rfedge.street.geometry.wall_texture import bricks
 from rfedge.street.geometry.world import Part
 from rfedge.street.scene_file import Geometry
 

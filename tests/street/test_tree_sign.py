@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from rfedge.street.geometry.furniture import post_of, signs, traffic_light
 from rfedge.street.geometry.layout import PAVEMENT_UP_M, Layout
 from rfedge.street.geometry.mesh import Label, Mesh
-from rfedge.street.geometry.sign import post_of, signs, traffic_light
 from rfedge.street.geometry.sign_face import FACES, NAMES, ROUND, face_picture, sign_materials
 from rfedge.street.geometry.tree import KINDS, grown, trees
 from rfedge.street.geometry.world import Part

@@ -8,8 +8,7 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfedge.street.geometry.layout import Layout
-from rfedge.street.geometry.material import Material
-from rfedge.street.geometry.mesh import Label, Mesh, faceted, joined, placed
+from rfedge.street.geometry.mesh import Label, Material, Mesh, faceted, joined, placed
 from rfedge.street.geometry.world import Part, Sky, World
 from rfedge.street.scene_file import Geometry
 

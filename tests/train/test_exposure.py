@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfcore.raster.native import Exposure, LearningRates, TrainableRasterizer
+from rfcore.raster.trainable import Exposure, LearningRates, TrainableRasterizer
 from rfcore.train import Bands, SplatTrainer, SplatTrainingConfig, mean_psnr_db
 from rfcore.train.exposure import ExposureModel
 
@@ -14,7 +14,7 @@ CONFIG = SplatTrainingConfig(gaussians=400, iterations=600, bands=Bands(degree=0
 
 
 def test_the_gradient_of_the_map_is_that_of_finite_differences(cameras, points) -> None:
-    from rfcore.train.initialise import gaussians_from_points
+    from rfcore.train.start import gaussians_from_points
 
     start = gaussians_from_points(points, 300, 0.6, np.random.default_rng(0))
     # Brighter than any picture, so that L1 has no kink on the way.
@@ -34,7 +34,7 @@ def test_the_gradient_of_the_map_is_that_of_finite_differences(cameras, points) 
 
 
 def test_no_change_costs_nothing_and_changes_nothing(cameras, points) -> None:
-    from rfcore.train.initialise import gaussians_from_points
+    from rfcore.train.start import gaussians_from_points
 
     start = gaussians_from_points(points, 300, 0.6, np.random.default_rng(0))
     target = np.full((24, 40, 3), 0.4, np.float32)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfcore.train.initialise import gaussians_from_points, spacing_m
+from rfcore.train.start import gaussians_from_points, spacing_m
 from rfcore.views import PointCloud
 
 

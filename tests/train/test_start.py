@@ -5,12 +5,7 @@ import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
-from rfcore.train.start import (
-    RandomStart,
-    looking_distance_m,
-    points_from_depth,
-    random_points,
-)
+from rfcore.train.start import RandomStart, looking_distance_m, points_from_depth, random_points
 
 K = Intrinsics(40, 24, 30.0, 30.0, 20.0, 12.0)
 

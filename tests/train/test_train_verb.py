@@ -13,15 +13,10 @@ from rfcore.errors import DatasetError, InvalidInput
 from rfcore.field import load_field, save_field
 from rfcore.train import NgpModel, NgpTrainingConfig
 from rfedge.cli.train import Train
-from rfedge.training import TrainingJob, train
-from rfedge.training_loop import LoopLimits
-from rfedge.training_result import training_result
-from rfedge.training_views import (
-    ViewChoice,
-    read_views,
-    share_of_views,
-    split_every,
-)
+from rfedge.training.finish import training_result
+from rfedge.training.loop import LoopLimits
+from rfedge.training.run import TrainingJob, train
+from rfedge.training.views import ViewChoice, read_views, share_of_views, split_every
 
 VIEWS = 8
 

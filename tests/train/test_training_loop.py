@@ -11,8 +11,7 @@ from rich.console import Console
 
 from rfcore.errors import InvalidInput, TrainingDiverged
 from rfcore.train import Checkpoint, TrainingProgress
-from rfedge.training_loop import LoopLimits, LoopStatus, TrainingLoop
-from rfedge.training_progress import run_showing
+from rfedge.training.loop import LoopLimits, LoopStatus, TrainingLoop, run_showing
 
 
 class Steps:

@@ -7,12 +7,7 @@ from pathlib import Path
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.training_memory import (
-    BASE_BYTES,
-    available_bytes,
-    check_memory,
-    splat_training_bytes,
-)
+from rfedge.training.run import BASE_BYTES, available_bytes, check_memory, splat_training_bytes
 
 SIZE_PX = (320, 184)
 GAUSSIANS = 60_000

@@ -3,7 +3,8 @@
 from dataclasses import replace
 
 from rfcore.camera import Pose
-from rfcore.codec import DeltaPacket, Reference
+from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.references import Reference
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Frame
 from rfcore.wire.v1 import edge_pb2 as pb

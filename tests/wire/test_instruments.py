@@ -9,7 +9,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from rfcore.errors import InvalidInput
 from rfcore.wire.conventions import FRAME_BUDGET_BUCKETS_S
 from rfcore.wire.instruments import Instruments
-from rfedge.report.metrics_page import families, metrics_page
+from rfedge.pages.metrics import families, metrics_page
 
 ROOT = Path(__file__).parents[2]
 DECLARED = {family.name: family for listed in families().values() for family in listed}

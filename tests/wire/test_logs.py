@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import structlog
 
-from rfcore.wire.logs import LogForm, configure_logs
+from rfcore.wire.settings import LogForm, configure_logs
 
 
 class Terminal(io.StringIO):

@@ -1,4 +1,4 @@
-// Bindings of the hash grid. Shapes and values are checked by rfcore/native/ngp.py; here the types
+// Bindings of the hash grid. Shapes and values are checked by rfcore/ngp/native.py; here the types
 // and contiguity are.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>

@@ -11,7 +11,9 @@ from functools import partial
 
 import numpy as np
 
-from rfcore.codec import CodecConfig, DeltaDecoder, DeltaEncoder
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.image import I420
 from rfcore.metrics import psnr
 from rfedge.evaluate.stability.case import Case, Finding, statement

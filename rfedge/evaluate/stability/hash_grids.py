@@ -18,8 +18,16 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.ngp.native import NgpRenderer
-from rfcore.ngp.parameters import NgpParameters, initial_parameters, matrix_shapes
-from rfcore.ngp.shape import HashGrid, Marching, NgpShape, Space, grid_levels
+from rfcore.ngp.shape import (
+    HashGrid,
+    Marching,
+    NgpParameters,
+    NgpShape,
+    Space,
+    grid_levels,
+    initial_parameters,
+    matrix_shapes,
+)
 from rfcore.ngp.trainable import NgpRates, RayBatch, TrainableNgp
 from rfcore.views import View
 from rfedge.evaluate.stability.case import Case, Finding, refusal, statement, within

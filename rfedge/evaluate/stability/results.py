@@ -9,7 +9,7 @@ from typing import Any
 
 from rfedge.evaluate.stability.case import Case
 from rfedge.evaluate.stability.registry import CASES
-from rfedge.provenance import host, revision
+from rfedge.results import host, revision
 
 __all__ = ["FORMAT", "run_cases", "stability_page"]
 

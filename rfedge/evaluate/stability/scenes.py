@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.raster.gaussians import F32, Gaussians
-from rfcore.raster.native import LearningRates, Rasterizer, TrainableRasterizer
+from rfcore.raster.native import Rasterizer
+from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfcore.views import View
 
 __all__ = [

@@ -9,7 +9,7 @@ import numpy as np
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import TrainableRasterizer
+from rfcore.raster.trainable import TrainableRasterizer
 from rfedge.evaluate.stability.case import Case, Finding, statement, within
 from rfedge.evaluate.stability.scenes import (
     AHEAD,

@@ -4,33 +4,41 @@
 those that a lower rate keeps, ``..._measured.json`` the same pictures with the poses as measured,
 where the scene declares noise. ``transforms.json`` is the training views' or, without any, that of
 the first split there is.
+
+What a dataset was built from: enough to tell whether a build can go on in its folder.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import rfedge.street
 from rfcore.camera import Pose
 from rfcore.dataset import write_manifest
 from rfcore.dataset.points import read_points
 from rfcore.dataset.source import SourceCamera, SourcePoints
 from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, write_points
+from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfcore.lens import LensCamera
+from rfedge.street.build.scene_renderer import RenderJob, camera_of_pictures
 from rfedge.street.build.shot_files import ShotFiles
-from rfedge.street.build.studio import Order, camera_of_pictures
-from rfedge.street.measured_pose import measured_pose
+from rfedge.street.scene_file import Scene
 from rfedge.street.shots import Shot, Split, shots_of, thinned_indices
+from rfedge.street.trajectory import measured_pose
 
-__all__ = ["list_dataset"]
+__all__ = ["ORIGIN_NAME", "claim_folder", "list_dataset", "origin_of"]
 
 
-def list_dataset(order: Order, about: dict[str, Any]) -> dict[str, int]:
+def list_dataset(order: RenderJob, about: dict[str, Any]) -> dict[str, int]:
     """Write transforms, points and manifest of what is finished; return how many of each split."""
     finished = {split: _finished(order, split) for split in Split}
     finished = {split: shots for split, shots in finished.items() if shots}
@@ -46,12 +54,12 @@ def list_dataset(order: Order, about: dict[str, Any]) -> dict[str, int]:
     return {str(split): len(shots) for split, shots in finished.items()}
 
 
-def _finished(order: Order, split: Split) -> list[Shot]:
+def _finished(order: RenderJob, split: Split) -> list[Shot]:
     shots = shots_of(order.scene, split, order.size_px)
     return [shot for shot in shots if ShotFiles.of(order.folder, shot).done]
 
 
-def _list_split(order: Order, split: Split, shots: Sequence[Shot]) -> None:
+def _list_split(order: RenderJob, split: Split, shots: Sequence[Shot]) -> None:
     kept = {"": shots}
     if split is Split.DRIVE:
         for rate_hz in order.scene.drive.thinned_hz:
@@ -68,7 +76,7 @@ def _list_split(order: Order, split: Split, shots: Sequence[Shot]) -> None:
             _write(measured, _written(order, chosen, measured=True))
 
 
-def _written(order: Order, shots: Sequence[Shot], measured: bool) -> list[WrittenPicture]:
+def _written(order: RenderJob, shots: Sequence[Shot], measured: bool) -> list[WrittenPicture]:
     seen_by = camera_of_pictures(order.scene, shots[0].camera)
     lens = seen_by.lens if isinstance(seen_by, LensCamera) else None
     camera = SourceCamera(seen_by.intrinsics, lens)
@@ -83,7 +91,7 @@ def _written(order: Order, shots: Sequence[Shot], measured: bool) -> list[Writte
     ]
 
 
-def _pose(order: Order, shot: Shot, measured: bool) -> Pose:
+def _pose(order: RenderJob, shot: Shot, measured: bool) -> Pose:
     true = shot.camera.world_from_cam
     return measured_pose(true, order.scene.pose_noise, shot.number) if measured else true
 
@@ -98,3 +106,57 @@ def _points(folder: Path, shots: Sequence[Shot]) -> SourcePoints:
         np.concatenate([points.xyz_m for points in each]),
         np.concatenate([points.rgb for points in each]),
     )
+
+
+ORIGIN_NAME = "build.json"
+STREET = Path(rfedge.street.__file__).parent
+
+
+def origin_of(order: RenderJob) -> dict[str, Any]:
+    """Return scene, settings, versions and the digest of the generator's own code.
+
+    The code of effects that the scene does not declare is no part of it.
+    """
+    return {
+        "scene": asdict(order.scene),
+        "size_px": order.size_px,
+        "samples": order.quality.samples,
+        "seed": order.quality.seed,
+        "renderer": order.backend.variant,
+        "versions": {name: version(name) for name in ("rfedge", "mitsuba", "pyoidn")},
+        "generator_sha256": _code_digest(order.scene),
+    }
+
+
+def claim_folder(order: RenderJob) -> None:
+    """Make the dataset's folder, or check that it holds the same build.
+
+    Raises ``InvalidInput`` for a folder of another build, or of something else.
+    """
+    origin = json.loads(json.dumps(origin_of(order)))
+    file = order.folder / ORIGIN_NAME
+    if not order.folder.exists() or not any(order.folder.iterdir()):
+        order.folder.mkdir(parents=True, exist_ok=True)
+        write_whole(file, json.dumps(origin, indent=1) + "\n")
+        return
+    try:
+        found = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise InvalidInput("out", f"{order.folder} holds no build of a scene") from error
+    differing = [key for key in origin if found.get(key) != origin[key]]
+    if differing:
+        raise InvalidInput(
+            "out",
+            f"{order.folder} holds another build (differs in {', '.join(differing)}); remove it or "
+            "name another folder",
+        )
+
+
+def _code_digest(scene: Scene) -> str:
+    digest = hashlib.sha256()
+    for path in sorted(STREET.rglob("*.py")):
+        if path.parent.name == "effects" and path.stem not in {"__init__", *scene.effects}:
+            continue
+        digest.update(path.relative_to(STREET).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -13,8 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from rfedge.street.geometry.grain import fractal
-from rfedge.street.geometry.material import Colour, Material, Texture
-from rfedge.street.geometry.mesh import F32
+from rfedge.street.geometry.mesh import F32, Colour, Material, Texture
 from rfedge.street.geometry.world import World
 from rfedge.street.schema import Range
 

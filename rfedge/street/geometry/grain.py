@@ -9,8 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from rfedge.street.geometry.material import Colour, Texture
-from rfedge.street.geometry.mesh import F32
+from rfedge.street.geometry.mesh import F32, Colour, Texture
 
 __all__ = ["enlarged", "fractal", "speckle", "texture", "tinted"]
 

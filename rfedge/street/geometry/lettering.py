@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from rfedge.street.geometry.material import Texture
-from rfedge.street.geometry.mesh import F32
+from rfedge.street.geometry.mesh import F32, Texture
 
 __all__ = ["Lettered", "atlas", "atlas_uv", "board"]
 

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 
 from rfedge.street.geometry.lettering import Lettered, atlas, atlas_uv, board
-from rfedge.street.geometry.material import Material, Texture
-from rfedge.street.geometry.mesh import F32
+from rfedge.street.geometry.mesh import F32, Material, Texture
 
 __all__ = ["FACES", "NAMES", "ROUND", "face_uv", "name_uv", "sign_materials"]
 

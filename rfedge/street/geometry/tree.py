@@ -2,21 +2,59 @@
 
 A few trees are grown and each is placed several times, turned and scaled; a leaf is a quad bent
 along its midrib, so that it catches the light in two ways.
+
+Bark, leaves and soil, painted once.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
+from rfedge.street.geometry.grain import fractal, speckle, texture, tinted
 from rfedge.street.geometry.layout import Layout, Place
-from rfedge.street.geometry.mesh import F64, Label, Mesh, joined, placed
+from rfedge.street.geometry.mesh import F64, Label, Material, Mesh, Texture, joined, placed
 from rfedge.street.geometry.solids import Stuff, boxes, quads, tube
-from rfedge.street.geometry.tree_texture import tree_materials
 from rfedge.street.geometry.world import Part
 
-__all__ = ["KINDS", "Kind", "grown", "trees"]
+__all__ = ["KINDS", "Kind", "grown", "tree_materials", "trees"]
+
+
+SIZE = (256, 256)
+
+
+@lru_cache(maxsize=1)
+def tree_materials() -> tuple[Material, ...]:
+    """Return what trees and their pits are made of; the same objects at each call."""
+    rng = np.random.default_rng(11)
+    return (
+        Material("bark", _bark(rng)),
+        Material("leaf", _leaf_shades(rng), roughness=0.9, transmission=0.0),
+        Material("soil", _soil(rng)),
+        Material("tree guard", (0.05, 0.045, 0.04), roughness=0.6, metallic=0.5),
+    )
+
+
+def _bark(rng: np.random.Generator) -> Texture:
+    """Furrows along v."""
+    furrows = fractal((64, 256), 1.6, rng).repeat(4, axis=0)
+    painted = tinted(SIZE, (104, 92, 76)) * (1 - 0.16 * np.clip(furrows, -1.5, 2.5))[..., None]
+    return texture(painted + 7 * speckle(SIZE, 1.0, rng)[..., None])
+
+
+def _leaf_shades(rng: np.random.Generator) -> Texture:
+    """Each leaf takes one place of it: yellower along u, darker along v."""
+    u, v = np.meshgrid(np.linspace(0, 1, SIZE[1]), np.linspace(0, 1, SIZE[0]))
+    colour = np.stack([74 + 46 * u, 108 + 22 * u, 40 + 6 * u], axis=2) * (1.2 - 0.5 * v)[..., None]
+    return texture((colour * (1 + 0.05 * fractal(SIZE, 2.0, rng))[..., None]).astype(np.float32))
+
+
+def _soil(rng: np.random.Generator) -> Texture:
+    painted = tinted(SIZE, (84, 70, 56)) * (1 + 0.2 * fractal(SIZE, 1.5, rng))[..., None]
+    return texture(painted + 12 * speckle(SIZE, 1.2, rng)[..., None])
+
 
 BARK = Stuff("bark", Label.VEGETATION, 1.2)
 LEAF = Stuff("leaf", Label.VEGETATION)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 from rfedge.street.geometry.lettering import Lettered, atlas
-from rfedge.street.geometry.material import Material
+from rfedge.street.geometry.mesh import Material
 
 __all__ = ["LIVERIES", "PAINTS", "PLATES", "vehicle_materials"]
 

@@ -20,8 +20,7 @@ import numpy as np
 
 from rfcore.errors import InvalidInput
 from rfedge.street.geometry.layout import Layout
-from rfedge.street.geometry.material import Colour, Material
-from rfedge.street.geometry.mesh import F32, F64, Mesh
+from rfedge.street.geometry.mesh import F32, F64, Colour, Material, Mesh
 
 __all__ = ["Mover", "Part", "Sky", "World"]
 

@@ -2,6 +2,16 @@
 
 83 instances of a tree made a frame seven times slower in the LLVM variant than the same triangles
 baked into one mesh.
+
+The sky as Mitsuba's environment map, the sun painted into it.
+
+One emitter, not two: the path tracer picks an emitter by chance for each shadow ray, so that a
+separate sun would get half of them. A map is sampled by its radiance, which goes to the sun anyway.
+
+Materials as Mitsuba's reflectance models, each seen from both sides.
+
+``plastic`` is what makes glossy surfaces cheap: a mirror over paint needs no more samples than
+paint does, where ``principled`` at a low roughness flickers and looks like clay.
 """
 
 from __future__ import annotations
@@ -11,13 +21,103 @@ from typing import Any
 
 import numpy as np
 
-from rfedge.street.geometry.material import Material
-from rfedge.street.geometry.mesh import I32, Mesh, joined, placed
-from rfedge.street.geometry.world import World
-from rfedge.street.render.light import environment
-from rfedge.street.render.surfaces import surface
+from rfedge.street.geometry.mesh import F32, F64, I32, Material, Mesh, joined, placed
+from rfedge.street.geometry.world import Sky, World
 
-__all__ = ["Stage"]
+__all__ = ["Stage", "environment", "surface", "with_sun"]
+
+
+ROWS = 512
+"""Of the map that is handed over: 0.35 degrees a pixel, so that the sun is a few of them."""
+LEAST_SUN_PX = 1.5
+
+
+def environment(mi: Any, sky: Sky) -> dict[str, Any]:
+    """Return the description that ``mi.load_dict`` takes.
+
+    Mitsuba's map has its zenith along y and column 0 along -z there; turned upright by 90 degrees
+    about x that is world +y, and the columns run from there towards -x (clockwise).
+    """
+    radiance = with_sun(sky)
+    columns = radiance.shape[1]
+    ours = (columns // 4 + columns - 1 - np.arange(columns)) % columns
+    bitmap = mi.Bitmap(np.ascontiguousarray(radiance[:, ours]))
+    upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    return {"type": "envmap", "bitmap": bitmap, "to_world": upright}
+
+
+def with_sun(sky: Sky) -> F32:
+    """Return the sky's radiance, at least 512 rows of it, with the sun's light in its disc.
+
+    The disc covers whole pixels; its radiance is scaled so that the light stays what the disc of
+    ``sun_diameter_deg`` would give.
+    """
+    repeat = -(-ROWS // len(sky.radiance))
+    radiance = sky.radiance.repeat(repeat, axis=0).repeat(repeat, axis=1)
+    if max(sky.sun_radiance) == 0:
+        return radiance
+    rows = len(radiance)
+    towards, solid_angle = _directions(rows)
+    cosine = towards @ np.array(sky.sun_towards)
+    radius = max(np.radians(sky.sun_diameter_deg) / 2, LEAST_SUN_PX * np.pi / rows)
+    inside = cosine > np.cos(radius)
+    true_angle = 2 * np.pi * (1 - np.cos(np.radians(sky.sun_diameter_deg) / 2))
+    share = true_angle / solid_angle[inside].sum()
+    radiance[inside] += (np.array(sky.sun_radiance) * share).astype(np.float32)
+    return radiance
+
+
+def _directions(rows: int) -> tuple[F64, F64]:
+    """Where each pixel of a map looks [H, 2 H, 3], and the solid angle that it covers [H, 2 H]."""
+    down = (np.arange(rows) + 0.5) / rows * np.pi
+    round_ = (np.arange(2 * rows) + 0.5) / rows * np.pi
+    theta, phi = np.meshgrid(down, round_, indexing="ij")
+    towards = np.stack(
+        [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1
+    )
+    return towards, np.sin(theta) * (np.pi / rows) ** 2
+
+
+MATT = 0.85
+"""From this roughness on a dielectric's highlight is not worth its samples."""
+GLASS_INDEX = 1.5
+
+
+def surface(mi: Any, material: Material) -> dict[str, Any]:
+    """Return the description that ``mi.load_dict`` takes."""
+    both_sides = {"type": "twosided", "inner": _model(mi, material)}
+    if material.transmission == 0:
+        return both_sides
+    return {"type": "mask", "opacity": 1.0 - material.transmission, "inner": both_sides}
+
+
+def _model(mi: Any, material: Material) -> dict[str, Any]:
+    colour = _colour(mi, material)
+    if material.gloss:
+        return {"type": "plastic", "diffuse_reflectance": colour, "int_ior": GLASS_INDEX}
+    if material.metallic == 0 and np.min(material.roughness) >= MATT:
+        return {"type": "diffuse", "reflectance": colour}
+    return {
+        "type": "principled",
+        "base_color": colour,
+        "roughness": _roughness(mi, material),
+        "metallic": material.metallic,
+        "specular": 0.5,
+    }
+
+
+def _colour(mi: Any, material: Material) -> dict[str, Any]:
+    if not isinstance(material.colour, np.ndarray):
+        return {"type": "rgb", "value": list(material.colour)}
+    bitmap = mi.Bitmap(np.ascontiguousarray(material.colour))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": False, "filter_type": "bilinear"}
+
+
+def _roughness(mi: Any, material: Material) -> Any:
+    if not isinstance(material.roughness, np.ndarray):
+        return float(material.roughness)
+    bitmap = mi.Bitmap(np.ascontiguousarray(material.roughness[..., None]))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True}
 
 
 class Stage:

@@ -1,0 +1,140 @@
+"""When the next picture is captured. Machines without clock: ``now`` is an argument.
+
+``Realtime``: picture i is captured at its time, whatever became of the ones before. ``Lockstep``:
+the next is captured when the previous was answered, and one that was lost is captured again; the
+experiment then covers every picture, at the speed of the link.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from cav_agent.frames import TOO_LATE, FrameResult, Outcome
+from rfcore.errors import InvalidInput, RfedgeError
+
+__all__ = ["MAX_TRIES", "CaptureSchedule", "Lockstep", "Realtime"]
+
+EARLY_S = 1e-6
+"""Sums of periods are rounded; a picture that is due this much early is not another one."""
+
+MAX_TRIES = 5
+"""How often lockstep captures the same picture before it gives up."""
+
+
+class CaptureSchedule(Protocol):
+    """Decides which picture of a drive is captured when."""
+
+    def next_capture(self, now: float) -> int | None:
+        """Return, once, the index of the picture to capture now, or None."""
+
+    def ended(self, result: FrameResult) -> None:
+        """Take note of how a captured picture ended; raise ``RfedgeError`` to give up."""
+
+    def get_timer(self) -> float | None:
+        """Return when ``next_capture`` will have a picture by time alone, or None."""
+
+    def limit(self, rate_hz: float) -> None:
+        """Capture no more than ``rate_hz`` pictures per second; 0: as many as there are."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether no further picture will be captured."""
+
+
+class Realtime:
+    """Picture i at ``start + i / rate_hz``; a late driver catches up by skipping nothing.
+
+    Below a limit, pictures in between are not captured: the drive goes on at its own speed.
+    """
+
+    def __init__(self, pictures: int, rate_hz: float, *, loop: bool = False) -> None:
+        _check(pictures, rate_hz)
+        self._pictures, self._rate_hz, self._loop = pictures, rate_hz, loop
+        self._count = 0
+        self._start_s: float | None = None
+        self._period_s = 0.0
+        self._open_s = float("-inf")
+
+    def next_capture(self, now: float) -> int | None:
+        """Return the next index once its time has come."""
+        if self._start_s is None:
+            self._start_s = now
+        while not self.finished and now >= (due_s := self._due_s(self._start_s)):
+            self._count += 1
+            if due_s >= self._open_s - EARLY_S:
+                behind = self._open_s < due_s - self._period_s
+                self._open_s = (due_s if behind else self._open_s) + self._period_s
+                return (self._count - 1) % self._pictures
+        return None
+
+    def limit(self, rate_hz: float) -> None:
+        """Capture no more than ``rate_hz`` pictures per second on average."""
+        self._period_s = 1.0 / rate_hz if rate_hz else 0.0
+
+    def ended(self, result: FrameResult) -> None:
+        """Nothing follows from it."""
+
+    def get_timer(self) -> float | None:
+        """Return when the next picture is due."""
+        if self.finished or self._start_s is None:
+            return None
+        return self._due_s(self._start_s)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the drive was driven once, and once is all."""
+        return not self._loop and self._count >= self._pictures
+
+    def _due_s(self, start_s: float) -> float:
+        return start_s + self._count / self._rate_hz
+
+
+class Lockstep:
+    """The next picture when the previous was answered; a lost one again."""
+
+    def __init__(self, pictures: int, *, loop: bool = False) -> None:
+        _check(pictures, 1.0)
+        self._pictures, self._loop = pictures, loop
+        self._index = 0
+        self._tries = 0
+        self._waiting = False
+
+    def next_capture(self, now: float) -> int | None:  # noqa: ARG002
+        """Return the index to capture, unless one is on its way."""
+        if self._waiting or self.finished:
+            return None
+        self._waiting = True
+        self._tries += 1
+        return self._index % self._pictures
+
+    def ended(self, result: FrameResult) -> None:
+        """Go on after an answer; raise ``RfedgeError`` for a picture that cannot be delivered."""
+        self._waiting = False
+        if result.outcome in (Outcome.ACKED, Outcome.NACKED):
+            self._index += 1
+            self._tries = 0
+            return
+        name = result.capture.picture.name
+        if result.outcome is Outcome.DROPPED and result.reason != TOO_LATE:
+            raise RfedgeError(f"picture {name} could not be coded: {result.reason}")
+        if self._tries >= MAX_TRIES:
+            raise RfedgeError(f"picture {name} was lost {self._tries} times: {result.reason}")
+
+    def limit(self, rate_hz: float) -> None:
+        """Do nothing: the server's answers are the limit."""
+
+    def get_timer(self) -> float | None:
+        """Return None: time alone changes nothing."""
+        return None
+
+    @property
+    def finished(self) -> bool:
+        """Whether every picture was answered."""
+        return not self._loop and self._index >= self._pictures
+
+
+def _check(pictures: int, rate_hz: float) -> None:
+    if pictures < 1:
+        raise InvalidInput("drive", "has no pictures")
+    if not 0.01 <= rate_hz <= 1000:
+        raise InvalidInput("rate", f"{rate_hz} Hz is outside 0.01..1000 Hz")

@@ -1,0 +1,120 @@
+"""The decoder process: FFmpeg's H.264 decoder alone, with little to win for whoever takes it over.
+
+Started by ``mec_server.decoding.process`` as ``python -m mec_server.decoding.child SOCKET MEMORY``,
+two inherited descriptors; it ends when the socket does. Before the first byte from outside it gives
+up what it will not need: address space, descriptors, files, processes, core dumps. The time limit
+moves along: so many seconds of CPU for one request, however long the process lives.
+"""
+
+from __future__ import annotations
+
+import mmap
+import resource
+import socket
+import sys
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from mec_server.decoding.protocol import (
+    DONE,
+    FAILED,
+    MAX_ANSWER_BYTES,
+    MAX_REQUEST_BYTES,
+    MEMORY_BYTES,
+    OUTPUT_AT,
+    Command,
+    request_from_bytes,
+)
+from rfcore.codec.h264.ffmpeg import H264Decoder
+from rfcore.errors import CodecError
+from rfcore.image import I420
+
+__all__ = ["ADDRESS_SPACE_BYTES", "REQUEST_CPU_S", "confine", "main"]
+
+ADDRESS_SPACE_BYTES = 1 << 30
+"""0.2 GiB is the interpreter; a 4096x2304 picture is 14 MB, and FFmpeg holds some twenty."""
+
+REQUEST_CPU_S = 5
+DESCRIPTORS = 16
+
+
+class DecoderChild:
+    """Answers requests about one stream."""
+
+    def __init__(self, memory: mmap.mmap) -> None:
+        self._memory = memory
+        self._decoder: H264Decoder | None = None
+
+    def answer(self, request: bytes) -> bytes:
+        """Do what ``request`` asks for; return what to say."""
+        command, numbers = request_from_bytes(request)
+        try:
+            self._obey(command, numbers)
+        except CodecError as error:
+            return FAILED + str(error).encode()[: MAX_ANSWER_BYTES - 1]
+        return DONE
+
+    def _obey(self, command: Command, numbers: Sequence[int]) -> None:
+        if command is Command.OPEN:
+            width_px, height_px = numbers
+            self._decoder = H264Decoder((width_px, height_px))
+            return
+        if self._decoder is None:
+            raise CodecError("decoder process: nothing is open")
+        if command is Command.RESET:
+            self._decoder.reset()
+            return
+        units = list(self._units(numbers))
+        wanted = units.pop() if command is Command.DECODE else None
+        for unit in units:
+            self._decoder.feed(unit)
+        if wanted is not None:
+            self._put(self._decoder.decode(wanted))
+
+    def _units(self, lengths: Sequence[int]) -> Iterator[bytes]:
+        start = 0
+        for length in lengths:
+            yield self._memory[start : start + length]
+            start += length
+
+    def _put(self, picture: I420) -> None:
+        offset = OUTPUT_AT
+        for plane in picture.planes:
+            target = np.frombuffer(self._memory, np.uint8, plane.size, offset)
+            target.reshape(plane.shape)[:] = plane
+            offset += plane.size
+
+
+def confine() -> None:
+    """Give up for good what decoding does not need."""
+    for limit, value in (
+        (resource.RLIMIT_AS, ADDRESS_SPACE_BYTES),
+        (resource.RLIMIT_NOFILE, DESCRIPTORS),
+        (resource.RLIMIT_FSIZE, 0),
+        (resource.RLIMIT_NPROC, 0),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        resource.setrlimit(limit, (value, value))
+
+
+def _allow_cpu() -> None:
+    """Let the kernel end this process if the next request keeps it busy for too long."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    until_s = int(used.ru_utime + used.ru_stime) + REQUEST_CPU_S + 1
+    resource.setrlimit(resource.RLIMIT_CPU, (until_s, resource.RLIM_INFINITY))
+
+
+def main() -> None:
+    """Serve until the socket closes."""
+    control = socket.socket(fileno=int(sys.argv[1]))
+    child = DecoderChild(mmap.mmap(int(sys.argv[2]), MEMORY_BYTES))
+    confine()
+    control.send(DONE)
+    while request := control.recv(MAX_REQUEST_BYTES):
+        _allow_cpu()
+        control.send(child.answer(request))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,160 @@
+"""Decoders in processes of their own, one a camera, and one that stands ready.
+
+Starting Python and FFmpeg takes 0.3 s, so the next process is started before it is needed: whoever
+loses one has another at once. All are started by one thread, which lives as long as the pool.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+
+from mec_server.decoding.process import DecoderLost, DecoderProcess
+from mec_server.decoding.protocol import INPUT_BYTES, Command
+from rfcore.errors import CodecError, RfedgeError
+from rfcore.image import I420
+
+__all__ = ["ChildDecoder", "DecoderPool"]
+
+
+MAX_WAITING = 15
+"""Access units that are fed with the one that is decoded; a frame has at most three references."""
+
+
+class DecoderPool:
+    """Starts decoder processes behind ``wrapper``; ``lost`` is told of each that dies in use."""
+
+    def __init__(self, wrapper: Sequence[str], lost: Callable[[DecoderLost], None]) -> None:
+        self.lost = lost
+        self._wrapper = tuple(wrapper)
+        self._lock = threading.Lock()
+        self._starter = ThreadPoolExecutor(1, "decoder-starter")
+        self._spare = self._starter.submit(self._start)
+
+    def wait_until_ready(self) -> None:
+        """Return when a process stands ready; raise ``RfedgeError`` if none can be started."""
+        self._spare.result()
+
+    def take(self) -> DecoderProcess:
+        """Return the process that stands ready, and have another started.
+
+        One that died while it waited is passed over. Raises ``RfedgeError`` if none can be started.
+        """
+        with suppress(RfedgeError):
+            ready = self._next()
+            if ready.is_alive:
+                return ready
+            ready.close()
+        return self._next()
+
+    def _next(self) -> DecoderProcess:
+        with self._lock:
+            try:
+                spare, self._spare = self._spare, self._starter.submit(self._start)
+            except RuntimeError as error:
+                raise RfedgeError("no decoder process is started any more") from error
+        return spare.result()
+
+    def open(self, size_px: tuple[int, int]) -> ChildDecoder:
+        """Return a decoder for pictures of ``size_px``, in a process of its own."""
+        return ChildDecoder(self, size_px)
+
+    def close(self) -> None:
+        """End the process that stands ready; those in use are their users' to close."""
+        self._starter.shutdown(cancel_futures=True)
+        self._spare.add_done_callback(_close_started)
+
+    def _start(self) -> DecoderProcess:
+        process = DecoderProcess(self._wrapper)
+        process.wait_until_ready()
+        return process
+
+
+class ChildDecoder:
+    """``H264Decoder`` in another process: the same pictures and the same errors.
+
+    What is fed waits in the shared memory for what comes next, so that a frame is one request. A
+    process that dies costs the picture it was asked for; the next request has the next process. One
+    caller at a time, but ``close`` may come from any thread.
+    """
+
+    def __init__(self, pool: DecoderPool, size_px: tuple[int, int]) -> None:
+        self._pool = pool
+        self._size_px = size_px
+        self._lock = threading.Lock()
+        self._closed = False
+        self._waiting: list[int] = []
+        self._process: DecoderProcess | None = self._open()
+
+    def decode(self, access_unit: bytes) -> I420:
+        """Decode one access unit of one whole picture, or raise ``CodecError``."""
+        with self._lock:
+            process = self._lay_down(access_unit)
+            self._request(process, Command.DECODE, *self._laid_down())
+            width, height = self._size_px
+            return I420.unpacked(self._size_px, process.take(width * height * 3 // 2))
+
+    def feed(self, access_unit: bytes | memoryview) -> None:
+        """Decode for the sake of what comes after, and with it: errors may wait until then."""
+        with self._lock:
+            self._lay_down(access_unit)
+
+    def reset(self) -> None:
+        """Forget everything; a process that died has nothing to forget."""
+        with self._lock:
+            self._waiting.clear()
+            if self._process is not None:
+                self._request(self._process, Command.RESET)
+
+    def close(self) -> None:
+        """End the process; nothing can be decoded any more."""
+        with self._lock:
+            self._closed = True
+            if self._process is not None:
+                self._process.close()
+                self._process = None
+
+    def _lay_down(self, access_unit: bytes | memoryview) -> DecoderProcess:
+        """Put an access unit behind those that wait, or after them where there is no room."""
+        if self._process is None:
+            self._process = self._open()
+        process, size = self._process, len(access_unit)
+        if size > INPUT_BYTES:
+            raise CodecError(f"access unit of {size} bytes exceeds {INPUT_BYTES}")
+        if len(self._waiting) == MAX_WAITING or sum(self._waiting) + size > INPUT_BYTES:
+            self._request(process, Command.FEED, *self._laid_down())
+        process.put(access_unit, sum(self._waiting))
+        self._waiting.append(size)
+        return process
+
+    def _laid_down(self) -> list[int]:
+        """Return the lengths of what waits, which the next request is about."""
+        lengths, self._waiting = self._waiting, []
+        return lengths
+
+    def _open(self) -> DecoderProcess:
+        if self._closed:
+            raise CodecError("decoder is closed: its stream is over")
+        self._waiting.clear()
+        try:
+            process = self._pool.take()
+        except RfedgeError as error:
+            raise CodecError(str(error)) from error
+        self._request(process, Command.OPEN, *self._size_px)
+        return process
+
+    def _request(self, process: DecoderProcess, command: Command, *numbers: int) -> None:
+        try:
+            process.ask(command, *numbers)
+        except DecoderLost as lost:
+            self._process = None
+            process.close()
+            self._pool.lost(lost)
+            raise
+
+
+def _close_started(spare: Future[DecoderProcess]) -> None:
+    if not spare.cancelled() and spare.exception() is None:
+        spare.result().close()

@@ -1,0 +1,61 @@
+"""What a server and its decoder processes agree on: commands, and a piece of memory they share.
+
+A request is a command and its numbers, on a socket that keeps messages apart; the answer is
+``DONE``, or ``FAILED`` and what is wrong. Access units lie one after the other at the start of the
+memory, a decoded picture (I420, plane after plane, of the size given by OPEN) at ``OUTPUT_AT``. The
+memory is a sealed memfd: it cannot shrink under its reader, is on no disk, and only the pages in
+use exist.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+
+from rfcore.codec.h264.config import MAX_MACROBLOCKS
+
+__all__ = [
+    "DONE",
+    "FAILED",
+    "INPUT_BYTES",
+    "MAX_ANSWER_BYTES",
+    "MAX_REQUEST_BYTES",
+    "MEMORY_BYTES",
+    "OUTPUT_AT",
+    "Command",
+    "request_from_bytes",
+    "request_to_bytes",
+]
+
+SAMPLES_PER_MACROBLOCK = 384
+
+INPUT_BYTES = MAX_MACROBLOCKS * SAMPLES_PER_MACROBLOCK * 3 // 2 + (1 << 20)
+"""The largest I_PCM picture, all of it escaped (7.4.1), with parameter sets and syntax to spare."""
+
+OUTPUT_AT = (INPUT_BYTES + 4095) // 4096 * 4096
+MEMORY_BYTES = OUTPUT_AT + MAX_MACROBLOCKS * SAMPLES_PER_MACROBLOCK
+
+DONE, FAILED = b".", b"!"
+MAX_ANSWER_BYTES = 1024
+MAX_REQUEST_BYTES = 1 + 4 * 16
+
+
+class Command(IntEnum):
+    """What a decoder process can be asked for: OPEN with width and height, RESET, and with the
+    lengths of access units FEED, which decodes them, and DECODE, which also returns the last."""
+
+    OPEN = 1
+    FEED = 2
+    DECODE = 3
+    RESET = 4
+
+
+def request_to_bytes(command: Command, *numbers: int) -> bytes:
+    """Return a request as it is sent."""
+    return struct.pack(f"<B{len(numbers)}I", command, *numbers)
+
+
+def request_from_bytes(data: bytes) -> tuple[Command, tuple[int, ...]]:
+    """Return the command and its numbers."""
+    command, *numbers = struct.unpack(f"<B{(len(data) - 1) // 4}I", data)
+    return Command(command), tuple(numbers)

@@ -1,0 +1,1 @@
+"""The fields a server holds: opened for rendering, published by tile, handed out to vehicles."""

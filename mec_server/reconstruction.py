@@ -1,0 +1,156 @@
+"""The numerical work of one session: render, convert, splice, decode. Runs on worker threads.
+
+Plain functions of values; nothing here knows asyncio or gRPC. One ``CameraDecoder`` is used by one
+thread at a time (the session has one frame of a camera in work).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
+from mec_server.decoding.decoders import OpenDecoder
+from rfcore.camera import Camera
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.state import DecoderState
+from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason, RfedgeError
+from rfcore.field import Quality
+from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
+from rfcore.native.yuv import i420_from_colour
+from rfcore.views import View
+from rfcore.wire.messages import CameraDescription, StageTimes
+
+__all__ = [
+    "CameraDecoder",
+    "Decoder",
+    "FieldSource",
+    "OpenCameras",
+    "Reconstruction",
+    "Renderer",
+    "Tools",
+    "open_cameras",
+]
+
+ClockNs = Callable[[], int]
+
+
+class Renderer(Protocol):
+    """A radiance field, ready to be looked at."""
+
+    def render(self, camera: Camera, quality: Quality) -> View:
+        """Return colour and depth seen from ``camera``."""
+
+
+class FieldSource(Protocol):
+    """Where fields come from."""
+
+    def open(self, field_id: str) -> Renderer:
+        """Return the field; raise ``UnknownField`` or ``InvalidData``."""
+
+
+@dataclass(frozen=True)
+class Tools:
+    """A clock for the stages, and where decoders come from."""
+
+    clock_ns: ClockNs
+    open_decoder: OpenDecoder
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A frame as the vehicle's closed loop holds it, with what the session answers."""
+
+    picture: I420
+    outcome: DecodeOutcome
+
+
+class Decoder(Protocol):
+    """Who reconstructs the frames of one camera."""
+
+    def reconstruct(self, job: DecodeJob) -> Reconstruction:
+        """Return the frame of ``job``; raise ``PacketRejected`` and stay good for the next."""
+
+    def close(self) -> None:
+        """Let go of what it holds."""
+
+
+OpenCameras = Callable[[OpenJob, FieldSource, Tools], dict[str, Decoder]]
+
+
+class CameraDecoder:
+    """Reconstructs the frames of one camera against this server's own renders."""
+
+    def __init__(
+        self,
+        camera: CameraDescription,
+        renderers: Mapping[str, Renderer],
+        exact: bool,
+        tools: Tools,
+    ) -> None:
+        self._camera = camera
+        self._renderers = renderers
+        self._clock_ns = tools.clock_ns
+        self._decoder = DeltaDecoder(camera.codec, exact, tools.clock_ns, tools.open_decoder)
+        self._state: DecoderState | None = None
+
+    def close(self) -> None:
+        """Let go of the decoder; waits for a frame that is being decoded."""
+        self._decoder.close()
+
+    def reconstruct(self, job: DecodeJob) -> Reconstruction:
+        """Return the frame of ``job``; raise ``PacketRejected`` and stay good for the next."""
+        try:
+            return self._reconstruct(job)
+        except CodecError as error:  # costs this frame, not the stream
+            raise PacketRejected(RejectReason.DECODER_FAILED, str(error)) from error
+
+    def _reconstruct(self, job: DecodeJob) -> Reconstruction:
+        started_ns = self._clock_ns()
+        render, seen = self._render(job)
+        rendered_ns = self._clock_ns()
+        packet = job.frame.packet
+        state = self._state
+        if state is None or state.epoch != packet.epoch:
+            state = self._decoder.start(packet.epoch, after=state)
+        decoded = self._decoder.decode(state, packet, render, seen)
+        self._state = decoded.state
+        times = StageTimes(
+            render_ns=rendered_ns - started_ns,
+            splice_ns=decoded.stage_ns.get("splice", 0),
+            decode_ns=decoded.stage_ns.get("decode", 0),
+        )
+        digest = decoded.state.kept[0].digest
+        outcome = DecodeOutcome(decoded.lost, digest, times, decoded.exact)
+        return Reconstruction(decoded.frame, outcome)
+
+    def _render(self, job: DecodeJob) -> tuple[I420, PosedDepth]:
+        camera = job.frame.camera(self._camera.intrinsics)
+        try:
+            view = self._renderers[job.field_id].render(camera, job.frame.quality)
+            return i420_from_colour(view.colour), PosedDepth(camera, view.depth)
+        except InvalidInput as error:
+            raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
+
+
+def open_cameras(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
+    """Return a decoder for each camera of a Hello, to be closed one by one.
+
+    Raises ``InvalidInput`` for a codec header that our encoder would not have made, ``CodecError``
+    if there is no decoder to be had, and what ``fields`` raises.
+    """
+    renderers = {field_id: fields.open(field_id) for field_id in job.hello.field_ids}
+    decoders: dict[str, Decoder] = {}
+    for index, camera in enumerate(job.hello.cameras):
+        try:
+            decoders[camera.camera_id] = CameraDecoder(camera, renderers, job.exact, tools)
+        except RfedgeError as error:
+            for opened in decoders.values():
+                opened.close()
+            if not isinstance(error, InvalidInput):
+                raise
+            name = f"hello.cameras[{index}].{error.field}"
+            raise InvalidInput(name, error.problem) from error
+    return decoders

@@ -1,0 +1,211 @@
+"""TwinService over grpc.aio: one coroutine a consumer, between its mailbox and its stream.
+
+Pictures of the twin as consumers want them: each is encoded once, for however many.
+
+Runs on one thread of its own, so that consumers cost vehicles no worker.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from concurrent.futures import ThreadPoolExecutor
+from enum import StrEnum
+from weakref import WeakKeyDictionary
+
+import grpc
+import structlog
+
+from mec_server.config import ConsumerLimits
+from mec_server.twin.metrics import TwinMetrics
+from mec_server.twin.state import Mailbox, Twin, TwinView
+from rfcore.errors import InvalidInput
+from rfcore.image import I420, jpeg_bytes, png_bytes
+from rfcore.native.yuv import rgb_from_i420
+from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, Wish, watch_response, wish_of
+from rfcore.wire.v1 import twin_pb2 as pb
+from rfcore.wire.v1 import twin_pb2_grpc
+
+__all__ = ["TwinPictures", "TwinService", "encoded"]
+
+
+class TwinPictures:
+    """Encodes views; what was encoded is kept as long as its view."""
+
+    def __init__(self) -> None:
+        self._executor = ThreadPoolExecutor(1, "twin")
+        self._done: WeakKeyDictionary[TwinView, dict[PictureEncoding, asyncio.Future[bytes]]] = (
+            WeakKeyDictionary()
+        )
+
+    async def bytes_of(self, view: TwinView, encoding: PictureEncoding) -> bytes:
+        """Return the picture of ``view``."""
+        done = self._done.setdefault(view, {})
+        if encoding not in done:
+            loop = asyncio.get_running_loop()
+            done[encoding] = loop.run_in_executor(self._executor, encoded, view.picture, encoding)
+        return await asyncio.shield(done[encoding])
+
+    def close(self) -> None:
+        """Stop the thread."""
+        self._executor.shutdown(cancel_futures=True)
+
+
+def encoded(picture: I420, encoding: PictureEncoding) -> bytes:
+    """Return ``picture`` as bytes: see ``PictureEncoding`` in twin.proto."""
+    match encoding:
+        case PictureEncoding.NONE:
+            return b""
+        case PictureEncoding.I420:
+            return picture.packed()
+        case PictureEncoding.JPEG:
+            return jpeg_bytes(rgb_from_i420(picture))
+        case PictureEncoding.PNG:
+            return png_bytes(rgb_from_i420(picture))
+
+
+log = structlog.get_logger()
+Context = grpc.aio.ServicerContext[pb.WatchRequest, pb.WatchResponse]
+
+
+class End(StrEnum):
+    """How a consumer ended."""
+
+    LEFT = "left"
+    SLOW = "slow"
+    REFUSED = "refused"
+    DRAINED = "drained"
+
+
+class TwinService(twin_pb2_grpc.TwinServiceServicer):
+    """Shows ``twin`` to consumers."""
+
+    def __init__(self, twin: Twin, metrics: TwinMetrics, limits: ConsumerLimits) -> None:
+        self._twin = twin
+        self._metrics = metrics
+        self._limits = limits
+        self._pictures = TwinPictures()
+        self._watching = 0
+        self._draining = asyncio.Event()
+
+    def register(self, server: grpc.aio.Server) -> None:
+        """Add the service to a server that has not started."""
+        twin_pb2_grpc.add_TwinServiceServicer_to_server(self, server)
+
+    def drain(self) -> None:
+        """Let every consumer go."""
+        self._draining.set()
+
+    def close(self) -> None:
+        """Stop encoding."""
+        self._pictures.close()
+
+    async def Watch(  # type: ignore[override]  # noqa: N802 (a coroutine that writes will do)
+        self, request: pb.WatchRequest, context: Context
+    ) -> None:
+        """Send what is to be seen, until the consumer leaves."""
+        try:
+            wish = wish_of(request)
+        except InvalidInput as error:
+            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
+        if self._watching >= self._limits.consumers:
+            self._metrics.ended.labels(End.REFUSED).inc()
+            await context.abort(
+                grpc.StatusCode.RESOURCE_EXHAUSTED,
+                f"{self._watching} consumers watch, {self._limits.consumers} may; try again later",
+            )
+        self._watching += 1
+        self._metrics.consumers.inc()
+        end = End.LEFT
+        try:
+            end = await _Consumer(self._twin, self._pictures, self._metrics, context).serve(
+                wish, self._limits.patience_s, self._draining
+            )
+        finally:
+            self._watching -= 1
+            self._metrics.consumers.dec()
+            self._metrics.ended.labels(end).inc()
+            log.info("consumer ended", peer=context.peer(), reason=str(end))
+        if end is End.SLOW:
+            await context.abort(
+                grpc.StatusCode.RESOURCE_EXHAUSTED,
+                f"nothing was taken for {self._limits.patience_s:g} s; read faster",
+            )
+
+
+class _Consumer:
+    """Writes what arrives in one mailbox."""
+
+    def __init__(
+        self, twin: Twin, pictures: TwinPictures, metrics: TwinMetrics, context: Context
+    ) -> None:
+        self._twin = twin
+        self._pictures = pictures
+        self._metrics = metrics
+        self._context = context
+        self._arrived = asyncio.Event()
+
+    async def serve(self, wish: Wish, patience_s: float, draining: asyncio.Event) -> End:
+        """Serve to the end, and say how it ended."""
+        mailbox = self._twin.watch(wish, self._arrived.set)
+        drained = asyncio.create_task(draining.wait())
+        try:
+            await self._context.send_initial_metadata(())  # from here on nothing is missed unseen
+            while not draining.is_set():
+                entry = mailbox.take()
+                if entry is None:
+                    await self._rest(drained)
+                    continue
+                writing = asyncio.create_task(self._write(mailbox, entry))
+                await asyncio.wait(
+                    {writing, drained},
+                    timeout=patience_s,
+                    return_when=asyncio.FIRST_COMPLETED,
+                )
+                if not writing.done():
+                    writing.cancel()
+                    return End.DRAINED if draining.is_set() else End.SLOW
+                writing.result()
+            return End.DRAINED
+        finally:
+            drained.cancel()
+            self._twin.unwatch(mailbox)
+
+    async def _rest(self, drained: asyncio.Task[bool]) -> None:
+        arrived = asyncio.create_task(self._arrived.wait())
+        await asyncio.wait({arrived, drained}, return_when=asyncio.FIRST_COMPLETED)
+        arrived.cancel()
+        self._arrived.clear()
+
+    async def _write(self, mailbox: Mailbox, entry: TwinView | Departure) -> None:
+        if isinstance(entry, Departure):
+            await self._context.write(watch_response(entry))
+            return
+        encoding = mailbox.wish.encoding
+        data = await self._pictures.bytes_of(entry, encoding)
+        age_s = entry.age_s(time.monotonic())
+        message = watch_response(_message(entry, age_s, mailbox, data))
+        await self._context.write(message)
+        self._metrics.sent.labels(encoding).inc()
+        self._metrics.bytes.inc(message.ByteSize())
+        self._metrics.sent_age.observe(age_s)
+
+
+def _message(view: TwinView, age_s: float, mailbox: Mailbox, data: bytes) -> TwinPicture:
+    packet = view.frame.packet
+    return TwinPicture(
+        vehicle_id=view.vehicle_id,
+        camera_id=view.frame.camera_id,
+        session_id=view.session_id,
+        epoch=packet.epoch,
+        sequence=packet.sequence,
+        capture_time_ns=view.frame.capture_time_ns,
+        age_ns=round(age_s * 1e9),
+        pose=view.frame.pose,
+        intrinsics=view.intrinsics,
+        field_id=view.field_id,
+        reconstruction_digest=view.digest,
+        encoding=mailbox.wish.encoding,
+        picture=data,
+        skipped=mailbox.skipped[view.key],
+    )

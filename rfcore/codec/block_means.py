@@ -1,0 +1,53 @@
+"""The coarse digest: enough of a picture to tell rounding from a wrong pose.
+
+The luma plane is cut into 8 x 8 cells; the digest is the mean of each, rounded half up, 64 bytes
+in reading order. Cell i of a side of n samples covers samples floor(i n / 8) up to
+floor((i + 1) n / 8), but at least one.
+
+Tolerance: if no sample differs by more than one level, no mean differs by more than one level,
+and neither do the rounded means (x -> floor(x + 1/2) maps numbers at most 1 apart to integers at
+most 1 apart). So two renderers that disagree in the last bit always pass at a tolerance of 1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.image import I420
+
+__all__ = [
+    "BLOCK_MEANS_BYTES",
+    "BLOCK_MEANS_TOLERANCE",
+    "block_mean_difference",
+    "block_mean_digest",
+]
+
+_CELLS = 8
+BLOCK_MEANS_BYTES = _CELLS * _CELLS
+BLOCK_MEANS_TOLERANCE = 1
+"""Levels by which a cell's mean may differ between renderers that agree up to rounding."""
+
+
+def block_mean_digest(picture: I420) -> bytes:
+    """Return the 64 rounded luma means of ``picture``."""
+    height, width = picture.y.shape
+    rows, row_counts = _cells(height)
+    columns, column_counts = _cells(width)
+    sums = np.add.reduceat(picture.y, columns, axis=1, dtype=np.int64)
+    sums = np.add.reduceat(sums, rows, axis=0)
+    counts = row_counts[:, None] * column_counts[None, :]
+    means: NDArray[np.int64] = (2 * sums + counts) // (2 * counts)
+    return means.astype(np.uint8).tobytes()
+
+
+def block_mean_difference(a: bytes, b: bytes) -> int:
+    """Return the largest difference of two coarse digests, in levels."""
+    means = (np.frombuffer(digest, np.uint8).astype(np.int16) for digest in (a, b))
+    return int(np.abs(np.subtract(*means)).max())
+
+
+def _cells(side: int) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """Return the first sample and the number of samples of each cell."""
+    edges = np.arange(_CELLS + 1) * side // _CELLS
+    return edges[:-1].astype(np.intp), np.maximum(np.diff(edges), 1)

@@ -1,0 +1,1 @@
+"""H.264 as the delta codec needs it: bitstream, parameter sets, I_PCM pictures, x264, FFmpeg."""

@@ -1,0 +1,125 @@
+"""What a stream is configured to be, and the level its size needs.
+
+Options are checked here against closed lists, because x264 takes an option it does not know
+without a word; ``rfcore.codec.h264.header`` checks afterwards that the encoder did as told.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from rfcore.errors import InvalidInput
+
+__all__ = ["CRF_RANGE", "MAX_MACROBLOCKS", "MAX_SIDE_PX", "PRESETS", "CodecConfig"]
+
+PRESETS = (
+    "ultrafast",
+    "superfast",
+    "veryfast",
+    "faster",
+    "fast",
+    "medium",
+    "slow",
+    "slower",
+    "veryslow",
+)
+"""x264's presets, but not placebo, which costs several times veryslow and gains nothing."""
+
+CRF_RANGE = (1.0, 51.0)
+"""Below 1 x264 leaves High profile for lossless High 4:4:4, which needs other parameter sets."""
+
+MIN_SIDE_PX = 2
+MAX_SIDE_PX = 8192
+MAX_MACROBLOCKS = 36_864
+"""The largest picture of level 5.2: 4096x2304, or another shape of no more macroblocks."""
+
+PICTURES_PER_SECOND = 50
+"""The rate levels are chosen for: 25 frames, each with the I_PCM picture it predicts from."""
+
+REFERENCE_FRAMES = 3
+"""Fixed so that one set of parameter sets serves any number of references up to it."""
+
+_LEVELS = (
+    (10, 1_485, 99, 396),
+    (11, 3_000, 396, 900),
+    (12, 6_000, 396, 2_376),
+    (13, 11_880, 396, 2_376),
+    (21, 19_800, 792, 4_752),
+    (22, 20_250, 1_620, 8_100),
+    (30, 40_500, 1_620, 8_100),
+    (31, 108_000, 3_600, 18_000),
+    (32, 216_000, 5_120, 20_480),
+    (40, 245_760, 8_192, 32_768),
+    (42, 522_240, 8_704, 34_816),
+    (50, 589_824, 22_080, 110_400),
+    (51, 983_040, 36_864, 184_320),
+    (52, 2_073_600, 36_864, 184_320),
+)
+"""level_idc, MaxMBPS, MaxFS, MaxDpbMbs of ITU-T H.264 table A-1, without levels that add nothing
+to the one before (2, 4.1) or need a constraint flag (1b)."""
+
+
+@dataclass(frozen=True)
+class CodecConfig:
+    """One stream's size and quality. Raises ``InvalidInput`` naming the field that is wrong.
+
+    ``crf`` is x264's constant rate factor: lower is better, 6 steps halve the quantiser.
+    """
+
+    width_px: int
+    height_px: int
+    preset: str = "medium"
+    crf: float = 23.0
+
+    def __post_init__(self) -> None:
+        for name in ("width_px", "height_px"):
+            side = getattr(self, name)
+            if not MIN_SIDE_PX <= side <= MAX_SIDE_PX:
+                raise InvalidInput(
+                    f"codec.{name}", f"{side} px is outside {MIN_SIDE_PX}..{MAX_SIDE_PX} px"
+                )
+        if self.macroblocks > MAX_MACROBLOCKS:
+            raise InvalidInput(
+                "codec.width_px x height_px",
+                f"{self.width_px}x{self.height_px} px are {self.macroblocks} macroblocks, more "
+                f"than the {MAX_MACROBLOCKS} of H.264 level 5.2; scale the pictures down",
+            )
+        if self.preset not in PRESETS:
+            raise InvalidInput("codec.preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
+        if not (math.isfinite(self.crf) and CRF_RANGE[0] <= self.crf <= CRF_RANGE[1]):
+            raise InvalidInput(
+                "codec.crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}"
+            )
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) of frames and renders."""
+        return (self.width_px, self.height_px)
+
+    @property
+    def coded_size_px(self) -> tuple[int, int]:
+        """The size rounded up to even, which 4:2:0 cropping can express (7.4.2.1.1)."""
+        return (self.width_px + self.width_px % 2, self.height_px + self.height_px % 2)
+
+    @property
+    def size_mbs(self) -> tuple[int, int]:
+        """(width, height) in macroblocks of 16x16 px."""
+        return ((self.width_px + 15) // 16, (self.height_px + 15) // 16)
+
+    @property
+    def macroblocks(self) -> int:
+        """How many macroblocks a picture has."""
+        return self.size_mbs[0] * self.size_mbs[1]
+
+    @property
+    def level_idc(self) -> int:
+        """The lowest level that allows this size at 25 frames a second (A.3.1, table A-1)."""
+        rate = PICTURES_PER_SECOND * self.macroblocks
+        stored = REFERENCE_FRAMES * self.macroblocks
+        side = max(self.size_mbs)
+        for level_idc, max_rate, max_size, max_stored in _LEVELS:
+            small_enough = self.macroblocks <= max_size and side * side <= 8 * max_size
+            if small_enough and rate <= max_rate and stored <= max_stored:
+                return level_idc
+        raise InvalidInput("codec.size", f"{self.size_px} px fit no level of H.264")

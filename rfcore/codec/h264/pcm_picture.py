@@ -1,0 +1,108 @@
+"""The I_PCM picture: a render as an H.264 picture that decodes to exactly itself.
+
+The receiver never gets the picture its P slice predicts from; it makes one from its own render. An
+I_PCM macroblock holds its 384 samples as they are (ITU-T H.264, 7.3.5 and 7.4.5), so every
+standard decoder reproduces them bit for bit. The picture is one slice under a picture parameter set
+of its own (id 1: CAVLC, so that macroblocks need no arithmetic coder, and deblocking off), beside
+x264's (id 0), which the P slice names. The first of several pictures is an IDR picture, those
+after it are not: an IDR picture would drop the ones before.
+
+In CAVLC each macroblock after the first begins byte-aligned with mb_type ue(25), nine bits, and
+seven zero bits: 0x0D 0x00. So the picture is one array of rows of 386 bytes
+(``rfcore.native.pcm``). Samples are clamped to at least 1; then no two zero bytes meet and no
+emulation prevention is needed (7.4.1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rfcore.codec.h264.bitstream import BitWriter, join_nals, nal_of_rbsp
+from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, NAL_PPS
+from rfcore.image import I420
+from rfcore.native.pcm import pcm_bytes, write_macroblocks
+
+__all__ = ["PCM_PPS_ID", "PcmPictures", "PcmPlace", "pcm_pps", "without_zeros"]
+
+PCM_PPS_ID = 1
+_NAL_REF_IDC = 3 << 5
+_I_SLICE_ONLY = 7
+_MB_TYPE_I_PCM = 25
+_STOP = 0x80
+_MAX_BYTES_BEFORE = 512
+"""Three parameter sets of at most 64 bytes, with emulation prevention, and a slice header."""
+
+
+def pcm_pps() -> bytes:
+    """Return the NAL unit of picture parameter set 1, referring to SPS 0 (7.3.2.2)."""
+    w = BitWriter()
+    w.ue(PCM_PPS_ID).ue(0)
+    w.u(1, 0).u(1, 0)  # entropy_coding_mode_flag: CAVLC; no field order
+    w.ue(0)  # one slice group
+    w.ue(0).ue(0)  # default reference counts - 1
+    w.u(1, 0).u(2, 0)  # no weighted prediction
+    w.se(0).se(0).se(0)  # pic_init_qp - 26, pic_init_qs - 26, chroma_qp_index_offset
+    w.u(1, 1)  # deblocking_filter_control_present_flag
+    w.u(1, 0).u(1, 0)  # constrained_intra_pred_flag, redundant_pic_cnt_present_flag
+    return nal_of_rbsp(_NAL_REF_IDC | NAL_PPS, w.stop().to_bytes())
+
+
+@dataclass(frozen=True)
+class PcmPlace:
+    """Where an I_PCM picture stands: ``frame_num`` 0 is an IDR picture, and then ``idr_pic_id``
+    must differ from that of an IDR picture right before it (7.4.3)."""
+
+    log2_max_frame_num: int
+    frame_num: int = 0
+    idr_pic_id: int = 0
+
+
+class PcmPictures:
+    """Makes I_PCM pictures of one size (width, height), all of them in the same memory."""
+
+    def __init__(self, size_px: tuple[int, int]) -> None:
+        self._samples_bytes = pcm_bytes(size_px)
+        self._memory = np.empty(self._samples_bytes + _MAX_BYTES_BEFORE, np.uint8)
+
+    def access_unit(self, picture: I420, place: PcmPlace, sets: bytes = b"") -> memoryview:
+        """Return the byte stream of a picture that decodes to ``picture``, samples raised to >= 1.
+
+        ``sets``: a byte stream to go before it. What is returned is overwritten by the next call.
+        The coded area is the size rounded up to whole macroblocks by repeating the last row and
+        column. The sequence must use picture order count type 2.
+        """
+        before = sets + join_nals([_slice_header(place)])
+        start, end = len(before), len(before) + self._samples_bytes
+        unit = self._memory[: end + 1]
+        unit[:start] = np.frombuffer(before, np.uint8)
+        write_macroblocks(picture, unit[start:end])
+        unit[end] = _STOP
+        return unit.data
+
+
+def without_zeros(picture: I420) -> I420:
+    """Return ``picture`` with its samples raised to at least 1: what an I_PCM one decodes to."""
+    y, u, v = (np.maximum(plane, 1) for plane in picture.planes)
+    return I420(y, u, v)
+
+
+def _slice_header(place: PcmPlace) -> bytes:
+    """Return the NAL unit up to the first macroblock's samples (7.3.3, 7.3.5)."""
+    w = BitWriter()
+    w.ue(0).ue(_I_SLICE_ONLY).ue(PCM_PPS_ID)
+    w.u(place.log2_max_frame_num, place.frame_num)
+    is_idr = place.frame_num == 0
+    if is_idr:
+        w.ue(place.idr_pic_id)
+        w.u(1, 0).u(1, 0)  # no_output_of_prior_pics_flag, long_term_reference_flag
+    else:
+        w.u(1, 0)  # adaptive_ref_pic_marking_mode_flag: the oldest picture leaves first
+    w.se(0)  # slice_qp_delta
+    w.ue(1)  # disable_deblocking_filter_idc
+    w.ue(_MB_TYPE_I_PCM).align()
+    # The sample that follows is >= 1 and the last byte is not zero unless the bits were: a final
+    # one bit stands in for what follows while emulation prevention is applied.
+    nal_unit_type = NAL_IDR if is_idr else NAL_P
+    return nal_of_rbsp(_NAL_REF_IDC | nal_unit_type, w.to_bytes() + b"\x01")[:-1]

@@ -1,0 +1,245 @@
+"""The sender: frames as slices against pictures that both ends make themselves.
+
+States are values: ``encode`` takes one and returns the next, and an error leaves the caller with
+the one it had. The object holds only the configuration and a decoder whose content does not
+outlive a frame. One caller at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+from rfcore.codec.block_means import block_mean_digest
+from rfcore.codec.h264.config import CRF_RANGE, PRESETS, REFERENCE_FRAMES, CodecConfig
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.h264.pcm_picture import without_zeros
+from rfcore.codec.h264.qp_map import QpMap, check_qp_map
+from rfcore.codec.h264.slices import SliceCoding, encode_slice
+from rfcore.codec.h264.splice import SpliceDecoder, grey
+from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
+from rfcore.codec.photometric import Photometric, adapt
+from rfcore.codec.prediction import Prediction
+from rfcore.codec.references import References, check_references, is_temporal
+from rfcore.codec.sender.rate import FittedSlice, RateModel, RateTarget, bits_curve, code_to_fit
+from rfcore.codec.sender.reference_choice import choose_photometric, choose_references
+from rfcore.codec.state import EncoderState, Past
+from rfcore.errors import CodecError, InvalidInput
+from rfcore.image import I420
+from rfcore.native.warp import PosedDepth
+
+__all__ = ["DeltaEncoder", "Encoded", "FrameChoice"]
+
+Clock = Callable[[], int]
+
+
+def _stopped_clock() -> int:
+    return 0
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """How one frame is to be coded.
+
+    ``references``: the pictures to predict from; ``None`` leaves it to the encoder, which takes at
+    most ``most``: each costs as much time as coding a frame. ``crf`` replaces the configured one.
+    ``photometric``: see there; ``None`` leaves it to the encoder. ``pose_only``: send no slice; the
+    frame is its only reference. ``coarse``: add the block means of the render, by which a receiver
+    whose renderer is not exact tells rounding from a wrong pose. ``limit_bytes``: a longer slice is
+    coded again at higher CRFs (``rfcore.codec.sender.rate``); one that is too long even at the
+    highest is returned all the same. ``preset`` replaces the configured one; the parameter sets of
+    a stream are those of any. ``target``: the bytes aimed at, by a CRF that is predicted before
+    coding and never below ``crf``. ``qp_map``: where the frame is coded finer or coarser.
+    """
+
+    references: References | None = None
+    crf: float | None = None
+    photometric: Photometric | None = None
+    pose_only: bool = False
+    most: int = REFERENCE_FRAMES
+    coarse: bool = False
+    limit_bytes: int | None = None
+    preset: str | None = None
+    target: RateTarget | None = None
+    qp_map: QpMap | None = None
+    rough: bool = False
+
+    def __post_init__(self) -> None:
+        if self.preset is not None and self.preset not in PRESETS:
+            raise InvalidInput("preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
+        if self.references is not None:
+            check_references(self.references)
+        if self.crf is not None and not CRF_RANGE[0] <= self.crf <= CRF_RANGE[1]:
+            raise InvalidInput("crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}")
+        if self.limit_bytes is not None and self.limit_bytes < 1:
+            raise InvalidInput("limit_bytes", f"{self.limit_bytes} must be at least 1")
+        if not 1 <= self.most <= REFERENCE_FRAMES:
+            raise InvalidInput("most", f"{self.most} references are outside 1..{REFERENCE_FRAMES}")
+        if self.pose_only and (self.references is None or len(self.references) != 1):
+            raise InvalidInput("references", "a pose-only packet names exactly one reference")
+
+
+LEFT_TO_THE_ENCODER = FrameChoice()
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A packet, what the receiver will see, and the sender's next state.
+
+    ``stage_ns`` has "references" (warp, choice), "encode" (x264) and "closed_loop" (decoding as the
+    receiver does, digests). ``tries``: how often the frame was coded to fit a limit. ``crf``: the
+    one it was coded at in the end. ``rate``: what a target's model learnt from it.
+    """
+
+    packet: DeltaPacket
+    reconstruction: I420
+    state: EncoderState
+    stage_ns: Mapping[str, int]
+    tries: int = 1
+    crf: float = 0.0
+    rate: RateModel | None = None
+
+
+class DeltaEncoder:
+    """The sender. Raises ``CodecError`` if x264 does not make the stream the config promises.
+
+    ``threads`` are for making references and coding. References are the same with any number;
+    slices may differ by a few bytes between one and more.
+    """
+
+    def __init__(
+        self, config: CodecConfig, clock_ns: Clock = _stopped_clock, threads: int = 1
+    ) -> None:
+        if threads < 1:
+            raise InvalidInput("threads", f"{threads} must be at least 1")
+        self._config = config
+        self._clock_ns = clock_ns
+        self._threads = threads
+        self._header = encode_slice(config, [grey(config)], grey(config)).header
+        try:
+            self._splice = SpliceDecoder(self._header)
+        except InvalidInput as error:
+            raise CodecError(f"x264 did not do as told: {error}") from error
+
+    @property
+    def header(self) -> StreamHeader:
+        """What a receiver needs before the first packet."""
+        return self._header
+
+    def start(self, epoch: int) -> EncoderState:
+        """Return the state before the first packet of a (re)started stream."""
+        return EncoderState(epoch)
+
+    def encode(
+        self,
+        state: EncoderState,
+        frame: I420,
+        render: I420,
+        seen: PosedDepth | None = None,
+        choice: FrameChoice = LEFT_TO_THE_ENCODER,
+    ) -> Encoded:
+        """Code ``frame`` against ``render`` (both of the configured size) and ``state.past``.
+
+        ``seen`` is the field's depth at the frame's pose; without it there is no warp, now or for
+        the next frame. Raises ``InvalidInput`` for another size, or references that cannot be made;
+        ``CodecError`` if x264 fails.
+        """
+        for name, picture in (("frame", frame), ("render", render)):
+            _require_size(name, picture, self._config)
+        if choice.qp_map is not None:
+            check_qp_map(choice.qp_map, self._config)
+        started_ns = self._clock_ns()
+        crf = self._first_crf(choice)
+        photometric = choice.photometric
+        if photometric is None:
+            photometric = choose_photometric(frame, render, crf)
+        prediction = Prediction(adapt(render, photometric), seen, state.past, self._threads)
+        references = choice.references
+        if references is None:
+            references = choose_references(frame, prediction, crf, choice.most)
+        pictures = prediction.pictures(references)
+        chosen_ns = self._clock_ns()
+        made, rate = self._coded(pictures, frame, choice, references)
+        encoded_ns = self._clock_ns()
+        reconstruction = self._reconstruct(pictures, made.payload)
+        past = state.past
+        shown = Past(reconstruction, seen, prediction.render)
+        packet = DeltaPacket(
+            epoch=state.epoch,
+            sequence=state.next_sequence,
+            reference_digest=render.digest(),
+            reference_coarse=block_mean_digest(render) if choice.coarse else b"",
+            reconstruction_digest=shown.digest,
+            payload=made.payload,
+            crc32=0,
+            references=references,
+            needed_digest=_name(past) if is_temporal(references) else b"",
+            photometric=photometric,
+        ).sealed()
+        stage_ns = {
+            "references": chosen_ns - started_ns,
+            "encode": encoded_ns - chosen_ns,
+            "closed_loop": self._clock_ns() - encoded_ns,
+        }
+        following = EncoderState(state.epoch, state.next_sequence + 1, shown)
+        return Encoded(packet, reconstruction, following, stage_ns, made.tries, made.crf, rate)
+
+    def _first_crf(self, choice: FrameChoice) -> float:
+        """Return the CRF that references are chosen for: with a target, about the one to come."""
+        lowest = self._config.crf if choice.crf is None else choice.crf
+        if choice.target is None or choice.target.model.crf is None:
+            return lowest
+        return max(lowest, choice.target.model.crf)
+
+    def _coded(
+        self,
+        pictures: tuple[I420, ...],
+        frame: I420,
+        choice: FrameChoice,
+        references: References,
+    ) -> tuple[FittedSlice, RateModel | None]:
+        """Return the slice at the CRF asked for, or at the one that a target calls for."""
+        lowest = self._config.crf if choice.crf is None else choice.crf
+        target = choice.target
+        if target is None or choice.pose_only:
+            return self._fitted(pictures, frame, lowest, choice), None
+        curve = bits_curve(frame, pictures, lowest)
+        crf = target.model.crf_for(target.size_bytes, curve, references)
+        made = self._fitted(pictures, frame, crf, choice)
+        return made, target.model.after(made.crf, curve, references, len(made.payload))
+
+    def _fitted(
+        self, pictures: tuple[I420, ...], frame: I420, crf: float, choice: FrameChoice
+    ) -> FittedSlice:
+        if choice.pose_only:
+            return FittedSlice(b"", crf, 1)
+        code = partial(self._slice, pictures, frame, choice)
+        if choice.limit_bytes is None:
+            return FittedSlice(code(crf), crf, 1)
+        return code_to_fit(code, crf, choice.limit_bytes)
+
+    def _slice(
+        self, pictures: tuple[I420, ...], frame: I420, choice: FrameChoice, crf: float
+    ) -> bytes:
+        config = replace(self._config, preset=choice.preset or self._config.preset)
+        coding = SliceCoding(crf, choice.qp_map, choice.rough, self._threads)
+        coded = encode_slice(config, pictures, frame, coding)
+        if (coded.header.sps, coded.header.pps) != (self._header.sps, self._header.pps):
+            raise CodecError("x264 changed its parameter sets within a stream")
+        return coded.payload
+
+    def _reconstruct(self, pictures: tuple[I420, ...], payload: bytes) -> I420:
+        if not payload:
+            return without_zeros(pictures[0])
+        self._splice.predict_from(*pictures)
+        return self._splice.decode(payload)
+
+
+def _name(past: Past | None) -> bytes:
+    return b"" if past is None else past.digest[:NEEDED_BYTES]
+
+
+def _require_size(name: str, picture: I420, config: CodecConfig) -> None:
+    if picture.size_px != config.size_px:
+        raise InvalidInput(name, f"{picture.size_px} px where the stream has {config.size_px} px")

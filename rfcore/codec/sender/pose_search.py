@@ -1,0 +1,113 @@
+"""The pose near the measured one at which a frame costs fewest bits.
+
+A pose is sent with every frame, so the sender may choose it: the receiver renders wherever it is
+told. Alignment (``rfcore.codec.sender.align``) proposes one, the field is rendered there, and the
+estimated bits of the frame against both renders decide. Time is bounded by a clock that is an
+argument; whatever was found by then is taken.
+
+Five frames of the first sample with vehicles, veryfast, BD-rate against true poses (30 to 36 dB):
+noise of 5 cm and 0.05 degrees costs 54 %, of 10 cm and 0.1 degrees 167 %, of 20 cm and 0.5 degrees
+218 %; after refinement 0.7, 1.7 and 1.4 % are left, and 4 mm and 0.02 degrees of noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from rfcore.camera import Camera, Pose
+from rfcore.codec.sender.align import Look, align
+from rfcore.codec.sender.rate import bits_curve
+from rfcore.errors import InvalidInput
+from rfcore.image import I420
+
+__all__ = ["PoseSearch", "Refined"]
+
+MOST_LOOKS = 2
+"""Renders beside that of the measured pose; the second finds what the first, seen from elsewhere,
+could not show. A look takes about 100 ms of one core at 640x360: aligning 70, rendering 30."""
+WORTH = 0.01
+"""Of the estimated bits, that another pose must save: less is noise of the estimate."""
+FURTHEST_M, FURTHEST_RAD = 1.0, math.radians(3.0)
+"""Beyond it the alignment has gone astray, and is not believed."""
+
+ClockNs = Callable[[], int]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """The pose taken, what the field shows there, and how far it is from the measured one.
+
+    ``looks``: how often the field was rendered beside.
+    """
+
+    look: Look
+    moved_m: float = 0.0
+    turned_rad: float = 0.0
+    looks: int = 0
+
+
+class PoseSearch:
+    """Searches within ``budget_ms`` of ``clock_ns``, which may be any clock that runs forward."""
+
+    def __init__(self, budget_ms: float, clock_ns: ClockNs) -> None:
+        if not budget_ms > 0:
+            raise InvalidInput("refine_pose_ms", f"{budget_ms} ms must be above 0")
+        self._budget_ns = round(1e6 * budget_ms)
+        self._clock_ns = clock_ns
+
+    def refine(
+        self, frame: I420, measured: Look, look_at: Callable[[Camera], Look], crf: float
+    ) -> Refined:
+        """Return the best of the measured pose and those found; ``look_at`` renders the field."""
+        ends_ns = self._clock_ns() + self._budget_ns
+        best, best_bits = measured, _bits(frame, measured, crf)
+        looks, rendering_ns = 0, 0
+        while looks < MOST_LOOKS:
+            camera = self._proposal(frame, best, ends_ns - rendering_ns)
+            started_ns = self._clock_ns()
+            too_late = started_ns + rendering_ns >= ends_ns
+            if camera is None or too_late or not _is_near(measured.seen.camera, camera):
+                break
+            found = look_at(camera)
+            rendering_ns = self._clock_ns() - started_ns
+            looks += 1
+            bits = _bits(frame, found, crf)
+            if bits > (1 - WORTH) * best_bits:
+                break
+            best, best_bits = found, bits
+        return Refined(best, *_distance(measured.seen.camera, best.seen.camera), looks)
+
+    def _proposal(self, frame: I420, look: Look, until_ns: int) -> Camera | None:
+        """Return where alignment would have the camera; None if it stays."""
+        if self._clock_ns() >= until_ns:
+            return None
+        return _moved(look.seen.camera, align(frame, look, lambda: self._clock_ns() < until_ns))
+
+
+def _bits(frame: I420, look: Look, crf: float) -> float:
+    return float(bits_curve(frame, [look.render], crf).bits[0])
+
+
+def _moved(camera: Camera, motion: Pose) -> Camera | None:
+    """Return the camera that ``motion`` maps points of ``camera`` into; None if it is the same.
+
+    The pose is rounded as it will be sent: both ends render at the very same one.
+    """
+    pose = camera.world_from_cam.compose(motion.inverse()).rounded()
+    return None if pose == camera.world_from_cam else replace(camera, world_from_cam=pose)
+
+
+def _is_near(measured: Camera, found: Camera) -> bool:
+    moved_m, turned_rad = _distance(measured, found)
+    return moved_m <= FURTHEST_M and turned_rad <= FURTHEST_RAD
+
+
+def _distance(a: Camera, b: Camera) -> tuple[float, float]:
+    """Return metres and radians between two cameras."""
+    motion = a.world_from_cam.inverse().compose(b.world_from_cam)
+    sine = math.sqrt(sum(value * value for value in motion.rotation[1:]))
+    return math.dist(a.world_from_cam.translation_m, b.world_from_cam.translation_m), 2 * math.asin(
+        min(1.0, sine)
+    )

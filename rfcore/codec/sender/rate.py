@@ -1,0 +1,213 @@
+"""How long a slice will be at which CRF, and so which CRF a number of bytes calls for.
+
+The bits of a frame at every CRF are estimated from what its references leave of each 8x8 block
+(``rfcore.codec.sender.reference_choice`` has the formula); what x264 makes of it differs by a
+factor that changes little from one frame to the next of the same references. ``RateModel`` keeps
+that factor, and how far it strays, for each set of references. States are values: ``after`` returns
+the next.
+
+A slice that is no longer than a limit: coded again at a higher CRF until it fits.
+
+6 of CRF double the quantiser's step and, in pictures of a street, about halve the bits; in noise
+they take one bit from each coefficient, which is far less. So the first step assumes a halving, and
+the further ones what the steps before have brought.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.codec.h264.config import CRF_RANGE
+from rfcore.codec.references import Reference, References
+from rfcore.codec.sender.reference_choice import BLOCK_BITS, DEAD_ZONE_SATD
+from rfcore.errors import InvalidInput
+from rfcore.image import I420
+from rfcore.native.warp import BLOCK_PX, block_costs
+
+__all__ = [
+    "MAX_TRIES",
+    "BitsCurve",
+    "FittedSlice",
+    "RateModel",
+    "RateTarget",
+    "bits_curve",
+    "code_to_fit",
+]
+
+
+CRF_STEP = 1.0
+LEAST_BITS = 200.0
+"""A slice in which every block is copied from reference 0: its header and a run of skips."""
+MEMORY = 0.5
+"""Weight of what was known of the factor, when a frame was coded."""
+CLIMB_CRF = 2.0
+"""Quality rises by at most so much a frame, but falls at once: it flickers less."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class BitsCurve:
+    """Estimated ``bits`` [K], falling, at each of the ascending ``crfs`` [K]."""
+
+    crfs: Array
+    bits: Array
+
+    def at(self, crf: float) -> float:
+        """Return the bits at ``crf``, between entries on a straight line of their logarithm."""
+        return float(2 ** np.interp(crf, self.crfs, np.log2(self.bits)))
+
+    def crf_for(self, bits: float) -> float:
+        """Return the lowest CRF of at most ``bits``; the highest there is when none has."""
+        falling = np.log2(self.bits)
+        if math.log2(max(bits, 1.0)) >= falling[0]:
+            return float(self.crfs[0])
+        wanted = np.interp(-math.log2(max(bits, 1.0)), -falling, self.crfs)
+        return float(min(wanted, self.crfs[-1]))
+
+
+def bits_curve(frame: I420, pictures: Sequence[I420], lowest_crf: float) -> BitsCurve:
+    """Estimate ``frame``'s bits when each block is predicted from the best of ``pictures``.
+
+    Without pictures each block is predicted from its mean. Raises ``InvalidInput`` for a CRF
+    outside 1..51.
+    """
+    low, high = CRF_RANGE
+    if not low <= lowest_crf <= high:
+        raise InvalidInput("crf", f"{lowest_crf} is outside {low:g}..{high:g}")
+    crfs = np.append(np.arange(lowest_crf, high, CRF_STEP), high)
+    satd, ssd = _left_over(frame, pictures)
+    bits = np.array([_bits(satd, ssd, crf) for crf in crfs])
+    return BitsCurve(crfs, np.minimum.accumulate(LEAST_BITS + bits))
+
+
+def _left_over(frame: I420, pictures: Sequence[I420]) -> tuple[Array, Array]:
+    if not pictures:
+        return _around_means(frame)
+    found = [block_costs(frame.y, picture.y) for picture in pictures]
+    satd = np.minimum.reduce([costs.satd for costs in found])
+    ssd = np.minimum.reduce([costs.ssd for costs in found])
+    return satd.astype(np.float64).ravel(), ssd.astype(np.float64).ravel()
+
+
+def _around_means(frame: I420) -> tuple[Array, Array]:
+    height, width = (side // BLOCK_PX * BLOCK_PX for side in frame.y.shape)
+    shape = (height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)
+    blocks = frame.y[:height, :width].reshape(shape)
+    ssd = BLOCK_PX**2 * blocks.astype(np.float64).var(axis=(1, 3)).ravel()
+    return np.sqrt(BLOCK_PX**2 * ssd), ssd
+
+
+def _bits(satd: Array, ssd: Array, crf: float) -> float:
+    """Return the bits of the blocks that are not better copied from reference 0."""
+    step: float = 2 ** ((crf - 4) / 6)
+    lambda_: float = 0.57 * 2 ** ((crf - 12) / 3)
+    bits = BLOCK_BITS + np.maximum(0.0, satd / step - DEAD_ZONE_SATD)
+    coded = np.minimum(ssd, BLOCK_PX**2 * step**2 / 12) + lambda_ * bits < ssd
+    return float(bits[coded].sum())
+
+
+@dataclass(frozen=True)
+class RateModel:
+    """What coding taught: ``octaves``, log2 of coded over estimated bits, by references.
+
+    ``crf`` is that of the last frame, which bounds how fast quality rises; None before the first.
+    """
+
+    octaves: Mapping[References, float] = field(default_factory=dict)
+    crf: float | None = None
+
+    def bytes_at(self, crf: float, curve: BitsCurve, references: References) -> float:
+        """Return how long a slice is predicted to be."""
+        return curve.at(crf) / 8 * 2 ** self._octaves_of(references)
+
+    def crf_for(self, size_bytes: float, curve: BitsCurve, references: References) -> float:
+        """Return the CRF that ``size_bytes`` call for, not below the curve's first."""
+        wanted = curve.crf_for(8 * size_bytes / 2 ** self._octaves_of(references))
+        slowest = wanted if self.crf is None else max(wanted, self.crf - CLIMB_CRF)
+        return min(max(slowest, float(curve.crfs[0])), CRF_RANGE[1])
+
+    def after(
+        self, crf: float, curve: BitsCurve, references: References, coded_bytes: int
+    ) -> RateModel:
+        """Return what is known once a frame took ``coded_bytes`` at ``crf``."""
+        if coded_bytes < 1:
+            raise InvalidInput("coded_bytes", f"{coded_bytes} must be at least 1")
+        found = math.log2(8 * coded_bytes / curve.at(crf))
+        known = self.octaves.get(references)
+        octaves = found if known is None else MEMORY * known + (1 - MEMORY) * found
+        return RateModel({**self.octaves, references: octaves}, crf)
+
+    def _octaves_of(self, references: References) -> float:
+        """Return the factor of ``references``, or of whichever is most like them."""
+        if not self.octaves:
+            return 0.0
+        like = max(self.octaves, key=lambda known: _likeness(known, references))
+        return self.octaves[like]
+
+
+def _likeness(known: References, wanted: References) -> tuple[bool, int]:
+    shared: set[Reference] = set(known) & set(wanted)
+    return known == wanted, 2 * len(shared) - len(known)
+
+
+@dataclass(frozen=True)
+class RateTarget:
+    """What a frame may take: ``size_bytes`` is aimed at by ``model``'s knowledge."""
+
+    size_bytes: float
+    model: RateModel = RateModel()
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.size_bytes) and self.size_bytes >= 1):
+            raise InvalidInput("target.size_bytes", f"{self.size_bytes} must be at least 1 byte")
+
+
+MAX_TRIES = 5
+"""Codings of one frame; the last is at the highest CRF there is."""
+HALVING_CRF = 6.0
+SLOWEST_CRF = 48.0
+"""CRF steps that are taken to halve a slice, at the least and at the most."""
+AIM = 0.95
+"""Share of the limit that a step aims at: a little less costs little, a miss costs a coding."""
+Code = Callable[[float], bytes]
+
+
+@dataclass(frozen=True)
+class FittedSlice:
+    """A slice, the CRF it was coded at, and how often the frame was coded for it."""
+
+    payload: bytes
+    crf: float
+    tries: int
+
+
+def code_to_fit(code: Code, crf: float, limit_bytes: int) -> FittedSlice:
+    """Return ``code`` at ``crf``, or at the lowest of a few higher ones that fits ``limit_bytes``.
+
+    What does not fit at the highest CRF is returned as it is: check the length.
+    """
+    payload = code(crf)
+    halving = HALVING_CRF
+    for tries in range(1, MAX_TRIES):
+        if len(payload) <= limit_bytes or crf == CRF_RANGE[1]:
+            return FittedSlice(payload, crf, tries)
+        last = tries == MAX_TRIES - 1
+        excess = math.log2(len(payload) / (AIM * limit_bytes))
+        following = CRF_RANGE[1] if last else min(crf + max(1.0, halving * excess), CRF_RANGE[1])
+        shorter = code(following)
+        halving = _halving_crf(following - crf, len(payload), len(shorter))
+        payload, crf = shorter, following
+    return FittedSlice(payload, crf, MAX_TRIES)
+
+
+def _halving_crf(step: float, before_bytes: int, after_bytes: int) -> float:
+    """Return how much CRF halves a slice, judging by one step."""
+    octaves = math.log2(before_bytes / after_bytes)
+    if octaves <= step / SLOWEST_CRF:
+        return SLOWEST_CRF
+    return max(HALVING_CRF, step / octaves)

@@ -1,0 +1,235 @@
+"""A certificate authority that signs once: X.509 version 3 (RFC 5280), ECDSA on P-256.
+
+Each certificate names one identity (``rfcore.wire.identity``); a server's also its hosts. The
+authority may sign certificates only, and none of those may sign.
+
+A folder of certificates and keys: there as a whole or not at all, keys for the owner's eyes.
+
+Reads certificates back, for people.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from rfcore.errors import InvalidData, InvalidInput
+from rfcore.files import whole_folder
+from rfcore.wire.checks import shown
+from rfcore.wire.identity import Role, identity_uri
+
+__all__ = ["Issued", "Members", "Says", "certify", "read_certificates", "write_certificates"]
+
+
+MAX_DAYS = 3650
+BACKDATED = timedelta(hours=1)
+"""A vehicle whose clock is a little slow shall not find its new certificate in the future."""
+
+
+@dataclass(frozen=True)
+class Members:
+    """Whom the authority vouches for; ``hosts`` are names or addresses of the server."""
+
+    vehicles: tuple[str, ...]
+    consumers: tuple[str, ...] = ()
+    hosts: tuple[str, ...] = ("localhost", "127.0.0.1", "::1")
+
+    def __post_init__(self) -> None:
+        for role, names in ((Role.VEHICLE, self.vehicles), (Role.CONSUMER, self.consumers)):
+            for name in names:
+                identity_uri(role, name)
+            if len(set(names)) != len(names):
+                raise InvalidInput(f"{role}s", f"{', '.join(names)}: a name is there twice")
+        if not self.hosts:
+            raise InvalidInput("hosts", "a server without a name cannot be reached")
+        for host in self.hosts:
+            _host_name(host)
+
+
+@dataclass(frozen=True)
+class Issued:
+    """One certificate as PEM; ``name`` is its file's, ``identity`` what it says."""
+
+    name: str
+    identity: str
+    certificate: bytes
+    key: bytes
+
+
+@dataclass(frozen=True)
+class _Authority:
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+    now: datetime
+    days: int
+
+
+def certify(members: Members, now: datetime, days: int) -> tuple[Issued, ...]:
+    """Make an authority and sign a certificate for everyone, good for ``days`` from ``now``."""
+    if not 1 <= days <= MAX_DAYS:
+        raise InvalidInput("days", f"{days} is outside 1..{MAX_DAYS}")
+    authority = _authority(now, days)
+    server = [x509.UniformResourceIdentifier(identity_uri(Role.SERVER, "edge"))]
+    issued = [
+        _issued("ca", "the authority", authority.certificate, authority.key),
+        _signed(authority, "server", [*server, *(_host_name(host) for host in members.hosts)]),
+    ]
+    for role, names in ((Role.VEHICLE, members.vehicles), (Role.CONSUMER, members.consumers)):
+        for name in names:
+            uri = x509.UniformResourceIdentifier(identity_uri(role, name))
+            issued.append(_signed(authority, f"{role}-{name}", [uri]))
+    return tuple(issued)
+
+
+def _authority(now: datetime, days: int) -> _Authority:
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = _subject("rfedge authority")
+    signs = x509.KeyUsage(
+        digital_signature=False,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=True,
+        crl_sign=True,
+        encipher_only=False,
+        decipher_only=False,
+    )
+    certificate = (
+        _begun(subject, key, now, days)
+        .issuer_name(subject)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(signs, critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    return _Authority(certificate, key, now, days)
+
+
+def _signed(authority: _Authority, name: str, names: list[x509.GeneralName]) -> Issued:
+    key = ec.generate_private_key(ec.SECP256R1())
+    usage = ExtendedKeyUsageOID.SERVER_AUTH if name == "server" else ExtendedKeyUsageOID.CLIENT_AUTH
+    issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
+    certificate = (
+        _begun(_subject(name[:64]), key, authority.now, authority.days)
+        .issuer_name(authority.certificate.subject)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .add_extension(issuer, critical=False)
+        .sign(authority.key, hashes.SHA256())
+    )
+    return _issued(name, str(names[0].value), certificate, key)
+
+
+def _begun(
+    subject: x509.Name, key: ec.EllipticCurvePrivateKey, now: datetime, days: int
+) -> x509.CertificateBuilder:
+    """Return what every certificate has in common."""
+    own = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - BACKDATED)
+        .not_valid_after(now + timedelta(days=days))
+        .add_extension(own, critical=False)
+    )
+
+
+def _issued(
+    name: str, identity: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey
+) -> Issued:
+    pem = serialization.Encoding.PEM
+    secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    return Issued(name, identity, certificate.public_bytes(pem), secret)
+
+
+def _subject(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+
+
+def _host_name(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        pass
+    if not host.isascii() or not host.replace("-", "").replace(".", "").isalnum():
+        raise InvalidInput("hosts", f"{shown(host)} is neither a host name nor an address")
+    return x509.DNSName(host)
+
+
+def write_certificates(folder: Path, issued: Sequence[Issued], *, replace: bool = False) -> None:
+    """Write ``NAME.pem`` and ``NAME.key`` (mode 0600) of each into a new folder.
+
+    ``replace``: a folder that holds nothing but certificates makes way, at the end. Raises
+    ``InvalidInput`` when the folder is there and may not be replaced, ``OSError``.
+    """
+    if not replace and folder.exists():
+        raise InvalidInput("out", f"{folder} exists; --replace makes all its certificates anew")
+    if replace and folder.exists():
+        _check_replaceable(folder)
+    new, old = (folder.with_name(f"{folder.name}.{age}") for age in ("new", "old"))
+    with whole_folder(new) as partial:
+        partial.chmod(0o700)
+        for one in issued:
+            (partial / f"{one.name}.pem").write_bytes(one.certificate)
+            _write_key(partial / f"{one.name}.key", one.key)
+        partial.chmod(0o755)  # the keys guard themselves, and services of other users read ca.pem
+    if folder.exists():
+        folder.rename(old)
+    new.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _check_replaceable(folder: Path) -> None:
+    if folder.is_symlink() or not (folder / "ca.pem").is_file():
+        raise InvalidInput("out", f"{folder} is no folder that `rfedge certs init` made")
+    strangers = sorted(p.name for p in folder.iterdir() if p.suffix not in (".pem", ".key"))
+    if strangers:
+        raise InvalidInput("out", f"{folder} also holds {', '.join(strangers)}; move it away")
+
+
+def _write_key(path: Path, key: bytes) -> None:
+    """Write a file that nobody else could ever have read."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with open(descriptor, "wb") as file:  # noqa: PTH123 (a descriptor, not a path)
+        file.write(key)
+
+
+@dataclass(frozen=True)
+class Says:
+    """Until when a certificate is good, and its subject alternative names (an authority's none)."""
+
+    until: datetime
+    names: tuple[str, ...]
+
+
+def read_certificates(folder: Path) -> dict[str, Says]:
+    """Read every ``*.pem`` in ``folder``, by name. Raises ``InvalidInput``, ``InvalidData``."""
+    paths = sorted(folder.glob("*.pem"))
+    if not paths:
+        raise InvalidInput("folder", f"{folder} holds no certificates")
+    return {path.name: _says(path) for path in paths}
+
+
+def _says(path: Path) -> Says:
+    try:
+        certificate = x509.load_pem_x509_certificate(path.read_bytes())
+    except ValueError as error:
+        raise InvalidData(f"{path} is no certificate") from error
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return Says(certificate.not_valid_after_utc, ())
+    return Says(certificate.not_valid_after_utc, tuple(str(name.value) for name in names))

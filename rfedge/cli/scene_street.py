@@ -1,0 +1,182 @@
+"""``rfedge scene build``: a declared street into pictures, depth, classes and poses.
+
+``rfedge scene plan``: what a scene declares, and what its effects cost.
+
+``rfedge scene sheet``: built scenes on one page, to be looked at.
+
+``rfedge scene sizes``: how many bytes built scenes' pictures take as I pictures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional
+
+if TYPE_CHECKING:
+    from rfedge.street.scene_file import Scene
+
+__all__ = ["SceneBuild", "ScenePlan", "SceneSheet", "SceneSizes"]
+
+
+@dataclass(frozen=True)
+class SceneBuild:
+    """Render a scene with Mitsuba 3 (pip install 'rfedge[scene]') into a dataset.
+
+    The same command goes on where it was stopped. The same scene, size, samples and seed give the
+    same pictures, whatever the number of workers.
+    """
+
+    scene: Annotated[str, Positional]
+    """A ready-made scene by name (samples/scenes), or a scene file (.toml)."""
+    out: Path
+    """The folder to make, or to go on with."""
+    size: str | None = None
+    """WIDTHxHEIGHT px of all pictures; default: what the scene says for each split."""
+    spp: int = 16
+    """Samples a pixel, a square number."""
+    workers: int = 1
+    """Processes. One uses all cores; more share them and take 1 to 2.5 GB each."""
+    frames: str | None = None
+    """Only frames a:b of the chosen splits, counted through drive, train, eval in that order."""
+    split: str = "default"
+    """drive, train, eval, a list of them with commas, or all; default: all, but without train where
+    the scene's field was trained on another scene."""
+
+    def run(self) -> None:
+        """Build."""
+        from rich.console import Console
+
+        from rfedge.street import load_scene
+        from rfedge.street.render.backend import require_renderer
+        from rfedge.street.shots import Selection
+        from rfedge.units import parse_size
+
+        require_renderer()
+        from rfedge.street.build.run import Settings, build_scene
+
+        size_px = parse_size(self.size) if self.size is not None else None
+        selection = Selection(load_scene(self.scene), self.split, self.frames, size_px)
+        settings = Settings(self.out, self.spp, self.workers)
+        build_scene(selection, settings, Console(soft_wrap=True))
+
+
+@dataclass(frozen=True)
+class ScenePlan:
+    """Check scene files; print their pictures and the effects that will run, with measured cost."""
+
+    scenes: Annotated[tuple[str, ...], Positional]
+    """Ready-made scenes by name (samples/scenes), or scene files (.toml)."""
+
+    render: bool = False
+    """Render the street small, with and without each effect, and say what share of a frame each
+    takes; needs rfedge[scene] and up to a minute for each effect."""
+    json: Path | None = None
+    """With --render: also write what was measured into this file."""
+    page: Path | None = None
+    """With --render: also put it as a table into this page, between its marks."""
+
+    def run(self) -> None:
+        """Print the plans."""
+        from rfcore.errors import InvalidInput
+        from rfedge.street import load_scene
+
+        if not self.scenes:
+            raise InvalidInput("scenes", "none is named; street-empty is one")
+        if not self.render and (self.json or self.page):
+            raise InvalidInput("json", "and page take what was rendered; add --render")
+        scenes = [load_scene(name) for name in self.scenes]
+        if self.render:
+            self._measure(scenes)
+        else:
+            _print_plans(scenes)
+
+    def _measure(self, scenes: list[Scene]) -> None:
+        from time import process_time
+
+        from rfedge.street.plan_table import (
+            effect_lines,
+            measured_plans,
+            scene_lines,
+            write_page,
+            write_rows,
+        )
+        from rfedge.street.render.backend import require_renderer
+
+        require_renderer()
+        rows = []
+        for plan in measured_plans(scenes, process_time):
+            print(*scene_lines(plan.scene), sep="\n")
+            print(*effect_lines(plan.effects, plan.cost), sep="\n", flush=True)
+            rows += plan.rows()
+        if self.json is not None:
+            write_rows(self.json, rows)
+        if self.page is not None:
+            write_page(self.page, rows)
+
+
+def _print_plans(scenes: list[Scene]) -> None:
+    from time import process_time
+
+    from rfedge.street.plan import planned_effects
+    from rfedge.street.plan_table import effect_lines, scene_lines
+
+    for scene in scenes:
+        print(*scene_lines(scene), sep="\n")
+        print(*effect_lines(planned_effects(scene, process_time), None), sep="\n")
+
+
+@dataclass(frozen=True)
+class SceneSheet:
+    """Write a contact sheet of built scenes; docs/scenes-contact-sheet.jpg is made with it."""
+
+    scenes: Annotated[tuple[Path, ...], Positional]
+    """Folders that `rfedge scene build` made."""
+    out: Path
+    """The picture to write (.jpg)."""
+    columns: int = 4
+    """Pictures of each scene, evenly chosen among those that there are."""
+    width_px: int = 1280
+    """Width of the sheet, px."""
+    max_bytes: int = 600_000
+    """The JPEG's quality is lowered until it fits."""
+
+    def run(self) -> None:
+        """Write the sheet; say how large it became."""
+        from rfedge.street.contact_sheet import write_contact_sheet
+
+        size = write_contact_sheet(
+            self.scenes, self.out, self.columns, self.width_px, self.max_bytes
+        )
+        print(f"{self.out}: {len(self.scenes)} scenes, {size / 1000:.0f} kB")
+
+
+@dataclass(frozen=True)
+class SceneSizes:
+    """Code each picture of built scenes alone by x264; real driving video has 120 to 250 kB."""
+
+    scenes: Annotated[tuple[Path, ...], Positional]
+    """Folders that `rfedge scene build` made."""
+    crf: float = 23.0
+    """x264's constant rate factor."""
+    rate_hz: int = 10
+    """Pictures a second that x264 is told: it spends more on a picture that is shown for longer."""
+    json: Path | None = None
+    """Also write the figures into this file."""
+
+    def run(self) -> None:
+        """Print a line for each scene."""
+        from rfcore.errors import InvalidInput
+        from rfedge.street.intra_size import IntraCoding, sizes_of, write_sizes
+
+        if not self.scenes:
+            raise InvalidInput("scenes", "no folder is named")
+        coding = IntraCoding(self.crf, self.rate_hz)
+        measured = []
+        for sizes in sizes_of(self.scenes, coding):
+            print(sizes.line(), flush=True)
+            measured.append(sizes)
+        if self.json is not None:
+            write_sizes(self.json, measured, coding)

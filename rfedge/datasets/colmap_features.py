@@ -1,0 +1,211 @@
+"""Features and matches of all pictures, in a COLMAP database.
+
+Pictures lie under one root: those of the dataset in ``known``, as PNG, the new ones in ``new``.
+
+Cameras and poses between this project and COLMAP: the same axes, the same pixel centres.
+
+What can be chosen about poses from pictures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rfcore.camera import Pose
+from rfcore.dataset.colmap import camera_of, parameter_count
+from rfcore.dataset.source import SourceCamera
+from rfcore.errors import InvalidInput
+from rfcore.lens import BrownLens, FisheyeLens
+
+if TYPE_CHECKING:
+    import pycolmap
+from collections.abc import Sequence
+from pathlib import Path
+
+import pycolmap
+
+from rfcore.dataset.picture_file import picture_size_px
+from rfcore.dataset.source import SourcePicture
+from rfcore.errors import DatasetError
+from rfcore.image import write_png
+
+__all__ = [
+    "Matching",
+    "PoseSettings",
+    "SharedCamera",
+    "Workplace",
+    "add_known",
+    "add_new",
+    "camera_parameters",
+    "match",
+    "pose_from_colmap",
+    "rigid_of",
+    "source_camera",
+]
+
+
+class Matching(StrEnum):
+    """Which pairs of pictures are matched."""
+
+    EXHAUSTIVE = "exhaustive"
+    SEQUENTIAL = "sequential"
+
+
+class SharedCamera(StrEnum):
+    """Where the intrinsics of new pictures come from when there is a dataset to register to."""
+
+    DATASET = "dataset"
+    ESTIMATE = "estimate"
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """``max_side_px``: pictures are reduced to it to find features; ``features``: at most so many
+    a picture; ``model``: the camera model of new pictures, ``parameters`` its values in COLMAP's
+    order where they are known, which are then held; ``seed`` of RANSAC.
+    """
+
+    matching: Matching = Matching.EXHAUSTIVE
+    camera: SharedCamera = SharedCamera.DATASET
+    model: str = "SIMPLE_RADIAL"
+    parameters: tuple[float, ...] = ()
+    max_side_px: int = 1600
+    features: int = 8192
+    threads: int = 2
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        needed = parameter_count("model", self.model)
+        if self.parameters and len(self.parameters) != needed:
+            raise InvalidInput(
+                "parameters", f"{self.model} has {needed}, not {len(self.parameters)}"
+            )
+        for name in ("max_side_px", "features", "threads"):
+            if getattr(self, name) < 1:
+                raise InvalidInput(name, f"{getattr(self, name)} must be at least 1")
+
+
+def camera_parameters(camera: SourceCamera) -> tuple[str, list[float]]:
+    """Return COLMAP's name of the camera's model and its parameters."""
+    k, lens = camera.intrinsics, camera.lens
+    pinhole = [k.fx_px, k.fy_px, k.cx_px, k.cy_px]
+    if isinstance(lens, FisheyeLens):
+        return "OPENCV_FISHEYE", [*pinhole, lens.k1, lens.k2, lens.k3, lens.k4]
+    if isinstance(lens, BrownLens):
+        brown = [*pinhole, lens.k1, lens.k2, lens.p1, lens.p2]
+        return ("FULL_OPENCV", [*brown, lens.k3, 0, 0, 0]) if lens.k3 else ("OPENCV", brown)
+    return "PINHOLE", pinhole
+
+
+def source_camera(camera: pycolmap.Camera) -> SourceCamera:
+    """Return a camera that COLMAP estimated."""
+    size_px = (camera.width, camera.height)
+    return camera_of("estimated camera", camera.model.name, size_px, list(camera.params))
+
+
+def rigid_of(world_from_cam: Pose) -> pycolmap.Rigid3d:
+    """Return COLMAP's cam_from_world; its quaternions are x, y, z, w."""
+    import pycolmap
+
+    pose = world_from_cam.inverse()
+    w, x, y, z = pose.rotation
+    rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
+    return pycolmap.Rigid3d(rotation, np.array(pose.translation_m))
+
+
+def pose_from_colmap(cam_from_world: pycolmap.Rigid3d) -> Pose:
+    """Return world_from_cam."""
+    return Pose.from_matrix(cam_from_world.matrix().tolist()).inverse()
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """A folder with the pictures and the database."""
+
+    root: Path
+
+    @property
+    def database(self) -> Path:
+        """COLMAP's SQLite file."""
+        return self.root / "database.db"
+
+
+def add_known(place: Workplace, known: Sequence[SourcePicture], settings: PoseSettings) -> None:
+    """Add a dataset's pictures with their own cameras, as ``known/000000.png`` and so on."""
+    (place.root / "known").mkdir()
+    groups: dict[SourceCamera, list[str]] = {}
+    for i, picture in enumerate(known):
+        name = f"known/{i:06d}.png"
+        write_png(place.root / name, picture.read())
+        groups.setdefault(picture.camera, []).append(name)
+    for camera, names in groups.items():
+        options = pycolmap.ImageReaderOptions()
+        options.camera_model, parameters = camera_parameters(camera)
+        options.camera_params = ",".join(repr(float(value)) for value in parameters)
+        _extract(place, names, options, settings)
+
+
+def add_new(place: Workplace, names: Sequence[str], settings: PoseSettings) -> None:
+    """Add the new pictures: with the dataset's camera, or with one that is to be estimated."""
+    options = pycolmap.ImageReaderOptions()
+    options.camera_model = settings.model
+    options.camera_params = ",".join(map(repr, settings.parameters))
+    with pycolmap.Database.open(place.database) as database:
+        cameras = database.read_all_cameras()
+    if cameras and settings.camera is SharedCamera.DATASET:
+        options.existing_camera_id = _shared_camera(place, names, cameras)
+    _extract(place, names, options, settings)
+
+
+def match(place: Workplace, settings: PoseSettings) -> None:
+    """Match features and keep what two-view geometry confirms."""
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu, options.num_threads = False, settings.threads
+    pycolmap.set_random_seed(settings.seed)
+    if settings.matching is Matching.SEQUENTIAL:
+        pycolmap.match_sequential(place.database, options, device=pycolmap.Device.cpu)
+    else:
+        pycolmap.match_exhaustive(place.database, options, device=pycolmap.Device.cpu)
+
+
+def _shared_camera(
+    place: Workplace, names: Sequence[str], cameras: Sequence[pycolmap.Camera]
+) -> int:
+    if len(cameras) > 1:
+        raise DatasetError(
+            f"the dataset has {len(cameras)} cameras; choose --camera estimate for new pictures"
+        )
+    size_px = (cameras[0].width, cameras[0].height)
+    for name in names:
+        found = picture_size_px(place.root / name)
+        if found != size_px:
+            raise DatasetError(
+                f"{Path(name).name}: {found} px is not the {size_px} px of the dataset's camera; "
+                "choose --camera estimate"
+            )
+    return int(cameras[0].camera_id)
+
+
+def _extract(
+    place: Workplace,
+    names: Sequence[str],
+    reader: pycolmap.ImageReaderOptions,
+    settings: PoseSettings,
+) -> None:
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu, options.num_threads = False, settings.threads
+    options.max_image_size = settings.max_side_px
+    options.sift.max_num_features = settings.features
+    pycolmap.extract_features(
+        place.database,
+        place.root,
+        list(names),
+        pycolmap.CameraMode.SINGLE,
+        reader,
+        options,
+        pycolmap.Device.cpu,
+    )

@@ -1,0 +1,143 @@
+"""Poses from features: a new world, or a dataset's world that stays as it is.
+
+To register, points are triangulated from the dataset's pictures at their given poses; the new
+pictures are then resected against them and refined, while every given pose and camera is held.
+Alone, COLMAP's incremental mapping finds a world of its own, whose scale is not metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from rfcore.camera import Pose, TileOrigin
+from rfcore.dataset.assemble import chosen_origin
+from rfcore.dataset.source import SourceCamera, SourcePicture, SourcePoints
+from rfcore.errors import DatasetError
+from rfedge.datasets.colmap_features import (
+    PoseSettings,
+    SharedCamera,
+    Workplace,
+    add_known,
+    add_new,
+    match,
+    pose_from_colmap,
+    rigid_of,
+    source_camera,
+)
+
+__all__ = ["Solution", "solve_poses"]
+
+ANY_FORWARD_MOTION = 1.0
+"""A drive moves forward; COLMAP's default, 0.95, would refuse every pair to start from."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Cameras and world_from_cam by name for the pictures that were placed, and the points."""
+
+    placed: Mapping[str, tuple[SourceCamera, Pose]]
+    lost: tuple[str, ...]
+    points: SourcePoints
+
+
+def solve_poses(
+    root: Path, names: Sequence[str], known: Sequence[SourcePicture], settings: PoseSettings
+) -> Solution:
+    """Place the pictures ``root / name``; with ``known`` pictures, in their world.
+
+    Raises ``DatasetError`` when fewer than two pictures, or none of the new ones, can be placed.
+    """
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    place = Workplace(root)
+    origin = chosen_origin(known) if known else TileOrigin()
+    if known:
+        add_known(place, known, settings)
+    add_new(place, names, settings)
+    match(place, settings)
+    model = _registered(place, known, origin, settings) if known else _alone(place, settings)
+    return _solution(model, names, origin)
+
+
+def _alone(place: Workplace, settings: PoseSettings) -> pycolmap.Reconstruction:
+    folder = place.root / "model"
+    folder.mkdir()
+    options = _options(settings)
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not settings.parameters
+    options.mapper.init_max_forward_motion = ANY_FORWARD_MOTION
+    models = pycolmap.incremental_mapping(place.database, place.root, folder, options)
+    if not models:
+        raise DatasetError("no two pictures share enough to start from; take them closer together")
+    return max(models.values(), key=lambda model: model.num_reg_images())
+
+
+def _registered(
+    place: Workplace, known: Sequence[SourcePicture], origin: TileOrigin, settings: PoseSettings
+) -> pycolmap.Reconstruction:
+    given = _given_poses(place, known, origin)
+    held = set(given.cameras)
+    options = _options(settings)
+    options.fix_existing_frames = True
+    options.constant_cameras = held
+    if settings.camera is SharedCamera.DATASET or settings.parameters:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    for name in ("given", "model"):
+        (place.root / name).mkdir()
+    pycolmap.triangulate_points(
+        given, place.database, place.root, place.root / "given", True, options, False
+    )
+    models = pycolmap.incremental_mapping(
+        place.database, place.root, place.root / "model", options, place.root / "given"
+    )
+    if not models:
+        raise DatasetError("the dataset's own pictures do not match at their given poses")
+    return models[min(models)]
+
+
+def _given_poses(
+    place: Workplace, known: Sequence[SourcePicture], origin: TileOrigin
+) -> pycolmap.Reconstruction:
+    """The dataset's cameras and poses under the ids the database gave them."""
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(place.database) as database:
+        cameras, images = database.read_all_cameras(), database.read_all_images()
+    poses = {f"known/{i:06d}.png": picture.world_from_cam for i, picture in enumerate(known)}
+    given = [image for image in images if image.name in poses]
+    used = {image.camera_id for image in given}
+    for camera in cameras:
+        if camera.camera_id in used:
+            model.add_camera_with_trivial_rig(camera)
+    for image in given:
+        bare = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+        model.add_image_with_trivial_frame(bare, rigid_of(origin.localise(poses[image.name])))
+    return model
+
+
+def _options(settings: PoseSettings) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = settings.threads, settings.seed
+    return options
+
+
+def _solution(model: pycolmap.Reconstruction, names: Sequence[str], origin: TileOrigin) -> Solution:
+    placed = {}
+    for image in model.images.values():
+        if image.has_pose and image.name in names:
+            local = pose_from_colmap(image.cam_from_world())
+            camera = source_camera(model.cameras[image.camera_id])
+            placed[image.name] = (camera, origin.globalise(local))
+    if not placed:
+        raise DatasetError(f"none of the {len(names)} pictures could be placed; do they overlap?")
+    lost = tuple(name for name in names if name not in placed)
+    return Solution(placed, lost, _points(model, origin))
+
+
+def _points(model: pycolmap.Reconstruction, origin: TileOrigin) -> SourcePoints:
+    points = list(model.points3D.values())
+    xyz_m = np.array([point.xyz for point in points]).reshape(-1, 3)
+    rgb = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
+    return SourcePoints(xyz_m + np.array(astuple(origin)), rgb)

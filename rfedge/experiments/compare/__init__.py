@@ -1,0 +1,72 @@
+"""``rfedge eval compare``: BD-rate against what a user would pick instead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional
+
+__all__ = ["EvalCompare"]
+
+Preset = Literal["ultrafast", "superfast", "veryfast", "faster", "fast", "medium"]
+
+
+@dataclass(frozen=True)
+class EvalCompare:
+    """Compare with low-delay x264, x265 and SVT-AV1 at equal quality, and at equal processor time.
+
+    Prints what it will cost before it starts; stopped and started again, it goes on where it was.
+    """
+
+    field: Annotated[Path, Positional]
+    """The field archive (.rff) both ends hold."""
+    drives: Annotated[tuple[str, ...], Positional] = ()
+    """NAME@HZ=DATASET for each drive, such as `yardstick-empty@10=street/transforms_drive.json`."""
+    decimated: tuple[str, ...] = ()
+    """The same for drives of which every fifth frame is taken, at a fifth of the rate."""
+    background: tuple[str, ...] = ()
+    """The same for the empty street of a drive, frame by frame at its poses: tells what is not in
+    the field, for the split of the bits and for a rival that sends only the foreground."""
+    preset: Preset = "veryfast"
+    """x264 preset of ours and of the anchor."""
+    out: Path = Path("results/compare.json")
+    """The result file to write."""
+    cells: Path = Path("out/eval/compare")
+    """Folder of finished pieces."""
+    method: tuple[str, ...] = ()
+    """More codecs to compare with, as package.module:Class (see docs/evaluation.md)."""
+    quick: bool = False
+    """Eight frames and few rivals: to see that it works, not for figures."""
+    retime: bool = False
+    """Take the processor times anew (on a quiet machine) and keep everything else."""
+    figures: Path | None = None
+    """Folder for the curves as SVG, with their numbers as CSV."""
+
+    def run(self) -> None:
+        """Run what is not there yet and write the rows."""
+        from rich.console import Console
+
+        from rfedge.experiments.compare.drives import CompareJob
+        from rfedge.experiments.compare.run import run_compare
+
+        job = CompareJob(
+            field=self.field,
+            drives=self.drives,
+            preset=self.preset,
+            out=self.out,
+            cells=self.cells,
+            decimated=self.decimated,
+            backgrounds=self.background,
+            methods=self.method,
+            quick=self.quick,
+            retime=self.retime,
+        )
+        console = Console()
+        result = run_compare(job, console)
+        if self.figures is not None:
+            from rfedge.experiments.compare.figures import write_compare_figures
+
+            for path in write_compare_figures(result, self.figures):
+                console.print(f"  {path}")

@@ -1,0 +1,203 @@
+"""One drive of a comparison with everybody who codes it, read and rendered before anything runs.
+
+Who is compared with: families of encoder settings, and codecs that a user brings.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.codec.references import RENDER_ONLY
+from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField
+from rfcore.train import mean_psnr_db
+from rfedge.experiments.clips import DECIMATION, ClipCoder, DriveFrames, DriveName, read_drive
+from rfedge.experiments.compare.foreground import ForegroundCoder, foreground_mask
+from rfedge.experiments.compare.measure import Clip
+from rfedge.experiments.field_coder import FieldCoder, SeenClip, see_clip
+from rfedge.experiments.rivals import (
+    Rival,
+    svtav1_lowdelay,
+    x264_for_psnr,
+    x264_lowdelay,
+    x265_for_psnr,
+    x265_lowdelay,
+)
+from rfedge.results import check_result_path, revision
+
+__all__ = [
+    "CompareJob",
+    "DriveComparison",
+    "foreign_coder",
+    "read_drive_comparisons",
+    "rival_families",
+]
+
+
+KEYINTS = (10, 30, 250)
+
+
+def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
+    """Return the rivals by codec: the anchors alone of their kind, the others at several settings.
+
+    The first anchor is x264 as it comes, which is what a user has. It spends bits on looks that a
+    PSNR does not see, and our encoder does not; the second is tuned for PSNR as ours is, and so are
+    the stronger presets.
+    """
+    anchors: dict[str, list[ClipCoder]] = {
+        "x264-lowdelay": [x264_lowdelay(preset)],
+        "x264-lowdelay-psnr": [x264_for_psnr(preset)],
+    }
+    if quick:
+        return {**anchors, "svtav1-lowdelay": [svtav1_lowdelay(8)]}
+    return {
+        **anchors,
+        "x264-stronger": [x264_for_psnr(p) for p in ("medium", "veryslow")],
+        **{f"x264-keyint-{n}": [_with_key_frames(preset, n)] for n in KEYINTS},
+        "x264-intra-refresh": [_with_intra_refresh(preset)],
+        "x265-lowdelay": [
+            x265_lowdelay("veryfast"),
+            *(x265_for_psnr(p) for p in ("veryfast", "medium")),
+        ],
+        "svtav1-lowdelay": [svtav1_lowdelay(p) for p in (10, 8, 6, 4)],
+    }
+
+
+def _with_key_frames(preset: str, keyint: int) -> Rival:
+    return x264_lowdelay(preset, f"x264-keyint-{keyint}-{preset}", keyint=str(keyint))
+
+
+def _with_intra_refresh(preset: str) -> Rival:
+    """A column of intra blocks crosses the picture in ten frames; x264 waits as long before it."""
+    params = {"intra-refresh": "1", "keyint": "10"}
+    return x264_lowdelay(preset, f"x264-intra-refresh-10-{preset}", **params)
+
+
+def foreign_coder(text: str) -> ClipCoder:
+    """Return an instance of ``package.module:Class``; raise ``InvalidInput`` if there is none."""
+    module, _, name = text.partition(":")
+    try:
+        coder: ClipCoder = getattr(importlib.import_module(module), name)()
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise InvalidInput("method", f"{text!r} is no package.module:Class ({error})") from error
+    missing = [key for key in ("name", "points", "version", "code") if not hasattr(coder, key)]
+    if missing:
+        raise InvalidInput("method", f"{text!r} lacks {', '.join(missing)} of a ClipCoder")
+    return coder
+
+
+QUICK_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class CompareJob:
+    """What to compare; see ``rfedge eval compare --help``."""
+
+    field: Path
+    drives: Sequence[str]
+    preset: str
+    out: Path
+    cells: Path
+    decimated: Sequence[str] = ()
+    backgrounds: Sequence[str] = ()
+    methods: Sequence[str] = ()
+    quick: bool = False
+    retime: bool = False
+
+    def __post_init__(self) -> None:
+        check_result_path(self.out)
+        if not (self.drives or self.decimated):
+            raise InvalidInput("drives", "there is none")
+
+
+@dataclass(frozen=True)
+class DriveComparison:
+    """One drive with everybody who codes it, ours (``methods``) from what the field shows.
+
+    ``foregrounds``: bool [H, W] a frame, what differs from the empty street, if a ``background``
+    drive shows that; else nothing. ``background``: its digest.
+    """
+
+    contest: Clip
+    seen: SeenClip
+    foregrounds: Sequence[NDArray[np.bool_]]
+    background: str | None
+    methods: Sequence[FieldCoder]
+    families: Mapping[str, Sequence[ClipCoder]]
+    foreground_only: ForegroundCoder | None
+
+    @property
+    def coders(self) -> list[ClipCoder]:
+        """All of them, ours first."""
+        rivals = (coder for family in self.families.values() for coder in family)
+        last = [] if self.foreground_only is None else [self.foreground_only]
+        return [*self.methods, *rivals, *last]
+
+
+def read_drive_comparisons(job: CompareJob, field: RadianceField) -> list[DriveComparison]:
+    """Return a bout per drive.
+
+    Raises ``InvalidInput`` for a background that does not fit its drive, and as ``read_drive``.
+    """
+    limit = QUICK_FRAMES if job.quick else None
+    backgrounds = {_name(text): text for text in job.backgrounds}
+    unknown = backgrounds.keys() - {_name(text) for text in job.drives}
+    if unknown:
+        raise InvalidInput("background", f"there is no drive {sorted(unknown)} to stand behind")
+    slow = [read_drive(text).every(DECIMATION) for text in job.decimated]
+    bouts = [_drive_comparison(job, drive, None, field) for drive in slow]
+    for text in job.drives:
+        behind = backgrounds.get(_name(text))
+        background = None if behind is None else read_drive(behind, limit)
+        bouts.append(_drive_comparison(job, read_drive(text, limit), background, field))
+    return bouts
+
+
+def _name(text: str) -> tuple[str, float]:
+    name = DriveName.parse(text)
+    return name.scene, name.rate_hz
+
+
+def _drive_comparison(
+    job: CompareJob, drive: DriveFrames, background: DriveFrames | None, field: RadianceField
+) -> DriveComparison:
+    name, quality_db = drive.name, mean_psnr_db(field, drive.pictures)
+    contest = Clip(name.scene, name.rate_hz, drive.frames, drive.digest, quality_db)
+    families = rival_families(job.preset, quick=job.quick)
+    families |= {coder.name: [coder] for coder in map(foreign_coder, job.methods)}
+    seen = see_clip(field, drive.cameras)
+    foregrounds = _foregrounds(drive, background)
+    behind = None if background is None else background.digest
+    stamp = revision() if behind is None else f"{revision()}-before-{behind[:16]}"
+    coders = [
+        FieldCoder(
+            seen,
+            f"{name}-{job.preset}-{seen.field_id[:12]}",
+            stamp,
+            preset=job.preset,
+            references=references,
+            foregrounds=() if behind is None else foregrounds,
+        )
+        for name, references in (("rfedge", None), ("rfedge-render-only", RENDER_ONLY))
+    ]
+    rival = None
+    if behind is not None:
+        rival_stamp = f"{stamp}-{seen.field_id}"
+        rival = ForegroundCoder.of(job.preset, foregrounds, seen.renders, rival_stamp)
+    return DriveComparison(contest, seen, foregrounds, behind, coders, families, rival)
+
+
+def _foregrounds(drive: DriveFrames, background: DriveFrames | None) -> list[NDArray[np.bool_]]:
+    if background is None:
+        return [np.zeros(frame.y.shape, bool) for frame in drive.frames]
+    if len(background.frames) != len(drive.frames):
+        counts = f"{len(background.frames)} frames where the drive has {len(drive.frames)}"
+        raise InvalidInput("background", f"{drive.name.scene}: {counts}")
+    pairs = zip(drive.frames, background.frames, strict=True)
+    return [foreground_mask(*pair) for pair in pairs]

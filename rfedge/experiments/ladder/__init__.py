@@ -1,0 +1,61 @@
+"""``rfedge eval ladder``: what accuracy costs in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+__all__ = ["EvalLadder"]
+
+
+@dataclass(frozen=True)
+class EvalLadder:
+    """Measure every rung of the ladder: milliseconds of sender and receiver, bits and quality.
+
+    The result is what `cav-agent --deadline-ms 33 --ladder FILE` chooses from. Prints what it will
+    cost before it starts; stopped and started again, it goes on where it was.
+    """
+
+    fields: Annotated[tuple[Path, ...], Positional] = (Path("samples/fields/street.rff"),)
+    """Field archives (.rff), of any kind; the first one's full rung is what rates are against."""
+    drive: Path = Path("samples/street/transforms_drive_vehicles.json")
+    """The drive to code."""
+    frames: int = 24
+    """How many of its pictures."""
+    out: Path = Path("results/ladder.json")
+    """The result file to write."""
+    figures: Path = Path("docs/figures")
+    """Folder of the figure (SVG, and CSV with its numbers)."""
+    cells: Path = Path("out/eval/ladder")
+    """Folder of finished pieces."""
+    quick: bool = False
+    """Four frames and few rungs: to see that it works, not for figures."""
+
+    def run(self) -> None:
+        """Measure what is not there yet, write rows and figure, print the front."""
+        from rich.console import Console
+        from rich.table import Table
+
+        from rfedge.experiments.ladder.page import middle_rows, write_ladder_figure
+        from rfedge.experiments.ladder.run import LadderJob, run_ladder
+
+        console = Console()
+        job = LadderJob(self.fields, self.drive, self.out, self.cells, self.frames, self.quick)
+        result = run_ladder(job, console)
+        table = Table("rung", "sender ms", "receiver ms", "kbit", "PSNR dB", "rate %")
+        for row in sorted(middle_rows(result), key=lambda row: float(row["sender_ms"])):
+            if row["on_front"]:
+                table.add_row(
+                    row["rung"],
+                    f"{row['sender_ms']:.1f}",
+                    f"{row['receiver_ms']:.1f}",
+                    f"{row['bits_per_frame'] / 1e3:.1f}",
+                    f"{row['psnr_db']:.2f}",
+                    f"{row['rate_percent']:+.1f}",
+                )
+        console.print(table)
+        for path in write_ladder_figure(result, self.figures):
+            console.print(f"  {path}")

@@ -1,0 +1,293 @@
+"""Measure a ladder: fields and a drive in, ``ladder.json`` out, the cost said before it starts.
+
+Which rungs are measured, and what a rung is worth against the first.
+
+For splats: every detail with three, one and no temporal references at three presets, and from the
+full rung one further knob at a time. For hash grids: samples along a ray, and the picture's scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from rfcore.codec.sender.ladder import Rung
+from rfcore.dataset import read_dataset
+from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField, load_field
+from rfcore.field.interface import NGP, SPLATS
+from rfcore.field.quality import DETAILS, Quality
+from rfedge.experiments.cells import CellKey, CellStore
+from rfedge.experiments.ladder.measure import LadderClip, Rendered, measure_rung, render_clip
+from rfedge.results import check_result_path, provenance, revision, write_result
+
+__all__ = ["CRFS", "LadderJob", "fronts", "rate_percents", "run_ladder", "rungs_for"]
+
+
+CRFS = (23.0, 28.0, 33.0)
+PRESETS = ("medium", "veryfast", "ultrafast")
+REFERENCES = (3, 1, 0)
+SAMPLES = (None, 32, 8)
+RungRow = Mapping[str, Any]
+
+
+def rungs_for(kind: str, *, quick: bool) -> list[Rung]:
+    """Return the rungs to measure with a field of ``kind``, the full one first."""
+    if kind == SPLATS:
+        return _splat_rungs(quick)
+    if kind == NGP:
+        samples = (None, 8) if quick else SAMPLES
+        return [
+            Rung(Quality(samples_per_ray=n, scale=scale), preset="veryfast")
+            for n in samples
+            for scale in ((0.5,) if quick else (1.0, 0.5))
+        ]
+    raise InvalidInput("field.kind", f"{kind!r} has no ladder")
+
+
+def _splat_rungs(quick: bool) -> list[Rung]:
+    details = (1.0, 0.25) if quick else DETAILS
+    presets = ("medium", "ultrafast") if quick else PRESETS
+    grid = [
+        Rung(Quality(detail), references, preset=preset)
+        for detail in details
+        for references in REFERENCES[:: 2 if quick else 1]
+        for preset in presets
+    ]
+    if quick:
+        return grid
+    one_knob = [
+        Rung(Quality(sh_degree=1)),
+        Rung(Quality(sh_degree=0)),
+        Rung(Quality(scale=0.5)),
+        Rung(references=2),
+        Rung(photometric=False),
+        Rung(preset="superfast"),
+        *(Rung(Quality(detail), n, rough=True) for detail in (1.0, 0.5) for n in (3, 2, 1, 0)),
+        *(Rung(references=n, preset="veryfast", rough=True) for n in (3, 2, 1, 0)),
+    ]
+    low = [
+        Rung(Quality(0.5, 1), 1, photometric=False, preset="ultrafast"),
+        Rung(Quality(0.25, 0), 1, photometric=False, preset="ultrafast"),
+    ]
+    return grid + one_knob + low
+
+
+def rate_percents(curves: Sequence[Sequence[RungRow]]) -> list[float]:
+    """Return for each curve (one rung's rows over CRFs) its bits at equal quality, in percent more
+    than the first curve's: the mean over the qualities both reach, log(bits) linear in dB.
+
+    Raises ``InvalidInput`` for curves that share no quality.
+    """
+    return [_rate_percent(curves[0], curve) for curve in curves]
+
+
+def _rate_percent(base: Sequence[RungRow], other: Sequence[RungRow]) -> float:
+    ours, theirs = _curve(base), _curve(other)
+    low, high = max(ours[0][0], theirs[0][0]), min(ours[0][-1], theirs[0][-1])
+    if not low < high:
+        raise InvalidInput(
+            "ladder",
+            f"{other[0]['rung']} reaches {theirs[0][0]:.1f}..{theirs[0][-1]:.1f} dB, the first "
+            f"rung {ours[0][0]:.1f}..{ours[0][-1]:.1f} dB; take CRFs further apart",
+        )
+    grid = np.linspace(low, high, 33)
+    difference = np.interp(grid, *theirs) - np.interp(grid, *ours)
+    return float(100 * np.expm1(difference.mean()))
+
+
+def _curve(rows: Sequence[RungRow]) -> tuple[list[float], list[float]]:
+    points = sorted((row["psnr_db"], float(np.log(row["bits_per_frame"]))) for row in rows)
+    return [db for db, _ in points], [log_bits for _, log_bits in points]
+
+
+def fronts(rows: Sequence[RungRow]) -> list[bool]:
+    """Tell of each row whether no other at its CRF takes less of the sender's time without more
+    bits at equal quality, or fewer bits without more time."""
+    return [not any(_beats(other, row) for other in rows) for row in rows]
+
+
+def _beats(other: RungRow, row: RungRow) -> bool:
+    if other["settings"]["crf"] != row["settings"]["crf"]:
+        return False
+    a = (other["sender_ms"], other["rate_percent"])
+    b = (row["sender_ms"], row["rate_percent"])
+    return a[0] <= b[0] and a[1] <= b[1] and a != b
+
+
+QUICK_FRAMES = 4
+PROBE_FRAMES = 3
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class LadderJob:
+    """What to measure; see ``rfedge eval ladder --help``."""
+
+    fields: Sequence[Path]
+    drive: Path
+    out: Path
+    cells: Path
+    frames: int
+    quick: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.fields:
+            raise InvalidInput("fields", "name at least one field")
+        check_result_path(self.out)
+        if self.frames < PROBE_FRAMES:
+            raise InvalidInput("frames", f"{self.frames} must be at least {PROBE_FRAMES}")
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One field with the rungs it is measured on, and its clip's renders as they are needed."""
+
+    field: RadianceField
+    clip: LadderClip
+    revision: str
+    quick: bool
+
+    @cached_property
+    def rungs(self) -> list[Rung]:
+        """The rungs of this kind of field."""
+        return rungs_for(self.field.metadata.kind, quick=self.quick)
+
+    @cached_property
+    def _seen(self) -> dict[Quality, Rendered]:
+        return {}
+
+    def seen(self, quality: Quality) -> Rendered:
+        """Return the clip rendered at ``quality``; the last one asked for is kept."""
+        if quality not in self._seen:
+            self._seen.clear()
+            self._seen[quality] = render_clip(self.field, self.clip, quality)
+        return self._seen[quality]
+
+    def key(self, rung: Rung, crf: float) -> CellKey:
+        """Name the cell of a rung at a CRF."""
+        return {
+            "verb": "ladder",
+            "field": self.field.field_id,
+            "frames": self.clip.digest,
+            "rung": rung.name,
+            "crf": crf,
+            "revision": self.revision,
+        }
+
+    def measured(self, rung: Rung, crf: float) -> Row:
+        """Return the row of a rung at a CRF, but for what takes the others to say."""
+        quality, kind = rung.quality, self.field.metadata.kind
+        return {
+            "rung": f"{kind} {rung.name} crf{crf:g}",
+            "settings": {
+                "kind": kind,
+                "detail": quality.detail,
+                "sh_degree": quality.sh_degree,
+                "samples_per_ray": quality.samples_per_ray,
+                "scale": quality.scale,
+                "references": rung.references,
+                "photometric": rung.photometric,
+                "preset": rung.preset,
+                "rough": rung.rough,
+                "crf": crf,
+            },
+            **measure_rung(self.clip, self.seen(quality), rung, crf),
+        }
+
+
+def run_ladder(job: LadderJob, console: Console) -> Row:
+    """Measure what is not measured yet, write ``job.out``, and return its content.
+
+    Raises ``InvalidInput`` or ``DatasetError`` before anything is measured if an input is wrong.
+    """
+    dataset = read_dataset(job.drive)
+    clip = LadderClip.of(dataset, QUICK_FRAMES if job.quick else job.frames)
+    at = revision()
+    contenders = [Contender(load_field(path), clip, at, job.quick) for path in job.fields]
+    store = CellStore(job.cells)
+    _say_cost(contenders, store, console)
+    curves = [
+        [_row(contender, rung, crf, store, console) for crf in CRFS]
+        for contender in contenders
+        for rung in contender.rungs
+    ]
+    rows = _judged(curves)
+    result = {
+        "case": "ladder",
+        **provenance(at),
+        "quick": job.quick,
+        "threads": 1,
+        "size_px": list(clip.frames[0].size_px),
+        "fields": [
+            {
+                "kind": c.field.metadata.kind,
+                "field_id": c.field.field_id,
+                "primitives": c.field.primitives,
+                "held_out_psnr_db": c.field.metadata.held_out_psnr_db,
+            }
+            for c in contenders
+        ],
+        "frames": {"drive": str(job.drive), "count": len(clip.frames), "sha256": clip.digest},
+        "rows": rows,
+    }
+    write_result(job.out, result)
+    return result
+
+
+def _judged(curves: Sequence[Sequence[Row]]) -> list[Row]:
+    """Add to every row what only the whole ladder can say: rate against its first rung, front."""
+    rates = rate_percents(curves)
+    rows = [
+        {**row, "rate_percent": rate}
+        for curve, rate in zip(curves, rates, strict=True)
+        for row in curve
+    ]
+    return [{**row, "on_front": on} for row, on in zip(rows, fronts(rows), strict=True)]
+
+
+def _row(contender: Contender, rung: Rung, crf: float, store: CellStore, console: Console) -> Row:
+    def make() -> list[Row]:
+        row = contender.measured(rung, crf)
+        console.print(
+            f"  {row['rung']}: {row['sender_ms']:.0f} ms, {row['bits_per_frame'] / 1e3:.0f} kbit, "
+            f"{row['psnr_db']:.2f} dB"
+        )
+        return [row]
+
+    (row,) = store.rows(contender.key(rung, crf), make)
+    return row
+
+
+def _say_cost(contenders: Sequence[Contender], store: CellStore, console: Console) -> None:
+    """Time the full rung of each field on a few frames."""
+    cells, left, seconds = 0, 0, 0.0
+    for contender in contenders:
+        keys = [contender.key(rung, crf) for rung in contender.rungs for crf in CRFS]
+        missing = sum(not store.has(key) for key in keys)
+        cells, left = cells + len(keys), left + missing
+        if missing:
+            probe = _shortened(contender.clip)
+            began_s = monotonic()
+            first = contender.rungs[0]
+            seen = render_clip(contender.field, probe, first.quality)
+            rendered_s = monotonic()
+            measure_rung(probe, seen, first, CRFS[1])
+            per_frame = len(contender.clip.frames) / PROBE_FRAMES
+            qualities = len({rung.quality for rung in contender.rungs})
+            seconds += per_frame * qualities * (rendered_s - began_s)
+            seconds += per_frame * missing * (monotonic() - rendered_s)
+    console.print(f"{cells} rungs to measure, {left} of them left: at most {seconds / 60:.1f} min")
+
+
+def _shortened(clip: LadderClip) -> LadderClip:
+    return LadderClip(
+        clip.cameras[:PROBE_FRAMES], clip.pictures[:PROBE_FRAMES], clip.frames[:PROBE_FRAMES]
+    )

@@ -1,0 +1,80 @@
+"""``rfedge eval latency``: how long frames take over links, and what uplink they need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+__all__ = ["EvalLatency"]
+
+SAMPLES = (
+    "empty@10=samples/street/transforms_drive_empty.json",
+    "vehicles@10=samples/street/transforms_drive_vehicles.json",
+)
+
+
+@dataclass(frozen=True)
+class EvalLatency:
+    """Play our frames and low-delay x264's, of equal quality, over links on a virtual clock.
+
+    Tau and network latency over throughput and over recorded traces, the share of frames within 5
+    and 10 ms, and the uplink at which 99 % of them are. Coded clips are kept and not coded again.
+    """
+
+    field: Annotated[Path, Positional] = Path("samples/fields/street.rff")
+    """The field archive (.rff) both ends hold."""
+    drives: Annotated[tuple[str, ...], Positional] = SAMPLES
+    """NAME@HZ=DATASET for each drive."""
+    traces: tuple[Path, ...] = (Path("samples/links/drive.up"),)
+    """Recorded uplinks in Mahimahi's format."""
+    preset: str = "veryfast"
+    """x264 preset of both."""
+    quality_db: float = 33.0
+    """Luma PSNR that both are coded to."""
+    out: Path = Path("results/latency.json")
+    """The result file to write."""
+    figures: Path = Path("docs/figures")
+    """Folder of the figures (SVG, and CSV with their numbers)."""
+    cells: Path = Path("out/eval/latency")
+    """Folder of finished pieces."""
+    quick: bool = False
+    """Six frames of each drive: to see that it works, not for figures."""
+
+    def run(self) -> None:
+        """Code what is not there yet, play it, write rows and figures, print what is needed."""
+        from rich.console import Console
+        from rich.table import Table
+
+        from rfedge.experiments.latency.report import write_latency_figures
+        from rfedge.experiments.latency.run import LatencyJob, run_latency
+
+        job = LatencyJob(
+            field=self.field,
+            drives=self.drives,
+            traces=self.traces,
+            preset=self.preset,
+            quality_db=self.quality_db,
+            out=self.out,
+            cells=self.cells,
+            quick=self.quick,
+        )
+        console = Console()
+        result = run_latency(job, console)
+        table = Table("scene", "Hz", "method", "dB", "kbit", "p99 <= 5 ms", "p99 <= 10 ms, Mbit/s")
+        for row in result["needed"]:
+            uplink = row["uplink_bps_p99_within"]
+            table.add_row(
+                row["scene"],
+                f"{row['hz']:g}",
+                row["method"],
+                f"{row['psnr_db']:.2f}",
+                f"{row['kbit_per_frame']:.1f}",
+                f"{uplink['5'] / 1e6:.2f}",
+                f"{uplink['10'] / 1e6:.2f}",
+            )
+        console.print(table)
+        for path in write_latency_figures(result, self.figures):
+            console.print(f"  {path}")

@@ -1,0 +1,316 @@
+"""Run the latency experiment: drives and a field in, ``latency.json`` out.
+
+Ours and low-delay x264 of the same preset are coded to the same quality (the CRF is searched in
+steps of a half), then played over constant rates and over recorded links.
+
+How long a frame takes over a link, on a virtual clock: the paper's tau, and what users feel.
+
+``tau`` is a message's own transmission time. The network latency adds waiting behind earlier
+frames and the link's propagation; end to end adds what both ends compute. A clip is played again
+and again (its first frame once), captured at its rate. As the product does, at most ``WINDOW``
+frames are under way: a frame that finds more is dropped before it is coded, and counts as late.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from rfcore.codec.sender.ladder import Rung
+from rfcore.dataset import read_dataset
+from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField, load_field
+from rfcore.link import DirectionPlan, LinkProfile
+from rfcore.link.trace import read_mahimahi
+from rfedge.experiments.cells import CellStore
+from rfedge.experiments.clips import ClipCoder, CodedClip, DriveName
+from rfedge.experiments.compare.measure import Clip
+from rfedge.experiments.field_coder import FieldCoder, see_clip
+from rfedge.experiments.ladder.measure import LadderClip, measure_rung, render_clip
+from rfedge.experiments.rivals import x264_lowdelay
+from rfedge.results import check_result_path, provenance, revision, write_result
+
+__all__ = [
+    "BUDGETS_MS",
+    "FRAMES_FOR_REQUIREMENT",
+    "REQUIREMENT",
+    "LatencyJob",
+    "Played",
+    "needed_rate_bps",
+    "play",
+    "repeated",
+    "run_latency",
+]
+
+
+WINDOW = 2
+"""Frames of one camera under way (``mec_server.config.SessionLimits``)."""
+BUDGETS_MS = (5.0, 10.0)
+"""Network latencies a digital twin asks for (the paper: 5 to 10 ms)."""
+REQUIREMENT = 0.99999
+"""Share of frames that must be so quick (the paper)."""
+FRAMES_FOR_REQUIREMENT = math.ceil(math.log(0.05) / math.log(REQUIREMENT))
+"""Frames in time without a single late one before 99.999 % may be claimed with 95 % confidence."""
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Played:
+    """A clip over a link. ``tau_ms`` and ``network_ms`` [N] are of the frames that were sent."""
+
+    tau_ms: F64
+    network_ms: F64
+    dropped: int
+
+    @property
+    def frames(self) -> int:
+        """How many frames were captured."""
+        return len(self.network_ms) + self.dropped
+
+    def share_within(self, budget_ms: float) -> float:
+        """Return the share of all captured frames that came within ``budget_ms``."""
+        return float((self.network_ms <= budget_ms).sum() / self.frames)
+
+    def quantile_ms(self, share: float) -> float:
+        """Return the latency that ``share`` of the captured frames stay within; dropped ones never
+        come, so it may be infinite."""
+        late = np.full(self.dropped, np.inf)
+        return float(np.quantile(np.concatenate([self.network_ms, late]), share, method="higher"))
+
+
+def repeated(frame_bytes: Sequence[int], count: int) -> list[int]:
+    """Return ``count`` sizes: the clip without its first frame, which a stream sends once, again
+    and again."""
+    steady = list(frame_bytes)[1:]
+    if not steady:
+        raise InvalidInput("frames", "a clip needs at least two frames")
+    return [steady[k % len(steady)] for k in range(count)]
+
+
+def play(frame_bytes: Sequence[int], rate_hz: float, link: DirectionPlan) -> Played:
+    """Send a frame of each size, one every ``1 / rate_hz`` seconds, over ``link``."""
+    machine = link.unbounded().link()
+    due: list[float] = []
+    tau, network = [], []
+    dropped = 0
+    for index, size in enumerate(frame_bytes):
+        now = index / rate_hz
+        machine.pop_due(now)
+        due = [at for at in due if at > now]
+        if len(due) >= WINDOW:
+            dropped += 1
+            continue
+        delivery = machine.push(index, size, now)
+        due.append(delivery.due_s)
+        tau.append(1e3 * (delivery.end_s - delivery.start_s))
+        network.append(1e3 * (delivery.due_s - now))
+    return Played(np.array(tau), np.array(network), dropped)
+
+
+def needed_rate_bps(
+    frame_bytes: Sequence[int], rate_hz: float, budget_ms: float, share: float = 0.99
+) -> float:
+    """Return the lowest constant rate, to 0.5 %, at which ``share`` of the frames come in time."""
+
+    def in_time(rate_bps: float) -> bool:
+        plan = DirectionPlan(LinkProfile(rate_bps))
+        return play(frame_bytes, rate_hz, plan).quantile_ms(share) <= budget_ms
+
+    return _lowest(in_time, 1e4, 1e10)
+
+
+def _lowest(holds: Callable[[float], bool], low: float, high: float) -> float:
+    """Return the lowest value for which ``holds``, which is monotonic, by halving in logarithms."""
+    if not holds(high):
+        raise InvalidInput("budget", f"not even {high:g} bit/s are enough")
+    while high > 1.005 * low:
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return high
+
+
+RATES_MBPS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+CRF_STEP = 0.5
+FIRST_CRF, LOWEST_CRF, HIGHEST_CRF = 27.0, 14.0, 44.0
+QUICK_FRAMES, PLAYED_FRAMES = 6, 3000
+CURVE_POINTS = 101
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class LatencyJob:
+    """What to play; see ``rfedge eval latency --help``."""
+
+    field: Path
+    drives: Sequence[str]
+    traces: Sequence[Path]
+    preset: str
+    quality_db: float
+    out: Path
+    cells: Path
+    quick: bool = False
+
+    def __post_init__(self) -> None:
+        check_result_path(self.out)
+        if not 20 <= self.quality_db <= 50:
+            raise InvalidInput("quality_db", f"{self.quality_db} dB is outside 20..50 dB")
+
+
+@dataclass(frozen=True)
+class Sender:
+    """A method at one quality: its frames, and what both ends compute, stage by stage."""
+
+    contest: Clip
+    method: str
+    clip: CodedClip
+    stage_ms: dict[str, float]
+
+    @property
+    def facts(self) -> Row:
+        """What every row says about the sender."""
+        mse = float(self.clip.luma_mse[1:].mean())
+        return {
+            "scene": self.contest.scene,
+            "hz": self.contest.rate_hz,
+            "method": self.method,
+            "crf": self.clip.point,
+            "psnr_db": float(10 * np.log10(255.0**2 / mse)),
+        }
+
+
+def run_latency(job: LatencyJob, console: Console) -> Row:
+    """Code, play, write ``job.out``, and return its content."""
+    names = [DriveName.parse(text) for text in job.drives]
+    links = list(_links(job.traces))
+    field = load_field(job.field)
+    console.print(
+        f"{2 * len(names)} clips to code at about 5 CRFs each, {len(links)} links to play them over"
+    )
+    began_s = monotonic()
+    senders = [s for name in names for s in _senders(job, name, field, console)]
+    console.print(f"coded in {monotonic() - began_s:.0f} s")
+    rows = [_row(sender, name, plan) for sender in senders for name, plan in links]
+    result = {
+        "case": "latency",
+        **provenance(revision()),
+        "quick": job.quick,
+        "field_id": field.field_id,
+        "field_psnr_db": {s.contest.scene: s.contest.field_psnr_db for s in senders},
+        "frames": {s.contest.scene: s.contest.frames_digest for s in senders},
+        "traces": {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in job.traces},
+        "played_frames": PLAYED_FRAMES,
+        "requirement": {"share": REQUIREMENT, "frames_needed": FRAMES_FOR_REQUIREMENT},
+        "needed": [_needed(sender) for sender in senders],
+        "rows": rows,
+    }
+    write_result(job.out, result)
+    return result
+
+
+def _links(traces: Sequence[Path]) -> Iterator[tuple[str, DirectionPlan]]:
+    for rate_mbps in RATES_MBPS:
+        yield f"{rate_mbps:g} Mbit/s", DirectionPlan(LinkProfile(1e6 * rate_mbps))
+    for path in traces:
+        trace = read_mahimahi(path)
+        yield path.stem, DirectionPlan(LinkProfile(trace.mean_rate_bps), (trace,))
+
+
+def _senders(
+    job: LatencyJob, name: DriveName, field: RadianceField, console: Console
+) -> Iterator[Sender]:
+    clip = LadderClip.of(read_dataset(name.dataset), QUICK_FRAMES if job.quick else None)
+    seen = see_clip(field, clip.cameras)
+    contest = Clip(name.scene, name.rate_hz, clip.frames, clip.digest, None)
+    store = CellStore(job.cells)
+    ours = FieldCoder(seen, f"rfedge-{job.preset}", revision(), preset=job.preset)
+    coded = _at_quality(contest, ours, job.quality_db, store)
+    yield Sender(contest, ours.name, coded, _own_stages(job, clip, field, coded.point))
+    rival = x264_lowdelay(job.preset)
+    coded = _at_quality(contest, rival, job.quality_db, store)
+    stages = {"sender encode": coded.cpu_ms / len(coded.frame_bytes)}
+    yield Sender(contest, rival.name, coded, stages)
+    console.print(f"  {name.scene} {name.rate_hz:g} Hz")
+
+
+def _own_stages(
+    job: LatencyJob, clip: LadderClip, field: RadianceField, crf: float
+) -> dict[str, float]:
+    """Return the milliseconds of both ends, from the ladder's measurement of the full rung."""
+    rung = Rung(preset=job.preset)
+    row = measure_rung(clip, render_clip(field, clip, rung.quality), rung, crf)
+    ours = {f"sender {name}": ms for name, ms in row["sender_stage_ms"].items()}
+    return ours | {f"receiver {name}": ms for name, ms in row["receiver_stage_ms"].items()}
+
+
+def _at_quality(contest: Clip, coder: ClipCoder, quality_db: float, store: CellStore) -> CodedClip:
+    """Return the clip at the highest CRF, in steps of a half, that is not below ``quality_db``."""
+
+    def coded(crf: float) -> CodedClip:
+        key = contest.cell_key(coder, crf)
+        return store.clip(key, lambda: coder.code(contest.frames, contest.rate_hz, crf))
+
+    low, high = LOWEST_CRF, HIGHEST_CRF
+    crf = FIRST_CRF
+    while high - low > CRF_STEP:
+        good = 10 * np.log10(255.0**2 / coded(crf).luma_mse[1:].mean()) >= quality_db
+        low, high = (crf, high) if good else (low, crf)
+        crf = low + CRF_STEP * max(1, round((high - low) / 2 / CRF_STEP))
+    return coded(low)
+
+
+def _row(sender: Sender, name: str, plan: DirectionPlan) -> Row:
+    sizes = repeated(sender.clip.frame_bytes.tolist(), PLAYED_FRAMES)
+    played = play(sizes, sender.contest.rate_hz, plan)
+    computing_ms = sum(sender.stage_ms.values())
+    curve = [played.quantile_ms(share) for share in np.linspace(0, 1, CURVE_POINTS)]
+    return {
+        **sender.facts,
+        "link": name,
+        "rate_bps": plan.profile.rate_bps,
+        "frames": played.frames,
+        "dropped": played.dropped,
+        "tau_ms": _spread(played.tau_ms),
+        "network_ms": _spread(played.network_ms),
+        "network_p99_ms": _finite(played.quantile_ms(0.99)),
+        "end_to_end_p50_ms": _finite(played.quantile_ms(0.5) + computing_ms),
+        "end_to_end_p99_ms": _finite(played.quantile_ms(0.99) + computing_ms),
+        "share_within": {f"{ms:g}": played.share_within(ms) for ms in BUDGETS_MS},
+        "network_quantiles_ms": [_finite(ms) for ms in curve],
+    }
+
+
+def _needed(sender: Sender) -> Row:
+    sizes = repeated(sender.clip.frame_bytes.tolist(), PLAYED_FRAMES)
+    rate_hz = sender.contest.rate_hz
+    return {
+        **sender.facts,
+        "kbit_per_frame": 8e-3 * float(sender.clip.frame_bytes[1:].mean()),
+        "largest_kbit": 8e-3 * float(sender.clip.frame_bytes[1:].max()),
+        "first_frame_kbit": 8e-3 * float(sender.clip.frame_bytes[0]),
+        "uplink_bps_p99_within": {
+            f"{ms:g}": needed_rate_bps(sizes, rate_hz, ms) for ms in BUDGETS_MS
+        },
+        "stage_ms": sender.stage_ms,
+    }
+
+
+def _spread(values: Any) -> dict[str, float]:
+    return {
+        "mean": float(np.mean(values)),
+        "p50": float(np.quantile(values, 0.5)),
+        "p99": float(np.quantile(values, 0.99)),
+    }
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity: a quantile of frames that never came is null."""
+    return value if np.isfinite(value) else None

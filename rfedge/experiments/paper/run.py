@@ -1,0 +1,220 @@
+"""The published experiment over drives and fields: one result file, its figures and their numbers.
+
+Cells are one frame at one size; their rows run over presets and rate factors. Two controls stand
+beside every field, as render: ``grey`` knows nothing, ``behind`` is the field itself seen in the
+opposite direction, the right kind of picture of the wrong place.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from rfcore.camera import Camera, Pose
+from rfcore.dataset import read_dataset
+from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField, load_field
+from rfcore.image import Rgb
+from rfcore.views import PosedPicture
+from rfedge.experiments.cells import CellStore, Rows
+from rfedge.experiments.paper.published import (
+    PUBLISHED_CRFS,
+    PUBLISHED_PRESETS,
+    Making,
+    PublishedFrame,
+    Setting,
+    Size,
+    published_rows,
+    reduced,
+)
+from rfedge.experiments.picture_quality import BANDS, flip
+from rfedge.results import check_result_path, provenance, revision, write_result
+
+__all__ = ["CONTROLS", "PaperJob", "named_path", "run_paper", "views_of"]
+
+CONTROLS = ("grey", "behind")
+CONTROL_PRESET, CONTROL_CRF = "medium", 23.0
+TURNED_ROUND = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+"""Half a turn about the camera's vertical axis."""
+QUICK_FRAMES = 2
+
+
+@dataclass(frozen=True)
+class PaperJob:
+    """What to run; see ``rfedge eval paper --help``. ``fields`` and ``drives`` are NAME=PATH."""
+
+    fields: Sequence[str]
+    drives: Sequence[str]
+    sizes_px: Sequence[Size]
+    out: Path
+    cells: Path
+    every: int = 1
+    quick: bool = False
+
+    def __post_init__(self) -> None:
+        check_result_path(self.out)
+        if not (self.fields and self.drives and self.sizes_px):
+            raise InvalidInput("paper", "needs at least one field, one drive and one size")
+        if self.every < 1:
+            raise InvalidInput("every", f"{self.every} must be at least 1")
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One frame of one drive, one field and one size."""
+
+    field_name: str
+    field: RadianceField
+    scene: str
+    picture: PosedPicture
+    size_px: Size
+
+
+def named_path(text: str) -> tuple[str, Path]:
+    """Return name and path of ``NAME=PATH``; raise ``InvalidInput`` for another form."""
+    name, equals, path = text.partition("=")
+    if not (name and equals and path):
+        raise InvalidInput("name", f"{text!r} is not NAME=PATH, as 3dgs=street.rff")
+    return name, Path(path)
+
+
+def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
+    """Run what is not there yet, write ``job.out`` and return its content.
+
+    Raises ``InvalidInput``, ``DatasetError`` or ``FieldFormatError`` before anything is coded if an
+    input is wrong.
+    """
+    fields = [(name, load_field(path)) for name, path in map(named_path, job.fields)]
+    pieces = list(_pieces(job, fields))
+    store, stamp = CellStore(job.cells), revision()
+    _say_cost(pieces, store, stamp, console)
+    rows = [row for piece in pieces for row in store.rows(_key(piece, stamp), _maker(piece))]
+    result = {
+        "case": "paper",
+        **provenance(stamp),
+        "quick": job.quick,
+        "field_ids": {name: field.field_id for name, field in fields},
+        "lpips": "n/a: no weights",
+        "bands_cycles_per_px": [list(band) for band in BANDS],
+        "rows": rows,
+    }
+    write_result(job.out, result)
+    return result
+
+
+def views_of(job: PaperJob) -> list[tuple[str, Rgb]]:
+    """Return the first frame of each drive as the camera has it and as each field renders it."""
+    views = []
+    for scene, path in map(named_path, job.drives):
+        picture = read_dataset(path).pictures[0]
+        views.append((f"{scene}: camera", picture.read()))
+        for name, field_path in map(named_path, job.fields):
+            views.append((f"{scene}: {name}", _render(load_field(field_path), picture.camera)))
+    return views
+
+
+def _pieces(job: PaperJob, fields: Sequence[tuple[str, RadianceField]]) -> Iterator[Piece]:
+    for scene, path in map(named_path, job.drives):
+        pictures = read_dataset(path).pictures[:: job.every]
+        pictures = pictures[: QUICK_FRAMES if job.quick else None]
+        for name, field in fields:
+            for picture in pictures:
+                for size_px in job.sizes_px:
+                    yield Piece(name, field, scene, picture, size_px)
+
+
+def _key(piece: Piece, stamp: str) -> dict[str, str | float | int | None]:
+    pixels = piece.picture.read()
+    pose = repr(piece.picture.camera).encode()
+    return {
+        "field": piece.field.field_id,
+        "field_name": piece.field_name,
+        "scene": piece.scene,
+        "frame": piece.picture.name,
+        "input": hashlib.sha256(pixels.tobytes() + pose).hexdigest(),
+        "width": piece.size_px[0],
+        "height": piece.size_px[1],
+        "revision": stamp,
+    }
+
+
+def _maker(piece: Piece) -> Any:
+    return lambda: list(_rows(piece))
+
+
+def _rows(piece: Piece) -> Iterator[dict[str, Any]]:
+    settings = [
+        Setting(piece.size_px, making, preset, crf)
+        for making in _makings(piece)
+        for preset in PUBLISHED_PRESETS
+        for crf in PUBLISHED_CRFS
+    ]
+    seen = _seen(piece, piece.picture.camera)
+    size_px = piece.size_px
+    difference = flip(seen.render(size_px, "downscaled"), reduced(seen.camera, size_px))
+    for row in _labelled(piece, piece.field_name, seen, settings):
+        yield row if row["render"] == "native" else {**row, "rf_flip": difference}
+    control = [Setting(piece.size_px, "downscaled", CONTROL_PRESET, CONTROL_CRF)]
+    camera = piece.picture.camera
+    behind = Camera(camera.intrinsics, camera.world_from_cam.compose(TURNED_ROUND))
+    yield from _labelled(piece, f"{piece.field_name}:behind", _seen(piece, behind), control)
+    grey = np.full((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), 128, np.uint8)
+    blind = PublishedFrame(
+        piece.picture.name, piece.picture.read(), lambda size_px, _making: reduced(grey, size_px)
+    )
+    yield from _labelled(piece, f"{piece.field_name}:grey", blind, control)
+
+
+def _makings(piece: Piece) -> Sequence[Making]:
+    k = piece.picture.camera.intrinsics
+    full = piece.size_px == (k.width_px, k.height_px)
+    return ("downscaled",) if full else ("downscaled", "native")
+
+
+def _labelled(piece: Piece, label: str, frame: PublishedFrame, settings: Sequence[Setting]) -> Rows:
+    return [
+        {"field": label, "scene": piece.scene, **row} for row in published_rows(frame, settings)
+    ]
+
+
+def _seen(piece: Piece, camera: Camera) -> PublishedFrame:
+    full = _render(piece.field, camera)
+
+    def render(size_px: Size, making: Making) -> Rgb:
+        if making == "downscaled":
+            return reduced(full, size_px)
+        return _render(
+            piece.field, Camera(camera.intrinsics.resized(*size_px), camera.world_from_cam)
+        )
+
+    return PublishedFrame(piece.picture.name, piece.picture.read(), render)
+
+
+def _render(field: RadianceField, camera: Camera) -> Rgb:
+    colour = np.clip(field.render_colour(camera), 0, 1)
+    pixels: Rgb = np.floor(colour * 255 + 0.5).astype(np.uint8)
+    return pixels
+
+
+def _say_cost(pieces: Sequence[Piece], store: CellStore, stamp: str, console: Console) -> None:
+    """Do the first piece that is not there, and say what the others will take by their pixels."""
+    left = [piece for piece in pieces if not store.has(_key(piece, stamp))]
+    estimate = "nothing left to do"
+    if left:
+        began_s = monotonic()
+        store.rows(_key(left[0], stamp), _maker(left[0]))
+        per_pixel_s = (monotonic() - began_s) / _pixels(left[0])
+        total_s = sum(map(_pixels, left[1:])) * per_pixel_s
+        estimate = f"{len(left)} left, about {total_s / 60:.1f} minutes"
+    console.print(f"{len(pieces)} frames and sizes, {estimate}")
+
+
+def _pixels(piece: Piece) -> int:
+    return piece.size_px[0] * piece.size_px[1]

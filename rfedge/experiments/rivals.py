@@ -1,0 +1,239 @@
+"""What a user would pick instead: x264, x265 and SVT-AV1 set for low delay, one thread.
+
+Each runs as a user would run it on a vehicle: every frame goes out before the next comes in (no
+reordering, no lookahead; checked, not hoped), rate by CRF, one key frame at the start unless the
+rival is about key frames. Options are the libraries' own names.
+
+Keep an encoder library from taking the machine.
+
+SVT-AV1 asks for real-time scheduling when it runs as root: its own threads and, for good, the one
+that opened it. Everything started afterwards inherits that and starves what else runs, and times
+taken beside it are worth nothing. Linux only; elsewhere there is nothing to undo.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+from time import process_time_ns
+from typing import Any, Literal, cast
+
+import av
+import numpy as np
+from av.error import FFmpegError
+from numpy.typing import NDArray
+
+from rfcore.errors import CodecError, InvalidInput
+from rfcore.image import I420
+from rfedge.experiments.clips import CodedClip, luma_mse
+from rfedge.experiments.picture_quality import luma_ssim
+
+__all__ = [
+    "CodedPictures",
+    "Rival",
+    "ordinary_scheduling",
+    "picture",
+    "svtav1_lowdelay",
+    "video_frame",
+    "x264_for_psnr",
+    "x264_lowdelay",
+    "x265_for_psnr",
+    "x265_lowdelay",
+]
+
+
+@contextmanager
+def ordinary_scheduling() -> Iterator[None]:
+    """Give all threads of this process, new ones too, the policy that this one had before."""
+    policy, priority = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        for task in Path("/proc/self/task").iterdir():
+            with suppress(ProcessLookupError):  # a thread may end meanwhile
+                if os.sched_getscheduler(int(task.name)) != policy:
+                    os.sched_setscheduler(int(task.name), policy, priority)
+
+
+X264_CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0, 38.0, 41.0)
+X265_CRFS = (19.0, 22.0, 25.0, 28.0, 31.0, 34.0, 37.0, 40.0, 43.0)
+SVT_CRFS = (20.0, 27.0, 34.0, 41.0, 48.0, 55.0)
+"""Spans the headline window of 32..35 dB on street pictures, with room on either side."""
+
+os.environ.setdefault("SVT_LOG", "1")  # read when the library opens: errors only
+
+
+@dataclass(frozen=True)
+class CodedPictures:
+    """Bytes of each frame, the pictures a decoder made of them, and the sender's time."""
+
+    frame_bytes: Sequence[int]
+    decoded: Sequence[I420]
+    cpu_ms: float
+
+
+@dataclass(frozen=True)
+class Rival:
+    """One encoder with its options; codes a clip by feeding frames one at a time."""
+
+    name: str
+    encoder: str
+    decoder: str
+    options: Mapping[str, str]
+    points: Sequence[float] = field(default=X264_CRFS)
+
+    @property
+    def version(self) -> str:
+        """The libraries come with PyAV."""
+        return f"PyAV {av.__version__}"
+
+    def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
+        """Code and decode ``frames`` at CRF ``point``.
+
+        Raises ``InvalidInput`` without frames or for odd sizes, ``CodecError`` if a library fails
+        or holds a frame back.
+        """
+        if not frames or any(n % 2 for n in frames[0].size_px):
+            raise InvalidInput("frames", "a rival needs frames of one even size")
+        made = self.pictures(frames, rate_hz, point)
+        pairs = list(zip(made.decoded, frames, strict=True))
+        return CodedClip(
+            point,
+            np.array(made.frame_bytes),
+            np.array([luma_mse(*pair) for pair in pairs]),
+            np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
+            made.cpu_ms,
+        )
+
+    def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
+        """Return what ``code`` measures; raises as it does, but does not look at the sizes."""
+        began_ns = process_time_ns()
+        packets = self._encoded(frames, rate_hz, point)
+        cpu_ms = (process_time_ns() - began_ns) / 1e6
+        return CodedPictures([len(packet) for packet in packets], self._decoded(packets), cpu_ms)
+
+    def _encoded(self, frames: Sequence[I420], rate_hz: float, point: float) -> list[bytes]:
+        encoder = self._encoder(frames[0].size_px, rate_hz, point)
+        packets = []
+        try:
+            for index, frame in enumerate(frames):
+                made = encoder.encode(video_frame(frame, index))
+                if len(made) != 1:
+                    raise CodecError(f"{self.name}: frame {index} came out as {len(made)} packets")
+                packets.append(bytes(made[0]))
+            if encoder.encode(None):
+                raise CodecError(f"{self.name}: kept a frame until the end")
+        except (FFmpegError, ValueError) as error:
+            raise CodecError(f"{self.name}: {error}") from error
+        return packets
+
+    def _encoder(
+        self, size_px: tuple[int, int], rate_hz: float, point: float
+    ) -> av.VideoCodecContext:
+        encoder = _opened(self.encoder, "w")
+        rate = Fraction(rate_hz).limit_denominator(1000)
+        encoder.width, encoder.height = size_px
+        encoder.pix_fmt = "yuv420p"
+        encoder.time_base, encoder.framerate = 1 / rate, rate
+        encoder.thread_count = 1
+        encoder.options = {**self.options, "crf": f"{point:g}"}
+        with ordinary_scheduling():
+            encoder.open()
+        return encoder
+
+    def _decoded(self, packets: Sequence[bytes]) -> list[I420]:
+        decoder = _opened(self.decoder, "r")
+        decoder.thread_count = 1
+        frames = [f for packet in packets for f in decoder.decode(av.Packet(packet))]
+        return [picture(frame) for frame in (*frames, *decoder.decode(None))]
+
+
+def x264_lowdelay(preset: str, name: str | None = None, **params: str) -> Rival:
+    """Return x264 with ``tune=zerolatency``: IPPP, no scene cuts; ``params`` are added to it."""
+    options = {"keyint": "infinite", "scenecut": "0", "threads": "1", **params}
+    return Rival(
+        name or f"x264-lowdelay-{preset}",
+        "libx264",
+        "h264",
+        {"preset": preset, "tune": "zerolatency", "x264-params": _joined(options)},
+    )
+
+
+def x264_for_psnr(preset: str) -> Rival:
+    """Return the same with ``tune=psnr``, as whoever compares PSNRs should have it."""
+    plain = x264_lowdelay(preset, f"x264-lowdelay-psnr-{preset}")
+    return replace(plain, options={**plain.options, "tune": "zerolatency,psnr"})
+
+
+def x265_lowdelay(preset: str) -> Rival:
+    """Return x265 with ``tune=zerolatency``, one key frame."""
+    return _x265(f"x265-lowdelay-{preset}", preset, {})
+
+
+def x265_for_psnr(preset: str) -> Rival:
+    """Return the same as ``tune=psnr`` would have it; x265 takes one tune only."""
+    tuned = {"aq-mode": "0", "psy-rd": "0", "psy-rdoq": "0"}
+    return _x265(f"x265-lowdelay-psnr-{preset}", preset, tuned)
+
+
+def _x265(name: str, preset: str, params: Mapping[str, str]) -> Rival:
+    options = {
+        "keyint": "-1",
+        "scenecut": "0",
+        "log-level": "none",
+        "pools": "none",
+        "frame-threads": "1",
+        **params,
+    }
+    return Rival(
+        name,
+        "libx265",
+        "hevc",
+        {"preset": preset, "tune": "zerolatency", "x265-params": _joined(options)},
+        X265_CRFS,
+    )
+
+
+def svtav1_lowdelay(preset: int) -> Rival:
+    """Return SVT-AV1 with ``pred-struct=1`` (low delay), one key frame."""
+    options = {"pred-struct": "1", "keyint": "-1", "lp": "1", "rc": "0"}
+    return Rival(
+        f"svtav1-lowdelay-p{preset}",
+        "libsvtav1",
+        "libdav1d",
+        {"preset": str(preset), "svtav1-params": _joined(options)},
+        SVT_CRFS,
+    )
+
+
+def _opened(codec: str, mode: Literal["r", "w"]) -> av.VideoCodecContext:
+    """PyAV knows only some codec names to be of video."""
+    return cast(av.VideoCodecContext, av.CodecContext.create(codec, mode))
+
+
+def _joined(options: Mapping[str, str]) -> str:
+    return ":".join(f"{name}={value}" for name, value in options.items())
+
+
+def video_frame(source: I420, index: int, pixel_format: str = "yuv420p") -> av.VideoFrame:
+    """Return a picture of even size as PyAV's encoders take it, the ``index``-th of its clip."""
+    frame = av.VideoFrame(*source.size_px, pixel_format)
+    for plane, samples in zip(frame.planes, source.planes, strict=True):
+        _samples(plane)[:] = samples
+    frame.pts = index
+    return frame
+
+
+def picture(frame: av.VideoFrame) -> I420:
+    """Return what a decoder showed."""
+    y, u, v = (_samples(plane).copy() for plane in frame.planes)
+    return I420(y, u, v)
+
+
+def _samples(plane: Any) -> NDArray[np.uint8]:
+    samples: NDArray[np.uint8] = np.frombuffer(memoryview(plane), np.uint8)
+    return samples.reshape(-1, plane.line_size)[: plane.height, : plane.width]

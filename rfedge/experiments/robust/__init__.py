@@ -1,0 +1,75 @@
+"""``rfedge eval robust``: what loss, a wrong pose and another light do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+__all__ = ["EvalRobust"]
+
+
+@dataclass(frozen=True)
+class EvalRobust:
+    """Send a drive over a lossy link, with noisy poses, and in another light.
+
+    Loss comes in bursts on a datagram link with a virtual clock; every method is compared at one
+    total rate, by the SSIM of what a viewer sees. Stopped and started again, it goes on.
+    """
+
+    field: Annotated[Path, Positional] = Path("samples/fields/street.rff")
+    """The field archive (.rff) both ends hold."""
+    drive: Annotated[str, Positional] = "vehicles@10=samples/street/transforms_drive_vehicles.json"
+    """NAME@HZ=DATASET of the drive."""
+    dusk: str | None = None
+    """NAME@HZ=DATASET of a drive in another light than the field's."""
+    lane: str | None = None
+    """NAME@HZ=DATASET of a drive in another lane than the training views."""
+    preset: str = "veryfast"
+    """x264 preset of every method."""
+    quality_db: float = 33.0
+    """Luma PSNR at which bits are compared where nothing is lost."""
+    frames: int = 36
+    """How many frames of the drive."""
+    out: Path = Path("results/robust.json")
+    """The result file to write."""
+    figures: Path = Path("docs/figures")
+    """Folder of the figure (SVG, and CSV with its numbers)."""
+    cells: Path = Path("out/eval/robust")
+    """Folder of finished pieces."""
+    quick: bool = False
+    """Eight frames and the extremes alone: to see that it works, not for figures."""
+
+    def run(self) -> None:
+        """Do what is not done yet, write rows and figure, print what came out."""
+        from rich.console import Console
+
+        from rfedge.experiments.robust.report import write_robust_figure
+        from rfedge.experiments.robust.run import RobustJob, run_robust
+
+        job = RobustJob(
+            field=self.field,
+            drive=self.drive,
+            dusk=self.dusk,
+            lane=self.lane,
+            preset=self.preset,
+            quality_db=self.quality_db,
+            frames=self.frames,
+            out=self.out,
+            cells=self.cells,
+            quick=self.quick,
+        )
+        console = Console()
+        result = run_robust(job, console)
+        for row in result["rows"]:
+            console.print(
+                f"{row['method']:>20} {row['rtt_ms']:4.0f} ms {row['loss_percent']:g} %: "
+                f"SSIM {row['ssim']:.4f} at {result['equal_rate_kbps']:.0f} kbit/s"
+            )
+        for row in result["disturbances"]:
+            found = row.get("reason") or f"{row['kbit']:.1f} kbit ({row['more_percent']:+.1f} %)"
+            console.print(f"{row['condition']:>20} {row['level']}: {found}")
+        for path in write_robust_figure(result, self.figures):
+            console.print(f"  {path}")

@@ -1,0 +1,99 @@
+"""What a wrong pose or another light costs: bits at equal quality, with and without it.
+
+Pose noise is independent from frame to frame, normal in each axis of translation and rotation, in
+the camera's own axes; both ends render at the noisy pose, for it is the one that is sent. Unless it
+is refined first, as a sender that may take its time would.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rfcore.camera import Camera, Pose
+from rfcore.codec.sender.align import Look
+from rfcore.codec.sender.pose_search import PoseSearch
+from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField
+from rfcore.image import I420
+from rfedge.experiments.clips import CodedClip
+
+__all__ = ["NOISES", "PoseNoise", "kbit_at", "noisy_cameras", "refined_cameras"]
+
+UNHURRIED_MS = 1000.0
+"""Of a clock that stands still: the search ends by itself, the same on every machine."""
+REFINE_CRF = 26.0
+"""At which poses are compared; about that of the quality asked for."""
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Standard deviations, per axis."""
+
+    position_m: float = 0.0
+    rotation_deg: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{100 * self.position_m:g} cm, {self.rotation_deg:g} deg"
+
+
+NOISES = (
+    PoseNoise(),
+    PoseNoise(0.02, 0.02),
+    PoseNoise(0.05, 0.05),
+    PoseNoise(0.1, 0.1),
+    PoseNoise(0.2, 0.5),
+)
+"""From none to what a receiver of satellites alone gives."""
+
+
+def noisy_cameras(cameras: Sequence[Camera], noise: PoseNoise, seed: int) -> list[Camera]:
+    """Return ``cameras`` with their poses disturbed, the same way for every size of noise."""
+    rng = np.random.default_rng(seed)
+    disturbed = []
+    for camera in cameras:
+        shift, turn = rng.normal(size=3), rng.normal(size=3)
+        x, y, z = (float(v) for v in noise.position_m * shift)
+        half = np.deg2rad(noise.rotation_deg) * turn / 2
+        angle = float(np.linalg.norm(half))
+        a, b, c = (float(v) for v in half * np.sinc(angle / math.pi))
+        step = Pose((x, y, z), (math.cos(angle), a, b, c))
+        disturbed.append(Camera(camera.intrinsics, camera.world_from_cam.compose(step)))
+    return disturbed
+
+
+def refined_cameras(
+    field: RadianceField, frames: Sequence[I420], measured: Sequence[Camera]
+) -> list[Camera]:
+    """Return the cameras that the search for the pose of fewest bits finds for ``frames``."""
+    search = PoseSearch(UNHURRIED_MS, lambda: 0)
+
+    def look_at(camera: Camera) -> Look:
+        return Look.of(field.render(camera), camera)
+
+    return [
+        search.refine(frame, look_at(camera), look_at, REFINE_CRF).look.seen.camera
+        for frame, camera in zip(frames, measured, strict=True)
+    ]
+
+
+def kbit_at(clips: Sequence[CodedClip], quality_db: float) -> float:
+    """Return kilobits a frame at a luma PSNR, log(bits) linear in dB between the clips' points,
+    the first frame left out. Raises ``InvalidInput`` when they do not span the quality."""
+    points = sorted(
+        (
+            10 * math.log10(255.0**2 / float(clip.luma_mse[1:].mean())),
+            math.log(8e-3 * float(clip.frame_bytes[1:].mean())),
+        )
+        for clip in clips
+    )
+    qualities = [db for db, _ in points]
+    if not qualities[0] <= quality_db <= qualities[-1]:
+        raise InvalidInput(
+            "quality_db",
+            f"{quality_db} dB is outside the {qualities[0]:.2f}..{qualities[-1]:.2f} dB reached",
+        )
+    return math.exp(float(np.interp(quality_db, qualities, [bits for _, bits in points])))

@@ -1,0 +1,296 @@
+"""Run the robustness experiment: loss, pose noise, light; drives and a field in, one file out.
+
+Loss: every method at three CRFs over the same link; what is compared is SSIM at one total rate,
+interpolated between them. The rest: bits at equal quality, against nothing disturbed and against
+x264, which no pose disturbs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from rfcore.camera import Camera
+from rfcore.codec.photometric import Photometric
+from rfcore.dataset import read_dataset
+from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField, load_field
+from rfedge.experiments.cells import CellStore
+from rfedge.experiments.clips import ClipCoder, DriveName
+from rfedge.experiments.compare.measure import Clip, perform
+from rfedge.experiments.field_coder import FieldCoder, see_clip
+from rfedge.experiments.ladder.measure import LadderClip
+from rfedge.experiments.rivals import x264_lowdelay
+from rfedge.experiments.robust.disturbed import (
+    NOISES,
+    PoseNoise,
+    kbit_at,
+    noisy_cameras,
+    refined_cameras,
+)
+from rfedge.experiments.robust.lossy_link import (
+    Bursts,
+    Crossing,
+    FrameCoder,
+    Policy,
+    own_crossing,
+    x264_crossing,
+)
+from rfedge.results import check_result_path, provenance, revision, write_result
+
+__all__ = ["RobustJob", "run_robust"]
+
+RTTS_S = (0.02, 0.05, 0.1)
+LOSSES = (0.0, 0.01, 0.05)
+OWN_CRFS, X264_CRFS = (20.0, 27.0), (22.0, 27.0, 33.0, 39.0, 45.0)
+DISTURBED_CRFS, RIVAL_CRFS = (23.0, 28.0, 33.0), (20.0, 25.0, 30.0, 35.0)
+QUICK_FRAMES = 8
+SEED = 5
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class RobustJob:
+    """What to disturb; see ``rfedge eval robust --help``."""
+
+    field: Path
+    drive: str
+    dusk: str | None
+    lane: str | None
+    preset: str
+    quality_db: float
+    frames: int
+    out: Path
+    cells: Path
+    quick: bool = False
+
+    def __post_init__(self) -> None:
+        check_result_path(self.out)
+        if self.frames < 4:
+            raise InvalidInput("frames", f"{self.frames} must be at least 4")
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive in memory."""
+
+    name: DriveName
+    clip: LadderClip
+
+    @staticmethod
+    def read(text: str, count: int) -> Drive:
+        """Read the first ``count`` frames of ``NAME@HZ=DATASET``."""
+        name = DriveName.parse(text)
+        return Drive(name, LadderClip.of(read_dataset(name.dataset), count))
+
+    def contest(self, condition: str) -> Clip:
+        """Name the drive under a condition, as cells are keyed."""
+        scene = f"{self.name.scene} {condition}".strip()
+        return Clip(scene, self.name.rate_hz, self.clip.frames, self.clip.digest, None)
+
+
+def run_robust(job: RobustJob, console: Console) -> Row:
+    """Do what is not done yet, write ``job.out``, and return its content."""
+    count = QUICK_FRAMES if job.quick else job.frames
+    drive = Drive.read(job.drive, count)
+    field = load_field(job.field)
+    bench = Bench(job, field, drive, CellStore(job.cells), console, revision())
+    scenarios = bench.scenarios()
+    disturbances = 2 * len(bench.noises()) + 2
+    console.print(f"{len(scenarios)} crossings and {disturbances} disturbances of {count} frames")
+    crossed = [bench.crossed(*scenario) for scenario in scenarios]
+    disturbed = [*bench.pose_rows(), bench.lane_row(), *bench.light_rows()]
+    result = {
+        "case": "robust",
+        **provenance(bench.revision),
+        "quick": job.quick,
+        "seed": SEED,
+        "field_id": field.field_id,
+        "frames": {"drive": job.drive, "count": count, "sha256": drive.clip.digest},
+        "quality_db": job.quality_db,
+        "crossings": crossed,
+        **_at_equal_rate(crossed),
+        "disturbances": disturbed,
+    }
+    write_result(job.out, result)
+    return result
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What every part of the experiment needs."""
+
+    job: RobustJob
+    field: RadianceField
+    drive: Drive
+    store: CellStore
+    console: Console
+    revision: str
+
+    # --- loss
+
+    def scenarios(self) -> list[tuple[str, float, float, float]]:
+        """Return (method, round trip, loss, CRF) of every crossing."""
+        rtts = (RTTS_S[0], RTTS_S[-1]) if self.job.quick else RTTS_S
+        losses = (LOSSES[0], LOSSES[-1]) if self.job.quick else LOSSES
+        own = [str(policy) for policy in Policy]
+        rivals = ["x264-intra-refresh", "x264-idr-on-nack"]
+        ours = product(OWN_CRFS, own, rtts, losses)
+        theirs = product(X264_CRFS, rivals, rtts, losses)
+        return [(method, rtt_s, loss, crf) for crf, method, rtt_s, loss in (*ours, *theirs)]
+
+    def crossed(self, method: str, rtt_s: float, loss: float, crf: float) -> Row:
+        """Return the row of one crossing."""
+        clip, rate_hz = self.drive.clip, self.drive.name.rate_hz
+        facts: Row = {
+            "method": method,
+            "rtt_ms": 1e3 * rtt_s,
+            "loss_percent": 100 * loss,
+            "crf": crf,
+        }
+        crossing = Crossing(clip.frames, rate_hz, self.job.preset, crf, Bursts(loss), rtt_s, SEED)
+        key: dict[str, str | float | int | None] = {
+            **facts,
+            "verb": "robust",
+            "field": self.field.field_id,
+            "frames": clip.digest,
+            "hz": rate_hz,
+            "preset": self.job.preset,
+            "seed": SEED,
+            "revision": self.revision,
+        }
+        (row,) = self.store.rows(key, lambda: [self._outcome(method, crossing)])
+        return {**facts, **row}
+
+    def _outcome(self, method: str, crossing: Crossing) -> Row:
+        if method.startswith("x264"):
+            made = x264_crossing(crossing, idr_on_nack=method.endswith("nack"))
+        else:
+            made = own_crossing(crossing, self._coder(crossing.crf), Policy(method))
+        row = made.row(crossing.rate_hz)
+        self.console.print(
+            f"  {method} {1e3 * crossing.rtt_s:.0f} ms {100 * crossing.bursts.share:g} %: "
+            f"{row['kbps']:.0f} kbit/s, SSIM {row['ssim']:.4f}"
+        )
+        return row
+
+    @cached_property
+    def _coders(self) -> dict[float, FrameCoder]:
+        return {}
+
+    def _coder(self, crf: float) -> FrameCoder:
+        """Return the coder of all crossings at ``crf``; the last one asked for is kept."""
+        if crf not in self._coders:
+            self._coders.clear()
+            clip = self.drive.clip
+            seen = see_clip(self.field, clip.cameras)
+            self._coders[crf] = FrameCoder(clip.frames, seen, self.job.preset, crf)
+        return self._coders[crf]
+
+    # --- pose and light
+
+    def noises(self) -> Sequence[PoseNoise]:
+        """Return the sizes of pose noise."""
+        return (NOISES[0], NOISES[-2]) if self.job.quick else NOISES
+
+    def pose_rows(self) -> list[Row]:
+        """Return what noise of each size costs, and what is left of it after refinement."""
+        drive, rival = self.drive, self._rival(self.drive)
+        still, *noises = self.noises()
+        kbit = self._own(drive, f"pose noise {still}", drive.clip.cameras)
+        rows = [self._row("pose noise", str(still), kbit, None, rival)]
+        for noise in noises:
+            measured = noisy_cameras(drive.clip.cameras, noise, SEED)
+            refined = refined_cameras(self.field, drive.clip.frames, measured)
+            for condition, cameras in (("pose noise", measured), ("refined pose noise", refined)):
+                kbit = self._own(drive, f"{condition} {noise}", cameras)
+                rows.append(self._row(condition, str(noise), kbit, rows[0], rival))
+        return rows
+
+    def lane_row(self) -> Row:
+        """Return what driving in another lane than the training views costs."""
+        if self.job.lane is None:
+            why = "no drive with a lane offset was given (--lane NAME@HZ=DATASET)"
+            return {"condition": "lane offset", "level": "n/a", "reason": why}
+        drive = Drive.read(self.job.lane, len(self.drive.clip.frames))
+        kbit = self._own(drive, "lane", drive.clip.cameras)
+        return self._row("lane offset", drive.name.scene, kbit, None, self._rival(drive))
+
+    def light_rows(self) -> list[Row]:
+        """Return what a drive at dusk costs with a field of noon, with and without the matrix."""
+        if self.job.dusk is None:
+            why = "no drive in another light was given (--dusk NAME@HZ=DATASET)"
+            return [{"condition": "light", "level": "n/a", "reason": why}]
+        drive = Drive.read(self.job.dusk, len(self.drive.clip.frames))
+        rival, rows = self._rival(drive), list[Row]()
+        for level, choice in (("uncorrected", ()), ("photometric", None)):
+            kbit = self._own(drive, level, drive.clip.cameras, photometric=choice)
+            rows.append(self._row("light", level, kbit, rows[0] if rows else None, rival))
+        return rows
+
+    def _own(
+        self,
+        drive: Drive,
+        condition: str,
+        cameras: Sequence[Camera],
+        photometric: Photometric | None = None,
+    ) -> float:
+        """Return kilobits a frame at the quality asked for, rendered from ``cameras``."""
+        coder = FieldCoder(
+            see_clip(self.field, cameras),
+            f"rfedge-{self.job.preset}-{self.field.field_id}",
+            self.revision,
+            preset=self.job.preset,
+            photometric=photometric,
+            points=DISTURBED_CRFS,
+        )
+        return self._kbit(drive.contest(condition), coder)
+
+    def _rival(self, drive: Drive) -> float:
+        coder = replace(x264_lowdelay(self.job.preset), points=RIVAL_CRFS)
+        return self._kbit(drive.contest(""), coder)
+
+    def _kbit(self, contest: Clip, coder: ClipCoder) -> float:
+        return kbit_at(perform(contest, coder, self.store).clips, self.job.quality_db)
+
+    def _row(
+        self, condition: str, level: str, kbit: float, base: Row | None, rival_kbit: float
+    ) -> Row:
+        undisturbed = kbit if base is None else base["kbit"]
+        return {
+            "condition": condition,
+            "level": level,
+            "kbit": kbit,
+            "more_percent": 100 * (kbit / undisturbed - 1),
+            "x264_kbit": rival_kbit,
+            "against_x264_percent": 100 * (kbit / rival_kbit - 1),
+        }
+
+
+def _at_equal_rate(crossed: Sequence[Row]) -> Row:
+    """Return SSIM of every scenario at one rate: the lowest that all can be interpolated at."""
+    scenarios: dict[tuple[Any, ...], list[Row]] = {}
+    for row in crossed:
+        scenarios.setdefault((row["method"], row["rtt_ms"], row["loss_percent"]), []).append(row)
+    low = max(min(row["kbps"] for row in rows) for rows in scenarios.values())
+    high = min(max(row["kbps"] for row in rows) for rows in scenarios.values())
+    if low > high:
+        raise InvalidInput("crf", f"no rate is reached by all: {low:.0f} > {high:.0f} kbit/s")
+    rate = float(np.sqrt(low * high))
+    rows = []
+    for (method, rtt_ms, loss), points in scenarios.items():
+        points = sorted(points, key=lambda row: float(row["kbps"]))
+        log_rates = np.log([row["kbps"] for row in points])
+        at = {
+            name: float(np.interp(np.log(rate), log_rates, [row[name] for row in points]))
+            for name in ("ssim", "ssim_p5")
+        }
+        rows.append({"method": method, "rtt_ms": rtt_ms, "loss_percent": loss, **at})
+    return {"equal_rate_kbps": rate, "rows": rows}

@@ -1,0 +1,136 @@
+"""One direction of the link on real time: a ``rfcore.link`` machine with a pump.
+
+Packets are callbacks: what is pushed is called when it is due. Used by ``rfedge.link.proxy``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from rfcore.link import DirectionPlan, Link
+from rfcore.link.shaper import BusyMeter
+
+__all__ = ["SPIN_S", "Direction", "Sender"]
+
+SPIN_S = 0.0002
+"""How long before a release the pump stops sleeping and yields in a loop: the kernel's timer slack
+of 50 us and the loop's own time. Longer would make the scheduler see a busy process and interrupt
+it just when it matters. Many links in one process would spin all the time; they are given 0."""
+
+
+class Sender(Protocol):
+    """Who pushes into a direction, and can be told to wait."""
+
+    def hold(self, reason: str) -> None:
+        """Push nothing until ``go_on`` with the same reason."""
+
+    def go_on(self, reason: str) -> None:
+        """Push again, if no other reason holds."""
+
+    def abort(self) -> None:
+        """Push nothing any more."""
+
+
+@dataclass(frozen=True)
+class Packet:
+    """What is in the link: what to do at the end, and since when."""
+
+    release: Callable[[], None]
+    pushed_s: float
+
+
+def _ignore(transit_s: float) -> None:
+    """Nobody wants to know."""
+
+
+class Direction:
+    """One direction of the link: senders push, the pump releases to receivers on time."""
+
+    def __init__(
+        self,
+        plan: DirectionPlan,
+        transit: Callable[[float], None] = _ignore,
+        spin_s: float = SPIN_S,
+    ) -> None:
+        self.meter = BusyMeter()
+        self.senders: set[Sender] = set()
+        self.profile = plan.profile
+        self._transit = transit
+        self._spin_s = spin_s
+        self._link: Link[Packet] = plan.link(time.perf_counter())
+        self._arrived = asyncio.Event()
+        self._holding = False
+
+    @property
+    def room_bytes(self) -> int:
+        """How much may still be pushed."""
+        return self._link.room_bytes(time.perf_counter())
+
+    @property
+    def held_bytes(self) -> int:
+        """How much is in the link."""
+        return self._link.held_bytes
+
+    def push(self, release: Callable[[], None], size_bytes: int) -> None:
+        """Let ``release`` be called when ``size_bytes`` have been through the link."""
+        now = time.perf_counter()
+        self._link.push(Packet(release, now), size_bytes, now)
+        self._arrived.set()
+        if self._link.is_full(now):
+            self._holding = True
+            for sender in self.senders:
+                sender.hold("link")
+
+    async def pump(self) -> None:
+        """Release packets when they are due, for ever."""
+        while True:
+            next_s = self._next_event_at()
+            if next_s is None:
+                self._arrived.clear()
+                await self._arrived.wait()
+                continue
+            await _sleep_until(next_s, self._spin_s)
+            self._release(time.perf_counter())
+            if self._holding and not self._link.is_full(time.perf_counter()):
+                self._holding = False
+                for sender in self.senders:
+                    sender.go_on("link")
+
+    def _next_event_at(self) -> float | None:
+        """When a packet is due, or senders that are held may go on."""
+        events = [self._link.next_event_at(), self._link.room_at() if self._holding else None]
+        return min((event for event in events if event is not None), default=None)
+
+    def _release(self, now: float) -> None:
+        for delivery in self._link.pop_due(now):
+            delivery.item.release()
+            released_s = time.perf_counter()
+            self.meter.released(delivery, released_s)
+            if delivery.size_bytes:
+                self._transit(released_s - delivery.item.pushed_s)
+
+    def report(self) -> dict[str, float | int | None]:
+        """Return what was measured."""
+        meter = self.meter
+        return {
+            "rate_bps": self.profile.rate_bps,
+            "delay_s": self.profile.delay_s,
+            "bytes": meter.wire_bytes,
+            "busy_s": meter.busy_s,
+            "expected_s": meter.expected_s,
+            "tau_error_percent": meter.tau_error_percent,
+            "busy_periods": meter.periods,
+            "largest_lateness_s": meter.largest_lateness_s,
+        }
+
+
+async def _sleep_until(due_s: float, spin_s: float) -> None:
+    ahead_s = due_s - time.perf_counter() - spin_s
+    if ahead_s > 0:
+        await asyncio.sleep(ahead_s)
+    while time.perf_counter() < due_s:
+        await asyncio.sleep(0)

@@ -1,0 +1,69 @@
+"""``docs/reliability.md`` from ``results/faults.json``, the scoreboard of the fault suite.
+
+python -m rfedge.pages.faults results/faults.json > docs/reliability.md
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from rfcore.errors import InvalidInput
+from rfedge.report.markdown_parts import Row
+
+__all__ = ["faults_page"]
+
+OPENING = """# What happens when things break
+
+Generated from `results/faults.json` by `make figures`; do not edit.
+
+What is promised, and no more:
+
+* No silently wrong picture. Every frame that is shown has passed its sequence, CRC, the digest of
+  the render it is predicted from, and the digest of what it decodes to; otherwise it is a Nack.
+* Nothing stale. Pictures are dropped before they are coded, at most two coded frames of a camera
+  are under way, and what was under way when a stream broke is never sent again.
+* One vehicle harms itself only. Its packets, its decoder, its streams and its speed are limited
+  by name ([limits](operations.md#limits)), and a frame it loses costs nobody else one.
+* Coming back needs no operator. A vehicle connects again by itself, with a first frame that needs
+  nothing from before; a decoder process is replaced by one that stands ready.
+* Frames are delivered at most once, and not stored: live pictures are gone when the server is.
+
+`make test-fault` starts real servers and vehicles as processes, does to them what the table says,
+and measures. Its bounds are part of the tests. A *bystander* is a vehicle at 20 Hz on the same
+server that nothing is done to; its latencies while the fault lasts are compared with those before
+and after, and with those of a *control*, a vehicle on a server of its own: what both suffer is the
+machine's doing. Byte-equal means that the digests of the pictures at the server are those of a
+stream that begins there and has no fault. Namespaces and mounts need root; without it those cases
+are skipped.
+"""
+
+
+def faults_page(path: Path) -> str:
+    """Return the page; raise ``InvalidInput`` for a file of another kind."""
+    result = json.loads(path.read_text())
+    if result.get("format") != "rfedge-faults-1":
+        raise InvalidInput("results", f"{path} is no result of the fault suite")
+    rows = result["rows"]
+    passed, machine = sum(row["passed"] for row in rows), result["host"]
+    score = (
+        f"## Scoreboard\n\n{passed} of {len(rows)} hold. `{result['command']}` at "
+        f"`{result['revision']}`; {machine['cpu']}, {machine['cores']} cores, {machine['isa']}.\n"
+    )
+    return "\n".join([OPENING, score, *_sections(rows)])
+
+
+def _sections(rows: list[Row]) -> Iterator[str]:
+    for row in rows:
+        verdict = "holds" if row["passed"] else "**does not hold**"
+        yield f"### {row['fault']}: {verdict}\n\n{row['injected_with']}\n"
+        yield "| what | measured |\n| --- | ---: |"
+        bounds, figures = row["bound"].split("; "), row["measured"].split("; ")
+        yield from (f"| {b} | {f} |" for b, f in zip(bounds, figures, strict=True))
+        yield ""
+
+
+if __name__ == "__main__":
+    print(faults_page(Path(sys.argv[1])), end="")

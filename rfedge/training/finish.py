@@ -1,0 +1,94 @@
+"""From a trained field to the one that is written: lower rungs, compression, held-out quality.
+
+The quality in the header is that of the field as it will be read, not as it was trained.
+
+One training run as one JSON object: quality, time, size, and how to repeat it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from rfcore.camera import Camera
+from rfcore.field import RadianceField, SplatField
+from rfcore.train import held_out_quality
+from rfcore.train.rungs import RungConfig, with_rungs
+from rfcore.views import PosedPicture
+from rfedge.results import host, revision
+from rfedge.training.run import Trained, TrainingJob
+
+__all__ = ["finish_field", "fit_rungs", "training_result"]
+
+
+def finish_field(
+    field: SplatField,
+    views: Sequence[PosedPicture],
+    held_out: Sequence[PosedPicture],
+    config: RungConfig,
+    console: Console,
+) -> SplatField:
+    """Return the field with rungs fitted to ``views``' cameras, compressed and measured.
+
+    ``held_out`` may be empty: then the header states no quality.
+    """
+    small = fit_rungs(field, [view.camera for view in views], config, console).compressed()
+    if not held_out:
+        return small
+    quality = held_out_quality(small, held_out)
+    console.print(f"  as written: {quality.psnr_db:.2f} dB, SSIM {quality.ssim:.3f} held out")
+    measured = replace(small.metadata, held_out_psnr_db=quality.psnr_db, held_out_ssim=quality.ssim)
+    return small.described(measured)
+
+
+def fit_rungs(
+    field: SplatField, cameras: list[Camera], config: RungConfig, console: Console
+) -> SplatField:
+    columns = (TextColumn("rungs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("rungs", total=None)
+
+        def moved(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        return with_rungs(field, cameras, config, moved)
+
+
+def training_result(
+    job: TrainingJob, trained: Trained, written: RadianceField, archive: Path
+) -> dict[str, Any]:
+    """Return the result of a run whose field was written to ``archive``.
+
+    ``held_out`` is the quality of the field as written; the curve ends with that as trained.
+    """
+    k = job.dataset.pictures[0].camera.intrinsics
+    metadata = written.metadata
+    return {
+        "field": f"{metadata.kind} {written.field_id}",
+        "views": len(job.dataset.pictures),
+        "held_out": {
+            "psnr_db": metadata.held_out_psnr_db,
+            "ssim": metadata.held_out_ssim,
+            "views": len(job.held_out.pictures) if job.held_out is not None else 0,
+        },
+        "as_trained": asdict(trained.quality) if trained.quality is not None else None,
+        "seconds": trained.seconds,
+        "iterations": trained.iterations,
+        "primitives": trained.primitives,
+        "bytes": archive.stat().st_size,
+        "curve": [list(point) for point in trained.curve],
+        "width": k.width_px,
+        "height": k.height_px,
+        "seed": job.seed,
+        "settings": asdict(job.config),
+        "training_digest": metadata.training_digest,
+        "command": " ".join(["rfedge", *sys.argv[1:]]),
+        "revision": revision(),
+        "host": host(),
+    }

@@ -1,0 +1,195 @@
+"""The loop around a trainer: time, measurements, checkpoints.
+
+Any ``FieldTrainer`` will do. Seconds are those of training: neither the time measuring takes nor
+that of reading the pictures counts, and a resumed run goes on counting where it stopped.
+
+How far a training is: a bar on a terminal, a line at each twentieth in a log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.field import RadianceField
+from rfcore.train import FieldTrainer, read_checkpoint, write_checkpoint
+from rfedge.units import time_text
+
+__all__ = ["LoopLimits", "LoopStatus", "TrainingLoop", "run_showing"]
+
+
+Measure = Callable[[RadianceField], float]
+MAX_MINUTES = 7 * 24 * 60.0
+
+
+@dataclass(frozen=True)
+class LoopLimits:
+    """When a run ends, and what it leaves behind on the way."""
+
+    minutes: float | None = None
+    """End after so many minutes of training instead of at the trainer's iterations."""
+    checkpoint: Path | None = None
+    checkpoint_every: int = 1000
+    """Iterations between two checkpoints."""
+    measurements: int = 12
+    """Points of the curve of quality over time; 0: none is measured."""
+
+    def __post_init__(self) -> None:
+        if self.minutes is not None and not 0 < self.minutes <= MAX_MINUTES:
+            raise InvalidInput("minutes", f"{self.minutes} is outside 0..{MAX_MINUTES:.0f}")
+        if self.checkpoint_every < 1:
+            raise InvalidInput("checkpoint_every", f"{self.checkpoint_every} must be at least 1")
+        if not 0 <= self.measurements <= 1000:
+            raise InvalidInput("measurements", f"{self.measurements} is outside 0..1000")
+
+
+@dataclass(frozen=True)
+class LoopStatus:
+    """Where a run is: ``progress`` 0..1, the loss of the last iteration, the last measurement."""
+
+    progress: float
+    iteration: int
+    loss: float
+    primitives: int
+    psnr_db: float | None
+
+
+class TrainingLoop:
+    """Runs a trainer to its end. ``clock`` returns seconds that never go back."""
+
+    def __init__(
+        self,
+        trainer: FieldTrainer,
+        limits: LoopLimits,
+        measure: Measure | None,
+        clock: Callable[[], float],
+    ) -> None:
+        self.trainer = trainer
+        self.curve: list[tuple[float, float]] = []
+        """Seconds of training and held-out PSNR in dB."""
+        self._limits, self._measure, self._clock = limits, measure, clock
+        self._before_s = self._aside_s = 0.0
+        self._started_s = clock()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of training so far."""
+        return self._before_s + self._clock() - self._started_s - self._aside_s
+
+    @property
+    def progress(self) -> float:
+        """How far the run is, 0..1."""
+        if self._limits.minutes is None:
+            return self.trainer.iteration / self.trainer.total
+        return min(self.seconds / (60 * self._limits.minutes), 1.0)
+
+    def resume(self) -> None:
+        """Go on after the checkpoint. Raises ``InvalidInput`` when it is of another run."""
+        if self._limits.checkpoint is None:
+            raise InvalidInput("resume", "needs a checkpoint to go on from")
+        checkpoint = read_checkpoint(self._limits.checkpoint)
+        self.trainer.restore(checkpoint)
+        loop = checkpoint.values["loop"]
+        self._before_s = float(loop["seconds"])
+        self.curve = [(float(s), float(db)) for s, db in loop["curve"]]
+        self._started_s, self._aside_s = self._clock(), 0.0
+
+    def run(self, tell: Callable[[LoopStatus], None]) -> None:
+        """Train to the end, telling where it is after every iteration.
+
+        Raises ``TrainingDiverged``; the last good checkpoint stays.
+        """
+        self._started_s, self._aside_s = self._clock(), 0.0
+        limits, trainer = self._limits, self.trainer
+        while not trainer.finished and self.progress < 1.0:
+            done = trainer.step(None if limits.minutes is None else self.progress)
+            if limits.checkpoint is not None and trainer.iteration % limits.checkpoint_every == 0:
+                self._save(limits.checkpoint)
+            if self._measure is not None and self._measurement_is_due():
+                self._take_measurement(self._measure)
+            psnr_db = self.curve[-1][1] if self.curve else None
+            tell(
+                LoopStatus(self.progress, trainer.iteration, done.loss, trainer.primitives, psnr_db)
+            )
+
+    def _measurement_is_due(self) -> bool:
+        points = self._limits.measurements
+        ended = self.trainer.finished or self.progress >= 1.0
+        return points > 0 and (ended or self.progress >= (len(self.curve) + 1) / points)
+
+    def _take_measurement(self, measure: Measure) -> None:
+        at_s, before_s = self.seconds, self._clock()
+        self.curve.append((at_s, measure(self.trainer.field())))
+        self._aside_s += self._clock() - before_s
+
+    def _save(self, path: Path) -> None:
+        checkpoint = self.trainer.checkpoint()
+        loop = {"seconds": self.seconds, "curve": self.curve}
+        write_checkpoint(replace(checkpoint, values={**checkpoint.values, "loop": loop}), path)
+
+
+STEPS = 1000
+"""Of the bar: progress is a share, of time or of iterations."""
+LINES = 20
+
+
+def run_showing(loop: TrainingLoop, console: Console, now_s: Callable[[], float]) -> None:
+    """Run ``loop`` to its end and show iterations, loss, held-out quality and time left."""
+    if console.is_terminal:
+        _with_bar(loop, console)
+    else:
+        loop.run(_Lines(console, now_s))
+
+
+def _with_bar(loop: TrainingLoop, console: Console) -> None:
+    columns = (
+        BarColumn(),
+        TextColumn("{task.fields[state]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("train", total=STEPS, state="")
+
+        def tell(status: LoopStatus) -> None:
+            bar.update(task, completed=STEPS * status.progress, state=_state(status))
+
+        try:
+            loop.run(tell)
+        except RfedgeError:
+            bar.stop()
+            raise
+
+
+class _Lines:
+    """Prints a line at each twentieth; time left goes by the pace since the start."""
+
+    def __init__(self, console: Console, now_s: Callable[[], float]) -> None:
+        self._console, self._now_s = console, now_s
+        self._start: tuple[float, float] | None = None
+        self._printed = 0
+
+    def __call__(self, status: LoopStatus) -> None:
+        now_s = self._now_s()
+        if self._start is None:
+            self._start, self._printed = (now_s, status.progress), int(LINES * status.progress)
+        if int(LINES * status.progress) == self._printed:
+            return
+        self._printed = int(LINES * status.progress)
+        start_s, start_progress = self._start
+        pace_s = (now_s - start_s) / max(status.progress - start_progress, 1e-9)
+        left = time_text(pace_s * (1.0 - status.progress))
+        self._console.print(f"  {status.progress:.0%}: {_state(status)}, {left} left")
+
+
+def _state(status: LoopStatus) -> str:
+    quality = f", held out {status.psnr_db:.2f} dB" if status.psnr_db is not None else ""
+    return (
+        f"{status.iteration:,} iterations, {status.primitives:,} primitives, "
+        f"loss {status.loss:.4f}{quality}"
+    )

@@ -1,0 +1,254 @@
+"""Train a field with progress on the console, and measure it on pictures it never saw.
+
+How much memory a training run takes, said before it starts.
+
+The estimate is the sum of what is allocated, for the largest set the run may grow to. The one run
+that tests/train/test_training_memory.py measures stays within 15 % of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from time import monotonic
+
+import numpy as np
+from rich.console import Console
+
+from rfcore.dataset import Dataset
+from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField, SplatField
+from rfcore.image import Rgb
+from rfcore.metrics import psnr
+from rfcore.ngp.shape import FEATURES
+from rfcore.train import (
+    FieldTrainer,
+    HeldOut,
+    NgpModel,
+    NgpTrainer,
+    NgpTrainingConfig,
+    SplatTrainer,
+    SplatTrainingConfig,
+    held_out_quality,
+)
+from rfcore.train.start import random_points
+from rfcore.views import PosedPicture
+from rfedge.training.loop import LoopLimits, TrainingLoop, run_showing
+
+__all__ = [
+    "UNLIMITED_ITERATIONS",
+    "Trained",
+    "TrainingJob",
+    "available_bytes",
+    "check_memory",
+    "ngp_training_bytes",
+    "splat_training_bytes",
+    "train",
+    "train_field",
+    "training_config",
+]
+
+
+BASE_BYTES = 350 << 20
+"""The interpreter, numpy, OpenCV and the report's libraries."""
+FLOATS_OF_GEOMETRY = 11
+SETS = 3
+"""Parameters and two moments."""
+SLACK = 1.25
+"""Buffers that grow are allocated a quarter larger than asked for."""
+SPLAT_BYTES = 64 + 3 * 16 + 2 * 4 + 8
+"""Projected splat, its sort items, its scores, its range of entries."""
+ENTRIES_PER_GAUSSIAN = 5
+"""Overlaps with tiles of 16x16 pixels; 3 to 4 on the street at 640x360."""
+ENTRY_BYTES = 64 + 3 * 4
+NGP_CELL_BYTES = 5
+"""Of the occupancy grid: a float and a bit, twice while it is built anew."""
+NGP_SCRATCH_BYTES = 150 << 20
+"""Samples and activations of one batch."""
+PICTURE_FLOATS = 9
+"""Colour, target, gradient: three channels each."""
+
+
+def splat_training_bytes(gaussians: int, sh_degree: int, sizes_px: list[tuple[int, int]]) -> int:
+    """Return an estimate of the peak for ``gaussians`` and pictures of ``sizes_px``."""
+    parameters = 4 * (FLOATS_OF_GEOMETRY + 3 * (sh_degree + 1) ** 2)
+    # The set is copied once: when it grows, for a measurement, or for a checkpoint.
+    of_gaussians = gaussians * (parameters * (SETS * SLACK + SETS) + SPLAT_BYTES * SLACK)
+    of_entries = gaussians * ENTRIES_PER_GAUSSIAN * ENTRY_BYTES * SLACK
+    pixels = [width * height for width, height in sizes_px]
+    of_pictures = 3 * sum(pixels) + 4 * PICTURE_FLOATS * max(pixels, default=0)
+    return BASE_BYTES + int(of_gaussians + of_entries + of_pictures)
+
+
+def ngp_training_bytes(model: NgpModel, sizes_px: list[tuple[int, int]]) -> int:
+    """Return an estimate of the peak for a hash grid and pictures of ``sizes_px``."""
+    table = 4 * FEATURES * model.L << model.log2_T
+    # Parameters, gradient, two moments, and one copy for a measurement or a checkpoint's four.
+    of_grid = 8 * table + NGP_CELL_BYTES * model.occupancy
+    pixels = sum(width * height for width, height in sizes_px)
+    return BASE_BYTES + NGP_SCRATCH_BYTES + of_grid + 3 * pixels
+
+
+def available_bytes(meminfo: Path = Path("/proc/meminfo")) -> int | None:
+    """Return the memory that can be had without swapping; None where the system does not say."""
+    try:
+        lines = meminfo.read_text().splitlines()
+    except OSError:
+        return None
+    kib = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    return kib[0] << 10 if kib else None
+
+
+def check_memory(needed: int, available: int | None) -> None:
+    """Raise ``InvalidInput`` when a run needs more memory than there is."""
+    if available is not None and needed > available:
+        raise InvalidInput(
+            "training",
+            f"needs about {needed / 2**30:.1f} GiB of memory and {available / 2**30:.1f} GiB are "
+            "available; take fewer Gaussians, fewer views or a smaller --size",
+        )
+
+
+UNLIMITED_ITERATIONS = 1_000_000
+"""Of a run that ends by the clock."""
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """What to train on, how, and what to measure on (``held_out`` may be None)."""
+
+    name: str
+    dataset: Dataset
+    held_out: Dataset | None
+    config: SplatTrainingConfig | NgpTrainingConfig
+    """Whose it is says what is trained."""
+    seed: int
+    limits: LoopLimits = field(default_factory=partial(LoopLimits, measurements=0))
+    resume: bool = False
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A field as it came out of training, and what that took."""
+
+    field: RadianceField
+    quality: HeldOut | None
+    seconds: float
+    iterations: int
+    primitives: int
+    curve: tuple[tuple[float, float], ...]
+    """Seconds of training and held-out PSNR in dB."""
+
+
+def training_config(
+    gaussians: int | None, iterations: int | None, threads: int
+) -> SplatTrainingConfig:
+    """Return the trainer's own settings with what the user chose instead."""
+    config = SplatTrainingConfig(threads=threads)
+    if gaussians is not None:
+        config = replace(config, gaussians=gaussians)
+    if iterations is not None:
+        config = replace(config, iterations=iterations)
+    return config
+
+
+def train_field(job: TrainingJob, console: Console) -> SplatField:
+    """Train splats as ``train`` does; return them alone."""
+    trained = train(job, console).field
+    if not isinstance(trained, SplatField):
+        raise InvalidInput("kind", f"{trained.metadata.kind} is not a field of splats")
+    return trained
+
+
+def train(job: TrainingJob, console: Console) -> Trained:
+    """Train to the end, showing progress, held-out PSNR and time left.
+
+    Says what memory it takes before it starts. Raises ``InvalidInput`` when that is not there, and
+    ``TrainingDiverged`` when the run is lost; the last good checkpoint stays.
+    """
+    _announce(job, console)
+    trainer = _trainer(job)
+    measure = _psnr_meter(job.held_out.pictures) if job.held_out is not None else None
+    loop = TrainingLoop(trainer, job.limits, measure, monotonic)
+    if job.resume:
+        loop.resume()
+        console.print(f"  going on after iteration {trainer.iteration:,}, {loop.seconds:.0f} s")
+    run_showing(loop, console, monotonic)
+    seconds = loop.seconds
+    quality = _quality(trainer, job)
+    _announce_end(seconds, quality, console)
+    return Trained(
+        field=trainer.field(job.name, job.dataset.tile_origin, quality),
+        quality=quality,
+        seconds=seconds,
+        iterations=trainer.iteration,
+        primitives=trainer.primitives,
+        curve=tuple(loop.curve),
+    )
+
+
+def _trainer(job: TrainingJob) -> FieldTrainer:
+    pictures, points = job.dataset.pictures, job.dataset.points
+    if isinstance(job.config, NgpTrainingConfig):
+        return NgpTrainer(pictures, points, job.config, seed=job.seed)
+    if points is None:
+        rng = np.random.default_rng([job.seed, 2])
+        points = random_points(pictures, job.config.gaussians, rng)
+    return SplatTrainer(pictures, points, job.config, seed=job.seed)
+
+
+def _announce(job: TrainingJob, console: Console) -> None:
+    config, pictures = job.config, job.dataset.pictures
+    sizes = [(k.width_px, k.height_px) for k in (p.camera.intrinsics for p in pictures)]
+    if isinstance(config, NgpTrainingConfig):
+        what, needed = "a hash grid", ngp_training_bytes(config.model, sizes)
+    else:
+        most = max(config.gaussians, config.density.limit)
+        what = f"{most:,} Gaussians at most"
+        what += "" if job.dataset.points is not None else ", from random points,"
+        needed = splat_training_bytes(most, config.bands.degree, sizes)
+    length = f"{config.iterations:,} iterations"
+    if job.limits.minutes is not None:
+        length = f"{job.limits.minutes:g} minutes"
+    console.print(
+        f"[bold]Training[/] {what} on {len(pictures)} pictures, {length}; about "
+        f"{needed / 2**30:.1f} GiB of memory"
+    )
+    check_memory(needed, available_bytes())
+
+
+def _announce_end(seconds: float, quality: HeldOut | None, console: Console) -> None:
+    measured = ""
+    if quality is not None:
+        measured = f", held-out PSNR {quality.psnr_db:.2f} dB, SSIM {quality.ssim:.3f}"
+    console.print(f"  {seconds:.0f} s of training{measured}")
+
+
+def _quality(trainer: FieldTrainer, job: TrainingJob) -> HeldOut | None:
+    if job.held_out is None:
+        return None
+    return held_out_quality(trainer.field(), job.held_out.pictures)
+
+
+class _psnr_meter:  # noqa: N801 - a function that remembers the pictures it has read
+    """Measures the mean PSNR of fields on the same pictures, read once."""
+
+    def __init__(self, pictures: Sequence[PosedPicture]) -> None:
+        if not pictures:
+            raise InvalidInput("held_out", "holds no pictures to measure on")
+        self._pictures = pictures
+        self._pixels: list[Rgb] = []
+
+    def __call__(self, field: RadianceField) -> float:
+        """Return the mean over pictures of the RGB PSNR."""
+        if not self._pixels:
+            self._pixels = [picture.read() for picture in self._pictures]
+        pairs = zip(self._pictures, self._pixels, strict=True)
+        return float(np.mean([_psnr_db(field, picture, rgb) for picture, rgb in pairs]))
+
+
+def _psnr_db(field: RadianceField, picture: PosedPicture, rgb: Rgb) -> float:
+    colour = np.clip(field.render_colour(picture.camera).astype(np.float64), 0.0, 1.0)
+    return psnr(colour, rgb / 255.0, peak=1.0)

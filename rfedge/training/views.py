@@ -1,0 +1,154 @@
+"""Which pictures a run trains on, which are held out, and which points it starts from.
+
+Points to start from out of depth maps beside a dataset's pictures.
+
+One file a picture, named as the picture with another suffix: ``.npy``, float32 [H, W] metres, or
+``.png``, 16 bits, millimetres (nerfstudio's and Record3D's). 0 means unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import isqrt
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.dataset import Dataset, Distortion, read_dataset
+from rfcore.dataset.assemble import localised
+from rfcore.dataset.points import read_points
+from rfcore.errors import DatasetError, InvalidInput
+from rfcore.train.start import points_from_depth
+from rfcore.views import PointCloud, PosedPicture
+
+__all__ = [
+    "ViewChoice",
+    "points_from_depth_maps",
+    "read_depth_m",
+    "read_views",
+    "share_of_views",
+    "split_every",
+]
+
+
+POINTS = 300_000
+"""About as many are made, twice what a run draws by default."""
+MILLIMETRES = 1000.0
+
+
+def points_from_depth_maps(pictures: Sequence[PosedPicture], folder: Path) -> PointCloud:
+    """Return points of all pictures that have a depth map in ``folder``.
+
+    Raises ``DatasetError`` when none has, or when a map cannot be read or has another size.
+    """
+    maps = [(picture, _map_of(picture, folder)) for picture in pictures]
+    found = [(picture, path) for picture, path in maps if path is not None]
+    if not found:
+        raise DatasetError(f"{folder}: holds no depth map (.npy or .png) named as a picture")
+    clouds = [_points_of(picture, path, POINTS // len(found)) for picture, path in found]
+    return PointCloud(
+        np.concatenate([cloud.xyz_m for cloud in clouds]),
+        np.concatenate([cloud.rgb for cloud in clouds]),
+    )
+
+
+def read_depth_m(path: Path) -> NDArray[np.float32]:
+    """Read a depth map in metres; raise ``DatasetError`` naming the file."""
+    try:
+        if path.suffix == ".npy":
+            depth = np.load(path, allow_pickle=False)
+        else:
+            depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path}: not a readable depth map ({error})") from error
+    if depth is None or depth.ndim != 2:
+        raise DatasetError(f"{path}: not a readable depth map of one channel")
+    if path.suffix == ".npy":
+        return np.asarray(depth, np.float32)
+    if depth.dtype != np.uint16:
+        raise DatasetError(f"{path}: {depth.dtype} pixels, a depth map has 16 bits of millimetres")
+    return np.asarray(depth / MILLIMETRES, np.float32)
+
+
+def _map_of(picture: PosedPicture, folder: Path) -> Path | None:
+    stem = Path(picture.name).stem
+    candidates = (folder / f"{stem}{suffix}" for suffix in (".npy", ".png"))
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _points_of(picture: PosedPicture, path: Path, count: int) -> PointCloud:
+    rgb, depth_m = picture.read(), read_depth_m(path)
+    if depth_m.shape != rgb.shape[:2]:
+        raise DatasetError(f"{path}: {depth_m.shape} pixels, the picture has {rgb.shape[:2]}")
+    step_px = max(1, isqrt(depth_m.size // max(count, 1)))
+    return points_from_depth(picture.camera, rgb, depth_m, step_px)
+
+
+@dataclass(frozen=True)
+class ViewChoice:
+    """What to read. ``held_out`` is another dataset, ``holdout`` every so many of this one."""
+
+    dataset: Path
+    held_out: Path | None = None
+    holdout: int | None = None
+    percent: float = 100.0
+    """Of the pictures that are not held out."""
+    points: Path | None = None
+    """A .ply instead of the dataset's own points."""
+    depths: Path | None = None
+    """A folder of depth maps to take points from instead."""
+    size_px: tuple[int, int] | None = None
+    undistort: bool = False
+
+    def __post_init__(self) -> None:
+        if self.held_out is not None and self.holdout is not None:
+            raise InvalidInput("holdout", "goes without --held-out: choose one of the two")
+        if self.points is not None and self.depths is not None:
+            raise InvalidInput("depths", "goes without --points: choose one of the two")
+        if not 0 < self.percent <= 100:
+            raise InvalidInput("views_percent", f"{self.percent} is outside 0..100")
+
+
+def read_views(choice: ViewChoice) -> tuple[Dataset, Dataset | None]:
+    """Return what to train on, and what to measure on, around the same origin."""
+    distortion = Distortion.UNDISTORT if choice.undistort else Distortion.REFUSE
+    dataset = read_dataset(choice.dataset, distortion=distortion, size_px=choice.size_px)
+    held_out = None
+    if choice.held_out is not None:
+        held_out = read_dataset(
+            choice.held_out,
+            tile_origin=dataset.tile_origin,
+            distortion=distortion,
+            size_px=choice.size_px,
+        )
+    elif choice.holdout is not None:
+        dataset, held_out = split_every(dataset, choice.holdout)
+    if choice.points is not None:
+        points = localised(read_points(choice.points), dataset.tile_origin)
+        dataset = replace(dataset, points=points)
+    dataset = replace(dataset, pictures=share_of_views(dataset.pictures, choice.percent))
+    if choice.depths is not None:
+        points = points_from_depth_maps(dataset.pictures, choice.depths)
+        dataset = replace(dataset, points=points)
+    return dataset, held_out
+
+
+def split_every(dataset: Dataset, every: int) -> tuple[Dataset, Dataset]:
+    """Return the dataset without every ``every``-th picture, the first among them, and those.
+
+    The convention of mip-NeRF 360 and of 3DGS (``llffhold``).
+    """
+    if not 2 <= every <= len(dataset.pictures):
+        raise InvalidInput("holdout", f"{every} is outside 2..{len(dataset.pictures)}")
+    kept = tuple(picture for i, picture in enumerate(dataset.pictures) if i % every)
+    held_out = dataset.pictures[::every]
+    return replace(dataset, pictures=kept), replace(dataset, pictures=held_out)
+
+
+def share_of_views(pictures: Sequence[PosedPicture], percent: float) -> tuple[PosedPicture, ...]:
+    """Return ``percent`` of the pictures, at least one, spread evenly over all of them."""
+    count = max(1, round(len(pictures) * percent / 100))
+    return tuple(pictures[i * len(pictures) // count] for i in range(count))
