@@ -1,7 +1,7 @@
 """The previous decoded picture carried to the present pose by depth, and block costs.
 
 Both ends make the warp from what both have, so every sample is defined here, in float32 without
-fused operations and in integers; ``csrc/warp.cpp`` computes exactly this on every machine.
+fused operations and in integers; ``csrc/picture/warp.cpp`` computes exactly this on every machine.
 
 Where: pixel (x, y) of the present camera, depth z = ``depth[y, x]``, has the ray
 ((x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy, 1). With R, t mapping points of the present camera into

@@ -1,7 +1,7 @@
 """RGB <-> I420: BT.709, limited range, integers only, the same bytes on every machine.
 
 Both ends of a stream turn their renders into codec pictures, so this conversion is part of what
-must be bit-exact. It is defined here by integers; ``csrc/yuv.cpp`` computes exactly this.
+must be bit-exact. It is defined here by integers; ``csrc/picture/yuv.cpp`` computes exactly this.
 
 Forward (ITU-R BT.709-6 section 3, 8 bits, with Kr = 0.2126, Kb = 0.0722). Coefficients are the
 exact ones times 2**16, rounded so that the luma row sums to round(219 / 255 * 2**16) and the

@@ -15,7 +15,7 @@
 #include "raster/camera.h"
 #include "raster/rasterizer.h"
 #include "raster/trainable.h"
-#include "yuv.h"
+#include "picture/yuv.h"
 
 namespace {
 
@@ -104,13 +104,12 @@ void train(const Scene& scene, const Kernels& kernels, int threads, File& out) {
 int main(int argc, char** argv) {
     try {
         if (argc != 5) throw std::runtime_error("usage: exactness_splats ISA THREADS SCENE RESULT");
-        const Kernels* kernels = kernels_named(argv[1]);
-        if (kernels == nullptr) throw std::runtime_error(std::string("no kernels named ") + argv[1]);
+        const Kernels& kernels = kernels_for(argv[1]);
         const int threads = std::atoi(argv[2]);
         const Scene scene = read_scene(argv[3]);
         File out(argv[4], "wb");
-        draw(scene, *kernels, threads, out);
-        train(scene, *kernels, threads, out);
+        draw(scene, kernels, threads, out);
+        train(scene, kernels, threads, out);
     } catch (const std::exception& error) {
         std::fprintf(stderr, "exactness_splats: %s\n", error.what());
         return 1;

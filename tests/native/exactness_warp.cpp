@@ -9,7 +9,7 @@
 // RESULT: bytes Y, U, V carried and corrected; int32 SATD and SSD of the previous picture's blocks
 // against the render.
 #include "exactness_file.h"
-#include "warp.h"
+#include "picture/warp.h"
 
 namespace {
 

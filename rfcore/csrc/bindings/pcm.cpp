@@ -1,6 +1,6 @@
 // Binds rfcore/csrc/pcm.h. Shapes and dtypes are checked by rfcore/native/pcm.py; the types below
 // refuse anything else that nanobind can see.
-#include "pcm.h"
+#include "picture/pcm.h"
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>

@@ -15,6 +15,7 @@
 #include "raster/camera.h"
 #include "raster/rasterizer.h"
 #include "raster/trainable.h"
+#include "simd/isa.h"
 
 namespace nb = nanobind;
 
@@ -23,7 +24,6 @@ namespace {
 
 using raster::Camera;
 using raster::GaussianArrays;
-using raster::Kernels;
 using raster::LearningRates;
 using raster::Rasterizer;
 using raster::Statistics;
@@ -32,17 +32,10 @@ using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using DoublesOut = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
 using FloatsOut = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 
-const Kernels& kernels_or_best(const std::string& isa) {
-    const Kernels* kernels =
-        isa.empty() ? raster::available_kernels()[0] : raster::kernels_named(isa.c_str());
-    if (kernels == nullptr) throw std::invalid_argument("no kernels named " + isa);
-    return *kernels;
-}
-
-std::vector<std::string> available_isas() {
+std::vector<std::string> isa_names() {
     std::vector<std::string> names;
-    for (const Kernels* const* k = raster::available_kernels(); *k != nullptr; ++k) {
-        names.emplace_back((*k)->isa);
+    for (const char* const* name = available_isas(); *name != nullptr; ++name) {
+        names.emplace_back(*name);
     }
     return names;
 }
@@ -66,7 +59,7 @@ Camera camera_of(const std::vector<double>& numbers, int width, int height) {
 
 void bind_rasterizer(nb::module_& m) {
     using nb::literals::operator""_a;
-    m.def("available_isas", &available_isas, "Instruction sets this machine can run, best first.");
+    m.def("available_isas", &isa_names, "Instruction sets this machine can run, best first.");
 
     nb::class_<Camera>(m, "RasterCamera")
         .def("__init__", [](Camera* self, const std::vector<double>& numbers, int width,
@@ -78,7 +71,7 @@ void bind_rasterizer(nb::module_& m) {
              [](Rasterizer* self, const Floats& means, const Floats& quaternions,
                 const Floats& log_scales, const Floats& opacity_logits, const Floats& sh,
                 int threads, const std::string& isa, bool antialiased) {
-                 const Kernels& kernels = kernels_or_best(isa);
+                 const raster::Kernels& kernels = raster::kernels_for(isa.c_str());
                  const GaussianArrays arrays =
                      arrays_of(means, quaternions, log_scales, opacity_logits, sh);
                  const nb::gil_scoped_release release;
@@ -195,7 +188,7 @@ void bind_trainable(nb::module_& m) {
              [](TrainableRasterizer* self, const Floats& means, const Floats& quaternions,
                 const Floats& log_scales, const Floats& opacity_logits, const Floats& sh,
                 int threads, const std::string& isa, bool antialiased) {
-                 const Kernels& kernels = kernels_or_best(isa);
+                 const raster::Kernels& kernels = raster::kernels_for(isa.c_str());
                  const GaussianArrays arrays =
                      arrays_of(means, quaternions, log_scales, opacity_logits, sh);
                  const nb::gil_scoped_release release;

@@ -9,7 +9,7 @@
 #include <optional>
 #include <tuple>
 
-#include "warp.h"
+#include "picture/warp.h"
 
 namespace nb = nanobind;
 

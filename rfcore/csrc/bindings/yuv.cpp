@@ -3,7 +3,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
-#include "yuv.h"
+#include "picture/yuv.h"
 
 namespace nb = nanobind;
 

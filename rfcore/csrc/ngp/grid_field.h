@@ -5,8 +5,8 @@
 #include <vector>
 
 #include "ngp/kernels.h"
-#include "raster/aligned_buffer.h"
-#include "raster/thread_pool.h"
+#include "threads/aligned_buffer.h"
+#include "threads/thread_pool.h"
 
 namespace rfcore::ngp {
 

@@ -2,7 +2,7 @@
 // reads at them. Everything is exact, so every instruction set gives the same bits.
 #pragma once
 
-#include "raster/simd.h"
+#include "simd/simd.h"
 
 namespace {
 

@@ -5,7 +5,7 @@
 #pragma once
 
 #include "ngp/encode.h"
-#include "raster/math.h"
+#include "simd/math.h"
 
 namespace {
 

@@ -3,8 +3,8 @@
 
 #include <vector>
 
-#include "raster/aligned_buffer.h"
-#include "raster/thread_pool.h"
+#include "threads/aligned_buffer.h"
+#include "threads/thread_pool.h"
 #include "raster/types.h"
 
 namespace rfcore::raster {

@@ -1,7 +1,7 @@
 // Which 16x16 tiles a splat touches: the exact extent of its ellipse in every row of tiles.
 #pragma once
 
-#include "raster/math.h"
+#include "simd/math.h"
 #include "raster/types.h"
 
 namespace {

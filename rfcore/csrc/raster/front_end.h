@@ -3,10 +3,10 @@
 
 #include <vector>
 
-#include "raster/aligned_buffer.h"
+#include "threads/aligned_buffer.h"
 #include "raster/depth_sort.h"
 #include "raster/kernels.h"
-#include "raster/thread_pool.h"
+#include "threads/thread_pool.h"
 
 namespace rfcore::raster {
 

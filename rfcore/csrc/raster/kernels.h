@@ -35,9 +35,7 @@ extern const Kernels kAvx512Kernels;
 extern const Kernels kNeonKernels;
 #endif
 
-// Kernels this machine can run, best first; null-terminated.
-const Kernels* const* available_kernels();
-// The table named `isa`, or null.
-const Kernels* kernels_named(const char* isa);
+// The table for the instruction set `isa`, "" for the best; throws for one this machine lacks.
+const Kernels& kernels_for(const char* isa);
 
 }  // namespace rfcore::raster

@@ -7,7 +7,7 @@
 // that vanish.
 #pragma once
 
-#include "raster/simd.h"
+#include "simd/simd.h"
 #include "raster/types.h"
 
 namespace {

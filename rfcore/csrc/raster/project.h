@@ -6,7 +6,7 @@
 #pragma once
 
 #include "raster/footprint.h"
-#include "raster/math.h"
+#include "simd/math.h"
 #include "raster/types.h"
 
 namespace {

@@ -5,7 +5,7 @@
 // a pixel alone is computed once per splat and row, and read back four floats at a time.
 #pragma once
 
-#include "raster/math.h"
+#include "simd/math.h"
 #include "raster/types.h"
 
 namespace {

@@ -6,7 +6,7 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "yuv.h"
+#include "picture/yuv.h"
 
 namespace rfcore {
 

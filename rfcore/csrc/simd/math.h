@@ -1,7 +1,7 @@
 // exp2, log2 and the real spherical harmonics on 16 lanes, the same bits everywhere.
 #pragma once
 
-#include "raster/simd.h"
+#include "simd/simd.h"
 
 namespace {
 

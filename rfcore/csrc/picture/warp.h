@@ -5,7 +5,7 @@
 
 #include <cstdint>
 
-#include "yuv.h"
+#include "picture/yuv.h"
 
 namespace rfcore {
 

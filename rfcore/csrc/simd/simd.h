@@ -19,13 +19,13 @@
 #endif
 
 #if defined(RF_ISA_AVX512)
-#include "raster/simd_avx512.h"
+#include "simd/avx512.h"
 #elif defined(RF_ISA_AVX2)
-#include "raster/simd_avx2.h"
+#include "simd/avx2.h"
 #elif defined(RF_ISA_NEON)
-#include "raster/simd_neon.h"
+#include "simd/neon.h"
 #else
-#include "raster/simd_scalar.h"
+#include "simd/scalar.h"
 #endif
 
 namespace {

@@ -1,4 +1,4 @@
-#include "raster/thread_pool.h"
+#include "threads/thread_pool.h"
 
 #include <cfenv>
 

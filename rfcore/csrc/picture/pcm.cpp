@@ -1,4 +1,4 @@
-#include "pcm.h"
+#include "picture/pcm.h"
 
 #include <algorithm>
 #include <cstring>

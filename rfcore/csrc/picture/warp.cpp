@@ -1,4 +1,4 @@
-#include "warp.h"
+#include "picture/warp.h"
 
 #include <algorithm>
 #include <cstddef>
@@ -8,7 +8,7 @@
 #include <numeric>
 #include <vector>
 
-#include "raster/thread_pool.h"
+#include "threads/thread_pool.h"
 
 #if defined(__SSE2__)
 #include <emmintrin.h>
@@ -34,7 +34,7 @@ constexpr float kRelative = 0.08f, kAbsolute = 0.1f;
 // Lanczos-3 at n / 64, rounded to 1/64 so that every row sums to 64 (rfcore/native/warp.py makes
 // this table again, tests/native/test_warp.py compares).
 constexpr std::int16_t kFilter[kSteps][kLanes] = {
-#include "warp_filter.inc"
+#include "picture/warp_filter.inc"
 };
 
 // A vector in the compilers' own notation (GCC, Clang), for any instruction set. Taps are 6 bits
