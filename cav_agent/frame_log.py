@@ -50,7 +50,7 @@ def log_line(result: FrameResult) -> dict[str, Any]:
         "crf": result.crf,
         "target_bytes": result.budget.target_bytes if result.budget else None,
         "packet_bytes": result.packet_bytes if packet else None,
-        "reference_digest": packet.reference_digest.hex() if packet else None,
+        "render_digest": packet.render_digest.hex() if packet else None,
         "reconstruction_digest": packet.reconstruction_digest.hex() if packet else None,
         "server_digest": result.server_digest.hex() or None,
         "stage_ms": stage_ms,

@@ -85,7 +85,7 @@ class RejectReason(StrEnum):
     STALE_SEQUENCE = "stale_sequence"
     SEQUENCE_GAP = "sequence_gap"
     CRC_MISMATCH = "crc_mismatch"
-    REFERENCE_MISMATCH = "reference_mismatch"
+    RENDER_MISMATCH = "render_mismatch"
     MALFORMED_PAYLOAD = "malformed_payload"
     DECODER_FAILED = "decoder_failed"
     RECONSTRUCTION_MISMATCH = "reconstruction_mismatch"

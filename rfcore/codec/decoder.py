@@ -32,7 +32,7 @@ __all__ = ["Decoded", "DeltaDecoder"]
 
 Clock = Callable[[], int]
 
-_COARSE_NEEDED = "between renderers that are not exact the sender must send them"
+_MEANS_REQUIRED = "between renderers that are not exact the sender must send them"
 
 
 def _stopped_clock() -> int:
@@ -61,7 +61,7 @@ class DeltaDecoder:
     With ``exact=False`` the sender's renderer may differ by rounding: a reference that fails the
     exact digest but passes the coarse one is accepted, and its reconstruction cannot be checked.
     Between exact renderers no packet needs the coarse one; where it is there, it is used to say
-    what kind of difference led to ``REFERENCE_MISMATCH``. ``open_decoder`` makes
+    what kind of difference led to ``RENDER_MISMATCH``. ``open_decoder`` makes
     the standard decoder that sees the sender's bytes.
     """
 
@@ -132,15 +132,15 @@ class DeltaDecoder:
 
     def _check_render(self, packet: DeltaPacket, render: I420) -> bool:
         """Tell whether the renders are identical; raise if they may not be used together."""
-        if render.digest() == packet.reference_digest:
+        if render.digest() == packet.render_digest:
             return True
-        if not packet.reference_coarse:
+        if not packet.render_block_means:
             raise PacketRejected(
-                RejectReason.REFERENCE_MISMATCH,
+                RejectReason.RENDER_MISMATCH,
                 "our render is not the sender's, and the packet has no block means to say by how "
-                f"much: {'another pose, field or camera' if self._exact else _COARSE_NEEDED}",
+                f"much: {'another pose, field or camera' if self._exact else _MEANS_REQUIRED}",
             )
-        difference = block_mean_difference(block_mean_digest(render), packet.reference_coarse)
+        difference = block_mean_difference(block_mean_digest(render), packet.render_block_means)
         rounding_sized = difference <= BLOCK_MEANS_TOLERANCE
         if rounding_sized and not self._exact:
             return False
@@ -150,7 +150,7 @@ class DeltaDecoder:
             else "another pose, field or camera"
         )
         raise PacketRejected(
-            RejectReason.REFERENCE_MISMATCH,
+            RejectReason.RENDER_MISMATCH,
             f"our render is not the sender's; block means differ by up to {difference} "
             f"levels (tolerance {BLOCK_MEANS_TOLERANCE}): {kind}",
         )
@@ -164,11 +164,11 @@ class DeltaDecoder:
                 RejectReason.INVALID_ARGUMENT,
                 "between renderers that are not exact only the render may be predicted from",
             )
-        past = state.past(packet.needed_digest)
+        past = state.past(packet.base_digest)
         if past is None:
             raise PacketRejected(
                 RejectReason.UNKNOWN_STATE,
-                f"frame {packet.needed_digest.hex()} is none of the {len(state.kept)} kept here",
+                f"frame {packet.base_digest.hex()} is none of the {len(state.kept)} kept here",
             )
         return past
 

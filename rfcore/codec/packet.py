@@ -11,17 +11,17 @@ from rfcore.codec.photometric import Photometric, check_photometric
 from rfcore.codec.references import RENDER_ONLY, References, check_references, is_temporal
 from rfcore.errors import InvalidInput
 
-__all__ = ["DIGEST_BYTES", "NEEDED_BYTES", "DeltaPacket"]
+__all__ = ["BASE_DIGEST_BYTES", "DIGEST_BYTES", "DeltaPacket"]
 
 DIGEST_BYTES = 16
 
-NEEDED_BYTES = 4
+BASE_DIGEST_BYTES = 4
 """Enough to tell a handful of kept frames apart; two of the same name end in the reconstruction's
 digest, not in a wrong picture."""
 
 _UINT32, _UINT64 = 1 << 32, 1 << 64
-_DIGEST, _COARSE, _NOTHING = (DIGEST_BYTES,), (0, BLOCK_MEANS_BYTES), (0,)
-_NEEDED = range(NEEDED_BYTES, DIGEST_BYTES + 1)
+_DIGEST, _BLOCK_MEANS, _NOTHING = (DIGEST_BYTES,), (0, BLOCK_MEANS_BYTES), (0,)
+_BASE = range(BASE_DIGEST_BYTES, DIGEST_BYTES + 1)
 
 
 @dataclass(frozen=True)
@@ -30,25 +30,26 @@ class DeltaPacket:
     outside uint64 (``epoch``, ``sequence``) or uint32 (``crc32``); nothing else is checked here.
 
     ``payload`` is one NAL unit without start code; empty, the frame is its only reference as it is.
-    ``reference_digest`` and ``reference_coarse`` are of the sender's render (whatever the frame is
-    predicted from: they say that pose and field are the same), ``reconstruction_digest`` is of what
-    the receiver must get (``I420.digest``). ``reference_coarse`` is empty between exact renderers,
-    where no difference is small enough. ``needed_digest`` names the earlier frame that
-    ``references`` call for by the first bytes of its digest (4 as we write it, up to all 16), and
-    is empty when they call for none; ``photometric`` changes the render before it is used.
+    ``render_digest`` and ``render_block_means`` are of the sender's render at the frame's pose,
+    whatever the frame is predicted from: they tell whether both ends have the same pose and field.
+    ``render_block_means`` is empty between exact renderers, where no difference is tolerated.
+    ``reconstruction_digest`` is of the picture the receiver must get (``I420.digest``).
+    ``base_digest`` names the earlier frame that ``references`` call for by the first bytes of its
+    reconstruction digest (4 as we write it, up to all 16), and is empty when they call for none;
+    ``photometric`` changes the render before it is used.
     ``crc32`` covers all other fields (``expected_crc32``): a damaged sequence number would
     otherwise make every later packet look stale.
     """
 
     epoch: int
     sequence: int
-    reference_digest: bytes
-    reference_coarse: bytes
+    render_digest: bytes
+    render_block_means: bytes
     reconstruction_digest: bytes
     payload: bytes
     crc32: int
     references: References = RENDER_ONLY
-    needed_digest: bytes = b""
+    base_digest: bytes = b""
     photometric: Photometric = ()
 
     def __post_init__(self) -> None:
@@ -58,26 +59,26 @@ class DeltaPacket:
         check_references(self.references)
         if self.photometric:
             check_photometric(self.photometric)
-        needed = _NEEDED if is_temporal(self.references) else _NOTHING
-        _require_length("reference_digest", self.reference_digest, _DIGEST)
-        _require_length("reference_coarse", self.reference_coarse, _COARSE)
+        base_lengths = _BASE if is_temporal(self.references) else _NOTHING
+        _require_length("render_digest", self.render_digest, _DIGEST)
+        _require_length("render_block_means", self.render_block_means, _BLOCK_MEANS)
         _require_length("reconstruction_digest", self.reconstruction_digest, _DIGEST)
-        _require_length("needed_digest", self.needed_digest, needed)
+        _require_length("base_digest", self.base_digest, base_lengths)
 
     def expected_crc32(self) -> int:
         """Return zlib.crc32 of epoch and sequence (8 bytes each, big-endian), the digests in the
-        order of the fields, the payload, a byte for each reference, the needed digest, and the
+        order of the fields, the payload, a byte for each reference, the base digest, and the
         photometric numbers (2 bytes each)."""
         head = (
             self.epoch.to_bytes(8, "big"),
             self.sequence.to_bytes(8, "big"),
-            self.reference_digest,
-            self.reference_coarse,
+            self.render_digest,
+            self.render_block_means,
             self.reconstruction_digest,
         )
         tail = (
             bytes(self.references),
-            self.needed_digest,
+            self.base_digest,
             *(number.to_bytes(2, "big", signed=True) for number in self.photometric),
         )
         crc = zlib.crc32(self.payload, zlib.crc32(b"".join(head)))

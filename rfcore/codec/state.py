@@ -1,7 +1,7 @@
 """What each end remembers between frames: sequence numbers, and frames to predict from.
 
 A frame's state is named by the digest of its picture. A packet that predicts from an earlier frame
-says which (``DeltaPacket.needed_digest``, the first bytes of the name), and its own
+says which (``DeltaPacket.base_digest``, the first bytes of the name), and its own
 ``reconstruction_digest`` names the state it makes. The sender predicts from one frame at a time,
 and which one is the caller's choice: the last sent, or, after a loss, the last that is known to
 have been decoded. The receiver keeps the last few, so that rolling back needs no new start.

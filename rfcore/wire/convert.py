@@ -118,7 +118,7 @@ def _camera_from_wire(field: str, camera: pb.CameraDescription) -> CameraDescrip
     )
 
 
-def _codec_from_wire(header: pb.CodecHeader) -> StreamHeader:
+def _codec_from_wire(header: pb.StreamHeader) -> StreamHeader:
     return StreamHeader(
         CodecConfig(
             header.width_px, header.height_px, check_name("codec.preset", header.preset), header.crf
@@ -149,7 +149,7 @@ def _camera_to_wire(camera: CameraDescription) -> pb.CameraDescription:
             cx_px=k.cx_px,
             cy_px=k.cy_px,
         ),
-        codec=pb.CodecHeader(
+        codec=pb.StreamHeader(
             width_px=config.width_px,
             height_px=config.height_px,
             preset=config.preset,
@@ -217,13 +217,13 @@ def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
         return DeltaPacket(  # checks lengths and unsigned numbers itself
             epoch=frame.epoch,
             sequence=frame.sequence,
-            reference_digest=frame.reference_digest,
-            reference_coarse=frame.reference_coarse,
+            render_digest=frame.render_digest,
+            render_block_means=frame.render_block_means,
             reconstruction_digest=frame.reconstruction_digest,
             payload=check_bytes("frame.payload", frame.payload, 0, MAX_PAYLOAD_BYTES),
             crc32=frame.crc32,
             references=_references_from_wire(tuple(frame.references)),
-            needed_digest=frame.needed_digest,
+            base_digest=frame.base_digest,
             photometric=tuple(frame.photometric),
         )
     except InvalidInput as error:
@@ -247,12 +247,12 @@ def _frame_to_wire(frame: Frame) -> pb.Frame:
         capture_time_ns=frame.capture_time_ns,
         field_id_prefix=frame.field_id_prefix,
         references=[cast(pb.Reference.ValueType, int(r)) for r in packet.references],
-        reference_digest=packet.reference_digest,
-        reference_coarse=packet.reference_coarse,
+        render_digest=packet.render_digest,
+        render_block_means=packet.render_block_means,
         reconstruction_digest=packet.reconstruction_digest,
         payload=packet.payload,
         crc32=packet.crc32,
-        needed_digest=packet.needed_digest,
+        base_digest=packet.base_digest,
         photometric=packet.photometric,
     )
     _add_pose(message, frame.pose)

@@ -22,7 +22,7 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
-from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
+from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket
 from rfcore.codec.references import INTRA, Reference
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.state import DecoderState
@@ -173,7 +173,7 @@ def insert_nal(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
 
 def flip_digests(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     """Flip bits in one of the digests."""
-    names = ["reference_digest", "reference_coarse", "reconstruction_digest", "needed_digest"]
+    names = ["render_digest", "render_block_means", "reconstruction_digest", "base_digest"]
     name = names[rng.integers(len(names))]
     changed: dict[str, Any] = {name: flip_bits(getattr(packet, name), rng)}
     return replace(packet, **changed)
@@ -191,8 +191,8 @@ def exchange_references(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     count = int(rng.integers(4))
     order = [Reference(int(n)) for n in rng.permutation(4)[:count] + 1]
     needs = any(reference is not Reference.RENDER for reference in order)
-    needed = (packet.needed_digest or rng.bytes(NEEDED_BYTES)) if needs else b""
-    return replace(packet, references=tuple(order), needed_digest=needed)
+    base = (packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)) if needs else b""
+    return replace(packet, references=tuple(order), base_digest=base)
 
 
 def relight(packet: DeltaPacket, rng: Rng) -> DeltaPacket:

@@ -164,13 +164,13 @@ def _numbered(packet: DeltaPacket, epoch: int, sequence: int) -> DeltaPacket:
         return DeltaPacket(
             epoch,
             sequence,
-            packet.reference_digest,
-            packet.reference_coarse,
+            packet.render_digest,
+            packet.render_block_means,
             packet.reconstruction_digest,
             packet.payload,
             crc32,
             packet.references,
-            packet.needed_digest,
+            packet.base_digest,
             packet.photometric,
         )
 

@@ -48,7 +48,7 @@ def test_a_noise_picture_is_coded_until_its_slice_is_below_the_limit(noisy: Capt
 def test_block_means_are_sent_only_where_the_server_is_not_exact(noisy: Capture) -> None:
     pipeline = Pipeline(Grey(), CodecConfig(32, 16, preset="ultrafast"), lambda: 0)
     lengths = [
-        len(pipeline.encode(EncodeJob(noisy, 0, 1, exact=exact)).packet.reference_coarse)
+        len(pipeline.encode(EncodeJob(noisy, 0, 1, exact=exact)).packet.render_block_means)
         for exact in (True, False)
     ]
     assert lengths == [0, 64]

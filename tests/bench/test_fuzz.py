@@ -25,7 +25,7 @@ def test_damaged_packets_never_show_a_wrong_picture(stream: FuzzStream) -> None:
         RejectReason.MALFORMED_PAYLOAD,
         RejectReason.DECODER_FAILED,
         RejectReason.RECONSTRUCTION_MISMATCH,
-        RejectReason.REFERENCE_MISMATCH,
+        RejectReason.RENDER_MISMATCH,
         RejectReason.UNKNOWN_STATE,
     }
     assert {str(reason) for reason in caught} <= set(outcomes)

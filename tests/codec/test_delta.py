@@ -50,8 +50,8 @@ def psnr_y_db(a: I420, b: I420) -> float:
         ({"epoch": 4, "sequence": 3, "crc32": 0}, RejectReason.STALE_EPOCH),
         ({"sequence": 9, "crc32": 0}, RejectReason.STALE_SEQUENCE),
         ({"crc32": 0}, RejectReason.CRC_MISMATCH),
-        ({"reference_digest": bytes(16), "crc32": 0}, RejectReason.CRC_MISMATCH),
-        ({"reference_digest": bytes(16), "payload": b""}, RejectReason.REFERENCE_MISMATCH),
+        ({"render_digest": bytes(16), "crc32": 0}, RejectReason.CRC_MISMATCH),
+        ({"render_digest": bytes(16), "payload": b""}, RejectReason.RENDER_MISMATCH),
         ({"payload": b""}, RejectReason.RECONSTRUCTION_MISMATCH),
         ({"payload": b"\x41"}, RejectReason.MALFORMED_PAYLOAD),
         ({"payload": b"\x41\x9a\x22"}, RejectReason.DECODER_FAILED),
@@ -130,7 +130,7 @@ def test_an_exact_receiver_refuses_rounding_and_says_what_it_is(
     decoder = DeltaDecoder(encoder.header)
     with pytest.raises(PacketRejected, match="rounding-sized") as caught:
         decoder.decode(decoder.start(5), sent.packet, perturbed(pair(*SIZE_PX)[1]))
-    assert caught.value.reason == RejectReason.REFERENCE_MISMATCH
+    assert caught.value.reason == RejectReason.RENDER_MISMATCH
 
 
 @pytest.mark.parametrize(
@@ -142,11 +142,11 @@ def test_without_block_means_any_difference_of_the_renders_is_refused(
 ) -> None:
     frame, render = pair(*SIZE_PX)
     sent = encoder.encode(encoder.start(0), frame, render)
-    assert sent.packet.reference_coarse == b""
+    assert sent.packet.render_block_means == b""
     decoder = DeltaDecoder(encoder.header, exact=exact)
     with pytest.raises(PacketRejected, match=f"no block means to say by how much: .*{named}") as no:
         decoder.decode(decoder.start(0), sent.packet, perturbed(render))
-    assert no.value.reason == RejectReason.REFERENCE_MISMATCH
+    assert no.value.reason == RejectReason.RENDER_MISMATCH
     shown = decoder.decode(decoder.start(0), sent.packet, render)
     assert shown.frame.digest() == sent.reconstruction.digest()
 
@@ -171,7 +171,7 @@ def test_a_render_of_another_pose_or_field_is_refused(
     decoder = DeltaDecoder(encoder.header, exact=exact)
     with pytest.raises(PacketRejected, match="another pose, field or camera") as caught:
         decoder.decode(decoder.start(5), sent.packet, render)
-    assert caught.value.reason == RejectReason.REFERENCE_MISMATCH
+    assert caught.value.reason == RejectReason.RENDER_MISMATCH
 
 
 def test_an_inexact_receiver_still_checks_what_it_can(
@@ -203,8 +203,8 @@ def test_pictures_of_another_size_are_the_callers_mistake(
         ({"epoch": -1}, "packet.epoch: -1"),
         ({"sequence": 1 << 64}, "packet.sequence"),
         ({"crc32": 1 << 32}, "packet.crc32"),
-        ({"reference_digest": b"short"}, "packet.reference_digest: 5 bytes where 16"),
-        ({"reference_coarse": b"c"}, "packet.reference_coarse: 1 bytes where 0 or 64"),
+        ({"render_digest": b"short"}, "packet.render_digest: 5 bytes where 16"),
+        ({"render_block_means": b"c"}, "packet.render_block_means: 1 bytes where 0 or 64"),
         ({"reconstruction_digest": bytes(17)}, "packet.reconstruction_digest: 17 bytes"),
     ],
 )

@@ -75,7 +75,7 @@ def overwrite(packet: DeltaPacket, rng: np.random.Generator) -> DeltaPacket:
 
 
 def flip_digests(packet: DeltaPacket, rng: np.random.Generator) -> DeltaPacket:
-    name = ("reference_digest", "reconstruction_digest")[rng.integers(2)]
+    name = ("render_digest", "reconstruction_digest")[rng.integers(2)]
     return replace(packet, **{name: flip_bits(getattr(packet, name), rng)})
 
 
@@ -123,7 +123,7 @@ def test_a_damaged_packet_is_refused_or_decodes_exactly(
 def test_parts_of_other_packets_are_refused(stream: Stream, repaired: bool) -> None:
     decoder = DeltaDecoder(stream.header)
     state = decoder.start(1)
-    names = ("payload", "reference_digest", "reconstruction_digest")
+    names = ("payload", "render_digest", "reconstruction_digest")
     for index, packet in enumerate(stream.packets):
         for other in stream.packets[:index] + stream.packets[index + 1 :]:
             for name in names:

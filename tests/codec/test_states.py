@@ -120,7 +120,7 @@ def test_the_states_of_a_stream_form_a_chain(encoder: DeltaEncoder, moments: lis
     state, made = encoder.start(0), b""
     for now in moments[:4]:
         sent = send(encoder, state, now)
-        assert sent.packet.needed_digest == made[:4]
+        assert sent.packet.base_digest == made[:4]
         made, state = sent.packet.reconstruction_digest, sent.state
 
 
@@ -147,7 +147,7 @@ def test_a_frame_whose_base_was_lost_is_refused_and_rolling_back_heals_it(
     assert caught.value.reason == RejectReason.UNKNOWN_STATE
     back = replace(encoder.start(1), past=first.state.past)
     again = send(encoder, back, moments[3])
-    assert again.packet.needed_digest == first.packet.reconstruction_digest[:4]
+    assert again.packet.base_digest == first.packet.reconstruction_digest[:4]
     state = decoder.start(1, after=got.state)
     healed = decoder.decode(state, again.packet, moments[3].render, moments[3].seen)
     assert healed.frame.digest() == again.reconstruction.digest()

@@ -60,7 +60,7 @@ async def test_damaged_packets_are_refused_and_the_next_is_right_again(
         (f[1], "ack"),
         (f[2], "ack"),
         (f[1], "stale_sequence"),
-        (moved, "reference_mismatch"),
+        (moved, "render_mismatch"),
         (changed(f[3], x_m=float("nan")), "invalid_argument"),
         (changed(f[3], rotation_w=2.0), "invalid_argument"),
         (b"\xffgarbage", "invalid_argument"),

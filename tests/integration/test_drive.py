@@ -84,7 +84,7 @@ async def test_the_report_keeps_the_sizes_apart_and_says_where_the_time_went(
         assert line["name"].endswith(f"{number:03}.png")
         assert 0 < line["payload_bytes"] < line["packet_bytes"] < line["payload_bytes"] + 260
         assert line["server_digest"] == line["reconstruction_digest"]
-        assert len(bytes.fromhex(line["reference_digest"])) == 16
+        assert len(bytes.fromhex(line["render_digest"])) == 16
         own = {"read", "convert", "render", "references", "encode", "closed_loop", "link"}
         server_s = {f"server_{s}" for s in ("queue", "render", "splice", "decode", "total")}
         assert set(line["stage_ms"]) == own | server_s

@@ -31,8 +31,8 @@ def frame() -> Frame:
     packet = DeltaPacket(
         epoch=3,
         sequence=41,
-        reference_digest=b"r" * 16,
-        reference_coarse=b"c" * 64,
+        render_digest=b"r" * 16,
+        render_block_means=b"c" * 64,
         reconstruction_digest=b"d" * 16,
         payload=PAYLOAD,
         crc32=zlib.crc32(PAYLOAD),

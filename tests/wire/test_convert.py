@@ -94,8 +94,11 @@ Change = Callable[[pb.StreamRequest], object]
         (lambda m: setattr(m.frame, "camera_id", "../etc"), "frame.camera_id: '../etc'"),
         (lambda m: setattr(m.frame, "camera_id", "a" * 65), "frame.camera_id"),
         (lambda m: setattr(m.frame, "payload", b"x" * 1_000_001), "frame.payload: 1000001 bytes"),
-        (lambda m: setattr(m.frame, "reference_digest", b"x"), "frame.reference_digest: 1 bytes"),
-        (lambda m: setattr(m.frame, "reference_coarse", b"x"), "frame.reference_coarse: 1 bytes"),
+        (lambda m: setattr(m.frame, "render_digest", b"x"), "frame.render_digest: 1 bytes"),
+        (
+            lambda m: setattr(m.frame, "render_block_means", b"x"),
+            "frame.render_block_means: 1 bytes",
+        ),
         (lambda m: setattr(m.frame, "reconstruction_digest", b""), "frame.reconstruction_digest"),
         (
             lambda m: setattr(m.frame, "field_id_prefix", b"x"),

@@ -22,13 +22,13 @@ BUDGET_BYTES = {
     "capture_time_ns": 9,
     "pose_f32": 30,
     "references": 5,
-    "reference_digest": 18,
+    "render_digest": 18,
     "reconstruction_digest": 18,
     "payload": 3,
     "crc32": 5,
-    "needed_digest": 6,
+    "base_digest": 6,
 }
-LONG_FORM_BYTES = {"pose": 65, "field_id_prefix": 10, "reference_coarse": 66, "needed_digest": 18}
+LONG_FORM_BYTES = {"pose": 65, "field_id_prefix": 10, "render_block_means": 66, "base_digest": 18}
 """What the same took with a float64 pose, a field id, block means and a whole digest."""
 
 
@@ -36,13 +36,13 @@ def frame_of(pose: Pose) -> Frame:
     packet = DeltaPacket(
         epoch=3,
         sequence=10_000,
-        reference_digest=b"r" * 16,
-        reference_coarse=b"",
+        render_digest=b"r" * 16,
+        render_block_means=b"",
         reconstruction_digest=b"d" * 16,
         payload=bytes(SLICE_BYTES),
         crc32=1,
         references=THREE,
-        needed_digest=b"need",
+        base_digest=b"need",
     )
     return Frame("front", 1_700_000_000_000_000_000, pose, b"", packet)
 
@@ -69,7 +69,7 @@ def test_a_frame_of_an_exact_stream_has_this_budget() -> None:
 
 def test_the_long_form_costs_more_than_twice_as_much() -> None:
     short = frame_of(TURN)
-    packet = replace(short.packet, reference_coarse=b"c" * 64, needed_digest=b"n" * 16)
+    packet = replace(short.packet, render_block_means=b"c" * 64, base_digest=b"n" * 16)
     budget = budget_bytes(replace(short, field_id_prefix=b"f" * 8, packet=packet))
     assert budget.items() >= LONG_FORM_BYTES.items()
     assert sum(budget.values()) == 232

@@ -18,7 +18,7 @@ from rfcore.codec.h264.pcm_picture import without_zeros
 from rfcore.codec.h264.qp_map import QpMap, check_qp_map
 from rfcore.codec.h264.slices import SliceCoding, encode_slice
 from rfcore.codec.h264.splice import SpliceDecoder, grey
-from rfcore.codec.packet import NEEDED_BYTES, DeltaPacket
+from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket
 from rfcore.codec.photometric import Photometric, adapt
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import References, check_references, is_temporal
@@ -168,13 +168,13 @@ class DeltaEncoder:
         packet = DeltaPacket(
             epoch=state.epoch,
             sequence=state.next_sequence,
-            reference_digest=render.digest(),
-            reference_coarse=block_mean_digest(render) if choice.coarse else b"",
+            render_digest=render.digest(),
+            render_block_means=block_mean_digest(render) if choice.coarse else b"",
             reconstruction_digest=shown.digest,
             payload=made.payload,
             crc32=0,
             references=references,
-            needed_digest=_name(past) if is_temporal(references) else b"",
+            base_digest=_name(past) if is_temporal(references) else b"",
             photometric=photometric,
         ).sealed()
         stage_ns = {
@@ -237,7 +237,7 @@ class DeltaEncoder:
 
 
 def _name(past: Past | None) -> bytes:
-    return b"" if past is None else past.digest[:NEEDED_BYTES]
+    return b"" if past is None else past.digest[:BASE_DIGEST_BYTES]
 
 
 def _require_size(name: str, picture: I420, config: CodecConfig) -> None:

@@ -37,7 +37,7 @@ class _ReferenceEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Reference.V
     REFERENCE_RENDER: _Reference.ValueType  # 1
     """The field rendered at the frame's pose."""
     REFERENCE_PREVIOUS: _Reference.ValueType  # 2
-    """The earlier frame that needed_digest names, as it was decoded."""
+    """The earlier frame that base_digest names, as it was decoded."""
     REFERENCE_WARP: _Reference.ValueType  # 3
     """That frame carried to this frame's pose by the field's depth, holes from the render."""
     REFERENCE_CORRECTION: _Reference.ValueType  # 4
@@ -50,7 +50,7 @@ REFERENCE_UNSPECIFIED: Reference.ValueType  # 0
 REFERENCE_RENDER: Reference.ValueType  # 1
 """The field rendered at the frame's pose."""
 REFERENCE_PREVIOUS: Reference.ValueType  # 2
-"""The earlier frame that needed_digest names, as it was decoded."""
+"""The earlier frame that base_digest names, as it was decoded."""
 REFERENCE_WARP: Reference.ValueType  # 3
 """That frame carried to this frame's pose by the field's depth, holes from the render."""
 REFERENCE_CORRECTION: Reference.ValueType  # 4
@@ -68,7 +68,7 @@ class _RejectReasonEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_RejectRe
     REJECT_REASON_STALE_SEQUENCE: _RejectReason.ValueType  # 2
     REJECT_REASON_SEQUENCE_GAP: _RejectReason.ValueType  # 3
     REJECT_REASON_CRC_MISMATCH: _RejectReason.ValueType  # 4
-    REJECT_REASON_REFERENCE_MISMATCH: _RejectReason.ValueType  # 5
+    REJECT_REASON_RENDER_MISMATCH: _RejectReason.ValueType  # 5
     REJECT_REASON_MALFORMED_PAYLOAD: _RejectReason.ValueType  # 6
     REJECT_REASON_DECODER_FAILED: _RejectReason.ValueType  # 7
     REJECT_REASON_RECONSTRUCTION_MISMATCH: _RejectReason.ValueType  # 8
@@ -83,7 +83,7 @@ REJECT_REASON_STALE_EPOCH: RejectReason.ValueType  # 1
 REJECT_REASON_STALE_SEQUENCE: RejectReason.ValueType  # 2
 REJECT_REASON_SEQUENCE_GAP: RejectReason.ValueType  # 3
 REJECT_REASON_CRC_MISMATCH: RejectReason.ValueType  # 4
-REJECT_REASON_REFERENCE_MISMATCH: RejectReason.ValueType  # 5
+REJECT_REASON_RENDER_MISMATCH: RejectReason.ValueType  # 5
 REJECT_REASON_MALFORMED_PAYLOAD: RejectReason.ValueType  # 6
 REJECT_REASON_DECODER_FAILED: RejectReason.ValueType  # 7
 REJECT_REASON_RECONSTRUCTION_MISMATCH: RejectReason.ValueType  # 8
@@ -207,13 +207,13 @@ class CameraDescription(_message.Message):
     @_builtins.property
     def intrinsics(self) -> Global___Intrinsics: ...
     @_builtins.property
-    def codec(self) -> Global___CodecHeader: ...
+    def codec(self) -> Global___StreamHeader: ...
     def __init__(
         self,
         *,
         camera_id: _builtins.str = ...,
         intrinsics: Global___Intrinsics | None = ...,
-        codec: Global___CodecHeader | None = ...,
+        codec: Global___StreamHeader | None = ...,
         rate_hz: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["codec", b"codec", "intrinsics", b"intrinsics"]  # noqa: Y015
@@ -261,7 +261,7 @@ class Intrinsics(_message.Message):
 Global___Intrinsics: _TypeAlias = Intrinsics  # noqa: Y015
 
 @_typing.final
-class CodecHeader(_message.Message):
+class StreamHeader(_message.Message):
     """All that a receiver needs before the first packet; pinned for the session."""
 
     DESCRIPTOR: _descriptor.Descriptor
@@ -295,7 +295,7 @@ class CodecHeader(_message.Message):
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
-Global___CodecHeader: _TypeAlias = CodecHeader  # noqa: Y015
+Global___StreamHeader: _TypeAlias = StreamHeader  # noqa: Y015
 
 @_typing.final
 class RendererContract(_message.Message):
@@ -409,12 +409,12 @@ class Frame(_message.Message):
     POSE_FIELD_NUMBER: _builtins.int
     FIELD_ID_PREFIX_FIELD_NUMBER: _builtins.int
     REFERENCES_FIELD_NUMBER: _builtins.int
-    REFERENCE_DIGEST_FIELD_NUMBER: _builtins.int
-    REFERENCE_COARSE_FIELD_NUMBER: _builtins.int
+    RENDER_DIGEST_FIELD_NUMBER: _builtins.int
+    RENDER_BLOCK_MEANS_FIELD_NUMBER: _builtins.int
     RECONSTRUCTION_DIGEST_FIELD_NUMBER: _builtins.int
     PAYLOAD_FIELD_NUMBER: _builtins.int
     CRC32_FIELD_NUMBER: _builtins.int
-    NEEDED_DIGEST_FIELD_NUMBER: _builtins.int
+    BASE_DIGEST_FIELD_NUMBER: _builtins.int
     PHOTOMETRIC_FIELD_NUMBER: _builtins.int
     POSE_F32_FIELD_NUMBER: _builtins.int
     QUALITY_FIELD_NUMBER: _builtins.int
@@ -425,9 +425,9 @@ class Frame(_message.Message):
     capture_time_ns: _builtins.int
     field_id_prefix: _builtins.bytes
     """First 8 bytes of the sha256 of the field; the whole id is in Hello. Empty: its first field."""
-    reference_digest: _builtins.bytes
+    render_digest: _builtins.bytes
     """BLAKE2b-128 of the render at the frame's pose."""
-    reference_coarse: _builtins.bytes
+    render_block_means: _builtins.bytes
     """Its 8x8 block means, by which a receiver tells rounding from a wrong pose or field; empty
     between exact renderers, where every difference is refused.
     """
@@ -436,7 +436,7 @@ class Frame(_message.Message):
     payload: _builtins.bytes
     crc32: _builtins.int
     """CRC-32 (zlib) of everything above that the codec relies on; see rfcore.codec.packet."""
-    needed_digest: _builtins.bytes
+    base_digest: _builtins.bytes
     """The first 4 to 16 bytes of the reconstruction_digest of the earlier frame that the references
     call for; else empty.
     """
@@ -474,19 +474,19 @@ class Frame(_message.Message):
         pose: Global___Pose | None = ...,
         field_id_prefix: _builtins.bytes = ...,
         references: _abc.Iterable[Global___Reference.ValueType] | None = ...,
-        reference_digest: _builtins.bytes = ...,
-        reference_coarse: _builtins.bytes = ...,
+        render_digest: _builtins.bytes = ...,
+        render_block_means: _builtins.bytes = ...,
         reconstruction_digest: _builtins.bytes = ...,
         payload: _builtins.bytes = ...,
         crc32: _builtins.int = ...,
-        needed_digest: _builtins.bytes = ...,
+        base_digest: _builtins.bytes = ...,
         photometric: _abc.Iterable[_builtins.int] | None = ...,
         pose_f32: _abc.Iterable[_builtins.float] | None = ...,
         quality: Global___Quality | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["pose", b"pose", "quality", b"quality"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "needed_digest", b"needed_digest", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "quality", b"quality", "reconstruction_digest", b"reconstruction_digest", "reference_coarse", b"reference_coarse", "reference_digest", b"reference_digest", "references", b"references", "sequence", b"sequence"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "camera_id", b"camera_id", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "quality", b"quality", "reconstruction_digest", b"reconstruction_digest", "references", b"references", "render_block_means", b"render_block_means", "render_digest", b"render_digest", "sequence", b"sequence"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
