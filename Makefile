@@ -10,7 +10,7 @@ NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
 .PHONY: help demo sample sample-field test test-slow test-prometheus test-netns test-fault test-compose \
-	test-system-packages check build bench proto figures images up down operations-figures \
+	test-system-packages stability check build bench proto figures images up down operations-figures \
 	load load-transport load-receiver load-full soak soak-short
 
 help:  ## show the targets
@@ -50,6 +50,10 @@ test-fault: build test-system-packages  ## break servers, vehicles and links; wr
 	$(BIN)/python -m pytest tests/fault -m fault --timeout 120 --faults-json results/faults.json
 	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
 	mv docs/reliability.md.part docs/reliability.md
+
+stability: build  ## run the hard cases; writes results/stability.json and docs/stability.md
+	$(BIN)/python -m pytest tests/hard/test_stability.py::test_the_case_holds \
+		--stability-json results/stability.json --stability-page docs/stability.md
 
 test-compose: images  ## start docker-compose.yml and look at it (root, docker, docker-compose)
 	$(BIN)/python -m pytest -m compose --timeout 1200

@@ -7,7 +7,6 @@ from typing import Annotated
 
 from tyro.conf import subcommand
 
-from rfedge.cli.eval_stability import EvalStability
 from rfedge.experiments.compare import EvalCompare
 from rfedge.experiments.ladder import EvalLadder
 from rfedge.experiments.latency import EvalLatency
@@ -29,7 +28,6 @@ class Eval:
         | Annotated[EvalLatency, subcommand("latency")]
         | Annotated[EvalPaper, subcommand("paper")]
         | Annotated[EvalRobust, subcommand("robust")]
-        | Annotated[EvalStability, subcommand("stability")]
     )
 
     def run(self) -> None:

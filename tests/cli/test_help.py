@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 VERBS = ("demo", "train", "render", "encode", "decode", "link", "loadtest", "watch", "bench")
-EVAL_VERBS = ("eval compare", "eval never-worse", "eval paper", "eval stability")
+EVAL_VERBS = ("eval compare", "eval never-worse", "eval paper", "eval robust")
 CERTS_VERBS = ("certs init", "certs show")
 SCENE_VERBS = ("scene build", "scene convert", "scene poses", "scene record-carla")
 FIELD_VERBS = tuple(

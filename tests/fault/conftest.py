@@ -6,7 +6,6 @@ what is tested here: bounds are in seconds of this machine, so run it on one tha
 """
 
 import asyncio
-import importlib.util
 import itertools
 import json
 import os
@@ -25,20 +24,13 @@ import pytest
 
 from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
+from integration.conftest import coded, raw_vehicle, street
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.dataset import read_dataset
 from rfcore.wire.messages import FrameAddress
 from rfedge.results import host, revision
 
-_spec = importlib.util.spec_from_file_location(
-    "integration_street", Path(__file__).parents[1] / "integration/conftest.py"
-)
-assert _spec is not None
-assert _spec.loader is not None
-_street = importlib.util.module_from_spec(_spec)
-sys.modules[_spec.name] = _street  # dataclasses look their module up
-_spec.loader.exec_module(_street)
-street, coded, raw_vehicle = _street.street, _street.coded, _street.raw_vehicle
+__all__ = ["coded", "raw_vehicle", "street"]
 
 RATE_HZ = 20
 CALM_S = 3.0

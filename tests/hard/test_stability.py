@@ -1,14 +1,15 @@
 """Every hard case holds, and the committed page is what came of them."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from hard.cases import CASES
+from hard.cases.case import Case, Finding, refusal, statement, within
+from hard.cases.page import case_row, stability_page, stability_result, unmeasured
 from rfcore.errors import InvalidInput
-from rfedge.evaluate.stability import CASES, Case
-from rfedge.evaluate.stability.case import refusal, statement, within
-from rfedge.evaluate.stability.results import run_cases, stability_page
 
 pytestmark = pytest.mark.hard
 
@@ -18,8 +19,9 @@ PAGE = ROOT / "docs" / "stability.md"
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.group}-{case.name}")
-def test_the_case_holds(case: Case) -> None:
+def test_the_case_holds(case: Case, record_finding: Callable[[Case, Finding], None]) -> None:
     finding = case.measure()
+    record_finding(case, finding)
     assert finding.holds, f"expected {case.expected}, got {finding}"
 
 
@@ -32,23 +34,28 @@ def test_there_are_enough_cases_of_every_kind_and_no_two_alike() -> None:
 
 def test_the_page_is_generated_from_the_result_file() -> None:
     result = json.loads(RESULT.read_text())
-    assert PAGE.read_text().rstrip() == stability_page(result).rstrip(), (
-        "run `rfedge eval stability`"
-    )
+    assert PAGE.read_text().rstrip() == stability_page(result).rstrip(), "run `make stability`"
 
 
 def test_the_result_file_has_exactly_these_cases_and_all_hold() -> None:
     rows = json.loads(RESULT.read_text())["cases"]
     listed = [(row["group"], row["name"], row["expected"]) for row in rows]
-    assert listed == [(c.group, c.name, c.expected) for c in CASES], "run `rfedge eval stability`"
+    assert listed == [(c.group, c.name, c.expected) for c in CASES], "run `make stability`"
     assert [row["name"] for row in rows if not row["holds"]] == []
 
 
 def test_a_case_that_breaks_is_named_on_the_page() -> None:
     broken = Case("Poses", "a lie", "truth", lambda: within(2.0, 1.0))
-    page = stability_page(run_cases([broken]))
+    page = stability_page(stability_result([case_row(broken, broken.measure())]))
     assert "Broken: Poses: a lie." in page
     assert "| a lie | truth | as expected | 2.0e+00 | 1.0e+00 |" in page
+
+
+def test_a_case_that_gave_no_finding_is_missed_by_name() -> None:
+    cases = [Case("Poses", name, "", lambda: within(0.0, 1.0)) for name in ("one", "two")]
+    row = case_row(cases[0], cases[0].measure())
+    assert unmeasured(cases, [row]) == ["two"]
+    assert unmeasured(cases[:1], [row]) == []
 
 
 def test_nothing_is_within_a_limit_that_is_not_a_number() -> None:

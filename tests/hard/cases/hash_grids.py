@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from hard.cases.case import Case, Finding, refusal, statement, within
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.ngp.native import NgpRenderer
@@ -30,7 +31,6 @@ from rfcore.ngp.shape import (
 )
 from rfcore.ngp.trainable import NgpRates, RayBatch, TrainableNgp
 from rfcore.views import View
-from rfedge.evaluate.stability.case import Case, Finding, refusal, statement, within
 
 __all__ = ["CASES"]
 

@@ -9,10 +9,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from hard.cases.case import Case, Finding, refusal, statement, within
 from rfcore.errors import InvalidInput
 from rfcore.metrics import psnr, ssim
 from rfcore.native.yuv import i420_from_colour, i420_from_rgb, rgb_from_i420
-from rfedge.evaluate.stability.case import Case, Finding, refusal, statement, within
 
 __all__ = ["CASES"]
 

@@ -1,7 +1,7 @@
 """What a hard case is: what must come out, and what came out.
 
-The same cases are run by the tests (``tests/hard``) and by ``rfedge eval stability``, which writes
-the page, so that the two cannot differ.
+``tests/hard/test_stability.py`` runs every case; the run that checks them also writes the page
+(``make stability``), so that the two cannot differ.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ def statement(holds: bool, got: str, otherwise: str) -> Finding:
     return Finding(got if holds else otherwise, bool(holds))
 
 
-def refusal(call: Callable[[], object], error: type[RfedgeError], *said: str) -> Finding:
-    """Return the finding that ``call`` raises ``error`` with a message that has every word said."""
+def refusal(call: Callable[[], object], error: type[RfedgeError], *words: str) -> Finding:
+    """Return the finding that ``call`` raises ``error`` with a message that has every word."""
     try:
         call()
     except error as refused:
-        missing = [word for word in said if word not in str(refused)]
+        missing = [word for word in words if word not in str(refused)]
         got = f"{type(refused).__name__}: {refused}"
         return Finding(got if not missing else f"{got} (without {missing})", not missing)
     return Finding("accepted", False)

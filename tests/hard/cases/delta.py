@@ -11,12 +11,12 @@ from functools import partial
 
 import numpy as np
 
+from hard.cases.case import Case, Finding, statement
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.image import I420
 from rfcore.metrics import psnr
-from rfedge.evaluate.stability.case import Case, Finding, statement
 
 __all__ = ["CASES"]
 

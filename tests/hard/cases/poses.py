@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable
 from functools import partial
 
+from hard.cases.case import Case, Finding, refusal, statement, within
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.motion import interpolated, quaternion_from_vector, rotation_vector
-from rfedge.evaluate.stability.case import Case, Finding, refusal, statement, within
 
 __all__ = ["CASES"]
 

@@ -7,11 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.trainable import TrainableRasterizer
-from rfedge.evaluate.stability.case import Case, Finding, statement, within
-from rfedge.evaluate.stability.scenes import (
+from hard.cases.case import Case, Finding, statement, within
+from hard.cases.scenes import (
     AHEAD,
     RATES,
     TURNED,
@@ -23,6 +20,9 @@ from rfedge.evaluate.stability.scenes import (
     poisoned,
     without,
 )
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.trainable import TrainableRasterizer
 
 __all__ = ["CASES"]
 

@@ -13,12 +13,8 @@ from functools import partial
 
 import numpy as np
 
-from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
-from rfcore.errors import InvalidInput
-from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import Rasterizer
-from rfedge.evaluate.stability.case import Case, Finding, refusal, statement, within
-from rfedge.evaluate.stability.scenes import (
+from hard.cases.case import Case, Finding, refusal, statement, within
+from hard.cases.scenes import (
     AHEAD,
     INTRINSICS,
     PICTURE_LIMIT,
@@ -33,6 +29,10 @@ from rfedge.evaluate.stability.scenes import (
     same_view,
     without,
 )
+from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
+from rfcore.errors import InvalidInput
+from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.native import Rasterizer
 
 __all__ = ["CASES"]
 

@@ -7,11 +7,11 @@ from functools import partial
 
 import numpy as np
 
+from hard.cases.case import Case, Finding, refusal, statement
 from rfcore.camera import Camera, Intrinsics, Pose, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native.warp import PosedDepth, Seen, correct_i420, warp_i420
-from rfedge.evaluate.stability.case import Case, Finding, refusal, statement
 
 __all__ = ["CASES"]
 

@@ -10,12 +10,12 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from hard.cases.case import Case, Finding, refusal, statement, within
+from hard.cases.scenes import arrays_of, blobs, poisoned
 from rfcore.camera import TileOrigin
 from rfcore.errors import FieldFormatError
 from rfcore.field.ply import read_ply, write_ply
 from rfcore.raster.gaussians import Gaussians
-from rfedge.evaluate.stability.case import Case, Finding, refusal, statement, within
-from rfedge.evaluate.stability.scenes import arrays_of, blobs, poisoned
 
 __all__ = ["CASES"]
 

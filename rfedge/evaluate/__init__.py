@@ -1,1 +1,0 @@
-"""Experiments: one package an experiment, results as immutable JSON."""
