@@ -1,0 +1,46 @@
+"""The structure stays what ``docs/architecture.md`` says: layers, number of modules and of verbs."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, get_args
+
+from rfedge.cli import Verb
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("rfcore", "cav_agent", "mec_server", "rfedge")
+MOST_MODULES, MOST_VERBS = 420, 14
+
+
+def layered_contracts() -> list[dict[str, Any]]:
+    config = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    contracts: list[dict[str, Any]] = config["tool"]["importlinter"]["contracts"]
+    return [contract for contract in contracts if contract["type"] == "layers"]
+
+
+def drawn_layers() -> list[list[str]]:
+    """The fenced blocks ``layers`` of the page, a line a layer, without what stands after ``#``."""
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```layers\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    return [[line.split("#")[0].strip() for line in block.splitlines()] for block in blocks]
+
+
+def test_the_page_draws_the_layers_that_are_enforced() -> None:
+    assert drawn_layers() == [contract["layers"] for contract in layered_contracts()]
+
+
+def test_layers_inside_a_package_name_every_room_of_it() -> None:
+    inside = [contract for contract in layered_contracts() if "containers" in contract]
+    assert {name for contract in inside for name in contract["containers"]} >= {"rfcore", "rfedge"}
+    assert all(contract["exhaustive"] for contract in inside)
+
+
+def test_there_are_no_more_modules_than_a_newcomer_can_survey() -> None:
+    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    modules = [path for path in files if "_pb2" not in path.name]
+    assert len(modules) > 100, "the sources are not where this test looks"
+    assert len(modules) <= MOST_MODULES
+
+
+def test_there_are_no_more_verbs_than_fit_on_a_screen() -> None:
+    assert 1 < len(get_args(Verb)) <= MOST_VERBS
