@@ -1,4 +1,4 @@
-"""The structure stays what ``docs/architecture.md`` says: layers, number of modules and of verbs."""
+"""The structure stays what ``docs/architecture.md`` says: layers, modules, top-level verbs."""
 
 import re
 import tomllib

@@ -29,7 +29,7 @@ from rfcore.ngp.native import NgpRenderer
 from rfcore.ngp.shape import NgpParameters
 from rfcore.train import NgpTrainer, NgpTrainingConfig
 from rfcore.views import PosedPicture
-from rfedge.bench.timing import median_ms
+from rfedge.timing import median_ms
 
 __all__ = ["check_against_reference", "ngp_rows"]
 

@@ -29,7 +29,7 @@ from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfedge.bench.results import Rows
 from rfedge.bench.street import street_camera, street_gaussians
-from rfedge.bench.timing import median_ms, medians_ms
+from rfedge.timing import median_ms, medians_ms
 
 __all__ = ["BASELINE", "check_against_reference", "mode_rows", "raster_rows"]
 

@@ -10,7 +10,7 @@ from rfcore.errors import RfedgeError
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfedge.bench.street import street_camera, street_gaussians
-from rfedge.bench.timing import median_ms
+from rfedge.timing import median_ms
 
 __all__ = ["check_gradients", "train_rows"]
 

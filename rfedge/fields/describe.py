@@ -18,8 +18,8 @@ from rfcore.field.quality import DETAILS, kept_of
 from rfcore.field.store import encode_field
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
-from rfedge.bench.timing import median_ms
 from rfedge.fields.check import to_rgb
+from rfedge.timing import median_ms
 
 __all__ = ["describe_field", "frame_ms", "print_rungs", "size_mb"]
 

@@ -8,7 +8,8 @@ import pytest
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.native import Rasterizer
-from rfedge.bench import print_rows, raster, results, run_case, timing, train, write_json
+from rfedge import timing
+from rfedge.bench import print_rows, raster, results, run_case, train, write_json
 from rfedge.bench.street import street_camera, street_gaussians
 
 RASTER_KEYS = [
