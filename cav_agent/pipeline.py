@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from typing import Protocol
 
 from cav_agent.deadline import FixedRung, Rungs
 from cav_agent.frames import EncodedFrame, EncodeJob
@@ -17,7 +15,6 @@ from rfcore.camera import Camera, Intrinsics
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.references import RENDER_ONLY
-from rfcore.codec.sender.align import Look
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.sender.ladder import Rung
 from rfcore.codec.sender.pose_search import PoseSearch
@@ -25,22 +22,15 @@ from rfcore.codec.sender.rate import RateModel, RateTarget
 from rfcore.codec.sender.steering import NO_STEERING, Steering
 from rfcore.codec.state import KEPT_FRAMES, EncoderState, Past
 from rfcore.errors import InvalidInput
-from rfcore.field import Quality
+from rfcore.field import Quality, Renderer, render_field_view
 from rfcore.image import I420, Rgb
 from rfcore.native.yuv import i420_from_rgb
-from rfcore.views import PosedPicture, View
+from rfcore.views import FieldView, PosedPicture
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 
-__all__ = ["Pipeline", "Renderer"]
+__all__ = ["Pipeline"]
 
 ClockNs = Callable[[], int]
-
-
-class Renderer(Protocol):
-    """A radiance field, ready to be looked at."""
-
-    def render(self, camera: Camera, quality: Quality) -> View:
-        """Return colour and depth seen from ``camera``."""
 
 
 class Pipeline:
@@ -92,13 +82,13 @@ class Pipeline:
         frame = i420_from_rgb(rgb)
         converted_ns = self._clock_ns()
         camera = job.capture.picture.camera
-        look = self._look(rung.quality, camera)
+        view = render_field_view(self._renderer, camera, rung.quality)
         rendered_ns = self._clock_ns()
-        look = self._refined(frame, look, rung.quality)
+        view = self._refined(frame, view, rung.quality)
         refined_ns = self._clock_ns()
         choice = self._choice(job, rung)
         state = self._state_for(job)
-        encoded = self._encoder.encode(state, frame, look.render, look.seen, choice)
+        encoded = self._encoder.encode(state, frame, view, choice)
         self._remember(encoded)
         stage_s = {
             "read": (read_ns - started_ns) / 1e9,
@@ -108,18 +98,19 @@ class Pipeline:
             **{stage: ns / 1e9 for stage, ns in encoded.stage_ns.items()},
         }
         self._rungs.coded(stage_s, self._clock_ns() / 1e9)
-        pose = look.seen.camera.world_from_cam
+        pose = view.camera.world_from_cam
         return EncodedFrame(encoded.packet, stage_s, encoded.tries, rung, encoded.crf, pose)
 
-    def _look(self, quality: Quality, camera: Camera) -> Look:
-        return Look.of(self._renderer.render(camera, quality), camera)
-
-    def _refined(self, frame: I420, measured: Look, quality: Quality) -> Look:
+    def _refined(self, frame: I420, measured: FieldView, quality: Quality) -> FieldView:
         """Return what the field shows at the pose to send."""
         if self._search is None:
             return measured
         crf = self._config.crf if self._rate.crf is None else self._rate.crf
-        return self._search.refine(frame, measured, partial(self._look, quality), crf).look
+
+        def render_at(camera: Camera) -> FieldView:
+            return render_field_view(self._renderer, camera, quality)
+
+        return self._search.refine(frame, measured, render_at, crf).view
 
     def _choice(self, job: EncodeJob, rung: Rung) -> FrameChoice:
         budget, limit_bytes = job.budget, self._limit_bytes

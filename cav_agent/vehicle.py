@@ -321,9 +321,7 @@ def _read_drive(config: AgentConfig, origin: TileOrigin) -> tuple[PosedPicture, 
 
 def _posed_for_the_wire(picture: PosedPicture) -> PosedPicture:
     """Round the pose before anything is rendered at it: both ends then have the same one."""
-    camera = picture.camera
-    rounded = replace(camera, world_from_cam=camera.world_from_cam.rounded())
-    return replace(picture, camera=rounded)
+    return replace(picture, camera=picture.camera.rounded())
 
 
 def _log_failure(session_id: str, result: FrameResult) -> None:

@@ -12,15 +12,12 @@ from typing import Protocol
 
 from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
 from mec_server.decoding.decoders import OpenDecoder
-from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.state import DecoderState
 from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason, RfedgeError
-from rfcore.field import Quality
+from rfcore.field import Renderer, render_field_view
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
-from rfcore.native.yuv import i420_from_colour
-from rfcore.views import View
+from rfcore.views import FieldView
 from rfcore.wire.messages import CameraDescription, StageTimes
 
 __all__ = [
@@ -29,19 +26,11 @@ __all__ = [
     "FieldSource",
     "OpenCameras",
     "Reconstruction",
-    "Renderer",
     "Tools",
     "open_cameras",
 ]
 
 ClockNs = Callable[[], int]
-
-
-class Renderer(Protocol):
-    """A radiance field, ready to be looked at."""
-
-    def render(self, camera: Camera, quality: Quality) -> View:
-        """Return colour and depth seen from ``camera``."""
 
 
 class FieldSource(Protocol):
@@ -109,13 +98,13 @@ class CameraDecoder:
 
     def _reconstruct(self, job: DecodeJob) -> Reconstruction:
         started_ns = self._clock_ns()
-        render, seen = self._render(job)
+        view = self._render(job)
         rendered_ns = self._clock_ns()
         packet = job.frame.packet
         state = self._state
         if state is None or state.epoch != packet.epoch:
             state = self._decoder.start(packet.epoch, after=state)
-        decoded = self._decoder.decode(state, packet, render, seen)
+        decoded = self._decoder.decode(state, packet, view)
         self._state = decoded.state
         times = StageTimes(
             render_ns=rendered_ns - started_ns,
@@ -126,11 +115,10 @@ class CameraDecoder:
         outcome = DecodeOutcome(decoded.lost, digest, times, decoded.exact)
         return Reconstruction(decoded.frame, outcome)
 
-    def _render(self, job: DecodeJob) -> tuple[I420, PosedDepth]:
+    def _render(self, job: DecodeJob) -> FieldView:
         camera = job.frame.camera(self._camera.intrinsics)
         try:
-            view = self._renderers[job.field_id].render(camera, job.frame.quality)
-            return i420_from_colour(view.colour), PosedDepth(camera, view.depth)
+            return render_field_view(self._renderers[job.field_id], camera, job.frame.quality)
         except InvalidInput as error:
             raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
 

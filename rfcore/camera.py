@@ -208,6 +208,13 @@ class Camera:
         """Return the extrinsics the renderer uses."""
         return self.world_from_cam.inverse()
 
+    def rounded(self) -> Camera:
+        """Return the camera at its pose as it is sent (``Pose.rounded``).
+
+        Whoever sends a pose renders at the rounded one, so that both ends render at the same.
+        """
+        return Camera(self.intrinsics, self.world_from_cam.rounded())
+
     def project(self, point: Sequence[float]) -> tuple[float, float, float]:
         """Project one world point [3] to (u_px, v_px, depth_m).
 

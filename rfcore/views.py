@@ -1,17 +1,17 @@
-"""What is seen from a camera: rendered views, posed pictures, and points of the scene.
+"""Rendered views of a radiance field, posed pictures, and points of the scene.
 
-Readers produce posed pictures, trainers consume them; renderers produce views.
+Readers of datasets produce posed pictures, trainers consume them. Renderers produce a ``View``;
+both ends of the codec hold it as a ``FieldView``.
 
-How far a rendered pixel is to be trusted, from what the renderer knows itself.
-
+Confidence, how far a rendered pixel can be trusted, follows from depth and opacity alone:
 ``confidence = opacity * (1 - min(bend / BEND_LIMIT, 1))``. ``opacity`` is clipped to 0..1: where
-rays pass through, the field saw nothing. ``bend`` is how far inverse depth w = 1 / z departs from
-a plane,
+rays pass through, the field has no surface. ``bend`` is how far inverse depth w = 1 / z departs
+from a plane,
 
     bend = max over both image axes of |w(i-1) - 2 w(i) + w(i+1)| / max(w(i-1), w(i), w(i+1)),
 
 0 on any plane, however oblique (inverse depth is affine in the picture there), and near 1 where a
-close thing borders on a distant one. A pixel at the border takes the bend of its neighbour inside;
+close object borders on a distant one. A pixel at the border takes the bend of its neighbour inside;
 along an axis of one or two pixels nothing bends.
 
 Only float32 subtraction, multiplication, division, minimum and maximum, each rounded once as
@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
+from rfcore.image import I420
 
-__all__ = ["BEND_LIMIT", "PointCloud", "PosedPicture", "View", "confidence"]
+__all__ = ["BEND_LIMIT", "FieldView", "PointCloud", "PosedPicture", "View", "confidence"]
 
 
 BEND_LIMIT = np.float32(0.1)
@@ -84,6 +85,50 @@ class View:
     def confidence(self) -> NDArray[np.float32]:
         """Opacity, less where depth breaks."""
         return confidence(self.depth, self.opacity)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldView:
+    """What a radiance field shows at a camera, as both ends of the codec hold it.
+
+    ``render``: the colours as a codec picture. ``depth``: float32 [H, W], z in metres, 0 where
+    nothing was hit. ``opacity``: float32 [H, W], or ``None`` where it was dropped because nobody
+    will ask for it. Raises ``InvalidInput`` for a render, depth or opacity that is not
+    of the camera's size, an array that is not float32, or a depth that is not finite.
+    """
+
+    camera: Camera
+    render: I420
+    depth: F32
+    opacity: F32 | None = None
+
+    def __post_init__(self) -> None:
+        k = self.camera.intrinsics
+        size_px = (k.width_px, k.height_px)
+        if self.render.size_px != size_px:
+            raise InvalidInput("render", f"{self.render.size_px} px of a camera of {size_px} px")
+        for name, array in (("depth", self.depth), ("opacity", self.opacity)):
+            if array is not None and (array.shape != size_px[::-1] or array.dtype != np.float32):
+                raise InvalidInput(
+                    name, f"{array.dtype} {array.shape} must be float32 {size_px[::-1]}"
+                )
+        if not np.isfinite(self.depth).all():
+            bad = int((~np.isfinite(self.depth)).sum())
+            raise InvalidInput("depth", f"{bad} of {self.depth.size} values are NaN or infinite")
+
+    @property
+    def confidence(self) -> F32:
+        """Opacity, less where depth breaks; raises ``InvalidInput`` where opacity was dropped."""
+        return confidence(self.depth, self._kept_opacity())
+
+    def covers(self, least_opacity: float) -> NDArray[np.bool_]:
+        """Return where opacity is above ``least_opacity``; raises as ``confidence`` does."""
+        return self._kept_opacity() > least_opacity
+
+    def _kept_opacity(self) -> F32:
+        if self.opacity is None:
+            raise InvalidInput("opacity", "was dropped from this view; render it again")
+        return self.opacity
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,15 @@ from dataclasses import dataclass, replace
 from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.sender.align import Look
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.sender.pose_search import PoseSearch
 from rfcore.codec.sender.steering import NO_STEERING, Steering
 from rfcore.dataset import Dataset
 from rfcore.errors import CodecError, DatasetError, InvalidData
-from rfcore.field import FULL, Quality, RadianceField
+from rfcore.field import RadianceField, render_field_view
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
-from rfcore.native.yuv import i420_from_colour, i420_from_rgb
+from rfcore.native.yuv import i420_from_rgb
+from rfcore.views import FieldView
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.drive_file import CodedDrive
@@ -70,16 +69,15 @@ def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSetting
         if picture.camera.intrinsics != intrinsics:
             raise DatasetError(f"{picture.name}: its camera differs from the first picture's")
         frame = i420_from_rgb(picture.read())
-        measured = Camera(intrinsics, picture.camera.world_from_cam.rounded())
-        look = place(frame, measured)
-        encoded = encoder.encode(state, frame, look.render, look.seen, choice)
+        view = place(frame, picture.camera.rounded())
+        encoded = encoder.encode(state, frame, view, choice)
         _require_fit(picture.name, encoded)
         state = encoded.state
         frames.append(
             Frame(
                 CAMERA_ID,
                 picture.time_ns,
-                look.seen.camera.world_from_cam,
+                view.camera.world_from_cam,
                 b"",
                 encoded.packet,
             )
@@ -88,17 +86,18 @@ def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSetting
     return CodedDrive(Hello(OFFLINE_VEHICLE, (camera,), (field.field_id,), RENDERER), tuple(frames))
 
 
-def _place(field: RadianceField, settings: CodingSettings) -> Callable[[I420, Camera], Look]:
-    """Return what finds the pose a frame is coded at, and renders the field there."""
+def _place(field: RadianceField, settings: CodingSettings) -> Callable[[I420, Camera], FieldView]:
+    """Return a function that finds the pose to code a frame at, and renders the field there."""
 
-    def look_at(camera: Camera) -> Look:
-        return Look.of(field.render(camera), camera)
+    def render_at(camera: Camera) -> FieldView:
+        return render_field_view(field, camera)
 
     refine_ms = settings.steering.refine_pose_ms
     if refine_ms is None:
-        return lambda _, camera: look_at(camera)
+        return lambda _, camera: render_at(camera)
     search = PoseSearch(refine_ms, time.perf_counter_ns)
-    return lambda frame, camera: search.refine(frame, look_at(camera), look_at, settings.crf).look
+    crf = settings.crf
+    return lambda frame, camera: search.refine(frame, render_at(camera), render_at, crf).view
 
 
 def _require_fit(name: str, encoded: Encoded) -> None:
@@ -124,15 +123,7 @@ def decode_drive(drive: CodedDrive, field: RadianceField) -> Iterator[DecodedFra
     decoder = DeltaDecoder(camera.codec)
     state = decoder.start(drive.frames[0].packet.epoch) if drive.frames else decoder.start(1)
     for frame in drive.frames:
-        seen = rendered(field, frame.camera(camera.intrinsics), frame.quality)
-        decoded = decoder.decode(state, frame.packet, *seen)
+        view = render_field_view(field, frame.camera(camera.intrinsics), frame.quality)
+        decoded = decoder.decode(state, frame.packet, view)
         state = decoded.state
         yield DecodedFrame(frame.packet.sequence, decoded.frame)
-
-
-def rendered(
-    field: RadianceField, camera: Camera, quality: Quality = FULL
-) -> tuple[I420, PosedDepth]:
-    """Return the field's picture and depth as both ends of the codec hold them."""
-    view = field.render(camera, quality)
-    return i420_from_colour(view.colour), PosedDepth(camera, view.depth)

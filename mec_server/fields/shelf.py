@@ -13,9 +13,8 @@ from typing import Protocol
 
 import structlog
 
-from mec_server.reconstruction import Renderer
 from rfcore.errors import InvalidInput
-from rfcore.field import FieldStore, RadianceField
+from rfcore.field import FieldStore, RadianceField, Renderer
 from rfcore.wire.settings import RenderSettings
 
 __all__ = ["CHUNK_BYTES", "FieldShelf", "Store", "field_loader", "read_chunks"]

@@ -20,13 +20,12 @@ from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.h264.pcm_picture import without_zeros
 from rfcore.codec.h264.splice import PictureDecoder, SpliceDecoder
 from rfcore.codec.packet import DeltaPacket
-from rfcore.codec.photometric import adapt
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import is_temporal
 from rfcore.codec.state import DecoderState, Past
 from rfcore.errors import BitstreamError, CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
+from rfcore.views import FieldView
 
 __all__ = ["Decoded", "DeltaDecoder"]
 
@@ -88,22 +87,16 @@ class DeltaDecoder:
         """
         return DecoderState(epoch, kept=() if after is None else after.kept)
 
-    def decode(
-        self,
-        state: DecoderState,
-        packet: DeltaPacket,
-        render: I420,
-        seen: PosedDepth | None = None,
-    ) -> Decoded:
-        """Decode one packet against our own ``render`` at its pose, and ``seen``, the depth there.
+    def decode(self, state: DecoderState, packet: DeltaPacket, view: FieldView) -> Decoded:
+        """Decode one packet against ``view``, our own render and depth at its pose.
 
         Raises ``PacketRejected`` with the reason; ``state`` stays good for the next packet.
-        Raises ``InvalidInput`` if the render is not of the stream's size.
+        Raises ``InvalidInput`` if the view is not of the stream's size.
         """
+        render = view.render
         if render.size_px != self._config.size_px:
             raise InvalidInput(
-                "render",
-                f"{render.size_px} px where the stream has {self._config.size_px} px",
+                "render", f"{render.size_px} px where the stream has {self._config.size_px} px"
             )
         started_ns = self._clock_ns()
         _check_order(state, packet)
@@ -111,11 +104,11 @@ class DeltaDecoder:
         same_render = self._check_render(packet, render)
         past = self._past(state, packet)
         self._check_payload(packet)
-        prediction = Prediction(adapt(render, packet.photometric), seen, past)
+        prediction = Prediction.under_light(view, packet.photometric, past)
         pictures = _pictures(packet, prediction)
         made_ns = self._clock_ns()
         spliced_ns, frame = self._reconstruct(packet, pictures)
-        made = Past(frame, seen, prediction.render)
+        made = prediction.past_of(frame)
         if same_render and made.digest != packet.reconstruction_digest:
             self._splice.reset()
             raise PacketRejected(

@@ -1,20 +1,20 @@
 """The references of a frame as pictures, made alike by both ends.
 
-What a frame may be predicted from is decided by what there is: an earlier frame for ``PREVIOUS``,
-and for ``WARP`` and ``CORRECTION`` the field's depth and picture at both poses as well.
+``PREVIOUS``, ``WARP`` and ``CORRECTION`` need an earlier frame; ``RENDER`` is always there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
+from rfcore.codec.photometric import Photometric, adapt
 from rfcore.codec.references import Reference, References
 from rfcore.codec.state import Past
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth, Seen, correct_i420, warp_i420
+from rfcore.native.warp import correct_i420, warp_i420
+from rfcore.views import FieldView
 
 __all__ = ["Prediction"]
 
@@ -23,65 +23,64 @@ __all__ = ["Prediction"]
 class Prediction:
     """What both ends hold of a frame before a bit of it is sent.
 
-    ``seen`` is the field's depth at the frame's pose, ``past`` the earlier frame to predict from.
-    ``threads`` changes no picture.
+    ``view`` is what the field shows at the frame's pose, its render under the frame's light;
+    ``past`` the earlier frame to predict from. ``threads`` changes no picture.
     """
 
-    render: I420
-    seen: PosedDepth | None = None
+    view: FieldView
     past: Past | None = None
     threads: int = 1
+
+    @staticmethod
+    def under_light(
+        view: FieldView, photometric: Photometric, past: Past | None, threads: int = 1
+    ) -> Prediction:
+        """Return the prediction with the render of ``view`` changed by ``photometric``."""
+        return Prediction(replace(view, render=adapt(view.render, photometric)), past, threads)
+
+    def past_of(self, picture: I420) -> Past:
+        """Return what later frames predict from once this frame was decoded to ``picture``."""
+        return Past(picture, replace(self.view, opacity=None))
 
     @property
     def available(self) -> frozenset[Reference]:
         """Which references can be made."""
-        found = {Reference.RENDER}
-        if self.past is not None:
-            found.add(Reference.PREVIOUS)
-            if self._before is not None and self.seen is not None:
-                found |= {Reference.WARP, Reference.CORRECTION}
-        return frozenset(found)
+        return frozenset({Reference.RENDER} if self.past is None else Reference)
 
     @property
-    def _before(self) -> Seen | None:
-        past = self.past
-        if past is None or past.seen is None or past.render is None:
-            return None
-        return Seen(past.picture, past.seen, past.render)
+    def render(self) -> I420:
+        """The field's picture at the frame's pose, under the frame's light."""
+        return self.view.render
 
     @cached_property
     def warp(self) -> I420:
         """The earlier frame at the present pose, holes filled from the render."""
-        before, seen = self._carried()
-        return warp_i420(before.picture, before.at, seen, self.render, self.threads)
+        past = self._past()
+        return warp_i420(past.picture, past.view, self.view, self.threads)
 
     @cached_property
     def correction(self) -> I420:
-        """The render, with most of what the earlier frame differed by from its own."""
-        return correct_i420(*self._carried(), self.render, self.threads)
+        """The render, with most of what the earlier frame differed by from its own render."""
+        past = self._past()
+        return correct_i420(past.picture, past.view, self.view, self.threads)
 
-    def _carried(self) -> tuple[Seen, PosedDepth]:
-        before, seen = self._before, self.seen
-        if before is None or seen is None:
-            raise InvalidInput("references", "need an earlier frame, and depth at both poses")
-        return before, seen
+    def _past(self) -> Past:
+        if self.past is None:
+            raise InvalidInput("references", "there is no earlier frame to predict from")
+        return self.past
 
     def picture(self, reference: Reference) -> I420:
         """Return one reference; raise ``InvalidInput`` for one that cannot be made."""
-        if reference is Reference.RENDER:
-            return self.render
-        if reference is Reference.WARP:
-            return self.warp
-        if reference is Reference.CORRECTION:
-            return self.correction
-        if self.past is None:
-            raise InvalidInput("references", "there is no earlier frame")
-        return self.past.picture
+        match reference:
+            case Reference.RENDER:
+                return self.render
+            case Reference.WARP:
+                return self.warp
+            case Reference.CORRECTION:
+                return self.correction
+            case Reference.PREVIOUS:
+                return self._past().picture
 
     def pictures(self, references: References) -> tuple[I420, ...]:
         """Return the references in their order."""
         return tuple(self.picture(reference) for reference in references)
-
-    def by_reference(self) -> Mapping[Reference, I420]:
-        """Return every reference that can be made."""
-        return {reference: self.picture(reference) for reference in sorted(self.available)}

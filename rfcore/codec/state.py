@@ -14,7 +14,7 @@ from functools import cached_property
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
+from rfcore.views import FieldView
 
 __all__ = ["KEPT_FRAMES", "DecoderState", "EncoderState", "Past"]
 
@@ -26,13 +26,12 @@ KEPT_FRAMES = 4
 class Past:
     """A decoded frame that later ones may predict from.
 
-    ``seen`` is the field's depth at its pose, ``render`` its picture there; without them nothing
-    can be carried to another pose.
+    ``view`` is what the field shows at the frame's pose, its render under the frame's light: with
+    it the frame can be carried to another pose.
     """
 
     picture: I420
-    seen: PosedDepth | None = None
-    render: I420 | None = None
+    view: FieldView
 
     @cached_property
     def digest(self) -> bytes:

@@ -1,6 +1,12 @@
 """Radiance fields as data: what they are made of, and the files that hold them."""
 
-from rfcore.field.interface import Bounds, FieldMetadata, RadianceField
+from rfcore.field.interface import (
+    Bounds,
+    FieldMetadata,
+    RadianceField,
+    Renderer,
+    render_field_view,
+)
 from rfcore.field.ngp import NgpField
 from rfcore.field.ply import read_ply, write_ply
 from rfcore.field.quality import FULL, Quality
@@ -15,9 +21,11 @@ __all__ = [
     "NgpField",
     "Quality",
     "RadianceField",
+    "Renderer",
     "SplatField",
     "load_field",
     "read_ply",
+    "render_field_view",
     "save_field",
     "write_ply",
 ]

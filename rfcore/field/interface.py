@@ -3,8 +3,7 @@
 A field is immutable, may be shared between threads, and is named by its id, the SHA-256 of its
 archive. The same field, camera and quality give the same bytes on every machine.
 
-A field's metadata in the JSON header of its archive, readable without its arrays.
-
+A field's metadata lies in the JSON header of its archive, readable without its arrays.
 ``bounds`` stands beside the values of ``FieldMetadata``; ``kind`` is the archive's own. Archives
 written before 0.2 lack ``held_out_ssim``, ``antialiased`` and ``bounds``: not measured, not
 antialiased, and not stated.
@@ -24,7 +23,8 @@ from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive
 from rfcore.field.quality import FULL, Quality
-from rfcore.views import View
+from rfcore.native.yuv import field_view_from_view
+from rfcore.views import FieldView, View
 
 __all__ = [
     "KINDS",
@@ -33,8 +33,10 @@ __all__ = [
     "Bounds",
     "FieldMetadata",
     "RadianceField",
+    "Renderer",
     "bounds_of_header",
     "metadata_of_header",
+    "render_field_view",
     "stored_metadata",
 ]
 
@@ -100,8 +102,15 @@ class FieldMetadata:
             raise InvalidInput("field.held_out_ssim", f"{ssim} is outside -1..1")
 
 
+class Renderer(Protocol):
+    """The part of a radiance field that a codec's end needs."""
+
+    def render(self, camera: Camera, quality: Quality) -> View:
+        """Return colour, depth and opacity as ``camera`` sees them."""
+
+
 class RadianceField(Protocol):
-    """A radiance field, ready to be looked at."""
+    """A radiance field with all that is known about it."""
 
     @property
     def metadata(self) -> FieldMetadata:
@@ -134,6 +143,14 @@ class RadianceField(Protocol):
 
     def archive(self) -> Archive:
         """Return what the field's file holds."""
+
+
+def render_field_view(renderer: Renderer, camera: Camera, quality: Quality = FULL) -> FieldView:
+    """Render what ``camera`` sees, as both ends of the codec hold it.
+
+    A sender passes the camera it announces: ``Camera.rounded``.
+    """
+    return field_view_from_view(renderer.render(camera, quality), camera)
 
 
 def stored_metadata(metadata: FieldMetadata, bounds: Bounds) -> dict[str, Any]:

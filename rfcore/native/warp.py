@@ -44,12 +44,11 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native import _native
+from rfcore.views import FieldView
 
 __all__ = [
     "BLOCK_PX",
     "BlockCosts",
-    "PosedDepth",
-    "Seen",
     "block_costs",
     "correct_i420",
     "warp_i420",
@@ -67,28 +66,6 @@ FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
-class PosedDepth:
-    """A camera and what it sees: ``depth`` float32 [H, W], z in metres, 0 where nothing is.
-
-    Raises ``InvalidInput`` when the depth is not of the camera's size, not float32 or not finite.
-    """
-
-    camera: Camera
-    depth: NDArray[np.float32]
-
-    def __post_init__(self) -> None:
-        k = self.camera.intrinsics
-        if self.depth.shape != (k.height_px, k.width_px) or self.depth.dtype != np.float32:
-            raise InvalidInput(
-                "depth",
-                f"{self.depth.dtype} {self.depth.shape} must be float32 {k.height_px, k.width_px}",
-            )
-        if not np.isfinite(self.depth).all():
-            bad = int((~np.isfinite(self.depth)).sum())
-            raise InvalidInput("depth", f"{bad} of {self.depth.size} values are NaN or infinite")
-
-
-@dataclass(frozen=True)
 class BlockCosts:
     """Costs of predicting each whole 8x8 luma block: int32 [H // 8, W // 8].
 
@@ -99,56 +76,43 @@ class BlockCosts:
     ssd: NDArray[np.int32]
 
 
-@dataclass(frozen=True)
-class Seen:
-    """A picture of a posed view: ``picture`` at ``at``, which the field rendered as ``render``."""
+def warp_i420(previous: I420, before: FieldView, now: FieldView, threads: int = 1) -> I420:
+    """Return ``previous``, taken at ``before``, as it would look from ``now.camera``.
 
-    picture: I420
-    at: PosedDepth
-    render: I420
-
-
-def warp_i420(
-    previous: I420, seen_before: PosedDepth, seen: PosedDepth, render: I420, threads: int = 1
-) -> I420:
-    """Return ``previous`` as it would look from ``seen.camera``, holes filled from ``render``.
-
-    Raises ``InvalidInput`` for pictures of another size, cameras of different intrinsics, or no
-    threads.
+    Samples that are not known are those of ``now.render``. Raises ``InvalidInput`` for pictures of
+    another size, cameras of different intrinsics, or no threads.
     """
-    return _carried(Seen(previous, seen_before, render), None, seen, render, threads)
+    return _carried(previous, None, before, now, threads)
 
 
-def correct_i420(before: Seen, seen: PosedDepth, render: I420, threads: int = 1) -> I420:
-    """Return ``render`` plus most of the carried difference of ``before`` from its own render.
+def correct_i420(previous: I420, before: FieldView, now: FieldView, threads: int = 1) -> I420:
+    """Return ``now.render`` plus most of what ``previous`` differed by from ``before.render``.
 
-    Raises ``InvalidInput`` for pictures of another size, cameras of different intrinsics, or no
-    threads.
+    The difference is carried from ``before.camera`` to ``now.camera``. Raises ``InvalidInput`` for
+    pictures of another size, cameras of different intrinsics, or no threads.
     """
-    return _carried(before, before.render, seen, render, threads)
+    return _carried(previous, before.render, before, now, threads)
 
 
 def _carried(
-    before: Seen, minus: I420 | None, seen: PosedDepth, render: I420, threads: int
+    previous: I420, minus: I420 | None, before: FieldView, now: FieldView, threads: int
 ) -> I420:
     if threads < 1:
         raise InvalidInput("threads", f"{threads} must be at least 1")
-    if before.at.camera.intrinsics != seen.camera.intrinsics:
+    if before.camera.intrinsics != now.camera.intrinsics:
         raise InvalidInput("warp", "the two cameras have different intrinsics")
-    k = seen.camera.intrinsics
-    size_px = (k.width_px, k.height_px)
-    for name, picture in (("previous", before.picture), ("render", render), ("minus", minus)):
-        if picture is not None and picture.size_px != size_px:
-            raise InvalidInput(f"warp.{name}", f"{picture.size_px} px of a camera of {size_px} px")
-    out = I420(*(np.empty(plane.shape, np.uint8) for plane in render.planes))
+    size_px = now.render.size_px
+    if previous.size_px != size_px:
+        raise InvalidInput("warp.previous", f"{previous.size_px} px of a camera of {size_px} px")
+    out = I420(*(np.empty(plane.shape, np.uint8) for plane in now.render.planes))
     _native.warp_i420(
-        _dense(before.picture),
-        np.ascontiguousarray(before.at.depth),
-        np.ascontiguousarray(seen.depth),
-        _dense(render),
+        _dense(previous),
+        np.ascontiguousarray(before.depth),
+        np.ascontiguousarray(now.depth),
+        _dense(now.render),
         None if minus is None else _dense(minus),
         0 if minus is None else CORRECTION_DOUBT,
-        warp_numbers(before.at.camera, seen.camera),
+        warp_numbers(before.camera, now.camera),
         *out.planes,
         threads,
     )

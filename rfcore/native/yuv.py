@@ -32,11 +32,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.image import I420, Rgb
 from rfcore.native import _native
+from rfcore.views import FieldView, View
 
-__all__ = ["i420_from_colour", "i420_from_rgb", "rgb_from_i420"]
+__all__ = ["field_view_from_view", "i420_from_colour", "i420_from_rgb", "rgb_from_i420"]
 
 
 def i420_from_rgb(rgb: Rgb) -> I420:
@@ -62,6 +64,14 @@ def i420_from_colour(colour: NDArray[np.float32]) -> I420:
             "colour", f"{bad} of {colour.size} values are NaN or infinite; repair the render"
         )
     return out
+
+
+def field_view_from_view(view: View, camera: Camera) -> FieldView:
+    """Return ``view``, rendered from ``camera``, with its colours as a codec picture.
+
+    Raises ``InvalidInput`` for colours or depth that are not finite or not of the camera's size.
+    """
+    return FieldView(camera, i420_from_colour(view.colour), view.depth, view.opacity)
 
 
 def rgb_from_i420(picture: I420) -> Rgb:

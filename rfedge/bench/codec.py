@@ -24,9 +24,9 @@ from rfcore.codec.references import Reference, References
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.errors import CodecError
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
-from rfcore.native.yuv import i420_from_colour, i420_from_rgb
+from rfcore.native.yuv import field_view_from_view, i420_from_rgb
 from rfcore.raster.native import Rasterizer
+from rfcore.views import FieldView
 from rfedge.bench.street import street_camera, street_gaussians
 
 __all__ = ["codec_rows"]
@@ -57,10 +57,9 @@ class Ends:
         pose = replace(self.camera.world_from_cam, translation_m=(x_m, y_m, z_m + STEP_M * index))
         return Camera(self.camera.intrinsics, pose)
 
-    def render(self, camera: Camera) -> tuple[I420, PosedDepth]:
+    def render(self, camera: Camera) -> FieldView:
         """Render as both ends do: field, then the project's own YUV conversion."""
-        view = self.rasterizer.render(camera)
-        return i420_from_colour(view.colour), PosedDepth(camera, view.depth)
+        return field_view_from_view(self.rasterizer.render(camera), camera)
 
 
 def codec_rows() -> list[dict[str, Any]]:
@@ -101,13 +100,13 @@ def _row(ends: Ends, references: References) -> dict[str, Any]:
     for repetition in range(WARM_UP + REPETITIONS):
         camera = ends.at(repetition)
         frame = _camera_frame(ends.rasterizer.render_colour(camera))
-        render_ms, (render, seen) = _timed(lambda: ends.render(camera))  # noqa: B023
+        render_ms, view = _timed(lambda: ends.render(camera))  # noqa: B023
         choice = FrameChoice(references if repetition else ONE)
         total_ms, encoded = _timed(
-            lambda: ends.encoder.encode(send_state, frame, render, seen, choice)  # noqa: B023
+            lambda: ends.encoder.encode(send_state, frame, view, choice)  # noqa: B023
         )
         decode_ms, decoded = _timed(
-            lambda: ends.decoder.decode(receive_state, encoded.packet, render, seen)  # noqa: B023
+            lambda: ends.decoder.decode(receive_state, encoded.packet, view)  # noqa: B023
         )
         if decoded.frame.digest() != encoded.reconstruction.digest():
             raise CodecError("the receiver's picture differs from the sender's closed loop")

@@ -21,12 +21,10 @@ from mec_server.decoding.decoders import Decoders
 from mec_server.metrics import ServerMetrics
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.state import DecoderState
-from rfcore.field import RadianceField, load_field
-from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
+from rfcore.field import RadianceField, load_field, render_field_view
+from rfcore.views import FieldView
 from rfcore.wire.messages import Frame
 from rfedge.loadtest.prerecorded import PrerecordedDrive, prerecorded_drive
-from rfedge.offline import rendered
 
 __all__ = ["decoder_rows"]
 
@@ -69,21 +67,21 @@ def _decoder(kind: DecoderKind, drive: PrerecordedDrive, opened: ExitStack) -> D
 def _times(
     drive: PrerecordedDrive, field: RadianceField, decoders: dict[DecoderKind, DeltaDecoder]
 ) -> dict[DecoderKind, list[float]]:
-    renders = [rendered(field, f.camera(drive.intrinsics), f.quality) for f in drive.chain]
+    views = [render_field_view(field, f.camera(drive.intrinsics), f.quality) for f in drive.chain]
     times_ms: dict[DecoderKind, list[float]] = {kind: [] for kind in decoders}
     for lap in range(1 + LAPS):
         states = {kind: decoder.start(0) for kind, decoder in decoders.items()}
-        for frame, (render, seen) in zip(drive.chain, renders, strict=True):
+        for frame, view in zip(drive.chain, views, strict=True):
             for kind, decoder in decoders.items():
-                ms, states[kind] = _timed(decoder, states[kind], frame, render, seen)
+                ms, states[kind] = _timed(decoder, states[kind], frame, view)
                 if lap:
                     times_ms[kind].append(ms)
     return times_ms
 
 
 def _timed(
-    decoder: DeltaDecoder, state: DecoderState, frame: Frame, render: I420, seen: PosedDepth
+    decoder: DeltaDecoder, state: DecoderState, frame: Frame, view: FieldView
 ) -> tuple[float, DecoderState]:
     started_ns = perf_counter_ns()
-    decoded = decoder.decode(state, frame.packet, render, seen)
+    decoded = decoder.decode(state, frame.packet, view)
     return (perf_counter_ns() - started_ns) / 1e6, decoded.state

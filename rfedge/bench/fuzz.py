@@ -28,8 +28,8 @@ from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.state import DecoderState
 from rfcore.errors import CodecError, PacketRejected
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
 from rfcore.native.yuv import i420_from_colour
+from rfcore.views import FieldView
 
 __all__ = ["MUTATIONS", "FuzzStream", "fuzz", "make_stream"]
 
@@ -59,11 +59,10 @@ Mutation = Callable[[DeltaPacket, Rng], DeltaPacket]
 
 @dataclass(frozen=True)
 class SentFrame:
-    """A packet with what its receiver holds: the render, the depth, and the state before it."""
+    """A packet with what its receiver holds: the field at its pose, and the state before it."""
 
     packet: DeltaPacket
-    render: I420
-    seen: PosedDepth
+    view: FieldView
     before: DecoderState
 
 
@@ -82,11 +81,11 @@ def make_stream(size_px: tuple[int, int] = SIZE_PX) -> FuzzStream:
     sending, receiving = encoder.start(1), decoder.start(1)
     frames = []
     for index, choice in enumerate(CHOICES):
-        frame, render, seen = _moment(index, size_px)
-        sent = encoder.encode(sending, frame, render, seen, choice)
-        frames.append(SentFrame(sent.packet, render, seen, receiving))
+        frame, view = _moment(index, size_px)
+        sent = encoder.encode(sending, frame, view, choice)
+        frames.append(SentFrame(sent.packet, view, receiving))
         sending = sent.state
-        receiving = decoder.decode(receiving, sent.packet, render, seen).state
+        receiving = decoder.decode(receiving, sent.packet, view).state
     return FuzzStream(encoder.header, tuple(frames))
 
 
@@ -113,7 +112,7 @@ def fuzz(stream: FuzzStream, packets: int, seed: int = 0) -> Counter[str]:
 def _try(decoder: DeltaDecoder, frame: SentFrame, packet: DeltaPacket) -> str:
     started_s = time.process_time()
     try:
-        shown = decoder.decode(frame.before, packet, frame.render, frame.seen).frame
+        shown = decoder.decode(frame.before, packet, frame.view).frame
     except PacketRejected as rejection:
         outcome = str(rejection.reason)
     else:
@@ -222,8 +221,8 @@ MUTATION_NAMES = tuple(MUTATIONS)
 # --- the stream
 
 
-def _moment(index: int, size_px: tuple[int, int]) -> tuple[I420, I420, PosedDepth]:
-    """Return frame, render and depth of a camera that moves along a painted wall."""
+def _moment(index: int, size_px: tuple[int, int]) -> tuple[I420, FieldView]:
+    """Return frame and field view of a camera that moves along a painted wall."""
     width, height = size_px
     k = Intrinsics(width, height, width, width, width / 2, height / 2)
     step_m = SHIFT_PX * WALL_M / width
@@ -236,7 +235,7 @@ def _moment(index: int, size_px: tuple[int, int]) -> tuple[I420, I420, PosedDept
     noisy = wall + rng.normal(0, 0.02, wall.shape)
     noisy[height // 2 :, :: 1 + index] *= 0.7
     frame, render = (i420_from_colour(c.astype(np.float32)) for c in (noisy, wall))
-    return frame, render, PosedDepth(Camera(k, pose), depth)
+    return frame, FieldView(Camera(k, pose), render, depth)
 
 
 def _report(outcomes: Counter[str], seconds: float) -> Iterator[str]:

@@ -16,7 +16,7 @@ from rich.console import Console
 from rfcore.camera import Camera
 from rfcore.dataset import Dataset, read_dataset, verify_manifest
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.field import RadianceField, load_field
+from rfcore.field import RadianceField, load_field, render_field_view
 from rfcore.files import write_whole
 from rfcore.image import Rgb, read_rgb
 from rfcore.native.yuv import rgb_from_i420
@@ -24,7 +24,6 @@ from rfcore.train import SplatTrainingConfig
 from rfedge.demo.field import FieldChoice, choose_field
 from rfedge.demo.measure import DriveOutcome, FrameAddress, Pictures, measure_drive
 from rfedge.demo.processes import command_of, run_to_end, service
-from rfedge.offline import rendered
 from rfedge.results import host, revision
 from rfedge.video import write_mp4
 
@@ -207,7 +206,7 @@ def _pictures(
 
 def _rendered(field: RadianceField, camera: Camera) -> Rgb:
     """The render as the codec sees it: through YUV 4:2:0 and back."""
-    return rgb_from_i420(rendered(field, camera)[0])
+    return rgb_from_i420(render_field_view(field, camera).render)
 
 
 def _wrong_street(sample: Path, field: RadianceField) -> Rgb:

@@ -21,10 +21,9 @@ from rfcore.codec.photometric import Photometric
 from rfcore.codec.references import References, is_temporal, references_name
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.errors import CodecError, InvalidInput
-from rfcore.field import RadianceField
+from rfcore.field import RadianceField, render_field_view
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
-from rfcore.native.yuv import i420_from_colour
+from rfcore.views import FieldView
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Frame
 from rfedge.experiments.clips import CodedClip, luma_mse, luma_sse
@@ -45,25 +44,31 @@ class SeenClip:
     ``covered``: bool [H, W] a frame, where the field shows anything (opacity above 1/2).
     """
 
-    cameras: tuple[Camera, ...]
-    renders: tuple[I420, ...]
-    depths: tuple[PosedDepth, ...]
+    views: tuple[FieldView, ...]
     covered: tuple[NDArray[np.bool_], ...]
     field_id: str
     render_cpu_ms: float
 
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The camera of each view."""
+        return tuple(view.camera for view in self.views)
+
+    @property
+    def renders(self) -> tuple[I420, ...]:
+        """The picture of each view."""
+        return tuple(view.render for view in self.views)
+
 
 def see_clip(field: RadianceField, cameras: Sequence[Camera]) -> SeenClip:
     """Render ``field`` from every camera, its pose rounded as a vehicle does before it renders."""
-    cameras = [Camera(c.intrinsics, c.world_from_cam.rounded()) for c in cameras]
+    cameras = [camera.rounded() for camera in cameras]
     field.render(cameras[0])  # what is made lazily is not held against the first frame
     began_ns = process_time_ns()
-    views = [field.render(camera) for camera in cameras]
-    renders = tuple(i420_from_colour(view.colour) for view in views)
+    views = tuple(render_field_view(field, camera) for camera in cameras)
     cpu_ms = (process_time_ns() - began_ns) / 1e6
-    depths = tuple(PosedDepth(c, view.depth) for c, view in zip(cameras, views, strict=True))
-    covered = tuple(view.opacity > COVERED for view in views)
-    return SeenClip(tuple(cameras), renders, depths, covered, field.field_id, cpu_ms)
+    covered = tuple(view.covers(COVERED) for view in views)
+    return SeenClip(views, covered, field.field_id, cpu_ms)
 
 
 class FieldCoder:
@@ -102,7 +107,7 @@ class FieldCoder:
         one, ``CodecError`` if a receiver does not see what the sender promised.
         """
         del rate_hz
-        seen = len(self._seen.renders)
+        seen = len(self._seen.views)
         if not 0 < len(frames) <= seen:
             raise InvalidInput("frames", f"{len(frames)} are outside the 1..{seen} that were seen")
         config = CodecConfig(*frames[0].size_px, preset=self._preset, crf=point)
@@ -134,8 +139,7 @@ class FieldCoder:
         coded = []
         for index, frame in enumerate(frames):
             choice = self._choice if index else self._first_choice
-            render, depth = self._seen.renders[index], self._seen.depths[index]
-            made = encoder.encode(state, frame, render, depth, choice)
+            made = encoder.encode(state, frame, self._seen.views[index], choice)
             state = made.state
             coded.append(made)
         return coded
@@ -145,8 +149,7 @@ class FieldCoder:
         state = decoder.start(1)
         pictures = []
         for index, made in enumerate(coded):
-            render, depth = self._seen.renders[index], self._seen.depths[index]
-            decoded = decoder.decode(state, made.packet, render, depth)
+            decoded = decoder.decode(state, made.packet, self._seen.views[index])
             state = decoded.state
             if decoded.frame.digest() != made.reconstruction.digest():
                 raise CodecError(f"frame {index} decodes to another picture than was promised")
@@ -154,6 +157,6 @@ class FieldCoder:
         return pictures
 
     def _message_bytes(self, index: int, made: Encoded) -> int:
-        pose = self._seen.cameras[index].world_from_cam
+        pose = self._seen.views[index].camera.world_from_cam
         message = Frame(MESSAGE_CAMERA, MESSAGE_TIME_NS, pose, b"", made.packet)
         return len(client_message_to_bytes(message))

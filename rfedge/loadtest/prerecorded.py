@@ -91,9 +91,7 @@ def _coded(
 
 
 def _capture(index: int, picture: PosedPicture) -> Capture:
-    camera = picture.camera
-    camera = replace(camera, world_from_cam=camera.world_from_cam.rounded())
-    return Capture(index, replace(picture, camera=camera), 0.0, 0)
+    return Capture(index, replace(picture, camera=picture.camera.rounded()), 0.0, 0)
 
 
 def _frame(pipeline: Pipeline, capture: Capture, epoch: int, after: int = -1) -> Frame:

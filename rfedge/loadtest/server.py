@@ -24,13 +24,12 @@ from mec_server.reconstruction import (
     FieldSource,
     OpenCameras,
     Reconstruction,
-    Renderer,
     Tools,
     open_cameras,
 )
 from rfcore.camera import Camera
 from rfcore.errors import PacketRejected, RejectReason
-from rfcore.field import Quality
+from rfcore.field import Quality, Renderer
 from rfcore.image import I420
 from rfcore.views import View
 from rfcore.wire.messages import CameraDescription, StageTimes

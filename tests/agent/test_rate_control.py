@@ -22,12 +22,12 @@ from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.sender.rate import RateModel, RateTarget
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
-from rfcore.field import load_field
+from rfcore.field import load_field, render_field_view
 from rfcore.link import LinkProfile
 from rfcore.link.profile_file import read_link
 from rfcore.link.shaper import Link
 from rfcore.link.trace import TraceTransmission, read_mahimahi
-from rfcore.native.yuv import i420_from_colour, i420_from_rgb
+from rfcore.native.yuv import i420_from_rgb
 from rfcore.wire.messages import (
     Ack,
     Credit,
@@ -102,9 +102,7 @@ class StreetCoder:
         field = load_field(Path("samples/fields/street.rff"), threads=2)
         pictures = read_dataset(Path("samples/street/transforms_drive_vehicles.json")).pictures
         self._frames = [i420_from_rgb(picture.read()) for picture in pictures]
-        self._renders = [
-            i420_from_colour(field.render(picture.camera).colour) for picture in pictures
-        ]
+        self._views = [render_field_view(field, picture.camera) for picture in pictures]
         self._encoder = DeltaEncoder(CodecConfig(640, 360, "ultrafast", LOWEST_CRF))
         self._state = self._encoder.start(0)
         self._model = RateModel()
@@ -116,7 +114,7 @@ class StreetCoder:
         choice = FrameChoice(RENDER_ONLY, limit_bytes=job.budget.limit_bytes, target=target)
         at = job.capture.index % len(self._frames)
         frame = self._frames[at]
-        made = self._encoder.encode(self._state, frame, self._renders[at], choice=choice)
+        made = self._encoder.encode(self._state, frame, self._views[at], choice=choice)
         self._state, self._model = made.state, made.rate or self._model
         squares = np.mean((made.reconstruction.y.astype(float) - frame.y) ** 2)
         self.psnr_db[job.capture.index] = float(10 * np.log10(255**2 / squares))

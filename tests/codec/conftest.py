@@ -5,11 +5,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_colour
+from rfcore.views import FieldView
 
 PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, I420]]
+PairMaker = Callable[..., tuple[I420, FieldView]]
+ViewMaker = Callable[[I420], FieldView]
 
 
 def make_picture(width_px: int, height_px: int, shift_px: float = 0.0, cars: int = 0) -> I420:
@@ -27,14 +30,23 @@ def make_picture(width_px: int, height_px: int, shift_px: float = 0.0, cars: int
     return i420_from_colour((luma[..., None] * tint).astype(np.float32))
 
 
-def make_pair(width_px: int, height_px: int, shift_px: float = 0.0) -> tuple[I420, I420]:
-    """Return (camera frame, render): the camera sees two cars and noise the field does not know."""
+def make_view(render: I420) -> FieldView:
+    """Return a view that shows ``render`` and no surface: nothing can be carried from or to it."""
+    width_px, height_px = render.size_px
+    k = Intrinsics(width_px, height_px, width_px, width_px, width_px / 2, height_px / 2)
+    depth = np.zeros((height_px, width_px), np.float32)
+    return FieldView(Camera(k, Pose.identity()), render, depth)
+
+
+def make_pair(width_px: int, height_px: int, shift_px: float = 0.0) -> tuple[I420, FieldView]:
+    """Return (camera frame, field's view): the camera sees two cars and noise that the field does
+    not know."""
     camera = make_picture(width_px, height_px, shift_px, cars=2)
     rng = np.random.default_rng(7)
     noise = np.rint(rng.normal(0, 2, camera.y.shape))
     noisy = np.clip(camera.y + noise, 0, 255).astype(np.uint8)
-    render = make_picture(width_px, height_px, shift_px)
-    return I420(noisy, camera.u, camera.v), render
+    view = make_view(make_picture(width_px, height_px, shift_px))
+    return I420(noisy, camera.u, camera.v), view
 
 
 def make_flat(width_px: int, height_px: int, level: int) -> I420:
@@ -58,6 +70,11 @@ def picture() -> PictureMaker:
 @pytest.fixture(scope="session")
 def pair() -> PairMaker:
     return make_pair
+
+
+@pytest.fixture(scope="session")
+def view_of() -> ViewMaker:
+    return make_view
 
 
 @pytest.fixture(scope="session")

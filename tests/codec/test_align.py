@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.codec.sender.align import Look, align
+from rfcore.codec.sender.align import align
 from rfcore.codec.sender.pose_search import PoseSearch
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
+from rfcore.views import FieldView
 
 INTRINSICS = Intrinsics(320, 192, 200.0, 200.0, 160.0, 96.0)
 TRUTH = Camera(INTRINSICS, Pose((1.0, -0.5, 2.0), (1.0, 0.0, 0.0, 0.0)))
@@ -29,7 +29,7 @@ def texture(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float6
     return waves + 0.5 * np.sin(8.9 * b + 1.3 * a)
 
 
-def look_at(camera: Camera) -> Look:
+def render_at(camera: Camera) -> FieldView:
     """Ray-trace a textured ground 1.5 m below the origin and a wall 12 m before it."""
     k = camera.intrinsics
     x, y = np.meshgrid(np.arange(k.width_px) + 0.5, np.arange(k.height_px) + 0.5)
@@ -44,11 +44,11 @@ def look_at(camera: Camera) -> Look:
     pattern = np.where(to_ground < to_wall, texture(px, pz), texture(px, py) + 0.3)
     luma = np.clip(np.rint(120 + 35 * pattern), 1, 255).astype(np.uint8)
     half = np.full((k.height_px // 2, k.width_px // 2), 128, np.uint8)
-    seen = PosedDepth(camera, depth.astype(np.float32))
-    return Look(I420(luma, half, half), seen, np.ones(depth.shape, np.float32))
+    opacity = np.ones(depth.shape, np.float32)
+    return FieldView(camera, I420(luma, half, half), depth.astype(np.float32), opacity)
 
 
-FRAME = look_at(TRUTH).render
+FRAME = render_at(TRUTH).render
 
 
 def off_by(metres: float, degrees: float, seed: int) -> Camera:
@@ -80,24 +80,24 @@ def test_a_pose_off_by_up_to_20_cm_and_half_a_degree_is_found(
 ) -> None:
     """To 1/4 px: a 320 px picture of f = 200 px sees 0.07 degrees, or 15 mm at 12 m, so."""
     refined = PoseSearch(1e3, clock_of(0)).refine(
-        FRAME, look_at(off_by(metres, degrees, seed)), look_at, 23
+        FRAME, render_at(off_by(metres, degrees, seed)), render_at, 23
     )
-    left_m, left_degrees = distance(refined.look.seen.camera)
+    left_m, left_degrees = distance(refined.view.camera)
     assert left_m < 0.015
     assert left_degrees < 0.07
 
 
 def test_a_true_pose_stays() -> None:
-    refined = PoseSearch(1e3, clock_of(0)).refine(FRAME, look_at(TRUTH), look_at, 23)
-    assert distance(refined.look.seen.camera)[0] < 0.001
+    refined = PoseSearch(1e3, clock_of(0)).refine(FRAME, render_at(TRUTH), render_at, 23)
+    assert distance(refined.view.camera)[0] < 0.001
 
 
 def test_another_light_and_a_car_do_not_move_it() -> None:
-    measured = look_at(off_by(0.1, 0.1, 3))
+    measured = render_at(off_by(0.1, 0.1, 3))
     luma = np.rint(0.7 * FRAME.y + 20).astype(np.uint8)
     luma[100:160, 60:140] = 220
     motion = align(I420(luma, FRAME.u, FRAME.v), measured)
-    camera = measured.seen.camera
+    camera = measured.camera
     found = replace(camera, world_from_cam=camera.world_from_cam.compose(motion.inverse()))
     left_m, left_degrees = distance(found)
     assert left_m < 0.02
@@ -107,16 +107,16 @@ def test_another_light_and_a_car_do_not_move_it() -> None:
 @pytest.mark.parametrize("level", [1, 128, 255])
 def test_a_picture_that_says_nothing_moves_nothing(level: int) -> None:
     flat = I420(np.full_like(FRAME.y, level), FRAME.u, FRAME.v)
-    measured = look_at(TRUTH)
+    measured = render_at(TRUTH)
     assert align(FRAME, replace(measured, render=flat)) == Pose.identity()
     moved = math.hypot(*align(flat, measured).translation_m)
     assert moved < 0.05
 
 
 def test_depth_of_nothing_moves_nothing() -> None:
-    measured = look_at(off_by(0.1, 0.1, 3))
-    nothing = PosedDepth(measured.seen.camera, np.zeros_like(measured.seen.depth))
-    assert align(FRAME, replace(measured, seen=nothing)) == Pose.identity()
+    measured = render_at(off_by(0.1, 0.1, 3))
+    nothing = np.zeros_like(measured.depth)
+    assert align(FRAME, replace(measured, depth=nothing)) == Pose.identity()
 
 
 @pytest.mark.parametrize("size_px", [(2, 2), (3, 61), (130, 7)])
@@ -127,40 +127,39 @@ def test_pictures_of_a_few_pixels_stay_where_they_are(size_px: tuple[int, int]) 
     noise = np.random.default_rng(1).integers(1, 255, (height, width), dtype=np.uint8)
     picture = I420(noise, half, half)
     depth = np.full((height, width), 5, np.float32)
-    look = Look(picture, PosedDepth(camera, depth), np.ones_like(depth))
-    moved = align(picture, look)
+    moved = align(picture, FieldView(camera, picture, depth, np.ones_like(depth)))
     assert math.hypot(*moved.translation_m) < 1e-6
 
 
 def test_a_noise_frame_is_not_believed() -> None:
     noise = np.random.default_rng(1).integers(1, 255, FRAME.y.shape, dtype=np.uint8)
-    measured = look_at(TRUTH)
+    measured = render_at(TRUTH)
     refined = PoseSearch(1e3, clock_of(0)).refine(
-        I420(noise, FRAME.u, FRAME.v), measured, look_at, 23
+        I420(noise, FRAME.u, FRAME.v), measured, render_at, 23
     )
-    assert refined.look is measured
+    assert refined.view is measured
     assert (refined.moved_m, refined.turned_rad) == (0.0, 0.0)
 
 
 def test_out_of_time_the_measured_pose_is_taken() -> None:
-    measured = look_at(off_by(0.1, 0.1, 3))
-    looks = []
+    measured = render_at(off_by(0.1, 0.1, 3))
+    rendered = []
 
-    def look(camera: Camera) -> Look:
-        looks.append(camera)
-        return look_at(camera)
+    def note_and_render(camera: Camera) -> FieldView:
+        rendered.append(camera)
+        return render_at(camera)
 
-    refined = PoseSearch(1.0, clock_of(2_000_000)).refine(FRAME, measured, look, 23)
-    assert refined.look is measured
-    assert not looks
+    refined = PoseSearch(1.0, clock_of(2_000_000)).refine(FRAME, measured, note_and_render, 23)
+    assert refined.view is measured
+    assert not rendered
 
 
 def test_a_longer_search_is_never_worse() -> None:
-    measured = look_at(off_by(0.2, 0.4, 5))
+    measured = render_at(off_by(0.2, 0.4, 5))
     left = []
     for budget_ms in (2, 20, 2000):
-        refined = PoseSearch(budget_ms, clock_of(1_000_000)).refine(FRAME, measured, look_at, 23)
-        left.append(distance(refined.look.seen.camera)[0])
+        refined = PoseSearch(budget_ms, clock_of(1_000_000)).refine(FRAME, measured, render_at, 23)
+        left.append(distance(refined.view.camera)[0])
     assert left == sorted(left, reverse=True)
     assert left[-1] < 0.01 < left[0]
 

@@ -17,18 +17,18 @@ from rfcore.codec.sender.reference_choice import choose_photometric, choose_refe
 from rfcore.codec.state import Past
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
+from rfcore.views import FieldView
 
 PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, I420]]
+PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (320, 192)
 
 
-@pytest.fixture
-def seen() -> PosedDepth:
+def wall(render: I420) -> FieldView:
+    """A wall 10 m ahead that shows ``render``."""
     width, height = SIZE_PX
     camera = Camera(Intrinsics(width, height, width, width, 160, 96), Pose.identity())
-    return PosedDepth(camera, np.full((height, width), 10, np.float32))
+    return FieldView(camera, render, np.full((height, width), 10, np.float32))
 
 
 def shade(picture: I420, gain: float, levels: float) -> I420:
@@ -43,43 +43,44 @@ def shade(picture: I420, gain: float, levels: float) -> I420:
 
 
 def test_a_render_like_the_frame_is_enough(pair: PairMaker) -> None:
-    frame, render = pair(*SIZE_PX)
-    assert choose_references(frame, Prediction(render), 23) == RENDER_ONLY
+    frame, view = pair(*SIZE_PX)
+    assert choose_references(frame, Prediction(view), 23) == RENDER_ONLY
 
 
-def test_a_render_that_shows_nothing_is_not_used(
-    pair: PairMaker, noise: PictureMaker, seen: PosedDepth
-) -> None:
-    frame, render = pair(*SIZE_PX)
-    for useless in (noise(*SIZE_PX, 1), shade(noise(*SIZE_PX, 2), 1.0, 0.0)):
+def test_a_render_that_shows_nothing_is_not_used(pair: PairMaker, noise: PictureMaker) -> None:
+    frame, view = pair(*SIZE_PX)
+    for render in (noise(*SIZE_PX, 1), shade(noise(*SIZE_PX, 2), 1.0, 0.0)):
+        useless = wall(render)
         assert choose_references(frame, Prediction(useless), 23) == INTRA
-        other = Past(noise(*SIZE_PX, 3), seen, noise(*SIZE_PX, 4))
-        chosen = choose_references(frame, Prediction(useless, seen, other), 23)
+        other = Past(noise(*SIZE_PX, 3), wall(noise(*SIZE_PX, 4)))
+        chosen = choose_references(frame, Prediction(useless, other), 23)
         assert chosen == (Reference.PREVIOUS,)
-    assert choose_references(frame, Prediction(render), 23) == RENDER_ONLY
+    assert choose_references(frame, Prediction(view), 23) == RENDER_ONLY
 
 
-def test_what_the_last_frame_taught_comes_first(pair: PairMaker, seen: PosedDepth) -> None:
+def test_what_the_last_frame_taught_comes_first(pair: PairMaker) -> None:
     """The cars are not in the render; nobody moved, so the correction has them."""
-    frame, render = pair(*SIZE_PX)
-    chosen = choose_references(frame, Prediction(render, seen, Past(frame, seen, render)), 23)
+    frame, view = pair(*SIZE_PX)
+    now = wall(view.render)
+    chosen = choose_references(frame, Prediction(now, Past(frame, now)), 23)
     assert chosen[0] is Reference.PREVIOUS
     assert chosen[-1] in (Reference.CORRECTION, Reference.WARP)
 
 
 @pytest.mark.parametrize("most", [1, 2, 3])
-def test_no_more_references_than_allowed(pair: PairMaker, seen: PosedDepth, most: int) -> None:
-    frame, render = pair(*SIZE_PX)
-    prediction = Prediction(render, seen, Past(frame, seen, render))
+def test_no_more_references_than_allowed(pair: PairMaker, most: int) -> None:
+    frame, view = pair(*SIZE_PX)
+    now = wall(view.render)
+    prediction = Prediction(now, Past(frame, now))
     assert 1 <= len(choose_references(frame, prediction, 23, most)) <= most
 
 
 @pytest.mark.parametrize("size_px", [(1, 1), (7, 40), (40, 7)])
 def test_pictures_smaller_than_a_block_have_the_render(
-    picture: PictureMaker, size_px: tuple[int, int]
+    picture: PictureMaker, view_of: Callable[[I420], FieldView], size_px: tuple[int, int]
 ) -> None:
     frame = picture(*size_px)
-    assert choose_references(frame, Prediction(frame), 23) == RENDER_ONLY
+    assert choose_references(frame, Prediction(view_of(frame)), 23) == RENDER_ONLY
     assert choose_photometric(frame, frame, 23) == ()
 
 
@@ -99,9 +100,9 @@ def test_a_change_of_light_is_found_and_undone(
 
 
 def test_what_the_field_has_never_seen_does_not_bend_the_light(pair: PairMaker) -> None:
-    frame, render = pair(*SIZE_PX)
+    frame, view = pair(*SIZE_PX)
     dark = shade(frame, 0.7, 0.0)
-    matrix = np.array(solve(dark, render)).reshape(3, 4)
+    matrix = np.array(solve(dark, view.render)).reshape(3, 4)
     assert abs(matrix[0, 0] / 4096 - 0.7) < 0.02
     assert abs(matrix[0, 3] / 16) < 3
 
@@ -123,8 +124,8 @@ def test_light_is_sent_when_it_pays_and_beats_weighted_prediction(pair: PairMake
 
 
 def test_light_that_did_not_change_is_not_sent(pair: PairMaker, noise: PictureMaker) -> None:
-    frame, render = pair(*SIZE_PX)
-    assert choose_photometric(frame, render, 23) == ()
+    frame, view = pair(*SIZE_PX)
+    assert choose_photometric(frame, view.render, 23) == ()
     assert choose_photometric(frame, noise(*SIZE_PX, 1), 23) == ()
 
 

@@ -12,9 +12,10 @@ from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
+from rfcore.views import FieldView
 
 PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, I420]]
+PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (160, 96)
 
 
@@ -29,14 +30,14 @@ def sent(encoder: DeltaEncoder, pair: PairMaker) -> Encoded:
     return encoder.encode(state, *pair(*SIZE_PX), choice=FrameChoice(coarse=True))
 
 
-def perturbed(picture: I420, seed: int = 0) -> I420:
-    """Move every sample by -1, 0 or +1 level."""
+def perturbed(view: FieldView, seed: int = 0) -> FieldView:
+    """Move every sample of the render by -1, 0 or +1 level."""
     rng = np.random.default_rng(seed)
     y, u, v = (
         np.clip(p.astype(np.int16) + rng.integers(-1, 2, p.shape), 0, 255).astype(np.uint8)
-        for p in picture.planes
+        for p in view.render.planes
     )
-    return I420(y, u, v)
+    return replace(view, render=I420(y, u, v))
 
 
 def psnr_y_db(a: I420, b: I420) -> float:
@@ -159,6 +160,7 @@ def test_a_render_of_another_pose_or_field_is_refused(
     picture: PictureMaker,
     flat: PictureMaker,
     noise: PictureMaker,
+    view_of: Callable[[I420], FieldView],
     exact: bool,
     wrong: str,
 ) -> None:
@@ -170,7 +172,7 @@ def test_a_render_of_another_pose_or_field_is_refused(
     }[wrong]()
     decoder = DeltaDecoder(encoder.header, exact=exact)
     with pytest.raises(PacketRejected, match="another pose, field or camera") as caught:
-        decoder.decode(decoder.start(5), sent.packet, render)
+        decoder.decode(decoder.start(5), sent.packet, view_of(render))
     assert caught.value.reason == RejectReason.RENDER_MISMATCH
 
 
@@ -186,10 +188,10 @@ def test_an_inexact_receiver_still_checks_what_it_can(
 def test_pictures_of_another_size_are_the_callers_mistake(
     encoder: DeltaEncoder, sent: Encoded, pair: PairMaker
 ) -> None:
-    frame, render = pair(*SIZE_PX)
-    small = pair(32, 32)[0]
+    frame, view = pair(*SIZE_PX)
+    small_frame, small = pair(32, 32)
     with pytest.raises(InvalidInput, match=r"frame: \(32, 32\) px where the stream has"):
-        encoder.encode(encoder.start(0), small, render)
+        encoder.encode(encoder.start(0), small_frame, view)
     with pytest.raises(InvalidInput, match="render: "):
         encoder.encode(encoder.start(0), frame, small)
     decoder = DeltaDecoder(encoder.header)

@@ -13,8 +13,10 @@ from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.sender.rate import MAX_TRIES, code_to_fit
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfcore.views import FieldView
 
 PictureMaker = Callable[..., I420]
+ViewMaker = Callable[[I420], FieldView]
 SIZE_PX = (160, 96)
 
 
@@ -55,8 +57,10 @@ def test_a_steady_rate_takes_three_codings_and_wastes_a_tenth(
 
 
 @pytest.mark.parametrize("share", [0.9, 0.5, 0.3])
-def test_noise_is_coded_again_until_it_fits_and_decodes(noise: PictureMaker, share: float) -> None:
-    frame, render = noise(*SIZE_PX, 1), noise(*SIZE_PX, 2)
+def test_noise_is_coded_again_until_it_fits_and_decodes(
+    noise: PictureMaker, view_of: ViewMaker, share: float
+) -> None:
+    frame, render = noise(*SIZE_PX, 1), view_of(noise(*SIZE_PX, 2))
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX))
     free = encoder.encode(encoder.start(0), frame, render)
     limit_bytes = int(share * len(free.packet.payload))
@@ -71,15 +75,16 @@ def test_noise_is_coded_again_until_it_fits_and_decodes(noise: PictureMaker, sha
     assert shown.frame.digest() == made.reconstruction.digest()
 
 
-def test_what_no_crf_makes_fit_comes_back_too_long(noise: PictureMaker) -> None:
+def test_what_no_crf_makes_fit_comes_back_too_long(noise: PictureMaker, view_of: ViewMaker) -> None:
+    frame, view = noise(*SIZE_PX, 1), view_of(noise(*SIZE_PX, 2))
     encoder = DeltaEncoder(CodecConfig(*SIZE_PX, preset="ultrafast"))
     choice = FrameChoice(limit_bytes=1)
-    made = encoder.encode(encoder.start(0), noise(*SIZE_PX, 1), noise(*SIZE_PX, 2), choice=choice)
+    made = encoder.encode(encoder.start(0), frame, view, choice=choice)
     assert len(made.packet.payload) > 1
     at_the_highest = encoder.encode(
         encoder.start(0),
-        noise(*SIZE_PX, 1),
-        noise(*SIZE_PX, 2),
+        frame,
+        view,
         choice=FrameChoice(made.packet.references, crf=51, photometric=made.packet.photometric),
     )
     assert made.packet.payload == at_the_highest.packet.payload

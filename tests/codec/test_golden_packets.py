@@ -12,7 +12,7 @@ import pytest
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.references import Reference
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
+from rfcore.views import FieldView
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.messages import Frame, Hello
 
@@ -34,8 +34,8 @@ def test_golden_packets_decode_to_their_digests(name: str) -> None:
         frame = client_message_from_bytes(arrays[f"frame{index}"].tobytes())
         assert isinstance(frame, Frame)
         render = I420(*(arrays[f"{name}{index}"] for name in "yuv"))
-        seen = PosedDepth(frame.camera(camera.intrinsics), arrays[f"depth{index}"])
-        decoded = decoder.decode(state, frame.packet, render, seen)
+        view = FieldView(frame.camera(camera.intrinsics), render, arrays[f"depth{index}"])
+        decoded = decoder.decode(state, frame.packet, view)
         assert decoded.frame.digest() == frame.packet.reconstruction_digest
         state = decoded.state
         used |= set(frame.packet.references)

@@ -15,8 +15,9 @@ from rfcore.codec.h264.slices import SliceCoding, encode_slice
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfcore.views import FieldView
 
-PairMaker = Callable[..., tuple[I420, I420]]
+PairMaker = Callable[..., tuple[I420, FieldView]]
 
 
 @pytest.fixture(scope="module")
@@ -28,11 +29,11 @@ def header() -> StreamHeader:
 def test_every_preset_crf_and_number_of_references_writes_the_same_parameter_sets(
     header: StreamHeader, pair: PairMaker, references: int
 ) -> None:
-    frame, render = pair(300, 168)
+    frame, view = pair(300, 168)
     for preset in PRESETS:
         for crf in (1, 17.5, 23, 28, 51):
             config = CodecConfig(300, 168, preset, crf)
-            coded = encode_slice(config, [render] * references, frame)
+            coded = encode_slice(config, [view.render] * references, frame)
             made = coded.header
             assert (made.sps, made.pps) == (header.sps, header.pps), (preset, crf)
             assert coded.payload
@@ -42,8 +43,8 @@ def test_every_preset_crf_and_number_of_references_writes_the_same_parameter_set
 def test_threads_and_rough_references_change_no_parameter_set(
     header: StreamHeader, pair: PairMaker, preset: str
 ) -> None:
-    frame, render = pair(300, 168)
-    pictures = [pair(300, 168, 2.0)[0], pair(300, 168, 1.0)[1], render]
+    frame, view = pair(300, 168)
+    pictures = [pair(300, 168, 2.0)[0], pair(300, 168, 1.0)[1].render, view.render]
     config = CodecConfig(300, 168, preset, 28)
     alone, shared, again, rough = (
         encode_slice(config, pictures, frame, coding)
@@ -63,14 +64,14 @@ def test_threads_and_rough_references_change_no_parameter_set(
 
 def test_a_better_preset_or_crf_changes_the_slice(pair: PairMaker) -> None:
     """The zone's analysis settings reach the P picture, and CRF its quantiser."""
-    frame, render = pair(300, 168)
+    frame, view = pair(300, 168)
     sizes = [
-        len(encode_slice(CodecConfig(300, 168, preset, crf), [render], frame).payload)
+        len(encode_slice(CodecConfig(300, 168, preset, crf), [view.render], frame).payload)
         for preset, crf in (("medium", 18), ("medium", 23), ("medium", 28))
     ]
     assert sizes == sorted(sizes, reverse=True)
     slices = {
-        encode_slice(CodecConfig(300, 168, preset, 23), [render], frame).payload
+        encode_slice(CodecConfig(300, 168, preset, 23), [view.render], frame).payload
         for preset in PRESETS
     }
     assert len(slices) >= len(PRESETS) - 1

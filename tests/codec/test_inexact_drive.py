@@ -11,20 +11,21 @@ from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.image import I420
+from rfcore.views import FieldView
 
-PairMaker = Callable[..., tuple[I420, I420]]
+PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (96, 64)
 FRAMES = 300
 WITH_COARSE = FrameChoice(coarse=True)
 
 
-def perturbed(picture: I420, rng: np.random.Generator) -> I420:
-    """Move every sample by -1, 0 or +1 level."""
+def perturbed(view: FieldView, rng: np.random.Generator) -> FieldView:
+    """Move every sample of the render by -1, 0 or +1 level."""
     y, u, v = (
         np.clip(p.astype(np.int16) + rng.integers(-1, 2, p.shape), 1, 255).astype(np.uint8)
-        for p in picture.planes
+        for p in view.render.planes
     )
-    return I420(y, u, v)
+    return replace(view, render=I420(y, u, v))
 
 
 def mse_y(a: I420, b: I420) -> float:

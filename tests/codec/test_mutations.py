@@ -18,8 +18,9 @@ from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.errors import PacketRejected, RejectReason
 from rfcore.image import I420
+from rfcore.views import FieldView
 
-PairMaker = Callable[..., tuple[I420, I420]]
+PairMaker = Callable[..., tuple[I420, FieldView]]
 Mutation = Callable[[DeltaPacket, np.random.Generator], DeltaPacket]
 SIZE_PX = (64, 48)
 FRAMES = 6
@@ -27,10 +28,10 @@ FRAMES = 6
 
 @dataclass(frozen=True)
 class Stream:
-    """A short sent stream: renders, packets, and what the sender's closed loop saw."""
+    """A short sent stream: views, packets, and what the sender's closed loop saw."""
 
     header: StreamHeader
-    renders: list[I420]
+    views: list[FieldView]
     packets: list[DeltaPacket]
     digests: list[bytes]
 
@@ -41,12 +42,12 @@ def stream(pair: PairMaker) -> Stream:
     state = encoder.start(1)
     pictures = [pair(*SIZE_PX, 5.0 * index) for index in range(FRAMES)]
     packets, digests = [], []
-    for frame, render in pictures:
-        encoded = encoder.encode(state, frame, render, choice=FrameChoice(RENDER_ONLY))
+    for frame, view in pictures:
+        encoded = encoder.encode(state, frame, view, choice=FrameChoice(RENDER_ONLY))
         state = encoded.state
         packets.append(encoded.packet)
         digests.append(encoded.reconstruction.digest())
-    return Stream(encoder.header, [render for _, render in pictures], packets, digests)
+    return Stream(encoder.header, [view for _, view in pictures], packets, digests)
 
 
 def flip_bits(data: bytes, rng: np.random.Generator) -> bytes:
@@ -103,14 +104,14 @@ def test_a_damaged_packet_is_refused_or_decodes_exactly(
         packet = MUTATIONS[name](stream.packets[index], rng)
         try:
             decoded = decoder.decode(
-                state, packet.sealed() if repaired else packet, stream.renders[index]
+                state, packet.sealed() if repaired else packet, stream.views[index]
             )
             assert decoded.frame.digest() == stream.digests[index]
             outcomes["accepted"] += packet != stream.packets[index]
         except PacketRejected as rejection:
             outcomes[rejection.reason] += 1
         if trial % 7 == 0:
-            good = decoder.decode(state, stream.packets[index], stream.renders[index])
+            good = decoder.decode(state, stream.packets[index], stream.views[index])
             assert good.frame.digest() == stream.digests[index], "the next good packet is right"
     if not repaired:
         assert outcomes["accepted"] == 0
@@ -130,7 +131,7 @@ def test_parts_of_other_packets_are_refused(stream: Stream, repaired: bool) -> N
                 mixed = replace(packet, **{name: getattr(other, name)})
                 with pytest.raises(PacketRejected):
                     decoder.decode(
-                        state, mixed.sealed() if repaired else mixed, stream.renders[index]
+                        state, mixed.sealed() if repaired else mixed, stream.views[index]
                     )
 
 
@@ -154,7 +155,7 @@ def test_a_stream_with_losses_duplicates_swaps_and_damage_shows_only_right_frame
                 packet = mutations[rng.integers(len(mutations))](packet, rng)
             expected = state.next_sequence
             try:
-                decoded = decoder.decode(state, packet, stream.renders[index])
+                decoded = decoder.decode(state, packet, stream.views[index])
             except PacketRejected:
                 assert damaged or index < expected, "a good packet in order is always taken"
                 continue

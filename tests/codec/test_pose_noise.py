@@ -10,13 +10,13 @@ import pytest
 
 from rfcore.camera import Camera, Pose
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.sender.align import Look
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.codec.sender.pose_search import PoseSearch
 from rfcore.dataset import read_dataset
-from rfcore.field import load_field
+from rfcore.field import load_field, render_field_view
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
+from rfcore.views import FieldView
 
 FRAMES = 5
 CRFS = (24.0, 32.0)
@@ -32,14 +32,14 @@ def shaken(camera: Camera, metres: float, degrees: float, rng: np.random.Generat
     return replace(camera, world_from_cam=camera.world_from_cam.compose(error).rounded())
 
 
-def curve(frames: Sequence[I420], looks: Sequence[Look]) -> list[tuple[float, float]]:
+def curve(frames: Sequence[I420], views: Sequence[FieldView]) -> list[tuple[float, float]]:
     """Return (PSNR in dB of the mean squared error, log2 of bytes) for each CRF, worst first."""
     points = []
     for crf in sorted(CRFS, reverse=True):
         encoder = DeltaEncoder(CodecConfig(640, 360, "veryfast", crf))
         state, size_bytes, squares = encoder.start(0), 0, []
-        for frame, look in zip(frames, looks, strict=True):
-            made = encoder.encode(state, frame, look.render, look.seen)
+        for frame, view in zip(frames, views, strict=True):
+            made = encoder.encode(state, frame, view)
             state = made.state
             size_bytes += len(made.packet.payload)
             squares.append(np.mean((made.reconstruction.y.astype(float) - frame.y) ** 2))
@@ -63,17 +63,17 @@ def test_refined_poses_cost_as_few_bits_as_true_ones(metres: float, degrees: flo
     frames = [i420_from_rgb(picture.read()) for picture in pictures]
     rng = np.random.default_rng(3)
 
-    def look_at(camera: Camera) -> Look:
-        return Look.of(field.render(camera), camera)
+    def render_at(camera: Camera) -> FieldView:
+        return render_field_view(field, camera)
 
-    true = [look_at(picture.camera) for picture in pictures]
-    noisy = [look_at(shaken(picture.camera, metres, degrees, rng)) for picture in pictures]
+    true = [render_at(picture.camera) for picture in pictures]
+    noisy = [render_at(shaken(picture.camera, metres, degrees, rng)) for picture in pictures]
     search = PoseSearch(1000, lambda: 0)
     refined = [
-        search.refine(frame, look, look_at, 26.0).look
-        for frame, look in zip(frames, noisy, strict=True)
+        search.refine(frame, view, render_at, 26.0).view
+        for frame, view in zip(frames, noisy, strict=True)
     ]
-    curves = [curve(frames, looks) for looks in (true, noisy, refined)]
+    curves = [curve(frames, views) for views in (true, noisy, refined)]
     for psnr_db in WINDOW_DB:
         clean, shaky, found = (octaves_at(points, psnr_db) for points in curves)
         assert shaky > clean + math.log2(4 / 3)

@@ -16,8 +16,9 @@ from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfcore.views import FieldView
 
-PairMaker = Callable[..., tuple[I420, I420]]
+PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (320, 192)
 MBS = (12, 20)
 
@@ -61,7 +62,7 @@ def test_macroblocks_that_the_edge_cuts_count_what_they_have() -> None:
     assert np.argwhere(offsets).tolist() == [[1, 2]]
 
 
-def code(encoder: DeltaEncoder, pair: tuple[I420, I420], choice: FrameChoice) -> Encoded:
+def code(encoder: DeltaEncoder, pair: tuple[I420, FieldView], choice: FrameChoice) -> Encoded:
     return encoder.encode(encoder.start(0), *pair, choice=choice)
 
 

@@ -14,9 +14,10 @@ from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.sender.rate import CLIMB_CRF, BitsCurve, RateModel, RateTarget, bits_curve
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfcore.views import FieldView
 
 PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, I420]]
+PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (320, 192)
 
 curves = st.builds(
@@ -81,7 +82,8 @@ def test_what_one_set_of_references_taught_serves_for_others() -> None:
 def test_the_curve_falls_and_more_pictures_never_cost_more(
     pair: PairMaker, noise: PictureMaker
 ) -> None:
-    frame, render = pair(*SIZE_PX)
+    frame, view = pair(*SIZE_PX)
+    render = view.render
     alone = bits_curve(frame, [render], 10)
     assert (np.diff(alone.bits) <= 0).all()
     both = bits_curve(frame, [render, frame], 10)

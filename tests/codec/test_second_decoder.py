@@ -46,7 +46,7 @@ def record(size_px: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> Recordi
     recording = Recording(decoder._splice._decoder)
     monkeypatch.setattr(decoder._splice, "_decoder", recording)
     for frame in stream.frames:
-        decoder.decode(frame.before, frame.packet, frame.render, frame.seen)
+        decoder.decode(frame.before, frame.packet, frame.view)
     return recording
 
 

@@ -12,13 +12,13 @@ from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.references import INTRA, RENDER_ONLY, Reference
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
-from rfcore.codec.state import KEPT_FRAMES, DecoderState, EncoderState
+from rfcore.codec.state import KEPT_FRAMES, EncoderState
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
+from rfcore.views import FieldView
 
 PictureMaker = Callable[..., I420]
-PairMaker = Callable[..., tuple[I420, I420]]
+PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (160, 96)
 WALL_M = 10.0
 TEMPORAL = [
@@ -34,24 +34,23 @@ class Moment:
     """One frame of a drive along a wall: what the camera sees, and the field at its pose."""
 
     frame: I420
-    render: I420
-    seen: PosedDepth
+    view: FieldView
 
 
 def moment(pair: PairMaker, index: int, size_px: tuple[int, int] = SIZE_PX) -> Moment:
     """The camera moves so that the picture shifts by 2 px a frame: f x / z of a wall."""
     width, height = size_px
-    frame, render = pair(width, height, 2.0 * index)
+    frame, still = pair(width, height, 2.0 * index)
     k = Intrinsics(width, height, width, width, width / 2, height / 2)
     pose = Pose((2.0 * index * WALL_M / width, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     depth = np.full((height, width), WALL_M, np.float32)
-    return Moment(frame, render, PosedDepth(Camera(k, pose), depth))
+    return Moment(frame, FieldView(Camera(k, pose), still.render, depth))
 
 
 def send(
     encoder: DeltaEncoder, state: EncoderState, now: Moment, choice: FrameChoice | None = None
 ) -> Encoded:
-    return encoder.encode(state, now.frame, now.render, now.seen, choice or FrameChoice())
+    return encoder.encode(state, now.frame, now.view, choice or FrameChoice())
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +73,7 @@ def test_every_mode_and_order_reconstructs_exactly(
     decoder = DeltaDecoder(encoder.header)
     state = decoder.start(0)
     for now, sent in zip(moments, (first, second), strict=False):
-        decoded = decoder.decode(state, sent.packet, now.render, now.seen)
+        decoded = decoder.decode(state, sent.packet, now.view)
         assert decoded.frame.digest() == sent.reconstruction.digest()
         state = decoded.state
 
@@ -90,7 +89,7 @@ def test_three_references_work_at_any_size(pair: PairMaker, size_px: tuple[int, 
     for index in range(3):
         now = moment(pair, index, size_px)
         sent = send(encoder, sending, now, three if index else None)
-        got = decoder.decode(receiving, sent.packet, now.render, now.seen)
+        got = decoder.decode(receiving, sent.packet, now.view)
         assert got.frame.digest() == sent.reconstruction.digest()
         assert got.frame.size_px == size_px
         sending, receiving = sent.state, got.state
@@ -109,11 +108,11 @@ def test_a_pose_only_packet_shows_the_reference_as_it_is(
     bare = send(encoder, first.state, moments[1], FrameChoice((reference,), pose_only=True))
     assert bare.packet.payload == b""
     decoder = DeltaDecoder(encoder.header)
-    state = decoder.decode(decoder.start(0), first.packet, moments[0].render, moments[0].seen).state
-    shown = decoder.decode(state, bare.packet, moments[1].render, moments[1].seen)
+    state = decoder.decode(decoder.start(0), first.packet, moments[0].view).state
+    shown = decoder.decode(state, bare.packet, moments[1].view)
     assert shown.frame.digest() == bare.reconstruction.digest()
     if reference is Reference.RENDER:
-        assert np.array_equal(shown.frame.y, moments[1].render.y)
+        assert np.array_equal(shown.frame.y, moments[1].view.render.y)
 
 
 def test_the_states_of_a_stream_form_a_chain(encoder: DeltaEncoder, moments: list[Moment]) -> None:
@@ -141,15 +140,15 @@ def test_a_frame_whose_base_was_lost_is_refused_and_rolling_back_heals_it(
     first = send(encoder, encoder.start(0), moments[0])
     lost = send(encoder, first.state, moments[1])
     late = send(encoder, lost.state, moments[2])
-    got = decoder.decode(decoder.start(0), first.packet, moments[0].render, moments[0].seen)
+    got = decoder.decode(decoder.start(0), first.packet, moments[0].view)
     with pytest.raises(PacketRejected, match="none of the 1 kept here") as caught:
-        decoder.decode(got.state, late.packet, moments[2].render, moments[2].seen)
+        decoder.decode(got.state, late.packet, moments[2].view)
     assert caught.value.reason == RejectReason.UNKNOWN_STATE
     back = replace(encoder.start(1), past=first.state.past)
     again = send(encoder, back, moments[3])
     assert again.packet.base_digest == first.packet.reconstruction_digest[:4]
     state = decoder.start(1, after=got.state)
-    healed = decoder.decode(state, again.packet, moments[3].render, moments[3].seen)
+    healed = decoder.decode(state, again.packet, moments[3].view)
     assert healed.frame.digest() == again.reconstruction.digest()
 
 
@@ -162,7 +161,7 @@ def test_the_receiver_keeps_a_bounded_number_of_frames(
     for now in moments[: KEPT_FRAMES + 1]:
         sent = send(encoder, sending, now)
         first = first or sent
-        got = decoder.decode(receiving, sent.packet, now.render, now.seen)
+        got = decoder.decode(receiving, sent.packet, now.view)
         sending, receiving = sent.state, got.state
     assert len(receiving.kept) == KEPT_FRAMES
     assert first is not None
@@ -175,27 +174,42 @@ def test_between_inexact_renderers_only_the_render_is_taken(
 ) -> None:
     decoder = DeltaDecoder(encoder.header, exact=False)
     first = send(encoder, encoder.start(0), moments[0])
-    got = decoder.decode(decoder.start(0), first.packet, moments[0].render, moments[0].seen)
+    got = decoder.decode(decoder.start(0), first.packet, moments[0].view)
     second = send(encoder, first.state, moments[1])
     with pytest.raises(PacketRejected, match="only the render") as caught:
-        decoder.decode(got.state, second.packet, moments[1].render, moments[1].seen)
+        decoder.decode(got.state, second.packet, moments[1].view)
     assert caught.value.reason == RejectReason.INVALID_ARGUMENT
 
 
-def test_without_depth_there_is_no_warp(encoder: DeltaEncoder, moments: list[Moment]) -> None:
-    first = encoder.encode(encoder.start(0), moments[0].frame, moments[0].render)
-    for reference in (Reference.WARP, Reference.CORRECTION):
-        with pytest.raises(InvalidInput, match="depth at both poses"):
-            send(encoder, first.state, moments[1], FrameChoice((reference,)))
-    with pytest.raises(InvalidInput, match="no earlier frame"):
-        send(encoder, encoder.start(0), moments[1], FrameChoice((Reference.PREVIOUS,)))
-    sent = send(encoder, send(encoder, encoder.start(0), moments[0]).state, moments[1])
-    decoder = DeltaDecoder(encoder.header)
-    if Reference.WARP in sent.packet.references or Reference.CORRECTION in sent.packet.references:
-        base = send(encoder, encoder.start(0), moments[0])
-        got = decoder.decode(DecoderState(0), base.packet, moments[0].render)
-        with pytest.raises(PacketRejected, match="depth at both poses"):
-            decoder.decode(got.state, sent.packet, moments[1].render, moments[1].seen)
+@pytest.mark.parametrize("reference", [Reference.PREVIOUS, Reference.WARP, Reference.CORRECTION])
+def test_the_first_frame_has_no_earlier_one_to_predict_from(
+    encoder: DeltaEncoder, moments: list[Moment], reference: Reference
+) -> None:
+    with pytest.raises(InvalidInput, match="no earlier frame to predict from"):
+        send(encoder, encoder.start(0), moments[0], FrameChoice((reference,)))
+
+
+@pytest.mark.parametrize("reference", [Reference.WARP, Reference.CORRECTION])
+def test_where_the_field_has_no_depth_what_is_carried_is_the_render(
+    encoder: DeltaEncoder, moments: list[Moment], reference: Reference
+) -> None:
+    flat = [replace(now, view=replace(now.view, depth=0 * now.view.depth)) for now in moments]
+    first = send(encoder, encoder.start(0), flat[0])
+    bare = send(encoder, first.state, flat[1], FrameChoice((reference,), pose_only=True))
+    for made, rendered in zip(bare.reconstruction.planes, flat[1].view.render.planes, strict=True):
+        assert np.array_equal(made, rendered)
+
+
+def test_a_kept_frame_drops_the_opacity_that_nobody_asks_for(
+    encoder: DeltaEncoder, moments: list[Moment]
+) -> None:
+    now = moments[0]
+    opaque = replace(now.view, opacity=np.ones_like(now.view.depth))
+    past = send(encoder, encoder.start(0), replace(now, view=opaque)).state.past
+    assert past is not None
+    assert past.view.opacity is None
+    with pytest.raises(InvalidInput, match="opacity: was dropped"):
+        _ = past.view.confidence
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 python tests/data/make_delta_packets.py; only when the packet or the codec's arithmetic must change.
 delta_packets_long.npz, which this revision can read and no longer writes, has a field id, a pose in
-float64, block means and whole needed digests in every frame.
+float64, block means and whole base digests in every frame.
 """
 
 from pathlib import Path
@@ -18,16 +18,16 @@ OUT = Path(__file__).with_name("delta_packets.npz")
 
 def main() -> None:
     stream = make_stream()
-    intrinsics = stream.frames[0].seen.camera.intrinsics
+    intrinsics = stream.frames[0].view.camera.intrinsics
     camera = CameraDescription("front", intrinsics, stream.header)
     hello = Hello("golden", (camera,), ("ab" * 32,), RendererContract("golden", exact=True))
     arrays = {"hello": np.frombuffer(client_message_to_bytes(hello), np.uint8)}
     for index, sent in enumerate(stream.frames):
-        pose = sent.seen.camera.world_from_cam
+        pose = sent.view.camera.world_from_cam
         message = Frame("front", index, pose, b"", sent.packet)
         arrays[f"frame{index}"] = np.frombuffer(client_message_to_bytes(message), np.uint8)
-        arrays[f"depth{index}"] = sent.seen.depth
-        for name, plane in zip("yuv", sent.render.planes, strict=True):
+        arrays[f"depth{index}"] = sent.view.depth
+        for name, plane in zip("yuv", sent.view.render.planes, strict=True):
             arrays[f"{name}{index}"] = plane
     np.savez_compressed(OUT, **arrays)
 

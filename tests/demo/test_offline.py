@@ -11,12 +11,12 @@ from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.codec.sender.steering import SteeringSettings
 from rfcore.dataset import Dataset, read_dataset
 from rfcore.errors import InvalidData
-from rfcore.field import SplatField
+from rfcore.field import SplatField, render_field_view
 from rfcore.image import write_png
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.drive_file import read_drive, write_drive
-from rfedge.offline import CodingSettings, decode_drive, encode_drive, rendered
+from rfedge.offline import CodingSettings, decode_drive, encode_drive
 
 SETTINGS = CodingSettings(preset="veryfast", crf=27.0)
 
@@ -41,7 +41,9 @@ def test_a_decoded_file_is_the_senders_closed_loop(
     decoded = list(decode_drive(read_drive(path), field))
     assert [frame.sequence for frame in decoded] == [0, 1, 2, 3]
     for picture, frame in zip(drive.pictures, decoded, strict=True):
-        own = encoder.encode(state, i420_from_rgb(picture.read()), *rendered(field, picture.camera))
+        own = encoder.encode(
+            state, i420_from_rgb(picture.read()), render_field_view(field, picture.camera)
+        )
         state = own.state
         assert frame.frame.digest() == own.reconstruction.digest()
 

@@ -7,7 +7,7 @@ import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
+from rfcore.views import FieldView
 from rfedge.experiments.compare.bit_split import KINDS, SplitClip, macroblock_kinds, split_rows
 from rfedge.experiments.field_coder import SeenClip
 
@@ -17,9 +17,17 @@ EVERYWHERE = np.ones(SIZE[::-1], bool)
 NOWHERE = ~EVERYWHERE
 
 
+def picture(luma):
+    chroma = np.full((SIZE[1] // 2, SIZE[0] // 2), 128, np.uint8)
+    return I420(luma, chroma, chroma)
+
+
+FLAT = picture(np.full(SIZE[::-1], 90, np.uint8))
+
+
 def wall(x_m=0.0, depth_m=4.0):
     camera = Camera(INTRINSICS, Pose((x_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
-    return PosedDepth(camera, np.full(SIZE[::-1], depth_m, np.float32))
+    return FieldView(camera, FLAT, np.full(SIZE[::-1], depth_m, np.float32))
 
 
 def names(*args):
@@ -49,22 +57,14 @@ def test_what_the_field_lacks_comes_before_what_moves():
     assert names(wall(), wall(), covered, moving)[0][:3] == ["off-map", "moving", "static"]
 
 
-def picture(luma):
-    chroma = np.full((SIZE[1] // 2, SIZE[0] // 2), 128, np.uint8)
-    return I420(luma, chroma, chroma)
-
-
 def test_bits_go_where_the_frame_differs_from_the_field():
     rng = np.random.default_rng(3)
-    flat = picture(np.full(SIZE[::-1], 90, np.uint8))
     moving = NOWHERE.copy()
     moving[16:48, 16:48] = True
-    noisy = [flat.y.copy() for _ in range(3)]
+    noisy = [FLAT.y.copy() for _ in range(3)]
     for luma in noisy:
         luma[moving] = rng.integers(30, 220, moving.sum())
-    depths = (wall(),) * 3
-    cameras = tuple(depth.camera for depth in depths)
-    seen = SeenClip(cameras, (flat,) * 3, depths, (EVERYWHERE,) * 3, "field", 0.0)
+    seen = SeenClip((wall(),) * 3, (EVERYWHERE,) * 3, "field", 0.0)
     rows = split_rows(SplitClip([picture(y) for y in noisy], seen, [moving] * 3, "veryfast", 26.0))
     shares = {row["shows"]: row for row in rows}
     assert shares["moving"]["slice_percent"] > 90

@@ -9,9 +9,8 @@ import pytest
 
 from mec_server.config import AdmissionLimits
 from rfcore.codec.decoder import DeltaDecoder
+from rfcore.field import render_field_view
 from rfcore.field.quality import FULL
-from rfcore.native.warp import PosedDepth
-from rfcore.native.yuv import i420_from_colour
 from rfedge.loadtest.command import Command
 from rfedge.loadtest.fleet import FleetSpec, run_fleet
 from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
@@ -38,11 +37,10 @@ def test_canned_frames_decode_in_a_chain_and_alone(street: Any, canned: Path) ->
         state = decoder.start(frames[0].packet.epoch)
         for frame in frames:
             camera = frame.camera(drive.intrinsics)
-            view = street.field.render(camera)
             if frame.packet.epoch != state.epoch:
                 state = decoder.start(frame.packet.epoch)
-            seen = PosedDepth(camera, view.depth)
-            done = decoder.decode(state, frame.packet, i420_from_colour(view.colour), seen)
+            view = render_field_view(street.field, camera)
+            done = decoder.decode(state, frame.packet, view)
             assert done.exact
             state = done.state
     assert any(len(frame.packet.references) > 1 for frame in drive.chain)

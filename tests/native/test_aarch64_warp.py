@@ -10,13 +10,12 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420
 from rfcore.native.warp import (
     CORRECTION_DOUBT,
-    PosedDepth,
-    Seen,
     block_costs,
     correct_i420,
     warp_i420,
     warp_numbers,
 )
+from rfcore.views import FieldView
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -50,15 +49,16 @@ def test_aarch64_carries_a_picture_to_the_same_bytes(
     emulated: Emulated, first_difference: FirstDifference
 ) -> None:
     previous, render, previous_render = (picture(seed) for seed in (1, 2, 3))
-    seen_before, seen = PosedDepth(BEFORE, depth(4)), PosedDepth(NOW, depth(5))
+    before = FieldView(BEFORE, previous_render, depth(4))
+    now = FieldView(NOW, render, depth(5))
     here = as_bytes(
-        warp_i420(previous, seen_before, seen, render),
-        correct_i420(Seen(previous, seen_before, previous_render), seen, render),
+        warp_i420(previous, before, now),
+        correct_i420(previous, before, now),
     )
     costs = block_costs(previous.y, render.y)
     here += costs.satd.tobytes() + costs.ssd.tobytes()
     numbers = struct.pack("<16f", *warp_numbers(BEFORE, NOW))
     scene = struct.pack("<3i", 83, 45, CORRECTION_DOUBT) + numbers
     scene += as_bytes(previous, render, previous_render)
-    scene += seen_before.depth.tobytes() + seen.depth.tobytes()
+    scene += before.depth.tobytes() + now.depth.tobytes()
     assert first_difference(emulated("exactness_warp", "neon", 1, scene), here) is None

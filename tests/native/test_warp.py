@@ -1,6 +1,7 @@
 """The warp against its definition in numpy, bit by bit; its geometry against plane homographies."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,12 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native.warp import (
-    PosedDepth,
-    Seen,
     block_costs,
     correct_i420,
     warp_i420,
     warp_numbers,
 )
+from rfcore.views import FieldView
 
 F32 = NDArray[np.float32]
 SIZES = [(1, 1), (2, 2), (3, 5), (17, 9), (64, 48), (101, 67)]
@@ -33,15 +33,15 @@ def filter_table() -> NDArray[np.int64]:
     return table
 
 
-def locate(seen: PosedDepth, before: PosedDepth) -> tuple[F32, F32, NDArray[np.bool_]]:
+def locate(now: FieldView, before: FieldView) -> tuple[F32, F32, NDArray[np.bool_]]:
     """Positions in 1/64 sample and what is known, each step in float32 as the docstring has it."""
     one = np.float32
-    numbers = [one(n) for n in warp_numbers(before.camera, seen.camera)]
+    numbers = [one(n) for n in warp_numbers(before.camera, now.camera)]
     r, t, (fx, fy, cx, cy) = numbers[:9], numbers[9:12], numbers[12:]
-    height, width = seen.depth.shape
+    height, width = now.depth.shape
     ray_x = ((np.arange(width, dtype=one) + one(0.5) - cx) / fx)[None]
     ray_y = ((np.arange(height, dtype=one) + one(0.5) - cy) / fy)[:, None]
-    z = seen.depth
+    z = now.depth
     px, py, pz = (
         z * (r[3 * i] * ray_x + (r[3 * i + 1] * ray_y + r[3 * i + 2])) + t[i] for i in range(3)
     )
@@ -71,9 +71,9 @@ def carried(
 
 
 def definition(
-    previous: I420, before: PosedDepth, seen: PosedDepth, render: I420, minus: I420 | None = None
+    previous: I420, before: FieldView, now: FieldView, minus: I420 | None = None
 ) -> I420:
-    u, v, known = locate(seen, before)
+    u, v, known = locate(now, before)
     height, width = known.shape
     pad = ((0, height % 2), (0, width % 2))
     quads = [
@@ -90,7 +90,7 @@ def definition(
     places = [(u, v, known), *[(np.where(known_c, u_c, 0), np.where(known_c, v_c, 0), known_c)] * 2]
     planes = []
     for n, (u_n, v_n, known_n) in enumerate(places):
-        base = render.planes[n].astype(np.int64)
+        base = now.render.planes[n].astype(np.int64)
         if minus is None:
             value = (carried(previous.planes[n], u_n, v_n) + (1 << 11)) >> 12
         else:
@@ -108,13 +108,15 @@ def noise(size_px: tuple[int, int], seed: int) -> I420:
     return I420(*(rng.integers(0, 256, s, dtype=np.uint8) for s in ((height, width), half, half)))
 
 
-def posed(size_px: tuple[int, int], depth: F32, pose: Pose) -> PosedDepth:
+def posed(
+    size_px: tuple[int, int], depth: F32, pose: Pose, render: I420 | None = None
+) -> FieldView:
     width, height = size_px
     k = Intrinsics(width, height, 0.8 * width, 0.9 * width, width / 2, height / 2)
-    return PosedDepth(Camera(k, pose), depth)
+    return FieldView(Camera(k, pose), render or noise(size_px, 2), depth)
 
 
-def scene(size_px: tuple[int, int], seed: int) -> tuple[I420, PosedDepth, PosedDepth, I420]:
+def scene(size_px: tuple[int, int], seed: int) -> tuple[I420, FieldView, FieldView]:
     """A rough surface, holes of zero depth, a turn and a step."""
     rng = np.random.default_rng(seed)
     width, height = size_px
@@ -129,7 +131,7 @@ def scene(size_px: tuple[int, int], seed: int) -> tuple[I420, PosedDepth, PosedD
     w, x, y, z = turn.tolist()
     step = Pose((0.2, -0.1, 0.5), (w, x, y, z))
     before = posed(size_px, depths[0], Pose.identity())
-    return noise(size_px, seed), before, posed(size_px, depths[1], step), noise(size_px, seed + 1)
+    return noise(size_px, seed), before, posed(size_px, depths[1], step, noise(size_px, seed + 1))
 
 
 def equal(a: I420, b: I420) -> bool:
@@ -145,29 +147,29 @@ def test_the_kernel_is_its_definition_bit_by_bit(size_px: tuple[int, int], seed:
 
 @pytest.mark.parametrize("size_px", SIZES)
 def test_the_correction_is_its_definition_bit_by_bit(size_px: tuple[int, int]) -> None:
-    previous, before, seen, render = scene(size_px, 5)
+    previous, before, now = scene(size_px, 5)
     was = noise(size_px, 9)
-    corrected = correct_i420(Seen(previous, before, was), seen, render)
-    assert equal(corrected, definition(previous, before, seen, render, minus=was))
+    corrected = correct_i420(previous, replace(before, render=was), now)
+    assert equal(corrected, definition(previous, before, now, minus=was))
 
 
 def test_a_render_that_was_right_is_not_corrected() -> None:
-    previous, before, seen, render = scene((64, 48), 5)
-    corrected = correct_i420(Seen(previous, before, previous), seen, render)
-    assert equal(corrected, I420(*(np.maximum(plane, 1) for plane in render.planes)))
+    previous, before, now = scene((64, 48), 5)
+    corrected = correct_i420(previous, replace(before, render=previous), now)
+    assert equal(corrected, I420(*(np.maximum(plane, 1) for plane in now.render.planes)))
 
 
 def test_golden_digests_pin_the_bytes() -> None:
-    previous, before, seen, render = scene((64, 48), 7)
-    corrected = correct_i420(Seen(previous, before, render), seen, render)
+    previous, before, now = scene((64, 48), 7)
+    corrected = correct_i420(previous, replace(before, render=now.render), now)
     assert corrected.digest().hex() == "c805d5b0e1a577d46842018c3f0ec45d"
     assert warp_i420(*scene((64, 48), 7)).digest().hex() == "2ee3f6ae0a6fb2fd569311b8eea77a8b"
 
 
 def test_without_motion_the_picture_stays_as_it_is() -> None:
-    picture, render = noise((40, 30), 1), noise((40, 30), 2)
-    seen = posed((40, 30), np.full((30, 40), 5, np.float32), Pose.identity())
-    kept = warp_i420(picture, seen, seen, render)
+    picture = noise((40, 30), 1)
+    view = posed((40, 30), np.full((30, 40), 5, np.float32), Pose.identity())
+    kept = warp_i420(picture, view, view)
     assert all(
         np.array_equal(a, np.maximum(b, 1))
         for a, b in zip(kept.planes, picture.planes, strict=True)
@@ -181,7 +183,7 @@ def test_a_step_sideways_shifts_a_wall_by_focal_length_over_distance() -> None:
     previous, render = noise(size, 1), noise(size, 2)
     moved = warp_i420(
         previous, posed(size, wall, Pose.identity()),
-        posed(size, wall, Pose((0.625, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))), render,
+        posed(size, wall, Pose((0.625, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), render),
     )  # fmt: skip
     assert np.array_equal(moved.y[:, :36], np.maximum(previous.y[:, 4:], 1))
     assert np.array_equal(moved.y[:, 36:], np.maximum(render.y[:, 36:], 1))
@@ -195,7 +197,7 @@ def test_what_another_surface_hid_comes_from_the_render() -> None:
     for before, now in ((near, far), (far, near), (np.zeros_like(far), far)):
         pose = Pose.identity()
         warped = warp_i420(
-            noise(size, 1), posed(size, before, pose), posed(size, now, pose), render
+            noise(size, 1), posed(size, before, pose), posed(size, now, pose, render)
         )
         assert np.array_equal(warped.y, np.maximum(render.y, 1))
 
@@ -209,30 +211,34 @@ def test_a_pose_that_saw_nothing_of_this_leaves_the_render(pose: Pose) -> None:
     depth = np.full((18, 24), 5, np.float32)
     render = noise(size, 2)
     warped = warp_i420(
-        noise(size, 1), posed(size, depth, pose), posed(size, depth, Pose.identity()), render
+        noise(size, 1), posed(size, depth, pose), posed(size, depth, Pose.identity(), render)
     )
     assert np.array_equal(warped.y, np.maximum(render.y, 1))
 
 
 def test_extreme_depths_are_computed_as_defined() -> None:
-    previous, before, seen, render = scene((64, 48), 3)
+    previous, before, now = scene((64, 48), 3)
     rng = np.random.default_rng(4)
     depth = (10.0 ** rng.uniform(-30, 30, (48, 64))).astype(np.float32)
     depth[0] = -1
-    given = (previous, before, PosedDepth(seen.camera, depth), render)
+    given = (previous, before, replace(now, depth=depth))
     with np.errstate(over="ignore"):
         assert equal(warp_i420(*given), definition(*given))
 
 
 def test_values_that_cannot_be_are_refused_by_name() -> None:
-    previous, before, seen, render = scene((16, 16), 1)
+    previous, before, now = scene((16, 16), 1)
+    luma = now.render.y
     bad: list[tuple[str, Callable[[], object]]] = [
-        ("NaN or infinite", lambda: PosedDepth(seen.camera, np.full((16, 16), np.nan, np.float32))),
-        ("must be float32", lambda: PosedDepth(seen.camera, np.ones((16, 15), np.float32))),
-        ("warp.previous", lambda: warp_i420(noise((8, 8), 1), before, seen, render)),
-        ("different intrinsics", lambda: warp_i420(previous, scene((8, 8), 1)[1], seen, render)),
-        ("reference", lambda: block_costs(render.y, render.y[:8])),
-        ("threads", lambda: warp_i420(previous, before, seen, render, 0)),
+        ("256 of 256 .* NaN or infinite", lambda: replace(now, depth=np.nan * now.depth)),
+        ("depth: float32 .* must be float32", lambda: replace(now, depth=now.depth[:, 1:])),
+        ("depth: float64 .* must be float32", lambda: replace(now, depth=now.depth.astype(float))),
+        ("opacity: float32 .* must be", lambda: replace(now, opacity=now.depth[1:])),
+        ("render: .* px of a camera of", lambda: replace(now, render=noise((8, 8), 1))),
+        ("warp.previous", lambda: warp_i420(noise((8, 8), 1), before, now)),
+        ("different intrinsics", lambda: warp_i420(previous, scene((8, 8), 1)[1], now)),
+        ("reference", lambda: block_costs(luma, luma[:8])),
+        ("threads", lambda: warp_i420(previous, before, now, 0)),
     ]  # fmt: skip
     for words, call in bad:
         with pytest.raises(InvalidInput, match=words):
@@ -242,12 +248,11 @@ def test_values_that_cannot_be_are_refused_by_name() -> None:
 @pytest.mark.parametrize("threads", [2, 3, 40])
 def test_any_number_of_threads_gives_the_same_bytes(threads: int) -> None:
     for size_px in ((64, 48), (35, 19)):
-        previous, before, seen, render = scene(size_px, 7)
-        once = warp_i420(previous, before, seen, render)
-        assert equal(warp_i420(previous, before, seen, render, threads), once)
-        seen_before = Seen(previous, before, render)
-        again = correct_i420(seen_before, seen, render, threads)
-        assert equal(again, correct_i420(seen_before, seen, render))
+        previous, before, now = scene(size_px, 7)
+        once = warp_i420(previous, before, now)
+        assert equal(warp_i420(previous, before, now, threads), once)
+        again = correct_i420(previous, before, now, threads)
+        assert equal(again, correct_i420(previous, before, now))
 
 
 def test_block_costs_are_hadamard_sums_and_squares() -> None:

@@ -25,13 +25,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.camera import Intrinsics, Pose
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
-from rfcore.native.yuv import i420_from_colour
-from rfcore.views import View, confidence
+from rfcore.views import FieldView
 
-__all__ = ["PRIOR_M", "PRIOR_RAD", "Look", "align"]
+__all__ = ["PRIOR_M", "PRIOR_RAD", "align"]
 
 COARSEST_PX = 60
 """Shortest side of the coarsest level; 0.2 m at 5 m are then less than 3 px."""
@@ -53,25 +51,6 @@ TRUSTED = 0.5
 
 F64 = NDArray[np.float64]
 Array = NDArray[Any]
-
-
-@dataclass(frozen=True, eq=False)
-class Look:
-    """What the field shows at a pose: the render, its depth, and its opacity [H, W]."""
-
-    render: I420
-    seen: PosedDepth
-    opacity: NDArray[np.float32]
-
-    @staticmethod
-    def of(view: View, camera: Camera) -> Look:
-        """Return a rendered view from ``camera`` as both ends hold it."""
-        return Look(i420_from_colour(view.colour), PosedDepth(camera, view.depth), view.opacity)
-
-    @property
-    def confidence(self) -> NDArray[np.float32]:
-        """How far each pixel is to be trusted."""
-        return confidence(self.seen.depth, self.opacity)
 
 
 @dataclass(frozen=True)
@@ -96,17 +75,17 @@ class _Level:
         )
 
 
-def align(frame: I420, look: Look, has_time: Callable[[], bool] = lambda: True) -> Pose:
+def align(frame: I420, view: FieldView, has_time: Callable[[], bool] = lambda: True) -> Pose:
     """Return the motion from the measured camera's axes into those of ``frame``'s camera.
 
     Stops, at the best motion so far, when ``has_time`` says no; it is asked before every step.
     """
     level = _Level(
         frame.y.astype(np.float64),
-        look.render.y.astype(np.float64),
-        look.seen.depth.astype(np.float64),
-        (look.confidence >= TRUSTED) & (look.seen.depth > NEAREST_M),
-        look.seen.camera.intrinsics,
+        view.render.y.astype(np.float64),
+        view.depth.astype(np.float64),
+        (view.confidence >= TRUSTED) & (view.depth > NEAREST_M),
+        view.camera.intrinsics,
     )
     levels = [level]
     while min(levels[-1].frame.shape) >= 2 * COARSEST_PX:

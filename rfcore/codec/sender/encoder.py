@@ -19,7 +19,7 @@ from rfcore.codec.h264.qp_map import QpMap, check_qp_map
 from rfcore.codec.h264.slices import SliceCoding, encode_slice
 from rfcore.codec.h264.splice import SpliceDecoder, grey
 from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket
-from rfcore.codec.photometric import Photometric, adapt
+from rfcore.codec.photometric import Photometric
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import References, check_references, is_temporal
 from rfcore.codec.sender.rate import FittedSlice, RateModel, RateTarget, bits_curve, code_to_fit
@@ -27,7 +27,7 @@ from rfcore.codec.sender.reference_choice import choose_photometric, choose_refe
 from rfcore.codec.state import EncoderState, Past
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
+from rfcore.views import FieldView
 
 __all__ = ["DeltaEncoder", "Encoded", "FrameChoice"]
 
@@ -135,16 +135,15 @@ class DeltaEncoder:
         self,
         state: EncoderState,
         frame: I420,
-        render: I420,
-        seen: PosedDepth | None = None,
+        view: FieldView,
         choice: FrameChoice = LEFT_TO_THE_ENCODER,
     ) -> Encoded:
-        """Code ``frame`` against ``render`` (both of the configured size) and ``state.past``.
+        """Code ``frame`` against ``view``, the field at its pose, and ``state.past``.
 
-        ``seen`` is the field's depth at the frame's pose; without it there is no warp, now or for
-        the next frame. Raises ``InvalidInput`` for another size, or references that cannot be made;
-        ``CodecError`` if x264 fails.
+        Raises ``InvalidInput`` for a frame or view that is not of the configured size, or
+        references that cannot be made; ``CodecError`` if x264 fails.
         """
+        render = view.render
         for name, picture in (("frame", frame), ("render", render)):
             _require_size(name, picture, self._config)
         if choice.qp_map is not None:
@@ -154,7 +153,7 @@ class DeltaEncoder:
         photometric = choice.photometric
         if photometric is None:
             photometric = choose_photometric(frame, render, crf)
-        prediction = Prediction(adapt(render, photometric), seen, state.past, self._threads)
+        prediction = Prediction.under_light(view, photometric, state.past, self._threads)
         references = choice.references
         if references is None:
             references = choose_references(frame, prediction, crf, choice.most)
@@ -164,7 +163,7 @@ class DeltaEncoder:
         encoded_ns = self._clock_ns()
         reconstruction = self._reconstruct(pictures, made.payload)
         past = state.past
-        shown = Past(reconstruction, seen, prediction.render)
+        shown = prediction.past_of(reconstruction)
         packet = DeltaPacket(
             epoch=state.epoch,
             sequence=state.next_sequence,

@@ -14,20 +14,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from rfcore.camera import Camera, Pose
-from rfcore.codec.sender.align import Look, align
+from rfcore.codec.sender.align import align
 from rfcore.codec.sender.rate import bits_curve
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfcore.views import FieldView
 
 __all__ = ["PoseSearch", "Refined"]
 
-MOST_LOOKS = 2
+MAX_RENDERS = 2
 """Renders beside that of the measured pose; the second finds what the first, seen from elsewhere,
-could not show. A look takes about 100 ms of one core at 640x360: aligning 70, rendering 30."""
-WORTH = 0.01
+could not show. One takes about 100 ms of one core at 640x360: aligning 70, rendering 30."""
+MIN_SAVING = 0.01
 """Of the estimated bits, that another pose must save: less is noise of the estimate."""
 FURTHEST_M, FURTHEST_RAD = 1.0, math.radians(3.0)
 """Beyond it the alignment has gone astray, and is not believed."""
@@ -37,15 +38,15 @@ ClockNs = Callable[[], int]
 
 @dataclass(frozen=True)
 class Refined:
-    """The pose taken, what the field shows there, and how far it is from the measured one.
+    """What the field shows at the pose taken, and how far that is from the measured one.
 
-    ``looks``: how often the field was rendered beside.
+    ``renders``: how often the field was rendered, the measured pose not counted.
     """
 
-    look: Look
+    view: FieldView
     moved_m: float = 0.0
     turned_rad: float = 0.0
-    looks: int = 0
+    renders: int = 0
 
 
 class PoseSearch:
@@ -58,36 +59,40 @@ class PoseSearch:
         self._clock_ns = clock_ns
 
     def refine(
-        self, frame: I420, measured: Look, look_at: Callable[[Camera], Look], crf: float
+        self,
+        frame: I420,
+        measured: FieldView,
+        render_at: Callable[[Camera], FieldView],
+        crf: float,
     ) -> Refined:
-        """Return the best of the measured pose and those found; ``look_at`` renders the field."""
+        """Return the best of the measured pose and those found; ``render_at`` renders the field."""
         ends_ns = self._clock_ns() + self._budget_ns
         best, best_bits = measured, _bits(frame, measured, crf)
-        looks, rendering_ns = 0, 0
-        while looks < MOST_LOOKS:
+        renders, rendering_ns = 0, 0
+        while renders < MAX_RENDERS:
             camera = self._proposal(frame, best, ends_ns - rendering_ns)
             started_ns = self._clock_ns()
             too_late = started_ns + rendering_ns >= ends_ns
-            if camera is None or too_late or not _is_near(measured.seen.camera, camera):
+            if camera is None or too_late or not _is_near(measured.camera, camera):
                 break
-            found = look_at(camera)
+            found = render_at(camera)
             rendering_ns = self._clock_ns() - started_ns
-            looks += 1
+            renders += 1
             bits = _bits(frame, found, crf)
-            if bits > (1 - WORTH) * best_bits:
+            if bits > (1 - MIN_SAVING) * best_bits:
                 break
             best, best_bits = found, bits
-        return Refined(best, *_distance(measured.seen.camera, best.seen.camera), looks)
+        return Refined(best, *_distance(measured.camera, best.camera), renders)
 
-    def _proposal(self, frame: I420, look: Look, until_ns: int) -> Camera | None:
+    def _proposal(self, frame: I420, view: FieldView, until_ns: int) -> Camera | None:
         """Return where alignment would have the camera; None if it stays."""
         if self._clock_ns() >= until_ns:
             return None
-        return _moved(look.seen.camera, align(frame, look, lambda: self._clock_ns() < until_ns))
+        return _moved(view.camera, align(frame, view, lambda: self._clock_ns() < until_ns))
 
 
-def _bits(frame: I420, look: Look, crf: float) -> float:
-    return float(bits_curve(frame, [look.render], crf).bits[0])
+def _bits(frame: I420, view: FieldView, crf: float) -> float:
+    return float(bits_curve(frame, [view.render], crf).bits[0])
 
 
 def _moved(camera: Camera, motion: Pose) -> Camera | None:
@@ -95,8 +100,8 @@ def _moved(camera: Camera, motion: Pose) -> Camera | None:
 
     The pose is rounded as it will be sent: both ends render at the very same one.
     """
-    pose = camera.world_from_cam.compose(motion.inverse()).rounded()
-    return None if pose == camera.world_from_cam else replace(camera, world_from_cam=pose)
+    found = Camera(camera.intrinsics, camera.world_from_cam.compose(motion.inverse())).rounded()
+    return None if found == camera else found
 
 
 def _is_near(measured: Camera, found: Camera) -> bool:

@@ -24,12 +24,11 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.photometric import adapt
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.state import EncoderState
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
+from rfcore.views import FieldView
 from rfedge.experiments.compare.foreground import by_macroblock, composed
 from rfedge.experiments.field_coder import SeenClip
 
@@ -47,11 +46,11 @@ Mask = NDArray[np.bool_]
 
 
 def macroblock_kinds(
-    before: PosedDepth, seen: PosedDepth, covered: Mask, foreground: Mask
+    before: FieldView, now: FieldView, covered: Mask, foreground: Mask
 ) -> NDArray[np.int8]:
     """Return the index into ``KINDS`` of each macroblock, [ceil(H / 16), ceil(W / 16)]."""
-    u, v, depth = _in_previous_view(before.camera, seen)
-    height, width = seen.depth.shape
+    u, v, depth = _in_previous_view(before.camera, now)
+    height, width = now.depth.shape
     inside = (depth > NEAR_M) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     columns = np.rint(np.clip(np.nan_to_num(u), 0, width - 1)).astype(int)
     rows = np.rint(np.clip(np.nan_to_num(v), 0, height - 1)).astype(int)
@@ -69,10 +68,10 @@ def macroblock_kinds(
     return kinds
 
 
-def _in_previous_view(previous: Camera, seen: PosedDepth) -> tuple[F64, F64, F64]:
+def _in_previous_view(previous: Camera, now: FieldView) -> tuple[F64, F64, F64]:
     """Return where the surface of each pixel lies in the previous view: (u, v) in pixels, depth."""
-    k = seen.camera.intrinsics
-    height, width = seen.depth.shape
+    k = now.camera.intrinsics
+    height, width = now.depth.shape
     rays = np.stack(
         [
             *np.meshgrid(
@@ -83,8 +82,8 @@ def _in_previous_view(previous: Camera, seen: PosedDepth) -> tuple[F64, F64, F64
         ],
         axis=-1,
     )
-    points = rays * seen.depth[..., None].astype(np.float64)
-    previous_from_now = previous.cam_from_world().compose(seen.camera.world_from_cam)
+    points = rays * now.depth[..., None].astype(np.float64)
+    previous_from_now = previous.cam_from_world().compose(now.camera.world_from_cam)
     rotation = np.array(previous_from_now.rotation_matrix())
     moved = points @ rotation.T + np.array(previous_from_now.translation_m)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -128,12 +127,12 @@ def _frames(clip: SplitClip) -> Iterator[tuple[F64, F64]]:
     encoder = DeltaEncoder(CodecConfig(*clip.frames[0].size_px, preset=clip.preset, crf=clip.crf))
     state, seen = encoder.start(1), clip.seen
     for index, frame in enumerate(clip.frames):
-        coding = _Coding(encoder, state, seen.renders[index], seen.depths[index])
+        coding = _Coding(encoder, state, seen.views[index])
         made = coding.of(frame)
         if index:
             kinds = macroblock_kinds(
-                seen.depths[index - 1],
-                seen.depths[index],
+                seen.views[index - 1],
+                seen.views[index],
                 seen.covered[index],
                 clip.foregrounds[index],
             )
@@ -150,13 +149,10 @@ class _Coding:
 
     encoder: DeltaEncoder
     state: EncoderState
-    render: I420
-    depth: PosedDepth
+    view: FieldView
 
     def of(self, frame: I420, choice: FrameChoice | None = None) -> Encoded:
-        return self.encoder.encode(
-            self.state, frame, self.render, self.depth, choice or FrameChoice()
-        )
+        return self.encoder.encode(self.state, frame, self.view, choice or FrameChoice())
 
 
 def _slice_bytes(frame: I420, coding: _Coding, made: Encoded, kinds: NDArray[np.int8]) -> F64:
@@ -166,8 +162,7 @@ def _slice_bytes(frame: I420, coding: _Coding, made: Encoded, kinds: NDArray[np.
     if not packet.references:  # an I picture has no reference to show
         spared += np.bincount(kinds.ravel(), minlength=len(KINDS))
     else:
-        render = adapt(coding.render, packet.photometric)
-        prediction = Prediction(render, coding.depth, coding.state.past)
+        prediction = Prediction.under_light(coding.view, packet.photometric, coding.state.past)
         reference = prediction.picture(packet.references[-1])
         choice = FrameChoice(references=packet.references, photometric=packet.photometric)
         for kind in np.unique(kinds):

@@ -27,11 +27,11 @@ from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.sender.ladder import Rung
 from rfcore.dataset import Dataset
 from rfcore.errors import CodecError
-from rfcore.field import Quality, RadianceField
+from rfcore.field import Quality, RadianceField, render_field_view
 from rfcore.image import I420, Rgb
 from rfcore.metrics import ssim
-from rfcore.native.warp import PosedDepth
-from rfcore.native.yuv import i420_from_colour, i420_from_rgb
+from rfcore.native.yuv import i420_from_rgb
+from rfcore.views import FieldView
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Frame
 from rfedge.experiments.clips import luma_mse
@@ -55,7 +55,7 @@ class LadderClip:
     def of(dataset: Dataset, count: int | None) -> LadderClip:
         """Read the first ``count`` pictures of a drive."""
         posed = dataset.pictures[:count]
-        cameras = [Camera(p.camera.intrinsics, p.camera.world_from_cam.rounded()) for p in posed]
+        cameras = [picture.camera.rounded() for picture in posed]
         pictures = tuple(picture.read() for picture in posed)
         return LadderClip(tuple(cameras), pictures, tuple(map(i420_from_rgb, pictures)))
 
@@ -83,11 +83,10 @@ class Marks:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A clip's renders at one quality, with what a frame took to render and to convert: (cpu, wall)
+    """A clip's views at one quality, with what a frame took to render and to convert: (cpu, wall)
     in milliseconds, lower quartiles."""
 
-    renders: tuple[I420, ...]
-    depths: tuple[PosedDepth, ...]
+    views: tuple[FieldView, ...]
     render_ms: tuple[float, float]
     convert_ms: tuple[float, float]
 
@@ -95,21 +94,19 @@ class Rendered:
 def render_clip(field: RadianceField, clip: LadderClip, quality: Quality) -> Rendered:
     """Render every pose of ``clip``, after one that makes what is made lazily."""
     field.prepare(quality)
-    i420_from_colour(field.render(clip.cameras[0], quality).colour)
+    render_field_view(field, clip.cameras[0], quality)
     marks = Marks()
-    renders, depths, render_ms, convert_ms = [], [], [], []
+    views, render_ms, convert_ms = [], [], []
     for camera, picture in zip(clip.cameras, clip.pictures, strict=True):
         marks()
-        view = field.render(camera, quality)
-        renders.append(i420_from_colour(view.colour))
+        views.append(render_field_view(field, camera, quality))
         marks()
         i420_from_rgb(picture)
         marks()
         rendering, converting = marks.spent_ms()
-        depths.append(PosedDepth(camera, view.depth))
         render_ms.append(rendering)
         convert_ms.append(converting)
-    return Rendered(tuple(renders), tuple(depths), _quartile(render_ms), _quartile(convert_ms))
+    return Rendered(tuple(views), _quartile(render_ms), _quartile(convert_ms))
 
 
 def measure_rung(clip: LadderClip, seen: Rendered, rung: Rung, crf: float) -> Row:
@@ -125,10 +122,10 @@ def measure_rung(clip: LadderClip, seen: Rendered, rung: Rung, crf: float) -> Ro
     coded: list[Encoded] = []
     shown: list[I420] = []
     for index, frame in enumerate(clip.frames):
-        render, depth = seen.renders[index], seen.depths[index]
-        made = encoder.encode(sending, frame, render, depth, choice)
+        view = seen.views[index]
+        made = encoder.encode(sending, frame, view, choice)
         sender.frame_ended()
-        got = decoder.decode(receiving, made.packet, render, depth)
+        got = decoder.decode(receiving, made.packet, view)
         receiver.frame_ended()
         if got.frame.digest() != made.reconstruction.digest():
             raise CodecError(f"frame {index} decodes to another picture than was promised")

@@ -23,7 +23,7 @@ from rfcore.camera import Camera, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth
+from rfcore.views import FieldView
 from rfedge.experiments.cells import CellStore
 from rfedge.experiments.clips import DECIMATION, ClipCoder, DriveFrames, DriveName, read_drive
 from rfedge.experiments.compare.measure import Clip, Performance, perform, seconds_left
@@ -61,22 +61,23 @@ def controls_of(field: RadianceField, drive: DriveFrames) -> Mapping[str, SeenCl
         for camera in right.cameras
     ]
     elsewhere = see_clip(field, turned)
-    depths = (
-        PosedDepth(camera, wrong.depth)
-        for camera, wrong in zip(right.cameras, elsewhere.depths, strict=True)
+    moved = (
+        replace(view, camera=camera)
+        for camera, view in zip(right.cameras, elsewhere.views, strict=True)
     )
-    wrong = replace(elsewhere, cameras=right.cameras, depths=tuple(depths))
+    wrong = replace(elsewhere, views=tuple(moved))
     return dict(zip(CONTROLS, (right, wrong, _black(right)), strict=True))
 
 
 def _black(right: SeenClip) -> SeenClip:
-    renders = (
-        I420(*(np.full_like(p, level) for p, level in zip(r.planes, BLACK_YUV, strict=True)))
-        for r in right.renders
-    )
-    depths = (PosedDepth(d.camera, np.zeros_like(d.depth)) for d in right.depths)
     covered = tuple(np.zeros_like(mask) for mask in right.covered)
-    return replace(right, renders=tuple(renders), depths=tuple(depths), covered=covered)
+    return replace(right, views=tuple(map(_black_view, right.views)), covered=covered)
+
+
+def _black_view(view: FieldView) -> FieldView:
+    planes = zip(view.render.planes, BLACK_YUV, strict=True)
+    nothing = np.zeros_like(view.depth)
+    return FieldView(view.camera, I420(*(np.full_like(p, v) for p, v in planes)), nothing, nothing)
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from rfcore.camera import Camera, Pose
-from rfcore.codec.sender.align import Look
 from rfcore.codec.sender.pose_search import PoseSearch
 from rfcore.errors import InvalidInput
-from rfcore.field import RadianceField
+from rfcore.field import RadianceField, render_field_view
 from rfcore.image import I420
+from rfcore.views import FieldView
 from rfedge.experiments.clips import CodedClip
 
 __all__ = ["NOISES", "PoseNoise", "kbit_at", "noisy_cameras", "refined_cameras"]
@@ -71,11 +71,11 @@ def refined_cameras(
     """Return the cameras that the search for the pose of fewest bits finds for ``frames``."""
     search = PoseSearch(UNHURRIED_MS, lambda: 0)
 
-    def look_at(camera: Camera) -> Look:
-        return Look.of(field.render(camera), camera)
+    def render_at(camera: Camera) -> FieldView:
+        return render_field_view(field, camera)
 
     return [
-        search.refine(frame, look_at(camera), look_at, REFINE_CRF).look.seen.camera
+        search.refine(frame, render_at(camera), render_at, REFINE_CRF).view.camera
         for frame, camera in zip(frames, measured, strict=True)
     ]
 

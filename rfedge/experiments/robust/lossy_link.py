@@ -212,13 +212,13 @@ class FrameCoder:
         if key not in self._made:
             choice = FrameChoice(references=RENDER_ONLY if render_only else None)
             state = EncoderState(1, index, past)
-            render, depth = self.seen.renders[index], self.seen.depths[index]
-            self._made[key] = self._encoder.encode(state, self._clip[index], render, depth, choice)
+            view = self.seen.views[index]
+            self._made[key] = self._encoder.encode(state, self._clip[index], view, choice)
         return self._made[key]
 
     def message_bytes(self, index: int, made: Encoded) -> int:
         """Return the size of the message that carries the frame."""
-        pose = self.seen.cameras[index].world_from_cam
+        pose = self.seen.views[index].camera.world_from_cam
         return len(client_message_to_bytes(Frame("front", 1 << 60, pose, b"", made.packet)))
 
 
@@ -236,9 +236,8 @@ def own_crossing(crossing: Crossing, coder: FrameCoder, policy: Policy) -> Outco
         size_bytes = coder.message_bytes(index, made)
         good = link.delivers(size_bytes) or index == 0
         if good:
-            render, depth = coder.seen.renders[index], coder.seen.depths[index]
             try:
-                got = decoder.decode(receiving, made.packet, render, depth)
+                got = decoder.decode(receiving, made.packet, coder.seen.views[index])
                 receiving = got.state
                 shown.append(got.frame)
             except PacketRejected:

@@ -12,11 +12,13 @@ from functools import partial
 import numpy as np
 
 from hard.cases.case import Case, Finding, statement
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.image import I420
 from rfcore.metrics import psnr
+from rfcore.views import FieldView
 
 __all__ = ["CASES"]
 
@@ -52,6 +54,14 @@ zeros, full = (partial(_flat, level) for level in (0, 255))
 noise, other_noise = partial(_noise, 1), partial(_noise, 2)
 
 
+def _view(render: Make, size_px: tuple[int, int] = SIZE_PX) -> FieldView:
+    """A view of no depth that shows ``render``."""
+    width_px, height_px = size_px
+    k = Intrinsics(width_px, height_px, 32.0, 32.0, 0.5 * width_px, 0.5 * height_px)
+    depth = np.zeros((height_px, width_px), np.float32)
+    return FieldView(Camera(k, Pose.identity()), render(size_px), depth)
+
+
 def _sent(
     frame: Make,
     render: Make,
@@ -62,8 +72,8 @@ def _sent(
     """Send one frame and receive it; ``least_db`` is asked of its luma."""
     encoder = DeltaEncoder(CodecConfig(*size_px, crf=crf))
     decoder = DeltaDecoder(encoder.header)
-    encoded = encoder.encode(encoder.start(1), frame(size_px), render(size_px))
-    decoded = decoder.decode(decoder.start(1), encoded.packet, render(size_px))
+    encoded = encoder.encode(encoder.start(1), frame(size_px), _view(render, size_px))
+    decoded = decoder.decode(decoder.start(1), encoded.packet, _view(render, size_px))
     quality_db = psnr(decoded.frame.y, frame(size_px).y)
     same = decoded.frame.digest() == encoded.reconstruction.digest()
     got = f"{quality_db:.1f} dB in {len(encoded.packet.payload)} bytes"
@@ -75,7 +85,7 @@ def _repeats() -> Finding:
     payloads = []
     for _ in range(2):
         encoder = DeltaEncoder(CodecConfig(*SIZE_PX))
-        encoded = encoder.encode(encoder.start(1), _ramp(SIZE_PX), noise(SIZE_PX))
+        encoded = encoder.encode(encoder.start(1), _ramp(SIZE_PX), _view(noise))
         payloads.append(encoded.packet.payload)
     return statement(payloads[0] == payloads[1], "equal bytes", "bytes differ")
 
@@ -84,7 +94,7 @@ def _monotonous() -> Finding:
     sizes, qualities = [], []
     for crf in (1.0, 18.0, 36.0, 51.0):
         encoder = DeltaEncoder(CodecConfig(*SIZE_PX, crf=crf))
-        encoded = encoder.encode(encoder.start(1), noise(SIZE_PX), grey(SIZE_PX))
+        encoded = encoder.encode(encoder.start(1), noise(SIZE_PX), _view(grey))
         sizes.append(len(encoded.packet.payload))
         qualities.append(psnr(encoded.reconstruction.y, noise(SIZE_PX).y))
     falling = sizes == sorted(sizes, reverse=True) and qualities == sorted(qualities, reverse=True)

@@ -11,7 +11,8 @@ from hard.cases.case import Case, Finding, refusal, statement
 from rfcore.camera import Camera, Intrinsics, Pose, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.native.warp import PosedDepth, Seen, correct_i420, warp_i420
+from rfcore.native.warp import correct_i420, warp_i420
+from rfcore.views import FieldView
 
 __all__ = ["CASES"]
 
@@ -34,11 +35,12 @@ def _seen(
     at_m: Vec3 = (0.0, 0.0, 0.0),
     rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
     size_px: tuple[int, int] = SIZE_PX,
-) -> PosedDepth:
+    seed: int = 2,
+) -> FieldView:
     width_px, height_px = size_px
     k = Intrinsics(width_px, height_px, 32.0, 32.0, 0.5 * width_px, 0.5 * height_px)
     depth = np.full((height_px, width_px), depth_m, np.float32)
-    return PosedDepth(Camera(k, Pose(at_m, rotation)), depth)
+    return FieldView(Camera(k, Pose(at_m, rotation)), _picture(seed, size_px), depth)
 
 
 def _same(a: I420, b: I420) -> bool:
@@ -47,19 +49,19 @@ def _same(a: I420, b: I420) -> bool:
 
 def _from_the_same_place(depth_m: float, size_px: tuple[int, int]) -> Finding:
     seen = _seen(depth_m, size_px=size_px)
-    warped = warp_i420(_picture(1, size_px), seen, seen, _picture(2, size_px))
+    warped = warp_i420(_picture(1, size_px), seen, seen)
     return statement(_same(warped, _picture(1, size_px)), "equal bytes", "bytes differ")
 
 
-def _is_the_render(before: PosedDepth, now: PosedDepth) -> Finding:
-    warped = warp_i420(_picture(1), before, now, _picture(2))
+def _is_the_render(before: FieldView, now: FieldView) -> Finding:
+    warped = warp_i420(_picture(1), before, now)
     return statement(_same(warped, _picture(2)), "equal bytes", "bytes differ")
 
 
 def _moved_by_whole_pixels() -> Finding:
     """At 4 m with f = 32 px, 0.25 m to the right is 2 px: the picture moves to the left by 2."""
     before, now = _seen(4.0), _seen(4.0, (0.25, 0.0, 0.0))
-    warped = warp_i420(_picture(1), before, now, _picture(2))
+    warped = warp_i420(_picture(1), before, now)
     moved = np.array_equal(warped.y[:, :-2], _picture(1).y[:, 2:])
     filled = np.array_equal(warped.y[:, -2:], _picture(2).y[:, -2:])
     return statement(moved and filled, "moved by 2 px, edge from the render", "not moved by 2 px")
@@ -70,14 +72,14 @@ def _on_the_globe() -> Finding:
     pictures = []
     for x, y in ((0.0, 0.0), (691_608.0, 5_334_760.0)):
         before, now = _seen(4.0, (x, y, 1.0)), _seen(4.0, (x + 0.125, y - 0.0625, 1.25))
-        pictures.append(warp_i420(_picture(1), before, now, _picture(2)))
+        pictures.append(warp_i420(_picture(1), before, now))
     return statement(_same(*pictures), "equal bytes", "bytes differ")
 
 
 def _nothing_to_correct() -> Finding:
     """A previous picture equal to its own render differs by nothing: the present render stays."""
-    before = Seen(_picture(1), _seen(4.0), _picture(1))
-    corrected = correct_i420(before, _seen(4.1, (0.1, 0.0, 0.05)), _picture(2))
+    before = _seen(4.0, seed=1)
+    corrected = correct_i420(_picture(1), before, _seen(4.1, (0.1, 0.0, 0.05)))
     return statement(_same(corrected, _picture(2)), "equal bytes", "bytes differ")
 
 
