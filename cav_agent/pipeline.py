@@ -16,8 +16,9 @@ from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
+from rfcore.codec.sender.frame_costs import FrameCosts
 from rfcore.codec.sender.ladder import Rung
-from rfcore.codec.sender.pose_search import PoseSearch
+from rfcore.codec.sender.pose_search import PoseSearch, Refined
 from rfcore.codec.sender.rate import RateModel, RateTarget
 from rfcore.codec.sender.steering import NO_STEERING, Steering
 from rfcore.codec.state import KEPT_FRAMES, EncoderState, Past
@@ -84,11 +85,11 @@ class Pipeline:
         camera = job.capture.picture.camera
         view = render_field_view(self._renderer, camera, rung.quality)
         rendered_ns = self._clock_ns()
-        view = self._refined(frame, view, rung.quality)
+        refined = self._refined(frame, view, rung.quality)
         refined_ns = self._clock_ns()
         choice = self._choice(job, rung)
         state = self._state_for(job)
-        encoded = self._encoder.encode(state, frame, view, choice)
+        encoded = self._encoder.encode(state, frame, refined.view, choice, refined.costs)
         self._remember(encoded)
         stage_s = {
             "read": (read_ns - started_ns) / 1e9,
@@ -98,19 +99,19 @@ class Pipeline:
             **{stage: ns / 1e9 for stage, ns in encoded.stage_ns.items()},
         }
         self._rungs.coded(stage_s, self._clock_ns() / 1e9)
-        pose = view.camera.world_from_cam
+        pose = refined.view.camera.world_from_cam
         return EncodedFrame(encoded.packet, stage_s, encoded.tries, rung, encoded.crf, pose)
 
-    def _refined(self, frame: I420, measured: FieldView, quality: Quality) -> FieldView:
+    def _refined(self, frame: I420, measured: FieldView, quality: Quality) -> Refined:
         """Return what the field shows at the pose to send."""
         if self._search is None:
-            return measured
+            return Refined(measured, FrameCosts(frame))
         crf = self._config.crf if self._rate.crf is None else self._rate.crf
 
         def render_at(camera: Camera) -> FieldView:
             return render_field_view(self._renderer, camera, quality)
 
-        return self._search.refine(frame, measured, render_at, crf).view
+        return self._search.refine(frame, measured, render_at, crf)
 
     def _choice(self, job: EncodeJob, rung: Rung) -> FrameChoice:
         budget, limit_bytes = job.budget, self._limit_bytes
@@ -119,11 +120,11 @@ class Pipeline:
         return FrameChoice(
             references=None if rung.references else RENDER_ONLY,
             photometric=None if rung.photometric else (),
-            most=max(1, rung.references),
-            coarse=not job.exact,
+            max_references=max(1, rung.references),
+            block_means=not job.exact,
             limit_bytes=limit_bytes,
             preset=rung.preset,
-            rough=rung.rough,
+            fast_unsent=rung.fast_unsent,
             qp_map=self._steering.qp_map,
             target=None if budget is None else RateTarget(budget.target_bytes, self._rate),
         )

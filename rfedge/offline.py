@@ -13,7 +13,8 @@ from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
-from rfcore.codec.sender.pose_search import PoseSearch
+from rfcore.codec.sender.frame_costs import FrameCosts
+from rfcore.codec.sender.pose_search import PoseSearch, Refined
 from rfcore.codec.sender.steering import NO_STEERING, Steering
 from rfcore.dataset import Dataset
 from rfcore.errors import CodecError, DatasetError, InvalidData
@@ -63,21 +64,21 @@ def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSetting
     encoder = DeltaEncoder(config)
     state = encoder.start(1)
     choice = replace(FITTING, qp_map=settings.steering.qp_map)
-    place = _place(field, settings)
+    place = _placer(field, settings)
     frames = []
     for picture in dataset.pictures:
         if picture.camera.intrinsics != intrinsics:
             raise DatasetError(f"{picture.name}: its camera differs from the first picture's")
         frame = i420_from_rgb(picture.read())
-        view = place(frame, picture.camera.rounded())
-        encoded = encoder.encode(state, frame, view, choice)
+        placed = place(frame, picture.camera.rounded())
+        encoded = encoder.encode(state, frame, placed.view, choice, placed.costs)
         _require_fit(picture.name, encoded)
         state = encoded.state
         frames.append(
             Frame(
                 CAMERA_ID,
                 picture.time_ns,
-                view.camera.world_from_cam,
+                placed.view.camera.world_from_cam,
                 b"",
                 encoded.packet,
             )
@@ -86,7 +87,7 @@ def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSetting
     return CodedDrive(Hello(OFFLINE_VEHICLE, (camera,), (field.field_id,), RENDERER), tuple(frames))
 
 
-def _place(field: RadianceField, settings: CodingSettings) -> Callable[[I420, Camera], FieldView]:
+def _placer(field: RadianceField, settings: CodingSettings) -> Callable[[I420, Camera], Refined]:
     """Return a function that finds the pose to code a frame at, and renders the field there."""
 
     def render_at(camera: Camera) -> FieldView:
@@ -94,10 +95,10 @@ def _place(field: RadianceField, settings: CodingSettings) -> Callable[[I420, Ca
 
     refine_ms = settings.steering.refine_pose_ms
     if refine_ms is None:
-        return lambda _, camera: render_at(camera)
+        return lambda frame, camera: Refined(render_at(camera), FrameCosts(frame))
     search = PoseSearch(refine_ms, time.perf_counter_ns)
     crf = settings.crf
-    return lambda frame, camera: search.refine(frame, render_at(camera), render_at, crf).view
+    return lambda frame, camera: search.refine(frame, render_at(camera), render_at, crf)
 
 
 def _require_fit(name: str, encoded: Encoded) -> None:

@@ -1,7 +1,7 @@
-"""The coarse digest: enough of a picture to tell rounding from a wrong pose.
+"""Block means of a picture: enough of it to tell rounding from a wrong pose.
 
-The luma plane is cut into 8 x 8 cells; the digest is the mean of each, rounded half up, 64 bytes
-in reading order. Cell i of a side of n samples covers samples floor(i n / 8) up to
+The luma plane is cut into 8 x 8 blocks; their means, rounded half up, are 64 bytes in reading
+order. Block i of a side of n samples covers samples floor(i n / 8) up to
 floor((i + 1) n / 8), but at least one.
 
 Tolerance: if no sample differs by more than one level, no mean differs by more than one level,
@@ -23,17 +23,17 @@ __all__ = [
     "block_mean_digest",
 ]
 
-_CELLS = 8
-BLOCK_MEANS_BYTES = _CELLS * _CELLS
+_BLOCKS_PER_SIDE = 8
+BLOCK_MEANS_BYTES = _BLOCKS_PER_SIDE * _BLOCKS_PER_SIDE
 BLOCK_MEANS_TOLERANCE = 1
-"""Levels by which a cell's mean may differ between renderers that agree up to rounding."""
+"""Levels by which a block's mean may differ between renderers that agree up to rounding."""
 
 
 def block_mean_digest(picture: I420) -> bytes:
     """Return the 64 rounded luma means of ``picture``."""
     height, width = picture.y.shape
-    rows, row_counts = _cells(height)
-    columns, column_counts = _cells(width)
+    rows, row_counts = _blocks(height)
+    columns, column_counts = _blocks(width)
     sums = np.add.reduceat(picture.y, columns, axis=1, dtype=np.int64)
     sums = np.add.reduceat(sums, rows, axis=0)
     counts = row_counts[:, None] * column_counts[None, :]
@@ -42,12 +42,12 @@ def block_mean_digest(picture: I420) -> bytes:
 
 
 def block_mean_difference(a: bytes, b: bytes) -> int:
-    """Return the largest difference of two coarse digests, in levels."""
+    """Return the largest difference of the block means of two pictures, in levels."""
     means = (np.frombuffer(digest, np.uint8).astype(np.int16) for digest in (a, b))
     return int(np.abs(np.subtract(*means)).max())
 
 
-def _cells(side: int) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Return the first sample and the number of samples of each cell."""
-    edges = np.arange(_CELLS + 1) * side // _CELLS
+def _blocks(side: int) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """Return the first sample and the number of samples of each block."""
+    edges = np.arange(_BLOCKS_PER_SIDE + 1) * side // _BLOCKS_PER_SIDE
     return edges[:-1].astype(np.intp), np.maximum(np.diff(edges), 1)

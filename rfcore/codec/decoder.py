@@ -57,11 +57,11 @@ class Decoded:
 class DeltaDecoder:
     """The receiver. Raises ``InvalidInput`` for a header our encoder would not make.
 
-    With ``exact=False`` the sender's renderer may differ by rounding: a reference that fails the
-    exact digest but passes the coarse one is accepted, and its reconstruction cannot be checked.
-    Between exact renderers no packet needs the coarse one; where it is there, it is used to say
-    what kind of difference led to ``RENDER_MISMATCH``. ``open_decoder`` makes
-    the standard decoder that sees the sender's bytes.
+    With ``exact=False`` the sender's renderer may differ by rounding: a render of another digest
+    but of the same block means, up to rounding, is accepted, and its reconstruction cannot be
+    checked. Between exact renderers no packet needs block means; where they are there, they say
+    what kind of difference led to ``RENDER_MISMATCH``. ``open_decoder`` makes the standard decoder
+    that sees the sender's bytes.
     """
 
     def __init__(

@@ -13,6 +13,7 @@ from rfcore.codec.photometric import adapt, check_photometric, solve
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import INTRA, RENDER_ONLY, Reference
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
+from rfcore.codec.sender.frame_costs import FrameCosts
 from rfcore.codec.sender.reference_choice import choose_photometric, choose_references
 from rfcore.codec.state import Past
 from rfcore.errors import InvalidInput
@@ -44,35 +45,36 @@ def shade(picture: I420, gain: float, levels: float) -> I420:
 
 def test_a_render_like_the_frame_is_enough(pair: PairMaker) -> None:
     frame, view = pair(*SIZE_PX)
-    assert choose_references(frame, Prediction(view), 23) == RENDER_ONLY
+    assert choose_references(FrameCosts(frame), Prediction(view), 23) == RENDER_ONLY
 
 
 def test_a_render_that_shows_nothing_is_not_used(pair: PairMaker, noise: PictureMaker) -> None:
     frame, view = pair(*SIZE_PX)
     for render in (noise(*SIZE_PX, 1), shade(noise(*SIZE_PX, 2), 1.0, 0.0)):
         useless = wall(render)
-        assert choose_references(frame, Prediction(useless), 23) == INTRA
+        assert choose_references(FrameCosts(frame), Prediction(useless), 23) == INTRA
         other = Past(noise(*SIZE_PX, 3), wall(noise(*SIZE_PX, 4)))
-        chosen = choose_references(frame, Prediction(useless, other), 23)
+        chosen = choose_references(FrameCosts(frame), Prediction(useless, other), 23)
         assert chosen == (Reference.PREVIOUS,)
-    assert choose_references(frame, Prediction(view), 23) == RENDER_ONLY
+    assert choose_references(FrameCosts(frame), Prediction(view), 23) == RENDER_ONLY
 
 
 def test_what_the_last_frame_taught_comes_first(pair: PairMaker) -> None:
     """The cars are not in the render; nobody moved, so the correction has them."""
     frame, view = pair(*SIZE_PX)
     now = wall(view.render)
-    chosen = choose_references(frame, Prediction(now, Past(frame, now)), 23)
+    chosen = choose_references(FrameCosts(frame), Prediction(now, Past(frame, now)), 23)
     assert chosen[0] is Reference.PREVIOUS
     assert chosen[-1] in (Reference.CORRECTION, Reference.WARP)
 
 
-@pytest.mark.parametrize("most", [1, 2, 3])
-def test_no_more_references_than_allowed(pair: PairMaker, most: int) -> None:
+@pytest.mark.parametrize("max_references", [1, 2, 3])
+def test_no_more_references_than_allowed(pair: PairMaker, max_references: int) -> None:
     frame, view = pair(*SIZE_PX)
     now = wall(view.render)
     prediction = Prediction(now, Past(frame, now))
-    assert 1 <= len(choose_references(frame, prediction, 23, most)) <= most
+    chosen = choose_references(FrameCosts(frame), prediction, 23, max_references)
+    assert 1 <= len(chosen) <= max_references
 
 
 @pytest.mark.parametrize("size_px", [(1, 1), (7, 40), (40, 7)])
@@ -80,8 +82,8 @@ def test_pictures_smaller_than_a_block_have_the_render(
     picture: PictureMaker, view_of: Callable[[I420], FieldView], size_px: tuple[int, int]
 ) -> None:
     frame = picture(*size_px)
-    assert choose_references(frame, Prediction(view_of(frame)), 23) == RENDER_ONLY
-    assert choose_photometric(frame, frame, 23) == ()
+    assert choose_references(FrameCosts(frame), Prediction(view_of(frame)), 23) == RENDER_ONLY
+    assert choose_photometric(FrameCosts(frame), frame, 23) == ()
 
 
 # --- light
@@ -125,8 +127,8 @@ def test_light_is_sent_when_it_pays_and_beats_weighted_prediction(pair: PairMake
 
 def test_light_that_did_not_change_is_not_sent(pair: PairMaker, noise: PictureMaker) -> None:
     frame, view = pair(*SIZE_PX)
-    assert choose_photometric(frame, view.render, 23) == ()
-    assert choose_photometric(frame, noise(*SIZE_PX, 1), 23) == ()
+    assert choose_photometric(FrameCosts(frame), view.render, 23) == ()
+    assert choose_photometric(FrameCosts(frame), noise(*SIZE_PX, 1), 23) == ()
 
 
 @pytest.mark.parametrize("size_px", [(1, 1), (2, 2), (3, 5), (101, 67)])

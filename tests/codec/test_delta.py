@@ -27,7 +27,7 @@ def encoder() -> DeltaEncoder:
 @pytest.fixture(scope="module")
 def sent(encoder: DeltaEncoder, pair: PairMaker) -> Encoded:
     state = replace(encoder.start(5), next_sequence=10)
-    return encoder.encode(state, *pair(*SIZE_PX), choice=FrameChoice(coarse=True))
+    return encoder.encode(state, *pair(*SIZE_PX), choice=FrameChoice(block_means=True))
 
 
 def perturbed(view: FieldView, seed: int = 0) -> FieldView:

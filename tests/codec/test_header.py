@@ -40,26 +40,26 @@ def test_every_preset_crf_and_number_of_references_writes_the_same_parameter_set
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_threads_and_rough_references_change_no_parameter_set(
+def test_threads_and_fast_unsent_references_change_no_parameter_set(
     header: StreamHeader, pair: PairMaker, preset: str
 ) -> None:
     frame, view = pair(300, 168)
     pictures = [pair(300, 168, 2.0)[0], pair(300, 168, 1.0)[1].render, view.render]
     config = CodecConfig(300, 168, preset, 28)
-    alone, shared, again, rough = (
+    alone, shared, again, fast = (
         encode_slice(config, pictures, frame, coding)
         for coding in (
             SliceCoding(),
             SliceCoding(threads=2),
             SliceCoding(threads=2),
-            SliceCoding(rough=True),
+            SliceCoding(fast_unsent=True),
         )
     )
-    for coded in (alone, shared, rough):
+    for coded in (alone, shared, fast):
         assert (coded.header.sps, coded.header.pps) == (header.sps, header.pps)
     assert shared == again
     assert len(shared.payload) == pytest.approx(len(alone.payload), rel=0.02)
-    assert rough.payload != alone.payload
+    assert fast.payload != alone.payload
 
 
 def test_a_better_preset_or_crf_changes_the_slice(pair: PairMaker) -> None:

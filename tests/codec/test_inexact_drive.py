@@ -16,7 +16,7 @@ from rfcore.views import FieldView
 PairMaker = Callable[..., tuple[I420, FieldView]]
 SIZE_PX = (96, 64)
 FRAMES = 300
-WITH_COARSE = FrameChoice(coarse=True)
+WITH_BLOCK_MEANS = FrameChoice(block_means=True)
 
 
 def perturbed(view: FieldView, rng: np.random.Generator) -> FieldView:
@@ -44,7 +44,7 @@ def test_over_300_frames_the_error_does_not_grow_and_is_visible(pair: PairMaker)
     errors = []
     for index in range(FRAMES):
         frame, render = pair(*SIZE_PX, 0.5 * index)
-        sent = encoder.encode(replace(sending, past=None), frame, render, choice=WITH_COARSE)
+        sent = encoder.encode(replace(sending, past=None), frame, render, choice=WITH_BLOCK_MEANS)
         assert sent.packet.references == RENDER_ONLY
         got = decoder.decode(receiving, sent.packet, perturbed(render, rng))
         assert not got.exact

@@ -28,14 +28,14 @@ def test_a_rung_is_named_by_what_distinguishes_it() -> None:
     assert Rung().name == "100% 3ref medium"
     low = Rung(Quality(0.25, 0, 16, 0.5), 0, photometric=False, preset="ultrafast")
     assert low.name == "25% sh0 16samples half-size render-only no-light ultrafast"
-    assert Rung(references=2, rough=True).name == "100% 2ref rough medium"
+    assert Rung(references=2, fast_unsent=True).name == "100% 2ref rough medium"
 
 
 def test_a_ladder_measured_before_references_could_be_rough_has_none_that_are(
     tmp_path: Path,
 ) -> None:
     path = write(tmp_path / "ladder.json", row(80, 0), row(60, 3, rough=True))
-    assert [r.rung.rough for r in read_ladder(path, "splats", 28)] == [False, True]
+    assert [r.rung.fast_unsent for r in read_ladder(path, "splats", 28)] == [False, True]
 
 
 def test_the_front_is_faster_step_by_step_and_never_worse_than_what_it_leaves_out() -> None:

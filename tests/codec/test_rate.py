@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.references import INTRA, RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
+from rfcore.codec.sender.frame_costs import FrameCosts
 from rfcore.codec.sender.rate import CLIMB_CRF, BitsCurve, RateModel, RateTarget, bits_curve
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
@@ -83,26 +84,26 @@ def test_the_curve_falls_and_more_pictures_never_cost_more(
     pair: PairMaker, noise: PictureMaker
 ) -> None:
     frame, view = pair(*SIZE_PX)
-    render = view.render
-    alone = bits_curve(frame, [render], 10)
+    render, costs = view.render, FrameCosts(frame)
+    alone = bits_curve(costs, [render], 10)
     assert (np.diff(alone.bits) <= 0).all()
-    both = bits_curve(frame, [render, frame], 10)
+    both = bits_curve(costs, [render, frame], 10)
     assert (both.bits <= alone.bits).all()
-    assert (bits_curve(frame, [noise(*SIZE_PX, 1)], 10).bits >= alone.bits).all()
-    assert bits_curve(frame, [], 20).bits[0] > bits_curve(frame, [render], 20).bits[0]
+    assert (bits_curve(costs, [noise(*SIZE_PX, 1)], 10).bits >= alone.bits).all()
+    assert bits_curve(costs, [], 20).bits[0] > bits_curve(costs, [render], 20).bits[0]
 
 
 @pytest.mark.parametrize("size_px", [(2, 2), (7, 40), (33, 17)])
 def test_pictures_of_odd_sizes_have_curves(picture: PictureMaker, size_px: tuple[int, int]) -> None:
     frame = picture(*size_px)
     for pictures in ([], [frame]):
-        assert np.isfinite(bits_curve(frame, pictures, 1).bits).all()
+        assert np.isfinite(bits_curve(FrameCosts(frame), pictures, 1).bits).all()
 
 
 @pytest.mark.parametrize("crf", [0.5, 51.5, float("nan")])
 def test_a_crf_out_of_range_is_refused(pair: PairMaker, crf: float) -> None:
     with pytest.raises(InvalidInput, match=r"outside 1..51"):
-        bits_curve(pair(32, 32)[0], [], crf)
+        bits_curve(FrameCosts(pair(32, 32)[0]), [], crf)
 
 
 @pytest.mark.parametrize("size_bytes", [0.0, -1.0, float("nan"), float("inf")])

@@ -8,9 +8,10 @@ x264's (id 0), which the P slice names. The first of several pictures is an IDR 
 after it are not: an IDR picture would drop the ones before.
 
 In CAVLC each macroblock after the first begins byte-aligned with mb_type ue(25), nine bits, and
-seven zero bits: 0x0D 0x00. So the picture is one array of rows of 386 bytes
-(``rfcore.native.pcm``). Samples are clamped to at least 1; then no two zero bytes meet and no
-emulation prevention is needed (7.4.1).
+seven zero bits: 0x0D 0x00. So the picture is one array of rows of 386 bytes, which a native kernel
+writes: those two bytes (not before the first macroblock), 256 Y, 64 Cb and 64 Cr. The last row and
+column are repeated up to whole macroblocks. Samples are clamped to at least 1; then no two zero
+bytes meet and no emulation prevention is needed (7.4.1).
 """
 
 from __future__ import annotations
@@ -18,18 +19,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rfcore.codec.h264.bitstream import BitWriter, join_nals, nal_of_rbsp
 from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, NAL_PPS
+from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.native.pcm import pcm_bytes, write_macroblocks
+from rfcore.native import _native
 
-__all__ = ["PCM_PPS_ID", "PcmPictures", "PcmPlace", "pcm_pps", "without_zeros"]
+__all__ = ["PCM_PPS_ID", "PcmPictures", "PcmPlace", "pcm_pps", "without_zeros", "write_macroblocks"]
 
 PCM_PPS_ID = 1
 _NAL_REF_IDC = 3 << 5
 _I_SLICE_ONLY = 7
 _MB_TYPE_I_PCM = 25
+_MB_PX = 16
+_MB_BYTES = 2 + 256 + 64 + 64
 _STOP = 0x80
 _MAX_BYTES_BEFORE = 512
 """Three parameter sets of at most 64 bytes, with emulation prevention, and a slice header."""
@@ -63,7 +68,7 @@ class PcmPictures:
     """Makes I_PCM pictures of one size (width, height), all of them in the same memory."""
 
     def __init__(self, size_px: tuple[int, int]) -> None:
-        self._samples_bytes = pcm_bytes(size_px)
+        self._samples_bytes = _samples_bytes(size_px)
         self._memory = np.empty(self._samples_bytes + _MAX_BYTES_BEFORE, np.uint8)
 
     def access_unit(self, picture: I420, place: PcmPlace, sets: bytes = b"") -> memoryview:
@@ -80,6 +85,26 @@ class PcmPictures:
         write_macroblocks(picture, unit[start:end])
         unit[end] = _STOP
         return unit.data
+
+
+def write_macroblocks(picture: I420, out: NDArray[np.uint8]) -> None:
+    """Write the macroblocks of ``picture`` to ``out``, uint8 [N], contiguous.
+
+    Raises ``InvalidInput`` for another N than the macroblocks take, or an empty picture.
+    """
+    expected = _samples_bytes(picture.size_px)
+    if out.shape != (expected,) or expected < _MB_BYTES - 2:
+        raise InvalidInput(
+            "out", f"shape {out.shape} for a picture of {picture.size_px} px, not ({expected},)"
+        )
+    y, u, v = (np.ascontiguousarray(plane) for plane in picture.planes)
+    _native.pcm_macroblocks(y, u, v, out)
+
+
+def _samples_bytes(size_px: tuple[int, int]) -> int:
+    """Return how many bytes the macroblocks of a picture of (width, height) take."""
+    width_px, height_px = size_px
+    return -(-width_px // _MB_PX) * -(-height_px // _MB_PX) * _MB_BYTES - 2
 
 
 def without_zeros(picture: I420) -> I420:

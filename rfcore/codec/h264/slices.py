@@ -69,7 +69,7 @@ _PARTITIONS = {
 """Of x264's presets; no commas, which would end an option within a zone."""
 
 _UNSENT_MARGIN = 17
-_ROUGH_MARGIN = 8
+_FAST_UNSENT_MARGIN = 8
 """CRF less the quantiser of unsent pictures, normally and where time is dearer than bits. On the
 first sample with three references, CRF 20 to 32, bits at equal PSNR against quantisers of 3 to 8:
 18, 17, 12, 8 and 4 take 0.4, 0.3, 1, 3 and 7 % more; of the time at CRF 29 they leave 85, 80, 75,
@@ -94,13 +94,13 @@ class CodedSlice:
 class SliceCoding:
     """How one slice is coded. ``crf`` replaces the configured one, ``qp_map`` is added to it.
 
-    ``rough``: see ``_UNSENT_MARGIN``. ``threads``: more than two gain nothing; with two the slice
-    may differ by a few bytes, because x264 looks less far up and down for what moved.
+    ``fast_unsent``: see ``_UNSENT_MARGIN``. ``threads``: more than two gain nothing; with two the
+    slice may differ by a few bytes, because x264 looks less far up and down for what moved.
     """
 
     crf: float | None = None
     qp_map: QpMap | None = None
-    rough: bool = False
+    fast_unsent: bool = False
     threads: int = 1
 
 
@@ -157,7 +157,7 @@ def slice_options(
         params["weightp"] = "1"
     crf = config.crf if coding.crf is None else coding.crf
     if references:
-        margin = _ROUGH_MARGIN if coding.rough else _UNSENT_MARGIN
+        margin = _FAST_UNSENT_MARGIN if coding.fast_unsent else _UNSENT_MARGIN
         params |= _unsent_params(config.preset, references, crf, margin)
     threads = min(coding.threads, _MOST_THREADS, references + 1)
     return EncoderOptions(config.coded_size_px, config.preset, crf, params, threads=threads)

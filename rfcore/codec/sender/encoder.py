@@ -22,6 +22,7 @@ from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket
 from rfcore.codec.photometric import Photometric
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import References, check_references, is_temporal
+from rfcore.codec.sender.frame_costs import FrameCosts
 from rfcore.codec.sender.rate import FittedSlice, RateModel, RateTarget, bits_curve, code_to_fit
 from rfcore.codec.sender.reference_choice import choose_photometric, choose_references
 from rfcore.codec.state import EncoderState, Past
@@ -40,30 +41,32 @@ def _stopped_clock() -> int:
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """How one frame is to be coded.
-
-    ``references``: the pictures to predict from; ``None`` leaves it to the encoder, which takes at
-    most ``most``: each costs as much time as coding a frame. ``crf`` replaces the configured one.
-    ``photometric``: see there; ``None`` leaves it to the encoder. ``pose_only``: send no slice; the
-    frame is its only reference. ``coarse``: add the block means of the render, by which a receiver
-    whose renderer is not exact tells rounding from a wrong pose. ``limit_bytes``: a longer slice is
-    coded again at higher CRFs (``rfcore.codec.sender.rate``); one that is too long even at the
-    highest is returned all the same. ``preset`` replaces the configured one; the parameter sets of
-    a stream are those of any. ``target``: the bytes aimed at, by a CRF that is predicted before
-    coding and never below ``crf``. ``qp_map``: where the frame is coded finer or coarser.
-    """
+    """How one frame is to be coded. Raises ``InvalidInput`` for what no frame can be."""
 
     references: References | None = None
+    """The pictures to predict from; ``None`` leaves it to the encoder."""
     crf: float | None = None
+    """Replaces the configured CRF."""
     photometric: Photometric | None = None
+    """The change of the render's light, see there; ``None`` leaves it to the encoder."""
     pose_only: bool = False
-    most: int = REFERENCE_FRAMES
-    coarse: bool = False
+    """Send no slice: the frame is its only reference."""
+    max_references: int = REFERENCE_FRAMES
+    """How many the encoder may choose: each costs as much time as coding a frame."""
+    block_means: bool = False
+    """Send those of the render, by which a receiver whose renderer is not exact tells rounding from
+    a wrong pose."""
     limit_bytes: int | None = None
+    """A longer slice is coded again at higher CRFs (``rfcore.codec.sender.rate``); one that is too
+    long even at the highest is returned all the same."""
     preset: str | None = None
+    """Replaces the configured preset; the parameter sets of a stream are those of any."""
     target: RateTarget | None = None
+    """Bytes aimed at, by a CRF that is predicted before coding and never below ``crf``."""
     qp_map: QpMap | None = None
-    rough: bool = False
+    """Where the frame is coded finer or coarser."""
+    fast_unsent: bool = False
+    """x264 predicts from cheaper copies of the references: saves time and costs bits."""
 
     def __post_init__(self) -> None:
         if self.preset is not None and self.preset not in PRESETS:
@@ -74,8 +77,10 @@ class FrameChoice:
             raise InvalidInput("crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}")
         if self.limit_bytes is not None and self.limit_bytes < 1:
             raise InvalidInput("limit_bytes", f"{self.limit_bytes} must be at least 1")
-        if not 1 <= self.most <= REFERENCE_FRAMES:
-            raise InvalidInput("most", f"{self.most} references are outside 1..{REFERENCE_FRAMES}")
+        if not 1 <= self.max_references <= REFERENCE_FRAMES:
+            raise InvalidInput(
+                "max_references", f"{self.max_references} is outside 1..{REFERENCE_FRAMES}"
+            )
         if self.pose_only and (self.references is None or len(self.references) != 1):
             raise InvalidInput("references", "a pose-only packet names exactly one reference")
 
@@ -137,11 +142,13 @@ class DeltaEncoder:
         frame: I420,
         view: FieldView,
         choice: FrameChoice = LEFT_TO_THE_ENCODER,
+        costs: FrameCosts | None = None,
     ) -> Encoded:
         """Code ``frame`` against ``view``, the field at its pose, and ``state.past``.
 
-        Raises ``InvalidInput`` for a frame or view that is not of the configured size, or
-        references that cannot be made; ``CodecError`` if x264 fails.
+        ``costs``: those of this very frame, where some are known already. Raises ``InvalidInput``
+        for a frame or view that is not of the configured size, or references that cannot be made;
+        ``CodecError`` if x264 fails.
         """
         render = view.render
         for name, picture in (("frame", frame), ("render", render)):
@@ -149,17 +156,18 @@ class DeltaEncoder:
         if choice.qp_map is not None:
             check_qp_map(choice.qp_map, self._config)
         started_ns = self._clock_ns()
+        costs = FrameCosts(frame) if costs is None else costs
         crf = self._first_crf(choice)
         photometric = choice.photometric
         if photometric is None:
-            photometric = choose_photometric(frame, render, crf)
+            photometric = choose_photometric(costs, render, crf)
         prediction = Prediction.under_light(view, photometric, state.past, self._threads)
         references = choice.references
         if references is None:
-            references = choose_references(frame, prediction, crf, choice.most)
+            references = choose_references(costs, prediction, crf, choice.max_references)
         pictures = prediction.pictures(references)
         chosen_ns = self._clock_ns()
-        made, rate = self._coded(pictures, frame, choice, references)
+        made, rate = self._coded(costs, pictures, choice, references)
         encoded_ns = self._clock_ns()
         reconstruction = self._reconstruct(pictures, made.payload)
         past = state.past
@@ -168,7 +176,7 @@ class DeltaEncoder:
             epoch=state.epoch,
             sequence=state.next_sequence,
             render_digest=render.digest(),
-            render_block_means=block_mean_digest(render) if choice.coarse else b"",
+            render_block_means=block_mean_digest(render) if choice.block_means else b"",
             reconstruction_digest=shown.digest,
             payload=made.payload,
             crc32=0,
@@ -193,8 +201,8 @@ class DeltaEncoder:
 
     def _coded(
         self,
+        costs: FrameCosts,
         pictures: tuple[I420, ...],
-        frame: I420,
         choice: FrameChoice,
         references: References,
     ) -> tuple[FittedSlice, RateModel | None]:
@@ -202,10 +210,10 @@ class DeltaEncoder:
         lowest = self._config.crf if choice.crf is None else choice.crf
         target = choice.target
         if target is None or choice.pose_only:
-            return self._fitted(pictures, frame, lowest, choice), None
-        curve = bits_curve(frame, pictures, lowest)
+            return self._fitted(pictures, costs.frame, lowest, choice), None
+        curve = bits_curve(costs, pictures, lowest)
         crf = target.model.crf_for(target.size_bytes, curve, references)
-        made = self._fitted(pictures, frame, crf, choice)
+        made = self._fitted(pictures, costs.frame, crf, choice)
         return made, target.model.after(made.crf, curve, references, len(made.payload))
 
     def _fitted(
@@ -222,7 +230,7 @@ class DeltaEncoder:
         self, pictures: tuple[I420, ...], frame: I420, choice: FrameChoice, crf: float
     ) -> bytes:
         config = replace(self._config, preset=choice.preset or self._config.preset)
-        coding = SliceCoding(crf, choice.qp_map, choice.rough, self._threads)
+        coding = SliceCoding(crf, choice.qp_map, choice.fast_unsent, self._threads)
         coded = encode_slice(config, pictures, frame, coding)
         if (coded.header.sps, coded.header.pps) != (self._header.sps, self._header.pps):
             raise CodecError("x264 changed its parameter sets within a stream")

@@ -24,19 +24,18 @@ __all__ = ["FULL_RUNG", "MeasuredRung", "Rung", "front", "read_ladder"]
 
 @dataclass(frozen=True)
 class Rung:
-    """One setting of the sender; raises ``InvalidInput`` for one that is not.
-
-    ``quality``: how the field is rendered, on both ends. ``references``: at most so many pictures
-    are predicted from; 0: the render alone, as the paper has it. ``photometric``: whether a change
-    of light is looked for. ``preset``: x264's. ``rough``: x264 predicts from cheaper copies of the
-    references (``FrameChoice``).
-    """
+    """One setting of the sender; raises ``InvalidInput`` for one that is not."""
 
     quality: Quality = FULL
+    """How the field is rendered, on both ends."""
     references: int = REFERENCE_FRAMES
+    """At most so many pictures are predicted from; 0: the render alone, as the paper has it."""
     photometric: bool = True
+    """Whether a change of light is looked for."""
     preset: str = "medium"
-    rough: bool = False
+    """x264's."""
+    fast_unsent: bool = False
+    """As in ``FrameChoice``; tables, logs and result files call it "rough"."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.references <= REFERENCE_FRAMES:
@@ -60,7 +59,7 @@ class Rung:
         parts.append(f"{self.references}ref" if self.references else "render-only")
         if not self.photometric:
             parts.append("no-light")
-        if self.rough:
+        if self.fast_unsent:
             parts.append("rough")
         return " ".join([*parts, self.preset])
 
@@ -124,6 +123,6 @@ def read_ladder(path: Path, kind: str, crf: float) -> tuple[MeasuredRung, ...]:
 def _measured(row: Mapping[str, Any]) -> MeasuredRung:
     knobs = row["settings"]
     quality = Quality(knobs["detail"], knobs["sh_degree"], knobs["samples_per_ray"], knobs["scale"])
-    rough = knobs.get("rough", False)  # ladders measured before there was a choice have none
-    rung = Rung(quality, knobs["references"], knobs["photometric"], knobs["preset"], rough)
+    fast_unsent = knobs.get("rough", False)  # ladders measured before there was a choice have none
+    rung = Rung(quality, knobs["references"], knobs["photometric"], knobs["preset"], fast_unsent)
     return MeasuredRung(rung, row["sender_ms"], row["receiver_ms"], row["rate_percent"])

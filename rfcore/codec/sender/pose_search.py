@@ -18,7 +18,8 @@ from dataclasses import dataclass
 
 from rfcore.camera import Camera, Pose
 from rfcore.codec.sender.align import align
-from rfcore.codec.sender.rate import bits_curve
+from rfcore.codec.sender.frame_costs import FrameCosts
+from rfcore.codec.sender.rate import estimated_bits
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.views import FieldView
@@ -40,10 +41,12 @@ ClockNs = Callable[[], int]
 class Refined:
     """What the field shows at the pose taken, and how far that is from the measured one.
 
-    ``renders``: how often the field was rendered, the measured pose not counted.
+    ``costs``: the frame's blocks against every render that was tried, for the encoder to go on
+    with. ``renders``: how often the field was rendered, the measured pose not counted.
     """
 
     view: FieldView
+    costs: FrameCosts
     moved_m: float = 0.0
     turned_rad: float = 0.0
     renders: int = 0
@@ -67,7 +70,8 @@ class PoseSearch:
     ) -> Refined:
         """Return the best of the measured pose and those found; ``render_at`` renders the field."""
         ends_ns = self._clock_ns() + self._budget_ns
-        best, best_bits = measured, _bits(frame, measured, crf)
+        costs = FrameCosts(frame)
+        best, best_bits = measured, estimated_bits(costs, measured.render, crf)
         renders, rendering_ns = 0, 0
         while renders < MAX_RENDERS:
             camera = self._proposal(frame, best, ends_ns - rendering_ns)
@@ -78,21 +82,17 @@ class PoseSearch:
             found = render_at(camera)
             rendering_ns = self._clock_ns() - started_ns
             renders += 1
-            bits = _bits(frame, found, crf)
+            bits = estimated_bits(costs, found.render, crf)
             if bits > (1 - MIN_SAVING) * best_bits:
                 break
             best, best_bits = found, bits
-        return Refined(best, *_distance(measured.camera, best.camera), renders)
+        return Refined(best, costs, *_distance(measured.camera, best.camera), renders)
 
     def _proposal(self, frame: I420, view: FieldView, until_ns: int) -> Camera | None:
         """Return where alignment would have the camera; None if it stays."""
         if self._clock_ns() >= until_ns:
             return None
         return _moved(view.camera, align(frame, view, lambda: self._clock_ns() < until_ns))
-
-
-def _bits(frame: I420, view: FieldView, crf: float) -> float:
-    return float(bits_curve(frame, [view.render], crf).bits[0])
 
 
 def _moved(camera: Camera, motion: Pose) -> Camera | None:

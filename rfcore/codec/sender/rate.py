@@ -1,13 +1,11 @@
-"""How long a slice will be at which CRF, and so which CRF a number of bytes calls for.
+"""Rate control of one frame: how long a slice will be at which CRF, and coding until it fits.
 
 The bits of a frame at every CRF are estimated from what its references leave of each 8x8 block
-(``rfcore.codec.sender.reference_choice`` has the formula); what x264 makes of it differs by a
+(``rfcore.codec.sender.frame_costs`` has the formula); what x264 makes of it differs by a
 factor that changes little from one frame to the next of the same references. ``RateModel`` keeps
-that factor, and how far it strays, for each set of references. States are values: ``after`` returns
-the next.
+that factor for each set of references. States are values: ``after`` returns the next.
 
-A slice that is no longer than a limit: coded again at a higher CRF until it fits.
-
+A slice that is longer than a limit is coded again at a higher CRF until it fits (``code_to_fit``).
 6 of CRF double the quantiser's step and, in pictures of a street, about halve the bits; in noise
 they take one bit from each coefficient, which is far less. So the first step assumes a halving, and
 the further ones what the steps before have brought.
@@ -24,10 +22,10 @@ from numpy.typing import NDArray
 
 from rfcore.codec.h264.config import CRF_RANGE
 from rfcore.codec.references import Reference, References
-from rfcore.codec.sender.reference_choice import BLOCK_BITS, DEAD_ZONE_SATD
+from rfcore.codec.sender.frame_costs import FrameCosts, RateDistortion
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.native.warp import BLOCK_PX, block_costs
+from rfcore.native.warp import BLOCK_PX
 
 __all__ = [
     "MAX_TRIES",
@@ -37,6 +35,7 @@ __all__ = [
     "RateTarget",
     "bits_curve",
     "code_to_fit",
+    "estimated_bits",
 ]
 
 
@@ -70,8 +69,8 @@ class BitsCurve:
         return float(min(wanted, self.crfs[-1]))
 
 
-def bits_curve(frame: I420, pictures: Sequence[I420], lowest_crf: float) -> BitsCurve:
-    """Estimate ``frame``'s bits when each block is predicted from the best of ``pictures``.
+def bits_curve(costs: FrameCosts, pictures: Sequence[I420], lowest_crf: float) -> BitsCurve:
+    """Estimate a frame's bits when each block is predicted from the best of ``pictures``.
 
     Without pictures each block is predicted from its mean. Raises ``InvalidInput`` for a CRF
     outside 1..51.
@@ -80,17 +79,23 @@ def bits_curve(frame: I420, pictures: Sequence[I420], lowest_crf: float) -> Bits
     if not low <= lowest_crf <= high:
         raise InvalidInput("crf", f"{lowest_crf} is outside {low:g}..{high:g}")
     crfs = np.append(np.arange(lowest_crf, high, CRF_STEP), high)
-    satd, ssd = _left_over(frame, pictures)
-    bits = np.array([_bits(satd, ssd, crf) for crf in crfs])
+    satd, ssd = _residual(costs, pictures)
+    bits = np.array([_coded_bits(satd, ssd, crf) for crf in crfs])
     return BitsCurve(crfs, np.minimum.accumulate(LEAST_BITS + bits))
 
 
-def _left_over(frame: I420, pictures: Sequence[I420]) -> tuple[Array, Array]:
+def estimated_bits(costs: FrameCosts, picture: I420, crf: float) -> float:
+    """Estimate a frame's bits at ``crf`` when it is predicted from ``picture``."""
+    return LEAST_BITS + _coded_bits(*_residual(costs, [picture]), crf)
+
+
+def _residual(costs: FrameCosts, pictures: Sequence[I420]) -> tuple[Array, Array]:
+    """Return SATD and SSD [N] of the blocks, each against the best of ``pictures``."""
     if not pictures:
-        return _around_means(frame)
-    found = [block_costs(frame.y, picture.y) for picture in pictures]
-    satd = np.minimum.reduce([costs.satd for costs in found])
-    ssd = np.minimum.reduce([costs.ssd for costs in found])
+        return _around_means(costs.frame)
+    found = [costs.against(picture) for picture in pictures]
+    satd = np.minimum.reduce([blocks.satd for blocks in found])
+    ssd = np.minimum.reduce([blocks.ssd for blocks in found])
     return satd.astype(np.float64).ravel(), ssd.astype(np.float64).ravel()
 
 
@@ -102,13 +107,10 @@ def _around_means(frame: I420) -> tuple[Array, Array]:
     return np.sqrt(BLOCK_PX**2 * ssd), ssd
 
 
-def _bits(satd: Array, ssd: Array, crf: float) -> float:
+def _coded_bits(satd: Array, ssd: Array, crf: float) -> float:
     """Return the bits of the blocks that are not better copied from reference 0."""
-    step: float = 2 ** ((crf - 4) / 6)
-    lambda_: float = 0.57 * 2 ** ((crf - 12) / 3)
-    bits = BLOCK_BITS + np.maximum(0.0, satd / step - DEAD_ZONE_SATD)
-    coded = np.minimum(ssd, BLOCK_PX**2 * step**2 / 12) + lambda_ * bits < ssd
-    return float(bits[coded].sum())
+    at_crf = RateDistortion.at(crf)
+    return float(at_crf.bits(satd)[at_crf.coded(satd, ssd) < ssd].sum())
 
 
 @dataclass(frozen=True)

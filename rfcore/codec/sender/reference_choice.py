@@ -1,27 +1,13 @@
 """What the sender decides about a frame before it codes it: references, and the render's light.
 
-Coding with every set of references and comparing would cost a run of x264 each, and comparing bytes
-at equal CRF would mislead, since a better reference also gives a better picture at the same CRF.
-Instead each 8x8 block gets an estimate of D + lambda R for each picture, from the sum of absolute
-Hadamard coefficients and of squares of the difference (0.4 ms a picture at 640x360)::
-
-    coded = min(SSD, step**2 * 64 / 12) + lambda * (1 + max(0, SATD / step - 16))
-    copied = SSD                    (reference 0 only)
-    step = 2**((CRF - 4) / 6),  lambda = 0.57 * 2**((CRF - 12) / 3)
-
-The 16 is what the quantiser swallows. So estimated, a 640x360 street takes 199, 76, 20 and 2.6
-kbit at CRF 17, 23, 29 and 35 against its render, where x264 takes 192, 69, 14 and 2.0; and against
-their own means, which stand in for intra prediction, its blocks take 395, 172, 65 and 20, where
-x264 takes 310, 163, 77 and 36.
-
-There is no motion in this: the pictures made from the field stand where the frame stands. The
-previous frame does not, and x264 looks for it; it is taken along whenever there is one.
+Both are decided by the estimate of D + lambda R that ``rfcore.codec.sender.frame_costs`` makes of
+each 8x8 block. There is no motion in it: the pictures made from the field stand where the frame
+stands. The previous frame does not, and x264 looks for it; it is taken along whenever there is one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +16,12 @@ from rfcore.codec.block_means import block_mean_digest
 from rfcore.codec.photometric import Photometric, adapt, solve
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import INTRA, RENDER_ONLY, Reference, References
+from rfcore.codec.sender.frame_costs import FrameCosts, RateDistortion
 from rfcore.image import I420
-from rfcore.native.warp import BLOCK_PX, block_costs
+from rfcore.native.warp import BLOCK_PX
 
 __all__ = ["choose_photometric", "choose_references"]
 
-BLOCK_BITS = 1.0
-DEAD_ZONE_SATD = 16.0
 INDEX_BITS = 1.0
 """What naming another reference than the first costs a block."""
 
@@ -59,71 +44,59 @@ PHOTOMETRIC_BITS = 12 * 16
 Costs = NDArray[np.float64]
 
 
-def choose_references(frame: I420, prediction: Prediction, crf: float, most: int = 3) -> References:
-    """Return at most ``most`` references for ``frame``, the most useful last."""
-    if min(frame.size_px) < BLOCK_PX:
+def choose_references(
+    costs: FrameCosts, prediction: Prediction, crf: float, max_references: int = 3
+) -> References:
+    """Return at most ``max_references`` references for a frame, the most useful last."""
+    if min(costs.frame.size_px) < BLOCK_PX:
         return RENDER_ONLY
-    costs = _Costs(frame, crf)
-    carried = Reference.CORRECTION in prediction.available
-    usable = {Reference.RENDER: costs.of(prediction.render)}
-    if carried:
-        usable[Reference.CORRECTION] = costs.of(prediction.correction)
-    if carried and min(map(_total, usable.values())) > POOR_INTRA_RATIO * costs.intra:
-        usable[Reference.WARP] = costs.of(prediction.warp)
+    at_crf = RateDistortion.at(crf)
+    usable, intra = _usable(costs, prediction, at_crf)
     has_past = Reference.PREVIOUS in prediction.available
     best = min(usable, key=lambda reference: _total(usable[reference]))
-    if _total(usable[best]) > USELESS_INTRA_RATIO * costs.intra:
+    if _total(usable[best]) > USELESS_INTRA_RATIO * intra:
         return (Reference.PREVIOUS,) if has_past else INTRA
-    room = most - 1 - has_past
+    room = max_references - 1 - has_past
     chosen = [best]
-    if room > 0 and (second := _second(usable, best, costs.index_cost)) is not None:
+    second = _second(usable, best, at_crf.bit_price * INDEX_BITS) if room > 0 else None
+    if second is not None:
         chosen.insert(0, second)
-    if has_past and most > 1:
+    if has_past and max_references > 1:
         chosen.insert(0, Reference.PREVIOUS)
     return tuple(chosen)
 
 
-def choose_photometric(frame: I420, render: I420, crf: float) -> Photometric:
+def _usable(
+    costs: FrameCosts, prediction: Prediction, at_crf: RateDistortion
+) -> tuple[dict[Reference, Costs], float]:
+    """Return the costs of the blocks by reference, and of the whole frame without any."""
+    usable = {Reference.RENDER: at_crf.coded_or_copied(costs.against(prediction.render))}
+    intra = _total(at_crf.coded_or_copied(costs.intra))
+    if Reference.CORRECTION in prediction.available:
+        found = costs.against(prediction.correction)
+        usable[Reference.CORRECTION] = at_crf.coded_or_copied(found)
+        if min(map(_total, usable.values())) > POOR_INTRA_RATIO * intra:
+            usable[Reference.WARP] = at_crf.coded_or_copied(costs.against(prediction.warp))
+    return usable, intra
+
+
+def choose_photometric(costs: FrameCosts, render: I420, crf: float) -> Photometric:
     """Return how the render's light is to be changed, if that saves more than it costs to say.
 
     It must make a good reference of the render: shadows that have moved and lamps that were lit are
     beyond one matrix, and half a change of light only disturbs what is carried from frame to frame.
     """
+    frame = costs.frame
     if min(frame.size_px) < BLOCK_PX or _light_difference(frame, render) < NOTICEABLE_LEVELS:
         return ()
     found = solve(frame, render)
-    costs = _Costs(frame, crf)
-    adapted = _total(costs.of(adapt(render, found)))
-    saved = _total(costs.of(render)) - adapted
-    pays = saved > costs.price_of(PHOTOMETRIC_BITS) and adapted < GOOD_INTRA_RATIO * costs.intra
-    return found if pays else ()
-
-
-class _Costs:
-    """D + lambda R of the blocks of one frame at one quality."""
-
-    def __init__(self, frame: I420, crf: float) -> None:
-        self._frame = frame
-        self._step: float = 2 ** ((crf - 4) / 6)
-        self._lambda: float = 0.57 * 2 ** ((crf - 12) / 3)
-        self.index_cost = self.price_of(INDEX_BITS)
-
-    def price_of(self, bits: float) -> float:
-        """Return lambda times ``bits``."""
-        return self._lambda * bits
-
-    def of(self, reference: I420) -> Costs:
-        """Return the cost of each block if it is predicted from ``reference`` as reference 0."""
-        found = block_costs(self._frame.y, reference.y)
-        ssd = found.ssd.astype(np.float64)
-        distortion = np.minimum(ssd, BLOCK_PX**2 * self._step**2 / 12)
-        bits = BLOCK_BITS + np.maximum(0, found.satd / self._step - DEAD_ZONE_SATD)
-        return np.minimum(ssd, distortion + self._lambda * bits)
-
-    @cached_property
-    def intra(self) -> float:
-        """The cost of the frame without any reference."""
-        return _total(self.of(_block_means(self._frame)))
+    at_crf = RateDistortion.at(crf)
+    as_it_is, adapted, intra = (
+        _total(at_crf.coded_or_copied(blocks))
+        for blocks in (costs.against(render), costs.against(adapt(render, found)), costs.intra)
+    )
+    pays = as_it_is - adapted > at_crf.bit_price * PHOTOMETRIC_BITS
+    return found if pays and adapted < GOOD_INTRA_RATIO * intra else ()
 
 
 def _second(
@@ -142,17 +115,6 @@ def _second(
 
 def _total(costs: Costs) -> float:
     return float(costs.sum())
-
-
-def _block_means(picture: I420) -> I420:
-    """Return the picture with each whole 8x8 luma block at its mean."""
-    height, width = (side // BLOCK_PX * BLOCK_PX for side in picture.y.shape)
-    blocks = picture.y[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width)
-    down = blocks.sum(axis=1, dtype=np.uint16).reshape(height // BLOCK_PX, -1, BLOCK_PX)
-    means = np.rint(down.sum(axis=2, dtype=np.uint16) / BLOCK_PX**2).astype(np.uint8)
-    flat = picture.y.copy()
-    flat[:height, :width] = means.repeat(BLOCK_PX, axis=1).repeat(BLOCK_PX, axis=0)
-    return I420(flat, picture.u, picture.v)
 
 
 def _light_difference(frame: I420, render: I420) -> float:

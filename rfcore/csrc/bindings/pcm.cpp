@@ -1,5 +1,5 @@
-// Binds rfcore/csrc/pcm.h. Shapes and dtypes are checked by rfcore/native/pcm.py; the types below
-// refuse anything else that nanobind can see.
+// Binds rfcore/csrc/pcm.h. Shapes and dtypes are checked by rfcore/codec/h264/pcm_picture.py; the
+// types below refuse anything else that nanobind can see.
 #include "picture/pcm.h"
 
 #include <nanobind/nanobind.h>

@@ -174,8 +174,8 @@ def _choice(rung: Rung) -> FrameChoice:
     return FrameChoice(
         references=None if rung.references else RENDER_ONLY,
         photometric=None if rung.photometric else (),
-        most=max(1, rung.references),
-        rough=rung.rough,
+        max_references=max(1, rung.references),
+        fast_unsent=rung.fast_unsent,
     )
 
 

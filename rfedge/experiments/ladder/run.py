@@ -70,8 +70,12 @@ def _splat_rungs(quick: bool) -> list[Rung]:
         Rung(references=2),
         Rung(photometric=False),
         Rung(preset="superfast"),
-        *(Rung(Quality(detail), n, rough=True) for detail in (1.0, 0.5) for n in (3, 2, 1, 0)),
-        *(Rung(references=n, preset="veryfast", rough=True) for n in (3, 2, 1, 0)),
+        *(
+            Rung(Quality(detail), n, fast_unsent=True)
+            for detail in (1.0, 0.5)
+            for n in (3, 2, 1, 0)
+        ),
+        *(Rung(references=n, preset="veryfast", fast_unsent=True) for n in (3, 2, 1, 0)),
     ]
     low = [
         Rung(Quality(0.5, 1), 1, photometric=False, preset="ultrafast"),
@@ -196,7 +200,7 @@ class Contender:
                 "references": rung.references,
                 "photometric": rung.photometric,
                 "preset": rung.preset,
-                "rough": rung.rough,
+                "rough": rung.fast_unsent,
                 "crf": crf,
             },
             **measure_rung(self.clip, self.seen(quality), rung, crf),

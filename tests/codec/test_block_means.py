@@ -1,4 +1,4 @@
-"""The coarse digest: block means, tolerant of rounding by construction."""
+"""Block means of the render: tolerant of rounding by construction."""
 
 from collections.abc import Callable
 
