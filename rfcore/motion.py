@@ -1,4 +1,4 @@
-"""Rotations as vectors, and poses between poses.
+"""Rotations as vectors, and poses between poses: the one exponential, logarithm and SLERP.
 
 A rotation vector points along the axis and is as long as the angle, in radians (the logarithm of
 SO(3)); quaternions are w, x, y, z as in ``rfcore.camera``. Angles lie in 0..pi: of q and -q, the
@@ -65,5 +65,5 @@ def interpolated(first: Pose, second: Pose, share: float) -> Pose:
     part = quaternion_from_vector((share * x, share * y, share * z))
     rotation = turned.compose(Pose((0.0, 0.0, 0.0), part)).rotation
     a, b = first.translation_m, second.translation_m
-    tx, ty, tz = ((1.0 - share) * p + share * q for p, q in zip(a, b, strict=True))
+    tx, ty, tz = (p + share * (q - p) for p, q in zip(a, b, strict=True))
     return Pose((tx, ty, tz), rotation)

@@ -14,6 +14,17 @@ component = st.floats(-1.8, 1.8)
 vectors = st.tuples(component, component, component).filter(lambda v: math.hypot(*v) < 3.1415)
 
 
+angle = st.floats(-3.1, 3.1)
+slopes = st.tuples(*[st.floats(-1, 1)] * 3)
+
+
+def turned(angle_rad: float, axis: tuple[float, float, float] = (0, 0, 1)) -> Pose:
+    """A turn about an axis through the origin, placed at (angle, 0, 0)."""
+    norm = math.hypot(*axis)
+    x, y, z = (math.sin(angle_rad / 2) * a / norm for a in axis)
+    return Pose((angle_rad, 0.0, 0.0), (math.cos(angle_rad / 2), x, y, z))
+
+
 @given(vectors)
 def test_the_logarithm_undoes_the_exponential(vector: Vec3) -> None:
     back = rotation_vector(quaternion_from_vector(vector))
@@ -36,6 +47,34 @@ def test_parts_of_a_turn_add_up(a: Vec3, b: Vec3, share: float) -> None:
     assert middle.translation_m[0] == pytest.approx(1.0 - 5.0 * share)
 
 
+@given(end=st.floats(0.0, 3.0), share=st.floats(0, 1))
+def test_a_turn_is_shared_evenly(end: float, share: float) -> None:
+    pose = interpolated(turned(0.0), turned(end), share)
+    expected = turned(end * share)
+    assert pose.rotation == pytest.approx(expected.rotation, abs=1e-12)
+    assert pose.translation_m == pytest.approx(expected.translation_m)
+
+
+@given(a=angle, b=angle, share=st.floats(0, 1), axis=slopes)
+def test_the_sign_of_a_quaternion_means_nothing(
+    a: float, b: float, share: float, axis: tuple[float, float, float]
+) -> None:
+    if math.hypot(*axis) < 1e-3 or abs(abs(a - b) - math.pi) < 1e-3:
+        return
+    first, second = turned(a, axis), turned(b, axis)
+    w, x, y, z = second.rotation
+    flipped = Pose(second.translation_m, (-w, -x, -y, -z))
+    one, other = interpolated(first, second, share), interpolated(first, flipped, share)
+    for i in range(3):
+        unit = [float(i == j) for j in range(3)]
+        assert one.apply(unit) == pytest.approx(other.apply(unit), abs=1e-9)
+
+
+def test_two_turns_that_hardly_differ_are_no_division_by_zero() -> None:
+    pose = interpolated(turned(1.0), turned(1.0 + 1e-9), 0.5)
+    assert pose.rotation == pytest.approx(turned(1.0).rotation, abs=1e-9)
+
+
 @given(vectors, vectors)
 def test_the_ends_come_back_as_they_are(a: Vec3, b: Vec3) -> None:
     first, second = (Pose((0.0, 0.0, 0.0), quaternion_from_vector(v)) for v in (a, b))
@@ -52,6 +91,14 @@ def test_a_share_outside_the_way_is_refused(share: float) -> None:
 def test_a_vector_that_is_not_finite_is_refused() -> None:
     with pytest.raises(InvalidInput, match="rotation_vector"):
         quaternion_from_vector((math.nan, 0.0, 0.0))
+
+
+@given(st.tuples(*[st.floats(-1e7, 1e7)] * 3), vectors, vectors, st.floats(0.0, 1.0))
+def test_a_camera_that_only_turns_stays_where_it_is(
+    at_m: Vec3, a: Vec3, b: Vec3, share: float
+) -> None:
+    first, second = (Pose(at_m, quaternion_from_vector(v)) for v in (a, b))
+    assert interpolated(first, second, share).translation_m == at_m
 
 
 def angle_rad(first: Pose, second: Pose) -> float:

@@ -6,14 +6,13 @@ metres, ``#`` starts a comment. CSV: a header with the columns ``time_s`` or ``t
 kept as whole nanoseconds, exactly as printed, and must increase.
 
 Between two poses the position is interpolated linearly and the rotation by SLERP (Shoemake 1985)
-along the shorter arc. Nothing is extrapolated.
+along the shorter arc (``rfcore.motion``). Nothing is extrapolated.
 """
 
 from __future__ import annotations
 
 import bisect
 import csv
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -23,13 +22,12 @@ from pathlib import Path
 from rfcore.camera import Pose
 from rfcore.dataset.keys import finite_numbers, pose_of_quaternion, text_lines
 from rfcore.errors import DatasetError
+from rfcore.motion import interpolated
 
-__all__ = ["Trajectory", "interpolated", "read_trajectory", "time_ns"]
+__all__ = ["Trajectory", "read_trajectory", "time_ns"]
 
 NS_PER_S = 1_000_000_000
 MAX_TIME_NS = 2**63 - 1
-NEARLY_PARALLEL = 1 - 1e-12
-"""Cosine of 1.4e-6 rad: the sines would lose their digits, and a straight line is exact there."""
 
 Row = tuple[str, int, Pose]
 
@@ -85,18 +83,6 @@ def read_trajectory(file: Path) -> Trajectory:
     return Trajectory(file, tuple(row[1] for row in rows), tuple(row[2] for row in rows))
 
 
-def interpolated(a: Pose, b: Pose, share: float) -> Pose:
-    """Return the pose that is ``share`` (0..1) of the way from a to b."""
-    x, y, z = (p + (q - p) * share for p, q in zip(a.translation_m, b.translation_m, strict=True))
-    cosine = sum(p * q for p, q in zip(a.rotation, b.rotation, strict=True))
-    sign = -1.0 if cosine < 0 else 1.0
-    of_a, of_b = _slerp_weights(abs(cosine), share)
-    mixed = [of_a * p + sign * of_b * q for p, q in zip(a.rotation, b.rotation, strict=True)]
-    norm = math.hypot(*mixed)
-    w, i, j, k = (value / norm for value in mixed)
-    return Pose((x, y, z), (w, i, j, k))
-
-
 def time_ns(where: str, word: str) -> int:
     """Return printed seconds as whole nanoseconds, without passing through a float."""
     return _whole_ns(where, word, NS_PER_S)
@@ -110,15 +96,6 @@ def _whole_ns(where: str, word: str, unit_ns: int) -> int:
     if not time.is_finite() or not 0 <= time <= MAX_TIME_NS:
         raise DatasetError(f"{where}: time {word} must be finite and at least 0")
     return int(time.to_integral_value())
-
-
-def _slerp_weights(cosine: float, share: float) -> tuple[float, float]:
-    if cosine >= NEARLY_PARALLEL:
-        return 1 - share, share
-    angle = math.acos(cosine)
-    return math.sin((1 - share) * angle) / math.sin(angle), math.sin(share * angle) / math.sin(
-        angle
-    )
 
 
 def _tum_rows(file: Path) -> Iterator[Row]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rfcore.camera import Pose
+from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfedge.datasets.rig import Mount
 from rfedge.street.geometry.layout import LANE_M
 from rfedge.street.geometry.mesh import F64
@@ -85,10 +86,9 @@ def drive_motion(drive: Drive, time_s: float) -> Motion:
     before, after = (drive_pose(drive, time_s + step) for step in (-STEP_S, STEP_S))
     now = np.array(drive_pose(drive, time_s).rotation_matrix())
     moved = np.array(after.translation_m) - np.array(before.translation_m)
-    turned = before.inverse().compose(after).rotation
-    half_angle = np.array(turned[1:]) * np.sign(turned[0])
+    turned = np.array(rotation_vector(before.inverse().compose(after).rotation))
     velocity = now.T @ moved / (2 * STEP_S)
-    return Motion(_triple(velocity), _triple(2 * half_angle / (2 * STEP_S)))
+    return Motion(_triple(velocity), _triple(turned / (2 * STEP_S)))
 
 
 def _triple(values: F64) -> tuple[float, float, float]:
@@ -105,7 +105,5 @@ def measured_pose(world_from_cam: Pose, noise: PoseNoise, frame: int) -> Pose:
     shift = rng.normal(0.0, 1.0, 3) * noise.position_m
     turn = rng.normal(0.0, 1.0, 3) * math.radians(noise.rotation_deg)
     x, y, z = (float(a + b) for a, b in zip(world_from_cam.translation_m, shift, strict=True))
-    angle = float(np.linalg.norm(turn))
-    a, b, c = (float(v) for v in turn * (math.sin(angle / 2) / angle if angle > 0 else 0.0))
-    off = Pose((0.0, 0.0, 0.0), (math.cos(angle / 2), a, b, c))
+    off = Pose((0.0, 0.0, 0.0), quaternion_from_vector(_triple(turn)))
     return Pose((x, y, z), world_from_cam.compose(off).rotation)

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.image import I420
+from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfcore.views import FieldView
 
 __all__ = ["PRIOR_M", "PRIOR_RAD", "align"]
@@ -207,18 +208,13 @@ def _step(
 
 def _pose(step: F64) -> Pose:
     """Return the motion of ``step`` [6]: a translation in metres, then a rotation vector."""
-    angle = float(np.linalg.norm(step[3:]))
-    half = math.sin(angle / 2) / angle if angle > 1e-12 else 0.5
-    rx, ry, rz = (half * float(value) for value in step[3:])
-    tx, ty, tz = (float(value) for value in step[:3])
-    return Pose((tx, ty, tz), (math.sqrt(max(0.0, 1 - rx**2 - ry**2 - rz**2)), rx, ry, rz))
+    tx, ty, tz, rx, ry, rz = (float(value) for value in step)
+    return Pose((tx, ty, tz), quaternion_from_vector((rx, ry, rz)))
 
 
 def _vector(motion: Pose) -> F64:
-    """Return the inverse of ``_pose`` for a small rotation."""
-    w, x, y, z = motion.rotation
-    sign = 1.0 if w >= 0 else -1.0
-    return np.array([*motion.translation_m, *(2 * sign * value for value in (x, y, z))])
+    """Return the step [6] of a motion: the inverse of ``_pose``."""
+    return np.array([*motion.translation_m, *rotation_vector(motion.rotation)])
 
 
 def _pixels(step: F64, level: _Level, template: _Template) -> float:

@@ -22,6 +22,7 @@ from rfcore.codec.sender.frame_costs import FrameCosts
 from rfcore.codec.sender.rate import estimated_bits
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfcore.motion import rotation_vector
 from rfcore.views import FieldView
 
 __all__ = ["PoseSearch", "Refined"]
@@ -112,7 +113,4 @@ def _is_near(measured: Camera, found: Camera) -> bool:
 def _distance(a: Camera, b: Camera) -> tuple[float, float]:
     """Return metres and radians between two cameras."""
     motion = a.world_from_cam.inverse().compose(b.world_from_cam)
-    sine = math.sqrt(sum(value * value for value in motion.rotation[1:]))
-    return math.dist(a.world_from_cam.translation_m, b.world_from_cam.translation_m), 2 * math.asin(
-        min(1.0, sine)
-    )
+    return math.hypot(*motion.translation_m), math.hypot(*rotation_vector(motion.rotation))

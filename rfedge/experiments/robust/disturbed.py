@@ -18,6 +18,7 @@ from rfcore.codec.sender.pose_search import PoseSearch
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, render_field_view
 from rfcore.image import I420
+from rfcore.motion import quaternion_from_vector
 from rfcore.views import FieldView
 from rfedge.experiments.clips import CodedClip
 
@@ -57,10 +58,8 @@ def noisy_cameras(cameras: Sequence[Camera], noise: PoseNoise, seed: int) -> lis
     for camera in cameras:
         shift, turn = rng.normal(size=3), rng.normal(size=3)
         x, y, z = (float(v) for v in noise.position_m * shift)
-        half = np.deg2rad(noise.rotation_deg) * turn / 2
-        angle = float(np.linalg.norm(half))
-        a, b, c = (float(v) for v in half * np.sinc(angle / math.pi))
-        step = Pose((x, y, z), (math.cos(angle), a, b, c))
+        a, b, c = (float(v) for v in np.deg2rad(noise.rotation_deg) * turn)
+        step = Pose((x, y, z), quaternion_from_vector((a, b, c)))
         disturbed.append(Camera(camera.intrinsics, camera.world_from_cam.compose(step)))
     return disturbed
 
