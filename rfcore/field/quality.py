@@ -1,15 +1,13 @@
-"""How much of a field is drawn: the knobs that trade accuracy for time, on both ends alike.
+"""How much of a field is drawn: settings that trade accuracy for time, on both ends alike.
 
-A quality is a value that both ends of a session can name; the same field, camera and quality give
-the same bytes everywhere. Each kind of field reads the knobs it has and ignores the others.
+A ``Quality`` is a value that both ends of a session can name; the same field, camera and quality
+give the same bytes everywhere. Each kind of field reads the settings it has and ignores the others.
 
-Which splats a quality draws.
-
-Rung ``detail`` of N splats is the first ``ceil(detail * N)`` of them in the archive's order, so
-that every rung is a prefix of the next; the product is taken in whole numbers. Where the archive
-has scales and opacities of that rung's own, they stand in place of the field's: fewer splats have
-to be wider and denser to leave no gaps (``rfcore.train.rungs`` fits them; what that is worth is
-measured there). Nothing is computed: the same splats on every machine.
+Of N splats, the level ``detail`` draws the first ``ceil(detail * N)`` in the archive's order, so
+that every level of detail is a prefix of the next; the product is taken in whole numbers. Where the
+archive has scales and opacities of that level's own, they stand in place of the field's: fewer
+splats have to be wider and denser to leave no gaps (``rfcore.train.levels`` fits them; what that is
+worth is measured there). Nothing is computed: the same splats on every machine.
 """
 
 from __future__ import annotations
@@ -26,18 +24,18 @@ __all__ = [
     "MAX_SAMPLES_PER_RAY",
     "MAX_SH_DEGREE",
     "SCALES",
+    "LevelOfDetail",
+    "LevelsOfDetail",
     "Quality",
-    "Rung",
-    "Rungs",
-    "check_rungs",
+    "check_levels",
     "kept_of",
-    "splats_of_rung",
+    "splats_at_detail",
 ]
 
 
 DETAILS = (1.0, 0.5, 0.25, 0.1)
-"""The shares of a field's splats that can be drawn. A fixed list, so that every rung has one
-definition (``rfcore.field.quality``) and a field keeps at most four sets."""
+"""The shares of a field's splats that can be drawn. A fixed list, so that every level has one
+definition and a field keeps at most four sets."""
 SCALES = (1.0, 0.5)
 """The sides a picture can be rendered at, of its own (``rfcore.field.scale``)."""
 MAX_SH_DEGREE = 3
@@ -46,7 +44,7 @@ MAX_SAMPLES_PER_RAY = 4096
 
 @dataclass(frozen=True)
 class Quality:
-    """One setting of the accuracy/time ladder; raises ``InvalidInput`` for one that is not."""
+    """How a field is drawn; raises ``InvalidInput`` for what cannot be asked for."""
 
     detail: float = 1.0
     """Share of the splats: 1, 0.5, 0.25 or 0.1, the most important ones first."""
@@ -82,8 +80,8 @@ FULL = Quality()
 
 
 @dataclass(frozen=True)
-class Rung:
-    """What the K splats of a rung have in place of the field's own.
+class LevelOfDetail:
+    """What the K splats of one level of detail have in place of the field's own.
 
     ``log_scales`` [K, 3] and ``opacity_logits`` [K] as in ``Gaussians``, float32.
     """
@@ -92,17 +90,17 @@ class Rung:
     opacity_logits: F32
 
 
-Rungs = Mapping[float, Rung]
-"""By detail; full detail has none, and neither need the others."""
+LevelsOfDetail = Mapping[float, LevelOfDetail]
+"""By ``Quality.detail``; full detail has none, and neither need the others."""
 
 
 def kept_of(count: int, detail: float) -> int:
-    """Return how many of ``count`` splats rung ``detail`` draws."""
+    """Return how many of ``count`` splats the level ``detail`` draws."""
     return -(-count * round(detail * 100) // 100)
 
 
-def splats_of_rung(gaussians: Gaussians, rungs: Rungs, detail: float) -> Gaussians:
-    """Return the splats of one rung; for full detail, ``gaussians`` itself."""
+def splats_at_detail(gaussians: Gaussians, levels: LevelsOfDetail, detail: float) -> Gaussians:
+    """Return the splats of one level of detail; for full detail, ``gaussians`` itself."""
     if detail == 1:
         return gaussians
     kept = kept_of(len(gaussians), detail)
@@ -113,18 +111,18 @@ def splats_of_rung(gaussians: Gaussians, rungs: Rungs, detail: float) -> Gaussia
         opacity_logits=gaussians.opacity_logits[:kept],
         sh=gaussians.sh[:kept],
     )
-    own = rungs.get(detail)
+    own = levels.get(detail)
     if own is None:
         return prefix
     return replace(prefix, log_scales=own.log_scales, opacity_logits=own.opacity_logits)
 
 
-def check_rungs(gaussians: Gaussians, rungs: Rungs) -> None:
-    """Raise ``InvalidInput`` unless every rung has finite float32 values for its splats."""
-    for detail, own in rungs.items():
+def check_levels(gaussians: Gaussians, levels: LevelsOfDetail) -> None:
+    """Raise ``InvalidInput`` unless every level has finite float32 values for its splats."""
+    for detail, own in levels.items():
         if detail not in DETAILS[1:]:
             raise InvalidInput("field.detail", f"{detail} is none of {DETAILS[1:]}")
         try:
-            splats_of_rung(gaussians, {detail: own}, detail)
+            splats_at_detail(gaussians, {detail: own}, detail)
         except InvalidInput as error:
             raise InvalidInput(f"field.detail {detail:g}", str(error)) from error

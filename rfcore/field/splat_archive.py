@@ -1,6 +1,6 @@
 """Splats as the content of an archive.
 
-Raw float32 arrays by the names of ``Gaussians``; what a lower rung has of its own follows as
+Raw float32 arrays by the names of ``Gaussians``; what a lower level has of its own follows as
 ``detail_50.log_scales`` and ``detail_50.opacity_logits``, likewise for 25 and 10. Where the header
 has an ``encoding``, ``rfcore.field.splat_archive`` says what the arrays are.
 
@@ -11,9 +11,9 @@ array of the archive is one stream of ``rfcore.field.integers``, holding the num
 ``rfcore.field.splat_grid``. The field id is of the archive, so both ends decode one set of splats.
 
 Splats are stored along a Morton curve within each band of detail (the first tenth, up to a
-quarter, up to half, the rest), so every rung keeps its splats and neighbours share a block.
+quarter, up to half, the rest), so every level keeps its splats and neighbours share a block.
 
-Measured on the first sample (150k splats, SH 3, three rungs): 3.03 MB, 20.2 bytes a splat, 8.1 %
+Measured on the first sample (150k splats, SH 3, three levels): 3.03 MB, 20.2 bytes a splat, 8.1 %
 of the raw 37.4 MB, at a loss of 0.05 dB on the held-out drive.
 """
 
@@ -31,15 +31,15 @@ from rfcore.field.archive import Archive, Array
 from rfcore.field.importance import reordered
 from rfcore.field.integers import Integers, decode_columns, encode_columns
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
-from rfcore.field.quality import DETAILS, Rung, Rungs, kept_of
+from rfcore.field.quality import DETAILS, LevelOfDetail, LevelsOfDetail, kept_of
 from rfcore.field.splat_grid import (
     BLOCK,
     SplatNumbers,
     Steps,
     gaussians_of,
+    level_numbers_of,
+    level_of,
     numbers_of,
-    rung_numbers_of,
-    rung_of,
 )
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
 
@@ -65,7 +65,10 @@ SPREAD = (
 
 
 def compressed_archive(
-    gaussians: Gaussians, rungs: Rungs, metadata: FieldMetadata, steps: Steps | None = None
+    gaussians: Gaussians,
+    levels: LevelsOfDetail,
+    metadata: FieldMetadata,
+    steps: Steps | None = None,
 ) -> Archive:
     """Return the archive of the nearest splats on the grid.
 
@@ -76,9 +79,9 @@ def compressed_archive(
     numbers = numbers_of(reordered(gaussians, order), chosen)
     parts: dict[str, Integers] = {f.name: getattr(numbers, f.name) for f in fields(numbers)}
     for detail in DETAILS[1:]:
-        if detail in rungs:
-            own = _reordered_rung(rungs[detail], order)
-            parts[_name(detail)] = rung_numbers_of(own, numbers, chosen)
+        if detail in levels:
+            own = _reordered_level(levels[detail], order)
+            parts[_name(detail)] = level_numbers_of(own, numbers, chosen)
     coded = {name: encode_columns(values) for name, values in parts.items()}
     bounds = Bounds.around(gaussians_of(numbers, chosen).means)
     encoding = {
@@ -92,7 +95,7 @@ def compressed_archive(
     return Archive(SPLATS, {**stored_metadata(metadata, bounds), "encoding": encoding}, arrays)
 
 
-def splats_of_compressed(archive: Archive) -> tuple[Gaussians, Rungs]:
+def splats_of_compressed(archive: Archive) -> tuple[Gaussians, LevelsOfDetail]:
     """Return the splats of a compressed archive.
 
     Raises ``InvalidInput``, ``KeyError`` or ``TypeError`` for one that holds none; every size is
@@ -111,12 +114,12 @@ def splats_of_compressed(archive: Archive) -> tuple[Gaussians, Rungs]:
         for name, shape in shapes.items()
     }
     numbers = SplatNumbers(**{f.name: parts[f.name] for f in fields(SplatNumbers)})
-    rungs = {
-        detail: rung_of(parts[_name(detail)], numbers, steps)
+    levels = {
+        detail: level_of(parts[_name(detail)], numbers, steps)
         for detail in DETAILS[1:]
         if _name(detail) in parts
     }
-    return gaussians_of(numbers, steps), rungs
+    return gaussians_of(numbers, steps), levels
 
 
 def _shapes(count: int, sh_degree: int, archive: Archive) -> dict[str, tuple[int, int]]:
@@ -144,10 +147,12 @@ def _name(detail: float) -> str:
     return f"detail_{round(detail * 100)}"
 
 
-def _reordered_rung(rung: Rung, order: NDArray[np.intp]) -> Rung:
-    """Return the rung in the field's new order, which keeps every band together."""
-    own = order[: len(rung.opacity_logits)]
-    return replace(rung, log_scales=rung.log_scales[own], opacity_logits=rung.opacity_logits[own])
+def _reordered_level(level: LevelOfDetail, order: NDArray[np.intp]) -> LevelOfDetail:
+    """Return the level in the field's new order, which keeps every band together."""
+    own = order[: len(level.opacity_logits)]
+    return replace(
+        level, log_scales=level.log_scales[own], opacity_logits=level.opacity_logits[own]
+    )
 
 
 def _local_order(gaussians: Gaussians) -> NDArray[np.intp]:
@@ -172,20 +177,20 @@ def _morton(means: NDArray[np.float64]) -> NDArray[np.uint64]:
 
 
 NAMES = tuple(f.name for f in fields(Gaussians))
-RUNG_NAMES = tuple(f.name for f in fields(Rung))
+LEVEL_NAMES = tuple(f.name for f in fields(LevelOfDetail))
 
 
-def splat_archive(gaussians: Gaussians, rungs: Rungs, metadata: FieldMetadata) -> Archive:
-    """Return the archive of ``gaussians`` and what their ``rungs`` have of their own."""
+def splat_archive(gaussians: Gaussians, levels: LevelsOfDetail, metadata: FieldMetadata) -> Archive:
+    """Return the archive of ``gaussians`` and what their ``levels`` have of their own."""
     arrays: dict[str, Array] = {name: getattr(gaussians, name) for name in NAMES}
     for detail in DETAILS:
-        if detail in rungs:
-            own = {_own(detail, name): getattr(rungs[detail], name) for name in RUNG_NAMES}
+        if detail in levels:
+            own = {_own(detail, name): getattr(levels[detail], name) for name in LEVEL_NAMES}
             arrays.update(own)
     return Archive(SPLATS, stored_metadata(metadata, Bounds.around(gaussians.means)), arrays)
 
 
-def splats_of_archive(archive: Archive) -> tuple[Gaussians, Rungs]:
+def splats_of_archive(archive: Archive) -> tuple[Gaussians, LevelsOfDetail]:
     """Return the content of an archive, raw or compressed.
 
     Raises ``InvalidInput`` if it does not hold splats; see also ``splats_of_compressed``.
@@ -193,14 +198,14 @@ def splats_of_archive(archive: Archive) -> tuple[Gaussians, Rungs]:
     if "encoding" in archive.metadata:
         return splats_of_compressed(archive)
     arrays = dict(archive.arrays)
-    rungs = {
-        detail: Rung(*(arrays.pop(_own(detail, name)) for name in RUNG_NAMES))
+    levels = {
+        detail: LevelOfDetail(*(arrays.pop(_own(detail, name)) for name in LEVEL_NAMES))
         for detail in DETAILS[1:]
-        if all(_own(detail, name) in arrays for name in RUNG_NAMES)
+        if all(_own(detail, name) in arrays for name in LEVEL_NAMES)
     }
     if set(arrays) != set(NAMES):
         raise InvalidInput("archive", f"arrays {', '.join(archive.arrays)} are not splats")
-    return Gaussians(**arrays), rungs
+    return Gaussians(**arrays), levels
 
 
 def _own(detail: float, name: str) -> str:

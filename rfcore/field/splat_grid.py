@@ -11,7 +11,7 @@ rotation aside, a float32 division by 127 each).
   Renderers normalise; the sign of a quaternion means nothing;
 * colours, per SH coefficient: (r, g, b) as luma and two differences by the reversible transform
   YCoCg-R (Malvar and Sullivan, 2003), which is exact in whole numbers;
-* a rung's own scales and opacities: their difference to the full rung's, in the same steps.
+* a level's own scales and opacities: their difference to the full level's, in the same steps.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfcore.field.integers import LIMIT, Integers
-from rfcore.field.quality import Rung
+from rfcore.field.quality import LevelOfDetail
 from rfcore.raster.gaussians import F32, Gaussians
 
 __all__ = [
@@ -31,9 +31,9 @@ __all__ = [
     "SplatNumbers",
     "Steps",
     "gaussians_of",
+    "level_numbers_of",
+    "level_of",
     "numbers_of",
-    "rung_numbers_of",
-    "rung_of",
 ]
 
 BLOCK = 256
@@ -99,19 +99,19 @@ def gaussians_of(numbers: SplatNumbers, steps: Steps) -> Gaussians:
     )
 
 
-def rung_numbers_of(rung: Rung, numbers: SplatNumbers, steps: Steps) -> Integers:
-    """Return a rung's [K, 4]: log scales and opacity less those of the full rung."""
-    kept = len(rung.opacity_logits)
-    scales = _rounded("log_scales", rung.log_scales, steps.log_scales) - numbers.log_scales[:kept]
-    opacity = _rounded("opacity_logits", rung.opacity_logits[:, None], steps.opacity_logits)
+def level_numbers_of(level: LevelOfDetail, numbers: SplatNumbers, steps: Steps) -> Integers:
+    """Return a level's [K, 4]: log scales and opacity less those of the full level."""
+    kept = len(level.opacity_logits)
+    scales = _rounded("log_scales", level.log_scales, steps.log_scales) - numbers.log_scales[:kept]
+    opacity = _rounded("opacity_logits", level.opacity_logits[:, None], steps.opacity_logits)
     return np.hstack([scales, opacity - numbers.opacity_logits[:kept]])
 
 
-def rung_of(own: Integers, numbers: SplatNumbers, steps: Steps) -> Rung:
-    """Return the rung of ``own`` [K, 4]."""
+def level_of(own: Integers, numbers: SplatNumbers, steps: Steps) -> LevelOfDetail:
+    """Return the level of ``own`` [K, 4]."""
     kept = len(own)
     opacity = own[:, 3:] + numbers.opacity_logits[:kept]
-    return Rung(
+    return LevelOfDetail(
         log_scales=_scaled(own[:, :3] + numbers.log_scales[:kept], steps.log_scales),
         opacity_logits=_scaled(opacity, steps.opacity_logits)[:, 0].copy(),
     )

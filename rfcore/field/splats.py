@@ -17,7 +17,7 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive, encode_archive
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
-from rfcore.field.quality import FULL, Quality, Rungs, check_rungs, splats_of_rung
+from rfcore.field.quality import FULL, LevelsOfDetail, Quality, check_levels, splats_at_detail
 from rfcore.field.scale import colour_at_scale, view_at_scale
 from rfcore.field.splat_archive import compressed_archive, splat_archive, splats_of_compressed
 from rfcore.native.backend import check_backend
@@ -31,8 +31,8 @@ __all__ = ["SplatField"]
 class SplatField:
     """Gaussians with metadata, ready to render.
 
-    ``rungs`` is what the lower rungs have of their own (``rfcore.field.quality``). ``archive`` is
-    the one the field came from, ``None`` for one that was just made: saving it is up to it.
+    ``levels`` is what the lower levels of detail have of their own (``rfcore.field.quality``).
+    ``archive`` is the one the field came from, ``None`` for one that was just made.
     ``threads`` and ``isa`` choose how it renders, never what: every choice gives the same bytes.
     Raises ``BackendUnavailable`` if this machine lacks ``isa``. Safe to share between threads.
     """
@@ -42,7 +42,7 @@ class SplatField:
         gaussians: Gaussians,
         metadata: FieldMetadata | None = None,
         *,
-        rungs: Rungs | None = None,
+        levels: LevelsOfDetail | None = None,
         threads: int = 1,
         isa: str | None = None,
         archive: Archive | None = None,
@@ -51,8 +51,8 @@ class SplatField:
         self.metadata = metadata if metadata is not None else FieldMetadata()
         if self.metadata.kind != SPLATS:
             raise InvalidInput("field.kind", f"'{self.metadata.kind}' is not '{SPLATS}'")
-        self.rungs = dict(rungs or {})
-        check_rungs(gaussians, self.rungs)
+        self.levels = dict(levels or {})
+        check_levels(gaussians, self.levels)
         self.isa = check_backend(threads, isa)
         self._threads = threads
         self._archive = archive
@@ -78,7 +78,7 @@ class SplatField:
         """Return what the field's file holds."""
         if self._archive is not None:
             return self._archive
-        return splat_archive(self.gaussians, self.rungs, self.metadata)
+        return splat_archive(self.gaussians, self.levels, self.metadata)
 
     def compressed(self) -> SplatField:
         """Return the field that a compressed archive of this one holds; of such a one, itself.
@@ -88,27 +88,27 @@ class SplatField:
         """
         if "encoding" in self.archive().metadata:
             return self
-        archive = compressed_archive(self.gaussians, self.rungs, self.metadata)
-        gaussians, rungs = splats_of_compressed(archive)
-        return self._like(gaussians, self.metadata, rungs, archive)
+        archive = compressed_archive(self.gaussians, self.levels, self.metadata)
+        gaussians, levels = splats_of_compressed(archive)
+        return self._like(gaussians, self.metadata, levels, archive)
 
     def described(self, metadata: FieldMetadata) -> SplatField:
         """Return the same splats with other metadata, another field."""
         old = self.archive()
         described = {**old.metadata, **stored_metadata(metadata, self.bounds)}
         archive = Archive(SPLATS, described, old.arrays)
-        return self._like(self.gaussians, metadata, self.rungs, archive)
+        return self._like(self.gaussians, metadata, self.levels, archive)
 
     def prepare(self, quality: Quality = FULL) -> None:
         """Make the renderer of ``quality``; without this the first picture makes it."""
         self.rasterizer(quality.detail)
 
     def rasterizer(self, detail: float = 1.0) -> Rasterizer:
-        """Return the renderer of a rung, made when it is first needed and kept."""
+        """Return the renderer of a level, made when it is first needed and kept."""
         with self._lock:
             if detail not in self._rasterizers:
                 self._rasterizers[detail] = Rasterizer(
-                    splats_of_rung(self.gaussians, self.rungs, detail),
+                    splats_at_detail(self.gaussians, self.levels, detail),
                     threads=self._threads,
                     isa=self.isa,
                     antialiased=self.metadata.antialiased,
@@ -131,12 +131,16 @@ class SplatField:
         return rasterizer.render_colour(camera, sh_degree=self._degree(quality))
 
     def _like(
-        self, gaussians: Gaussians, metadata: FieldMetadata, rungs: Rungs, archive: Archive
+        self,
+        gaussians: Gaussians,
+        metadata: FieldMetadata,
+        levels: LevelsOfDetail,
+        archive: Archive,
     ) -> SplatField:
         return SplatField(
             gaussians,
             metadata,
-            rungs=rungs,
+            levels=levels,
             threads=self._threads,
             isa=self.isa,
             archive=archive,

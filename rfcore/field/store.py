@@ -54,11 +54,11 @@ class FieldFile:
 
 
 def _splats(file: FieldFile) -> RadianceField:
-    gaussians, rungs = splats_of_archive(file.archive)
+    gaussians, levels = splats_of_archive(file.archive)
     field = SplatField(
         gaussians,
         file.metadata,
-        rungs=rungs,
+        levels=levels,
         threads=file.threads,
         isa=file.isa,
         archive=file.archive,

@@ -48,7 +48,7 @@ class FieldImport:
         from rfcore.field import FieldMetadata, SplatField, read_ply, save_field
         from rfcore.field.importance import most_important_first, reordered, visible_area
         from rfcore.field.similarity import moved, read_field_from_world
-        from rfedge.fields.describe import print_rungs, size_mb
+        from rfedge.fields.describe import print_levels, size_mb
         from rfedge.fields.find import FOLDER
         from rfedge.fields.viewpoints import look_around
 
@@ -70,7 +70,7 @@ class FieldImport:
         field_id = save_field(field, out)
         console = Console()
         print(f"{out}: field {field_id}, {field.primitives:,} splats, {size_mb(field):.2f} MB")
-        print_rungs(console, field, look_around(field, 1280, 720))
+        print_levels(console, field, look_around(field, 1280, 720))
 
 
 @dataclass(frozen=True)
@@ -88,14 +88,14 @@ class FieldExport:
         """Load and export."""
         from rfcore.errors import InvalidInput
         from rfcore.field import Quality, write_ply
-        from rfcore.field.quality import splats_of_rung
+        from rfcore.field.quality import splats_at_detail
         from rfedge.fields.find import open_splats
 
         if self.out.suffix != ".ply":
             raise InvalidInput("out", f"{self.out} must end in .ply")
         detail = Quality(self.detail).detail
         field = open_splats(self.field, threads=1)
-        splats = splats_of_rung(field.gaussians, field.rungs, detail)
+        splats = splats_at_detail(field.gaussians, field.levels, detail)
         self.out.parent.mkdir(parents=True, exist_ok=True)
         write_ply(self.out, splats)
         print(f"{self.out}: {len(splats):,} splats of SH degree {splats.sh_degree}")
@@ -103,14 +103,14 @@ class FieldExport:
 
 @dataclass(frozen=True)
 class FieldInfo:
-    """Print what is known about a field, and what a frame of each rung takes here."""
+    """Print what is known about a field, and what a frame of each level of detail takes here."""
 
     field: Annotated[Path, Positional]
     """The archive (.rff), or the name it was imported under."""
     size: tuple[int, int] = (1280, 720)
     """Width and height of the frames measured, px (without --drive)."""
     drive: Path | None = None
-    """Posed pictures to measure every rung against, in dB and in ms."""
+    """Posed pictures to measure every level of detail against, in dB and in ms."""
     threads: int = 2
     """Threads of the renderer."""
 
@@ -121,7 +121,7 @@ class FieldInfo:
         from rfcore.dataset import read_dataset
         from rfcore.field import SplatField
         from rfcore.views import PosedPicture
-        from rfedge.fields.describe import describe_field, frame_ms, print_rungs
+        from rfedge.fields.describe import describe_field, frame_ms, print_levels
         from rfedge.fields.find import open_field
         from rfedge.fields.viewpoints import look_around
 
@@ -136,7 +136,7 @@ class FieldInfo:
             pictures = read_dataset(self.drive, tile_origin=origin).pictures
             cameras = [picture.camera for picture in pictures]
         if isinstance(field, SplatField):
-            print_rungs(console, field, cameras, pictures)
+            print_levels(console, field, cameras, pictures)
         else:
             console.print(f"{'frame':>13}  {frame_ms(field, cameras, rounds=1):.1f} ms")
 

@@ -1,6 +1,6 @@
 """``rfedge field slim``: fewer splats, without training pictures.
 
-``rfedge field rungs``: give a field lower rungs that fill their gaps.
+``rfedge field rungs``: give a field lower levels of detail that fill their gaps.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class FieldSlim:
         from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidInput
         from rfcore.field import save_field
-        from rfcore.train.rungs import RungConfig
+        from rfcore.train.levels import LevelFitConfig
         from rfedge.fields.describe import size_mb
         from rfedge.fields.find import open_splats
         from rfedge.fields.slim import slimmed
@@ -51,7 +51,7 @@ class FieldSlim:
         if self.drive is not None:
             dataset = read_dataset(self.drive, tile_origin=field.metadata.tile_origin)
             cameras = [picture.camera for picture in dataset.pictures]
-        config = RungConfig(iterations=self.iterations, threads=self.threads)
+        config = LevelFitConfig(iterations=self.iterations, threads=self.threads)
         small = slimmed(field, self.keep, cameras, config)
         small = small if self.raw else small.compressed()
         self.out.parent.mkdir(parents=True, exist_ok=True)
@@ -73,7 +73,7 @@ class FieldRungs:
     out: Path
     """The archive to write (.rff)."""
     iterations: int = 240
-    """Iterations of fitting, per rung."""
+    """Iterations of fitting, per level."""
     raw: bool = False
     """Write float32 instead of the compressed form."""
     threads: int = 2
@@ -86,19 +86,19 @@ class FieldRungs:
         from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidInput
         from rfcore.field import save_field
-        from rfcore.train.rungs import RungConfig
+        from rfcore.train.levels import LevelFitConfig
         from rfedge.fields.describe import size_mb
         from rfedge.fields.find import open_splats
-        from rfedge.training.finish import fit_rungs
+        from rfedge.training.finish import fit_levels
 
         if self.out.suffix != ".rff":
             raise InvalidInput("out", f"{self.out} must end in .rff")
         field = open_splats(self.field, threads=self.threads)
         dataset = read_dataset(self.drive, tile_origin=field.metadata.tile_origin)
         cameras = [picture.camera for picture in dataset.pictures]
-        config = RungConfig(iterations=self.iterations, threads=self.threads)
+        config = LevelFitConfig(iterations=self.iterations, threads=self.threads)
         console = Console()
-        refined = fit_rungs(field, cameras, config, console)
+        refined = fit_levels(field, cameras, config, console)
         refined = refined if self.raw else refined.compressed()
         self.out.parent.mkdir(parents=True, exist_ok=True)
         field_id = save_field(refined, self.out)

@@ -71,7 +71,7 @@ class Train:
     name: str = "field"
     """A name kept in the archive's header."""
     plain: bool = False
-    """Write parameters as they were trained: no lower rungs, no compression."""
+    """Write parameters as they were trained: no lower levels of detail, no compression."""
     checkpoint_every: int = 0
     """Write OUT.ckpt every so many iterations; 0: never."""
     resume: bool = False
@@ -165,11 +165,11 @@ class Train:
         self, job: TrainingJob, trained: RadianceField, console: Console
     ) -> RadianceField:
         from rfcore.field import SplatField
-        from rfcore.train.rungs import RungConfig
+        from rfcore.train.levels import LevelFitConfig
         from rfedge.training.finish import finish_field
 
         if self.plain or not isinstance(trained, SplatField):
             return trained
         held_out = job.held_out.pictures if job.held_out is not None else ()
-        rungs = RungConfig(threads=self.threads)
-        return finish_field(trained, job.dataset.pictures, held_out, rungs, console)
+        levels = LevelFitConfig(threads=self.threads)
+        return finish_field(trained, job.dataset.pictures, held_out, levels, console)

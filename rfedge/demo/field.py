@@ -32,7 +32,7 @@ from rfcore.field import SplatField, load_field, save_field
 from rfcore.field.store import encode_field
 from rfcore.files import write_whole
 from rfcore.train import DensityControl, SplatTrainingConfig
-from rfcore.train.rungs import RungConfig
+from rfcore.train.levels import LevelFitConfig
 from rfedge.demo.make_sample import run_maker
 from rfedge.results import host, revision
 from rfedge.training.finish import finish_field
@@ -121,7 +121,7 @@ def _manifest_digest(sample: Path) -> str:
 
 @dataclass(frozen=True)
 class MakeSampleField:
-    """Train a sample's field, fit its rungs, compress it, and write it with its record."""
+    """Train a sample's field, fit its levels, compress it, and write it with its record."""
 
     sample: Annotated[Path, Positional] = Path("samples/street")
     """Dataset folder with a manifest: training views, points and the drive `empty`."""
@@ -198,13 +198,13 @@ def choose_field(choice: FieldChoice, console: Console) -> Path:
 
 
 def trained_field(sample: Path, config: SplatTrainingConfig, console: Console) -> SplatField:
-    """Train the field of a sample and finish it: rungs, compression, quality on the empty drive."""
+    """Train the field of a sample and finish it: levels, compression, held-out quality."""
     views = read_dataset(sample / "transforms_train.json")
     held_out = read_dataset(sample / "transforms_drive_empty.json")
     job = TrainingJob(name=sample.name, dataset=views, held_out=held_out, config=config, seed=SEED)
     field = train_field(job, console)
-    rungs = RungConfig(threads=config.threads)
-    return finish_field(field, views.pictures, held_out.pictures, rungs, console)
+    levels = LevelFitConfig(threads=config.threads)
+    return finish_field(field, views.pictures, held_out.pictures, levels, console)
 
 
 def cache_path(sample: Path, cache: Path, config: SplatTrainingConfig) -> Path:

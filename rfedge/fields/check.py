@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
-from rfcore.field.quality import Rung
+from rfcore.field.quality import LevelOfDetail
 from rfcore.field.similarity import Similarity, moved
 from rfcore.image import Rgb
 from rfcore.metrics import psnr
@@ -97,12 +97,12 @@ def in_drive_world(field: RadianceField, convention: Convention) -> SplatField:
         raise InvalidInput("fix", f"the drive's poses are to be changed: {convention.name}")
     world_from_field = convention.field_from_world.inverse()
     wider = np.float32(np.log(world_from_field.scale))
-    rungs = {
-        detail: Rung(own.log_scales + wider, own.opacity_logits)
-        for detail, own in field.rungs.items()
+    levels = {
+        detail: LevelOfDetail(own.log_scales + wider, own.opacity_logits)
+        for detail, own in field.levels.items()
     }
     splats = moved(field.gaussians, world_from_field)
-    fixed = SplatField(splats, field.metadata, rungs=rungs, isa=field.isa)
+    fixed = SplatField(splats, field.metadata, levels=levels, isa=field.isa)
     return fixed.compressed() if "encoding" in field.archive().metadata else fixed
 
 

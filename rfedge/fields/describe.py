@@ -21,7 +21,7 @@ from rfcore.views import PosedPicture
 from rfedge.fields.check import to_rgb
 from rfedge.timing import median_ms
 
-__all__ = ["describe_field", "frame_ms", "print_rungs", "size_mb"]
+__all__ = ["describe_field", "frame_ms", "print_levels", "size_mb"]
 
 
 def frame_ms(
@@ -56,23 +56,23 @@ def describe_field(field: RadianceField) -> list[tuple[str, str]]:
         ("bounds", f"{_corner(box.low_m)} to {_corner(box.high_m)} m"),
     ]
     if isinstance(field, SplatField):
-        rungs = ", ".join(f"{100 * detail:g} %" for detail in sorted(field.rungs, reverse=True))
+        levels = ", ".join(f"{100 * detail:g} %" for detail in sorted(field.levels, reverse=True))
         rows += [
             ("SH degree", str(field.gaussians.sh_degree)),
             ("antialiased", "yes" if m.antialiased else "no"),
             ("encoding", "compressed" if "encoding" in field.archive().metadata else "raw"),
-            ("fitted rungs", rungs or "none: lower rungs are plain prefixes"),
+            ("fitted levels of detail", levels or "none: lower ones are plain prefixes"),
         ]
     return rows
 
 
-def print_rungs(
+def print_levels(
     console: Console,
     field: SplatField,
     cameras: Sequence[Camera],
     pictures: Sequence[PosedPicture] = (),
 ) -> None:
-    """Measure every rung on this machine and print the table.
+    """Measure every level on this machine and print the table.
 
     The time of a frame from ``cameras``, and where there are ``pictures`` the mean PSNR to them.
     """

@@ -1,7 +1,7 @@
 """Fewer splats, without training pictures.
 
 With cameras the splats that contribute least are left out and the others are fitted to the full
-field's own renders (``rfcore.train.rungs``). Without any, opacity and area decide, and all
+field's own renders (``rfcore.train.levels``). Without any, opacity and area decide, and all
 survivors are widened by a common factor: the one of three whose pictures, from the middle of the
 field, are nearest to the full field's.
 """
@@ -25,7 +25,7 @@ from rfcore.field.importance import (
 )
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
-from rfcore.train.rungs import Progress, RungConfig, fitted
+from rfcore.train.levels import LevelFitConfig, Progress, fitted
 from rfedge.fields.viewpoints import look_around
 
 __all__ = ["slimmed"]
@@ -41,16 +41,16 @@ def slimmed(
     field: SplatField,
     keep: int,
     cameras: Sequence[Camera] = (),
-    config: RungConfig | None = None,
+    config: LevelFitConfig | None = None,
     progress: Progress | None = None,
 ) -> SplatField:
-    """Return a field of the ``keep`` splats that matter most; its rungs are plain prefixes.
+    """Return a field of the ``keep`` splats that matter most; its levels are plain prefixes.
 
     Raises ``InvalidInput`` unless 1 <= keep <= the splats there are.
     """
     if not 1 <= keep <= field.primitives:
         raise InvalidInput("keep", f"{keep} is outside 1..{field.primitives}, the splats there are")
-    settings = config if config is not None else RungConfig()
+    settings = config if config is not None else LevelFitConfig()
     antialiased = field.metadata.antialiased
     if cameras:
         importance = contributions(

@@ -1,4 +1,4 @@
-"""From a trained field to the one that is written: lower rungs, compression, held-out quality.
+"""From a trained field to the one written: levels of detail, compression, held-out quality.
 
 The quality in the header is that of the field as it will be read, not as it was trained.
 
@@ -19,26 +19,26 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rfcore.camera import Camera
 from rfcore.field import RadianceField, SplatField
 from rfcore.train import held_out_quality
-from rfcore.train.rungs import RungConfig, with_rungs
+from rfcore.train.levels import LevelFitConfig, with_levels
 from rfcore.views import PosedPicture
 from rfedge.results import host, revision
 from rfedge.training.run import Trained, TrainingJob
 
-__all__ = ["finish_field", "fit_rungs", "training_result"]
+__all__ = ["finish_field", "fit_levels", "training_result"]
 
 
 def finish_field(
     field: SplatField,
     views: Sequence[PosedPicture],
     held_out: Sequence[PosedPicture],
-    config: RungConfig,
+    config: LevelFitConfig,
     console: Console,
 ) -> SplatField:
-    """Return the field with rungs fitted to ``views``' cameras, compressed and measured.
+    """Return the field with levels fitted to ``views``' cameras, compressed and measured.
 
     ``held_out`` may be empty: then the header states no quality.
     """
-    small = fit_rungs(field, [view.camera for view in views], config, console).compressed()
+    small = fit_levels(field, [view.camera for view in views], config, console).compressed()
     if not held_out:
         return small
     quality = held_out_quality(small, held_out)
@@ -47,17 +47,22 @@ def finish_field(
     return small.described(measured)
 
 
-def fit_rungs(
-    field: SplatField, cameras: list[Camera], config: RungConfig, console: Console
+def fit_levels(
+    field: SplatField, cameras: list[Camera], config: LevelFitConfig, console: Console
 ) -> SplatField:
-    columns = (TextColumn("rungs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("levels of detail"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("rungs", total=None)
+        task = bar.add_task("levels", total=None)
 
         def moved(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        return with_rungs(field, cameras, config, moved)
+        return with_levels(field, cameras, config, moved)
 
 
 def training_result(

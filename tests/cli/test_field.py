@@ -131,12 +131,12 @@ def test_a_field_is_slimmed_with_and_without_cameras(
     assert load_field(here / "b.rff").primitives == load_field(here / "c.rff").primitives == 50
 
 
-def test_rungs_are_fitted_to_a_drives_cameras(here: Path, splats: Gaussians, drive: Path) -> None:
+def test_levels_are_fitted_to_a_drives_cameras(here: Path, splats: Gaussians, drive: Path) -> None:
     save_field(SplatField(splats), here / "a.rff")
     FieldRungs(here / "a.rff", drive, here / "b.rff", iterations=5).run()
     field = load_field(here / "b.rff")
     assert isinstance(field, SplatField)
-    assert set(field.rungs) == {0.5, 0.25, 0.1}
+    assert set(field.levels) == {0.5, 0.25, 0.1}
 
 
 def test_a_field_is_looked_at_around_and_along_a_drive(

@@ -39,13 +39,13 @@ def test_a_trained_field_is_found_again(tiny_sample: Path, tmp_path: Path) -> No
     assert (again, again.stat().st_mtime_ns) == (path, written_ns)
 
 
-def test_a_trained_field_is_small_has_rungs_and_says_how_good_it_is(
+def test_a_trained_field_is_small_has_levels_and_says_how_good_it_is(
     tiny_sample: Path, tmp_path: Path
 ) -> None:
     field = load_field(chosen(tiny_sample, tmp_path / "c"))
     assert isinstance(field, SplatField)
     assert "encoding" in field.archive().metadata
-    assert set(field.rungs) == {0.5, 0.25, 0.1}
+    assert set(field.levels) == {0.5, 0.25, 0.1}
     assert field.metadata.held_out_psnr_db is not None
     assert field.metadata.held_out_ssim is not None
 

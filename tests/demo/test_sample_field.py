@@ -26,7 +26,7 @@ def test_the_shipped_field_is_whole_and_small() -> None:
     assert isinstance(field, SplatField)
     assert path.stat().st_size <= MAX_BYTES
     assert path.stat().st_size <= 0.25 * RAW_BYTES_A_SPLAT * field.primitives
-    assert set(field.rungs) == {0.5, 0.25, 0.1}
+    assert set(field.levels) == {0.5, 0.25, 0.1}
 
 
 @pytest.mark.sample

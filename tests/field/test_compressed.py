@@ -15,7 +15,7 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.field import FieldMetadata, Quality, SplatField, load_field, save_field
 from rfcore.field.archive import Archive, decode_archive, encode_archive
-from rfcore.field.quality import DETAILS, Rung, kept_of
+from rfcore.field.quality import DETAILS, LevelOfDetail, kept_of
 from rfcore.field.splat_archive import compressed_archive, splats_of_compressed
 from rfcore.field.splat_grid import BLOCK, Steps, gaussians_of, numbers_of
 from rfcore.field.store import decode_field, encode_field
@@ -28,21 +28,21 @@ STEPS = Steps()
 
 
 def field_of(gaussians: Gaussians, *details: float) -> SplatField:
-    """A field with rungs a little wider than their prefix."""
-    rungs = {}
+    """A field with levels a little wider than their prefix."""
+    levels = {}
     for detail in details:
         kept = kept_of(len(gaussians), detail)
         wider = gaussians.log_scales[:kept] + np.float32(1 / detail / 16)
-        rungs[detail] = Rung(wider, gaussians.opacity_logits[:kept] + np.float32(0.5))
-    return SplatField(gaussians, FieldMetadata("street", held_out_psnr_db=27.0), rungs=rungs)
+        levels[detail] = LevelOfDetail(wider, gaussians.opacity_logits[:kept] + np.float32(0.5))
+    return SplatField(gaussians, FieldMetadata("street", held_out_psnr_db=27.0), levels=levels)
 
 
 def digest_of(field: SplatField) -> str:
-    """SHA-256 over every array of the splats and rungs."""
+    """SHA-256 over every array of the splats and levels."""
     digest = hashlib.sha256()
     for f in fields(Gaussians):
         digest.update(getattr(field.gaussians, f.name).tobytes())
-    for own in field.rungs.values():
+    for own in field.levels.values():
         digest.update(own.log_scales.tobytes() + own.opacity_logits.tobytes())
     return digest.hexdigest()
 
@@ -59,7 +59,7 @@ def test_a_compressed_field_survives_its_file(
     assert back.field_id == field.field_id == field_id
     assert (back.metadata, back.bounds) == (field.metadata, field.bounds)
     assert digest_of(back) == digest_of(field)
-    assert set(back.rungs) == {0.5, 0.1}
+    assert set(back.levels) == {0.5, 0.1}
     assert back.compressed() is back
     assert save_field(back, tmp_path / "b.rff") == field_id, "what was loaded is saved as it was"
 
@@ -117,7 +117,7 @@ def test_splats_far_from_the_origin_keep_what_float32_keeps(make_gaussians) -> N
     assert np.abs(back.means - distant.means).max() <= 2.0 ** (20 - 23) / 2
 
 
-def test_every_rung_keeps_its_splats(make_gaussians) -> None:
+def test_every_level_keeps_its_splats(make_gaussians) -> None:
     """Neighbours are brought together within a band only; opacity tells which splat is which."""
     g = make_gaussians(1000, 0)
     marked = replace(g, opacity_logits=np.arange(1000, dtype=np.float32))
@@ -129,7 +129,7 @@ def test_every_rung_keeps_its_splats(make_gaussians) -> None:
     assert distance < 0.5 * np.linalg.norm(np.diff(g.means[500:], axis=0), axis=1).mean()
 
 
-def test_pictures_of_every_rung_stay_close(make_gaussians) -> None:
+def test_pictures_of_every_level_stay_close(make_gaussians) -> None:
     field = field_of(make_gaussians(700, 1), 0.5, 0.25)
     small = field.compressed()
     for detail in DETAILS:

@@ -1,4 +1,4 @@
-"""A quality is on the ladder or refused, and draws what its rung is defined to draw."""
+"""A quality is on the ladder or refused, and draws what its level is defined to draw."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import FULL, Quality, SplatField, load_field, save_field
-from rfcore.field.quality import DETAILS, Rung, kept_of, splats_of_rung
+from rfcore.field.quality import DETAILS, LevelOfDetail, kept_of, splats_at_detail
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 
@@ -16,7 +16,7 @@ CAMERA = Camera(Intrinsics(30, 20, 20.0, 20.0, 15.0, 10.0), Pose((0, 0, -4), (1,
 
 
 @pytest.mark.parametrize("detail", [0, -1.0, 0.3, 1.5, float("nan")])
-def test_a_share_between_two_rungs_is_refused(detail: float) -> None:
+def test_a_share_between_two_levels_is_refused(detail: float) -> None:
     with pytest.raises(InvalidInput, match=r"quality\.detail: .*none of 1, 0\.5, 0\.25, 0\.1"):
         Quality(detail=detail)
 
@@ -28,7 +28,7 @@ def test_a_knob_out_of_range_is_refused_by_name(knob: dict[str, int]) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 9, 10, 11, 150_000, 10**7 + 3])
-def test_a_rung_holds_its_share_rounded_up(count: int) -> None:
+def test_a_level_holds_its_share_rounded_up(count: int) -> None:
     kept = [kept_of(count, detail) for detail in DETAILS]
     assert kept == [count, -(-count // 2), -(-count // 4), -(-count // 10)]
 
@@ -54,29 +54,29 @@ def test_a_field_draws_the_first_splats_with_the_first_bands(
 
 def test_everything_is_drawn_unless_less_is_asked_for(make_gaussians) -> None:
     field = SplatField(make_gaussians(20))
-    assert splats_of_rung(field.gaussians, {}, 1.0) is field.gaussians, "and nothing is copied"
+    assert splats_at_detail(field.gaussians, {}, 1.0) is field.gaussians, "and nothing is copied"
     assert field.render_colour(CAMERA).tobytes() == field.render_colour(CAMERA, FULL).tobytes()
 
 
-def test_the_renderer_of_a_rung_is_made_once_and_only_when_asked_for(make_gaussians) -> None:
+def test_the_renderer_of_a_level_is_made_once_and_only_when_asked_for(make_gaussians) -> None:
     field = SplatField(make_gaussians(20, 1))
     half = field.rasterizer(0.5)
     assert field.rasterizer(0.5) is half
     assert field.rasterizer() is not half
 
 
-def test_a_rung_with_scales_and_opacities_of_its_own_is_drawn_with_them(
+def test_a_level_with_scales_and_opacities_of_its_own_is_drawn_with_them(
     make_gaussians, tmp_path: Path
 ) -> None:
     g, other = make_gaussians(21, 1), make_gaussians(11, 1, seed=1)
-    own = Rung(other.log_scales, other.opacity_logits)
-    save_field(SplatField(g, rungs={0.5: own}), tmp_path / "a.rff")
+    own = LevelOfDetail(other.log_scales, other.opacity_logits)
+    save_field(SplatField(g, levels={0.5: own}), tmp_path / "a.rff")
     field = load_field(tmp_path / "a.rff")
     drawn = (g.means[:11], g.quaternions[:11], own.log_scales, own.opacity_logits, g.sh[:11])
     want = Rasterizer(Gaussians(*drawn)).render_colour(CAMERA)
     np.testing.assert_array_equal(field.render_colour(CAMERA, Quality(0.5)), want)
     np.testing.assert_array_equal(field.render_colour(CAMERA), Rasterizer(g).render_colour(CAMERA))
-    plain = Rasterizer(splats_of_rung(g, {}, 0.25)).render_colour(CAMERA)
+    plain = Rasterizer(splats_at_detail(g, {}, 0.25)).render_colour(CAMERA)
     np.testing.assert_array_equal(field.render_colour(CAMERA, Quality(0.25)), plain)
 
 
@@ -88,9 +88,9 @@ def test_a_rung_with_scales_and_opacities_of_its_own_is_drawn_with_them(
         (1.0, 21, 0.0, r"1\.0 is none of \(0\.5, 0\.25, 0\.1\)"),
     ],
 )
-def test_a_rung_that_does_not_fit_is_refused_by_name(
+def test_a_level_that_does_not_fit_is_refused_by_name(
     make_gaussians, detail: float, count: int, value: float, named: str
 ) -> None:
-    own = Rung(np.full((count, 3), value, np.float32), np.full(count, value, np.float32))
+    own = LevelOfDetail(np.full((count, 3), value, np.float32), np.full(count, value, np.float32))
     with pytest.raises(InvalidInput, match=named):
-        SplatField(make_gaussians(21), rungs={detail: own})
+        SplatField(make_gaussians(21), levels={detail: own})

@@ -6,7 +6,7 @@ import pytest
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.field.importance import most_important_first, reordered, visible_area
-from rfcore.train.rungs import RungConfig
+from rfcore.train.levels import LevelFitConfig
 from rfedge.fields.slim import slimmed
 
 
@@ -32,7 +32,7 @@ def test_keeping_all_keeps_the_picture(place) -> None:
 def test_cameras_make_the_choice_better_and_fitting_better_still(place) -> None:
     cameras = [picture.camera for picture in place.pictures]
     blind = error(slimmed(place.field, 120), place)
-    fitted = error(slimmed(place.field, 120, cameras, RungConfig(iterations=90)), place)
+    fitted = error(slimmed(place.field, 120, cameras, LevelFitConfig(iterations=90)), place)
     g = place.field.gaussians
     plain = SplatField(reordered(g, most_important_first(visible_area(g))[:120]))
     assert fitted < 0.8 * blind

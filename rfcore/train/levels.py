@@ -1,8 +1,8 @@
-"""Fits the lower rungs of a splat field to its full rung, without training pictures.
+"""Fits the lower levels of detail of a splat field to the full field, without training pictures.
 
-The splats are put in order of what they contribute to the cameras given. A rung is then the first
+The splats are put in order of what they contribute to the cameras given. A level is then the first
 of them, and to fill the gaps its scales and opacities are optimised against the full field's own
-renders; means, rotations and colours stay, so a rung costs four numbers a splat and no more.
+renders; means, rotations and colours stay, so a level costs four numbers a splat and no more.
 
 Measured on the held-out drive of the first sample (150k splats, 27.14 dB), half of the splats:
 prefix alone 24.22 dB; all wider by e^0.1, 25.48 dB; opacities and scales fitted for 240 / 360
@@ -19,29 +19,29 @@ import numpy as np
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.field.importance import contributions, most_important_first, reordered
-from rfcore.field.quality import DETAILS, Rung, Rungs, kept_of
+from rfcore.field.quality import DETAILS, LevelOfDetail, LevelsOfDetail, kept_of
 from rfcore.field.splats import SplatField
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfcore.train.schedule import view_order
 
-__all__ = ["Progress", "RungConfig", "fitted", "with_rungs"]
+__all__ = ["LevelFitConfig", "Progress", "fitted", "with_levels"]
 
 Progress = Callable[[int, int], None]
 """Told how many steps are done and how many there are."""
 
 
 @dataclass(frozen=True)
-class RungConfig:
+class LevelFitConfig:
     """How to fit. ``threads`` changes how long it takes, nothing else."""
 
     iterations: int = 240
-    """Per rung; 0 leaves every rung a plain prefix."""
+    """Per level; 0 leaves every level a plain prefix."""
     log_scales_rate: float = 2e-2
     opacity_rate: float = 5e-2
     widening: float = 0.15
-    """Added to the log scales before the first iteration of each rung."""
+    """Added to the log scales before the first iteration of each level."""
     final_factor: float = 0.02
     """What is left of the rates at the end; they fall in the second half."""
     seed: int = 0
@@ -49,10 +49,10 @@ class RungConfig:
 
     def __post_init__(self) -> None:
         if not 0 <= self.iterations <= 1_000_000:
-            raise InvalidInput("rungs.iterations", f"{self.iterations} is outside 0..1000000")
+            raise InvalidInput("levels.iterations", f"{self.iterations} is outside 0..1000000")
         for name in ("log_scales_rate", "opacity_rate", "widening", "final_factor"):
             if not 0 < getattr(self, name) <= 1:
-                raise InvalidInput(f"rungs.{name}", f"{getattr(self, name)} is outside 0..1")
+                raise InvalidInput(f"levels.{name}", f"{getattr(self, name)} is outside 0..1")
 
     def rates(self, progress: float) -> LearningRates:
         """Return Adam's rates at ``progress`` 0..1."""
@@ -67,33 +67,35 @@ class RungConfig:
         )
 
 
-def with_rungs(
+def with_levels(
     field: SplatField,
     cameras: Sequence[Camera],
-    config: RungConfig | None = None,
+    config: LevelFitConfig | None = None,
     progress: Progress | None = None,
 ) -> SplatField:
-    """Return the field with its splats in order of importance and its lower rungs fitted.
+    """Return the field with its splats in order of importance and its lower levels fitted.
 
-    ``cameras`` are those the field is to be seen from, as the training views'. The full rung draws
+    ``cameras`` are those the field is to be seen from, as the training views'. The full level draws
     the same splats as before. Raises ``InvalidInput`` when there is no camera.
     """
-    settings = config if config is not None else RungConfig()
+    settings = config if config is not None else LevelFitConfig()
     antialiased = field.metadata.antialiased
     weights = contributions(
         field.gaussians, cameras, threads=settings.threads, antialiased=antialiased
     )
     ordered = reordered(field.gaussians, most_important_first(weights))
     wanted = len(ordered) and settings.iterations
-    rungs = _rungs(ordered, antialiased, cameras, settings, progress) if wanted else {}
-    return SplatField(ordered, field.metadata, rungs=rungs, threads=settings.threads, isa=field.isa)
+    levels = _fitted_levels(ordered, antialiased, cameras, settings, progress) if wanted else {}
+    return SplatField(
+        ordered, field.metadata, levels=levels, threads=settings.threads, isa=field.isa
+    )
 
 
 def fitted(
     start: Gaussians,
     target: Rasterizer,
     cameras: Sequence[Camera],
-    config: RungConfig,
+    config: LevelFitConfig,
     progress: Progress | None = None,
 ) -> Gaussians:
     """Return ``start`` with scales and opacities that bring its pictures nearest to ``target``'s.
@@ -114,17 +116,17 @@ def fitted(
     return rasterizer.gaussians()
 
 
-def _rungs(
+def _fitted_levels(
     gaussians: Gaussians,
     antialiased: bool,
     cameras: Sequence[Camera],
-    config: RungConfig,
+    config: LevelFitConfig,
     progress: Progress | None,
-) -> Rungs:
-    """Fit every rung, each starting from the one above it."""
+) -> LevelsOfDetail:
+    """Fit every level, each starting from the one above it."""
     full = Rasterizer(gaussians, threads=config.threads, antialiased=antialiased)
     above = gaussians
-    rungs: dict[float, Rung] = {}
+    levels: dict[float, LevelOfDetail] = {}
     for number, detail in enumerate(DETAILS[1:]):
 
         def moved(done: int, total: int, before: int = number) -> None:
@@ -134,8 +136,8 @@ def _rungs(
         kept = np.arange(kept_of(len(gaussians), detail))
         start = _widened(reordered(above, kept), config.widening)
         above = fitted(start, full, cameras, config, moved)
-        rungs[detail] = Rung(above.log_scales, above.opacity_logits)
-    return rungs
+        levels[detail] = LevelOfDetail(above.log_scales, above.opacity_logits)
+    return levels
 
 
 def _widened(gaussians: Gaussians, widening: float) -> Gaussians:

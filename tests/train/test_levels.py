@@ -1,4 +1,4 @@
-"""A fitted rung shows the full field better than a prefix; the full rung stays as it was."""
+"""A fitted level shows the full field better than a prefix; the full level stays as it was."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import FieldMetadata, Quality, SplatField
 from rfcore.field.quality import DETAILS
 from rfcore.raster.gaussians import Gaussians
-from rfcore.train.rungs import RungConfig, with_rungs
+from rfcore.train.levels import LevelFitConfig, with_levels
 
 INTRINSICS = Intrinsics(60, 40, 40.0, 40.0, 30.0, 20.0)
 CAMERAS = [Camera(INTRINSICS, Pose((x / 4, 0, 0), (1, 0, 0, 0))) for x in range(-3, 4)]
@@ -35,34 +35,37 @@ def error(field: SplatField, full: SplatField, detail: float) -> float:
     return float(np.sqrt(np.mean(np.square(differences))))
 
 
-def test_fitted_rungs_show_the_full_field_better_than_prefixes(field: SplatField) -> None:
+def test_fitted_levels_show_the_full_field_better_than_prefixes(field: SplatField) -> None:
     steps: list[tuple[int, int]] = []
-    plain = with_rungs(field, CAMERAS, RungConfig(iterations=0))
-    fitted = with_rungs(
-        field, CAMERAS, RungConfig(iterations=60), lambda done, total: steps.append((done, total))
+    plain = with_levels(field, CAMERAS, LevelFitConfig(iterations=0))
+    fitted = with_levels(
+        field,
+        CAMERAS,
+        LevelFitConfig(iterations=60),
+        lambda done, total: steps.append((done, total)),
     )
-    assert error(fitted, field, 1.0) < 1e-3, "order aside, the full rung is the field"
+    assert error(fitted, field, 1.0) < 1e-3, "order aside, the full level is the field"
     for detail in DETAILS[1:]:
         assert error(fitted, field, detail) < 0.7 * error(plain, field, detail)
     assert steps == [(i + 1, 180) for i in range(180)]
     assert fitted.metadata == field.metadata
 
 
-def test_the_same_field_and_cameras_give_the_same_rungs(field: SplatField) -> None:
+def test_the_same_field_and_cameras_give_the_same_levels(field: SplatField) -> None:
     ids = {
-        with_rungs(field, CAMERAS, RungConfig(iterations=3, threads=threads)).field_id
+        with_levels(field, CAMERAS, LevelFitConfig(iterations=3, threads=threads)).field_id
         for threads in (1, 3)
     }
     assert len(ids) == 1
 
 
-def test_an_empty_field_has_empty_rungs() -> None:
+def test_an_empty_field_has_empty_levels() -> None:
     nothing = Gaussians(*(np.zeros((0, *s), "f4") for s in ((3,), (4,), (3,), (), (1, 3))))
-    empty = with_rungs(SplatField(nothing), CAMERAS)
+    empty = with_levels(SplatField(nothing), CAMERAS)
     assert not empty.render_colour(CAMERAS[0], Quality(0.1)).any()
 
 
 @pytest.mark.parametrize("wrong", [{"iterations": -1}, {"widening": 0.0}, {"opacity_rate": 2.0}])
 def test_settings_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
-    with pytest.raises(InvalidInput, match=f"rungs.{next(iter(wrong))}"):
-        RungConfig(**wrong)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match=f"levels.{next(iter(wrong))}"):
+        LevelFitConfig(**wrong)  # type: ignore[arg-type]
