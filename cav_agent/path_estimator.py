@@ -1,17 +1,18 @@
-"""What a path takes, from when packets were sent and when their answers came.
+"""How long a network path takes for a packet, from when packets were sent and answered.
 
-A path delays a packet of B bytes by ``base + B * cost`` after the packets before it; ``base`` is
-propagation, answer and the receiver's own time. Nobody tells the two apart: packets much like one
-another fit any base from 0 to the shortest delay seen. So both ends of that range are asked, and
-the smaller answer counts:
+A packet of B bytes is answered ``min_rtt + B * cost`` after the packets before it were delivered:
+``min_rtt`` is propagation, the answer's way back and the receiver's own time, ``cost`` the time of
+a byte on the bottleneck. Delivery samples (size, round-trip time) do not tell the two apart:
+packets of much the same size fit any ``min_rtt`` from 0 to the shortest round trip. So both ends of
+that range are considered, and the smaller room counts:
 
-* base 0: a packet that took T for B bytes proves that B * X / T bytes take no longer than X, for
-  any X >= T. So quality climbs by what was proven, a frame at a time.
-* base = the shortest delay of the last seconds: what is beyond it is cost, the worse of the newest
-  packet's and the running mean's. So a rate that fell is believed at the first late packet.
+* ``min_rtt`` 0: a sample of B bytes in T means that B * X / T bytes take no longer than X, for any
+  X >= T. So quality climbs by what was delivered, a frame at a time.
+* ``min_rtt`` = the shortest round trip of the last seconds: time beyond it is cost, the worse of
+  the newest sample's and the running mean's. So a rate that fell shows in the first late packet.
 
-An unanswered packet that is overdue raises the cost before its answer does. A machine without
-clock: ``now_ns`` is an argument, from any clock that does not run backwards.
+A packet in flight that is overdue raises the cost before its answer does. No clock is read:
+``now_ns`` is an argument, from any clock that does not run backwards.
 """
 
 from __future__ import annotations
@@ -27,29 +28,33 @@ __all__ = ["PathEstimator"]
 FIRST_NS_PER_BYTE = 8_000.0
 """Before the first answer: 1 Mbit/s, which every access network that carries video has."""
 
-BASE_MEMORY_NS = 10_000_000_000
-"""Routes and radio cells change; a base delay older than 10 s is forgotten."""
+MIN_RTT_WINDOW_NS = 10_000_000_000
+"""Routes and radio cells change; a shortest round trip older than 10 s is forgotten."""
 
-PROOFS = 8
-"""Answers that may prove what the path carries: most of a second at 10 Hz."""
+DELIVERY_SAMPLES = 8
+"""Answers that tell what the path carries: most of a second at 10 Hz."""
 
-MEMORY = 0.7
-"""Weight of what was known, when an answer comes."""
+MEAN_MEMORY = 0.7
+"""Weight of the running mean so far, when an answer comes."""
 
-WEIGHTY = 0.5
+TELLING_SIZE = 0.5
 """Share of the mean size from which one packet alone may tell the cost: jitter drowns less."""
 
 
 @dataclass(frozen=True)
-class _Flying:
+class _InFlight:
+    """A packet without an answer yet."""
+
     size_bytes: int
     sent_ns: int
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _DeliverySample:
+    """An answered packet; ``rtt_ns`` does not hold the wait behind the packets before it."""
+
     size_bytes: int
-    delay_ns: int
+    rtt_ns: int
     at_ns: int
 
 
@@ -60,49 +65,50 @@ class PathEstimator:
     """
 
     def __init__(self) -> None:
-        self._flying: dict[Hashable, _Flying] = {}
-        self._proofs: deque[_Seen] = deque(maxlen=PROOFS)
-        self._shortest: deque[_Seen] = deque()
+        self._in_flight: dict[Hashable, _InFlight] = {}
+        self._samples: deque[_DeliverySample] = deque(maxlen=DELIVERY_SAMPLES)
+        self._shortest: deque[_DeliverySample] = deque()
+        """Samples of the window that none after them undercuts: the first has the minimum."""
         self._answered_ns: int | None = None
         self._mean_bytes = 0.0
-        self._mean_delay_ns = 0.0
+        self._mean_rtt_ns = 0.0
 
     @property
-    def flying_bytes(self) -> int:
+    def bytes_in_flight(self) -> int:
         """Bytes sent and not answered."""
-        return sum(packet.size_bytes for packet in self._flying.values())
+        return sum(packet.size_bytes for packet in self._in_flight.values())
 
     @property
-    def base_ns(self) -> int:
-        """The shortest delay of the last seconds, an upper bound of the base; 0 before any."""
-        return self._shortest[0].delay_ns if self._shortest else 0
+    def min_rtt_ns(self) -> int:
+        """The shortest round trip of the last seconds; 0 before any."""
+        return self._shortest[0].rtt_ns if self._shortest else 0
 
     @property
     def rate_bps(self) -> float | None:
-        """Bits per second that the last answers prove, their base delay counted as transmission:
-        no more than the path has. None before the first answer."""
-        if not self._proofs:
+        """Bits per second that the last answers prove, all of their round trips counted as
+        transmission: no more than the path has. None before the first answer."""
+        if not self._samples:
             return None
-        return max(8e9 * seen.size_bytes / max(seen.delay_ns, 1) for seen in self._proofs)
+        return max(8e9 * sample.size_bytes / max(sample.rtt_ns, 1) for sample in self._samples)
 
     def sent(self, key: Hashable, size_bytes: int, now_ns: int) -> None:
         """A packet of ``size_bytes`` went out."""
         if size_bytes < 1:
             raise InvalidInput("packet.size_bytes", f"{size_bytes} must be at least 1")
-        self._flying[key] = _Flying(size_bytes, now_ns)
+        self._in_flight[key] = _InFlight(size_bytes, now_ns)
 
     def lost(self, key: Hashable) -> None:
         """No answer will come, or one that says nothing of the path; unknown keys are ignored."""
-        self._flying.pop(key, None)
+        self._in_flight.pop(key, None)
 
     def answered(self, key: Hashable, now_ns: int) -> None:
         """The answer to ``key`` came; unknown keys are ignored."""
-        packet = self._flying.pop(key, None)
+        packet = self._in_flight.pop(key, None)
         if packet is None:
             return
-        delay_ns = max(1, now_ns - self._start_ns(packet, self._answered_ns))
+        rtt_ns = max(1, now_ns - self._start_ns(packet, self._answered_ns))
         self._answered_ns = now_ns
-        self._learn(_Seen(packet.size_bytes, delay_ns, now_ns))
+        self._add(_DeliverySample(packet.size_bytes, rtt_ns, now_ns))
 
     def room_bytes(self, ready_ns: int, due_ns: int, now_ns: int) -> float:
         """Return how large a packet sent at ``ready_ns`` may be to be answered by ``due_ns``.
@@ -110,11 +116,11 @@ class PathEstimator:
         0 or less when even an empty one would be late.
         """
         cost, free_ns = self._outlook(now_ns)
-        spare_ns = due_ns - max(ready_ns, free_ns - self.base_ns)
-        room = (spare_ns - self.base_ns) / cost if cost else float("inf")
-        if not self._proofs:
+        spare_ns = due_ns - max(ready_ns, free_ns - self.min_rtt_ns)
+        room = (spare_ns - self.min_rtt_ns) / cost if cost else float("inf")
+        if not self._samples:
             return min(room, spare_ns / FIRST_NS_PER_BYTE)
-        proven = max(seen.size_bytes / seen.delay_ns for seen in self._proofs)
+        proven = max(sample.size_bytes / sample.rtt_ns for sample in self._samples)
         return min(room, spare_ns * proven)
 
     def sustained_bytes(self, interval_ns: float, now_ns: int) -> float:
@@ -122,50 +128,51 @@ class PathEstimator:
         cost, _ = self._outlook(now_ns)
         return interval_ns / cost if cost else float("inf")
 
-    def _learn(self, seen: _Seen) -> None:
-        if self._is_surprise(seen):
-            self._proofs.clear()
-        self._proofs.append(seen)
-        while self._shortest and self._shortest[-1].delay_ns >= seen.delay_ns:
+    def _add(self, sample: _DeliverySample) -> None:
+        if self._outdates_others(sample):
+            self._samples.clear()
+        self._samples.append(sample)
+        while self._shortest and self._shortest[-1].rtt_ns >= sample.rtt_ns:
             self._shortest.pop()
-        self._shortest.append(seen)
-        while self._shortest[0].at_ns < seen.at_ns - BASE_MEMORY_NS:
+        self._shortest.append(sample)
+        while self._shortest[0].at_ns < sample.at_ns - MIN_RTT_WINDOW_NS:
             self._shortest.popleft()
-        keep = MEMORY if self._mean_bytes else 0.0
-        self._mean_bytes = keep * self._mean_bytes + (1 - keep) * seen.size_bytes
-        self._mean_delay_ns = keep * self._mean_delay_ns + (1 - keep) * seen.delay_ns
+        keep = MEAN_MEMORY if self._mean_bytes else 0.0
+        self._mean_bytes = keep * self._mean_bytes + (1 - keep) * sample.size_bytes
+        self._mean_rtt_ns = keep * self._mean_rtt_ns + (1 - keep) * sample.rtt_ns
 
-    def _is_surprise(self, seen: _Seen) -> bool:
-        """Whether some larger packet took half the time or less: its proof is out of date."""
+    def _outdates_others(self, sample: _DeliverySample) -> bool:
+        """Tell whether a packet no larger than an earlier one took twice its time or more."""
         return any(
-            proof.size_bytes >= seen.size_bytes and 2 * proof.delay_ns <= seen.delay_ns
-            for proof in self._proofs
+            other.size_bytes >= sample.size_bytes and 2 * other.rtt_ns <= sample.rtt_ns
+            for other in self._samples
         )
 
     def _cost(self) -> float:
-        """Return nanoseconds per byte beyond the base."""
-        if not self._proofs:
+        """Return nanoseconds per byte beyond the shortest round trip."""
+        if not self._samples:
             return FIRST_NS_PER_BYTE
-        cost = max(0.0, self._mean_delay_ns - self.base_ns) / self._mean_bytes
-        newest = self._proofs[-1]
-        if newest.size_bytes >= WEIGHTY * self._mean_bytes:
-            cost = max(cost, (newest.delay_ns - self.base_ns) / newest.size_bytes)
+        cost = max(0.0, self._mean_rtt_ns - self.min_rtt_ns) / self._mean_bytes
+        newest = self._samples[-1]
+        if newest.size_bytes >= TELLING_SIZE * self._mean_bytes:
+            cost = max(cost, (newest.rtt_ns - self.min_rtt_ns) / newest.size_bytes)
         return cost
 
     def _outlook(self, now_ns: int) -> tuple[float, int]:
-        """Return the cost per byte, and when all that flies will have been answered."""
+        """Return the cost per byte, and when all that is in flight will have been answered."""
         cost, free_ns = self._cost(), self._answered_ns
-        for packet in self._flying.values():
+        for packet in self._in_flight.values():
             start_ns = self._start_ns(packet, free_ns)
-            free_ns = start_ns + self.base_ns + round(cost * packet.size_bytes)
+            free_ns = start_ns + self.min_rtt_ns + round(cost * packet.size_bytes)
             overdue_ns = now_ns - free_ns
             if overdue_ns > 0:
-                cost = max(cost, (now_ns - start_ns - self.base_ns) / packet.size_bytes)
+                cost = max(cost, (now_ns - start_ns - self.min_rtt_ns) / packet.size_bytes)
                 free_ns = now_ns + overdue_ns
         return cost, now_ns if free_ns is None else free_ns
 
-    def _start_ns(self, packet: _Flying, before_ns: int | None) -> int:
-        """Return when the path turned to ``packet``: as it was sent, or as the one before left."""
-        return (
-            packet.sent_ns if before_ns is None else max(packet.sent_ns, before_ns - self.base_ns)
-        )
+    def _start_ns(self, packet: _InFlight, before_ns: int | None) -> int:
+        """Return when the path began with ``packet``: when it was sent, or when the packet before
+        it, answered at ``before_ns``, had left the bottleneck."""
+        if before_ns is None:
+            return packet.sent_ns
+        return max(packet.sent_ns, before_ns - self.min_rtt_ns)

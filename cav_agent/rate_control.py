@@ -86,14 +86,14 @@ class RateControl:
 
     def is_late(self, captured_s: float, now: float) -> bool:
         """Whether a picture has waited so long that not even an empty frame would be in time."""
-        least_s = self._work_s + self._path.base_ns / 1e9
+        least_s = self._work_s + self._path.min_rtt_ns / 1e9
         left_s = self._max_delay_s - least_s
         return now - captured_s > (left_s if left_s > 0 else self._max_delay_s)
 
     def budget(self, captured_s: float, now: float) -> ByteBudget | None:
         """Return what the picture of ``captured_s`` may take if coding begins ``now``; None while
         it had better wait for an answer."""
-        if self._path.flying_bytes and self._room_bytes(captured_s, now, 1.0) < LEAST_BYTES:
+        if self._path.bytes_in_flight and self._room_bytes(captured_s, now, 1.0) < LEAST_BYTES:
             return None
         room = self._share * self._room_bytes(captured_s, now, SHARE)
         if self._interval_s:

@@ -12,12 +12,12 @@ from rfcore.errors import InvalidInput
 MS = 1_000_000
 
 
-def answered(path: PathEstimator, sizes: list[int], base_ms: float, ns_per_byte: float) -> int:
+def answered(path: PathEstimator, sizes: list[int], min_rtt_ms: float, ns_per_byte: float) -> int:
     """Send packets one after the other, each after the answer to the last; return the time."""
     now = 0
     for key, size_bytes in enumerate(sizes):
         path.sent(key, size_bytes, now)
-        now += round(base_ms * MS + ns_per_byte * size_bytes)
+        now += round(min_rtt_ms * MS + ns_per_byte * size_bytes)
         path.answered(key, now)
         now += 10 * MS
     return now
@@ -25,23 +25,23 @@ def answered(path: PathEstimator, sizes: list[int], base_ms: float, ns_per_byte:
 
 @given(
     sizes=st.lists(st.integers(200, 100_000), min_size=1, max_size=20),
-    base_ms=st.floats(0, 200),
+    min_rtt_ms=st.floats(0, 200),
     ns_per_byte=st.floats(80, 80_000),
     spare_ms=st.integers(1, 1000),
 )
-@example(sizes=[295], base_ms=0.0, ns_per_byte=81.5, spare_ms=1)
+@example(sizes=[295], min_rtt_ms=0.0, ns_per_byte=81.5, spare_ms=1)
 def test_what_it_says_has_room_has(
-    sizes: list[int], base_ms: float, ns_per_byte: float, spare_ms: int
+    sizes: list[int], min_rtt_ms: float, ns_per_byte: float, spare_ms: int
 ) -> None:
     """On a steady path, wherever its delay is above that of the shortest packet."""
     path = PathEstimator()
-    now = answered(path, sizes, base_ms, ns_per_byte)
+    now = answered(path, sizes, min_rtt_ms, ns_per_byte)
     spare_ns = spare_ms * MS
     room = path.room_bytes(now, now + spare_ns, now)
-    shortest_ns = base_ms * MS + ns_per_byte * min(sizes)
+    shortest_ns = min_rtt_ms * MS + ns_per_byte * min(sizes)
     slack = 1 + 1e-6 + 1 / shortest_ns  # delays are whole nanoseconds
-    if spare_ns >= base_ms * MS + ns_per_byte * max(sizes):
-        assert base_ms * MS + ns_per_byte * room <= spare_ns * slack
+    if spare_ns >= min_rtt_ms * MS + ns_per_byte * max(sizes):
+        assert min_rtt_ms * MS + ns_per_byte * room <= spare_ns * slack
     elif spare_ns < shortest_ns:
         assert room <= min(sizes) * spare_ns / shortest_ns * slack
 
@@ -53,7 +53,7 @@ def test_what_it_says_has_room_has(
 def test_later_is_never_less_room(sizes: list[int], waits_ms: list[int]) -> None:
     path = PathEstimator()
     now = answered(path, sizes, 20, 1000)
-    path.sent("flying", 5000, now)
+    path.sent("in flight", 5000, now)
     rooms = [path.room_bytes(now, now + wait * MS, now) for wait in sorted(waits_ms)]
     assert rooms == sorted(rooms)
     assert not any(room != room for room in rooms), "NaN"
@@ -81,11 +81,11 @@ def test_an_overdue_packet_leaves_no_room_before_its_answer() -> None:
 
 def test_what_waits_before_it_takes_from_the_room() -> None:
     rooms = []
-    for flying in range(4):
+    for packets_in_flight in range(4):
         path = PathEstimator()
         now = answered(path, [1000, 8000, 2000, 8000], 20, 1000)
-        for key in range(flying):
-            path.sent(f"flying {key}", 20_000, now)
+        for key in range(packets_in_flight):
+            path.sent(f"in flight {key}", 20_000, now)
         rooms.append(path.room_bytes(now, now + 200 * MS, now))
     assert all(more > less for more, less in itertools.pairwise(rooms))
 
@@ -103,10 +103,31 @@ def test_a_fallen_rate_is_believed_at_once() -> None:
 def test_packets_without_answer_are_forgotten() -> None:
     path = PathEstimator()
     path.sent("a", 1000, 0)
-    assert path.flying_bytes == 1000
+    assert path.bytes_in_flight == 1000
     path.lost("a")
     path.lost("unknown")
     path.answered("unknown", 5)
-    assert path.flying_bytes == 0
+    assert path.bytes_in_flight == 0
     with pytest.raises(InvalidInput, match=r"packet\.size_bytes: 0"):
         path.sent("b", 0, 0)
+
+
+def test_the_shortest_round_trip_is_forgotten_after_ten_seconds() -> None:
+    path = PathEstimator()
+    assert path.min_rtt_ns == 0
+    for key, (sent_ms, rtt_ms) in enumerate([(0, 20), (1_000, 35), (5_000, 30), (10_100, 40)]):
+        path.sent(key, 1000, sent_ms * MS)
+        path.answered(key, (sent_ms + rtt_ms) * MS)
+    assert path.min_rtt_ns == 30 * MS, "20 ms came 10.12 s ago, 35 ms was undercut"
+
+
+def test_a_wait_behind_another_packet_is_not_the_paths() -> None:
+    """Two packets sent at once: the second is answered when the bottleneck has had both."""
+    path = PathEstimator()
+    now = answered(path, [1000] * 8, 20, 1000)
+    path.sent("first", 10_000, now)
+    path.sent("second", 10_000, now)
+    path.answered("first", now + 20 * MS + 10_000 * 1000)
+    path.answered("second", now + 20 * MS + 20_000 * 1000)
+    cost = 100 * MS / path.sustained_bytes(100 * MS, now + 40 * MS)
+    assert cost == pytest.approx(1000, rel=0.02), "1900 if the wait counted as the path's time"
