@@ -1,12 +1,12 @@
-"""The receiver: slices back into frames, against pictures it makes itself.
+"""The receiver: decodes slices into frames, against pictures it makes itself.
 
-Why a packet carries what it does: losing a P slice, or one flipped bit in it, can go unnoticed in a
-standard decoder (ITU-T H.264 says nothing about damaged streams). So the receiver compares, in this
-order, epoch, sequence, CRC, the digest of its render, the earlier frame that is needed, the shape
-of the payload, and at last the digest of what it decoded.
+A standard decoder may not notice a lost P slice or a flipped bit in one (ITU-T H.264 does not
+define what damaged streams decode to). So a packet carries digests, and the receiver checks, in
+this order: epoch, sequence, CRC, the digest of its render, that the earlier frame is kept here, the
+form of the payload, and at last the digest of the decoded picture.
 
-With inexact renderers an error would be handed on from frame to frame, so only references made at
-the frame's own pose are taken then.
+With inexact renderers an error would pass on from frame to frame, so then only the render may be
+predicted from.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _stopped_clock() -> int:
 
 @dataclass(frozen=True)
 class Decoded:
-    """A frame and the receiver's next state; ``lost`` packets are missing right before this one.
+    """A frame and the receiver's next state; ``lost`` packets are missing right before it.
 
     ``exact``: the frame is the sender's to the bit; otherwise the render differed by rounding.
     ``stage_ns`` has "references" (checks, making what is not the render), "splice" (the references
@@ -55,7 +55,7 @@ class Decoded:
 
 
 class DeltaDecoder:
-    """The receiver. Raises ``InvalidInput`` for a header our encoder would not make.
+    """Decodes packets one by one. Raises ``InvalidInput`` for a header our encoder would not make.
 
     With ``exact=False`` the sender's renderer may differ by rounding: a render of another digest
     but of the same block means, up to rounding, is accepted, and its reconstruction cannot be
@@ -77,7 +77,7 @@ class DeltaDecoder:
         self._clock_ns = clock_ns
 
     def close(self) -> None:
-        """Let go of the standard decoder."""
+        """Release the standard decoder."""
         self._splice.close()
 
     def start(self, epoch: int, after: DecoderState | None = None) -> DecoderState:
@@ -176,7 +176,7 @@ class DeltaDecoder:
             raise PacketRejected(RejectReason.MALFORMED_PAYLOAD, str(error)) from error
 
     def _reconstruct(self, packet: DeltaPacket, pictures: tuple[I420, ...]) -> tuple[int, I420]:
-        """Return the time at which the references stood, and the decoded frame."""
+        """Return the time at which the decoder held the references, and the decoded frame."""
         if not packet.payload:
             return self._clock_ns(), without_zeros(pictures[0])
         try:

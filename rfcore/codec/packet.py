@@ -1,4 +1,4 @@
-"""The delta packet: one slice with everything a receiver needs to trust or refuse it."""
+"""The delta packet: one slice with everything a receiver needs to verify or refuse it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ __all__ = ["BASE_DIGEST_BYTES", "DIGEST_BYTES", "DeltaPacket"]
 DIGEST_BYTES = 16
 
 BASE_DIGEST_BYTES = 4
-"""Enough to tell a handful of kept frames apart; two of the same name end in the reconstruction's
-digest, not in a wrong picture."""
+"""Enough to tell a few kept frames apart. Should two begin alike, the check of the reconstruction's
+digest fails; no wrong picture is shown."""
 
 _UINT32, _UINT64 = 1 << 32, 1 << 64
 _DIGEST, _BLOCK_MEANS, _NOTHING = (DIGEST_BYTES,), (0, BLOCK_MEANS_BYTES), (0,)

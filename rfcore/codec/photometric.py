@@ -1,4 +1,4 @@
-"""The photometric side channel: a render under another light, made alike by both ends.
+"""The photometric side channel: a render under another light, computed alike by both ends.
 
 When the scene is lit otherwise than the field was, the sender finds the matrix M [3, 4] that maps
 the render's (Y, U, V, 1) closest to the frame's (Y, U, V), and sends it in 12 numbers. Both ends
@@ -60,7 +60,7 @@ def adapt(render: I420, photometric: Photometric) -> I420:
     height, width = luma.shape
     chroma_for_luma = m[0, 1] * u + m[0, 2] * v + m[0, 3]
     y_out = m[0, 0] * luma + chroma_for_luma.repeat(2, 0).repeat(2, 1)[:height, :width]
-    mean = _block_means(luma)
+    mean = _luma_at_chroma(luma)
     u_out, v_out = (m[row, 0] * mean + m[row, 1] * u + m[row, 2] * v + m[row, 3] for row in (1, 2))
     return I420(*(_levels(p, b) for p, b in zip((y_out, u_out, v_out), _BLACK, strict=True)))
 
@@ -69,7 +69,7 @@ def solve(frame: I420, render: I420) -> Photometric:
     """Return the matrix that maps ``render`` closest to ``frame``.
 
     Least squares over about 90x90 blocks of 2x2 px, three times, each time with blocks further than
-    twice the median off left out: those show what the field has never seen.
+    twice the median off left out: those show what is not in the field.
     """
     source, target = _samples(render), _samples(frame)
     keep = np.ones(len(source), bool)
@@ -85,15 +85,15 @@ def solve(frame: I420, render: I420) -> Photometric:
 
 def _samples(picture: I420) -> F64:
     """Return [N, 4]: Y, U, V without offsets, and 1, of evenly spread 2x2 blocks."""
-    luma = _block_means(picture.y.astype(np.int32) - _BLACK[0])
+    luma = _luma_at_chroma(picture.y.astype(np.int32) - _BLACK[0])
     planes = (luma, picture.u.astype(np.int32) - 128, picture.v.astype(np.int32) - 128)
     step = max(1, min(luma.shape) // _SAMPLES_PER_SIDE)
     columns = [plane[::step, ::step].ravel() for plane in planes]
     return np.stack([*columns, np.ones_like(columns[0])], axis=1).astype(np.float64)
 
 
-def _block_means(luma: I32) -> I32:
-    """Return the means of 2x2 blocks, rounded half up."""
+def _luma_at_chroma(luma: I32) -> I32:
+    """Return the means of 2x2 luma blocks, one for each chroma sample, rounded half up."""
     height, width = luma.shape
     if height % 2 or width % 2:
         luma = np.pad(luma, ((0, height % 2), (0, width % 2)), mode="edge")

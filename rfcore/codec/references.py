@@ -1,12 +1,12 @@
 """Which pictures a frame is predicted from, and in which order.
 
-All of them both ends can make: the field's *render* at the frame's pose; the *previous* frame as
+Both ends can make all of them: the field's *render* at the frame's pose; the *previous* frame as
 decoded; the *warp*, the previous frame carried to the present pose by the field's depth; and the
 *correction*, the render plus what the previous frame's render was found to lack, carried the same
-way (``rfcore.native.warp``). None of them is a frame of its own account (intra).
+way (``rfcore.native.warp``). A frame without references is coded by itself (intra).
 
-The order is that of feeding the decoder: the picture fed last is reference 0, which skipped blocks
-copy and whose index costs least.
+The order is the one in which the decoder is fed: the last picture is reference 0, which skipped
+blocks copy and whose index costs least.
 """
 
 from __future__ import annotations

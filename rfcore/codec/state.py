@@ -1,10 +1,10 @@
 """What each end remembers between frames: sequence numbers, and frames to predict from.
 
-A frame's state is named by the digest of its picture. A packet that predicts from an earlier frame
-says which (``DeltaPacket.base_digest``, the first bytes of the name), and its own
-``reconstruction_digest`` names the state it makes. The sender predicts from one frame at a time,
-and which one is the caller's choice: the last sent, or, after a loss, the last that is known to
-have been decoded. The receiver keeps the last few, so that rolling back needs no new start.
+A decoded frame is identified by the digest of its picture. A packet that predicts from an earlier
+frame names it (``DeltaPacket.base_digest``, the first bytes of that digest), and its own
+``reconstruction_digest`` identifies the frame it makes. The sender predicts from one frame at a
+time, and which one is the caller's choice: the last sent, or, after a loss, the last that is known
+to have been decoded. The receiver keeps the last few, so that rolling back needs no new start.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Past:
 
     @cached_property
     def digest(self) -> bytes:
-        """Name the state: the digest of the picture."""
+        """The digest of the picture, by which packets name the frame."""
         return self.picture.digest()
 
 

@@ -1,4 +1,4 @@
-"""What every kernel shares: the instruction sets of this machine, and the number of threads."""
+"""What all kernels have in common: the instruction sets of this machine, and limits."""
 
 from __future__ import annotations
 

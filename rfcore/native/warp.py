@@ -1,6 +1,6 @@
-"""The previous decoded picture carried to the present pose by depth, and block costs.
+"""Carries the previous decoded picture to the present pose by depth; costs of 8x8 blocks.
 
-Both ends make the warp from what both have, so every sample is defined here, in float32 without
+Both ends compute the warp from what both hold, so every sample is defined here, in float32 without
 fused operations and in integers; ``csrc/picture/warp.cpp`` computes exactly this on every machine.
 
 Where: pixel (x, y) of the present camera, depth z = ``depth[y, x]``, has the ray
@@ -25,9 +25,9 @@ odd column counts twice, and its u without the - 0.5, for it is where its chroma
 The *correction* carries, instead of the picture, its signed difference from the field's render at
 its own pose, and adds most of it to the present render: with ``sum`` as above,
 ``render + ((sum - clamp(sum >> 2, -4 * 2**12, 4 * 2**12) + 2**11) >> 12)``, clamped as above. A
-quarter is left out of small differences, which are mostly noise, and 4 levels of large ones, which
-are mostly true. What the field shows wrongly from one pose it shows wrongly from the next, while
-detail that resampling would soften comes from the render.
+quarter of a small difference is left out, for those are mostly noise, and 4 levels of a large one,
+for those are mostly true. What the field shows wrongly from one pose it shows wrongly from the
+next, while detail that resampling would soften comes from the render.
 
 Lanczos-3 was chosen over a bicubic filter because a picture is resampled again and again along a
 drive, and every pass of a softer filter takes away detail that has to be sent again.

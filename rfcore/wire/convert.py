@@ -1,8 +1,8 @@
-"""Vehicle to server: between protobuf and the values of ``rfcore.wire.messages``, both ways.
+"""Messages from vehicle to server: protobuf to the values of ``rfcore.wire.messages`` and back.
 
 Everything that comes from a peer is checked here, once: finite, unit quaternion, ranges, sizes,
-names. A bad value raises ``InvalidInput`` with the dotted name of the field as the proto has it;
-one that spoils a single frame raises ``FrameRefused``, which also says which frame to answer for.
+names. A bad value raises ``InvalidInput`` with the dotted name of the field as in the proto; one
+that concerns a single frame raises ``FrameRefused``, which holds the address to answer to.
 """
 
 from __future__ import annotations

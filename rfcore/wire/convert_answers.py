@@ -1,4 +1,4 @@
-"""Server to vehicle: between protobuf and the values of ``rfcore.wire.messages``, both ways.
+"""Messages from server to vehicle: protobuf to the values of ``rfcore.wire.messages`` and back.
 
 A server is not trusted either: what cannot be one of its messages raises ``ProtocolError``.
 """

@@ -1,4 +1,4 @@
-"""What vehicle and server say to each other, as plain frozen values.
+"""The messages between vehicle and server, as plain frozen values.
 
 The same names as in ``proto/rfcore/wire/v1/edge.proto``; ``rfcore.wire.convert`` is the only place
 that knows both forms. A value of these types that came through ``convert`` has been checked.
@@ -51,7 +51,7 @@ class RendererContract:
 @dataclass(frozen=True)
 class CameraDescription:
     """One camera of a vehicle: its geometry, how its pictures are coded, and how many a second it
-    would send (0: not said)."""
+    would send (0: not stated)."""
 
     camera_id: str
     intrinsics: Intrinsics
@@ -71,9 +71,12 @@ class Hello:
 
 @dataclass(frozen=True)
 class Frame:
-    """One coded picture: ``pose`` is world_from_cam, tile-relative; short on the wire when it is
+    """One coded picture.
+
+    ``pose`` is world_from_cam, tile-relative; it takes half the bytes on the wire when it is
     ``Pose.rounded``. An empty ``field_id_prefix`` means the first field of Hello. ``quality`` is
-    what the vehicle rendered the field with, and the server is to render it with."""
+    what the vehicle rendered the field with, and what the server is to render it with.
+    """
 
     camera_id: str
     capture_time_ns: int

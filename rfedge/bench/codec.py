@@ -43,7 +43,7 @@ WARM_UP = 3
 
 
 @dataclass(frozen=True)
-class Ends:
+class CodecSetup:
     """Everything one size needs: a renderer, the codec's two ends, and the first camera."""
 
     rasterizer: Rasterizer
@@ -67,19 +67,19 @@ def codec_rows() -> list[dict[str, Any]]:
     ends' stages."""
     gaussians = street_gaussians()
     return [
-        {"threads": threads, **_row(_ends(rasterizer, threads, *size), references)}
+        {"threads": threads, **_row(_setup(rasterizer, threads, *size), references)}
         for threads, rasterizer in ((n, Rasterizer(gaussians, threads=n)) for n in THREADS)
         for size in SIZES_PX
         for references in (ONE, THREE)
     ]
 
 
-def _ends(rasterizer: Rasterizer, threads: int, width_px: int, height_px: int) -> Ends:
+def _setup(rasterizer: Rasterizer, threads: int, width_px: int, height_px: int) -> CodecSetup:
     camera = street_camera(width_px, height_px)
     config = CodecConfig(width_px, height_px)
     encoder = DeltaEncoder(config, clock_ns=perf_counter_ns, threads=threads)
     decoder = DeltaDecoder(encoder.header, clock_ns=perf_counter_ns)
-    return Ends(rasterizer, camera, encoder, decoder)
+    return CodecSetup(rasterizer, camera, encoder, decoder)
 
 
 def _camera_frame(colour: np.ndarray[Any, np.dtype[np.float32]]) -> I420:
@@ -93,20 +93,20 @@ def _camera_frame(colour: np.ndarray[Any, np.dtype[np.float32]]) -> I420:
     return i420_from_rgb(np.clip(rgb, 0, 255).astype(np.uint8))
 
 
-def _row(ends: Ends, references: References) -> dict[str, Any]:
+def _row(setup: CodecSetup, references: References) -> dict[str, Any]:
     sender: dict[str, list[float]] = {}
     receiver: dict[str, list[float]] = {}
-    send_state, receive_state = ends.encoder.start(1), ends.decoder.start(1)
+    send_state, receive_state = setup.encoder.start(1), setup.decoder.start(1)
     for repetition in range(WARM_UP + REPETITIONS):
-        camera = ends.at(repetition)
-        frame = _camera_frame(ends.rasterizer.render_colour(camera))
-        render_ms, view = _timed(lambda: ends.render(camera))  # noqa: B023
+        camera = setup.at(repetition)
+        frame = _camera_frame(setup.rasterizer.render_colour(camera))
+        render_ms, view = _timed(lambda: setup.render(camera))  # noqa: B023
         choice = FrameChoice(references if repetition else ONE)
         total_ms, encoded = _timed(
-            lambda: ends.encoder.encode(send_state, frame, view, choice)  # noqa: B023
+            lambda: setup.encoder.encode(send_state, frame, view, choice)  # noqa: B023
         )
         decode_ms, decoded = _timed(
-            lambda: ends.decoder.decode(receive_state, encoded.packet, view)  # noqa: B023
+            lambda: setup.decoder.decode(receive_state, encoded.packet, view)  # noqa: B023
         )
         if decoded.frame.digest() != encoded.reconstruction.digest():
             raise CodecError("the receiver's picture differs from the sender's closed loop")
@@ -114,7 +114,7 @@ def _row(ends: Ends, references: References) -> dict[str, Any]:
         if repetition >= WARM_UP:
             _note(sender, render_ms, total_ms, encoded.stage_ns)
             _note(receiver, render_ms, decode_ms, decoded.stage_ns)
-    k = ends.camera.intrinsics
+    k = setup.camera.intrinsics
     return {
         "width": k.width_px,
         "height": k.height_px,

@@ -1,7 +1,7 @@
-"""What a stream is configured to be, and the level its size needs.
+"""A stream's configuration, and the H.264 level its size needs.
 
-Options are checked here against closed lists, because x264 takes an option it does not know
-without a word; ``rfcore.codec.h264.header`` checks afterwards that the encoder did as told.
+Options are checked here against closed lists, because x264 ignores an option it does not know;
+``rfcore.codec.h264.header`` checks afterwards that the encoder did what it was asked.
 """
 
 from __future__ import annotations

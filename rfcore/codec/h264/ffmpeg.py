@@ -1,7 +1,7 @@
-"""libx264 and FFmpeg's H.264 decoder behind two small doors; the only codec module that knows av.
+"""libx264 and FFmpeg's H.264 decoder, as one function and one class: the codec's only use of PyAV.
 
-Everything that changes x264's output is said here or comes in as options. Threads work on pictures,
-never on parts of one: one picture is one slice.
+Whatever changes x264's output is set here or is an argument. Threads work on whole pictures, never
+on parts of one: one picture is one slice.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ SIGNAL = MappingProxyType(
         "chromaloc": "1",
     }
 )
-"""What every stream says about its colours: ``rfcore.native.yuv`` in the words of annex E."""
+"""The colour description in every stream: ``rfcore.native.yuv`` in the terms of annex E."""
 
 
 WHOLE_PICTURES = MappingProxyType({"sliced-threads": "0"})
-"""Zerolatency would divide pictures among threads, and make slices of them."""
+"""Without it the tune zerolatency divides a picture among threads, as several slices."""
 
 QP_RANGE = 51
 
@@ -53,7 +53,7 @@ class PictureKind(Enum):
 
 @dataclass(frozen=True)
 class EncoderOptions:
-    """One x264 encoder. ``params`` are x264's own option names; nothing here checks them.
+    """Options of one x264 encoder. ``params`` are x264's own names and are not checked here.
 
     With more than one of ``threads`` a picture is begun while the one before it is still coded.
     """
@@ -75,7 +75,7 @@ def encode_pictures(
     """Encode a clip with a fresh encoder; return one access unit (byte stream) per picture.
 
     Pictures may have odd sizes; the last row and column are repeated to the options' even size.
-    ``regions`` are coded finer or coarser in the last picture; x264 heeds them only with adaptive
+    ``regions`` are coded finer or coarser in the last picture, which x264 does only with adaptive
     quantisation on. Access units come in coding order. Raises ``CodecError`` if x264 fails or
     returns another number of pictures.
     """
@@ -99,8 +99,8 @@ class H264Decoder:
     """A decoder that returns one picture for one access unit, at once, or raises.
 
     ``size_px`` is the even, cropped size the stream must have; larger pictures are refused before
-    memory is taken for them. After an error the decoder must be ``reset``: what it holds is of no
-    use, and parameter sets must be sent again.
+    memory is allocated for them. After an error the decoder must be ``reset``, and parameter sets
+    must be sent again.
     """
 
     def __init__(self, size_px: tuple[int, int]) -> None:
@@ -112,17 +112,17 @@ class H264Decoder:
         self._context = self._open()
 
     def close(self) -> None:
-        """Nothing is held but memory, which goes with the object."""
+        """Do nothing: the decoder holds only memory, which is freed with the object."""
 
     def decode(self, access_unit: bytes) -> I420:
         """Decode one access unit (byte stream) of one whole picture, or raise ``CodecError``.
 
-        FFmpeg conceals some damage without saying so: callers compare a digest.
+        FFmpeg conceals some damage without reporting it: callers compare a digest.
         """
         return self._picture_of(self._frame(access_unit))
 
     def feed(self, access_unit: bytes | memoryview) -> None:
-        """Decode like ``decode``, for the sake of what comes after: the picture is not copied."""
+        """Decode like ``decode``, as a reference for later units: the picture is not copied."""
         self._frame(access_unit)
 
     def _frame(self, access_unit: bytes | memoryview) -> av.VideoFrame:
@@ -137,7 +137,7 @@ class H264Decoder:
         return frames[0]
 
     def decode_all(self, access_units: Sequence[bytes]) -> list[I420]:
-        """Decode a stream to its end, pictures that were held back included."""
+        """Decode a stream to its end, with the pictures that the decoder had held back."""
         try:
             frames = [f for unit in access_units for f in self._context.decode(av.Packet(unit))]
             frames += self._context.decode(None)

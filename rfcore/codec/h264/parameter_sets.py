@@ -1,4 +1,4 @@
-"""What the sequence and picture parameter sets and the first words of a slice say.
+"""Parsers of the sequence and picture parameter sets, and of the first fields of a slice.
 
 Only the parts of ITU-T H.264 (08/2021) that x264 writes for progressive 8-bit 4:2:0 are read: a
 set that uses another part (scaling matrices, slice groups, picture order count type 1, HRD) raises
@@ -36,7 +36,7 @@ _MAX_HEADER_BYTES = 64
 
 @dataclass(frozen=True)
 class Vui:
-    """Video usability information (annex E); ``None`` where the stream does not say."""
+    """Video usability information (annex E); ``None`` where the stream has no value."""
 
     full_range: bool | None = None
     primaries_transfer_matrix: tuple[int, int, int] | None = None

@@ -1,14 +1,14 @@
 """Where a frame is coded finer or coarser: an offset to the quantiser for each macroblock.
 
 A map is int8 [rows, columns] of macroblocks of 16x16 px, added to the quantiser the CRF calls for;
--6 halves its step. The slice says every macroblock's quantiser itself, so no receiver needs the
-map, and the parameter sets stay as they are. x264 is told in rectangles, so a map has to be taken
-apart into those of one offset.
+-6 halves its step. The slice carries every macroblock's quantiser itself, so no receiver needs the
+map, and the parameter sets stay as they are. x264 takes rectangles, so a map is divided into
+rectangles of one offset.
 
 On five frames of the first sample with vehicles, -6 in a mask of a tenth of the picture raises its
 PSNR by 2.8 dB at equal bits of the whole, which loses 0.3 dB. Where the field's confidence is low,
 or its error large, neither finer nor coarser pays (-2 and +2: 0.05 to 0.1 dB less at equal bits),
-so nothing is steered by them.
+so neither sets an offset.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ __all__ = ["MB_PX", "QP_OFFSET_RANGE", "QpMap", "Region", "check_qp_map", "qp_ma
 
 MB_PX = 16
 QP_OFFSET_RANGE = (-24, 24)
-"""16 times finer or coarser a step; beyond it one end of the quantiser's 0..51 is always met."""
+"""A step 16 times finer or coarser; beyond it the quantiser always reaches an end of 0..51."""
 
 COVERED = 0.25
-"""Share of a macroblock that must lie in a mask of pixels, for it to be of the mask."""
+"""Share of a macroblock's pixels that must be in a mask for the macroblock to be in it."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ def qp_map_of_mask(
 ) -> QpMap:
     """Return ``qp_offset`` where ``mask`` is true (not 0) and ``rest`` elsewhere.
 
-    ``mask`` is [rows, columns] of macroblocks, or [height, width] of pixels, of which a quarter of
-    a macroblock counts. Raises ``InvalidInput`` for any other shape, and for NaN.
+    ``mask`` is [rows, columns] of macroblocks, or [height, width] of pixels: a macroblock is in it
+    when a quarter of its pixels are. Raises ``InvalidInput`` for any other shape, and for NaN.
     """
     width_px, height_px = size_px
     shape = (-(-height_px // MB_PX), -(-width_px // MB_PX))
@@ -93,7 +93,7 @@ def qp_map_of_mask(
     low, high = QP_OFFSET_RANGE
     if not (low <= qp_offset <= high and low <= rest <= high):
         raise InvalidInput("qp_offset", f"{qp_offset} and {rest} must be within {low}..{high}")
-    inside = mask != 0 if mask.shape == shape else block_means(mask != 0) >= COVERED
+    inside = mask != 0 if mask.shape == shape else macroblock_means(mask != 0) >= COVERED
     return QpMap(np.where(inside, qp_offset, rest).astype(np.int8))
 
 
@@ -106,7 +106,7 @@ def check_qp_map(qp_map: QpMap, config: CodecConfig) -> None:
         )
 
 
-def block_means(values: NDArray[Any]) -> NDArray[np.float64]:
+def macroblock_means(values: NDArray[Any]) -> NDArray[np.float64]:
     """Return the means over macroblocks; those at the right and the bottom may be cut."""
     height, width = values.shape
     rows, columns = np.arange(0, height, MB_PX), np.arange(0, width, MB_PX)

@@ -1,11 +1,12 @@
 """The sender's x264 run: reference pictures that are not sent, then the frame as one slice.
 
-A fresh encoder codes one frame, so every frame may have references, quality and analysis of its
-own. What matters; figures are for a 640x360 street with unseen vehicles, medium, CRF 23, one core.
+A fresh encoder codes each frame, so every frame may have its own references, quality and analysis.
+Why x264 is configured as it is; figures are for a 640x360 street with vehicles that the field does
+not hold, medium, CRF 23, one core.
 
 * The unsent pictures get quantisers 17 below the CRF: what x264 predicts from is then almost what
-  the receiver predicts from. ``ipratio`` says so for the first; zones can not (x264 gives picture 0
-  the CRF's own), but do for further ones, P pictures (a second I picture would become an IDR
+  the receiver predicts from. ``ipratio`` sets the first one's; zones can not (x264 gives picture 0
+  the CRF's own), but set those of further ones, P pictures (a second I picture would become an IDR
   picture and drop the first). They cost no bytes, but most of their time is arithmetic coding.
 * The encoder starts with cheap analysis (``subme=2``, no trellis) and a zone gives the sent
   picture the preset's own. The I picture takes 21 ms instead of 51; P slices are 1 % larger and
@@ -17,7 +18,7 @@ own. What matters; figures are for a 640x360 street with unseen vehicles, medium
   would drop them; and without psychovisual analysis no preset has a chroma QP offset.
 * No adaptive quantisation and no psychovisual analysis: x264 would spend bits by the variance of
   the frame, most of which the references explain, and on noise that looks sharp. Without them 10 %
-  fewer bits give the same PSNR, as they do in any stream; so whoever compares with x264 should say
+  fewer bits give the same PSNR, as they do in any stream; so a comparison with x264 must state
   which of the two had them (``--tune psnr``).
 * Two threads code two pictures at a time, for 1 % more processor time and up to 0.2 % more bits.
 * A map of quantiser offsets needs adaptive quantisation on, or FFmpeg leaves it out; at a strength
@@ -57,7 +58,7 @@ _SUBME = {
 _TRELLIS = 2
 """For every preset: 1 ms of 70 at veryfast, and 5 % fewer bits at equal PSNR."""
 
-_HEED_REGIONS = {"aq-mode": "1", "aq-strength": "0.0001"}
+_REGIONS_ON = {"aq-mode": "1", "aq-strength": "0.0001"}
 
 _PARTITIONS = {
     **dict.fromkeys(_SUBME, "p8x8b8x8i8x8i4x4"),
@@ -70,7 +71,7 @@ _PARTITIONS = {
 
 _UNSENT_MARGIN = 17
 _FAST_UNSENT_MARGIN = 8
-"""CRF less the quantiser of unsent pictures, normally and where time is dearer than bits. On the
+"""CRF less the quantiser of unsent pictures, normally and with ``fast_unsent``. On the
 first sample with three references, CRF 20 to 32, bits at equal PSNR against quantisers of 3 to 8:
 18, 17, 12, 8 and 4 take 0.4, 0.3, 1, 3 and 7 % more; of the time at CRF 29 they leave 85, 80, 75,
 67 and 65 %."""
@@ -79,7 +80,7 @@ _LOWEST_UNSENT_QP = 8
 """Between 2 and 8 P slices change by 0.3 %, and the time of the unsent pictures by a fifth."""
 
 
-_MOST_THREADS = 2
+_MAX_THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class SliceCoding:
     """How one slice is coded. ``crf`` replaces the configured one, ``qp_map`` is added to it.
 
     ``fast_unsent``: see ``_UNSENT_MARGIN``. ``threads``: more than two gain nothing; with two the
-    slice may differ by a few bytes, because x264 looks less far up and down for what moved.
+    slice may differ by a few bytes, because x264 searches motion less far up and down.
     """
 
     crf: float | None = None
@@ -123,7 +124,7 @@ def encode_slice(
     regions = () if coding.qp_map is None else coding.qp_map.regions()
     options = slice_options(config, len(references), coding)
     if regions:
-        options = replace(options, params={**options.params, **_HEED_REGIONS})
+        options = replace(options, params={**options.params, **_REGIONS_ON})
     units = encode_pictures(options, list(zip([*references, frame], kinds, strict=True)), regions)
     first = {nal_type(nal): nal for nal in split_nals(units[0])}
     if not {NAL_SPS, NAL_PPS} <= first.keys():
@@ -159,7 +160,7 @@ def slice_options(
     if references:
         margin = _FAST_UNSENT_MARGIN if coding.fast_unsent else _UNSENT_MARGIN
         params |= _unsent_params(config.preset, references, crf, margin)
-    threads = min(coding.threads, _MOST_THREADS, references + 1)
+    threads = min(coding.threads, _MAX_THREADS, references + 1)
     return EncoderOptions(config.coded_size_px, config.preset, crf, params, threads=threads)
 
 

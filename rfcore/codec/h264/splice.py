@@ -1,11 +1,11 @@
-"""The splice: a decoder whose reference pictures are put there by us.
+"""The splice: a standard decoder is fed our own reference pictures, then the received slice.
 
 Sender and receiver run the same code: an I_PCM picture for each reference, then the received slice.
-The P slice predicts from exactly those samples, and whatever it carries, the next frame begins with
-an IDR picture again, so nothing outlives a frame.
+The P slice predicts from exactly those samples. Whatever it carries, the next frame begins with an
+IDR picture again, so no decoder state outlives a frame.
 
-A frame without references is an IDR picture of its own. A grey I_PCM picture goes before it, so
-that its ``idr_pic_id``, which is always 0, never follows another 0 (7.4.3).
+A frame without references is an IDR picture. A grey I_PCM picture goes before it, so that its
+``idr_pic_id``, which is always 0, never follows another 0 (7.4.3).
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ class PictureDecoder(Protocol):
         """Return the picture of one access unit; raise ``CodecError``."""
 
     def feed(self, access_unit: bytes | memoryview) -> None:
-        """Decode for the sake of what comes after; raise ``CodecError``. Nothing is held of it."""
+        """Decode a reference for later units; raise ``CodecError``. The buffer is not kept."""
 
     def reset(self) -> None:
         """Forget everything, parameter sets included."""
 
     def close(self) -> None:
-        """Let go of what the decoder holds; it is not used again."""
+        """Release the decoder's resources; it is not used again."""
 
 
 class SpliceDecoder:
     """Decodes slices against references. One caller at a time.
 
-    Raises ``InvalidInput`` for a header that our encoder would not make, before it has
-    ``open_decoder`` make a decoder for the coded size.
+    Raises ``InvalidInput`` for a header that our encoder would not make, before ``open_decoder``
+    is called with the coded size.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class SpliceDecoder:
     def decode(self, payload: bytes) -> I420:
         """Return the picture that ``payload`` makes of the references, cropped to size.
 
-        Raises ``CodecError`` when the decoder notices damage; it does not notice all of it.
+        Raises ``CodecError`` for damage that the decoder detects; it does not detect all damage.
         """
         with self._fresh_after_errors():
             picture = self._decoder.decode(join_nals([payload]))
@@ -117,7 +117,7 @@ class SpliceDecoder:
         self._decoder.reset()
 
     def close(self) -> None:
-        """Let go of the decoder."""
+        """Release the decoder's resources."""
         self._decoder.close()
 
     @contextmanager

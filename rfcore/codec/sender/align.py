@@ -1,4 +1,4 @@
-"""How a camera moved against a render: direct photometric alignment, coarse to fine.
+"""The motion between a frame's camera and a render's: direct photometric alignment, coarse to fine.
 
 The render's pixels x with depth are points X in the measured camera; the frame is sampled where a
 rigid motion M puts them, and M is moved until both agree (inverse compositional alignment, Baker
@@ -8,10 +8,10 @@ and Matthews, IJCV 2004; on depth, Kerl et al., ICRA 2013)::
     delta = argmin sum w (r - J delta)^2 + prior,    M <- M exp(delta)^-1
 
 a and b, a change of light, are solved along. Weights are Cauchy's at twice the residuals' spread:
-what the field has never seen has no say. The prior holds M near the measured pose, as far as poses
-are known beforehand: a picture that says nothing moves nothing.
+what is not in the field has no weight. The prior holds M near the measured pose, by the accuracy
+poses are measured with: a picture without texture moves nothing.
 
-J, of the render, is computed once a level; a level uses at most ``MOST_PIXELS``, those of the
+J, of the render, is computed once a level; a level uses at most ``MAX_PIXELS``, those of the
 strongest gradient. float64 and numpy: only the sender does this, and sends the pose it took.
 """
 
@@ -34,21 +34,21 @@ __all__ = ["PRIOR_M", "PRIOR_RAD", "align"]
 
 COARSEST_PX = 60
 """Shortest side of the coarsest level; 0.2 m at 5 m are then less than 3 px."""
-MOST_PIXELS = 12_000
+MAX_PIXELS = 12_000
 """Half of them leave 0.60 cm and 0.025 degrees where these leave 0.49 and 0.017 (10 and 20 cm, 0.1
 and 0.5 degrees of noise on the first sample with vehicles), and save a quarter of the time."""
-ROUNDS = 12
-"""Steps of a level, at most."""
-ENOUGH_PX = 0.01
+MAX_STEPS = 12
+"""Per level."""
+CONVERGED_PX = 0.01
 """A step that moves pixels by less ends a level."""
 MIN_PIXELS = 60
-"""Fewer textured pixels than ten for each unknown say nothing."""
+"""Fewer than ten textured pixels for each unknown do not determine a motion."""
 
 PRIOR_M, PRIOR_RAD = 0.2, math.radians(0.5)
 """How far a measured pose is expected to be off (one sigma)."""
 NEAREST_M = 0.2
-TRUSTED = 0.5
-"""Confidence of a pixel (``rfcore.views``) that takes part: not where depth breaks."""
+MIN_CONFIDENCE = 0.5
+"""Of a pixel that takes part (``rfcore.views``): none where depth breaks."""
 
 F64 = NDArray[np.float64]
 Array = NDArray[Any]
@@ -85,7 +85,7 @@ def align(frame: I420, view: FieldView, has_time: Callable[[], bool] = lambda: T
         frame.y.astype(np.float64),
         view.render.y.astype(np.float64),
         view.depth.astype(np.float64),
-        (view.confidence >= TRUSTED) & (view.depth > NEAREST_M),
+        (view.confidence >= MIN_CONFIDENCE) & (view.depth > NEAREST_M),
         view.camera.intrinsics,
     )
     levels = [level]
@@ -105,7 +105,7 @@ def _aligned(level: _Level, motion: Pose, has_time: Callable[[], bool]) -> Pose:
     if template is None:
         return motion
     gain, offset = 1.0, 0.0
-    for _ in range(ROUNDS):
+    for _ in range(MAX_STEPS):
         if not has_time():
             break
         sampled, inside = _sampled(level.frame, level.intrinsics, template.points, motion)
@@ -117,7 +117,7 @@ def _aligned(level: _Level, motion: Pose, has_time: Callable[[], bool]) -> Pose:
         gain, offset = gain * (1 + step[6]), offset + gain * step[7]
         if not 0.2 < gain < 5:
             return motion
-        if _pixels(step, level, template) < ENOUGH_PX:
+        if _pixels(step, level, template) < CONVERGED_PX:
             break
     return motion
 
@@ -136,8 +136,8 @@ def _template(level: _Level) -> _Template | None:
     strength = np.where(level.trusted, gradient_x**2 + gradient_y**2, 0.0).ravel()
     strength[_border(level.render.shape)] = 0.0
     chosen = np.flatnonzero(strength > 1.0)
-    if len(chosen) > MOST_PIXELS:
-        chosen = chosen[np.argpartition(strength[chosen], -MOST_PIXELS)[-MOST_PIXELS:]]
+    if len(chosen) > MAX_PIXELS:
+        chosen = chosen[np.argpartition(strength[chosen], -MAX_PIXELS)[-MAX_PIXELS:]]
     if len(chosen) < MIN_PIXELS:
         return None
     k = level.intrinsics

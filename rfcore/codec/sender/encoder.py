@@ -1,4 +1,4 @@
-"""The sender: frames as slices against pictures that both ends make themselves.
+"""The sender: codes frames as slices against pictures that both ends make themselves.
 
 States are values: ``encode`` takes one and returns the next, and an error leaves the caller with
 the one it had. The object holds only the configuration and a decoder whose content does not
@@ -94,7 +94,7 @@ class Encoded:
 
     ``stage_ns`` has "references" (warp, choice), "encode" (x264) and "closed_loop" (decoding as the
     receiver does, digests). ``tries``: how often the frame was coded to fit a limit. ``crf``: the
-    one it was coded at in the end. ``rate``: what a target's model learnt from it.
+    one it was coded at in the end. ``rate``: the target's model with this frame learnt.
     """
 
     packet: DeltaPacket
@@ -107,7 +107,8 @@ class Encoded:
 
 
 class DeltaEncoder:
-    """The sender. Raises ``CodecError`` if x264 does not make the stream the config promises.
+    """Codes frames one by one. Raises ``CodecError`` if x264 writes other parameter sets than the
+    configuration calls for.
 
     ``threads`` are for making references and coding. References are the same with any number;
     slices may differ by a few bytes between one and more.
@@ -125,7 +126,7 @@ class DeltaEncoder:
         try:
             self._splice = SpliceDecoder(self._header)
         except InvalidInput as error:
-            raise CodecError(f"x264 did not do as told: {error}") from error
+            raise CodecError(f"x264 wrote other parameter sets than asked for: {error}") from error
 
     @property
     def header(self) -> StreamHeader:
@@ -181,7 +182,7 @@ class DeltaEncoder:
             payload=made.payload,
             crc32=0,
             references=references,
-            base_digest=_name(past) if is_temporal(references) else b"",
+            base_digest=_base_digest(past) if is_temporal(references) else b"",
             photometric=photometric,
         ).sealed()
         stage_ns = {
@@ -243,7 +244,7 @@ class DeltaEncoder:
         return self._splice.decode(payload)
 
 
-def _name(past: Past | None) -> bytes:
+def _base_digest(past: Past | None) -> bytes:
     return b"" if past is None else past.digest[:BASE_DIGEST_BYTES]
 
 

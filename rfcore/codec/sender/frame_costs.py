@@ -80,10 +80,10 @@ class FrameCosts:
     @cached_property
     def intra(self) -> BlockCosts:
         """The costs of predicting each block from its own mean, for want of any reference."""
-        return block_costs(self.frame.y, _block_means(self.frame.y))
+        return block_costs(self.frame.y, _at_block_means(self.frame.y))
 
 
-def _block_means(luma: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _at_block_means(luma: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return ``luma`` with each whole 8x8 block at its mean."""
     height, width = (side // BLOCK_PX * BLOCK_PX for side in luma.shape)
     blocks = luma[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width)

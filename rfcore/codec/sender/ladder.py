@@ -1,9 +1,9 @@
 """The ladder of accuracy and time: settings of the sender, and what each was measured to cost.
 
-A rung is all that a sender may decide about a frame but its CRF. What the receiver must know of it
-(how the field is rendered, which references) travels with each frame, so any frame may stand on
-another rung than the one before. ``rfedge eval ladder`` measures rungs and writes the file that
-``read_ladder`` reads.
+A rung is everything a sender may decide about a frame except its CRF. What the receiver must know
+of it (how the field is rendered, which references) travels with each frame, so every frame may be
+coded at another rung than the one before. ``rfedge eval ladder`` measures rungs and writes the file
+that ``read_ladder`` reads.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Rung:
 
 
 FULL_RUNG = Rung()
-"""All there is, at the preset a stream has unless told otherwise."""
+"""The best there is, at the default preset."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class MeasuredRung:
 
 
 def front(rungs: Sequence[MeasuredRung]) -> tuple[MeasuredRung, ...]:
-    """Return the rungs that no other beats in time and rate at once, fewest bits first."""
+    """Return the Pareto front of time and rate, fewest bits first."""
     ordered = sorted(rungs, key=lambda rung: (rung.rate_percent, rung.sender_ms))
     kept: list[MeasuredRung] = []
     for rung in ordered:
@@ -121,8 +121,12 @@ def read_ladder(path: Path, kind: str, crf: float) -> tuple[MeasuredRung, ...]:
 
 
 def _measured(row: Mapping[str, Any]) -> MeasuredRung:
-    knobs = row["settings"]
-    quality = Quality(knobs["detail"], knobs["sh_degree"], knobs["samples_per_ray"], knobs["scale"])
-    fast_unsent = knobs.get("rough", False)  # ladders measured before there was a choice have none
-    rung = Rung(quality, knobs["references"], knobs["photometric"], knobs["preset"], fast_unsent)
+    stored = row["settings"]
+    rung = Rung(
+        Quality(stored["detail"], stored["sh_degree"], stored["samples_per_ray"], stored["scale"]),
+        stored["references"],
+        stored["photometric"],
+        stored["preset"],
+        fast_unsent=stored.get("rough", False),  # absent from the first ladders
+    )
     return MeasuredRung(rung, row["sender_ms"], row["receiver_ms"], row["rate_percent"])

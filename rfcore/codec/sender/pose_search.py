@@ -1,9 +1,9 @@
 """The pose near the measured one at which a frame costs fewest bits.
 
 A pose is sent with every frame, so the sender may choose it: the receiver renders wherever it is
-told. Alignment (``rfcore.codec.sender.align``) proposes one, the field is rendered there, and the
-estimated bits of the frame against both renders decide. Time is bounded by a clock that is an
-argument; whatever was found by then is taken.
+told to. Alignment (``rfcore.codec.sender.align``) proposes one, the field is rendered there, and
+the estimated bits of the frame against both renders decide. Time is bounded by a clock that is an
+argument; when it is over, the best pose so far is taken.
 
 Five frames of the first sample with vehicles, veryfast, BD-rate against true poses (30 to 36 dB):
 noise of 5 cm and 0.05 degrees costs 54 %, of 10 cm and 0.1 degrees 167 %, of 20 cm and 0.5 degrees
@@ -28,12 +28,12 @@ from rfcore.views import FieldView
 __all__ = ["PoseSearch", "Refined"]
 
 MAX_RENDERS = 2
-"""Renders beside that of the measured pose; the second finds what the first, seen from elsewhere,
-could not show. One takes about 100 ms of one core at 640x360: aligning 70, rendering 30."""
+"""Renders beside that of the measured pose; the second corrects what the first, rendered elsewhere,
+left. One takes about 100 ms of one core at 640x360: aligning 70, rendering 30."""
 MIN_SAVING = 0.01
-"""Of the estimated bits, that another pose must save: less is noise of the estimate."""
+"""Share of the estimated bits that another pose must save: less is noise of the estimate."""
 FURTHEST_M, FURTHEST_RAD = 1.0, math.radians(3.0)
-"""Beyond it the alignment has gone astray, and is not believed."""
+"""Beyond it the alignment has diverged and is discarded."""
 
 ClockNs = Callable[[], int]
 

@@ -45,7 +45,7 @@ LEAST_BITS = 200.0
 MEMORY = 0.5
 """Weight of what was known of the factor, when a frame was coded."""
 CLIMB_CRF = 2.0
-"""Quality rises by at most so much a frame, but falls at once: it flickers less."""
+"""Quality rises by at most so much a frame, against flicker, but falls at once."""
 Array = NDArray[np.float64]
 
 
@@ -115,7 +115,7 @@ def _coded_bits(satd: Array, ssd: Array, crf: float) -> float:
 
 @dataclass(frozen=True)
 class RateModel:
-    """What coding taught: ``octaves``, log2 of coded over estimated bits, by references.
+    """Learnt from coded frames: ``octaves``, log2 of coded over estimated bits, by references.
 
     ``crf`` is that of the last frame, which bounds how fast quality rises; None before the first.
     """
@@ -136,7 +136,7 @@ class RateModel:
     def after(
         self, crf: float, curve: BitsCurve, references: References, coded_bytes: int
     ) -> RateModel:
-        """Return what is known once a frame took ``coded_bytes`` at ``crf``."""
+        """Return the model once a frame took ``coded_bytes`` at ``crf``."""
         if coded_bytes < 1:
             raise InvalidInput("coded_bytes", f"{coded_bytes} must be at least 1")
         found = math.log2(8 * coded_bytes / curve.at(crf))
@@ -145,7 +145,7 @@ class RateModel:
         return RateModel({**self.octaves, references: octaves}, crf)
 
     def _octaves_of(self, references: References) -> float:
-        """Return the factor of ``references``, or of whichever is most like them."""
+        """Return the factor of ``references``, or of the known ones that are most like them."""
         if not self.octaves:
             return 0.0
         like = max(self.octaves, key=lambda known: _likeness(known, references))
@@ -159,7 +159,7 @@ def _likeness(known: References, wanted: References) -> tuple[bool, int]:
 
 @dataclass(frozen=True)
 class RateTarget:
-    """What a frame may take: ``size_bytes`` is aimed at by ``model``'s knowledge."""
+    """The size to aim at, ``size_bytes``, and the ``model`` that finds the CRF for it."""
 
     size_bytes: float
     model: RateModel = RateModel()
@@ -171,11 +171,11 @@ class RateTarget:
 
 MAX_TRIES = 5
 """Codings of one frame; the last is at the highest CRF there is."""
-HALVING_CRF = 6.0
-SLOWEST_CRF = 48.0
-"""CRF steps that are taken to halve a slice, at the least and at the most."""
+MIN_HALVING_CRF = 6.0
+MAX_HALVING_CRF = 48.0
+"""CRF steps that are assumed to halve a slice, at the least and at the most."""
 AIM = 0.95
-"""Share of the limit that a step aims at: a little less costs little, a miss costs a coding."""
+"""Share of the limit that a step aims at: aiming low costs a little, a miss costs a coding."""
 Code = Callable[[float], bytes]
 
 
@@ -194,7 +194,7 @@ def code_to_fit(code: Code, crf: float, limit_bytes: int) -> FittedSlice:
     What does not fit at the highest CRF is returned as it is: check the length.
     """
     payload = code(crf)
-    halving = HALVING_CRF
+    halving = MIN_HALVING_CRF
     for tries in range(1, MAX_TRIES):
         if len(payload) <= limit_bytes or crf == CRF_RANGE[1]:
             return FittedSlice(payload, crf, tries)
@@ -210,6 +210,6 @@ def code_to_fit(code: Code, crf: float, limit_bytes: int) -> FittedSlice:
 def _halving_crf(step: float, before_bytes: int, after_bytes: int) -> float:
     """Return how much CRF halves a slice, judging by one step."""
     octaves = math.log2(before_bytes / after_bytes)
-    if octaves <= step / SLOWEST_CRF:
-        return SLOWEST_CRF
-    return max(HALVING_CRF, step / octaves)
+    if octaves <= step / MAX_HALVING_CRF:
+        return MAX_HALVING_CRF
+    return max(MIN_HALVING_CRF, step / octaves)

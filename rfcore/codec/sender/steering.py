@@ -1,6 +1,6 @@
-"""What a caller asks of every frame beside its quality: where it matters, and a better pose.
+"""What a caller asks of every frame beside its quality: a quantiser map and a refined pose.
 
-``SteeringSettings`` is how it is asked on a command line; a mask is a picture file there.
+``SteeringSettings`` is its form on a command line, where the map is the file of a mask.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ BRIGHT = 128
 
 @dataclass(frozen=True)
 class Steering:
-    """``qp_map``: where frames are coded finer or coarser. ``refine_pose_ms``: time in which a pose
-    of fewer bits is looked for near a frame's measured one; ``None``: the measured one is taken."""
+    """What is asked of every frame."""
 
     qp_map: QpMap | None = None
+    """Where frames are coded finer or coarser."""
     refine_pose_ms: float | None = None
+    """Time a frame to look for a pose of fewer bits near the measured one; ``None``: that one."""
 
 
 NO_STEERING = Steering()
@@ -34,7 +35,7 @@ NO_STEERING = Steering()
 
 @dataclass(frozen=True)
 class SteeringSettings:
-    """Where bits go, and from which pose."""
+    """Where bits go, and from which pose frames are coded."""
 
     mask: Path | None = None
     """Picture of the camera's size, white where frames are to be coded finer."""
