@@ -1,0 +1,107 @@
+"""A field's view at a camera is the same on both ends: one conversion, one rounding, one check."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.errors import InvalidInput
+from rfcore.field import FULL, Quality, render_field_view
+from rfcore.motion import quaternion_from_vector, rotation_vector
+from rfcore.native.yuv import i420_from_colour
+from rfcore.views import FieldView, View, confidence
+
+SIZE_PX = (10, 6)
+CAMERA = Camera(
+    Intrinsics(*SIZE_PX, 8.0, 8.0, 5.0, 3.0), Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
+)
+
+
+class Wall:
+    """A renderer of a wall 5 m ahead that lets a quarter of the light through; notes requests."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Camera, Quality]] = []
+        rng = np.random.default_rng(3)
+        self.view = View(
+            rng.uniform(0, 1, (*SIZE_PX[::-1], 3)).astype(np.float32),
+            np.full(SIZE_PX[::-1], 5, np.float32),
+            np.full(SIZE_PX[::-1], 0.75, np.float32),
+        )
+
+    def render(self, camera: Camera, quality: Quality) -> View:
+        self.asked.append((camera, quality))
+        return self.view
+
+
+def test_a_rendered_view_is_the_codecs_picture_with_the_renderers_depth_and_opacity() -> None:
+    wall = Wall()
+    view = render_field_view(wall, CAMERA)
+    assert view.render.digest() == i420_from_colour(wall.view.colour).digest()
+    assert view.camera is CAMERA
+    assert view.depth is wall.view.depth
+    assert view.opacity is wall.view.opacity
+    assert np.array_equal(view.confidence, confidence(wall.view.depth, wall.view.opacity))
+
+
+def test_the_renderer_is_asked_for_the_camera_and_quality_given() -> None:
+    wall, half = Wall(), Quality(detail=0.5)
+    render_field_view(wall, CAMERA)
+    render_field_view(wall, CAMERA, half)
+    assert wall.asked == [(CAMERA, FULL), (CAMERA, half)]
+
+
+def test_a_view_covers_what_is_more_opaque_than_asked() -> None:
+    view = render_field_view(Wall(), CAMERA)
+    assert view.covers(0.5).all()
+    assert not view.covers(0.75).any()
+
+
+def test_a_view_without_opacity_has_no_confidence_to_give() -> None:
+    view = replace(render_field_view(Wall(), CAMERA), opacity=None)
+    with pytest.raises(InvalidInput, match="opacity: was dropped"):
+        _ = view.confidence
+    with pytest.raises(InvalidInput, match="opacity: was dropped"):
+        view.covers(0.5)
+
+
+@pytest.mark.parametrize("name", ["colour", "depth"])
+def test_a_renderer_that_returns_numbers_that_are_none_is_refused(name: str) -> None:
+    wall = Wall()
+    bad = getattr(wall.view, name).copy()
+    bad[2, 3] = np.nan
+    wall.view = replace(wall.view, **{name: bad})
+    with pytest.raises(InvalidInput, match=f"{name}: [13] of .* NaN or infinite"):
+        render_field_view(wall, CAMERA)
+
+
+def test_a_camera_of_another_size_is_refused() -> None:
+    small = Camera(Intrinsics(8, 6, 8.0, 8.0, 4.0, 3.0), CAMERA.world_from_cam)
+    with pytest.raises(InvalidInput, match=r"render: \(10, 6\) px of a camera of \(8, 6\) px"):
+        render_field_view(Wall(), small)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_rounded_camera_is_rounded_once_and_for_all(seed: int) -> None:
+    """Within float32's step: 2**-24 of each number, so of 1 km and of a quaternion's parts."""
+    rng = np.random.default_rng(seed)
+    x, y, z, a, b, c = map(float, rng.uniform(-1, 1, 6))
+    exact = replace(
+        CAMERA, world_from_cam=Pose((1e3 * x, 1e3 * y, 1e3 * z), quaternion_from_vector((a, b, c)))
+    )
+    sent = exact.rounded()
+    assert sent != exact
+    assert sent.rounded() == sent
+    assert sent.intrinsics == exact.intrinsics
+    moved = exact.world_from_cam.inverse().compose(sent.world_from_cam)
+    assert max(map(abs, moved.translation_m)) <= 2 * 1e3 * 2**-24
+    assert max(map(abs, rotation_vector(moved.rotation))) <= 4 * 2**-24
+
+
+def test_views_are_values_that_share_what_does_not_change() -> None:
+    view = render_field_view(Wall(), CAMERA)
+    elsewhere = replace(view, camera=replace(CAMERA, world_from_cam=Pose.identity()))
+    assert elsewhere.depth is view.depth
+    assert elsewhere.render is view.render
+    assert isinstance(elsewhere, FieldView)
