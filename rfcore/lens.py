@@ -21,7 +21,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.camera import Intrinsics, Pose
 from rfcore.errors import InvalidInput
 
 __all__ = ["BrownLens", "FisheyeLens", "Lens", "LensCamera"]
@@ -194,10 +194,6 @@ class LensCamera:
         sensor = np.array([[(u_px - k.cx_px) / k.fx_px, (v_px - k.cy_px) / k.fy_px]])
         x, y = self.lens.undistort(sensor)[0]
         return (float(x), float(y), 1.0)
-
-    def without_lens(self) -> Camera:
-        """Return the pinhole camera of the same intrinsics and pose."""
-        return Camera(self.intrinsics, self.world_from_cam)
 
 
 def _check_finite(lens: BrownLens | FisheyeLens) -> None:

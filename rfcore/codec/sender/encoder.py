@@ -106,6 +106,16 @@ class Encoded:
     rate: RateModel | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """What a frame is predicted from: ``pictures`` are ``references`` of ``prediction``."""
+
+    photometric: Photometric
+    prediction: Prediction
+    references: References
+    pictures: tuple[I420, ...]
+
+
 class DeltaEncoder:
     """Codes frames one by one. Raises ``CodecError`` if x264 writes other parameter sets than the
     configuration calls for.
@@ -151,47 +161,54 @@ class DeltaEncoder:
         for a frame or view that is not of the configured size, or references that cannot be made;
         ``CodecError`` if x264 fails.
         """
-        render = view.render
-        for name, picture in (("frame", frame), ("render", render)):
-            _require_size(name, picture, self._config)
-        if choice.qp_map is not None:
-            check_qp_map(choice.qp_map, self._config)
+        self._check(frame, view, choice)
         started_ns = self._clock_ns()
         costs = FrameCosts(frame) if costs is None else costs
-        crf = self._first_crf(choice)
-        photometric = choice.photometric
-        if photometric is None:
-            photometric = choose_photometric(costs, render, crf)
-        prediction = Prediction.under_light(view, photometric, state.past, self._threads)
-        references = choice.references
-        if references is None:
-            references = choose_references(costs, prediction, crf, choice.max_references)
-        pictures = prediction.pictures(references)
+        plan = self._plan(state, view, choice, costs)
         chosen_ns = self._clock_ns()
-        made, rate = self._coded(costs, pictures, choice, references)
+        made, rate = self._coded(costs, plan, choice)
         encoded_ns = self._clock_ns()
-        reconstruction = self._reconstruct(pictures, made.payload)
-        past = state.past
-        shown = prediction.past_of(reconstruction)
+        reconstruction = self._reconstruct(plan.pictures, made.payload)
+        past = plan.prediction.past_of(reconstruction)
         packet = DeltaPacket(
             epoch=state.epoch,
             sequence=state.next_sequence,
-            render_digest=render.digest(),
-            render_block_means=block_mean_digest(render) if choice.block_means else b"",
-            reconstruction_digest=shown.digest,
+            render_digest=view.render.digest(),
+            render_block_means=block_mean_digest(view.render) if choice.block_means else b"",
+            reconstruction_digest=past.digest,
             payload=made.payload,
             crc32=0,
-            references=references,
-            base_digest=_base_digest(past) if is_temporal(references) else b"",
-            photometric=photometric,
+            references=plan.references,
+            base_digest=_base_digest(state.past) if is_temporal(plan.references) else b"",
+            photometric=plan.photometric,
         ).sealed()
         stage_ns = {
             "references": chosen_ns - started_ns,
             "encode": encoded_ns - chosen_ns,
             "closed_loop": self._clock_ns() - encoded_ns,
         }
-        following = EncoderState(state.epoch, state.next_sequence + 1, shown)
+        following = EncoderState(state.epoch, state.next_sequence + 1, past)
         return Encoded(packet, reconstruction, following, stage_ns, made.tries, made.crf, rate)
+
+    def _check(self, frame: I420, view: FieldView, choice: FrameChoice) -> None:
+        for name, picture in (("frame", frame), ("render", view.render)):
+            _require_size(name, picture, self._config)
+        if choice.qp_map is not None:
+            check_qp_map(choice.qp_map, self._config)
+
+    def _plan(
+        self, state: EncoderState, view: FieldView, choice: FrameChoice, costs: FrameCosts
+    ) -> _Plan:
+        """Return what to predict the frame from, choosing what ``choice`` leaves open."""
+        crf = self._first_crf(choice)
+        photometric = choice.photometric
+        if photometric is None:
+            photometric = choose_photometric(costs, view.render, crf)
+        prediction = Prediction.under_light(view, photometric, state.past, self._threads)
+        references = choice.references
+        if references is None:
+            references = choose_references(costs, prediction, crf, choice.max_references)
+        return _Plan(photometric, prediction, references, prediction.pictures(references))
 
     def _first_crf(self, choice: FrameChoice) -> float:
         """Return the CRF that references are chosen for: with a target, about the one to come."""
@@ -201,21 +218,17 @@ class DeltaEncoder:
         return max(lowest, choice.target.model.crf)
 
     def _coded(
-        self,
-        costs: FrameCosts,
-        pictures: tuple[I420, ...],
-        choice: FrameChoice,
-        references: References,
+        self, costs: FrameCosts, plan: _Plan, choice: FrameChoice
     ) -> tuple[FittedSlice, RateModel | None]:
         """Return the slice at the CRF asked for, or at the one that a target calls for."""
         lowest = self._config.crf if choice.crf is None else choice.crf
         target = choice.target
         if target is None or choice.pose_only:
-            return self._fitted(pictures, costs.frame, lowest, choice), None
-        curve = bits_curve(costs, pictures, lowest)
-        crf = target.model.crf_for(target.size_bytes, curve, references)
-        made = self._fitted(pictures, costs.frame, crf, choice)
-        return made, target.model.after(made.crf, curve, references, len(made.payload))
+            return self._fitted(plan.pictures, costs.frame, lowest, choice), None
+        curve = bits_curve(costs, plan.pictures, lowest)
+        crf = target.model.crf_for(target.size_bytes, curve, plan.references)
+        made = self._fitted(plan.pictures, costs.frame, crf, choice)
+        return made, target.model.after(made.crf, curve, plan.references, len(made.payload))
 
     def _fitted(
         self, pictures: tuple[I420, ...], frame: I420, crf: float, choice: FrameChoice
