@@ -8,7 +8,7 @@ that factor for each set of references. States are values: ``after`` returns the
 A slice that is longer than a limit is coded again at a higher CRF until it fits (``code_to_fit``).
 6 of CRF double the quantiser's step and, in pictures of a street, about halve the bits; in noise
 they take one bit from each coefficient, which is far less. So the first step assumes a halving, and
-the further ones what the steps before have brought.
+the further ones take the slope of the step before.
 """
 
 from __future__ import annotations

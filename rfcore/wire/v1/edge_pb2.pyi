@@ -137,7 +137,7 @@ class StreamResponse(_message.Message):
     def field_notice(self) -> Global___FieldNotice: ...
     @_builtins.property
     def credit(self) -> Global___Credit:
-        """Alone, or beside the answer that changed it: a message less for every frame."""
+        """Alone, or in the message of the answer that changed it, which saves a message a frame."""
 
     def __init__(
         self,
@@ -203,7 +203,7 @@ class CameraDescription(_message.Message):
     RATE_HZ_FIELD_NUMBER: _builtins.int
     camera_id: _builtins.str
     rate_hz: _builtins.float
-    """Pictures per second it would send; 0 or absent: not said."""
+    """Pictures per second it would send; 0 or absent: not stated."""
     @_builtins.property
     def intrinsics(self) -> Global___Intrinsics: ...
     @_builtins.property
@@ -262,7 +262,7 @@ Global___Intrinsics: _TypeAlias = Intrinsics  # noqa: Y015
 
 @_typing.final
 class StreamHeader(_message.Message):
-    """All that a receiver needs before the first packet; pinned for the session."""
+    """Everything a receiver needs before the first packet; it does not change within a session."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -362,7 +362,7 @@ Global___Pose: _TypeAlias = Pose  # noqa: Y015
 
 @_typing.final
 class Quality(_message.Message):
-    """How much of the field is drawn; what is absent is the most there is."""
+    """How much of the field is drawn; an absent field of this message means all there is."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -426,10 +426,10 @@ class Frame(_message.Message):
     field_id_prefix: _builtins.bytes
     """First 8 bytes of the sha256 of the field; the whole id is in Hello. Empty: its first field."""
     render_digest: _builtins.bytes
-    """BLAKE2b-128 of the render at the frame's pose."""
+    """BLAKE2b-128 of the sender's render at the frame's pose."""
     render_block_means: _builtins.bytes
-    """Its 8x8 block means, by which a receiver tells rounding from a wrong pose or field; empty
-    between exact renderers, where every difference is refused.
+    """That render's 8x8 block means, by which a receiver tells rounding from a wrong pose or field;
+    empty between exact renderers, where every difference is refused.
     """
     reconstruction_digest: _builtins.bytes
     """BLAKE2b-128 of the picture that the receiver must end up with."""
