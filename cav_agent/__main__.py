@@ -1,4 +1,4 @@
-"""``cav-agent``: the vehicle's command."""
+"""``cav-agent``: the command that runs one vehicle; ``cav_agent.vehicle`` puts it together."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def main() -> None:
     try:
         config = tyro.cli(AgentConfig, config=OPTIONS, prog="cav-agent")
         configure_logs(sys.stderr, config.log)
-        asyncio.run(travel(config))
+        asyncio.run(drive(config))
     except (RfedgeError, OSError) as error:
         print(f"cav-agent: {error}", file=sys.stderr)
         sys.exit(2)
 
 
-async def travel(config: AgentConfig) -> None:
-    """Drive to the end, or until told to stop."""
+async def drive(config: AgentConfig) -> None:
+    """Drive to the end, or until SIGTERM or SIGINT."""
     vehicle = Vehicle(config)
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, vehicle.stop)

@@ -1,24 +1,28 @@
-"""When the next picture is captured. Machines without clock: ``now`` is an argument.
+"""When the next picture of a drive is captured: the first step of a frame's path.
 
-``Realtime``: picture i is captured at its time, whatever became of the ones before. ``Lockstep``:
-the next is captured when the previous was answered, and one that was lost is captured again; the
-experiment then covers every picture, at the speed of the link.
+``Realtime`` captures picture i at its time, whatever became of the ones before. ``Lockstep``
+captures the next when the previous was answered, and one that was lost again; an experiment then
+covers every picture, at the speed of the link. State machines without a clock: ``now`` is an
+argument. ``cav_agent.handover_controller`` asks them and decides which server takes the picture.
 """
 
 from __future__ import annotations
 
 from typing import Protocol
 
-from cav_agent.frames import TOO_LATE, FrameResult, Outcome
+from cav_agent.frames import EndReason, FrameResult, Outcome
 from rfcore.errors import InvalidInput, RfedgeError
 
 __all__ = ["MAX_TRIES", "CaptureSchedule", "Lockstep", "Realtime"]
 
-EARLY_S = 1e-6
-"""Sums of periods are rounded; a picture that is due this much early is not another one."""
+ROUNDING_S = 1e-6
+"""Tolerance for the rounding error of summed periods."""
 
 MAX_TRIES = 5
 """How often lockstep captures the same picture before it gives up."""
+
+HOPELESS = frozenset({EndReason.NOT_CODED, EndReason.OVERSIZE})
+"""Ends that another capture of the same picture would only repeat."""
 
 
 class CaptureSchedule(Protocol):
@@ -42,9 +46,9 @@ class CaptureSchedule(Protocol):
 
 
 class Realtime:
-    """Picture i at ``start + i / rate_hz``; a late driver catches up by skipping nothing.
+    """Picture i at ``start + i / rate_hz``; a caller that asks late gets every picture, late.
 
-    Below a limit, pictures in between are not captured: the drive goes on at its own speed.
+    Under a limit, pictures in between are not captured: the drive goes on at its own speed.
     """
 
     def __init__(self, pictures: int, rate_hz: float, *, loop: bool = False) -> None:
@@ -61,7 +65,7 @@ class Realtime:
             self._start_s = now
         while not self.finished and now >= (due_s := self._due_s(self._start_s)):
             self._count += 1
-            if due_s >= self._open_s - EARLY_S:
+            if due_s >= self._open_s - ROUNDING_S:
                 behind = self._open_s < due_s - self._period_s
                 self._open_s = (due_s if behind else self._open_s) + self._period_s
                 return (self._count - 1) % self._pictures
@@ -72,7 +76,7 @@ class Realtime:
         self._period_s = 1.0 / rate_hz if rate_hz else 0.0
 
     def ended(self, result: FrameResult) -> None:
-        """Nothing follows from it."""
+        """Do nothing: the schedule does not depend on it."""
 
     def get_timer(self) -> float | None:
         """Return when the next picture is due."""
@@ -82,7 +86,7 @@ class Realtime:
 
     @property
     def finished(self) -> bool:
-        """Whether the drive was driven once, and once is all."""
+        """Whether every picture was captured and the drive is not to begin again."""
         return not self._loop and self._count >= self._pictures
 
     def _due_s(self, start_s: float) -> float:
@@ -115,10 +119,10 @@ class Lockstep:
             self._tries = 0
             return
         name = result.capture.picture.name
-        if result.outcome is Outcome.DROPPED and result.reason != TOO_LATE:
-            raise RfedgeError(f"picture {name} could not be coded: {result.reason}")
-        if self._tries >= MAX_TRIES:
-            raise RfedgeError(f"picture {name} was lost {self._tries} times: {result.reason}")
+        if result.reason in HOPELESS:
+            raise RfedgeError(f"picture {name} could not be coded: {result.problem}")
+        if self._tries >= MAX_TRIES and result.reason is not EndReason.STOPPING:
+            raise RfedgeError(f"picture {name} was lost {self._tries} times: {result.explanation}")
 
     def limit(self, rate_hz: float) -> None:
         """Do nothing: the server's answers are the limit."""

@@ -1,4 +1,4 @@
-"""What the agent can be told; parsed once, in ``__main__``."""
+"""The agent's options and limits; parsed and checked once, in ``__main__``."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ __all__ = ["AgentConfig", "AgentLimits", "PaceKind"]
 
 @dataclass(frozen=True)
 class AgentLimits:
-    """Deadlines in seconds, and how many pictures may wait for the encoder.
+    """Time limits in seconds, and how many pictures may wait for the encoder.
 
-    ``answer_s``: longest from encoding to Ack or Nack, before the stream is given up; less once it
-    is known what is usual (``cav_agent.answer_timeout``). ``give_up_s``: without
-    any connection; 0 means never.
+    ``greeting_s``: from Hello to Welcome. ``answer_s``: from encoding to Ack or Nack, before the
+    stream is given up; less once the server's usual time is known (``AnswerTimeout``).
+    ``give_up_s``: without any connection, before the drive ends with an error; 0 means never.
+    ``drain_s``: for the last frames, after ``stop`` and at the end of the drive.
     """
 
     greeting_s: float = 10.0
@@ -62,8 +63,8 @@ class AgentConfig:
     fields: Path = Path("~/.cache/rfedge/fields")
     """Directory of field archives; a field the server has is fetched into it."""
     neighbours: tuple[str, ...] = ()
-    """HOST:PORT of further servers along the drive: the vehicle moves on from tile to tile, and to
-    a neighbour in reach when a server is lost."""
+    """HOST:PORT of further servers along the drive: the vehicle is handed over from tile to tile,
+    and to a neighbour whose tile covers it when a server is lost."""
     camera: str = "front"
     """Name of the camera on the wire."""
     rate: float = 10.0
@@ -82,13 +83,13 @@ class AgentConfig:
     preset: str = "medium"
     """x264 preset, ultrafast to veryslow."""
     max_delay_ms: float | None = None
-    """From capture to Ack, at most; quality falls to keep it, from --crf on, and pictures are
-    dropped when the lowest cannot. Without it every frame has --crf."""
+    """Longest time from capture to Ack; quality falls below --crf to keep it, and pictures are
+    dropped when the lowest quality cannot. Without it every frame has --crf."""
     deadline_ms: float | None = None
-    """Milliseconds a frame may take here, from the picture to the packet: the best rung of the
-    ladder that keeps it is used, a lower one under load, in place of the preset."""
+    """Milliseconds a frame may take on this machine, from the picture to the packet: the best rung
+    of the ladder that keeps it is used, a lower one under load, in place of the preset."""
     ladder: Path = Path("results/ladder.json")
-    """What rungs take and cost, as `rfedge eval ladder` measured it."""
+    """Times and rates of the rungs, as `rfedge eval ladder` measured them."""
     steering: SteeringSettings = SteeringSettings()
     log: LogForm = LogForm.AUTO
     """console lines, json lines, or auto: console on a terminal."""

@@ -1,20 +1,20 @@
-"""Which rung to code on, so that a frame is ready within a deadline. A machine without clock.
+"""Which rung of the ladder the next frame is coded on, so that it is ready within a deadline.
 
-The ladder's times are another machine's. ``slowness`` is how much longer a frame takes here and
-now, a running mean over the last few; a rung is predicted to take its ladder time times that. After
-a frame that was late the best rung that is predicted to fit is taken at once; a better one only
-when it has been predicted to fit with room to spare for a while, which doubles each time a climb
-had to be taken back soon, so that a load near a rung's edge does not make it flap.
+A rung is one setting of the sender; the ladder says what each took and cost on the machine that
+measured it. ``slowness`` is how much longer a frame takes here and now, a running mean over the
+last few; a rung is predicted to take its ladder time times that. After a late frame the best rung
+that is predicted to fit is taken at once. A better one is taken only when it has been predicted to
+fit with room to spare for a while, which doubles each time a climb was soon taken back, so that a
+load near a rung's edge does not make it alternate.
 
-Which rung of the ladder the next frame is coded on: always the same, or what a deadline allows.
-
-Used on the encoder's thread alone.
+``DeadlineController`` is the state machine; ``Rungs`` is what ``cav_agent.pipeline`` asks, on the
+encoder's thread alone: one rung for ever, or the controller's.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -28,27 +28,29 @@ __all__ = [
     "FixedRung",
     "Rungs",
     "Step",
-    "sender_ms",
 ]
 
 
 @dataclass(frozen=True)
 class DeadlineLimits:
-    """``room``: share of the deadline a better rung must stay below before it is climbed to, for
-    ``patience_s`` at first and ``longest_patience_s`` at most. ``memory``: weight of the newest
-    frame in the running mean."""
+    """When to take a better rung: once it was predicted to stay below the share ``room`` of the
+    deadline for ``climb_delay_s``, which grows to ``max_climb_delay_s`` at most. ``memory``: weight
+    of the newest frame in the running mean."""
 
     room: float = 0.85
-    patience_s: float = 2.0
-    longest_patience_s: float = 60.0
+    climb_delay_s: float = 2.0
+    max_climb_delay_s: float = 60.0
     memory: float = 0.25
 
     def __post_init__(self) -> None:
         for name in ("room", "memory"):
             if not 0 < getattr(self, name) <= 1:
                 raise InvalidInput(f"deadline.{name}", f"{getattr(self, name)} is outside 0..1")
-        if not 0 < self.patience_s <= self.longest_patience_s:
-            raise InvalidInput("deadline.patience_s", f"{self.patience_s} s is out of range")
+        if not 0 < self.climb_delay_s <= self.max_climb_delay_s:
+            raise InvalidInput(
+                "deadline.climb_delay_s",
+                f"{self.climb_delay_s} s is outside 0..{self.max_climb_delay_s:g} s",
+            )
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Step:
 
     @property
     def down(self) -> bool:
-        """Tell whether accuracy was given up."""
+        """Whether accuracy was given up."""
         return self.after.rate_percent > self.before.rate_percent
 
 
@@ -81,7 +83,7 @@ class DeadlineController:
         self._rungs = tuple(rungs)
         self._deadline_ms = deadline_ms
         self._limits = limits or DeadlineLimits()
-        self._patience_s = self._limits.patience_s
+        self._climb_delay_s = self._limits.climb_delay_s
         self._room_since_s: float | None = None
         self._climbed_s = -math.inf
         self.slowness: float | None = None
@@ -114,8 +116,8 @@ class DeadlineController:
         return self._climb(now)
 
     def _fall(self, now: float) -> Step | None:
-        if now - self._climbed_s < 2 * self._patience_s:
-            self._patience_s = min(2 * self._patience_s, self._limits.longest_patience_s)
+        if now - self._climbed_s < 2 * self._climb_delay_s:
+            self._climb_delay_s = min(2 * self._climb_delay_s, self._limits.max_climb_delay_s)
         self._room_since_s = None
         return self._move(self._best(1.0))
 
@@ -126,10 +128,10 @@ class DeadlineController:
             return None
         if self._room_since_s is None:
             self._room_since_s = now
-        if now - self._room_since_s < self._patience_s:
+        if now - self._room_since_s < self._climb_delay_s:
             return None
-        if now - self._climbed_s > 4 * self._patience_s:
-            self._patience_s = self._limits.patience_s
+        if now - self._climbed_s > 4 * self._climb_delay_s:
+            self._climb_delay_s = self._limits.climb_delay_s
         self._room_since_s, self._climbed_s = None, now
         return self._move(better)
 
@@ -148,24 +150,15 @@ class DeadlineController:
         return Step(before, after, 1.0 if self.slowness is None else self.slowness)
 
 
-NOT_THE_SENDERS = frozenset({"read"})
-"""Stages that a vehicle does not have: its camera hands the picture over."""
-
-
-def sender_ms(stage_s: Mapping[str, float]) -> float:
-    """Return what a frame took the sender, from the picture in memory to the packet."""
-    return 1e3 * sum(spent for stage, spent in stage_s.items() if stage not in NOT_THE_SENDERS)
-
-
 class Rungs(Protocol):
-    """Says how to code, and is told what it took."""
+    """Decides on which rung each frame is coded, from what the frames before it took."""
 
     @property
     def current(self) -> Rung:
         """The rung for the next frame."""
 
-    def coded(self, stage_s: Mapping[str, float], now: float) -> None:
-        """A frame on ``current`` took so many seconds by stage, until ``now``."""
+    def coded(self, sender_s: float, now: float) -> None:
+        """A frame on ``current`` took ``sender_s`` from picture to packet, until ``now``."""
 
 
 class FixedRung:
@@ -174,28 +167,28 @@ class FixedRung:
     def __init__(self, rung: Rung) -> None:
         self.current = rung
 
-    def coded(self, stage_s: Mapping[str, float], now: float) -> None:
-        """Nothing follows from it."""
+    def coded(self, sender_s: float, now: float) -> None:
+        """Do nothing: the rung does not depend on it."""
 
 
 class DeadlineRungs:
-    """What ``controller`` says; ``told`` hears of every frame: the controller, and its step."""
+    """The rungs ``controller`` chooses; ``on_coded`` gets the controller and its step per frame."""
 
     def __init__(
         self,
         controller: DeadlineController,
-        told: Callable[[DeadlineController, Step | None], None],
+        on_coded: Callable[[DeadlineController, Step | None], None],
     ) -> None:
         self._controller = controller
-        self._told = told
+        self._on_coded = on_coded
 
     @property
     def current(self) -> Rung:
         """The rung for the next frame."""
         return self._controller.current.rung
 
-    def coded(self, stage_s: Mapping[str, float], now: float) -> None:
-        """Let the controller know, and pass on what it makes of it."""
+    def coded(self, sender_s: float, now: float) -> None:
+        """Let the controller choose anew, and report what it did."""
         controller = self._controller
-        step = controller.measured(controller.current, sender_ms(stage_s), now)
-        self._told(controller, step)
+        step = controller.measured(controller.current, 1e3 * sender_s, now)
+        self._on_coded(controller, step)

@@ -1,18 +1,33 @@
-"""One JSON line per captured picture: what it cost and how it ended."""
+"""What is recorded of a drive: a line of JSON per picture, log lines, and metrics.
+
+``DriveObserver`` is the one place that hears of everything that happens to the vehicle's frames,
+streams and fields. Frames are counted when they have ended, however they ended.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from cav_agent.frames import FrameResult
+import structlog
 
-__all__ = ["FrameLog", "log_line"]
+from cav_agent.deadline import DeadlineController, Step
+from cav_agent.frames import FrameResult, Outcome
+from cav_agent.handover import HandoverCause, ServedTile
+from cav_agent.metrics import AgentMetrics
+from cav_agent.rate_control import QualitySteps
+from rfcore.field import RadianceField
+from rfcore.wire.address import Address
+
+__all__ = ["DriveObserver", "FrameLog", "log_line"]
+
+log = structlog.get_logger()
 
 
 class FrameLog:
-    """Writes lines as pictures end; the file is complete up to the last line at any time."""
+    """Writes a line per picture as it ends; the file is complete up to its last line."""
 
     def __init__(self, path: Path) -> None:
         self._file: TextIO = path.open("w", buffering=1)
@@ -26,33 +41,126 @@ class FrameLog:
         self._file.close()
 
 
+class DriveObserver:
+    """Turns the events of a drive into metrics, log lines and, if given, the frame log."""
+
+    def __init__(
+        self, metrics: AgentMetrics, servers: Sequence[Address], frame_log: FrameLog | None = None
+    ) -> None:
+        self._metrics = metrics
+        self._servers = tuple(servers)
+        self._frame_log = frame_log
+        self._quality_steps = QualitySteps()
+
+    def ended(self, result: FrameResult) -> None:
+        """A captured picture came to its end."""
+        self._metrics.ended(result)
+        if self._frame_log is not None:
+            self._frame_log.ended(result)
+        _log_failure(result)
+        self._log_quality(result)
+
+    def connected(self, is_connected: bool) -> None:
+        """A server welcomed the vehicle, or its stream was lost."""
+        self._metrics.connected(is_connected)
+
+    def handed_over(self, served: ServedTile, cause: HandoverCause) -> None:
+        """``served`` takes the vehicle's pictures now."""
+        self._metrics.handed_over(cause)
+        server = str(self._servers[served.server])
+        log.info("handed over", server=server, tile=served.tile.name, cause=str(cause))
+
+    def field_ready(self, field: RadianceField, pictures: int) -> None:
+        """A field was opened and can be coded against."""
+        self._metrics.field_ready(field.field_id, field.metadata.kind)
+        log.info("ready", pictures=pictures, field=field.field_id, isa=field.isa)
+
+    def coded_under_deadline(self, controller: DeadlineController, step: Step | None) -> None:
+        """A frame was coded under a deadline; ``step`` is the change of rung that followed."""
+        self._metrics.coded_under_deadline(controller.position, step, controller.late)
+        if step is not None:
+            log.info(
+                "stepped down" if step.down else "stepped up",
+                before=step.before.rung.name,
+                rung=step.after.rung.name,
+                slowness=round(step.slowness, 2),
+            )
+
+    def _log_quality(self, result: FrameResult) -> None:
+        """Log when rate control lowered or raised the quality by much."""
+        encoded, budget = result.encoded, result.budget
+        if encoded is None or encoded.crf is None or budget is None:
+            return
+        step = self._quality_steps.step(encoded.crf)
+        if step is not None:
+            before, after = step
+            rate_bps = budget.rate_bps
+            log.info(
+                "quality falls" if after > before else "quality rises",
+                session=result.session_id,
+                crf=round(after, 1),
+                crf_before=round(before, 1),
+                target_bytes=round(budget.target_bytes),
+                proven_mbps=None if rate_bps is None else round(rate_bps / 1e6, 3),
+            )
+
+
+def _log_failure(result: FrameResult) -> None:
+    """Log a frame that was coded in vain, or coarser than asked for to fit the limit.
+
+    A picture that was dropped before it was encoded is only counted.
+    """
+    encoded, packet = result.encoded, result.packet
+    if encoded is None or packet is None:
+        return
+    frame = {"session": result.session_id, "epoch": packet.epoch, "seq": packet.sequence}
+    if encoded.tries > 1 and result.budget is None:
+        size_bytes = len(packet.payload)
+        event = "slice above the limit coded again"
+        log.warning(event, **frame, tries=encoded.tries, payload_bytes=size_bytes)
+    if result.outcome is not Outcome.ACKED:
+        event = f"frame {result.outcome}"
+        log.warning(event, **frame, reason=str(result.reason), problem=result.problem)
+
+
 def log_line(result: FrameResult) -> dict[str, Any]:
-    """Return the line of a picture; what it did not reach is null."""
-    packet, server = result.packet, result.server
-    stage_ms = {name: spent_s * 1e3 for name, spent_s in result.stage_s.items()}
-    if server is not None:
-        for stage in ("queue", "render", "splice", "decode", "total"):
-            stage_ms[f"server_{stage}"] = getattr(server, f"{stage}_ns") / 1e6
-    if result.link_s is not None:
-        stage_ms["link"] = result.link_s * 1e3
+    """Return the frame log's line of a picture; what the picture did not get to is null."""
     return {
         "name": result.capture.picture.name,
         "index": result.capture.index,
         "capture_time_ns": result.capture.capture_time_ns,
         "result": str(result.outcome),
-        "reason": result.reason,
+        "reason": str(result.reason),
+        "problem": result.problem,
+        **_coding_of(result),
+        "server_digest": result.server_digest.hex() or None,
+        "stage_ms": _stage_ms(result),
+        "latency_ms": None if result.latency_s is None else result.latency_s * 1e3,
+    }
+
+
+def _coding_of(result: FrameResult) -> dict[str, Any]:
+    encoded, packet = result.encoded, result.packet
+    return {
         "epoch": packet.epoch if packet else None,
         "sequence": packet.sequence if packet else None,
         "references": [r.name.lower() for r in packet.references] if packet else None,
         "payload_bytes": len(packet.payload) if packet else None,
-        "tries": result.tries if packet else None,
-        "rung": result.rung.name if result.rung else None,
-        "crf": result.crf,
+        "tries": encoded.tries if encoded else None,
+        "rung": encoded.rung.name if encoded else None,
+        "crf": encoded.crf if encoded else None,
         "target_bytes": result.budget.target_bytes if result.budget else None,
         "packet_bytes": result.packet_bytes if packet else None,
         "render_digest": packet.render_digest.hex() if packet else None,
         "reconstruction_digest": packet.reconstruction_digest.hex() if packet else None,
-        "server_digest": result.server_digest.hex() or None,
-        "stage_ms": stage_ms,
-        "latency_ms": None if result.latency_s is None else result.latency_s * 1e3,
     }
+
+
+def _stage_ms(result: FrameResult) -> dict[str, float]:
+    stage_ms = {stage: spent_s * 1e3 for stage, spent_s in result.stage_s.items()}
+    if result.server is not None:
+        for stage in ("queue", "render", "splice", "decode", "total"):
+            stage_ms[f"server_{stage}"] = getattr(result.server, f"{stage}_ns") / 1e6
+    if result.link_s is not None:
+        stage_ms["link"] = result.link_s * 1e3
+    return stage_ms

@@ -1,23 +1,32 @@
-"""A picture's way through the agent: captured, taken for encoding, encoded, answered.
+"""The values that follow one picture through the agent: captured, encoded, ended.
 
-Values only. ``captured_s`` and the like are seconds on the agent's monotonic clock; ``_ns`` fields
-are nanoseconds of the Unix epoch.
+They hold no behaviour. ``captured_s`` and the like are seconds on the agent's monotonic clock;
+``_ns`` fields are nanoseconds of the Unix epoch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 
 from cav_agent.rate_control import ByteBudget
 from rfcore.camera import Pose
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.sender.ladder import FULL_RUNG, Rung
+from rfcore.errors import RejectReason
 from rfcore.views import PosedPicture
 from rfcore.wire.messages import FrameAddress, StageTimes
 
-__all__ = ["TOO_LATE", "Capture", "EncodeJob", "EncodedFrame", "FrameResult", "Outcome"]
+__all__ = [
+    "Capture",
+    "EncodeJob",
+    "EncodedFrame",
+    "EndReason",
+    "FrameResult",
+    "Outcome",
+    "StreamEnd",
+]
 
 
 @dataclass(frozen=True)
@@ -36,7 +45,7 @@ class EncodeJob:
 
     ``base`` is the frame it may be predicted from; ``None``: nothing but the render. ``exact``:
     whether the server's renders are ours to the bit. ``budget``: the bytes it may take;
-    ``None``: the configured CRF.
+    ``None``: the configured CRF. ``connection`` counts the streams the session has opened.
     """
 
     capture: Capture
@@ -49,10 +58,14 @@ class EncodeJob:
 
 @dataclass(frozen=True)
 class EncodedFrame:
-    """A coded picture; ``stage_s`` has read, convert, render, references, encode and
-    closed_loop; ``tries`` is how often it was coded, to fit the payload's limit; ``rung`` is the
-    setting it was coded with, ``crf`` its quality, ``pose`` the one it was coded at, if that is not
-    the measured one."""
+    """A coded picture and what coding it took.
+
+    ``stage_s``: seconds by stage (convert, render, refine if poses are refined, references, encode,
+    closed_loop). ``tries``: how often it was coded to fit the payload's limit. ``rung``, ``crf``:
+    the setting it was coded with. ``pose``: the one it was coded at; ``None``: the measured one.
+    ``read_s``: seconds it took to load the picture from the dataset. A vehicle's camera hands its
+    pictures over, so this is no stage of the sender and part of no delay.
+    """
 
     packet: DeltaPacket
     stage_s: Mapping[str, float]
@@ -60,10 +73,12 @@ class EncodedFrame:
     rung: Rung = FULL_RUNG
     crf: float | None = None
     pose: Pose | None = None
+    read_s: float = 0.0
 
-
-TOO_LATE = "too late"
-"""Why a picture was dropped that had waited longer than its delay; a fresh one may be in time."""
+    @property
+    def sender_s(self) -> float:
+        """Seconds from the picture in memory to the packet."""
+        return sum(self.stage_s.values())
 
 
 class Outcome(StrEnum):
@@ -75,26 +90,82 @@ class Outcome(StrEnum):
     LOST = "lost"
 
 
+class EndReason(StrEnum):
+    """Why a picture, or a stream, ended as it did: a closed set, fit for a metric's label.
+
+    A refused frame has the server's ``RejectReason`` instead. Numbers and messages belong into the
+    ``problem`` beside the reason.
+    """
+
+    NONE = ""
+    """Acknowledged."""
+    SUPERSEDED = "superseded"
+    """A newer picture took its place before it was encoded."""
+    TOO_LATE = "too_late"
+    """It waited longer than its delay allows; a fresh picture may be in time."""
+    STOPPING = "stopping"
+    NOT_CODED = "not_coded"
+    """It could not be read or encoded."""
+    OVERSIZE = "oversize"
+    """Its slice exceeds the payload limit at the highest CRF."""
+    HANDED_OVER = "handed_over"
+    """Another server takes the vehicle over; it is captured again for that one."""
+    NOT_SENT = "not_sent"
+    """Its stream ended while it was encoded."""
+    BASE_LOST = "base_lost"
+    """The frame it was predicted from was not decoded."""
+    NO_WELCOME = "no_welcome"
+    NO_ANSWER = "no_answer"
+    STREAM_LOST = "stream_lost"
+    """The transport failed, or the server ended the stream with an error."""
+    SERVER_CLOSED = "server_closed"
+    ABANDONED = "abandoned"
+    """The stream's task ended before the picture did."""
+
+
+@dataclass(frozen=True)
+class StreamEnd:
+    """Why a stream to a server ended; ``problem`` is for the log."""
+
+    reason: EndReason
+    problem: str
+
+
 @dataclass(frozen=True)
 class FrameResult:
-    """The end of one captured picture.
+    """The end of one captured picture; ``encoded`` and times are there as far as the frame got.
 
-    ``reason`` is empty for an acknowledged frame. Packet, sizes and times are there as far as the
-    frame got. ``latency_s`` runs from capture to answer, ``link_s`` from sending to answer without
-    the server's own time.
+    ``reason`` is a word that can be counted, ``problem`` says more. ``packet_bytes``: the whole
+    message as sent. ``latency_s``: from capture to answer; ``link_s``: from sending to answer
+    without the server's own time. ``session_id``: the stream it was encoded for.
     """
 
     capture: Capture
     outcome: Outcome
-    reason: str = ""
-    packet: DeltaPacket | None = None
+    reason: EndReason | RejectReason = EndReason.NONE
+    problem: str = ""
+    encoded: EncodedFrame | None = None
     packet_bytes: int = 0
-    stage_s: Mapping[str, float] = field(default_factory=dict)
+    budget: ByteBudget | None = None
+    session_id: str = ""
     server: StageTimes | None = None
     server_digest: bytes = b""
     latency_s: float | None = None
     link_s: float | None = None
-    tries: int = 1
-    rung: Rung | None = None
-    crf: float | None = None
-    budget: ByteBudget | None = None
+
+    @property
+    def packet(self) -> DeltaPacket | None:
+        """The coded picture, if it got so far."""
+        return None if self.encoded is None else self.encoded.packet
+
+    @property
+    def stage_s(self) -> dict[str, float]:
+        """Seconds by stage, with ``read`` for loading the picture; empty if it was not encoded."""
+        if self.encoded is None:
+            return {}
+        return {"read": self.encoded.read_s, **self.encoded.stage_s}
+
+    @property
+    def explanation(self) -> str:
+        """Reason and problem as one text."""
+        return f"{self.reason}: {self.problem}" if self.problem else str(self.reason)

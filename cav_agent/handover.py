@@ -1,15 +1,15 @@
-"""Who codes the next picture: a machine without clock, sockets or tasks.
+"""Which server's tile takes each picture of a drive, and which streams are held open.
 
-``choose`` gives each captured picture to one stop; ``wanted`` says to which stops a stream should
-be open: where the vehicle is, where it will be within moments, so that the first picture there
-finds its stream open, and a neighbour when home has not answered for a while. A picture that nobody
-can take stays at home, where the newest wins.
+``TileRoute`` assigns every picture of a drive to the tile on whose ground it was taken. A vehicle
+that leaves a tile stays with it for a share of the tile's margin, so that driving along a border
+does not alternate between two tiles. ``Handover`` follows that route with the servers as they are:
+``choose`` gives a captured picture to one tile; ``wanted`` lists the tiles to which a stream should
+be open: the assigned one, those of the next moments, so that the first picture there finds its
+stream open, and a neighbour once the assigned server has been lost for a while. A picture that no
+server can take stays with its assigned tile, where the newest wins.
 
-Which server's tile serves which picture of a drive.
-
-A stop is one tile of one server. A picture belongs to the stop whose ground it was taken on; a
-vehicle that leaves that ground stays for a share of the margin, so that driving along a border is
-no coming and going. Positions are (east, north) in metres, in the drive's own global frame.
+A state machine without clock, sockets or tasks. Positions are (east, north) in metres, in the
+drive's own global frame.
 """
 
 from __future__ import annotations
@@ -21,126 +21,135 @@ from enum import StrEnum
 from rfcore.errors import InvalidInput
 from rfcore.wire.tiles import Tile
 
-__all__ = ["LOST_AFTER_S", "Cause", "Handover", "Route", "Stop"]
-
+__all__ = ["LEAVE_SHARE", "LOST_AFTER_S", "Handover", "HandoverCause", "ServedTile", "TileRoute"]
 
 LEAVE_SHARE = 0.25
 """Of a tile's margin, how far a vehicle drives into it before another tile takes over."""
+
+LOST_AFTER_S = 1.0
+"""A server that is silent for so long is replaced by a neighbour; a shorter pause is waited for."""
+
 Position = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Stop:
-    """Tile ``tile`` of server number ``server``."""
+class ServedTile:
+    """Tile ``tile`` as published by server number ``server``."""
 
     server: int
     tile: Tile
 
 
-class Route:
-    """A drive past ``stops``: ``home[i]`` is the stop that picture i belongs to."""
+class TileRoute:
+    """A drive across ``tiles``: ``assigned[i]`` is the tile that picture i belongs to."""
 
-    def __init__(self, stops: Sequence[Stop], positions: Sequence[Position]) -> None:
-        if not stops or not positions:
-            raise InvalidInput("route", f"{len(stops)} stops, {len(positions)} positions")
-        self.stops = tuple(stops)
+    def __init__(self, tiles: Sequence[ServedTile], positions: Sequence[Position]) -> None:
+        if not tiles or not positions:
+            raise InvalidInput("route", f"{len(tiles)} tiles, {len(positions)} positions")
+        self.tiles = tuple(tiles)
         self._positions = tuple(positions)
-        self.home = _homes(self.stops, self._positions)
+        self.assigned = _assign(self.tiles, self._positions)
 
     def __len__(self) -> int:
         return len(self._positions)
 
-    def reaching(self, index: int) -> list[Stop]:
-        """Return the stops that picture ``index`` may be sent to, the nearest ground first."""
+    def in_range(self, index: int) -> list[ServedTile]:
+        """Return the tiles that picture ``index`` may be sent to, the nearest ground first."""
         position = self._positions[index % len(self)]
-        within = [stop for stop in self.stops if self.within(stop, index)]
-        return sorted(within, key=lambda stop: stop.tile.distance_m(*position))
+        covering = [served for served in self.tiles if self.covers(served, index)]
+        return sorted(covering, key=lambda served: served.tile.distance_m(*position))
 
-    def within(self, stop: Stop, index: int) -> bool:
-        """Whether picture ``index`` may be sent to ``stop``, which may be one of an older route."""
-        return stop.tile.reaches(*self._positions[index % len(self)])
+    def covers(self, served: ServedTile, index: int) -> bool:
+        """Whether picture ``index`` may be sent to ``served``, which may be of an older route."""
+        return served.tile.reaches(*self._positions[index % len(self)])
 
-    def ahead(self, index: int, pictures: int) -> list[Stop]:
-        """Return the homes of the next ``pictures`` pictures, each once, in their order."""
+    def ahead(self, index: int, pictures: int) -> list[ServedTile]:
+        """Return the tiles of the next ``pictures`` pictures, each once, in their order."""
         count = min(pictures, len(self))
-        return list(dict.fromkeys(self.home[(index + i) % len(self)] for i in range(count)))
+        return list(dict.fromkeys(self.assigned[(index + i) % len(self)] for i in range(count)))
 
 
-def _homes(stops: Sequence[Stop], positions: Sequence[Position]) -> tuple[Stop, ...]:
-    homes: list[Stop] = []
+def _assign(tiles: Sequence[ServedTile], positions: Sequence[Position]) -> tuple[ServedTile, ...]:
+    assigned: list[ServedTile] = []
     for position in positions:
-        nearest = min(stops, key=lambda stop: stop.tile.distance_m(*position))
-        if homes and _stays(homes[-1].tile, position):
-            nearest = homes[-1]
-        homes.append(nearest)
-    return tuple(homes)
+        nearest = min(tiles, key=lambda served: served.tile.distance_m(*position))
+        if assigned and _stays(assigned[-1].tile, position):
+            nearest = assigned[-1]
+        assigned.append(nearest)
+    return tuple(assigned)
 
 
 def _stays(tile: Tile, position: Position) -> bool:
     return tile.distance_m(*position) <= LEAVE_SHARE * tile.margin_m
 
 
-LOST_AFTER_S = 1.0
-"""A server that is silent for so long is given up for a neighbour; a blink is waited for."""
-
-
-class Cause(StrEnum):
-    """Why a vehicle went to another stop."""
+class HandoverCause(StrEnum):
+    """Why another tile takes a picture than took the one before."""
 
     TILE = "tile"
     SERVER_LOST = "server_lost"
 
 
 class Handover:
-    """Follows ``route``; ``near`` pictures ahead a stream is opened."""
+    """Follows ``route``; a stream is opened ``near`` pictures before its first one."""
 
-    def __init__(self, route: Route, near: int) -> None:
+    def __init__(self, route: TileRoute, near: int) -> None:
         self.route = route
-        self.in_charge: Stop | None = None
+        self.current: ServedTile | None = None
+        """The tile that took the last picture."""
         self._near = near
         self._absent_since_s: float | None = None
 
-    def follow(self, route: Route) -> None:
+    def follow(self, route: TileRoute) -> None:
         """Go on along another route: other tiles are published."""
         self.route = route
 
-    def wanted(self, index: int, ready: Collection[Stop], now: float) -> list[Stop]:
-        """Return the stops to hold a stream to while picture ``index`` is next."""
-        ahead = self.route.ahead(index, self._near)
-        home = ahead[0]
-        self._watch(home, ready, now)
+    def wanted(self, index: int, streaming: Collection[ServedTile], now: float) -> list[ServedTile]:
+        """Return the tiles to hold a stream to while picture ``index`` is next.
+
+        ``streaming``: the tiles whose server takes pictures now.
+        """
+        wanted = self.route.ahead(index, self._near)
+        assigned, current = wanted[0], self.current
+        self._watch(assigned, streaming, now)
         if self._is_lost(now):
-            ahead += [stop for stop in self.route.reaching(index) if stop not in ahead]
-        leaving = self.in_charge
-        if home not in ready and leaving in ready and leaving is not None and leaving not in ahead:
-            ahead.append(leaving)
-        return ahead
+            wanted += [served for served in self.route.in_range(index) if served not in wanted]
+        is_needed = assigned not in streaming and current in streaming
+        if is_needed and current is not None and current not in wanted:
+            wanted.append(current)
+        return wanted
 
-    def taker(self, index: int, ready: Collection[Stop], now: float) -> Stop:
-        """Return who would take picture ``index``."""
-        home = self.route.home[index % len(self.route)]
-        self._watch(home, ready, now)
-        return home if home in ready else self._substitute(index, ready, now) or home
+    def candidate(self, index: int, streaming: Collection[ServedTile], now: float) -> ServedTile:
+        """Return the tile that would take picture ``index``."""
+        assigned = self.route.assigned[index % len(self.route)]
+        self._watch(assigned, streaming, now)
+        if assigned in streaming:
+            return assigned
+        return self._substitute(index, streaming, now) or assigned
 
-    def choose(self, index: int, ready: Collection[Stop], now: float) -> tuple[Stop, Cause | None]:
-        """Return who takes picture ``index``, and why it is another than before."""
-        chosen = self.taker(index, ready, now)
-        before, self.in_charge = self.in_charge, chosen
+    def choose(
+        self, index: int, streaming: Collection[ServedTile], now: float
+    ) -> tuple[ServedTile, HandoverCause | None]:
+        """Return the tile that takes picture ``index``, and why if it is another than before."""
+        chosen = self.candidate(index, streaming, now)
+        before, self.current = self.current, chosen
         if before is None or before == chosen:
             return chosen, None
-        at_home = chosen == self.route.home[index % len(self.route)]
-        return chosen, Cause.TILE if at_home else Cause.SERVER_LOST
+        is_assigned = chosen == self.route.assigned[index % len(self.route)]
+        return chosen, HandoverCause.TILE if is_assigned else HandoverCause.SERVER_LOST
 
-    def _substitute(self, index: int, ready: Collection[Stop], now: float) -> Stop | None:
-        staying = self.in_charge
-        if staying is not None and staying in ready and self.route.within(staying, index):
-            return staying
+    def _substitute(
+        self, index: int, streaming: Collection[ServedTile], now: float
+    ) -> ServedTile | None:
+        current = self.current
+        if current is not None and current in streaming and self.route.covers(current, index):
+            return current
         if not self._is_lost(now):
             return None
-        return next((stop for stop in self.route.reaching(index) if stop in ready), None)
+        return next((tile for tile in self.route.in_range(index) if tile in streaming), None)
 
-    def _watch(self, home: Stop, ready: Collection[Stop], now: float) -> None:
-        if home in ready or self.in_charge is None:  # what has not begun is not lost
+    def _watch(self, assigned: ServedTile, streaming: Collection[ServedTile], now: float) -> None:
+        if assigned in streaming or self.current is None:  # what has not begun is not lost
             self._absent_since_s = None
         elif self._absent_since_s is None:
             self._absent_since_s = now

@@ -1,8 +1,9 @@
-"""A drive past one server or several: each picture goes to the stop whose ground it was taken on.
+"""The drive itself: captures pictures in time and gives each to the stream of its tile.
 
-One loop captures (by the pace), gives pictures to legs (by ``cav_agent.handover``), opens the next
-leg before it is needed and closes the last one when it is not. The next tile's field is fetched
-while the present one is in use; a leg that has been made ready stays so while it lies ahead.
+One loop asks ``cav_agent.capture_schedule`` which picture is due and ``cav_agent.handover`` which
+tile takes it, opens the next tile's stream before it is needed and closes the last one's when it is
+not. The next tile's field is fetched while the present one is in use, and stays prepared while its
+tile lies ahead.
 """
 
 from __future__ import annotations
@@ -11,20 +12,21 @@ import asyncio
 import math
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
 import structlog
 
 from cav_agent.capture_schedule import CaptureSchedule, Lockstep, Realtime
+from cav_agent.client import CameraTaken
 from cav_agent.config import AgentConfig, PaceKind
+from cav_agent.frame_log import DriveObserver
 from cav_agent.frames import FrameResult
-from cav_agent.handover import LOST_AFTER_S, Cause, Handover, Position, Route, Stop
-from cav_agent.tile_stream import Ready, TileStream
+from cav_agent.handover import LOST_AFTER_S, Handover, Position, ServedTile, TileRoute
+from cav_agent.tile_stream import PrepareStream, TileStream
 from rfcore.errors import RfedgeError
 
-__all__ = ["HandoverController", "Hooks"]
+__all__ = ["HandoverController"]
 
 log = structlog.get_logger()
 
@@ -32,60 +34,63 @@ NEAR_S, NEAR_PICTURES = 2.0, 3
 """How long before a border the next stream is opened; in lockstep, how many pictures."""
 
 AHEAD_S, AHEAD_PICTURES = 30.0, 30
-"""How long before a border the next field is fetched."""
+"""How long before a border the next field is fetched; in lockstep, how many pictures."""
 
 RETRY_S = 2.0
+"""Until a stream that failed is opened again."""
+
 SHORTEST_REST_S = 0.001
-LOOK_EVERY_S = 0.25
-"""A stream that opens or breaks between two pictures is noticed so soon."""
-
-
-@dataclass(frozen=True)
-class Hooks:
-    """``prepare`` makes a stop's leg ready; ``moved`` is told of every handover."""
-
-    prepare: Callable[[Stop], Awaitable[Ready]]
-    ended: Callable[[FrameResult], None]
-    moved: Callable[[Stop, Cause], None]
+POLL_S = 0.25
+"""A stream that opens or breaks between two pictures is noticed within this time."""
 
 
 class HandoverController:
-    """Drives ``positions`` past the stops that ``found`` tells of."""
+    """Drives along ``positions`` across the tiles that ``tiles_published`` names.
 
-    def __init__(self, config: AgentConfig, positions: Sequence[Position], hooks: Hooks) -> None:
+    It is the ``StreamObserver`` of every stream: each result passes here once, is counted, and goes
+    on to the schedule and to ``observer``.
+    """
+
+    def __init__(
+        self,
+        config: AgentConfig,
+        positions: Sequence[Position],
+        prepare: PrepareStream,
+        observer: DriveObserver,
+    ) -> None:
         self.counts: Counter[str] = Counter()
         self._config = config
         self._positions = tuple(positions)
-        self._hooks = hooks
-        self._pace = _pace(config, len(positions))
-        self._stops: dict[int, tuple[Stop, ...]] = {}
-        self._legs: dict[Stop, TileStream] = {}
+        self._prepare = prepare
+        self._observer = observer
+        self._schedule = _schedule(config, len(positions))
+        self._tiles: dict[int, tuple[ServedTile, ...]] = {}
+        self._streams: dict[ServedTile, TileStream] = {}
         self._handover: Handover | None = None
         self._next = 0
-        self._wake = asyncio.Event()
+        self._changed = asyncio.Event()
         self._stopping = False
         self._began_s = self._streaming_at_s = time.monotonic()
 
-    def found(self, server: int, stops: Sequence[Stop]) -> None:
+    def tiles_published(self, server: int, tiles: Sequence[ServedTile]) -> None:
         """Follow what a server publishes now."""
-        self._stops[server] = tuple(stops)
-        every = [stop for number in sorted(self._stops) for stop in self._stops[number]]
+        self._tiles[server] = tuple(tiles)
+        every = [served for number in sorted(self._tiles) for served in self._tiles[number]]
         if not every:
             return
-        route = Route(every, self._positions)
+        route = TileRoute(every, self._positions)
         if self._handover is None:
             self._handover = Handover(route, self._pictures(NEAR_S, NEAR_PICTURES))
         else:
             self._handover.follow(route)
-        self._wake.set()
+        self._changed.set()
 
     def stop(self) -> None:
         """Capture no more; ``run`` ends when what is in flight was answered."""
         self._stopping = True
-        for leg in self._legs.values():
-            if leg.agent is not None:
-                leg.agent.stop()
-        self._wake.set()
+        for stream in self._streams.values():
+            stream.stop()
+        self._changed.set()
 
     async def run(self) -> None:
         """Drive to the end; raise ``RfedgeError`` if that cannot be."""
@@ -93,101 +98,122 @@ class HandoverController:
             while not self._is_done():
                 now = time.monotonic()
                 self._collect(now)
-                knows_home = 0 in self._stops or now - self._began_s >= LOST_AFTER_S
-                if self._handover is not None and knows_home:
+                knows_first = 0 in self._tiles or now - self._began_s >= LOST_AFTER_S
+                if self._handover is not None and knows_first:
                     self._advance(self._handover, now)
                 await self._rest(now)
             await self._finish()
         finally:
-            tasks = [task for leg in self._legs.values() for task in leg.tasks]
+            tasks = [task for stream in self._streams.values() for task in stream.tasks]
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
     def _is_done(self) -> bool:
-        return self._stopping or self._pace.finished
+        return self._stopping or self._schedule.finished
+
+    # --- what streams report
+
+    def ended(self, result: FrameResult) -> None:
+        """Count a picture that came to its end; the schedule may raise ``RfedgeError``."""
+        self.counts[str(result.outcome)] += 1
+        self._observer.ended(result)
+        self._schedule.ended(result)
+        self._changed.set()
+
+    def connected(self, is_connected: bool) -> None:
+        """Pass on that a server welcomed the vehicle, or that its stream was lost."""
+        self._observer.connected(is_connected)
+
+    # --- pictures
 
     def _advance(self, handover: Handover, now: float) -> None:
-        """Open and close legs, then give away the pictures that are due."""
-        self._hold(handover, now)
-        while self._leg(handover.taker(self._next, self._streaming(), now)).agent is not None:
-            index = self._pace.next_capture(now)
+        """Open and close streams, then capture the pictures that are due."""
+        self._hold_streams(handover, now)
+        while self._candidate(handover, now).client is not None:
+            index = self._schedule.next_capture(now)
             if index is None:
                 return
-            self._give(handover, index, now)
+            self._capture(handover, index, now)
 
-    def _give(self, handover: Handover, index: int, now: float) -> None:
-        before = handover.in_charge
-        stop, cause = handover.choose(index, self._streaming(), now)
+    def _candidate(self, handover: Handover, now: float) -> TileStream:
+        return self._stream(handover.candidate(self._next, self._streaming(), now))
+
+    def _capture(self, handover: Handover, index: int, now: float) -> None:
+        before = handover.current
+        served, cause = handover.choose(index, self._streaming(), now)
         if cause is not None:
-            self._hooks.moved(stop, cause)
-            if before in self._legs and before is not None:
-                self._legs[before].withdraw()
-                self._legs[before].close()  # or its server would go on showing the vehicle
-        leg = self._leg(stop)
-        self._pace.limit(leg.pace.limit_hz)
-        leg.give(index)
+            self._observer.handed_over(served, cause)
+            if before in self._streams and before is not None:
+                self._streams[before].withdraw()
+                self._streams[before].close()  # or its server would go on showing the vehicle
+        stream = self._stream(served)
+        self._schedule.limit(0.0 if stream.client is None else stream.client.rate_limit_hz)
+        stream.capture(index)
         self._next = index + 1
 
-    def _hold(self, handover: Handover, now: float) -> None:
+    # --- streams
+
+    def _hold_streams(self, handover: Handover, now: float) -> None:
+        """Open what is wanted, prepare what lies ahead, and close the rest."""
         wanted = handover.wanted(self._next, self._streaming(), now)
         ahead = handover.route.ahead(self._next, self._pictures(AHEAD_S, AHEAD_PICTURES))
-        for stop in wanted:
-            self._leg(stop).open(now)
+        for served in wanted:
+            self._stream(served).open(now)
         if self._streaming():
-            for stop in ahead[:2]:
-                self._leg(stop).make_ready(now)
-        for stop, leg in tuple(self._legs.items()):
-            if stop not in wanted:
-                leg.close()
-                if stop not in ahead and not leg.tasks:
-                    del self._legs[stop]
+            for served in ahead[:2]:
+                self._stream(served).prepare(now)
+        for served, stream in tuple(self._streams.items()):
+            if served not in wanted:
+                stream.close()
+                if served not in ahead and not stream.tasks:
+                    del self._streams[served]
 
-    def _leg(self, stop: Stop) -> TileStream:
-        if stop not in self._legs:
-            self._legs[stop] = TileStream(stop, self._hooks.prepare, self._ended)
-        return self._legs[stop]
+    def _stream(self, served: ServedTile) -> TileStream:
+        if served not in self._streams:
+            self._streams[served] = TileStream(served, self._prepare, self)
+        return self._streams[served]
 
-    def _streaming(self) -> frozenset[Stop]:
-        return frozenset(stop for stop, leg in self._legs.items() if leg.is_streaming)
-
-    def _ended(self, result: FrameResult) -> None:
-        self.counts[str(result.outcome)] += 1
-        self._hooks.ended(result)
-        self._pace.ended(result)
-        self._wake.set()
+    def _streaming(self) -> frozenset[ServedTile]:
+        streams = self._streams.items()
+        return frozenset(served for served, stream in streams if stream.is_streaming)
 
     def _collect(self, now: float) -> None:
-        """Learn of legs that ended; a trip ends with its only leg, or when nobody takes it."""
+        """Note streams that ended.
+
+        An error ends the drive if it is of the only stream, if no server has taken the vehicle for
+        as long as it may, or if another agent sends its camera; else the stream is tried again.
+        """
         if self._streaming():
             self._streaming_at_s = now
         limit_s = self._config.limits.give_up_s or math.inf
-        is_over = now - self._streaming_at_s >= limit_s or len(self._legs) == 1
-        for leg in self._legs.values():
-            error = leg.collect(now)
+        is_over = now - self._streaming_at_s >= limit_s or len(self._streams) == 1
+        for stream in self._streams.values():
+            error = stream.collect()
             if error is None:
                 continue
-            if is_over or not isinstance(error, RfedgeError):
+            if is_over or isinstance(error, CameraTaken) or not isinstance(error, RfedgeError):
                 raise error
-            leg.retry_at_s = now + RETRY_S
-            log.warning("leg given up for now", tile=leg.stop.tile.name, problem=str(error))
+            stream.retry_at_s = now + RETRY_S
+            tile = stream.served.tile.name
+            log.warning("stream given up for now", tile=tile, problem=str(error))
 
     async def _rest(self, now: float) -> None:
-        due = [now + LOOK_EVERY_S]
-        timer = self._pace.get_timer()
+        due = [now + POLL_S]
+        timer = self._schedule.get_timer()
         if timer is not None:
             due.append(max(timer, now + SHORTEST_REST_S))
         with suppress(TimeoutError):
             async with asyncio.timeout(max(0.0, min(due) - now)):
-                await self._wake.wait()
-        self._wake.clear()
+                await self._changed.wait()
+        self._changed.clear()
 
     async def _finish(self) -> None:
-        """Let every leg finish what it has."""
-        for leg in self._legs.values():
-            leg.close()
-        driving = [task for leg in self._legs.values() for task in leg.tasks[-1:] if leg.agent]
-        for result in await asyncio.gather(*driving, return_exceptions=True):
+        """Let every stream finish what it has taken."""
+        for stream in self._streams.values():
+            stream.close()
+        closing = (stream.wait_closed() for stream in self._streams.values())
+        for result in await asyncio.gather(*closing, return_exceptions=True):
             if isinstance(result, BaseException):
                 raise result
 
@@ -197,7 +223,7 @@ class HandoverController:
         return max(in_lockstep, math.ceil(seconds * self._config.rate))
 
 
-def _pace(config: AgentConfig, pictures: int) -> CaptureSchedule:
+def _schedule(config: AgentConfig, pictures: int) -> CaptureSchedule:
     if config.pace is PaceKind.LOCKSTEP:
         return Lockstep(pictures, loop=config.loop)
     return Realtime(pictures, config.rate, loop=config.loop)

@@ -1,7 +1,8 @@
-"""What Prometheus sees of the agent. All names of its own begin with ``rfedge_agent_``.
+"""The agent's Prometheus metrics. All names of its own begin with ``rfedge_agent_``.
 
 An agent is one vehicle and one target of Prometheus, so ``instance`` tells vehicles apart. Their
-names appear only in ``rfedge_agent_info``, and only when asked for.
+names appear only in ``rfedge_agent_info``, and only when asked for. Values of labels come from
+closed sets (enumerations, stages, references), but for the ids of fields.
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ from __future__ import annotations
 from prometheus_client import CollectorRegistry
 
 from cav_agent.deadline import Step
-from cav_agent.frames import FrameResult
+from cav_agent.frames import EncodedFrame, FrameResult
+from cav_agent.handover import HandoverCause
 from rfcore.codec.references import references_name
 from rfcore.wire.instruments import Instruments
 
@@ -89,23 +91,23 @@ class AgentMetrics:
             ("cause",),
         )
 
-    def travelling(self, vehicle_id: str, camera_id: str) -> None:
-        """Tell who this is; for operators who want names."""
+    def identify(self, vehicle_id: str, camera_id: str) -> None:
+        """Export the names of vehicle and camera, for operators who want them."""
         self.instruments.info(
             "rfedge_agent_info",
             "1; the vehicle and its camera. Only with --metrics-per-vehicle.",
             {"vehicle": vehicle_id, "camera": camera_id},
         )
 
-    def field(self, field_id: str, kind: str) -> None:
-        """Tell which field was made ready to code frames against."""
+    def field_ready(self, field_id: str, kind: str) -> None:
+        """Note a field that was made ready to code frames against."""
         self._fields.labels(field_id[:16], kind).set(1)
 
-    def moved(self, cause: str) -> None:
+    def handed_over(self, cause: HandoverCause) -> None:
         """Count a handover."""
         self._handovers.labels(cause).inc()
 
-    def coded(self, position: int, step: Step | None, late: bool) -> None:
+    def coded_under_deadline(self, position: int, step: Step | None, late: bool) -> None:
         """Note the rung after a frame under a deadline, and whether the frame kept it."""
         self._rung.set(position)
         if step is not None:
@@ -114,31 +116,30 @@ class AgentMetrics:
             self._late.inc()
 
     def connected(self, is_connected: bool) -> None:
-        """Note that the server welcomed us, or was lost."""
+        """Note that a server welcomed the vehicle, or that its stream was lost."""
         self._connected.set(is_connected)
         if not is_connected:
             self._lost.inc()
 
     def ended(self, result: FrameResult) -> None:
         """Count a picture that came to its end."""
-        reason = result.reason.partition(":")[0][:40]
-        self._frames.labels(str(result.outcome), reason).inc()
-        if result.packet is not None:
-            references = references_name(result.packet.references)
-            self._payload.labels(references).inc(len(result.packet.payload))
-            self._sent.inc(result.packet_bytes)
-        if result.tries > 1:
-            self._recoded.inc()
-        self._chosen(result)
+        self._frames.labels(str(result.outcome), str(result.reason)).inc()
+        if result.encoded is not None:
+            self._encoded(result.encoded, result.packet_bytes)
+        if result.budget is not None:
+            self._target.set(result.budget.target_bytes)
+            self._rate.set((result.budget.rate_bps or 0.0) / 8)
         for stage, spent_s in result.stage_s.items():
             self._stages.labels(stage).observe(spent_s)
         if result.server is not None and result.link_s is not None and result.latency_s is not None:
             self._stages.labels("link").observe(result.link_s)
             self._latency.observe(result.latency_s)
 
-    def _chosen(self, result: FrameResult) -> None:
-        if result.crf is not None:
-            self._crf.set(result.crf)
-        if result.budget is not None:
-            self._target.set(result.budget.target_bytes)
-            self._rate.set((result.budget.rate_bps or 0.0) / 8)
+    def _encoded(self, encoded: EncodedFrame, packet_bytes: int) -> None:
+        packet = encoded.packet
+        self._payload.labels(references_name(packet.references)).inc(len(packet.payload))
+        self._sent.inc(packet_bytes)
+        if encoded.tries > 1:
+            self._recoded.inc()
+        if encoded.crf is not None:
+            self._crf.set(encoded.crf)

@@ -1,13 +1,15 @@
-"""From a captured picture to a packet: read, convert, render, encode. Runs on a worker thread.
+"""From a captured picture to a packet: convert, render, encode. Runs on the encoder's thread.
 
-The encoder's state is a value. Its numbering starts afresh whenever the session asks for another
-epoch; the frames it made last are kept, so that the session can say from which one to go on.
+A vehicle's camera hands its picture over in memory. Here it comes from a dataset, so it is loaded
+before any timing of the sender starts. The encoder's state is a value. Its numbering starts afresh
+whenever the session asks for another epoch; the frames it made last are kept, so that the session
+can say from which one to go on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from cav_agent.deadline import FixedRung, Rungs
 from cav_agent.frames import EncodedFrame, EncodeJob
@@ -29,39 +31,57 @@ from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, PosedPicture
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 
-__all__ = ["Pipeline"]
+__all__ = ["Pipeline", "PipelineOptions"]
 
 ClockNs = Callable[[], int]
 
 
-class Pipeline:
-    """Codes the pictures of one camera against renders of one field; one caller at a time.
+@dataclass(frozen=True)
+class PipelineOptions:
+    """How frames are coded beyond the codec's configuration."""
 
-    A slice above ``limit_bytes`` is coded again at a higher CRF, as long as there is one. ``rungs``
-    says how each frame is coded; without it all are at the configured preset, with all there is.
-    ``steering`` applies to every frame. ``threads`` are the encoder's; the renderer has its own.
-    """
+    limit_bytes: int = MAX_PAYLOAD_BYTES
+    """A larger slice is coded again at a higher CRF, as long as there is one."""
+    rungs: Rungs | None = None
+    """Says on which rung each frame is coded; ``None``: the preset, with every reference."""
+    steering: Steering = NO_STEERING
+    """Applies to every frame."""
+    threads: int = 1
+    """The encoder's; the renderer has its own."""
+
+
+class Stopwatch:
+    """Splits time into laps."""
+
+    def __init__(self, clock_ns: ClockNs) -> None:
+        self._clock_ns = clock_ns
+        self._lap_began_ns = clock_ns()
+
+    def lap_s(self) -> float:
+        """Return the seconds since the last lap ended, and begin another."""
+        began_ns, self._lap_began_ns = self._lap_began_ns, self._clock_ns()
+        return (self._lap_began_ns - began_ns) / 1e9
+
+
+class Pipeline:
+    """Codes the pictures of one camera against renders of one field; one caller at a time."""
 
     def __init__(
         self,
         renderer: Renderer,
         config: CodecConfig,
         clock_ns: ClockNs,
-        limit_bytes: int = MAX_PAYLOAD_BYTES,
-        rungs: Rungs | None = None,
-        steering: Steering = NO_STEERING,
-        threads: int = 1,
+        options: PipelineOptions | None = None,
     ) -> None:
         self._renderer = renderer
         self._config = config
         self._clock_ns = clock_ns
-        self._limit_bytes = limit_bytes
-        self._rungs = rungs or FixedRung(Rung(preset=config.preset))
-        self._encoder = DeltaEncoder(config, clock_ns, threads)
+        self._options = options = options or PipelineOptions()
+        self._rungs = options.rungs or FixedRung(Rung(preset=config.preset))
+        self._encoder = DeltaEncoder(config, clock_ns, options.threads)
         self._state: EncoderState | None = None
         self._rate = RateModel()
-        self._steering = steering
-        refine_ms = steering.refine_pose_ms
+        refine_ms = options.steering.refine_pose_ms
         self._search = None if refine_ms is None else PoseSearch(refine_ms, clock_ns)
         self._pasts: dict[tuple[int, int] | None, Past] = {}
 
@@ -76,45 +96,42 @@ class Pipeline:
         Raises ``DatasetError`` for a picture that cannot be read, ``InvalidInput`` for one of
         another size, ``CodecError`` when x264 fails.
         """
+        watch = Stopwatch(self._clock_ns)
+        picture = job.capture.picture
+        rgb = self._read(picture)
+        read_s = watch.lap_s()
         rung = self._rungs.current
-        started_ns = self._clock_ns()
-        rgb = self._read(job.capture.picture)
-        read_ns = self._clock_ns()
         frame = i420_from_rgb(rgb)
-        converted_ns = self._clock_ns()
-        camera = job.capture.picture.camera
-        view = render_field_view(self._renderer, camera, rung.quality)
-        rendered_ns = self._clock_ns()
-        refined = self._refined(frame, view, rung.quality)
-        refined_ns = self._clock_ns()
+        stage_s = {"convert": watch.lap_s()}
+        view = render_field_view(self._renderer, picture.camera, rung.quality)
+        stage_s["render"] = watch.lap_s()
+        refined = Refined(view, FrameCosts(frame))
+        if self._search is not None:
+            refined = self._refined(self._search, frame, view, rung.quality)
+            stage_s["refine"] = watch.lap_s()
         choice = self._choice(job, rung)
         state = self._state_for(job)
         encoded = self._encoder.encode(state, frame, refined.view, choice, refined.costs)
         self._remember(encoded)
-        stage_s = {
-            "read": (read_ns - started_ns) / 1e9,
-            "convert": (converted_ns - read_ns) / 1e9,
-            "render": (rendered_ns - converted_ns) / 1e9,
-            **({"refine": (refined_ns - rendered_ns) / 1e9} if self._search else {}),
-            **{stage: ns / 1e9 for stage, ns in encoded.stage_ns.items()},
-        }
-        self._rungs.coded(stage_s, self._clock_ns() / 1e9)
+        stage_s |= {stage: ns / 1e9 for stage, ns in encoded.stage_ns.items()}
         pose = refined.view.camera.world_from_cam
-        return EncodedFrame(encoded.packet, stage_s, encoded.tries, rung, encoded.crf, pose)
+        made = EncodedFrame(encoded.packet, stage_s, encoded.tries, rung, encoded.crf, pose, read_s)
+        self._rungs.coded(made.sender_s, self._clock_ns() / 1e9)
+        return made
 
-    def _refined(self, frame: I420, measured: FieldView, quality: Quality) -> Refined:
+    def _refined(
+        self, search: PoseSearch, frame: I420, measured: FieldView, quality: Quality
+    ) -> Refined:
         """Return what the field shows at the pose to send."""
-        if self._search is None:
-            return Refined(measured, FrameCosts(frame))
         crf = self._config.crf if self._rate.crf is None else self._rate.crf
 
         def render_at(camera: Camera) -> FieldView:
             return render_field_view(self._renderer, camera, quality)
 
-        return self._search.refine(frame, measured, render_at, crf)
+        return search.refine(frame, measured, render_at, crf)
 
     def _choice(self, job: EncodeJob, rung: Rung) -> FrameChoice:
-        budget, limit_bytes = job.budget, self._limit_bytes
+        budget, limit_bytes = job.budget, self._options.limit_bytes
         if budget is not None:
             limit_bytes = min(limit_bytes, budget.limit_bytes)
         return FrameChoice(
@@ -125,7 +142,7 @@ class Pipeline:
             limit_bytes=limit_bytes,
             preset=rung.preset,
             fast_unsent=rung.fast_unsent,
-            qp_map=self._steering.qp_map,
+            qp_map=self._options.steering.qp_map,
             target=None if budget is None else RateTarget(budget.target_bytes, self._rate),
         )
 

@@ -1,15 +1,15 @@
 """How many bytes the next frame may have, so that its answer comes within a delay. No clock.
 
-The delay runs from capture to Ack, as ``rfedge_agent_capture_to_ack_seconds`` has it: waiting,
-rendering, coding, the way there, the server's work and the way back. Quality falls first: the frame
-gets the bytes that what the path did lately leaves room for, and no more than it can carry at the
-rate of capture. When not even the smallest frame has room, the next waits for an answer, and the
-newest picture then takes the place of the one that waited: dropped before it was coded.
+The delay runs from capture to Ack, as ``rfedge_agent_capture_to_ack_seconds`` measures it: waiting,
+rendering, coding, the uplink, the server's work and the downlink. Quality falls first: a frame gets
+the bytes that the path's recent behaviour leaves room for (``cav_agent.path_estimator``), and no
+more than it can carry at the rate of capture. When not even the smallest frame has room, the next
+picture waits for an answer; a newer one may take its place, so pictures are dropped before they are
+coded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from cav_agent.path_estimator import PathEstimator
@@ -19,38 +19,42 @@ from rfcore.wire.messages import FrameAddress
 __all__ = ["ByteBudget", "QualitySteps", "RateControl"]
 
 SHARE = 0.75
-"""Of the delay that is aimed at; the rest is for what a frame, a path and a machine stray."""
+"""Share of the delay that is aimed at; the rest is a margin for frames, path and machine."""
 
 SUSTAINED = 0.85
-"""Of what the path carries that frames may take for ever; the rest drains queues."""
+"""Share of the path's rate that frames may use steadily; the rest drains queues."""
 
 LEAST_BYTES = 240
-"""A frame less than which is not worth coding; at the highest CRF a street's has 100 to 300."""
+"""The smallest frame worth coding; at the highest CRF a frame of a street has 100 to 300."""
 
 MOST_BYTES = 1e9
-"""Stands for any number of bytes."""
+"""Stands for an unlimited number of bytes."""
 
 LIMIT = 1.5
-"""Times its target a slice may have before it is coded again."""
+"""A slice of more than this many times its target is coded again."""
 
 SHRINK, GROW = 0.7, 0.004
-"""Of the room that is used: times 0.7 when a frame was late (one coded before the last cut says
-nothing of it), and 0.004 more for each in time. They balance at 1 late frame in 100: 0.3 of any
-share up to 1 against 99 times 0.004."""
+"""How the share of the room that is used changes: times 0.7 when a frame was late (unless it was
+coded before the last cut), plus 0.004 for each in time. They balance at 1 late frame in 100: 0.3 of
+any share up to 1 against 99 times 0.004."""
 LEAST_SHARE = 0.1
 
 MEMORY = 0.75
+"""Weight of what was known in the running means."""
+
 OVERHEAD_BYTES = 150
-"""Pose, digests, gRPC and HTTP/2 framing around a slice, before one was sent."""
+"""Pose, digests, gRPC and HTTP/2 framing around a slice: assumed until one was sent."""
 
 STEP_CRF = 4.0
-"""A change of quality worth a line in the log: 4 of CRF are 60 % of the bits."""
+"""A change of quality worth a line in the log: 4 of CRF change the bits by 60 %."""
 
 
 @dataclass(frozen=True)
 class ByteBudget:
-    """What a slice may take: ``target_bytes``, coded again above ``limit_bytes``. ``rate_bps`` is
-    what the path has proven, None before the first answer."""
+    """The bytes a slice is to have: ``target_bytes``; above ``limit_bytes`` it is coded again.
+
+    ``rate_bps``: what answers have proven the path to carry; None before the first one.
+    """
 
     target_bytes: float
     limit_bytes: int
@@ -74,11 +78,11 @@ class RateControl:
 
     @property
     def rate_bps(self) -> float | None:
-        """What the path has proven to carry."""
+        """What answers have proven the path to carry; None before the first one."""
         return self._path.rate_bps
 
     def captured(self, now: float) -> None:
-        """A picture was taken."""
+        """A picture was captured."""
         if self._captured_s is not None:
             interval_s = now - self._captured_s
             self._interval_s = _mean(self._interval_s, interval_s)
@@ -91,8 +95,10 @@ class RateControl:
         return now - captured_s > (left_s if left_s > 0 else self._max_delay_s)
 
     def budget(self, captured_s: float, now: float) -> ByteBudget | None:
-        """Return what the picture of ``captured_s`` may take if coding begins ``now``; None while
-        it had better wait for an answer."""
+        """Return the bytes for the picture of ``captured_s`` if coding begins ``now``.
+
+        None while it should wait for an answer.
+        """
         if self._path.bytes_in_flight and self._room_bytes(captured_s, now, 1.0) < LEAST_BYTES:
             return None
         room = self._share * self._room_bytes(captured_s, now, SHARE)
@@ -108,14 +114,13 @@ class RateControl:
         room = self._path.room_bytes(_ns(now + self._work_s), _ns(due_s), _ns(now))
         return room - self._overhead_bytes
 
-    def coded(self, stage_s: Mapping[str, float], payload_bytes: int, packet_bytes: int) -> None:
-        """A frame took the sender ``stage_s``; reading it from a file is not counted."""
-        spent_s = sum(stage_s.values()) - stage_s.get("read", 0.0)
-        self._work_s = _mean(self._work_s or None, spent_s)
+    def coded(self, sender_s: float, payload_bytes: int, packet_bytes: int) -> None:
+        """A frame took the sender ``sender_s`` from the picture to the packet."""
+        self._work_s = _mean(self._work_s or None, sender_s)
         self._overhead_bytes = _mean(self._overhead_bytes, packet_bytes - payload_bytes)
 
     def sent(self, address: FrameAddress, packet_bytes: int, now: float) -> None:
-        """A frame went out."""
+        """A frame was sent."""
         self._path.sent(address, packet_bytes, _ns(now))
 
     def answered(self, address: FrameAddress, latency_s: float, now: float) -> None:
@@ -133,17 +138,17 @@ class RateControl:
 
 
 class QualitySteps:
-    """Tells changes of CRF that are worth mentioning."""
+    """Detects changes of CRF that are worth a line in the log."""
 
     def __init__(self) -> None:
-        self._told: float | None = None
+        self._reported: float | None = None
 
     def step(self, crf: float) -> tuple[float, float] | None:
-        """Return (before, after) when ``crf`` is ``STEP_CRF`` from the one told last."""
-        before = self._told
+        """Return (before, after) when ``crf`` is ``STEP_CRF`` from the one reported last."""
+        before = self._reported
         if before is not None and abs(crf - before) < STEP_CRF:
             return None
-        self._told = crf
+        self._reported = crf
         return None if before is None else (before, crf)
 
 

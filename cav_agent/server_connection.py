@@ -1,57 +1,148 @@
-"""The channel to the server, and waiting for it without hiding why nobody answers."""
+"""One server as the vehicle sees it: its address, the channel to it, and what it publishes.
+
+Every stream and every fetch of a field to that server goes over this channel. Waiting for a server
+that does not answer says why: a refused certificate is not mistaken for a server that is away.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
 
 import grpc
 
+from cav_agent.config import AgentConfig
+from rfcore.errors import InvalidInput, RfedgeError, UnknownField
 from rfcore.wire.address import Address, check_handshake
+from rfcore.wire.checks import check_field_id
 from rfcore.wire.conventions import CHANNEL_OPTIONS
+from rfcore.wire.tiles import MAX_TILES, Tile, tile_of
 from rfcore.wire.tls import TlsFiles
+from rfcore.wire.v1 import field_pb2 as pb
+from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 
-__all__ = ["ServerConnection"]
+__all__ = ["WHOLE_STREET", "ServerConnection", "server_connections"]
 
 ASK_AFTER_S = 1.0
-"""A server that can be had is connected to sooner; later, it is asked what it holds against us."""
+"""A server that does not connect within this time is asked whether it refuses the handshake."""
+
+WHOLE_STREET = "street"
+"""Name of the only tile of a server that publishes none."""
 
 
-@dataclass(frozen=True)
 class ServerConnection:
-    """Where the server is, and how to be let in."""
+    """A server's address and, inside ``async with``, the channel to it.
 
-    address: Address
-    tls: TlsFiles | None
+    ``fields_changed`` is set when a stream is told that the server publishes other fields.
+    """
 
-    def open(self) -> grpc.aio.Channel:
-        """Return a channel, encrypted if there are certificates."""
-        if self.tls is None:
+    def __init__(self, address: Address, tls: TlsFiles | None) -> None:
+        self.address = address
+        self.fields_changed = asyncio.Event()
+        self._tls = tls
+        self._channel: grpc.aio.Channel | None = None
+
+    async def __aenter__(self) -> Self:
+        self._channel = self._open()
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._channel is not None:
+            await self._channel.close()
+
+    @property
+    def channel(self) -> grpc.aio.Channel:
+        """The channel, encrypted if there are certificates."""
+        if self._channel is None:
+            raise InvalidInput("channel", f"the connection to {self.address} is not open")
+        return self._channel
+
+    def _open(self) -> grpc.aio.Channel:
+        if self._tls is None:
             return grpc.aio.insecure_channel(str(self.address), options=CHANNEL_OPTIONS)
-        credentials = self.tls.channel_credentials()
+        credentials = self._tls.channel_credentials()
         return grpc.aio.secure_channel(str(self.address), credentials, options=CHANNEL_OPTIONS)
 
-    async def reached(self, channel: grpc.aio.Channel, within_s: float | None) -> None:
+    async def wait_until_ready(self, within_s: float | None) -> None:
         """Wait until the channel is connected, for ever if ``within_s`` is None.
 
         Raises ``AccessDenied`` if the ends refuse each other, else ``TimeoutError``.
         """
         try:
             async with asyncio.timeout(within_s):
-                await (channel.channel_ready() if self.tls is None else self._admitted(channel))
+                await (self.channel.channel_ready() if self._tls is None else self._ready_by_tls())
         except TimeoutError:
-            await self._ask()
+            await self._check_handshake()
             raise
 
-    async def _admitted(self, channel: grpc.aio.Channel) -> None:
-        ready = asyncio.ensure_future(channel.channel_ready())
+    async def require(self, within_s: float | None) -> grpc.aio.Channel:
+        """Return the channel once it is connected; raise ``RfedgeError`` if that takes longer."""
+        try:
+            await self.wait_until_ready(within_s)
+        except TimeoutError as error:
+            raise self._no_server(within_s) from error
+        return self.channel
+
+    async def published_tiles(self, within_s: float | None) -> tuple[Tile, ...]:
+        """Return the tiles the server publishes; without tiles, its only field, everywhere.
+
+        Raises ``UnknownField`` for several fields without tiles, ``InvalidInput`` for a wrong tile,
+        ``RfedgeError`` when no answer comes within ``within_s``.
+        """
+        stub = FieldServiceStub(await self.require(within_s))
+        try:
+            async with asyncio.timeout(within_s):
+                listed = await stub.ListFields(pb.ListFieldsRequest(), wait_for_ready=True)
+        except TimeoutError as error:
+            raise self._no_server(within_s) from error
+        except grpc.aio.AioRpcError as error:
+            raise RfedgeError(f"the server does not list its fields: {error.details()}") from error
+        return _tiles_of(listed)
+
+    def _no_server(self, within_s: float | None) -> RfedgeError:
+        return RfedgeError(f"no server at {self.address} within {within_s:g} s")
+
+    async def _ready_by_tls(self) -> None:
+        ready = asyncio.ensure_future(self.channel.channel_ready())
         try:
             while not (await asyncio.wait({ready}, timeout=ASK_AFTER_S))[0]:
-                await self._ask()
+                await self._check_handshake()
             ready.result()
         finally:
             ready.cancel()
             await asyncio.gather(ready, return_exceptions=True)
 
-    async def _ask(self) -> None:
-        await asyncio.to_thread(check_handshake, self.address, self.tls)
+    async def _check_handshake(self) -> None:
+        await asyncio.to_thread(check_handshake, self.address, self._tls)
+
+
+def server_connections(config: AgentConfig) -> tuple[ServerConnection, ...]:
+    """Return the server of ``config`` and its neighbours; raise ``InvalidInput`` for an address
+    that cannot be, or a remote one without encryption."""
+    named = [("server", config.server), *(("neighbours", text) for text in config.neighbours)]
+    return tuple(_server_connection(name, text, config) for name, text in named)
+
+
+def _server_connection(name: str, text: str, config: AgentConfig) -> ServerConnection:
+    address = Address.parse(name, text)
+    tls = config.transport.tls()
+    if tls is None:
+        address.require_private(name, config.transport.allow_insecure)
+    return ServerConnection(address, tls)
+
+
+def _tiles_of(listed: pb.ListFieldsResponse) -> tuple[Tile, ...]:
+    if len(listed.tiles) > MAX_TILES:
+        raise InvalidInput("tiles", f"the server lists {len(listed.tiles)}, above {MAX_TILES}")
+    if listed.tiles:
+        return tuple(map(tile_of, listed.tiles))
+    if len(listed.field_ids) != 1:
+        here = ", ".join(listed.field_ids) or "none"
+        raise UnknownField(f"the server holds several fields or none ({here}); choose with --field")
+    return (Tile(WHOLE_STREET, check_field_id("field", listed.field_ids[0])),)

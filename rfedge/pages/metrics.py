@@ -34,8 +34,8 @@ Recording rules and alerts over these metrics are in `deploy/prometheus/rules.ym
 def families() -> Mapping[str, Sequence[Family]]:
     """Return what each command declares, with everything that a flag can add."""
     agent = AgentMetrics(CollectorRegistry())
-    agent.travelling("cav-1", "front")
-    agent.field("0" * 16, "splats")
+    agent.identify("cav-1", "front")
+    agent.field_ready("0" * 16, "splats")
     server = ServerMetrics(CollectorRegistry(), per_vehicle=True)
     TwinMetrics(server.instruments, dict, int, per_vehicle=True)
     return {

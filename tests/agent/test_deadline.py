@@ -78,7 +78,7 @@ def test_one_slow_frame_alone_changes_nothing() -> None:
     assert not machine.controller.late
 
 
-def test_a_load_near_the_edge_does_not_make_it_flap() -> None:
+def test_a_load_near_the_edge_does_not_make_it_alternate() -> None:
     machine = Machine(100)
     machine.drive(2, 1.0)
     machine.drive(300, 1.1)  # 88 ms: on time, but above the room, so never climbed to

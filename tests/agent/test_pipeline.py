@@ -6,15 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cav_agent.deadline import FixedRung
 from cav_agent.frames import Capture, EncodeJob
-from cav_agent.pipeline import Pipeline
+from cav_agent.pipeline import Pipeline, PipelineOptions, Stopwatch
 from cav_agent.rate_control import ByteBudget
 from rfcore.camera import Camera
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.qp_map import QpMap
+from rfcore.codec.sender.ladder import Rung
 from rfcore.codec.sender.steering import Steering
+from rfcore.errors import InvalidInput
 from rfcore.field import Quality
+from rfcore.image import Rgb
 from rfcore.views import View
+from rfcore.wire.messages import FrameAddress
 
 LIMIT_BYTES = 300
 
@@ -39,7 +44,9 @@ def noisy(make_capture: Callable[..., Capture]) -> Capture:
 def test_a_noise_picture_is_coded_until_its_slice_is_below_the_limit(noisy: Capture) -> None:
     config = CodecConfig(32, 16, preset="ultrafast", crf=10)
     free = Pipeline(Grey(), config, lambda: 0).encode(EncodeJob(noisy, 0, 1))
-    made = Pipeline(Grey(), config, lambda: 0, LIMIT_BYTES).encode(EncodeJob(noisy, 0, 1))
+    made = Pipeline(Grey(), config, lambda: 0, PipelineOptions(LIMIT_BYTES)).encode(
+        EncodeJob(noisy, 0, 1)
+    )
     assert free.tries == 1
     assert len(free.packet.payload) > LIMIT_BYTES >= len(made.packet.payload)
     assert made.tries > 1
@@ -71,14 +78,80 @@ def test_a_map_reaches_the_encoder(noisy: Capture) -> None:
     config = CodecConfig(32, 16, preset="ultrafast", crf=30)
     coarser = Steering(QpMap(np.full((1, 2), 12, np.int8)))
     plain = Pipeline(Grey(), config, lambda: 0).encode(EncodeJob(noisy, 0, 1))
-    made = Pipeline(Grey(), config, lambda: 0, steering=coarser).encode(EncodeJob(noisy, 0, 1))
+    made = Pipeline(Grey(), config, lambda: 0, PipelineOptions(steering=coarser)).encode(
+        EncodeJob(noisy, 0, 1)
+    )
     assert len(made.packet.payload) < 0.7 * len(plain.packet.payload)
 
 
 def test_the_pose_sent_is_the_one_that_was_rendered(noisy: Capture) -> None:
-    """A grey field says nothing of the pose, so the measured one stays, and time is told."""
-    config = CodecConfig(32, 16, preset="ultrafast")
-    pipeline = Pipeline(Grey(), config, lambda: 0, steering=Steering(refine_pose_ms=50))
+    """A grey field says nothing of the pose, so the measured one stays; the time is kept."""
+    config, refining = CodecConfig(32, 16, preset="ultrafast"), Steering(refine_pose_ms=50)
+    pipeline = Pipeline(Grey(), config, lambda: 0, PipelineOptions(steering=refining))
     made = pipeline.encode(EncodeJob(noisy, 0, 1))
     assert made.pose == noisy.picture.camera.world_from_cam
     assert "refine" in made.stage_s
+
+
+class StepClock:
+    """A clock that advances by a millisecond whenever it is read."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+
+    def __call__(self) -> int:
+        self.now_ns += 1_000_000
+        return self.now_ns
+
+
+class RecordedRungs(FixedRung):
+    """One rung; keeps what it was told of every frame."""
+
+    def __init__(self) -> None:
+        super().__init__(Rung(preset="ultrafast"))
+        self.sender_s: list[float] = []
+
+    def coded(self, sender_s: float, now: float) -> None:  # noqa: ARG002
+        self.sender_s.append(sender_s)
+
+
+def test_loading_the_picture_is_measured_apart_from_the_senders_stages(noisy: Capture) -> None:
+    clock, rungs = StepClock(), RecordedRungs()
+
+    def load() -> Rgb:
+        clock.now_ns += 700_000_000  # a slow disk
+        return noisy.picture.read()
+
+    slow = replace(noisy, picture=replace(noisy.picture, read=load))
+    config = CodecConfig(32, 16, preset="ultrafast")
+    made = Pipeline(Grey(), config, clock, PipelineOptions(rungs=rungs)).encode(
+        EncodeJob(slow, 0, 1)
+    )
+    assert made.read_s == pytest.approx(0.701)
+    assert list(made.stage_s)[:2] == ["convert", "render"]
+    assert made.sender_s == pytest.approx(sum(made.stage_s.values()))
+    assert made.sender_s < 0.1
+    assert rungs.sender_s == [made.sender_s], "a deadline is not missed by a slow disk"
+
+
+def test_laps_add_up_to_the_time_that_passed() -> None:
+    clock = StepClock()
+    watch = Stopwatch(clock)
+    began_ns = clock.now_ns
+    laps = [watch.lap_s() for _ in range(5)]
+    assert sum(laps) == pytest.approx((clock.now_ns - began_ns) / 1e9)
+
+
+def test_a_picture_of_another_size_is_refused_by_name_and_both_sizes(noisy: Capture) -> None:
+    pipeline = Pipeline(Grey(), CodecConfig(64, 16, preset="ultrafast"), lambda: 0)
+    with pytest.raises(InvalidInput, match=r"000\.png: 32x16 px, the stream is coded at 64x16 px"):
+        pipeline.encode(EncodeJob(noisy, 0, 1))
+
+
+def test_a_base_that_is_no_longer_kept_counts_as_none(noisy: Capture) -> None:
+    pipeline = Pipeline(Grey(), CodecConfig(32, 16, preset="ultrafast"), lambda: 0)
+    gone = FrameAddress("front", 7, 99)
+    packet = pipeline.encode(EncodeJob(noisy, 0, 1, base=gone)).packet
+    assert packet.base_digest == b""
+    kept = FrameAddress("front", packet.epoch, packet.sequence)
+    assert pipeline.encode(EncodeJob(noisy, 0, 1, base=kept)).packet.sequence == 1

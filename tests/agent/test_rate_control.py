@@ -92,7 +92,7 @@ class ModelCoder:
         digest, payload = b"d" * 16, bytes(size_bytes)
         packet = DeltaPacket(job.epoch, self.sequence, digest, b"", digest, payload, 0)
         self.sequence += 1
-        return EncodedFrame(packet, {"read": 0.0, "encode": CODING_S}, crf=crf)
+        return EncodedFrame(packet, {"encode": CODING_S}, crf=crf)
 
 
 class StreetCoder:
@@ -154,7 +154,8 @@ class World:
 
     def send(self, now: float) -> list[tuple[float, ServerMessage]]:
         answers: list[tuple[float, ServerMessage]] = []
-        for message in self.session.messages_to_send(now):
+        for outgoing in self.session.messages_to_send(now):
+            message = outgoing.message
             if isinstance(message, Frame):
                 size_bytes = len(message.packet.payload) + 150
                 due_s = self.uplink.push(message.address, size_bytes, now).due_s
@@ -168,7 +169,8 @@ class World:
 def _picture(result: FrameResult) -> Picture:
     delay_s = result.latency_s if result.outcome is Outcome.ACKED else None
     size_bytes = len(result.packet.payload) if result.packet else 0
-    return Picture(result.capture.captured_s, delay_s, result.crf, size_bytes)
+    crf = result.encoded.crf if result.encoded else None
+    return Picture(result.capture.captured_s, delay_s, crf, size_bytes)
 
 
 @pytest.fixture
@@ -335,7 +337,7 @@ def test_what_can_never_be_in_time_is_still_sent_small(
     assert max(p.payload_bytes for p in pictures[5:]) < 1000
 
 
-def test_a_step_of_quality_is_told_once() -> None:
+def test_a_step_of_quality_is_reported_once() -> None:
     steps = QualitySteps()
     crfs = [23.0, 24.0, 28.0, 30.0, 23.5]
     assert [steps.step(crf) for crf in crfs] == [None, None, (23.0, 28.0), None, (28.0, 23.5)]

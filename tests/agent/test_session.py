@@ -1,15 +1,26 @@
 """The vehicle's conversation: newest picture first, credits kept, losses answered by an epoch."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
 from cav_agent.config import AgentLimits
-from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
-from cav_agent.session import AgentSession, LinkState
+from cav_agent.frames import (
+    Capture,
+    EncodedFrame,
+    EncodeJob,
+    EndReason,
+    FrameResult,
+    Outcome,
+    StreamEnd,
+)
+from cav_agent.session import AgentSession, LinkState, OutgoingMessage
 from rfcore.errors import InvalidInput, RejectReason, RfedgeError
+from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import (
     Ack,
+    ClientMessage,
     Credit,
     FieldNotice,
     Frame,
@@ -23,6 +34,8 @@ from rfcore.wire.messages import (
 MakeCapture = Callable[..., Capture]
 Encode = Callable[..., EncodedFrame]
 
+UNAVAILABLE = StreamEnd(EndReason.STREAM_LOST, "UNAVAILABLE: connection reset")
+
 
 def send(session: AgentSession, capture: Capture, encode: Encode, now: float = 1.0) -> Frame:
     """Offer, encode and send one picture; return the frame as the server would get it."""
@@ -30,9 +43,9 @@ def send(session: AgentSession, capture: Capture, encode: Encode, now: float = 1
     job = session.job_to_start(0.0)
     assert job is not None
     session.encoded(encode(job), now)
-    (frame,) = session.messages_to_send(now)
-    assert isinstance(frame, Frame)
-    return frame
+    (outgoing,) = session.messages_to_send(now)
+    assert isinstance(outgoing.message, Frame)
+    return outgoing.message
 
 
 def ack(frame: Frame, total_ns: int = 0) -> Ack:
@@ -49,7 +62,7 @@ def outcomes(results: list[FrameResult]) -> list[tuple[int, str]]:
 def test_a_connection_begins_with_hello_and_streams_after_welcome(hello: Hello) -> None:
     session = AgentSession(hello)
     session.connected(0.0)
-    assert session.messages_to_send(0.0) == [hello]
+    assert session.messages_to_send(0.0) == [OutgoingMessage.of(hello)]
     assert session.state is LinkState.GREETING
     session.receive(Welcome("s-7", exact=True), 0.1)
     assert (session.state, session.session_id) == (LinkState.STREAMING, "s-7")
@@ -71,7 +84,7 @@ def test_a_server_that_does_not_welcome_is_given_up(hello: Hello) -> None:
     session.handle_timer(11.9)
     assert session.broken is None
     session.handle_timer(12.0)
-    assert session.broken == "no Welcome within 2 s"
+    assert session.broken == StreamEnd(EndReason.NO_WELCOME, "no Welcome within 2 s")
 
 
 def test_nothing_is_encoded_before_welcome_and_credit(
@@ -187,7 +200,8 @@ def test_after_a_nack_the_next_packet_begins_a_new_epoch(
     frame = send(session, make_capture(0), encode)
     session.receive(Nack(frame.address, RejectReason.CRC_MISMATCH, "crc"), 2.0)
     (result,) = session.take_results()
-    assert (result.outcome, result.reason) == (Outcome.NACKED, "crc_mismatch: crc")
+    assert result.outcome is Outcome.NACKED
+    assert (result.reason, result.problem) == (RejectReason.CRC_MISMATCH, "crc")
     after = send(session, make_capture(1), encode)
     assert (after.packet.epoch, after.packet.sequence) == (1, 0)
 
@@ -239,7 +253,7 @@ def test_a_lost_connection_loses_what_was_unanswered_and_the_next_starts_afresh(
     session: AgentSession, make_capture: MakeCapture, encode: Encode
 ) -> None:
     send(session, make_capture(0), encode)
-    session.connection_lost("UNAVAILABLE", 2.0)
+    session.connection_lost(UNAVAILABLE, 2.0)
     assert outcomes(session.take_results()) == [(0, "lost")]
     session.connected(3.0)
     session.messages_to_send(3.0)
@@ -254,11 +268,11 @@ def test_a_lost_connection_loses_what_was_unanswered_and_the_next_starts_afresh(
 
 def test_a_failed_first_connection_costs_no_epoch(hello: Hello) -> None:
     session = AgentSession(hello)
-    session.connection_lost("UNAVAILABLE", 0.5)
+    session.connection_lost(UNAVAILABLE, 0.5)
     session.connected(1.0)
     session.receive(Welcome("s-1", exact=True), 1.0)
     session.receive(Credit("front", 2), 1.0)
-    assert session._epoch == 0
+    assert session.epoch == 0
 
 
 def test_a_picture_encoded_for_a_lost_connection_is_lost(
@@ -267,12 +281,12 @@ def test_a_picture_encoded_for_a_lost_connection_is_lost(
     session.offer(make_capture(0))
     job = session.job_to_start(0.0)
     assert job is not None
-    session.connection_lost("UNAVAILABLE", 1.0)
+    session.connection_lost(UNAVAILABLE, 1.0)
     session.connected(1.1)
     session.receive(Welcome("s-2", exact=True), 1.1)
     session.encoded(encode(job), 1.2)
     assert outcomes(session.take_results()) == [(0, "lost")]
-    assert not any(isinstance(m, Frame) for m in session.messages_to_send(1.2))
+    assert not any(isinstance(m.message, Frame) for m in session.messages_to_send(1.2))
 
 
 def test_an_answer_that_does_not_come_breaks_the_stream(
@@ -283,7 +297,7 @@ def test_an_answer_that_does_not_come_breaks_the_stream(
     session.handle_timer(5.9)
     assert session.broken is None
     session.handle_timer(6.0)
-    assert session.broken == "no answer to a frame within 5 s"
+    assert session.broken == StreamEnd(EndReason.NO_ANSWER, "no answer to a frame within 5 s")
 
 
 def test_a_picture_that_cannot_be_coded_uses_no_credit(
@@ -307,7 +321,110 @@ def test_a_payload_no_server_would_take_is_dropped_here(
     assert session.messages_to_send(1.0) == []
     (result,) = session.take_results()
     assert result.outcome is Outcome.DROPPED
-    assert result.reason.startswith("oversize: 1000001 bytes")
+    assert result.reason is EndReason.OVERSIZE
+    assert result.problem.startswith("1000001 bytes of payload exceed")
+
+
+def test_a_frame_is_serialised_once_and_its_length_is_the_packets_size(
+    session: AgentSession,
+    make_capture: MakeCapture,
+    encode: Encode,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    serialised: list[ClientMessage] = []
+
+    def count(message: ClientMessage) -> bytes:
+        serialised.append(message)
+        return client_message_to_bytes(message)
+
+    monkeypatch.setattr("cav_agent.session.client_message_to_bytes", count)
+    session.offer(make_capture(0))
+    job = session.job_to_start(0.0)
+    assert job is not None
+    session.encoded(encode(job), 1.0)
+    (outgoing,) = session.messages_to_send(1.0)
+    assert isinstance(outgoing.message, Frame)
+    session.receive(ack(outgoing.message), 2.0)
+    (result,) = session.take_results()
+    assert serialised == [outgoing.message]
+    assert outgoing.data == client_message_to_bytes(outgoing.message)
+    assert result.packet_bytes == len(outgoing.data)
+
+
+def test_loading_a_picture_is_no_part_of_its_latency(
+    session: AgentSession, make_capture: MakeCapture, encode: Encode
+) -> None:
+    def encode_slowly_read(job: EncodeJob) -> EncodedFrame:
+        return replace(encode(job), read_s=0.25)
+
+    frame = send(session, make_capture(0, captured_s=0.5), encode_slowly_read)
+    session.receive(ack(frame), 2.0)
+    (result,) = session.take_results()
+    assert result.latency_s == 1.25
+    assert result.stage_s == {"read": 0.25, "render": 0.01, "encode": 0.02}
+    assert result.encoded is not None
+    assert result.encoded.sender_s == pytest.approx(0.03)
+
+
+def test_a_frame_refused_before_it_was_written_is_still_written(
+    session: AgentSession, make_capture: MakeCapture, encode: Encode
+) -> None:
+    """It has used its credit; a Nack of something unreadable ended it meanwhile."""
+    session.offer(make_capture(0))
+    job = session.job_to_start(0.0)
+    assert job is not None
+    session.encoded(encode(job), 1.0)
+    session.receive(Nack(FrameAddress("", 0, 0), RejectReason.INVALID_ARGUMENT, "garbage"), 1.1)
+    (outgoing,) = session.messages_to_send(1.2)
+    assert isinstance(outgoing.message, Frame)
+    session.receive(ack(outgoing.message), 2.0)
+    assert outcomes(session.take_results()) == [(0, "nacked")], "it ends once"
+
+
+def test_an_abandoned_session_ends_every_picture_it_took(
+    hello: Hello, make_capture: MakeCapture, encode: Encode
+) -> None:
+    session = AgentSession(hello)
+    session.connected(0.0)
+    session.receive(Welcome("s-1", exact=True), 0.0)
+    session.receive(Credit("front", 3), 0.0)
+    session.messages_to_send(0.0)
+    send(session, make_capture(0), encode)
+    session.offer(make_capture(1))
+    assert session.job_to_start(1.0) is not None
+    session.offer(make_capture(2))
+    session.abandon(StreamEnd(EndReason.ABANDONED, "its stream was given up"), 2.0)
+    results = session.take_results()
+    assert sorted(outcomes(results)) == [(0, "lost"), (1, "lost"), (2, "lost")]
+    assert {result.reason for result in results} == {EndReason.ABANDONED}
+    assert session.is_idle
+
+
+@pytest.mark.parametrize("answered_s", [0.02, 0.3, 0.9])
+def test_how_long_an_answer_was_waited_for_is_in_the_problem_and_not_in_the_reason(
+    session: AgentSession, make_capture: MakeCapture, encode: Encode, answered_s: float
+) -> None:
+    """Reasons are values of a metric's label: a number would make a time series of each wait."""
+    session.receive(ack(send(session, make_capture(0), encode, now=1.0)), 1.0 + answered_s)
+    session.take_results()
+    send(session, make_capture(1), encode, now=2.0)
+    timer = session.get_timer()
+    assert timer is not None
+    session.handle_timer(timer)
+    assert session.broken is not None
+    assert session.broken.reason is EndReason.NO_ANSWER
+    assert session.broken.problem == f"no answer to a frame within {timer - 2.0:.2g} s"
+    session.connection_lost(session.broken, timer)
+    (result,) = session.take_results()
+    assert str(result.reason) == "no_answer"
+
+
+def test_the_rate_that_a_welcome_grants_is_kept(hello: Hello) -> None:
+    session = AgentSession(hello)
+    session.connected(0.0)
+    assert session.rate_limit_hz == 0.0
+    session.receive(Welcome("s-1", exact=True, rate_hz=7.5), 0.0)
+    assert session.rate_limit_hz == 7.5
 
 
 @pytest.mark.parametrize(

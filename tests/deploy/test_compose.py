@@ -76,7 +76,7 @@ def config_of(
     words = [word.replace("/certs/demo", str(certificates)) for word in command(name)]
     words = [re.sub(r"=/(fields|cache)$", f"={tmp_path}", word) for word in words]
     configs: list[Any] = []
-    start = "travel" if module is agent_command else "serve"
+    start = "drive" if module is agent_command else "serve"
     monkeypatch.setattr(module, start, configs.append)
     monkeypatch.setattr(asyncio, "run", lambda _: None)
     monkeypatch.setattr(module, "configure_logs", lambda *_: None)

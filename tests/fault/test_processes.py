@@ -35,7 +35,7 @@ async def test_kill_9_of_the_server(site: Any, case: Any, appears: Any) -> None:
     case.at_most("stream back after the port opens", vehicle.acked_at_s(opened_s)[0] - opened_s, 1)
     case.recovers_exactly(vehicle, opened_s)
     (lost, *_) = vehicle.entries("stream lost")
-    case.holds("vehicle's log says UNAVAILABLE", lost["reason"].startswith("UNAVAILABLE"))
+    case.holds("vehicle's log says UNAVAILABLE", lost["problem"].startswith("UNAVAILABLE"))
     case.holds("one session at the new server", second.value("rfedge_server_sessions") == 1)
     stale = [x for x in vehicle.lines() if killed_s < x["capture_time_ns"] / 1e9 < opened_s - 1]
     case.holds("nothing from before is sent", all(x["result"] != "acked" for x in stale))

@@ -160,19 +160,19 @@ def serve(street: Street) -> Callable[..., Any]:
 
 
 @dataclass(frozen=True)
-class Trip:
-    """What a vehicle brought home."""
+class DriveRecord:
+    """How the pictures of a drive ended: counted, and the lines of the frame log."""
 
     counts: Counter[str]
     lines: list[dict[str, Any]]
 
 
 @pytest.fixture
-def travel(street: Street, tmp_path: Path) -> Callable[..., Awaitable[Trip]]:
+def travel(street: Street, tmp_path: Path) -> Callable[..., Awaitable[DriveRecord]]:
     """Return a coroutine that drives the street past a server, in lockstep."""
     numbers = itertools.count()
 
-    async def run(address: object, **changes: Any) -> Trip:
+    async def run(address: object, **changes: Any) -> DriveRecord:
         report = tmp_path / f"report{next(numbers)}.jsonl"
         config = AgentConfig(
             str(address),
@@ -184,7 +184,7 @@ def travel(street: Street, tmp_path: Path) -> Callable[..., Awaitable[Trip]]:
             report=report,
         )
         counts = await Vehicle(replace(config, **secured(changes))).run()
-        return Trip(counts, [json.loads(line) for line in report.read_text().splitlines()])
+        return DriveRecord(counts, [json.loads(line) for line in report.read_text().splitlines()])
 
     return run
 
@@ -288,7 +288,7 @@ class Driving:
                 await asyncio.sleep(0.02)
 
     async def end(self) -> Counter[str]:
-        """Return what it brought home."""
+        """Wait for the end of the drive; return how many pictures ended how."""
         assert self.task is not None
         return await self.task
 

@@ -60,14 +60,14 @@ async def test_a_refused_vehicle_comes_again_when_it_was_told_to(
         with capture_logs() as logs:
             async with raw_vehicle(server.address) as first:
                 await first.greet(asking(coded, "cav-1", 30.0))
-                trip = asyncio.create_task(travel(server.address))
+                travelling = asyncio.create_task(travel(server.address))
                 while counted(server, "rfedge_server_limited_total", limit="capacity") < 2:
-                    assert not trip.done()
+                    assert not travelling.done()
                     await asyncio.sleep(0.01)
                 await first.farewell()
-            counts = (await trip).counts
+            counts = (await travelling).counts
     assert set(counts) == {"acked"}
-    assert any("come again" in line.get("reason", "") for line in logs)
+    assert any("come again" in line.get("problem", "") for line in logs)
 
 
 @pytest.mark.parametrize(("asked_hz", "granted_hz"), [(10.0, 10.0), (0.0, 0.0)])

@@ -79,10 +79,10 @@ async def test_frames_on_different_rungs_follow_each_other_in_one_stream(
     the first frame shows how quick this one is."""
     ladder = write_ladder(tmp_path / "ladder.json", 1e9, 9e8)
     async with serve() as server:
-        trip = await travel(server.address, deadline_ms=60_000.0, ladder=ladder)
-    assert trip.counts == {"acked": len(trip.lines)}
-    assert [line["rung"] for line in trip.lines[:2]] == [LOW, FULL]
-    for line in trip.lines:
+        record = await travel(server.address, deadline_ms=60_000.0, ladder=ladder)
+    assert record.counts == {"acked": len(record.lines)}
+    assert [line["rung"] for line in record.lines[:2]] == [LOW, FULL]
+    for line in record.lines:
         assert line["server_digest"] == line["reconstruction_digest"]
 
 

@@ -28,12 +28,12 @@ async def test_the_server_ends_up_with_the_pictures_of_the_vehicles_closed_loop(
     street: Any, serve: Any, travel: Any, tmp_path: Path
 ) -> None:
     async with serve(save=tmp_path) as server:
-        trip = await travel(server.address)
-    assert trip.counts == {"acked": 6}
+        record = await travel(server.address)
+    assert record.counts == {"acked": 6}
     index = index_of(tmp_path)
     assert [line["file"] for line in index] == [f"{i:06}.png" for i in range(6)]
     assert [line["digest"] for line in index] == [
-        line["reconstruction_digest"] for line in trip.lines
+        line["reconstruction_digest"] for line in record.lines
     ]
     for line, picture in zip(index, read_dataset(street.drive).pictures, strict=True):
         shown = read_rgb(tmp_path / "cav-1/front" / line["file"])
@@ -53,9 +53,9 @@ async def test_neither_instruction_set_nor_threads_at_either_end_change_a_byte(
         agent_threads, server_threads = threads[number % len(threads)]
         saved = tmp_path / str(number)
         async with serve(save=saved, render=RenderSettings(server_threads, server_isa)) as server:
-            trip = await travel(server.address, render=RenderSettings(agent_threads, agent_isa))
-        assert trip.counts == {"acked": 6}
-        closed_loop = [line["reconstruction_digest"] for line in trip.lines]
+            record = await travel(server.address, render=RenderSettings(agent_threads, agent_isa))
+        assert record.counts == {"acked": 6}
+        closed_loop = [line["reconstruction_digest"] for line in record.lines]
         assert [line["digest"] for line in index_of(saved)] == closed_loop
         digests.add(tuple(closed_loop))
     assert len(digests) == 1
@@ -65,12 +65,12 @@ async def test_two_vehicles_share_a_server_and_a_field(
     serve: Any, travel: Any, tmp_path: Path
 ) -> None:
     async with serve(save=tmp_path) as server:
-        trips = await asyncio.gather(
+        records = await asyncio.gather(
             *(travel(server.address, vehicle=name) for name in ("cav-1", "cav-2"))
         )
-    for name, trip in zip(("cav-1", "cav-2"), trips, strict=True):
-        assert trip.counts == {"acked": 6}
-        digests = [line["reconstruction_digest"] for line in trip.lines]
+    for name, record in zip(("cav-1", "cav-2"), records, strict=True):
+        assert record.counts == {"acked": 6}
+        digests = [line["reconstruction_digest"] for line in record.lines]
         assert [line["digest"] for line in index_of(tmp_path, name)] == digests
 
 
@@ -78,8 +78,8 @@ async def test_the_report_keeps_the_sizes_apart_and_says_where_the_time_went(
     serve: Any, travel: Any
 ) -> None:
     async with serve() as server:
-        trip = await travel(server.address)
-    for number, line in enumerate(trip.lines):
+        record = await travel(server.address)
+    for number, line in enumerate(record.lines):
         assert (line["sequence"], line["epoch"], line["result"]) == (number, 0, "acked")
         assert line["name"].endswith(f"{number:03}.png")
         assert 0 < line["payload_bytes"] < line["packet_bytes"] < line["payload_bytes"] + 260
@@ -98,11 +98,11 @@ async def test_a_drive_through_the_link_is_whole_and_its_wire_bytes_exceed_its_p
     async with serve() as server:
         proxy = LinkProxy(ProxySettings(str(server.address), delay_ms=1.0))
         await proxy.start()
-        trip = await travel(proxy.address)
+        record = await travel(proxy.address)
         await proxy.stop()
-    assert trip.counts == {"acked": 6}
+    assert record.counts == {"acked": 6}
     uplink = proxy.report()["uplink"]
-    assert uplink["bytes"] > sum(line["packet_bytes"] for line in trip.lines)
+    assert uplink["bytes"] > sum(line["packet_bytes"] for line in record.lines)
 
 
 async def test_in_realtime_what_the_link_cannot_take_is_dropped_before_it_is_encoded(
@@ -111,11 +111,11 @@ async def test_in_realtime_what_the_link_cannot_take_is_dropped_before_it_is_enc
     async with serve() as server:
         proxy = LinkProxy(ProxySettings(str(server.address), uplink_bps=60e3, delay_ms=1.0))
         await proxy.start()
-        trip = await travel(proxy.address, pace=PaceKind.REALTIME, rate=200.0)
+        record = await travel(proxy.address, pace=PaceKind.REALTIME, rate=200.0)
         await proxy.stop()
-    assert trip.counts["acked"] + trip.counts["dropped"] == 6
-    assert trip.counts["dropped"] > 0
-    for line in trip.lines:
+    assert record.counts["acked"] + record.counts["dropped"] == 6
+    assert record.counts["dropped"] > 0
+    for line in record.lines:
         if line["result"] == "dropped":
             assert (line["reason"], line["packet_bytes"]) == ("superseded", None)
 
@@ -145,9 +145,9 @@ async def test_a_drive_with_a_mask_and_refined_poses_is_reconstructed(
     write_png(tmp_path / "mask.png", np.full((52, 76, 3), 255, np.uint8))
     steering = SteeringSettings(tmp_path / "mask.png", -3, refine_pose_ms=1000.0)
     async with serve() as server:
-        trip = await travel(server.address, steering=steering)
-    assert trip.counts == {"acked": 6}
-    assert all("refine" in line["stage_ms"] for line in trip.lines)
+        record = await travel(server.address, steering=steering)
+    assert record.counts == {"acked": 6}
+    assert all("refine" in line["stage_ms"] for line in record.lines)
 
 
 async def test_the_server_counts_frames_bytes_and_seconds(

@@ -6,7 +6,7 @@ from typing import Any
 import grpc
 import pytest
 
-from cav_agent.field_fetch import fetch_field
+from cav_agent.field_cache import fetch_field
 from rfcore.errors import FieldFormatError, ProtocolError, UnknownField
 from rfcore.field import FieldStore
 from rfcore.wire.v1 import field_pb2 as pb
@@ -17,8 +17,8 @@ async def test_a_field_the_vehicle_lacks_is_fetched_and_used(
     street: Any, serve: Any, travel: Any, tmp_path: Path
 ) -> None:
     async with serve() as server:
-        trip = await travel(server.address, fields=tmp_path / "mine")
-    assert trip.counts == {"acked": 6}
+        record = await travel(server.address, fields=tmp_path / "mine")
+    assert record.counts == {"acked": 6}
     assert FieldStore(tmp_path / "mine").ids() == (street.field_id,)
     assert [p.name for p in (tmp_path / "mine").iterdir()] == [f"{street.field_id}.rff"]
 
@@ -27,8 +27,8 @@ async def test_the_servers_only_field_is_used_when_none_is_named(
     serve: Any, travel: Any, tmp_path: Path
 ) -> None:
     async with serve() as server:
-        trip = await travel(server.address, fields=tmp_path / "mine", field=None)
-    assert trip.counts == {"acked": 6}
+        record = await travel(server.address, fields=tmp_path / "mine", field=None)
+    assert record.counts == {"acked": 6}
 
 
 async def test_a_field_the_server_lacks_is_refused_with_both_ids_named(

@@ -125,9 +125,9 @@ async def test_a_vehicle_crosses_without_a_late_picture_or_a_keyframe(
     ]
     async with vehicle(
         a.address, neighbours=(b.address,), fields=tmp_path / "mine", loop=True
-    ) as trip:
-        await trip.until(lambda: trip.handovers("tile") >= 5)
-    lines = trip.lines()
+    ) as driving:
+        await driving.until(lambda: driving.handovers("tile") >= 5)
+    lines = driving.lines()
     late = [line for line in lines if line["result"] != "acked"]
     assert late == [], "dropped, lost or sent in vain"
     for line in lines:
@@ -156,12 +156,12 @@ async def test_a_vehicle_goes_to_the_neighbour_when_its_server_is_killed(
     async with vehicle(
         a.address, neighbours=(b.address,), fields=tmp_path / "mine",
         pace=PaceKind.REALTIME, rate=10.0, loop=True,
-    ) as trip:  # fmt: skip
-        await trip.until(lambda: len(a.pictures()) >= 3)
+    ) as driving:  # fmt: skip
+        await driving.until(lambda: len(a.pictures()) >= 3)
         a.process.kill()
-        await trip.until(lambda: len(b.pictures()) >= 12)
-        assert trip.handovers("server_lost") == 1
-    for line in trip.lines():
+        await driving.until(lambda: len(b.pictures()) >= 12)
+        assert driving.handovers("server_lost") == 1
+    for line in driving.lines():
         if line["result"] == "acked":
             assert line["server_digest"] == line["reconstruction_digest"]
 
@@ -175,12 +175,12 @@ async def test_without_a_neighbour_in_reach_the_newest_picture_waits_for_the_ser
     async with vehicle(
         a.address, neighbours=(b.address,), fields=tmp_path / "mine",
         pace=PaceKind.REALTIME, rate=10.0, loop=True,
-    ) as trip:  # fmt: skip
-        await trip.until(lambda: len(b.pictures()) >= 3)
+    ) as driving:  # fmt: skip
+        await driving.until(lambda: len(b.pictures()) >= 3)
         b.process.kill()
         there = len(a.pictures())
-        await trip.until(lambda: len(a.pictures()) >= there + 6)
-    late = [line["reason"] for line in trip.lines() if line["result"] != "acked"]
+        await driving.until(lambda: len(a.pictures()) >= there + 6)
+    late = [line["reason"] for line in driving.lines() if line["result"] != "acked"]
     assert late, "what belongs to the east ends somehow, and is counted"
 
 
@@ -196,8 +196,8 @@ async def test_two_tiles_of_one_field_fetch_it_once(
         serve(fields=tmp_path / "east") as b,
         vehicle(
             a.address, neighbours=(str(b.address),), fields=tmp_path / "mine", loop=True
-        ) as trip,
+        ) as driving,
     ):
-        await trip.until(lambda: trip.handovers("tile") >= 2)
-    assert {line["result"] for line in trip.lines()} == {"acked"}
-    assert trip.fields() == {f"{street.field_id}.rff"}
+        await driving.until(lambda: driving.handovers("tile") >= 2)
+    assert {line["result"] for line in driving.lines()} == {"acked"}
+    assert driving.fields() == {f"{street.field_id}.rff"}

@@ -37,7 +37,7 @@ async def test_the_vehicle_says_which_frame_was_lost_with_its_connection(
         async with serve() as server:
             first = LinkProxy(ProxySettings(str(server.address), uplink_bps=20e3, delay_ms=0.0))
             address = await first.start()
-            trip = asyncio.create_task(travel(address))
+            travelling = asyncio.create_task(travel(address))
             while not server.registry.get_sample_value(
                 "rfedge_server_frames_total", {"result": "acked", "reason": ""}
             ):
@@ -47,7 +47,7 @@ async def test_the_vehicle_says_which_frame_was_lost_with_its_connection(
             await first.stop()
             second = LinkProxy(ProxySettings(str(server.address), listen=str(address)))
             await second.start()
-            assert (await trip).counts["acked"] == 6
+            assert (await travelling).counts["acked"] == 6
             await second.stop()
     lost = [line for line in lines if line["event"] == "frame lost"]
     assert lost

@@ -234,8 +234,8 @@ async def test_a_disk_that_refuses_stops_the_recording_and_not_the_streaming(
     (tmp_path / "cav-1").write_text("a file where the pictures' folder should be")
     async with serve(save=tmp_path) as server:
         assert server.registry.get_sample_value("rfedge_server_recording") == 1
-        trip = await travel(server.address)
-    assert trip.counts == {"acked": 6}
+        record = await travel(server.address)
+    assert record.counts == {"acked": 6}
     assert server.registry.get_sample_value("rfedge_server_recording") == 0
 
 

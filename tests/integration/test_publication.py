@@ -36,8 +36,8 @@ async def test_a_published_version_is_used_without_a_restart(
         await travel(server.address, **mine)
         new = publish(folder, "street", archives[1], Ground(), NOW)
         await server.take_up_fields()
-        trip = await travel(server.address, **mine)
-        assert trip.counts == {"acked": 6}
+        record = await travel(server.address, **mine)
+        assert record.counts == {"acked": 6}
         assert FieldStore(tmp_path / "mine").ids() == tuple(sorted((old.field_id, new.field_id)))
         roll_back(folder, "street")
         await server.take_up_fields()
@@ -50,17 +50,17 @@ async def test_a_vehicle_under_way_goes_over_to_a_published_version(
     publish(folder, "street", archives[0], Ground(), NOW)
     async with (
         serve(fields=folder) as server,
-        vehicle(server.address, fields=tmp_path / "mine", field=None, loop=True) as trip,
+        vehicle(server.address, fields=tmp_path / "mine", field=None, loop=True) as driving,
     ):
-        await trip.until(lambda: trip.acked() >= 3)
+        await driving.until(lambda: driving.acked() >= 3)
         new = publish(folder, "street", archives[1], Ground(), NOW)
         await server.take_up_fields()
-        await trip.until(lambda: f"{new.field_id}.rff" in trip.fields())
-        await trip.until(lambda: trip.handovers("tile") == 1)
-        seen = trip.acked()
-        await trip.until(lambda: trip.acked() >= seen + 6)
-    assert {line["result"] for line in trip.lines()} == {"acked"}
-    for line in trip.lines():
+        await driving.until(lambda: f"{new.field_id}.rff" in driving.fields())
+        await driving.until(lambda: driving.handovers("tile") == 1)
+        seen = driving.acked()
+        await driving.until(lambda: driving.acked() >= seen + 6)
+    assert {line["result"] for line in driving.lines()} == {"acked"}
+    for line in driving.lines():
         assert line["server_digest"] == line["reconstruction_digest"]
 
 
@@ -72,12 +72,12 @@ async def test_a_version_that_cannot_be_opened_leaves_the_last_good_one(
         new = publish(folder, "street", archives[1], Ground(), NOW)
         (folder / f"{new.field_id}.rff").write_bytes(b"not a field")
         await server.take_up_fields()
-        trip = await travel(server.address, fields=tmp_path / "mine", field=None)
-        assert trip.counts == {"acked": 6}
+        record = await travel(server.address, fields=tmp_path / "mine", field=None)
+        assert record.counts == {"acked": 6}
         (folder / MANIFEST).write_text("not a manifest")
         await server.take_up_fields()
-        trip = await travel(server.address, fields=tmp_path / "mine", field=None)
-        assert trip.counts == {"acked": 6}
+        record = await travel(server.address, fields=tmp_path / "mine", field=None)
+        assert record.counts == {"acked": 6}
     assert FieldStore(tmp_path / "mine").ids() == (old.field_id,)
 
 

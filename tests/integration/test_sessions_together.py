@@ -22,7 +22,7 @@ from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.views import PosedPicture
 from rfcore.wire.conventions import RENDERER_CONTRACT
-from rfcore.wire.convert import client_message_from_bytes, client_message_to_bytes
+from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract, StageTimes
 
 FIELD = "ab" * 32
@@ -82,10 +82,10 @@ class World:
         return EncodedFrame(packet.sealed(), {})
 
     def exchange(self) -> None:
-        for message in self.agent.messages_to_send(self.now):
-            data = client_message_to_bytes(message)
-            fault = next(self.plan, "deliver") if isinstance(message, Frame) else "deliver"
-            for arrived in self.through(data, fault):
+        for outgoing in self.agent.messages_to_send(self.now):
+            is_frame = isinstance(outgoing.message, Frame)
+            fault = next(self.plan, "deliver") if is_frame else "deliver"
+            for arrived in self.through(outgoing.data, fault):
                 self.serve(arrived)
             answers = self.server.messages_to_send(self.now)
             for answer in answers if fault != "answer lost" else []:

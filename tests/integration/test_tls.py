@@ -65,8 +65,8 @@ async def test_a_vehicle_with_its_certificate_drives_and_gets_its_field(
 ) -> None:
     async with serve(tls=certs("server")) as server:
         tls = certs("vehicle-cav-1")
-        trip = await travel(server.address, tls=tls, field=None, fields=tmp_path / "mine")
-    assert trip.counts == {"acked": 6}
+        record = await travel(server.address, tls=tls, field=None, fields=tmp_path / "mine")
+    assert record.counts == {"acked": 6}
 
 
 async def test_encryption_changes_no_byte_of_a_packet_or_picture(
@@ -101,8 +101,8 @@ async def test_a_false_name_is_permission_denied_and_leaves_the_others_alone(
         await stream.write(client_message_to_bytes(coded.hello))
         assert await stream.code() is grpc.StatusCode.PERMISSION_DENIED
         assert "'cav-raw' is not whom its certificate names" in (await stream.details() or "")
-        trip = await travel(server.address, tls=certs("vehicle-cav-1"))
-    assert trip.counts == {"acked": 6}
+        record = await travel(server.address, tls=certs("vehicle-cav-1"))
+    assert record.counts == {"acked": 6}
 
 
 async def test_an_expired_vehicle_is_told_so_in_one_line(
@@ -225,8 +225,8 @@ async def test_half_of_a_new_certificate_is_not_taken_up(
         (tmp_path / "certs" / "server.pem").write_bytes(
             next(one.certificate for one in other if one.name == "server")
         )
-        trip = await travel(server.address, tls=certs("vehicle-cav-1"))
-    assert trip.counts == {"acked": 6}
+        record = await travel(server.address, tls=certs("vehicle-cav-1"))
+    assert record.counts == {"acked": 6}
 
 
 async def test_a_consumer_asks_for_health_and_sees_the_drive(

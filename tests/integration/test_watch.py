@@ -64,9 +64,9 @@ async def test_a_consumer_sees_to_the_bit_what_the_vehicle_holds(serve: Any, tra
         serve() as server,
         consumer(server.address, Wish(encoding=PictureEncoding.I420)) as call,
     ):
-        trip = await travel(server.address)
+        record = await travel(server.address)
         pictures = await seen_until_departure(call)
-    held = {line["sequence"]: line["reconstruction_digest"] for line in trip.lines}
+    held = {line["sequence"]: line["reconstruction_digest"] for line in record.lines}
     assert [p.sequence for p in pictures] == sorted({p.sequence for p in pictures})
     assert pictures[-1].sequence == 5, "the newest is always seen"
     assert len(pictures) + pictures[-1].skipped == 6
@@ -107,13 +107,13 @@ async def test_a_consumer_that_never_reads_slows_no_vehicle_and_is_let_go(
         value = server.registry.get_sample_value
         async with consumer(server.address, Wish(encoding=PictureEncoding.I420)):
             while not value("rfedge_twin_pictures_missed_total"):
-                trip = await travel(server.address)
-                assert trip.counts == {"acked": 6}
+                record = await travel(server.address)
+                assert record.counts == {"acked": 6}
             while value("rfedge_twin_consumers_ended_total", {"reason": "slow"}) < 1:
                 await asyncio.sleep(0.01)
             assert value("rfedge_twin_consumers") == 0
-        trip = await travel(server.address)
-        assert trip.counts == {"acked": 6}
+        record = await travel(server.address)
+        assert record.counts == {"acked": 6}
 
 
 async def test_consumers_are_limited_and_one_that_leaves_makes_room(
@@ -199,12 +199,12 @@ async def test_the_watch_command_keeps_pictures_and_a_video(
         while not server.registry.get_sample_value("rfedge_twin_consumers"):
             await asyncio.sleep(0.01)
         while not watching.done():
-            trip = await travel(server.address)
+            record = await travel(server.address)
         await watching
     folder = tmp_path / "kept" / "cav-1" / "front"
     index = [json.loads(line) for line in (folder / "index.jsonl").read_text().splitlines()]
     assert len(index) == 4
-    known = {line["reconstruction_digest"] for line in trip.lines}
+    known = {line["reconstruction_digest"] for line in record.lines}
     for line in index:
         assert line["digest"] in known
         assert read_rgb(folder / line["file"]).shape == (52, 76, 3)

@@ -1,0 +1,171 @@
+"""Frames without an answer: how long each may take, which a refusal is about, what comes next."""
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cav_agent.frames import Capture, FrameResult, Outcome
+from cav_agent.frames_in_flight import (
+    SLOWEST_BPS,
+    STALL_S,
+    AnswerTimeout,
+    FramesInFlight,
+    PredictionChain,
+)
+from rfcore.errors import RejectReason
+from rfcore.wire.messages import Ack, FrameAddress, Nack, StageTimes
+
+
+def test_a_first_answer_may_take_the_longest_time_allowed() -> None:
+    timeout = AnswerTimeout(5.0)
+    assert timeout.timeout_s(1000) == 5.0
+    timeout.answered(0.05)
+    timeout.reset()
+    assert timeout.timeout_s(1000) == 5.0
+
+
+def test_a_small_frame_of_a_quick_server_is_given_up_after_little_more_than_a_second() -> None:
+    timeout = AnswerTimeout(5.0)
+    timeout.answered(0.1)
+    assert timeout.timeout_s(3000) == pytest.approx(STALL_S + 0.08 + 0.2)
+
+
+@given(st.lists(st.floats(0, 3), min_size=1), st.integers(0, 200_000))
+def test_what_was_usual_and_what_the_slowest_link_takes_is_always_waited_for(
+    usual_s: list[float], size_bytes: int
+) -> None:
+    timeout = AnswerTimeout(5.0)
+    for spent_s in usual_s:
+        timeout.answered(spent_s)
+    needed_s = 8 * size_bytes / SLOWEST_BPS + max(usual_s[-8:])
+    assert min(5.0, needed_s) <= timeout.timeout_s(size_bytes) <= 5.0
+
+
+# --- frames without an answer
+
+
+def address(sequence: int, epoch: int = 0) -> FrameAddress:
+    return FrameAddress("front", epoch, sequence)
+
+
+@pytest.fixture
+def in_flight(make_capture: Callable[..., Capture]) -> FramesInFlight:
+    """Three frames of 1 kB, encoded at seconds 1, 2 and 3; the longest wait is 5 s."""
+    frames = FramesInFlight(5.0)
+    for sequence in range(3):
+        result = FrameResult(make_capture(sequence), Outcome.LOST, packet_bytes=1000)
+        frames.add(address(sequence), result, None, 1.0 + sequence)
+    return frames
+
+
+def test_the_oldest_frame_is_overdue_first(in_flight: FramesInFlight) -> None:
+    assert in_flight.timeout_at() == 6.0
+    assert in_flight.longest_wait_s(6.5) == 5.5
+    in_flight.pop(address(0))
+    assert in_flight.timeout_at() == 7.0
+
+
+def test_without_frames_nothing_is_overdue() -> None:
+    empty = FramesInFlight(5.0)
+    assert empty.timeout_at() is None
+    assert empty.longest_wait_s(9.0) == 0.0
+    assert len(empty) == 0
+
+
+def test_a_frame_may_take_longer_behind_others_on_a_slow_link(
+    make_capture: Callable[..., Capture],
+) -> None:
+    frames = FramesInFlight(60.0)
+    large = FrameResult(make_capture(0), Outcome.LOST, packet_bytes=37_500)  # 1 s at the slowest
+    frames.add(address(0), large, None, 0.0)
+    frames.acked(Ack(address(0), StageTimes(), b""), 0.5)
+    frames.pop(address(0))
+    for sequence in (1, 2):
+        frames.add(address(sequence), large, None, 10.0)
+    waits = [STALL_S + behind + 2 * 0.5 for behind in (1.0, 2.0)]
+    assert frames.timeout_at() == pytest.approx(10.0 + waits[0])
+    frames.pop(address(1))
+    assert frames.timeout_at() == pytest.approx(10.0 + waits[1])
+
+
+def test_link_time_runs_from_sending_and_excludes_the_servers_own(
+    in_flight: FramesInFlight,
+) -> None:
+    in_flight.sent(address(0), 1.25)
+    frame = in_flight.acked(Ack(address(0), StageTimes(total_ns=500_000_000), b"x" * 16), 2.0)
+    assert frame is not None
+    assert frame.result.link_s == pytest.approx(0.25)
+    assert frame.result.server_digest == b"x" * 16
+
+
+def test_an_answer_to_a_frame_that_is_not_in_flight_changes_nothing(
+    in_flight: FramesInFlight,
+) -> None:
+    assert in_flight.acked(Ack(address(7), StageTimes(), b""), 2.0) is None
+    assert in_flight.addresses == [address(0), address(1), address(2)]
+
+
+@pytest.mark.parametrize(
+    ("nack", "sequences"),
+    [
+        (Nack(address(1), RejectReason.CRC_MISMATCH, "crc"), [1]),
+        (Nack(address(1), RejectReason.SEQUENCE_GAP, "lost", count=2), [1, 2]),
+        (Nack(address(0, epoch=1), RejectReason.STALE_EPOCH, "old"), []),
+        (Nack(FrameAddress("rear", 0, 1), RejectReason.CRC_MISMATCH, "crc"), []),
+        (Nack(FrameAddress("", 0, 0), RejectReason.INVALID_ARGUMENT, "garbage"), [0, 1, 2]),
+    ],
+)
+def test_a_refusal_is_about_the_frames_it_names_or_about_all_if_it_could_not_read_them(
+    in_flight: FramesInFlight, nack: Nack, sequences: list[int]
+) -> None:
+    assert [a.sequence for a, _ in in_flight.refused_by(nack)] == sequences
+
+
+# --- what the next frame is predicted from
+
+
+def test_a_new_epoch_goes_back_to_the_last_decoded_frame() -> None:
+    chain = PredictionChain(0)
+    chain.started()
+    chain.sent(address(0))
+    chain.decoded(address(0))
+    chain.sent(address(1))
+    assert chain.base == address(1)
+    chain.restart()
+    assert (chain.epoch, chain.base) == (1, address(0))
+
+
+def test_an_epoch_without_a_packet_is_used_again() -> None:
+    chain = PredictionChain(4)
+    chain.restart()
+    assert chain.epoch == 4
+    chain.started()
+    chain.restart()
+    assert chain.epoch == 5
+
+
+def test_a_new_epoch_is_later_than_the_servers() -> None:
+    chain = PredictionChain(0)
+    chain.restart(above=9)
+    assert chain.epoch == 10
+
+
+def test_a_frame_the_server_lost_is_no_base_and_another_is() -> None:
+    chain = PredictionChain(0)
+    chain.decoded(address(3))
+    chain.unknown_to_server(address(2))
+    chain.restart()
+    assert chain.base == address(3)
+    chain.unknown_to_server(address(3))
+    chain.restart()
+    assert chain.base is None
+
+
+def test_another_connection_begins_without_a_base() -> None:
+    chain = PredictionChain(0)
+    chain.decoded(address(3))
+    chain.forget()
+    chain.restart()
+    assert chain.base is None

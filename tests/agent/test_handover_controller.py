@@ -1,0 +1,285 @@
+"""The drive over streams in memory: who takes each picture, what is counted, and what ends it."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from prometheus_client import CollectorRegistry
+
+from cav_agent.client import CameraTaken, StreamObserver
+from cav_agent.config import AgentConfig, AgentLimits, PaceKind
+from cav_agent.frame_log import DriveObserver
+from cav_agent.frames import Capture, EndReason, FrameResult, Outcome
+from cav_agent.handover import ServedTile
+from cav_agent.handover_controller import HandoverController
+from cav_agent.metrics import AgentMetrics
+from cav_agent.tile_stream import OpenStream, TileStream
+from rfcore.errors import ProtocolError, RfedgeError
+from rfcore.wire.address import Address
+from rfcore.wire.tiles import Area, Tile
+
+ADDRESSES = (Address("127.0.0.1", 1), Address("127.0.0.1", 2))
+
+
+def tile(server: int, west_m: float, east_m: float) -> ServedTile:
+    area = Area((west_m, -5.0), (east_m, 5.0))
+    return ServedTile(server, Tile(f"tile-{server}", f"{server}a" * 32, 1, area, 4.0))
+
+
+WEST, EAST = tile(0, -100, 0), tile(1, 0, 100)
+POSITIONS = [(-20.0, 0.0), (-10.0, 0.0), (10.0, 0.0), (20.0, 0.0)]
+
+
+class MemoryClient:
+    """Stands for ``StreamClient``: acknowledges every picture as soon as it is captured."""
+
+    rate_limit_hz = 0.0
+
+    def __init__(
+        self,
+        observer: StreamObserver,
+        make_capture: Callable[..., Capture],
+        error: Exception | None,
+        on_capture: Callable[[int], None],
+    ) -> None:
+        self.captured: list[int] = []
+        self.left_behind: list[Capture] = []
+        self.is_streaming = error is None
+        self.withdrawn = False
+        self._observer = observer
+        self._make_capture = make_capture
+        self._error = error
+        self._on_capture = on_capture
+        self._finishing = asyncio.Event()
+
+    def capture(self, index: int) -> None:
+        self.captured.append(index)
+        self._on_capture(index)
+        result = FrameResult(self._make_capture(index), Outcome.ACKED)
+        asyncio.get_running_loop().call_soon(self._observer.ended, result)
+
+    def withdraw(self) -> None:
+        self.withdrawn = True
+
+    def finish(self) -> None:
+        self.is_streaming = False
+        self._finishing.set()
+
+    stop = finish
+
+    def abandon(self, problem: str) -> None:
+        for capture in self.left_behind:
+            lost = FrameResult(capture, Outcome.LOST, EndReason.ABANDONED, problem)
+            self._observer.ended(lost)
+
+    async def run(self) -> None:
+        self._observer.connected(self.is_streaming)
+        if self._error is not None:
+            raise self._error
+        await self._finishing.wait()
+
+
+@dataclass
+class Site:
+    """Makes streams, and keeps them by tile; ``errors`` says which fail."""
+
+    make_capture: Callable[..., Capture]
+    errors: dict[ServedTile, Exception] = field(default_factory=dict)
+    failing_fields: dict[ServedTile, Exception] = field(default_factory=dict)
+    clients: dict[ServedTile, list[MemoryClient]] = field(default_factory=dict)
+    streaming: dict[int, set[ServedTile]] = field(default_factory=dict)
+    """Who had a stream when a picture was captured."""
+
+    async def prepare(self, served: ServedTile) -> OpenStream:
+        if served in self.failing_fields:
+            raise self.failing_fields[served]
+
+        def open_stream(observer: StreamObserver) -> MemoryClient:
+            error = self.errors.get(served)
+            client = MemoryClient(observer, self.make_capture, error, self._note_streaming)
+            self.clients.setdefault(served, []).append(client)
+            return client
+
+        return open_stream  # type: ignore[return-value]
+
+    def _note_streaming(self, index: int) -> None:
+        self.streaming[index] = {
+            served
+            for served, clients in self.clients.items()
+            if any(client.is_streaming for client in clients)
+        }
+
+    def captured(self, served: ServedTile) -> list[int]:
+        return [index for client in self.clients.get(served, []) for index in client.captured]
+
+
+@pytest.fixture
+def site(make_capture: Callable[..., Capture]) -> Site:
+    return Site(make_capture)
+
+
+@pytest.fixture
+def registry() -> CollectorRegistry:
+    return CollectorRegistry()
+
+
+@pytest.fixture
+def drive(site: Site, registry: CollectorRegistry) -> Callable[..., HandoverController]:
+    """Return a function that makes the controller of a drive in lockstep past ``tiles``."""
+
+    def make(*tiles: ServedTile, give_up_s: float = 30.0) -> HandoverController:
+        config = AgentConfig(
+            "127.0.0.1:1",
+            Path("drive"),
+            pace=PaceKind.LOCKSTEP,
+            limits=AgentLimits(give_up_s=give_up_s),
+        )
+        observer = DriveObserver(AgentMetrics(registry), ADDRESSES)
+        controller = HandoverController(config, POSITIONS, site.prepare, observer)
+        for server in sorted({served.server for served in tiles}):
+            mine = [served for served in tiles if served.server == server]
+            controller.tiles_published(server, mine)
+        return controller
+
+    return make
+
+
+Drive = Callable[..., HandoverController]
+
+
+async def test_every_picture_goes_to_the_tile_it_was_taken_on(drive: Drive, site: Site) -> None:
+    await drive(WEST, EAST).run()
+    assert site.captured(WEST) == [0, 1]
+    assert site.captured(EAST) == [2, 3]
+
+
+async def test_a_result_is_counted_once(drive: Drive, registry: CollectorRegistry) -> None:
+    controller = drive(WEST, EAST)
+    await controller.run()
+    assert controller.counts == {"acked": 4}
+    labels = {"result": "acked", "reason": ""}
+    assert registry.get_sample_value("rfedge_agent_frames_total", labels) == 4
+
+
+async def test_a_handover_is_counted_and_closes_the_stream_that_was_left(
+    drive: Drive, site: Site, registry: CollectorRegistry
+) -> None:
+    await drive(WEST, EAST).run()
+    labels = {"cause": "tile"}
+    assert registry.get_sample_value("rfedge_agent_handovers_total", labels) == 1
+    assert site.streaming[1] == {WEST, EAST}, "opened ahead of the border"
+    assert site.streaming[2] == {EAST}, "one vehicle is shown by one server at a time"
+    assert not site.clients[WEST][0].withdrawn, "its server answers, so it keeps what it has taken"
+
+
+async def test_the_only_stream_that_fails_ends_the_drive_with_its_error(
+    drive: Drive, site: Site
+) -> None:
+    site.errors[WEST] = ProtocolError("hello.field_ids: none is here")
+    with pytest.raises(ProtocolError, match="none is here"):
+        await drive(WEST).run()
+
+
+async def test_a_field_that_cannot_be_prepared_ends_the_drive_with_its_error(
+    drive: Drive, site: Site
+) -> None:
+    site.failing_fields[WEST] = RfedgeError("field 0a0a does not arrive")
+    with pytest.raises(RfedgeError, match="does not arrive"):
+        await drive(WEST).run()
+    assert site.clients == {}
+
+
+async def test_a_camera_that_another_agent_sends_ends_the_drive_though_a_neighbour_is_there(
+    drive: Drive, site: Site
+) -> None:
+    """The neighbour would only let the two agents alternate."""
+    site.errors[WEST] = CameraTaken("camera_taken: another agent sends camera front")
+    with pytest.raises(CameraTaken):
+        await drive(WEST, EAST).run()
+
+
+async def test_one_of_two_streams_that_fails_is_held_back_and_tried_again(
+    site: Site, make_capture: Callable[..., Capture]
+) -> None:
+    results: list[FrameResult] = []
+
+    class Observer:
+        def ended(self, result: FrameResult) -> None:
+            results.append(result)
+
+        def connected(self, is_connected: bool) -> None:
+            """Not looked at."""
+
+    site.errors[WEST] = ProtocolError("draining")
+    stream = TileStream(WEST, site.prepare, Observer())
+    stream.open(0.0)
+    await asyncio.gather(*stream.tasks)
+    assert stream.collect() is None
+    stream.open(0.0)
+    (client,) = site.clients[WEST]
+    client.left_behind.append(make_capture(1))
+    await asyncio.gather(*stream.tasks, return_exceptions=True)
+    assert isinstance(stream.collect(), ProtocolError)
+    assert [(r.capture.index, r.reason) for r in results] == [(1, EndReason.ABANDONED)]
+    assert stream.client is None
+    stream.retry_at_s = 2.0
+    stream.open(1.9)
+    assert len(site.clients[WEST]) == 1, "too early"
+    del site.errors[WEST]
+    stream.open(2.0)
+    assert len(site.clients[WEST]) == 2
+    assert stream.is_streaming
+    stream.close()
+    await stream.wait_closed()
+
+
+async def test_a_field_is_prepared_once_for_all_streams_of_its_tile(site: Site) -> None:
+    prepared: list[ServedTile] = []
+
+    async def prepare(served: ServedTile) -> OpenStream:
+        prepared.append(served)
+        return await site.prepare(served)
+
+    class Observer:
+        def ended(self, result: FrameResult) -> None:
+            raise AssertionError(result)
+
+        def connected(self, is_connected: bool) -> None:
+            """Not looked at."""
+
+    stream = TileStream(WEST, prepare, Observer())
+    for _ in range(3):
+        stream.prepare(0.0)
+    await asyncio.gather(*stream.tasks)
+    stream.collect()
+    for _ in range(2):
+        stream.open(0.0)
+        stream.close()
+        await stream.wait_closed()
+        stream.collect()
+    assert prepared == [WEST]
+    assert len(site.clients[WEST]) == 2
+
+
+async def test_a_drive_that_is_stopped_captures_no_more(drive: Drive, site: Site) -> None:
+    controller = drive(WEST, EAST)
+    running = asyncio.create_task(controller.run())
+    while not site.captured(WEST):
+        await asyncio.sleep(0)
+    controller.stop()
+    await running
+    assert sum(controller.counts.values()) <= 2
+    assert site.captured(EAST) == []
+
+
+async def test_tiles_that_are_published_later_are_followed(drive: Drive, site: Site) -> None:
+    """The first server lists its tiles before the second: its own pictures are sent meanwhile."""
+    controller = drive(WEST)
+    running = asyncio.create_task(controller.run())
+    while not site.captured(WEST):
+        await asyncio.sleep(0)
+    controller.tiles_published(1, [EAST])
+    await running
+    assert site.captured(EAST) == [2, 3]
