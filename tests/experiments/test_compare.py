@@ -5,18 +5,12 @@ import pytest
 
 from rfcore.image import I420
 from rfedge.experiments.cells import CellStore
-from rfedge.experiments.clips import CodedClip
-from rfedge.experiments.compare.measure import (
-    BEST,
-    TIMED_REPEATS,
-    Clip,
-    Performance,
-    compare_rows,
-    perform,
-)
+from rfedge.experiments.clips import Clip, CodedClip
+from rfedge.experiments.compare.measure import BEST, compare_rows
+from rfedge.experiments.performance import TIMED_REPEATS, Performance, perform
 
 PLANE = np.zeros((2, 2), np.uint8)
-CONTEST = Clip("street", 10.0, [I420(PLANE, PLANE[:1, :1], PLANE[:1, :1])], "digest", 27.5)
+CLIP = Clip("street", 10.0, [I420(PLANE, PLANE[:1, :1], PLANE[:1, :1])], "digest", 27.5)
 
 
 def performance(name, rate_factor, cpu_ms, frames=10):
@@ -48,7 +42,7 @@ FAMILIES = {
 def rows():
     return {
         row["rival"]: row
-        for row in compare_rows(CONTEST, OURS, FAMILIES)
+        for row in compare_rows(CLIP, OURS, FAMILIES)
         if row["window_db"] == [32.0, 35.0]
     }
 
@@ -81,7 +75,7 @@ def test_the_first_frame_is_told_apart_from_the_steady_state(rows):
 def test_a_wider_window_is_left_out_where_a_field_shows_more_before_a_bit_is_sent():
     good = Performance("good", tuple(clip for clip in OURS.clips if clip.luma_mse[0] < 42), 50)
     assert good.steady.psnr_db[0] > 30
-    rows = compare_rows(CONTEST, good, {"x264-lowdelay": FAMILIES["x264-lowdelay"]})
+    rows = compare_rows(CLIP, good, {"x264-lowdelay": FAMILIES["x264-lowdelay"]})
     assert {tuple(row["window_db"]) for row in rows} == {(32.0, 35.0)}
     assert set(rows[0]["saving_percent_at_db"]) == {"33", "35"}
 
@@ -105,16 +99,16 @@ class Counting:
 def test_what_was_coded_once_is_not_coded_again(tmp_path):
     store, coders = CellStore(tmp_path), [Counting("a"), Counting("a"), Counting("b")]
     for coder in coders:
-        perform(CONTEST, coder, store)
+        perform(CLIP, coder, store)
     assert [coder.calls for coder in coders] == [2 + TIMED_REPEATS, 0, 2 + TIMED_REPEATS]
 
 
 def test_processor_time_can_be_taken_anew_without_coding_again(tmp_path):
     store, coder = CellStore(tmp_path), Counting("a")
-    before = perform(CONTEST, coder, store)
+    before = perform(CLIP, coder, store)
     calls = coder.calls
     coder.cpu_ms = 0.5
-    after = perform(CONTEST, coder, store, retime=True)
+    after = perform(CLIP, coder, store, retime=True)
     assert coder.calls == calls + TIMED_REPEATS
     assert after.clips[0].frame_bytes == before.clips[0].frame_bytes
     assert after.cpu_ms_per_frame == before.cpu_ms_per_frame / 2

@@ -14,7 +14,7 @@ from rfcore.native.yuv import i420_from_colour
 from rfcore.raster.gaussians import Gaussians
 from rfcore.views import PosedPicture
 from rfedge.experiments.cells import CellStore
-from rfedge.experiments.clips import DriveFrames, DriveName
+from rfedge.experiments.clips import Drive, DriveName
 from rfedge.experiments.never_worse.measure import (
     CONTROLS,
     NeverWorse,
@@ -53,7 +53,7 @@ def drive():
         PosedPicture(str(k), camera, lambda: np.zeros((96, 160, 3), np.uint8))
         for k, camera in enumerate(CAMERAS)
     ]
-    return DriveFrames(DriveName("wall", 10.0, Path("wall.json")), pictures, frames)
+    return Drive(DriveName("wall", 10.0, Path("wall.json")), pictures, frames)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_a_row_tells_excess_without_header_and_whether_it_holds(tmp_path, seen):
         )
         for f in drive().frames
     ]
-    table = NeverWorse(DriveFrames(drive().name, drive().pictures, noisy), seen, "veryfast", "test")
+    table = NeverWorse(Drive(drive().name, drive().pictures, noisy), seen, "veryfast", "test")
     rows = list(table.rows(CellStore(tmp_path)))
     assert [(row["control"], row["at_db"]) for row in rows] == [
         (control, db) for control in CONTROLS for db in (31.0, 33.0, 35.0)

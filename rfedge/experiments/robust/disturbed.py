@@ -82,13 +82,7 @@ def refined_cameras(
 def kbit_at(clips: Sequence[CodedClip], quality_db: float) -> float:
     """Return kilobits a frame at a luma PSNR, log(bits) linear in dB between the clips' points,
     the first frame left out. Raises ``InvalidInput`` when they do not span the quality."""
-    points = sorted(
-        (
-            10 * math.log10(255.0**2 / float(clip.luma_mse[1:].mean())),
-            math.log(8e-3 * float(clip.frame_bytes[1:].mean())),
-        )
-        for clip in clips
-    )
+    points = sorted((clip.psnr_db(), math.log(8e-3 * clip.bytes_per_frame())) for clip in clips)
     qualities = [db for db, _ in points]
     if not qualities[0] <= quality_db <= qualities[-1]:
         raise InvalidInput(

@@ -19,14 +19,12 @@ from rich.console import Console
 
 from rfcore.camera import Camera
 from rfcore.codec.photometric import Photometric
-from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
-from rfedge.experiments.cells import CellStore
-from rfedge.experiments.clips import ClipCoder, DriveName
-from rfedge.experiments.compare.measure import Clip, perform
+from rfedge.experiments.cells import CellStore, program_version
+from rfedge.experiments.clips import Clip, ClipCoder, Drive, read_drive
 from rfedge.experiments.field_coder import FieldCoder, see_clip
-from rfedge.experiments.ladder.measure import LadderClip
+from rfedge.experiments.performance import perform
 from rfedge.experiments.rivals import x264_lowdelay
 from rfedge.experiments.robust.disturbed import (
     NOISES,
@@ -77,29 +75,10 @@ class RobustJob:
             raise InvalidInput("frames", f"{self.frames} must be at least 4")
 
 
-@dataclass(frozen=True)
-class Drive:
-    """A drive in memory."""
-
-    name: DriveName
-    clip: LadderClip
-
-    @staticmethod
-    def read(text: str, count: int) -> Drive:
-        """Read the first ``count`` frames of ``NAME@HZ=DATASET``."""
-        name = DriveName.parse(text)
-        return Drive(name, LadderClip.of(read_dataset(name.dataset), count))
-
-    def contest(self, condition: str) -> Clip:
-        """Name the drive under a condition, as cells are keyed."""
-        scene = f"{self.name.scene} {condition}".strip()
-        return Clip(scene, self.name.rate_hz, self.clip.frames, self.clip.digest, None)
-
-
 def run_robust(job: RobustJob, console: Console) -> Row:
     """Do what is not done yet, write ``job.out``, and return its content."""
     count = QUICK_FRAMES if job.quick else job.frames
-    drive = Drive.read(job.drive, count)
+    drive = read_drive(job.drive, count)
     field = load_field(job.field)
     bench = Bench(job, field, drive, CellStore(job.cells), console, revision())
     scenarios = bench.scenarios()
@@ -113,7 +92,7 @@ def run_robust(job: RobustJob, console: Console) -> Row:
         "quick": job.quick,
         "seed": SEED,
         "field_id": field.field_id,
-        "frames": {"drive": job.drive, "count": count, "sha256": drive.clip.digest},
+        "frames": {"drive": job.drive, "count": count, "sha256": drive.digest},
         "quality_db": job.quality_db,
         "crossings": crossed,
         **_at_equal_rate(crossed),
@@ -148,23 +127,23 @@ class Bench:
 
     def crossed(self, method: str, rtt_s: float, loss: float, crf: float) -> Row:
         """Return the row of one crossing."""
-        clip, rate_hz = self.drive.clip, self.drive.name.rate_hz
+        drive, rate_hz = self.drive, self.drive.name.rate_hz
         facts: Row = {
             "method": method,
             "rtt_ms": 1e3 * rtt_s,
             "loss_percent": 100 * loss,
             "crf": crf,
         }
-        crossing = Crossing(clip.frames, rate_hz, self.job.preset, crf, Bursts(loss), rtt_s, SEED)
+        crossing = Crossing(drive.frames, rate_hz, self.job.preset, crf, Bursts(loss), rtt_s, SEED)
         key: dict[str, str | float | int | None] = {
             **facts,
             "verb": "robust",
             "field": self.field.field_id,
-            "frames": clip.digest,
+            "frames": drive.digest,
             "hz": rate_hz,
             "preset": self.job.preset,
             "seed": SEED,
-            "revision": self.revision,
+            "program": program_version(),
         }
         (row,) = self.store.rows(key, lambda: [self._outcome(method, crossing)])
         return {**facts, **row}
@@ -189,9 +168,8 @@ class Bench:
         """Return the coder of all crossings at ``crf``; the last one asked for is kept."""
         if crf not in self._coders:
             self._coders.clear()
-            clip = self.drive.clip
-            seen = see_clip(self.field, clip.cameras)
-            self._coders[crf] = FrameCoder(clip.frames, seen, self.job.preset, crf)
+            seen = see_clip(self.field, self.drive.cameras)
+            self._coders[crf] = FrameCoder(self.drive.frames, seen, self.job.preset, crf)
         return self._coders[crf]
 
     # --- pose and light
@@ -204,11 +182,11 @@ class Bench:
         """Return what noise of each size costs, and what is left of it after refinement."""
         drive, rival = self.drive, self._rival(self.drive)
         still, *noises = self.noises()
-        kbit = self._own(drive, f"pose noise {still}", drive.clip.cameras)
+        kbit = self._own(drive, f"pose noise {still}", drive.cameras)
         rows = [self._row("pose noise", str(still), kbit, None, rival)]
         for noise in noises:
-            measured = noisy_cameras(drive.clip.cameras, noise, SEED)
-            refined = refined_cameras(self.field, drive.clip.frames, measured)
+            measured = noisy_cameras(drive.cameras, noise, SEED)
+            refined = refined_cameras(self.field, drive.frames, measured)
             for condition, cameras in (("pose noise", measured), ("refined pose noise", refined)):
                 kbit = self._own(drive, f"{condition} {noise}", cameras)
                 rows.append(self._row(condition, str(noise), kbit, rows[0], rival))
@@ -219,8 +197,8 @@ class Bench:
         if self.job.lane is None:
             why = "no drive with a lane offset was given (--lane NAME@HZ=DATASET)"
             return {"condition": "lane offset", "level": "n/a", "reason": why}
-        drive = Drive.read(self.job.lane, len(self.drive.clip.frames))
-        kbit = self._own(drive, "lane", drive.clip.cameras)
+        drive = read_drive(self.job.lane, len(self.drive.frames))
+        kbit = self._own(drive, "lane", drive.cameras)
         return self._row("lane offset", drive.name.scene, kbit, None, self._rival(drive))
 
     def light_rows(self) -> list[Row]:
@@ -228,10 +206,10 @@ class Bench:
         if self.job.dusk is None:
             why = "no drive in another light was given (--dusk NAME@HZ=DATASET)"
             return [{"condition": "light", "level": "n/a", "reason": why}]
-        drive = Drive.read(self.job.dusk, len(self.drive.clip.frames))
+        drive = read_drive(self.job.dusk, len(self.drive.frames))
         rival, rows = self._rival(drive), list[Row]()
         for level, choice in (("uncorrected", ()), ("photometric", None)):
-            kbit = self._own(drive, level, drive.clip.cameras, photometric=choice)
+            kbit = self._own(drive, level, drive.cameras, photometric=choice)
             rows.append(self._row("light", level, kbit, rows[0] if rows else None, rival))
         return rows
 
@@ -246,19 +224,19 @@ class Bench:
         coder = FieldCoder(
             see_clip(self.field, cameras),
             f"rfedge-{self.job.preset}-{self.field.field_id}",
-            self.revision,
+            program_version(),
             preset=self.job.preset,
             photometric=photometric,
             points=DISTURBED_CRFS,
         )
-        return self._kbit(drive.contest(condition), coder)
+        return self._kbit(drive.clip(condition), coder)
 
     def _rival(self, drive: Drive) -> float:
         coder = replace(x264_lowdelay(self.job.preset), points=RIVAL_CRFS)
-        return self._kbit(drive.contest(""), coder)
+        return self._kbit(drive.clip(""), coder)
 
-    def _kbit(self, contest: Clip, coder: ClipCoder) -> float:
-        return kbit_at(perform(contest, coder, self.store).clips, self.job.quality_db)
+    def _kbit(self, clip: Clip, coder: ClipCoder) -> float:
+        return kbit_at(perform(clip, coder, self.store).clips, self.job.quality_db)
 
     def _row(
         self, condition: str, level: str, kbit: float, base: Row | None, rival_kbit: float
