@@ -10,9 +10,12 @@ from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rfcore.errors import InvalidInput
 from rfedge.experiments.cells import CellStore, Rows, clip_key
-from rfedge.experiments.clips import STEADY, Clip, ClipCoder, CodedClip
+from rfedge.experiments.clips import STEADY, Clip, ClipCoder, CodedClip, psnr_of_mse
 from rfedge.experiments.rate_curve import RateCurve, Window, rate_curve
 
 __all__ = [
@@ -25,8 +28,6 @@ __all__ = [
 
 HEADLINE_DB: Window = (32.0, 35.0)
 """Luma PSNR over which BD-rates are quoted, unless a window is asked for."""
-MARGIN_DB = 0.5
-"""By which a curve should reach beyond a window, so that resampled frames span it too."""
 PROBE_FRAMES = 2
 TIMED_FRAMES, TIMED_REPEATS = 12, 3
 
@@ -109,25 +110,26 @@ def spanning_points(
 
     Codes the clip at the ends alone, so that a window that cannot be spanned is found before the
     rest is coded. Added points are as far apart as the last two, up to the coder's ``limits``.
-    Raises ``InvalidInput`` with the quality reached where that, or a coder without limits, ends.
+    Every frame should span the window, so that any resampled clip does; the clip must: raises
+    ``InvalidInput`` with the quality reached otherwise.
     """
     low_db, high_db = window_db
     points = list(coder.points)
 
-    def psnr_db(point: float) -> float:
-        return _coded(clip, coder, point, store).psnr_db()
+    def coded(point: float) -> CodedClip:
+        return _coded(clip, coder, point, store)
 
-    while psnr_db(points[0]) < high_db + MARGIN_DB:
+    while _frame_psnr_db(coded(points[0])).min() < high_db:
         better = _beyond(coder, points[1], points[0])
         if better is None:
             break
         points.insert(0, better)
-    while psnr_db(points[-1]) > low_db - MARGIN_DB:
+    while _frame_psnr_db(coded(points[-1])).max() > low_db:
         worse = _beyond(coder, points[-2], points[-1])
         if worse is None:
             break
         points.append(worse)
-    best_db, worst_db = psnr_db(points[0]), psnr_db(points[-1])
+    best_db, worst_db = coded(points[0]).psnr_db(), coded(points[-1]).psnr_db()
     if not worst_db <= low_db <= high_db <= best_db:
         raise InvalidInput(
             "window",
@@ -136,6 +138,10 @@ def spanning_points(
             "give --window LOW HIGH within them",
         )
     return tuple(points)
+
+
+def _frame_psnr_db(coded: CodedClip) -> NDArray[np.float64]:
+    return np.array([psnr_of_mse(mse) for mse in coded.luma_mse[STEADY]])
 
 
 def _beyond(coder: ClipCoder, inner: float, end: float) -> float | None:

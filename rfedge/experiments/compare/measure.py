@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from itertools import chain
 from typing import Any
 
@@ -41,19 +42,27 @@ def compare_rows(
 
     A family is one codec at several settings; the strongest that takes no more processor time than
     the method stands for it, or its quickest if none is that quick. Windows after the first are
-    left out where a curve does not span them: a good field shows 30 dB before a bit is sent. Raises
-    ``InvalidInput`` when a curve does not span the first.
+    left out where a curve, or that of resampled frames, does not span them: a good field shows
+    30 dB before a bit is sent. Raises ``InvalidInput`` when a curve does not span the first.
     """
-    rows = []
-    everybody = [method, *chain.from_iterable(families.values())]
     headline, *wider = windows_db
-    for window in (headline, *(w for w in wider if all(p.steady.spans(w) for p in everybody))):
-        chosen = {name: _champion(method, rivals, window) for name, rivals in families.items()}
-        able = [rival for rival in chosen.values() if _comparable(method, rival)]
-        if able:
-            chosen[BEST] = min(able, key=lambda rival: rival.steady.mean_log_bytes(window))
-        rows += [_row(clip, method, name, rival, window) for name, rival in chosen.items()]
+    rows = _window_rows(clip, method, families, headline)
+    everybody = [method, *chain.from_iterable(families.values())]
+    for window in wider:
+        if all(each.steady.spans(window) for each in everybody):
+            with suppress(InvalidInput):  # resampled clips leave the window
+                rows += _window_rows(clip, method, families, window)
     return rows
+
+
+def _window_rows(
+    clip: Clip, method: Performance, families: Mapping[str, Sequence[Performance]], window: Window
+) -> list[Row]:
+    chosen = {name: _champion(method, rivals, window) for name, rivals in families.items()}
+    able = [rival for rival in chosen.values() if _comparable(method, rival)]
+    if able:
+        chosen[BEST] = min(able, key=lambda rival: rival.steady.mean_log_bytes(window))
+    return [_row(clip, method, name, rival, window) for name, rival in chosen.items()]
 
 
 def _champion(method: Performance, rivals: Sequence[Performance], window: Window) -> Performance:
