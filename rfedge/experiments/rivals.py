@@ -134,9 +134,9 @@ class Rival:
         return CodedPictures([len(packet) for packet in packets], self._decoded(packets), cpu_ms)
 
     def _encoded(self, frames: Sequence[I420], rate_hz: float, point: float) -> list[bytes]:
-        encoder = self._encoder(frames[0].size_px, rate_hz, point)
         packets = []
         try:
+            encoder = self._encoder(frames[0].size_px, rate_hz, point)
             for index, frame in enumerate(frames):
                 made = encoder.encode(video_frame(frame, index))
                 if len(made) != 1:

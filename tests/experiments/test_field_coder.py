@@ -11,6 +11,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_colour
 from rfcore.raster.gaussians import Gaussians
+from rfedge.experiments import field_coder
 from rfedge.experiments.field_coder import FieldCoder, see_clip
 
 INTRINSICS = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -62,6 +63,60 @@ def test_processor_time_holds_the_render():
     slow = replace(seen, render_cpu_ms=1e6)
     clip = FieldCoder(slow, "ours", "test", preset="veryfast").code(FRAMES[:2], 10, 30.0)
     assert clip.cpu_ms == pytest.approx(5e5, rel=0.1)
+
+
+def test_processor_time_is_coding_and_the_frames_share_of_rendering(monkeypatch):
+    """7 ms of coding by a stopped clock, and 2 of 4 frames that took 40 ms to render."""
+    clock = iter((1_000_000, 8_000_000))
+    seen = replace(see_clip(street(2), CAMERAS), render_cpu_ms=40.0)
+    monkeypatch.setattr(field_coder, "process_time_ns", lambda: next(clock))
+    clip = FieldCoder(seen, "ours", "test", preset="veryfast").code(FRAMES[:2], 10, 30.0)
+    assert clip.cpu_ms == pytest.approx(7 + 20)
+
+
+def test_without_rendering_there_is_still_coding_to_be_timed():
+    seen = replace(see_clip(street(2), CAMERAS), render_cpu_ms=0.0)
+    assert FieldCoder(seen, "ours", "test", preset="veryfast").code(FRAMES, 10, 30.0).cpu_ms > 0
+
+
+def test_squared_errors_of_the_foreground_are_noted_frame_by_frame():
+    everything = [np.ones(frame.y.shape, bool) for frame in FRAMES]
+    clip = coded(street(2), foregrounds=everything)
+    np.testing.assert_allclose(
+        clip.notes["foreground_sse"], clip.luma_mse * FRAMES[0].y.size, rtol=1e-12
+    )
+
+
+def versions(**change):
+    given = {"field": street(2), "preset": "veryfast", "program": "a"} | change
+    field, program = given.pop("field"), given.pop("program")
+    return FieldCoder(see_clip(field, CAMERAS), "ours", program, **given).version
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"preset": "medium"},
+        {"program": "b"},
+        {"field": street(3)},
+        {"references": RENDER_ONLY},
+        {"photometric": ()},
+        {"foregrounds": [np.ones((48, 64), bool)] * 4},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_whatever_changes_the_result_is_another_version(change):
+    assert versions(**change) != versions()
+
+
+def test_the_same_codec_has_the_same_version_again():
+    assert versions() == versions()
+
+
+def test_other_poses_are_another_version():
+    near = FieldCoder(see_clip(street(2), CAMERAS), "ours", "a", preset="veryfast").version
+    far = FieldCoder(see_clip(street(2), CAMERAS[::-1]), "ours", "a", preset="veryfast").version
+    assert near != far
 
 
 def test_more_frames_than_were_seen_are_refused():
