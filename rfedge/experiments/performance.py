@@ -135,7 +135,7 @@ def spanning_points(
             "window",
             f"{low_db:g}..{high_db:g} dB is not within the {worst_db:.2f}..{best_db:.2f} dB that "
             f"{coder.name} reaches on {clip.scene} (points {points[0]:g} to {points[-1]:g}); "
-            "give --window LOW HIGH within them",
+            "choose one within them, as with `eval compare --window LOW HIGH`",
         )
     return tuple(points)
 

@@ -184,9 +184,7 @@ def test_a_finished_comparison_is_not_coded_again(compared):
 
 def test_a_window_nobody_reaches_ends_the_comparison_before_its_long_part(thumbnail, tmp_path):
     job = job_of(thumbnail, tmp_path, window_db=(15.0, 18.0))
-    with pytest.raises(
-        InvalidInput, match=r"15\.\.18 dB is not within .*rfedge-ultra.* reaches"
-    ):
+    with pytest.raises(InvalidInput, match=r"15\.\.18 dB is not within .*rfedge-ultra.* reaches"):
         run_compare(job, Console(quiet=True))
     assert len(list(job.cells.iterdir())) <= 8, "our own ends alone were coded"
     assert not job.out.exists()

@@ -77,7 +77,7 @@ def test_points_end_at_the_limits_of_the_codec(store):
 
 @pytest.mark.parametrize("window", [(60, 70), (-5, 30)])
 def test_a_window_beyond_the_limits_is_refused_with_what_is_reached(store, window):
-    with pytest.raises(InvalidInput, match=r"window.*ideal reaches on street .*--window LOW HIGH"):
+    with pytest.raises(InvalidInput, match=r"ideal reaches on street .*choose one within them"):
         spanning_points(CLIP, Bounded((20.0, 30.0)), store, window)
 
 

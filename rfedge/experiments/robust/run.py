@@ -236,7 +236,9 @@ class Bench:
         return self._kbit(drive.clip(""), coder)
 
     def _kbit(self, clip: Clip, coder: ClipCoder) -> float:
-        return kbit_at(perform(clip, coder, self.store).clips, self.job.quality_db)
+        at_db = self.job.quality_db
+        coded = perform(clip, coder, self.store, window_db=(at_db, at_db))
+        return kbit_at(coded.clips, at_db)
 
     def _row(
         self, condition: str, level: str, kbit: float, base: Row | None, rival_kbit: float
