@@ -163,8 +163,7 @@ class Drive:
     @property
     def cameras(self) -> list[Camera]:
         """Where the frames were taken, the poses rounded as a vehicle sends them."""
-        cameras = (picture.camera for picture in self.pictures)
-        return [Camera(c.intrinsics, c.world_from_cam.rounded()) for c in cameras]
+        return [picture.camera.rounded() for picture in self.pictures]
 
     @property
     def digest(self) -> str:

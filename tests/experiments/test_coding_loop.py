@@ -10,7 +10,7 @@ from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.errors import CodecError, PacketRejected
-from rfcore.field import load_field
+from rfcore.field import load_field, render_field_view
 from rfcore.image import I420
 from rfedge.experiments.clips import read_drive
 from rfedge.offline import (
@@ -18,7 +18,6 @@ from rfedge.offline import (
     decode_frames,
     decode_promised,
     encode_frames,
-    rendered,
 )
 
 CONFIG = CodecConfig(96, 64, preset="ultrafast", crf=28.0)
@@ -28,7 +27,7 @@ CONFIG = CodecConfig(96, 64, preset="ultrafast", crf=28.0)
 def inputs(thumbnail):
     drive, field = read_drive(thumbnail.drive), load_field(thumbnail.field)
     pairs = zip(drive.frames, drive.cameras, strict=True)
-    return [FrameInput(frame, *rendered(field, camera)) for frame, camera in pairs]
+    return [FrameInput(frame, render_field_view(field, camera)) for frame, camera in pairs]
 
 
 @pytest.fixture
