@@ -1,16 +1,15 @@
 """Where the bits of a drive go, by what each macroblock of a frame shows.
 
-The bits of a kind are those a frame is shorter by when its macroblocks of that kind show exactly
-what reference 0 shows there, so that nothing is left to send. That is a measurement by x264 itself,
-not an estimate; neighbours lean on each other, so the parts are scaled to the sum of the slice.
-
-What each macroblock of a frame shows, by what the sender and the receiver could know of it.
-
-Per pixel, in this order: *off-map*, where the field shows nothing; *moving*, where the camera
+A pixel shows, in this order: *off-map*, where the field has nothing; *moving*, where the camera
 differs from the same drive through the empty street (parked objects count too: what is not in the
 field); *entering*, where the field's surface was outside the previous view; *disoccluded*, where it
 was inside but behind another surface; and *static*, all else. A macroblock is of the first kind
 that covers a quarter of it.
+
+The bits of a kind are measured with x264: by how much the frame's slice becomes shorter when its
+macroblocks of that kind show exactly what reference 0 shows there, so that nothing is left to send.
+Neighbouring macroblocks predict each other, so these parts do not add up to the slice; they are
+scaled to its size.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Measure a ladder: fields and a drive in, ``ladder.json`` out, the cost said before it starts.
+"""Measure a ladder: fields and a drive in, ``ladder.json`` out.
 
-Which rungs are measured, and what a rung is worth against the first.
-
-For splats: every detail with three, one and no temporal references at three presets, and from the
-full rung one further knob at a time. For hash grids: samples along a ray, and the picture's scale.
+A rung is one setting of the sender. Measured are, for splats, every level of detail with three, one
+and no temporal references at three presets, and each other setting alone against the full rung; for
+hash grids, samples along a ray and the picture's scale. A rung is judged by its bits at equal
+quality against the first one, and by whether another beats it in both time and bits.
 """
 
 from __future__ import annotations

@@ -1,14 +1,12 @@
-"""Run the latency experiment: drives and a field in, ``latency.json`` out.
+"""How long frames take over links, on a virtual clock: drives and a field in, one result out.
 
 Ours and low-delay x264 of the same preset are coded to the same quality (the CRF is searched in
-steps of a half), then played over constant rates and over recorded links.
-
-How long a frame takes over a link, on a virtual clock: the paper's tau, and what users feel.
+steps of a half), then sent over constant rates and over recorded links.
 
 ``tau`` is a message's own transmission time. The network latency adds waiting behind earlier
-frames and the link's propagation; end to end adds what both ends compute. A clip is played again
-and again (its first frame once), captured at its rate. As the product does, at most ``WINDOW``
-frames are under way: a frame that finds more is dropped before it is coded, and counts as late.
+frames and the link's propagation; end to end adds what both ends compute. A clip is sent again and
+again without its first frame, captured at its rate. As the product does, at most ``WINDOW`` frames
+are under way: a frame that finds more is dropped before it is coded, and counts as late.
 """
 
 from __future__ import annotations

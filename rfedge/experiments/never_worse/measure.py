@@ -3,9 +3,7 @@
 At 31, 33 and 35 dB a frame may cost at most 2 % more than x264 with low delay at the same preset,
 its header apart. Two controls make the field useless: ``wrong-street`` is the field seen a quarter
 turn to the left, depth and picture alike, and ``black`` is a black picture at depth 0. Both ends
-believe them; what saves the sender is that it notices.
-
-Run the never-worse table over drives, with every fifth frame of some as a slow camera.
+predict from them; the sender must notice by itself that they are of no use.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What a wrong pose or another light costs: bits at equal quality, with and without it.
+"""Pose noise, its refinement, and bits at one quality, which say what a disturbance costs.
 
-Pose noise is independent from frame to frame, normal in each axis of translation and rotation, in
-the camera's own axes; both ends render at the noisy pose, for it is the one that is sent. Unless it
-is refined first, as a sender that may take its time would.
+Noise is independent from frame to frame, normal in each axis of translation and rotation, in the
+camera's own axes. Both ends render at the noisy pose, since it is the one that is sent; or the
+sender first refines it, with as much time as that takes.
 """
 
 from __future__ import annotations
