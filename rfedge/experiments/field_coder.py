@@ -34,7 +34,7 @@ from rfedge.experiments.clips import CodedClip, luma_mse, luma_sse
 from rfedge.experiments.picture_quality import luma_ssim
 from rfedge.offline import Arrival, FrameInput, decode_promised, encode_frames
 
-__all__ = ["FieldCoder", "SeenClip", "message_bytes", "see_clip"]
+__all__ = ["FieldCoder", "RenderedClip", "message_bytes", "render_clip"]
 
 LIMITS = (1.0, 51.0)
 CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0, 38.0)
@@ -44,8 +44,8 @@ MESSAGE_TIME_NS = 1_700_000_000_000_000_000
 
 
 @dataclass(frozen=True)
-class SeenClip:
-    """A field seen from every pose of a clip, as both ends hold it, and what rendering took.
+class RenderedClip:
+    """A field rendered at every pose of a clip, as both ends hold it, and what that took.
 
     ``covered``: bool [H, W] a frame, where the field shows anything (opacity above 1/2).
     """
@@ -73,7 +73,7 @@ class SeenClip:
         return f"{_digest(chain.from_iterable(arrays))}-{cameras[:8]}"
 
 
-def see_clip(field: RadianceField, cameras: Sequence[Camera]) -> SeenClip:
+def render_clip(field: RadianceField, cameras: Sequence[Camera]) -> RenderedClip:
     """Render ``field`` from every camera, its pose rounded as a vehicle does before it renders.
 
     Processor time is that of all threads over the clip, without what a first render makes once.
@@ -84,7 +84,7 @@ def see_clip(field: RadianceField, cameras: Sequence[Camera]) -> SeenClip:
     views = tuple(render_field_view(field, camera) for camera in cameras)
     cpu_ms = (process_time_ns() - began_ns) / 1e6
     covered = tuple(view.covers(COVERED) for view in views)
-    return SeenClip(views, covered, field.field_id, cpu_ms)
+    return RenderedClip(views, covered, field.field_id, cpu_ms)
 
 
 def _digest(arrays: Iterable[NDArray[Any]]) -> str:
@@ -95,7 +95,7 @@ def _digest(arrays: Iterable[NDArray[Any]]) -> str:
 
 
 class FieldCoder:
-    """Codes the clip a field was seen along; ``version`` names the program that does.
+    """Codes the clip that a field was rendered along; ``version`` names the program that does.
 
     ``references`` and ``photometric`` None leave them to the encoder.
 
@@ -104,7 +104,7 @@ class FieldCoder:
 
     def __init__(
         self,
-        seen: SeenClip,
+        rendered: RenderedClip,
         name: str,
         version: str,
         *,
@@ -118,7 +118,7 @@ class FieldCoder:
         self.points = tuple(points)
         self.limits = LIMITS
         self._program = version
-        self._seen = seen
+        self._rendered = rendered
         self._preset = preset
         self._foregrounds = foregrounds
         self._choice = FrameChoice(references=references, photometric=photometric)
@@ -136,7 +136,7 @@ class FieldCoder:
         light = "chosen" if choice.photometric is None else str(tuple(choice.photometric))
         return (
             f"{self._program}; preset {self._preset}, references {references}, light {light}, "
-            f"views {self._seen.digest}, foregrounds {self._foregrounds_digest()}"
+            f"views {self._rendered.digest}, foregrounds {self._foregrounds_digest()}"
         )
 
     def _foregrounds_digest(self) -> str:
@@ -145,19 +145,19 @@ class FieldCoder:
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` at CRF ``point``; ``rate_hz`` changes nothing here.
 
-        The clip may be the beginning of the one that was seen. Raises ``InvalidInput`` for a longer
-        one, ``CodecError`` if a receiver does not see what the sender promised.
+        The clip may be the beginning of the one that was rendered. Raises ``InvalidInput`` for a
+        longer one, ``CodecError`` if a receiver does not see what the sender promised.
         """
         del rate_hz
-        seen = len(self._seen.views)
-        if not 0 < len(frames) <= seen:
-            raise InvalidInput("frames", f"{len(frames)} are outside the 1..{seen} that were seen")
+        count = len(self._rendered.views)
+        if not 0 < len(frames) <= count:
+            raise InvalidInput("frames", f"{len(frames)} are outside the 1..{count} rendered")
         config = CodecConfig(*frames[0].size_px, preset=self._preset, crf=point)
         began_ns = process_time_ns()
         encoder = DeltaEncoder(config)
         coded = list(encode_frames(encoder, self._inputs(frames)))
         cpu_ms = (process_time_ns() - began_ns) / 1e6
-        cpu_ms += self._seen.render_cpu_ms * len(frames) / seen
+        cpu_ms += self._rendered.render_cpu_ms * len(frames) / count
         decoded = decode_promised(DeltaDecoder(encoder.header), coded)
         pairs = [(picture, coded_frame.given.frame) for coded_frame, picture in decoded]
         packets = [coded_frame.encoded.packet for coded_frame in coded]
@@ -180,7 +180,7 @@ class FieldCoder:
     def _inputs(self, frames: Sequence[I420]) -> Iterator[FrameInput]:
         for index, frame in enumerate(frames):
             choice = self._choice if index else self._first_choice
-            yield FrameInput(frame, self._seen.views[index], choice)
+            yield FrameInput(frame, self._rendered.views[index], choice)
 
 
 def message_bytes(arrival: Arrival, quality: Quality = FULL) -> int:

@@ -210,7 +210,7 @@ def test_a_decimated_drive_is_every_fifth_frame_at_a_fifth_of_the_rate(tmp_path)
     assert comparison.clip.rate_hz == 2.0
     whole = read_drive(job.decimated[0])
     assert [f.digest() for f in comparison.clip.frames] == [f.digest() for f in whole.frames[::5]]
-    assert [c.world_from_cam for c in comparison.seen.cameras] == [
+    assert [c.world_from_cam for c in comparison.rendered.cameras] == [
         c.world_from_cam.rounded() for c in whole.cameras[::5]
     ]
 

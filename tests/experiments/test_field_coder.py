@@ -12,7 +12,7 @@ from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_colour
 from rfcore.raster.gaussians import Gaussians
 from rfedge.experiments import field_coder
-from rfedge.experiments.field_coder import FieldCoder, see_clip
+from rfedge.experiments.field_coder import FieldCoder, render_clip
 
 INTRINSICS = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
 
@@ -37,7 +37,7 @@ FRAMES = [i420_from_colour(street(1).render_colour(camera)) for camera in CAMERA
 
 
 def coded(field, point=23.0, **how):
-    coder = FieldCoder(see_clip(field, CAMERAS), "ours", "test", preset="veryfast", **how)
+    coder = FieldCoder(render_clip(field, CAMERAS), "ours", "test", preset="veryfast", **how)
     return coder.code(FRAMES, 10, point)
 
 
@@ -59,7 +59,7 @@ def test_the_references_are_told_frame_by_frame():
 
 
 def test_processor_time_holds_the_render():
-    seen = see_clip(street(2), CAMERAS)
+    seen = render_clip(street(2), CAMERAS)
     slow = replace(seen, render_cpu_ms=1e6)
     clip = FieldCoder(slow, "ours", "test", preset="veryfast").code(FRAMES[:2], 10, 30.0)
     assert clip.cpu_ms == pytest.approx(5e5, rel=0.1)
@@ -68,14 +68,14 @@ def test_processor_time_holds_the_render():
 def test_processor_time_is_coding_and_the_frames_share_of_rendering(monkeypatch):
     """7 ms of coding by a stopped clock, and 2 of 4 frames that took 40 ms to render."""
     clock = iter((1_000_000, 8_000_000))
-    seen = replace(see_clip(street(2), CAMERAS), render_cpu_ms=40.0)
+    seen = replace(render_clip(street(2), CAMERAS), render_cpu_ms=40.0)
     monkeypatch.setattr(field_coder, "process_time_ns", lambda: next(clock))
     clip = FieldCoder(seen, "ours", "test", preset="veryfast").code(FRAMES[:2], 10, 30.0)
     assert clip.cpu_ms == pytest.approx(7 + 20)
 
 
 def test_without_rendering_there_is_still_coding_to_be_timed():
-    seen = replace(see_clip(street(2), CAMERAS), render_cpu_ms=0.0)
+    seen = replace(render_clip(street(2), CAMERAS), render_cpu_ms=0.0)
     assert FieldCoder(seen, "ours", "test", preset="veryfast").code(FRAMES, 10, 30.0).cpu_ms > 0
 
 
@@ -90,7 +90,7 @@ def test_squared_errors_of_the_foreground_are_noted_frame_by_frame():
 def versions(**change):
     given = {"field": street(2), "preset": "veryfast", "program": "a"} | change
     field, program = given.pop("field"), given.pop("program")
-    return FieldCoder(see_clip(field, CAMERAS), "ours", program, **given).version
+    return FieldCoder(render_clip(field, CAMERAS), "ours", program, **given).version
 
 
 @pytest.mark.parametrize(
@@ -114,12 +114,12 @@ def test_the_same_codec_has_the_same_version_again():
 
 
 def test_other_poses_are_another_version():
-    near = FieldCoder(see_clip(street(2), CAMERAS), "ours", "a", preset="veryfast").version
-    far = FieldCoder(see_clip(street(2), CAMERAS[::-1]), "ours", "a", preset="veryfast").version
+    near = FieldCoder(render_clip(street(2), CAMERAS), "ours", "a", preset="veryfast").version
+    far = FieldCoder(render_clip(street(2), CAMERAS[::-1]), "ours", "a", preset="veryfast").version
     assert near != far
 
 
-def test_more_frames_than_were_seen_are_refused():
-    coder = FieldCoder(see_clip(street(1), CAMERAS[:2]), "ours", "test", preset="veryfast")
+def test_more_frames_than_were_rendered_are_refused():
+    coder = FieldCoder(render_clip(street(1), CAMERAS[:2]), "ours", "test", preset="veryfast")
     with pytest.raises(InvalidInput, match=r"1\.\.2"):
         coder.code(FRAMES, 10, 23.0)

@@ -11,9 +11,9 @@ from rfcore.codec.sender.ladder import Rung, read_ladder
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, load_field
 from rfedge.experiments.clips import read_drive
-from rfedge.experiments.field_coder import FieldCoder, see_clip
+from rfedge.experiments.field_coder import FieldCoder, render_clip
 from rfedge.experiments.ladder import run
-from rfedge.experiments.ladder.measure import measure_rung, render_clip
+from rfedge.experiments.ladder.measure import measure_rung, time_renders
 from rfedge.experiments.ladder.page import ladder_page, write_ladder_figure
 from rfedge.experiments.ladder.run import LadderJob, fronts, rate_percents, run_ladder, rungs_for
 
@@ -106,7 +106,7 @@ def test_a_ladder_is_measured_written_drawn_and_read_by_an_agent(tmp_path, monke
 def measured(thumbnail):
     """Two rungs on the thumbnail at CRF 28: all there is, and the render alone."""
     drive, field = read_drive(thumbnail.drive), load_field(thumbnail.field)
-    seen = render_clip(field, drive, Quality())
+    seen = time_renders(field, drive, Quality())
     return {
         references: measure_rung(drive, seen, Rung(references=references, preset="ultrafast"), 28.0)
         for references in (3, 0)
@@ -138,7 +138,11 @@ def test_bits_of_a_rung_are_those_of_whole_messages_in_the_steady_state(measured
     """The same as the coder of clips says, which codes in another order."""
     drive, field = read_drive(thumbnail.drive), load_field(thumbnail.field)
     coder = FieldCoder(
-        see_clip(field, drive.cameras), "ours", "test", preset="ultrafast", references=RENDER_ONLY
+        render_clip(field, drive.cameras),
+        "ours",
+        "test",
+        preset="ultrafast",
+        references=RENDER_ONLY,
     )
     clip = coder.code(drive.frames, 10, 28.0)
     alone = measured[0]

@@ -10,7 +10,7 @@ import pytest
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field
 from rfedge.experiments.clips import read_drive
-from rfedge.experiments.field_coder import see_clip
+from rfedge.experiments.field_coder import render_clip
 from rfedge.experiments.robust.lossy_link import (
     DATAGRAM_BYTES,
     Bursts,
@@ -20,7 +20,7 @@ from rfedge.experiments.robust.lossy_link import (
     Lossy,
     Outcome,
     Policy,
-    own_crossing,
+    delta_crossing,
     x264_crossing,
 )
 
@@ -102,7 +102,7 @@ def drive(thumbnail):
 
 @pytest.fixture(scope="module")
 def coder(drive, thumbnail):
-    seen = see_clip(load_field(thumbnail.field), drive.cameras)
+    seen = render_clip(load_field(thumbnail.field), drive.cameras)
     return FrameCoder(drive.frames, seen, "ultrafast", 30.0)
 
 
@@ -118,7 +118,7 @@ def fates(crossing, sizes):
 
 @pytest.mark.parametrize("policy", Policy)
 def test_over_a_link_that_loses_nothing_every_frame_is_new(drive, coder, policy):
-    outcome = own_crossing(crossing_of(drive, 0.0), coder, policy)
+    outcome = delta_crossing(crossing_of(drive, 0.0), coder, policy)
     assert all(outcome.new)
     assert len(outcome.frame_bytes) == len(outcome.ssim) == len(drive.frames)
     assert min(outcome.ssim) > 0.8
@@ -127,7 +127,7 @@ def test_over_a_link_that_loses_nothing_every_frame_is_new(drive, coder, policy)
 @pytest.mark.parametrize("seed", range(3))
 def test_frames_that_need_the_field_alone_are_new_exactly_when_they_arrive(drive, coder, seed):
     crossing = crossing_of(drive, 0.3, seed=seed)
-    outcome = own_crossing(crossing, coder, Policy.RENDER_ONLY)
+    outcome = delta_crossing(crossing, coder, Policy.RENDER_ONLY)
     arrived = fates(crossing, outcome.frame_bytes)
     assert not all(arrived)
     assert list(outcome.new) == arrived
@@ -136,7 +136,7 @@ def test_frames_that_need_the_field_alone_are_new_exactly_when_they_arrive(drive
 @pytest.mark.parametrize("policy", Policy)
 def test_no_frame_is_new_that_did_not_arrive(drive, coder, policy):
     crossing = crossing_of(drive, 0.3)
-    outcome = own_crossing(crossing, coder, policy)
+    outcome = delta_crossing(crossing, coder, policy)
     arrived = fates(crossing, outcome.frame_bytes)
     assert all(there for new, there in zip(outcome.new, arrived, strict=True) if new)
 
@@ -144,7 +144,7 @@ def test_no_frame_is_new_that_did_not_arrive(drive, coder, policy):
 def test_what_is_predicted_from_a_lost_frame_is_not_shown(drive, coder):
     """Sent on without an answer for 20 frames: all after the first loss are useless."""
     crossing = crossing_of(drive, 0.3, rtt_s=2.0)
-    outcome = own_crossing(crossing, coder, Policy.LAST_SENT)
+    outcome = delta_crossing(crossing, coder, Policy.LAST_SENT)
     arrived = fates(crossing, outcome.frame_bytes)
     lost = arrived.index(False)
     assert outcome.new[:lost] == (True,) * lost
@@ -153,8 +153,8 @@ def test_what_is_predicted_from_a_lost_frame_is_not_shown(drive, coder):
 
 
 def test_a_frame_that_is_not_new_shows_the_one_before(drive, coder):
-    outcome = own_crossing(crossing_of(drive, 0.3), coder, Policy.RENDER_ONLY)
-    perfect = own_crossing(crossing_of(drive, 0.0), coder, Policy.RENDER_ONLY)
+    outcome = delta_crossing(crossing_of(drive, 0.3), coder, Policy.RENDER_ONLY)
+    perfect = delta_crossing(crossing_of(drive, 0.0), coder, Policy.RENDER_ONLY)
     stale = [k for k, new in enumerate(outcome.new) if not new]
     assert all(outcome.ssim[k] < perfect.ssim[k] for k in stale)
     fresh = [k for k, new in enumerate(outcome.new) if new]
@@ -163,13 +163,13 @@ def test_a_frame_that_is_not_new_shows_the_one_before(drive, coder):
 
 def test_the_last_acked_frame_is_always_there_to_predict_from(drive, coder):
     crossing = crossing_of(drive, 0.3, rtt_s=0.25)
-    outcome = own_crossing(crossing, coder, Policy.LAST_ACKED)
+    outcome = delta_crossing(crossing, coder, Policy.LAST_ACKED)
     assert list(outcome.new) == fates(crossing, outcome.frame_bytes)
 
 
 def test_the_same_seed_gives_the_same_outcome_and_another_one_another(drive, coder):
     first, again, other = (
-        own_crossing(crossing_of(drive, 0.3, seed=seed), coder, Policy.RENDER_ONLY)
+        delta_crossing(crossing_of(drive, 0.3, seed=seed), coder, Policy.RENDER_ONLY)
         for seed in (1, 1, 2)
     )
     assert first == again

@@ -29,7 +29,7 @@ from rfcore.codec.state import EncoderState
 from rfcore.image import I420
 from rfcore.views import FieldView
 from rfedge.experiments.compare.foreground import by_macroblock, composed
-from rfedge.experiments.field_coder import SeenClip
+from rfedge.experiments.field_coder import RenderedClip
 
 __all__ = ["KINDS", "SplitClip", "macroblock_kinds", "split_rows"]
 
@@ -96,7 +96,7 @@ class SplitClip:
     """A clip to look into; ``foregrounds`` bool [H, W] a frame, what is not in the field."""
 
     frames: Sequence[I420]
-    seen: SeenClip
+    rendered: RenderedClip
     foregrounds: Sequence[NDArray[np.bool_]]
     preset: str
     crf: float
@@ -124,15 +124,15 @@ def split_rows(clip: SplitClip) -> list[dict[str, Any]]:
 def _frames(clip: SplitClip) -> Iterator[tuple[F64, F64]]:
     """Yield macroblocks and slice bytes by kind for every frame but the first."""
     encoder = DeltaEncoder(CodecConfig(*clip.frames[0].size_px, preset=clip.preset, crf=clip.crf))
-    state, seen = encoder.start(1), clip.seen
+    state, rendered = encoder.start(1), clip.rendered
     for index, frame in enumerate(clip.frames):
-        coding = _Coding(encoder, state, seen.views[index])
+        coding = _Coding(encoder, state, rendered.views[index])
         made = coding.of(frame)
         if index:
             kinds = macroblock_kinds(
-                seen.views[index - 1],
-                seen.views[index],
-                seen.covered[index],
+                rendered.views[index - 1],
+                rendered.views[index],
+                rendered.covered[index],
                 clip.foregrounds[index],
             )
             yield (

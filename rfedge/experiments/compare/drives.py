@@ -25,7 +25,7 @@ from rfedge.experiments.cells import program_version
 from rfedge.experiments.clips import DECIMATION, Clip, ClipCoder, Drive, DriveName, read_drive
 from rfedge.experiments.compare.foreground import ForegroundCoder, foreground_mask
 from rfedge.experiments.compare.measure import WINDOWS_DB
-from rfedge.experiments.field_coder import FieldCoder, SeenClip, see_clip
+from rfedge.experiments.field_coder import FieldCoder, RenderedClip, render_clip
 from rfedge.experiments.rate_curve import Window
 from rfedge.experiments.rivals import (
     Rival,
@@ -176,7 +176,7 @@ class DriveComparison:
     """
 
     clip: Clip
-    seen: SeenClip
+    rendered: RenderedClip
     foregrounds: Sequence[NDArray[np.bool_]]
     background: str | None
     methods: Sequence[FieldCoder]
@@ -226,7 +226,7 @@ def _drive_comparison(
     clip = drive.clip(field_psnr_db=mean_psnr_db(field, drive.pictures))
     families = rival_families(job.preset, quick=job.quick)
     families |= {coder.name: [coder] for coder in map(foreign_coder, job.methods)}
-    seen = see_clip(field, drive.cameras)
+    rendered = render_clip(field, drive.cameras)
     foregrounds = _foregrounds(drive, background)
     behind = None if background is None else background.digest
     stamp = program_version()
@@ -234,8 +234,8 @@ def _drive_comparison(
         stamp += f", before {behind[:16]}"
     coders = [
         FieldCoder(
-            seen,
-            f"{name}-{job.preset}-{seen.field_id[:12]}",
+            rendered,
+            f"{name}-{job.preset}-{rendered.field_id[:12]}",
             stamp,
             preset=job.preset,
             references=references,
@@ -245,9 +245,9 @@ def _drive_comparison(
     ]
     rival = None
     if behind is not None:
-        rival_stamp = f"{stamp}, field {seen.field_id}"
-        rival = ForegroundCoder.of(job.preset, foregrounds, seen.renders, rival_stamp)
-    return DriveComparison(clip, seen, foregrounds, behind, coders, families, rival)
+        rival_stamp = f"{stamp}, field {rendered.field_id}"
+        rival = ForegroundCoder.of(job.preset, foregrounds, rendered.renders, rival_stamp)
+    return DriveComparison(clip, rendered, foregrounds, behind, coders, families, rival)
 
 
 def _foregrounds(drive: Drive, background: Drive | None) -> list[NDArray[np.bool_]]:

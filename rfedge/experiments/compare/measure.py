@@ -58,14 +58,16 @@ def compare_rows(
 def _window_rows(
     clip: Clip, method: Performance, families: Mapping[str, Sequence[Performance]], window: Window
 ) -> list[Row]:
-    chosen = {name: _champion(method, rivals, window) for name, rivals in families.items()}
+    chosen = {name: _representative(method, rivals, window) for name, rivals in families.items()}
     able = [rival for rival in chosen.values() if _comparable(method, rival)]
     if able:
         chosen[BEST] = min(able, key=lambda rival: rival.steady.mean_log_bytes(window))
     return [_row(clip, method, name, rival, window) for name, rival in chosen.items()]
 
 
-def _champion(method: Performance, rivals: Sequence[Performance], window: Window) -> Performance:
+def _representative(
+    method: Performance, rivals: Sequence[Performance], window: Window
+) -> Performance:
     if not rivals:
         raise InvalidInput("rivals", "a family needs at least one setting")
     able = [rival for rival in rivals if _comparable(method, rival)]

@@ -33,31 +33,31 @@ from rfedge.experiments.clips import Drive, luma_mse, psnr_of_mse
 from rfedge.experiments.field_coder import message_bytes
 from rfedge.offline import CodedFrame, FrameInput, decode_promised, encode_frames
 
-__all__ = ["Rendered", "measure_rung", "render_clip"]
+__all__ = ["TimedRenders", "measure_rung", "time_renders"]
 
 SENDER_STAGES = ("references", "encode", "closed_loop")
 RECEIVER_STAGES = ("references", "splice", "decode")
 Row = dict[str, Any]
 
 
-class Marks:
-    """A clock for codec objects that notes both times whenever it is looked at."""
+class StageClock:
+    """A clock for codec objects that keeps processor and wall time of every reading."""
 
     def __init__(self) -> None:
-        self._seen: list[tuple[int, int]] = []
+        self._readings: list[tuple[int, int]] = []
 
     def __call__(self) -> int:
-        self._seen.append((process_time_ns(), perf_counter_ns()))
-        return self._seen[-1][0]
+        self._readings.append((process_time_ns(), perf_counter_ns()))
+        return self._readings[-1][0]
 
     def spent_ms(self) -> list[tuple[float, float]]:
-        """Return (cpu, wall) between the looks since last asked, and forget them."""
-        seen, self._seen = self._seen, []
-        return [((b[0] - a[0]) / 1e6, (b[1] - a[1]) / 1e6) for a, b in pairwise(seen)]
+        """Return (cpu, wall) between the readings since the last call, and forget them."""
+        readings, self._readings = self._readings, []
+        return [((b[0] - a[0]) / 1e6, (b[1] - a[1]) / 1e6) for a, b in pairwise(readings)]
 
 
 @dataclass(frozen=True)
-class Rendered:
+class TimedRenders:
     """A clip's views at one quality, with what a frame took to render and to convert: (cpu, wall)
     in milliseconds, lower quartiles."""
 
@@ -66,37 +66,39 @@ class Rendered:
     convert_ms: tuple[float, float]
 
 
-def render_clip(field: RadianceField, drive: Drive, quality: Quality) -> Rendered:
+def time_renders(field: RadianceField, drive: Drive, quality: Quality) -> TimedRenders:
     """Render every pose of ``drive``, after one that makes what is made lazily."""
     pictures = [picture.read() for picture in drive.pictures]
     cameras = drive.cameras
     field.prepare(quality)
     render_field_view(field, cameras[0], quality)
-    marks = Marks()
+    clock = StageClock()
     views, render_ms, convert_ms = [], [], []
     for camera, picture in zip(cameras, pictures, strict=True):
-        marks()
+        clock()
         views.append(render_field_view(field, camera, quality))
-        marks()
+        clock()
         i420_from_rgb(picture)
-        marks()
-        rendering, converting = marks.spent_ms()
+        clock()
+        rendering, converting = clock.spent_ms()
         render_ms.append(rendering)
         convert_ms.append(converting)
-    return Rendered(tuple(views), _quartile(render_ms), _quartile(convert_ms))
+    return TimedRenders(tuple(views), _quartile(render_ms), _quartile(convert_ms))
 
 
-def measure_rung(drive: Drive, seen: Rendered, rung: Rung, crf: float) -> Row:
+def measure_rung(drive: Drive, rendered: TimedRenders, rung: Rung, crf: float) -> Row:
     """Code and decode ``drive`` on ``rung``; return times, bits of whole messages, and quality.
 
     Raises ``CodecError`` if the receiver does not see what the sender promised.
     """
     sender, receiver = _Stages(SENDER_STAGES), _Stages(RECEIVER_STAGES)
     config = CodecConfig(*drive.frames[0].size_px, rung.preset, crf)
-    encoder = DeltaEncoder(config, sender.marks)
-    decoder = DeltaDecoder(encoder.header, clock_ns=receiver.marks)
+    encoder = DeltaEncoder(config, sender.clock)
+    decoder = DeltaDecoder(encoder.header, clock_ns=receiver.clock)
     choice = _choice(rung)
-    inputs = (FrameInput(*given, choice) for given in zip(drive.frames, seen.views, strict=True))
+    inputs = (
+        FrameInput(*given, choice) for given in zip(drive.frames, rendered.views, strict=True)
+    )
     coded: list[CodedFrame] = []
     shown: list[I420] = []
     # Nothing is collected in between, so that a frame is decoded before the next one is coded.
@@ -108,8 +110,8 @@ def measure_rung(drive: Drive, seen: Rendered, rung: Rung, crf: float) -> Row:
     sizes = [message_bytes(frame.arrival, rung.quality) for frame in coded]
     pairs = list(zip(shown, drive.frames, strict=True))[1:]
     mse = float(np.mean([luma_mse(*pair) for pair in pairs]))
-    sender_ms = {"convert": seen.convert_ms, "render": seen.render_ms, **sender.quartiles()}
-    receiver_ms = {"render": seen.render_ms, **receiver.quartiles()}
+    sender_ms = {"convert": rendered.convert_ms, "render": rendered.render_ms, **sender.quartiles()}
+    receiver_ms = {"render": rendered.render_ms, **receiver.quartiles()}
     return {
         "sender_ms": sum(cpu for cpu, _ in sender_ms.values()),
         "receiver_ms": sum(cpu for cpu, _ in receiver_ms.values()),
@@ -125,15 +127,15 @@ def measure_rung(drive: Drive, seen: Rendered, rung: Rung, crf: float) -> Row:
 
 
 class _Stages:
-    """(cpu, wall) of each stage of each frame; the codec looks at the clock between them."""
+    """(cpu, wall) of each stage of each frame; the codec reads the clock between them."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        self.marks = Marks()
+        self.clock = StageClock()
         self._names = names
         self._frames: list[list[tuple[float, float]]] = []
 
     def frame_ended(self) -> None:
-        spent = self.marks.spent_ms()
+        spent = self.clock.spent_ms()
         if len(spent) != len(self._names):
             raise CodecError(f"{len(spent)} stages where {', '.join(self._names)} are expected")
         self._frames.append(spent)

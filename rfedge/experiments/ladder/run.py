@@ -25,7 +25,7 @@ from rfcore.field.interface import NGP, SPLATS
 from rfcore.field.quality import DETAILS, Quality
 from rfedge.experiments.cells import CellKey, CellStore, program_version
 from rfedge.experiments.clips import Drive, DriveName, read_drive
-from rfedge.experiments.ladder.measure import Rendered, measure_rung, render_clip
+from rfedge.experiments.ladder.measure import TimedRenders, measure_rung, time_renders
 from rfedge.results import check_result_path, provenance, revision, write_result
 
 __all__ = ["CRFS", "LadderJob", "fronts", "rate_percents", "run_ladder", "rungs_for"]
@@ -167,15 +167,15 @@ class Contender:
         return rungs_for(self.field.metadata.kind, quick=self.quick)
 
     @cached_property
-    def _seen(self) -> dict[Quality, Rendered]:
+    def _kept(self) -> dict[Quality, TimedRenders]:
         return {}
 
-    def seen(self, quality: Quality) -> Rendered:
+    def rendered(self, quality: Quality) -> TimedRenders:
         """Return the drive rendered at ``quality``; the last one asked for is kept."""
-        if quality not in self._seen:
-            self._seen.clear()
-            self._seen[quality] = render_clip(self.field, self.drive, quality)
-        return self._seen[quality]
+        if quality not in self._kept:
+            self._kept.clear()
+            self._kept[quality] = time_renders(self.field, self.drive, quality)
+        return self._kept[quality]
 
     def key(self, rung: Rung, crf: float) -> CellKey:
         """Name the cell of a rung at a CRF."""
@@ -205,7 +205,7 @@ class Contender:
                 "rough": rung.fast_unsent,
                 "crf": crf,
             },
-            **measure_rung(self.drive, self.seen(quality), rung, crf),
+            **measure_rung(self.drive, self.rendered(quality), rung, crf),
         }
 
 
@@ -285,9 +285,9 @@ def _say_cost(contenders: Sequence[Contender], store: CellStore, console: Consol
             probe = contender.drive.first(PROBE_FRAMES)
             began_s = monotonic()
             first = contender.rungs[0]
-            seen = render_clip(contender.field, probe, first.quality)
+            rendered = time_renders(contender.field, probe, first.quality)
             rendered_s = monotonic()
-            measure_rung(probe, seen, first, CRFS[1])
+            measure_rung(probe, rendered, first, CRFS[1])
             per_frame = len(contender.drive.frames) / PROBE_FRAMES
             qualities = len({rung.quality for rung in contender.rungs})
             seconds += per_frame * qualities * (rendered_s - began_s)

@@ -30,8 +30,8 @@ from rfcore.link import DirectionPlan, LinkProfile
 from rfcore.link.trace import read_mahimahi
 from rfedge.experiments.cells import CellStore, clip_key, program_version
 from rfedge.experiments.clips import Clip, ClipCoder, CodedClip, Drive, DriveName, read_drive
-from rfedge.experiments.field_coder import FieldCoder, see_clip
-from rfedge.experiments.ladder.measure import measure_rung, render_clip
+from rfedge.experiments.field_coder import FieldCoder, render_clip
+from rfedge.experiments.ladder.measure import measure_rung, time_renders
 from rfedge.experiments.rivals import x264_lowdelay
 from rfedge.results import check_result_path, provenance, revision, write_result
 
@@ -223,9 +223,9 @@ def _senders(
     job: LatencyJob, name: DriveName, field: RadianceField, console: Console
 ) -> Iterator[Sender]:
     drive = read_drive(name, QUICK_FRAMES if job.quick else None)
-    seen, clip = see_clip(field, drive.cameras), drive.clip()
+    rendered, clip = render_clip(field, drive.cameras), drive.clip()
     store = CellStore(job.cells)
-    ours = FieldCoder(seen, f"rfedge-{job.preset}", program_version(), preset=job.preset)
+    ours = FieldCoder(rendered, f"rfedge-{job.preset}", program_version(), preset=job.preset)
     coded = _at_quality(clip, ours, job.quality_db, store)
     yield Sender(clip, ours.name, coded, _own_stages(job, drive, field, coded.point))
     rival = x264_lowdelay(job.preset)
@@ -240,7 +240,7 @@ def _own_stages(
 ) -> dict[str, float]:
     """Return the milliseconds of both ends, from the ladder's measurement of the full rung."""
     rung = Rung(preset=job.preset)
-    row = measure_rung(drive, render_clip(field, drive, rung.quality), rung, crf)
+    row = measure_rung(drive, time_renders(field, drive, rung.quality), rung, crf)
     ours = {f"sender {name}": ms for name, ms in row["sender_stage_ms"].items()}
     return ours | {f"receiver {name}": ms for name, ms in row["receiver_stage_ms"].items()}
 

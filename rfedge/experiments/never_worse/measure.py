@@ -24,7 +24,7 @@ from rfcore.image import I420
 from rfcore.views import FieldView
 from rfedge.experiments.cells import CellStore, program_version
 from rfedge.experiments.clips import DECIMATION, Clip, ClipCoder, Drive, DriveName, read_drive
-from rfedge.experiments.field_coder import FieldCoder, SeenClip, see_clip
+from rfedge.experiments.field_coder import FieldCoder, RenderedClip, render_clip
 from rfedge.experiments.performance import Performance, perform, seconds_left
 from rfedge.experiments.rivals import x264_for_psnr, x264_lowdelay
 from rfedge.results import check_result_path, provenance, revision, write_result
@@ -51,14 +51,14 @@ BLACK_YUV = (16, 128, 128)
 Row = dict[str, Any]
 
 
-def controls_of(field: RadianceField, drive: Drive) -> Mapping[str, SeenClip]:
+def controls_of(field: RadianceField, drive: Drive) -> Mapping[str, RenderedClip]:
     """Return what both ends believe to see along ``drive``, by the names in ``CONTROLS``."""
-    right = see_clip(field, drive.cameras)
+    right = render_clip(field, drive.cameras)
     turned = [
         Camera(camera.intrinsics, camera.world_from_cam.compose(QUARTER_TURN))
         for camera in right.cameras
     ]
-    elsewhere = see_clip(field, turned)
+    elsewhere = render_clip(field, turned)
     moved = (
         replace(view, camera=camera)
         for camera, view in zip(right.cameras, elsewhere.views, strict=True)
@@ -67,7 +67,7 @@ def controls_of(field: RadianceField, drive: Drive) -> Mapping[str, SeenClip]:
     return dict(zip(CONTROLS, (right, wrong, _black(right)), strict=True))
 
 
-def _black(right: SeenClip) -> SeenClip:
+def _black(right: RenderedClip) -> RenderedClip:
     covered = tuple(np.zeros_like(mask) for mask in right.covered)
     return replace(right, views=tuple(map(_black_view, right.views)), covered=covered)
 
@@ -83,7 +83,7 @@ class NeverWorse:
     """One drive under all controls, at one preset; ``program`` names what codes."""
 
     drive: Drive
-    seen: Mapping[str, SeenClip]
+    rendered: Mapping[str, RenderedClip]
     preset: str
     program: str
 
@@ -97,13 +97,13 @@ class NeverWorse:
         """Ours by control, then the anchors."""
         ours: dict[str, ClipCoder] = {
             control: FieldCoder(
-                seen,
-                f"rfedge-{control}-{self.preset}-{seen.field_id[:12]}",
+                rendered,
+                f"rfedge-{control}-{self.preset}-{rendered.field_id[:12]}",
                 self.program,
                 preset=self.preset,
                 points=POINTS,
             )
-            for control, seen in self.seen.items()
+            for control, rendered in self.rendered.items()
         }
         return ours | {
             "plain": replace(x264_lowdelay(self.preset), points=POINTS),
@@ -120,7 +120,7 @@ class NeverWorse:
             name: perform(self.clip, coder, store, retime=retime)
             for name, coder in self.coders.items()
         }
-        for control in self.seen:
+        for control in self.rendered:
             for db in AT_DB:
                 yield self._row(control, done[control], done["plain"], done["psnr"], db)
 

@@ -156,13 +156,13 @@ class Setting:
 
 def published_rows(frame: PublishedFrame, settings: Sequence[Setting]) -> Iterator[dict[str, Any]]:
     """Yield a row per setting. Raises ``InvalidInput`` for a size larger than the frame."""
-    seen: dict[tuple[Size, Making], _Seen] = {}
+    pairs: dict[tuple[Size, Making], _Pair] = {}
     alone: dict[tuple[Size, str, float], tuple[int, float]] = {}
     for setting in settings:
-        look = (setting.size_px, setting.making)
-        if look not in seen:
-            seen[look] = _seen(frame, *look)
-        camera, render, quality = seen[look]
+        made = (setting.size_px, setting.making)
+        if made not in pairs:
+            pairs[made] = _pair(frame, *made)
+        camera, render, quality = pairs[made]
         coding = (setting.size_px, setting.preset, setting.crf)
         if coding not in alone:
             alone[coding] = _alone(camera, setting)
@@ -182,10 +182,10 @@ def published_rows(frame: PublishedFrame, settings: Sequence[Setting]) -> Iterat
         }
 
 
-_Seen = tuple[Rgb, Rgb, RenderQuality]
+_Pair = tuple[Rgb, Rgb, RenderQuality]
 
 
-def _seen(frame: PublishedFrame, size_px: Size, making: Making) -> _Seen:
+def _pair(frame: PublishedFrame, size_px: Size, making: Making) -> _Pair:
     camera, render = reduced(frame.camera, size_px), frame.render(size_px, making)
     return camera, render, render_quality(render, camera)
 

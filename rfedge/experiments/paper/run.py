@@ -156,20 +156,22 @@ def _rows(piece: Piece) -> Iterator[dict[str, Any]]:
         for preset in PUBLISHED_PRESETS
         for crf in PUBLISHED_CRFS
     ]
-    seen = _seen(piece, piece.picture.camera)
+    frame = _published_frame(piece, piece.picture.camera)
     size_px = piece.size_px
-    difference = flip(seen.render(size_px, "downscaled"), reduced(seen.camera, size_px))
-    for row in _labelled(piece, piece.field_name, seen, settings):
+    difference = flip(frame.render(size_px, "downscaled"), reduced(frame.camera, size_px))
+    for row in _labelled(piece, piece.field_name, frame, settings):
         yield row if row["render"] == "native" else {**row, "rf_flip": difference}
     control = [Setting(piece.size_px, "downscaled", CONTROL_PRESET, CONTROL_CRF)]
     camera = piece.picture.camera
     behind = Camera(camera.intrinsics, camera.world_from_cam.compose(TURNED_ROUND))
-    yield from _labelled(piece, f"{piece.field_name}:behind", _seen(piece, behind), control)
+    yield from _labelled(
+        piece, f"{piece.field_name}:behind", _published_frame(piece, behind), control
+    )
     grey = np.full((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), 128, np.uint8)
-    blind = PublishedFrame(
+    without_field = PublishedFrame(
         piece.picture.name, piece.picture.read(), lambda size_px, _making: reduced(grey, size_px)
     )
-    yield from _labelled(piece, f"{piece.field_name}:grey", blind, control)
+    yield from _labelled(piece, f"{piece.field_name}:grey", without_field, control)
 
 
 def _makings(piece: Piece) -> Sequence[Making]:
@@ -184,7 +186,7 @@ def _labelled(piece: Piece, label: str, frame: PublishedFrame, settings: Sequenc
     ]
 
 
-def _seen(piece: Piece, camera: Camera) -> PublishedFrame:
+def _published_frame(piece: Piece, camera: Camera) -> PublishedFrame:
     full = _render(piece.field, camera)
 
     def render(size_px: Size, making: Making) -> Rgb:

@@ -33,7 +33,7 @@ from rfcore.codec.state import EncoderState, Past
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfcore.metrics import ssim
-from rfedge.experiments.field_coder import SeenClip, message_bytes
+from rfedge.experiments.field_coder import RenderedClip, message_bytes
 from rfedge.experiments.rivals import picture, video_frame
 from rfedge.offline import Arrival, decode_frames
 
@@ -46,7 +46,7 @@ __all__ = [
     "Lossy",
     "Outcome",
     "Policy",
-    "own_crossing",
+    "delta_crossing",
     "x264_crossing",
 ]
 
@@ -192,8 +192,10 @@ class FrameCoder:
     Crossings share what they have in common: all that was sent before the first loss.
     """
 
-    def __init__(self, clip: Sequence[I420], seen: SeenClip, preset: str, crf: float) -> None:
-        self.seen = seen
+    def __init__(
+        self, clip: Sequence[I420], rendered: RenderedClip, preset: str, crf: float
+    ) -> None:
+        self.rendered = rendered
         self._clip = clip
         self._encoder = DeltaEncoder(CodecConfig(*clip[0].size_px, preset, crf))
         self._made: dict[tuple[int, bytes, bool], Encoded] = {}
@@ -209,13 +211,13 @@ class FrameCoder:
         if key not in self._made:
             choice = FrameChoice(references=RENDER_ONLY if render_only else None)
             state = EncoderState(1, index, past)
-            view = self.seen.views[index]
+            view = self.rendered.views[index]
             self._made[key] = self._encoder.encode(state, self._clip[index], view, choice)
         return self._made[key]
 
     def arrival(self, index: int, made: Encoded) -> Arrival:
         """Return the frame as a receiver gets it, if it gets it."""
-        return Arrival(made.packet, self.seen.views[index])
+        return Arrival(made.packet, self.rendered.views[index])
 
 
 class LossySender:
@@ -243,7 +245,7 @@ class LossySender:
             yield arrival if delivered or index == 0 else None
 
 
-def own_crossing(crossing: Crossing, coder: FrameCoder, policy: Policy) -> Outcome:
+def delta_crossing(crossing: Crossing, coder: FrameCoder, policy: Policy) -> Outcome:
     """Send the clip by our codec."""
     sender, decoder = LossySender(crossing, coder, policy), DeltaDecoder(coder.header)
     new, shown = [], list[I420]()

@@ -23,7 +23,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfedge.experiments.cells import CellStore, program_version
 from rfedge.experiments.clips import Clip, ClipCoder, Drive, read_drive
-from rfedge.experiments.field_coder import FieldCoder, see_clip
+from rfedge.experiments.field_coder import FieldCoder, render_clip
 from rfedge.experiments.performance import perform
 from rfedge.experiments.rivals import x264_lowdelay
 from rfedge.experiments.robust.disturbed import (
@@ -38,7 +38,7 @@ from rfedge.experiments.robust.lossy_link import (
     Crossing,
     FrameCoder,
     Policy,
-    own_crossing,
+    delta_crossing,
     x264_crossing,
 )
 from rfedge.results import check_result_path, provenance, revision, write_result
@@ -47,7 +47,7 @@ __all__ = ["RobustJob", "run_robust"]
 
 RTTS_S = (0.02, 0.05, 0.1)
 LOSSES = (0.0, 0.01, 0.05)
-OWN_CRFS, X264_CRFS = (20.0, 27.0), (22.0, 27.0, 33.0, 39.0, 45.0)
+DELTA_CRFS, X264_CRFS = (20.0, 27.0), (22.0, 27.0, 33.0, 39.0, 45.0)
 DISTURBED_CRFS, RIVAL_CRFS = (23.0, 28.0, 33.0), (20.0, 25.0, 30.0, 35.0)
 QUICK_FRAMES = 8
 SEED = 5
@@ -121,7 +121,7 @@ class Bench:
         losses = (LOSSES[0], LOSSES[-1]) if self.job.quick else LOSSES
         own = [str(policy) for policy in Policy]
         rivals = ["x264-intra-refresh", "x264-idr-on-nack"]
-        ours = product(OWN_CRFS, own, rtts, losses)
+        ours = product(DELTA_CRFS, own, rtts, losses)
         theirs = product(X264_CRFS, rivals, rtts, losses)
         return [(method, rtt_s, loss, crf) for crf, method, rtt_s, loss in (*ours, *theirs)]
 
@@ -152,7 +152,7 @@ class Bench:
         if method.startswith("x264"):
             made = x264_crossing(crossing, idr_on_nack=method.endswith("nack"))
         else:
-            made = own_crossing(crossing, self._coder(crossing.crf), Policy(method))
+            made = delta_crossing(crossing, self._coder(crossing.crf), Policy(method))
         row = made.row(crossing.rate_hz)
         self.console.print(
             f"  {method} {1e3 * crossing.rtt_s:.0f} ms {100 * crossing.bursts.share:g} %: "
@@ -168,8 +168,8 @@ class Bench:
         """Return the coder of all crossings at ``crf``; the last one asked for is kept."""
         if crf not in self._coders:
             self._coders.clear()
-            seen = see_clip(self.field, self.drive.cameras)
-            self._coders[crf] = FrameCoder(self.drive.frames, seen, self.job.preset, crf)
+            rendered = render_clip(self.field, self.drive.cameras)
+            self._coders[crf] = FrameCoder(self.drive.frames, rendered, self.job.preset, crf)
         return self._coders[crf]
 
     # --- pose and light
@@ -222,7 +222,7 @@ class Bench:
     ) -> float:
         """Return kilobits a frame at the quality asked for, rendered from ``cameras``."""
         coder = FieldCoder(
-            see_clip(self.field, cameras),
+            render_clip(self.field, cameras),
             f"rfedge-{self.job.preset}-{self.field.field_id}",
             program_version(),
             preset=self.job.preset,
