@@ -1,23 +1,28 @@
-"""The codec without a network: a drive into a ``.rfv`` file, and back into pictures.
+"""The codec without a network: frame by frame, and a drive into a ``.rfv`` file and back.
 
-The file holds the very messages a vehicle would send, so its size is the packets' size.
+``encode_frames`` and ``decode_frames`` are the loops of whoever codes a clip in one process. Both
+are generators: what is between them (a list, or nothing) decides whether a frame is decoded before
+the next one is coded. A ``.rfv`` file holds the very messages a vehicle would send, so its size is
+the packets' size.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import tee
 
 from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.sender.frame_costs import FrameCosts
 from rfcore.codec.sender.pose_search import PoseSearch, Refined
 from rfcore.codec.sender.steering import NO_STEERING, Steering
 from rfcore.dataset import Dataset
-from rfcore.errors import CodecError, DatasetError, InvalidData
+from rfcore.errors import CodecError, DatasetError, InvalidData, PacketRejected
 from rfcore.field import RadianceField, render_field_view
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
@@ -27,12 +32,110 @@ from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.drive_file import CodedDrive
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
 
-__all__ = ["CodingSettings", "DecodedFrame", "decode_drive", "encode_drive"]
+__all__ = [
+    "Arrival",
+    "CodedFrame",
+    "CodingSettings",
+    "DecodedFrame",
+    "FrameInput",
+    "decode_drive",
+    "decode_frames",
+    "decode_promised",
+    "encode_drive",
+    "encode_frames",
+]
 
 OFFLINE_VEHICLE = "offline"
 CAMERA_ID = "front"
 RENDERER = RendererContract(RENDERER_CONTRACT, exact=True)
 FITTING = FrameChoice(limit_bytes=MAX_PAYLOAD_BYTES)
+LEFT_TO_THE_ENCODER = FrameChoice()
+EPOCH = 1
+"""Of a stream that is coded and decoded in one go."""
+
+
+@dataclass(frozen=True)
+class FrameInput:
+    """A frame to code, with what the field shows at its pose, and how it is to be coded.
+
+    ``costs`` are those of the frame's blocks, as far as they are known already.
+    """
+
+    frame: I420
+    view: FieldView
+    choice: FrameChoice = LEFT_TO_THE_ENCODER
+    costs: FrameCosts | None = None
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A packet at the receiver, with what the field shows at the packet's pose."""
+
+    packet: DeltaPacket
+    view: FieldView
+
+
+@dataclass(frozen=True)
+class CodedFrame:
+    """A frame and what the encoder made of it."""
+
+    given: FrameInput
+    encoded: Encoded
+
+    @property
+    def arrival(self) -> Arrival:
+        """The packet as a receiver of the same field gets it."""
+        return Arrival(self.encoded.packet, self.given.view)
+
+
+def encode_frames(encoder: DeltaEncoder, inputs: Iterable[FrameInput]) -> Iterator[CodedFrame]:
+    """Code one frame after another, each from the state that the one before it left.
+
+    An input is asked for when its frame is coded, not earlier. Raises as ``DeltaEncoder.encode``.
+    """
+    state = encoder.start(EPOCH)
+    for given in inputs:
+        encoded = encoder.encode(state, given.frame, given.view, given.choice, given.costs)
+        state = encoded.state
+        yield CodedFrame(given, encoded)
+
+
+def decode_frames(
+    decoder: DeltaDecoder,
+    arrivals: Iterable[Arrival | None],
+    *,
+    epoch: int = EPOCH,
+    skip_rejected: bool = False,
+) -> Iterator[I420 | None]:
+    """Decode one packet after another; None stands for one that was lost, and yields None.
+
+    ``PacketRejected`` ends the loop, unless ``skip_rejected``: then a packet that the decoder
+    refuses yields None and leaves its state as it was, as a receiver's that asks for another one.
+    """
+    state = decoder.start(epoch)
+    for arrival in arrivals:
+        shown = None
+        if arrival is not None:
+            try:
+                decoded = decoder.decode(state, arrival.packet, arrival.view)
+                state, shown = decoded.state, decoded.frame
+            except PacketRejected:
+                if not skip_rejected:
+                    raise
+        yield shown
+
+
+def decode_promised(
+    decoder: DeltaDecoder, coded: Iterable[CodedFrame]
+) -> Iterator[tuple[CodedFrame, I420]]:
+    """Decode every coded frame; raise ``CodecError`` if one is not what its sender promised."""
+    frames, sent = tee(coded)
+    pictures = decode_frames(decoder, (frame.arrival for frame in sent))
+    for index, (frame, picture) in enumerate(zip(frames, pictures, strict=True)):
+        promised = frame.encoded.reconstruction
+        if picture is None or picture.digest() != promised.digest():
+            raise CodecError(f"frame {index} decodes to another picture than was promised")
+        yield frame, picture
 
 
 @dataclass(frozen=True)
@@ -62,29 +165,29 @@ def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSetting
     intrinsics = dataset.pictures[0].camera.intrinsics
     config = CodecConfig(intrinsics.width_px, intrinsics.height_px, settings.preset, settings.crf)
     encoder = DeltaEncoder(config)
-    state = encoder.start(1)
+    coded_frames = encode_frames(encoder, _placed(dataset, field, settings))
+    frames = []
+    for picture, coded in zip(dataset.pictures, coded_frames, strict=True):
+        _require_fit(picture.name, coded.encoded)
+        pose = coded.given.view.camera.world_from_cam
+        frames.append(Frame(CAMERA_ID, picture.time_ns, pose, b"", coded.encoded.packet))
+    camera = CameraDescription(CAMERA_ID, intrinsics, encoder.header)
+    return CodedDrive(Hello(OFFLINE_VEHICLE, (camera,), (field.field_id,), RENDERER), tuple(frames))
+
+
+def _placed(
+    dataset: Dataset, field: RadianceField, settings: CodingSettings
+) -> Iterator[FrameInput]:
+    """Read one picture after another and render the field at the pose it is coded at."""
+    intrinsics = dataset.pictures[0].camera.intrinsics
     choice = replace(FITTING, qp_map=settings.steering.qp_map)
     place = _placer(field, settings)
-    frames = []
     for picture in dataset.pictures:
         if picture.camera.intrinsics != intrinsics:
             raise DatasetError(f"{picture.name}: its camera differs from the first picture's")
         frame = i420_from_rgb(picture.read())
         placed = place(frame, picture.camera.rounded())
-        encoded = encoder.encode(state, frame, placed.view, choice, placed.costs)
-        _require_fit(picture.name, encoded)
-        state = encoded.state
-        frames.append(
-            Frame(
-                CAMERA_ID,
-                picture.time_ns,
-                placed.view.camera.world_from_cam,
-                b"",
-                encoded.packet,
-            )
-        )
-    camera = CameraDescription(CAMERA_ID, intrinsics, encoder.header)
-    return CodedDrive(Hello(OFFLINE_VEHICLE, (camera,), (field.field_id,), RENDERER), tuple(frames))
+        yield FrameInput(frame, placed.view, choice, placed.costs)
 
 
 def _placer(field: RadianceField, settings: CodingSettings) -> Callable[[I420, Camera], Refined]:
@@ -121,10 +224,15 @@ def decode_drive(drive: CodedDrive, field: RadianceField) -> Iterator[DecodedFra
             f"coded against field {', '.join(drive.hello.field_ids)}, given {field.field_id}"
         )
     camera = drive.hello.cameras[0]
-    decoder = DeltaDecoder(camera.codec)
-    state = decoder.start(drive.frames[0].packet.epoch) if drive.frames else decoder.start(1)
-    for frame in drive.frames:
-        view = render_field_view(field, frame.camera(camera.intrinsics), frame.quality)
-        decoded = decoder.decode(state, frame.packet, view)
-        state = decoded.state
-        yield DecodedFrame(frame.packet.sequence, decoded.frame)
+    arrivals = (
+        Arrival(
+            frame.packet,
+            render_field_view(field, frame.camera(camera.intrinsics), frame.quality),
+        )
+        for frame in drive.frames
+    )
+    epoch = drive.frames[0].packet.epoch if drive.frames else EPOCH
+    pictures = decode_frames(DeltaDecoder(camera.codec), arrivals, epoch=epoch)
+    for frame, picture in zip(drive.frames, pictures, strict=True):
+        assert picture is not None, "every packet of a file arrives"
+        yield DecodedFrame(frame.packet.sequence, picture)

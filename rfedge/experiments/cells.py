@@ -1,17 +1,18 @@
 """Finished pieces of an evaluation on disk, so that a stopped run goes on where it was.
 
 A cell is one clip coded by one method at one operating point. Its key names everything the result
-depends on (digests of inputs, method, options, revision of the program); its file is named by the
-digest of the key and holds key and result. Files appear whole or not at all and are never changed;
-only processor times are forgotten and taken again.
+depends on: digests of inputs, the method with the options its encoder runs with, the program. Its
+file is named by the digest of the key and holds key and result. Files appear whole or not at all
+and are never changed; only processor times are forgotten and taken again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,50 @@ import numpy as np
 
 from rfcore.errors import InvalidData
 from rfcore.files import write_whole
-from rfedge.experiments.clips import CodedClip
+from rfedge.experiments.clips import Clip, ClipCoder, CodedClip
 
-__all__ = ["CellKey", "CellStore", "Rows"]
+__all__ = ["CellKey", "CellStore", "Rows", "clip_key", "program_version"]
 
 CellKey = Mapping[str, str | float | int | None]
 Rows = list[dict[str, Any]]
+CHECKOUT = Path(__file__).parents[2]
+PROGRAM = ("rfcore", "rfedge/experiments", "rfedge/offline.py")
+"""What decides about a cell, in the folder that the packages lie in."""
+
+
+def clip_key(clip: Clip, coder: ClipCoder, point: float) -> CellKey:
+    """Name the cell of ``clip`` coded by ``coder`` at ``point``."""
+    return {
+        "scene": clip.scene,
+        "hz": clip.rate_hz,
+        "frames": clip.frames_digest,
+        "method": coder.name,
+        "point": point,
+        "version": coder.version,
+    }
+
+
+@cache
+def program_version(root: Path = CHECKOUT) -> str:
+    """Return the digest of the modules and kernels that make a cell.
+
+    A revision would do only in a clean checkout: one with changes keeps its name when they change.
+    """
+    total = hashlib.sha256()
+    for path in sorted(_program_files(root)):
+        content = hashlib.sha256(path.read_bytes()).hexdigest()
+        total.update(f"{path.relative_to(root)} {content}\n".encode())
+    return f"program {total.hexdigest()[:16]}"
+
+
+def _program_files(root: Path) -> Iterator[Path]:
+    for name in PROGRAM:
+        path = root / name
+        yield from (
+            (path,)
+            if path.is_file()
+            else (found for pattern in ("*.py", "*.so") for found in path.rglob(pattern))
+        )
 
 
 @dataclass(frozen=True)

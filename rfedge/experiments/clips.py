@@ -1,11 +1,14 @@
-"""A clip as somebody coded it: bytes, pictures and processor time, and nothing of how.
+"""What experiments code: drives, clips of them, and a clip as some codec coded it.
 
-Drives as evaluations take them: named with a rate on the command line, read once, digested.
+A ``Drive`` is a data set in time order, named with its rate on the command line (``NAME@HZ=
+DATASET``) and read once. A ``Clip`` is what a codec gets of it, a ``ClipCoder`` a codec under test,
+and a ``CodedClip`` what it made: bytes, errors and processor time a frame, and nothing of how.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,14 +27,22 @@ from rfcore.views import PosedPicture
 
 __all__ = [
     "DECIMATION",
+    "STEADY",
+    "Clip",
     "ClipCoder",
     "CodedClip",
-    "DriveFrames",
+    "Drive",
     "DriveName",
     "luma_mse",
     "luma_sse",
+    "psnr_of_mse",
     "read_drive",
 ]
+
+
+PEAK = 255.0
+STEADY = slice(1, None)
+"""Every frame but the first, which a stream sends once and a clip of 24 frames counts too much."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +60,7 @@ class CodedClip:
     ssim: NDArray[np.float64]
     cpu_ms: float
     notes: Mapping[str, tuple[float | str, ...]] = field(default_factory=dict)
-    """What the method wants to tell of each frame, by name: modes chosen, bits by kind..."""
+    """What the method wants to tell of each frame, by name: references chosen, bits by kind..."""
 
     def __post_init__(self) -> None:
         shapes = {self.frame_bytes.shape, self.luma_mse.shape, self.ssim.shape}
@@ -57,6 +68,14 @@ class CodedClip:
             raise InvalidInput("clip", f"shapes {shapes} must be one value per frame")
         if any(len(values) != len(self.frame_bytes) for values in self.notes.values()):
             raise InvalidInput("clip.notes", "must have one value per frame")
+
+    def psnr_db(self, frames: slice = STEADY) -> float:
+        """Return the luma PSNR of the mean squared error over ``frames``; inf if that is 0."""
+        return psnr_of_mse(float(self.luma_mse[frames].mean()))
+
+    def bytes_per_frame(self, frames: slice = STEADY) -> float:
+        """Return the mean size of a frame of ``frames``."""
+        return float(self.frame_bytes[frames].mean())
 
 
 class ClipCoder(Protocol):
@@ -81,6 +100,11 @@ class ClipCoder(Protocol):
 
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` with low delay: no frame may wait for a later one."""
+
+
+def psnr_of_mse(mse: float) -> float:
+    """Return the PSNR in dB of a mean squared error of 8-bit samples; infinite for 0."""
+    return 10 * math.log10(PEAK * PEAK / mse) if mse else math.inf
 
 
 def luma_mse(decoded: I420, frame: I420) -> float:
@@ -117,8 +141,20 @@ class DriveName:
 
 
 @dataclass(frozen=True)
-class DriveFrames:
-    """The pictures of a drive, as posed pictures and as the codec takes them."""
+class Clip:
+    """Frames to code: their rate, the scene's name, their digest, and the field's own quality."""
+
+    scene: str
+    rate_hz: float
+    frames: Sequence[I420]
+    frames_digest: str
+    field_psnr_db: float | None
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The frames of a drive: as posed pictures, read again when asked for, and as the codec takes
+    them, in memory."""
 
     name: DriveName
     pictures: Sequence[PosedPicture]
@@ -126,22 +162,32 @@ class DriveFrames:
 
     @property
     def cameras(self) -> list[Camera]:
-        """Where the frames were taken."""
-        return [picture.camera for picture in self.pictures]
+        """Where the frames were taken, the poses rounded as a vehicle sends them."""
+        return [picture.camera.rounded() for picture in self.pictures]
 
     @property
     def digest(self) -> str:
         """The sha256 over the frames' digests."""
         return hashlib.sha256(b"".join(frame.digest() for frame in self.frames)).hexdigest()
 
-    def every(self, step: int) -> DriveFrames:
+    def every(self, step: int) -> Drive:
         """Return each ``step``-th frame, at the rate that makes."""
         name = replace(self.name, rate_hz=self.name.rate_hz / step)
-        return DriveFrames(name, self.pictures[::step], self.frames[::step])
+        return Drive(name, self.pictures[::step], self.frames[::step])
+
+    def first(self, count: int) -> Drive:
+        """Return the first ``count`` frames."""
+        return Drive(self.name, self.pictures[:count], self.frames[:count])
+
+    def clip(self, condition: str = "", field_psnr_db: float | None = None) -> Clip:
+        """Return what a codec gets, its scene named with the ``condition`` it is coded under."""
+        scene = f"{self.name.scene} {condition}".strip()
+        return Clip(scene, self.name.rate_hz, self.frames, self.digest, field_psnr_db)
 
 
-def read_drive(text: str, limit: int | None = None) -> DriveFrames:
+def read_drive(name: DriveName | str, limit: int | None = None) -> Drive:
     """Read at most ``limit`` frames of ``NAME@HZ=DATASET``; raises as ``DriveName.parse`` does."""
-    name = DriveName.parse(text)
+    if isinstance(name, str):
+        name = DriveName.parse(name)
     pictures = read_dataset(name.dataset).pictures[:limit]
-    return DriveFrames(name, pictures, [i420_from_rgb(picture.read()) for picture in pictures])
+    return Drive(name, pictures, [i420_from_rgb(picture.read()) for picture in pictures])

@@ -7,9 +7,13 @@ loop. Pictures are what a receiver decoded from those very packets, not what the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
 from time import process_time_ns
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,18 +23,20 @@ from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.photometric import Photometric
 from rfcore.codec.references import References, is_temporal, references_name
-from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
-from rfcore.errors import CodecError, InvalidInput
-from rfcore.field import RadianceField, render_field_view
+from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
+from rfcore.errors import InvalidInput
+from rfcore.field import FULL, Quality, RadianceField, render_field_view
 from rfcore.image import I420
 from rfcore.views import FieldView
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Frame
 from rfedge.experiments.clips import CodedClip, luma_mse, luma_sse
 from rfedge.experiments.picture_quality import luma_ssim
+from rfedge.offline import Arrival, FrameInput, decode_promised, encode_frames
 
-__all__ = ["FieldCoder", "SeenClip", "see_clip"]
+__all__ = ["FieldCoder", "RenderedClip", "message_bytes", "render_clip"]
 
+LIMITS = (1.0, 51.0)
 CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0, 38.0)
 COVERED = 0.5
 MESSAGE_CAMERA = "front"
@@ -38,8 +44,8 @@ MESSAGE_TIME_NS = 1_700_000_000_000_000_000
 
 
 @dataclass(frozen=True)
-class SeenClip:
-    """A field seen from every pose of a clip, as both ends hold it, and what rendering took.
+class RenderedClip:
+    """A field rendered at every pose of a clip, as both ends hold it, and what that took.
 
     ``covered``: bool [H, W] a frame, where the field shows anything (opacity above 1/2).
     """
@@ -59,27 +65,46 @@ class SeenClip:
         """The picture of each view."""
         return tuple(view.render for view in self.views)
 
+    @property
+    def digest(self) -> str:
+        """Of every picture, depth and camera: what a result depends on."""
+        cameras = hashlib.sha256(repr(self.cameras).encode()).hexdigest()
+        arrays = ((*view.render.planes, view.depth) for view in self.views)
+        return f"{_digest(chain.from_iterable(arrays))}-{cameras[:8]}"
 
-def see_clip(field: RadianceField, cameras: Sequence[Camera]) -> SeenClip:
-    """Render ``field`` from every camera, its pose rounded as a vehicle does before it renders."""
+
+def render_clip(field: RadianceField, cameras: Sequence[Camera]) -> RenderedClip:
+    """Render ``field`` from every camera, its pose rounded as a vehicle does before it renders.
+
+    Processor time is that of all threads over the clip, without what a first render makes once.
+    """
     cameras = [camera.rounded() for camera in cameras]
-    field.render(cameras[0])  # what is made lazily is not held against the first frame
+    field.render(cameras[0])
     began_ns = process_time_ns()
     views = tuple(render_field_view(field, camera) for camera in cameras)
     cpu_ms = (process_time_ns() - began_ns) / 1e6
     covered = tuple(view.covers(COVERED) for view in views)
-    return SeenClip(views, covered, field.field_id, cpu_ms)
+    return RenderedClip(views, covered, field.field_id, cpu_ms)
+
+
+def _digest(arrays: Iterable[NDArray[Any]]) -> str:
+    total = hashlib.sha256()
+    for array in arrays:
+        total.update(np.ascontiguousarray(array).data)
+    return total.hexdigest()[:16]
 
 
 class FieldCoder:
-    """Codes the clip a field was seen along. ``references`` None leaves them to the encoder.
+    """Codes the clip that a field was rendered along; ``version`` names the program that does.
+
+    ``references`` and ``photometric`` None leave them to the encoder.
 
     With ``foregrounds``, bool [H, W] a frame, the notes have the luma's squared error there.
     """
 
     def __init__(
         self,
-        seen: SeenClip,
+        rendered: RenderedClip,
         name: str,
         version: str,
         *,
@@ -90,9 +115,10 @@ class FieldCoder:
         foregrounds: Sequence[NDArray[np.bool_]] = (),
     ) -> None:
         self.name = name
-        self.version = version
         self.points = tuple(points)
-        self._seen = seen
+        self.limits = LIMITS
+        self._program = version
+        self._rendered = rendered
         self._preset = preset
         self._foregrounds = foregrounds
         self._choice = FrameChoice(references=references, photometric=photometric)
@@ -100,63 +126,65 @@ class FieldCoder:
         temporal = references is not None and is_temporal(references)
         self._first_choice = FrameChoice(photometric=photometric) if temporal else self._choice
 
+    @cached_property
+    def version(self) -> str:
+        """The program, the options of the encoder, and what the field shows along the clip."""
+        choice = self._choice
+        references = "chosen"
+        if choice.references is not None:
+            references = references_name(choice.references)
+        light = "chosen" if choice.photometric is None else str(tuple(choice.photometric))
+        return (
+            f"{self._program}; preset {self._preset}, references {references}, light {light}, "
+            f"views {self._rendered.digest}, foregrounds {self._foregrounds_digest()}"
+        )
+
+    def _foregrounds_digest(self) -> str:
+        return _digest(mask for mask in self._foregrounds) if self._foregrounds else "none"
+
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` at CRF ``point``; ``rate_hz`` changes nothing here.
 
-        The clip may be the beginning of the one that was seen. Raises ``InvalidInput`` for a longer
-        one, ``CodecError`` if a receiver does not see what the sender promised.
+        The clip may be the beginning of the one that was rendered. Raises ``InvalidInput`` for a
+        longer one, ``CodecError`` if a receiver does not see what the sender promised.
         """
         del rate_hz
-        seen = len(self._seen.views)
-        if not 0 < len(frames) <= seen:
-            raise InvalidInput("frames", f"{len(frames)} are outside the 1..{seen} that were seen")
+        count = len(self._rendered.views)
+        if not 0 < len(frames) <= count:
+            raise InvalidInput("frames", f"{len(frames)} are outside the 1..{count} rendered")
         config = CodecConfig(*frames[0].size_px, preset=self._preset, crf=point)
         began_ns = process_time_ns()
         encoder = DeltaEncoder(config)
-        coded = self._coded(encoder, frames)
+        coded = list(encode_frames(encoder, self._inputs(frames)))
         cpu_ms = (process_time_ns() - began_ns) / 1e6
-        cpu_ms += self._seen.render_cpu_ms * len(frames) / seen
-        decoded = self._decoded(encoder, coded)
-        pairs = list(zip(decoded, frames, strict=True))
+        cpu_ms += self._rendered.render_cpu_ms * len(frames) / count
+        decoded = decode_promised(DeltaDecoder(encoder.header), coded)
+        pairs = [(picture, coded_frame.given.frame) for coded_frame, picture in decoded]
+        packets = [coded_frame.encoded.packet for coded_frame in coded]
         notes: dict[str, tuple[float | str, ...]] = {
-            "references": tuple(references_name(made.packet.references) for made in coded),
-            "slice_bytes": tuple(len(made.packet.payload) for made in coded),
+            "references": tuple(references_name(packet.references) for packet in packets),
+            "slice_bytes": tuple(len(packet.payload) for packet in packets),
         }
         if self._foregrounds:
             masked = zip(pairs, self._foregrounds, strict=False)
             notes["foreground_sse"] = tuple(luma_sse(*pair, mask) for pair, mask in masked)
         return CodedClip(
             point,
-            np.array([self._message_bytes(k, made) for k, made in enumerate(coded)]),
+            np.array([message_bytes(frame.arrival) for frame in coded]),
             np.array([luma_mse(*pair) for pair in pairs]),
             np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
             cpu_ms,
             notes,
         )
 
-    def _coded(self, encoder: DeltaEncoder, frames: Sequence[I420]) -> list[Encoded]:
-        state = encoder.start(1)
-        coded = []
+    def _inputs(self, frames: Sequence[I420]) -> Iterator[FrameInput]:
         for index, frame in enumerate(frames):
             choice = self._choice if index else self._first_choice
-            made = encoder.encode(state, frame, self._seen.views[index], choice)
-            state = made.state
-            coded.append(made)
-        return coded
+            yield FrameInput(frame, self._rendered.views[index], choice)
 
-    def _decoded(self, encoder: DeltaEncoder, coded: Sequence[Encoded]) -> list[I420]:
-        decoder = DeltaDecoder(encoder.header)
-        state = decoder.start(1)
-        pictures = []
-        for index, made in enumerate(coded):
-            decoded = decoder.decode(state, made.packet, self._seen.views[index])
-            state = decoded.state
-            if decoded.frame.digest() != made.reconstruction.digest():
-                raise CodecError(f"frame {index} decodes to another picture than was promised")
-            pictures.append(decoded.frame)
-        return pictures
 
-    def _message_bytes(self, index: int, made: Encoded) -> int:
-        pose = self._seen.views[index].camera.world_from_cam
-        message = Frame(MESSAGE_CAMERA, MESSAGE_TIME_NS, pose, b"", made.packet)
-        return len(client_message_to_bytes(message))
+def message_bytes(arrival: Arrival, quality: Quality = FULL) -> int:
+    """Return the size of the whole message that carries the packet from a vehicle."""
+    pose = arrival.view.camera.world_from_cam
+    message = Frame(MESSAGE_CAMERA, MESSAGE_TIME_NS, pose, b"", arrival.packet, quality)
+    return len(client_message_to_bytes(message))

@@ -1,16 +1,14 @@
-"""How good a render is by itself: PSNR, SSIM, FLIP, and what it misses at which spatial frequency.
+"""How good a picture is: PSNR, SSIM, FLIP, and what a render misses at which spatial frequency.
 
 The published work explains why savings fall as resolution rises by high frequencies that the field
-lost. That is tested here: the residual's luma energy in octave bands of radial frequency over the
-camera's own in the same band; 0 is a perfect render, 1 one that might as well be flat there, above
-1 one that does harm. Bands are in cycles a pixel, so that they mean the same at every size.
+lost. ``residual_bands`` measures that: the luma energy of the residual in octave bands of radial
+frequency, over the camera's own in the same band; 0 is a perfect render, 1 one that might as well
+be flat there, above 1 one that does harm. Bands are in cycles a pixel, so that they mean the same
+at every size. LPIPS is not computed: its weights are not ours to ship.
 
-LPIPS needs weights that are not ours to ship; without them it is not computed, and said so.
-
-SSIM of luma planes in float32: ``rfcore.metrics.ssim`` for those who need it by the thousand.
-
-Same window, constants and mirrored border. Samples have 128 taken off for the variances, which they
-do not depend on, so that float32 leaves an error below 1e-4; it takes a fifth of the time.
+``luma_ssim`` is ``rfcore.metrics.ssim`` in float32, in a fifth of the time: the same window,
+constants and mirrored border. 128 is subtracted from all samples before variances are taken, which
+do not depend on it, so that the error stays below 1e-4.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The distortion of a clip is the PSNR of the mean squared error over its frames (not the mean of
 PSNRs, which lets one easy frame outweigh a hard one). Between points, log(rate) is interpolated
 over decibels by a monotone cubic (PCHIP; Bjontegaard, VCEG-M33, with the interpolation of
-JVET-M0166), and outside them nothing is said: a window that a curve does not span is an error.
+JVET-M0166). There is no extrapolation: a window that a curve does not span is an error.
 """
 
 from __future__ import annotations

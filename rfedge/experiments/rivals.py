@@ -1,23 +1,19 @@
 """What a user would pick instead: x264, x265 and SVT-AV1 set for low delay, one thread.
 
 Each runs as a user would run it on a vehicle: every frame goes out before the next comes in (no
-reordering, no lookahead; checked, not hoped), rate by CRF, one key frame at the start unless the
-rival is about key frames. Options are the libraries' own names.
-
-Keep an encoder library from taking the machine.
-
-SVT-AV1 asks for real-time scheduling when it runs as root: its own threads and, for good, the one
-that opened it. Everything started afterwards inherits that and starves what else runs, and times
-taken beside it are worth nothing. Linux only; elsewhere there is nothing to undo.
+reordering, no lookahead; an encoder that holds a frame back is an error), rate by CRF, one key
+frame at the start unless the rival is about key frames. Options are the libraries' own names.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 from time import process_time_ns
 from typing import Any, Literal, cast
@@ -48,7 +44,12 @@ __all__ = [
 
 @contextmanager
 def ordinary_scheduling() -> Iterator[None]:
-    """Give all threads of this process, new ones too, the policy that this one had before."""
+    """Give all threads of this process, new ones too, the scheduling policy this one had before.
+
+    SVT-AV1 asks for real-time scheduling when it runs as root: for its own threads and, for good,
+    for the one that opened it. What is started afterwards inherits that and starves everything
+    else, and times taken beside it are worth nothing. Linux only.
+    """
     policy, priority = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         yield
@@ -62,7 +63,14 @@ def ordinary_scheduling() -> Iterator[None]:
 X264_CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0, 38.0, 41.0)
 X265_CRFS = (19.0, 22.0, 25.0, 28.0, 31.0, 34.0, 37.0, 40.0, 43.0)
 SVT_CRFS = (20.0, 27.0, 34.0, 41.0, 48.0, 55.0)
-"""Spans the headline window of 32..35 dB on street pictures, with room on either side."""
+"""Spans the headline window of 32..35 dB on most street pictures, with room on either side."""
+H26X_LIMITS, SVT_LIMITS = (1.0, 51.0), (1.0, 63.0)
+"""CRFs of the best and the worst quality; 0 would be lossless."""
+
+PROBE = I420(np.full((48, 64), 128, np.uint8), *[np.full((24, 32), 128, np.uint8)] * 2)
+PROBE_HZ, PROBE_CRF = 10.0, 30.0
+SETTINGS = re.compile(rb"x26[45] [^\0]*options: [^\0\x80]*")
+"""What x264 and x265 write about themselves into the first packet, as an SEI message."""
 
 os.environ.setdefault("SVT_LOG", "1")  # read when the library opens: errors only
 
@@ -85,11 +93,20 @@ class Rival:
     decoder: str
     options: Mapping[str, str]
     points: Sequence[float] = field(default=X264_CRFS)
+    limits: tuple[float, float] = H26X_LIMITS
 
     @property
     def version(self) -> str:
-        """The libraries come with PyAV."""
-        return f"PyAV {av.__version__}"
+        """The libraries, which come with PyAV, and the options that the encoder runs with."""
+        return f"PyAV {av.__version__}; {self.effective_options}"
+
+    @property
+    def effective_options(self) -> str:
+        """What the encoder itself says that it is and does, presets and tunes resolved.
+
+        x264 and x265 write it into the stream; SVT-AV1 does not: the options as they are given.
+        """
+        return _effective_options(self.encoder, tuple(self.options.items()))
 
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` at CRF ``point``.
@@ -117,9 +134,9 @@ class Rival:
         return CodedPictures([len(packet) for packet in packets], self._decoded(packets), cpu_ms)
 
     def _encoded(self, frames: Sequence[I420], rate_hz: float, point: float) -> list[bytes]:
-        encoder = self._encoder(frames[0].size_px, rate_hz, point)
         packets = []
         try:
+            encoder = self._encoder(frames[0].size_px, rate_hz, point)
             for index, frame in enumerate(frames):
                 made = encoder.encode(video_frame(frame, index))
                 if len(made) != 1:
@@ -150,6 +167,14 @@ class Rival:
         decoder.thread_count = 1
         frames = [f for packet in packets for f in decoder.decode(av.Packet(packet))]
         return [picture(frame) for frame in (*frames, *decoder.decode(None))]
+
+
+@cache
+def _effective_options(encoder: str, options: tuple[tuple[str, str], ...]) -> str:
+    rival = Rival(encoder, encoder, "", dict(options))
+    first = rival._encoded([PROBE], PROBE_HZ, PROBE_CRF)[0]
+    found = SETTINGS.search(first)
+    return found[0].decode("ascii", "replace") if found else f"{encoder} {dict(options)}"
 
 
 def x264_lowdelay(preset: str, name: str | None = None, **params: str) -> Rival:
@@ -207,6 +232,7 @@ def svtav1_lowdelay(preset: int) -> Rival:
         "libdav1d",
         {"preset": str(preset), "svtav1-params": _joined(options)},
         SVT_CRFS,
+        SVT_LIMITS,
     )
 
 

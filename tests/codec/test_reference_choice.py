@@ -68,6 +68,40 @@ def test_what_the_last_frame_taught_comes_first(pair: PairMaker) -> None:
     assert chosen[-1] in (Reference.CORRECTION, Reference.WARP)
 
 
+FIELD_REFERENCES = {Reference.RENDER, Reference.CORRECTION, Reference.WARP}
+
+
+def half_known(pair: PairMaker, noise: PictureMaker) -> tuple[I420, Prediction]:
+    """A frame whose cars only the last frame had; left of the middle that one was noise."""
+    frame, view = pair(*SIZE_PX)
+    now = wall(view.render)
+    left = np.arange(SIZE_PX[0]) < SIZE_PX[0] // 2
+    planes = zip(frame.planes, noise(*SIZE_PX, 5).planes, (left, left[::2], left[::2]), strict=True)
+    last = I420(*(np.where(where, bad, good) for good, bad, where in planes))
+    return frame, Prediction(now, Past(last, now))
+
+
+def test_a_second_picture_of_the_field_is_taken_where_it_saves(
+    pair: PairMaker, noise: PictureMaker
+) -> None:
+    """The render has the left half, what was carried from the last frame the right one."""
+    frame, prediction = half_known(pair, noise)
+    chosen = choose_references(FrameCosts(frame), prediction, 23)
+    assert chosen[0] is Reference.PREVIOUS
+    assert set(chosen[1:]) > {Reference.RENDER}
+    assert set(chosen[1:]) <= FIELD_REFERENCES
+    assert len(chosen) == 3
+
+
+def test_no_second_picture_of_the_field_is_taken_where_the_first_has_everything(
+    pair: PairMaker,
+) -> None:
+    frame, view = pair(*SIZE_PX)
+    now = wall(view.render)
+    chosen = choose_references(FrameCosts(frame), Prediction(now, Past(frame, now)), 23)
+    assert len(FIELD_REFERENCES & set(chosen)) == 1
+
+
 @pytest.mark.parametrize("max_references", [1, 2, 3])
 def test_no_more_references_than_allowed(pair: PairMaker, max_references: int) -> None:
     frame, view = pair(*SIZE_PX)

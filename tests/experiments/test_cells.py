@@ -1,13 +1,16 @@
 """What an evaluation keeps between runs."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from rfcore.errors import InvalidData, InvalidInput
-from rfedge.experiments.cells import CellStore
-from rfedge.experiments.clips import CodedClip
+from rfcore.image import I420
+from rfedge.experiments.cells import CellStore, clip_key, program_version
+from rfedge.experiments.clips import Clip, CodedClip
+from rfedge.experiments.rivals import x264_lowdelay
 
 KEY = {"scene": "street", "hz": 10, "method": "x264", "point": 23.0}
 CLIP = CodedClip(
@@ -39,6 +42,63 @@ def test_any_other_key_is_another_cell(tmp_path, change):
     store = CellStore(tmp_path)
     store.clip(KEY, lambda: CLIP)
     assert not store.has({**KEY, **change})
+
+
+def test_a_cell_of_other_options_is_not_taken(tmp_path):
+    """The same name, clip and point, and one option of the encoder changed: coded anew."""
+    frame = I420(np.zeros((48, 64), np.uint8), *[np.zeros((24, 32), np.uint8)] * 2)
+    clip = Clip("street", 10.0, [frame] * 2, "digest", None)
+    coder = replace(x264_lowdelay("veryfast", "x264"), points=(30.0,))
+    changed = replace(coder, options={**coder.options, "tune": "zerolatency,psnr"})
+    store, made = CellStore(tmp_path), []
+    for each in (coder, changed, coder):
+        store.clip(clip_key(clip, each, 30.0), lambda: made.append(1) or CLIP)
+    assert len(made) == 2
+    assert store.has(clip_key(clip, changed, 30.0))
+
+
+@pytest.fixture
+def program(tmp_path):
+    """A copy of the shape of the program: what decides about a cell, and what does not."""
+    for name in ("rfcore/codec/encoder.py", "rfcore/native/_native.so", "rfedge/offline.py"):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"one")
+    (tmp_path / "rfedge/experiments").mkdir()
+    (tmp_path / "docs").mkdir()
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "changed", ["rfcore/codec/encoder.py", "rfcore/native/_native.so", "rfedge/experiments/new.py"]
+)
+def test_a_changed_program_is_another_one(program, changed):
+    before = program_version.__wrapped__(program)
+    (program / changed).write_bytes(b"two")
+    assert program_version.__wrapped__(program) != before
+
+
+def test_a_program_is_not_its_documents(program):
+    before = program_version.__wrapped__(program)
+    (program / "docs/page.md").write_text("new")
+    (program / "rfcore/note.txt").write_text("new")
+    assert program_version.__wrapped__(program) == before
+
+
+def test_a_program_whose_modules_changed_places_is_another_one(program):
+    before = program_version.__wrapped__(program)
+    (program / "rfcore/codec/encoder.py").rename(program / "rfcore/codec/decoder.py")
+    assert program_version.__wrapped__(program) != before
+
+
+def test_a_cell_that_is_forgotten_is_made_again(tmp_path):
+    store = CellStore(tmp_path)
+    store.forget(KEY)
+    store.clip(KEY, lambda: CLIP)
+    store.forget(KEY)
+    assert not store.has(KEY)
+    with pytest.raises(AssertionError):
+        store.clip(KEY, forbidden)
 
 
 def test_a_computation_that_fails_leaves_nothing_behind(tmp_path):

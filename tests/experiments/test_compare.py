@@ -3,31 +3,27 @@
 import numpy as np
 import pytest
 
+from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfedge.experiments.cells import CellStore
-from rfedge.experiments.clips import CodedClip
-from rfedge.experiments.compare.measure import (
-    BEST,
-    TIMED_REPEATS,
-    Clip,
-    Performance,
-    compare_rows,
-    perform,
-)
+from rfedge.experiments.clips import Clip, CodedClip
+from rfedge.experiments.compare.measure import BEST, compare_rows
+from rfedge.experiments.performance import TIMED_REPEATS, Performance, perform
 
 PLANE = np.zeros((2, 2), np.uint8)
-CONTEST = Clip("street", 10.0, [I420(PLANE, PLANE[:1, :1], PLANE[:1, :1])], "digest", 27.5)
+CLIP = Clip("street", 10.0, [I420(PLANE, PLANE[:1, :1], PLANE[:1, :1])], "digest", 27.5)
 
 
-def performance(name, rate_factor, cpu_ms, frames=10):
-    """Nine points, 28..44 dB, each of ``rate_factor`` times a common exponential rate."""
+def performance(name, rate_factor, cpu_ms, frames=10, first=5):
+    """Nine points, 28..44 dB, each of ``rate_factor`` times a common exponential rate; the first
+    frame of a clip takes ``first`` times the others' bytes."""
     clips = []
     for point in range(9):
         db = 44 - 2 * point
         rate = round(1000 * rate_factor * np.exp(0.25 * (db - 28)))
         mse = np.full(frames, 255.0**2 / 10 ** (db / 10))
         sizes = np.full(frames, rate)
-        sizes[0] *= 5
+        sizes[0] *= first
         clips.append(CodedClip(point, sizes, mse, np.full(frames, 0.9), cpu_ms * frames))
     return Performance(name, tuple(clips), cpu_ms)
 
@@ -48,7 +44,7 @@ FAMILIES = {
 def rows():
     return {
         row["rival"]: row
-        for row in compare_rows(CONTEST, OURS, FAMILIES)
+        for row in compare_rows(CLIP, OURS, FAMILIES)
         if row["window_db"] == [32.0, 35.0]
     }
 
@@ -78,10 +74,51 @@ def test_the_first_frame_is_told_apart_from_the_steady_state(rows):
     assert row["saving_percent_at_db"]["33"] == pytest.approx(50, abs=0.1)
 
 
+def test_what_the_first_frame_takes_does_not_count_in_the_steady_state():
+    """A stream sends it once: 40 times the bytes there change no figure but its own column."""
+    heavy = {"x264-lowdelay": [performance("x264", 1.0, cpu_ms=10, first=40)]}
+    (row, *_) = compare_rows(CLIP, OURS, heavy)
+    assert row["bd_rate_percent"] == pytest.approx(-50, abs=0.1)
+    assert row["ci95"] == pytest.approx([-50, -50], abs=0.1)
+    assert row["saving_percent_at_db"]["33"] == pytest.approx(50, abs=0.1)
+    assert row["rival_first_frame_bytes"] == pytest.approx(16 * row["first_frame_bytes"], rel=1e-3)
+
+
+def test_quality_of_the_first_frame_does_not_count_either():
+    clips = []
+    for clip in OURS.clips:
+        mse = clip.luma_mse.copy()
+        mse[0] = 1e4
+        clips.append(CodedClip(clip.point, clip.frame_bytes, mse, clip.ssim, clip.cpu_ms))
+    ours = Performance("ours", tuple(clips), 50)
+    np.testing.assert_allclose(ours.steady.psnr_db, OURS.steady.psnr_db)
+
+
+def test_a_window_that_is_asked_for_is_the_only_one():
+    rows = compare_rows(CLIP, OURS, FAMILIES, [(36.0, 39.0)])
+    assert {tuple(row["window_db"]) for row in rows} == {(36.0, 39.0)}
+    assert len(rows) == len(FAMILIES) + 1
+
+
+def test_a_window_that_must_be_spanned_and_is_not_is_an_error():
+    with pytest.raises(InvalidInput, match=r"20\.\.25 dB is not within the curve's 28\.00"):
+        compare_rows(CLIP, OURS, FAMILIES, [(20.0, 25.0)])
+
+
+def test_a_family_of_nobody_is_an_error():
+    with pytest.raises(InvalidInput, match="at least one setting"):
+        compare_rows(CLIP, OURS, {"x265-lowdelay": []})
+
+
+def test_without_a_comparable_rival_there_is_no_best_one():
+    slow = {"x265-lowdelay": [performance("slow", 0.3, 99)]}
+    assert BEST not in {row["rival"] for row in compare_rows(CLIP, OURS, slow)}
+
+
 def test_a_wider_window_is_left_out_where_a_field_shows_more_before_a_bit_is_sent():
     good = Performance("good", tuple(clip for clip in OURS.clips if clip.luma_mse[0] < 42), 50)
     assert good.steady.psnr_db[0] > 30
-    rows = compare_rows(CONTEST, good, {"x264-lowdelay": FAMILIES["x264-lowdelay"]})
+    rows = compare_rows(CLIP, good, {"x264-lowdelay": FAMILIES["x264-lowdelay"]})
     assert {tuple(row["window_db"]) for row in rows} == {(32.0, 35.0)}
     assert set(rows[0]["saving_percent_at_db"]) == {"33", "35"}
 
@@ -105,16 +142,16 @@ class Counting:
 def test_what_was_coded_once_is_not_coded_again(tmp_path):
     store, coders = CellStore(tmp_path), [Counting("a"), Counting("a"), Counting("b")]
     for coder in coders:
-        perform(CONTEST, coder, store)
+        perform(CLIP, coder, store)
     assert [coder.calls for coder in coders] == [2 + TIMED_REPEATS, 0, 2 + TIMED_REPEATS]
 
 
 def test_processor_time_can_be_taken_anew_without_coding_again(tmp_path):
     store, coder = CellStore(tmp_path), Counting("a")
-    before = perform(CONTEST, coder, store)
+    before = perform(CLIP, coder, store)
     calls = coder.calls
     coder.cpu_ms = 0.5
-    after = perform(CONTEST, coder, store, retime=True)
+    after = perform(CLIP, coder, store, retime=True)
     assert coder.calls == calls + TIMED_REPEATS
     assert after.clips[0].frame_bytes == before.clips[0].frame_bytes
     assert after.cpu_ms_per_frame == before.cpu_ms_per_frame / 2

@@ -1,6 +1,9 @@
 """The verb ``rfedge eval compare``, from files to a result file."""
 
+import io
 import json
+import math
+import re
 import sys
 from pathlib import Path
 
@@ -50,10 +53,147 @@ def test_another_form_is_refused_by_an_example(text):
         DriveName.parse(text)
 
 
-@pytest.mark.parametrize("text", ["nowhere:X", "json:Nothing", "json", "json:JSONDecoder"])
-def test_a_method_that_is_none_is_refused(text):
-    with pytest.raises(InvalidInput, match="method"):
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("json", "is not MODULE:CLASS, as mjpeg_rival:MotionJpeg"),
+        ("json:", "is not MODULE:CLASS"),
+        ("nowhere:X", r"neither .*nowhere\.py nor an installed module 'nowhere'"),
+        ("json.nowhere:X", r"neither .*json/nowhere\.py nor an installed module"),
+        ("json:Nothing", r"json \(.*\) has no 'Nothing'"),
+        ("json:JSONDecoder", "lacks name, points, version, code of a ClipCoder"),
+        ("json:load", "cannot be called without arguments"),
+        (".relative:X", "cannot be imported"),
+    ],
+)
+def test_a_method_that_is_none_is_refused_with_what_was_looked_for(text, why):
+    with pytest.raises(InvalidInput, match=f"method: .*{why}"):
         foreign_coder(text)
+
+
+MJPEG = """
+class MotionJpeg:
+    name, points, version = "mjpeg", (2.0, 8.0), "1"
+
+    def code(self, frames, rate_hz, point):
+        raise NotImplementedError
+"""
+
+
+@pytest.fixture
+def working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    for name in ("mjpeg_rival_here", "rivals_here", "rivals_here.mjpeg", "broken_rival"):
+        sys.modules.pop(name, None)
+
+
+def test_a_method_is_found_in_the_working_folder(working_folder):
+    (working_folder / "mjpeg_rival_here.py").write_text(MJPEG)
+    before = list(sys.path)
+    assert foreign_coder("mjpeg_rival_here:MotionJpeg").name == "mjpeg"
+    assert sys.path == before
+
+
+def test_a_method_is_found_in_a_package_of_the_working_folder(working_folder):
+    (working_folder / "rivals_here").mkdir()
+    (working_folder / "rivals_here/mjpeg.py").write_text(MJPEG)
+    assert foreign_coder("rivals_here.mjpeg:MotionJpeg").points == (2.0, 8.0)
+
+
+def test_a_module_that_lacks_something_itself_is_told_from_one_that_is_not_there(working_folder):
+    (working_folder / "broken_rival.py").write_text("import not_installed_here")
+    with pytest.raises(InvalidInput, match="broken_rival needs 'not_installed_here'"):
+        foreign_coder("broken_rival:X")
+
+
+@pytest.mark.parametrize("window", [(35.0, 32.0), (32.0, 32.0), (0.0, 30.0), (30.0, math.inf)])
+def test_a_window_that_does_not_rise_is_refused(tmp_path, window):
+    with pytest.raises(InvalidInput, match="window"):
+        CompareJob(
+            Path("f.rff"), ("a@1=b",), "veryfast", tmp_path / "c.json", tmp_path, window_db=window
+        )
+
+
+def job_of(thumbnail, folder, **change):
+    given = {
+        "field": thumbnail.field,
+        "drives": (thumbnail.drive,),
+        "preset": "ultrafast",
+        "out": folder / "compare.json",
+        "cells": folder / "cells",
+        "quick": True,
+    }
+    return CompareJob(**given | change)
+
+
+@pytest.fixture(scope="module")
+def compared(thumbnail, tmp_path_factory):
+    """A comparison over a window that our own points do not reach down to, with a background."""
+    folder = tmp_path_factory.mktemp("compared")
+    job = job_of(thumbnail, folder, window_db=(33.0, 36.0), backgrounds=(thumbnail.empty,))
+    console = Console(record=True, quiet=False, file=io.StringIO(), width=200)
+    return job, run_compare(job, console), console.export_text()
+
+
+def test_a_comparison_says_what_it_will_do_before_it_starts(compared):
+    _, _, said = compared
+    first = said.splitlines()[0]
+    assert first.startswith("BD-rates over 33..36 dB: 49 clips to code, about ")
+    assert "Points are added where a curve does not span the window" in said
+    assert re.search(r"rfedge-ultrafast-\w+ also at 41", said)
+
+
+def test_every_curve_spans_the_window_that_was_asked_for(compared):
+    _, result, _ = compared
+    for curve in result["curves"]:
+        assert curve["psnr_db"][0] <= 33 <= 36 <= curve["psnr_db"][-1]
+        assert curve["psnr_db"] == sorted(curve["psnr_db"])
+        assert len(curve["point"]) == len(curve["bytes_per_frame"]) == len(curve["ssim"])
+    assert {tuple(row["window_db"]) for row in result["rows"]} == {(33.0, 36.0)}
+
+
+def test_every_row_of_a_comparison_has_its_interval_around_its_figure(compared):
+    _, result, _ = compared
+    for row in result["rows"]:
+        assert set(row) >= ROW_KEYS
+        low, high = row["ci95"]
+        assert low <= row["bd_rate_percent"] <= high
+    assert {row["method"].rsplit("-", 2)[0] for row in result["rows"]} == {
+        "rfedge",
+        "rfedge-render-only",
+    }
+
+
+def test_shares_of_area_and_bits_are_whole(compared):
+    _, result, _ = compared
+    assert sum(row["area_percent"] for row in result["bits"]) == pytest.approx(100)
+    assert sum(row["slice_percent"] for row in result["bits"]) == pytest.approx(100)
+    moving = next(row for row in result["bits"] if row["shows"] == "moving")
+    assert moving["slice_percent"] > moving["area_percent"], "the box is not in the field"
+
+
+def test_a_finished_comparison_is_not_coded_again(compared):
+    job, result, _ = compared
+    cells = {path: path.read_bytes() for path in job.cells.iterdir()}
+    again = run_compare(job, Console(quiet=True))
+    assert again["rows"] == result["rows"]
+    assert {path: path.read_bytes() for path in job.cells.iterdir()} == cells
+    assert json.loads(job.out.read_text())["curves"] == result["curves"]
+
+
+def test_a_window_nobody_reaches_ends_the_comparison_before_its_long_part(thumbnail, tmp_path):
+    job = job_of(thumbnail, tmp_path, window_db=(15.0, 18.0))
+    with pytest.raises(InvalidInput, match=r"15\.\.18 dB is not within .*rfedge-ultra.* reaches"):
+        run_compare(job, Console(quiet=True))
+    assert len(list(job.cells.iterdir())) <= 8, "our own ends alone were coded"
+    assert not job.out.exists()
+
+
+def test_a_background_without_its_drive_is_refused(thumbnail, tmp_path):
+    elsewhere = thumbnail.empty.replace("wall@10", "alley@10")
+    with pytest.raises(InvalidInput, match="alley"):
+        run_compare(job_of(thumbnail, tmp_path, backgrounds=(elsewhere,)), Console(quiet=True))
 
 
 def test_a_decimated_drive_is_every_fifth_frame_at_a_fifth_of_the_rate(tmp_path):
@@ -66,11 +206,11 @@ def test_a_decimated_drive_is_every_fifth_frame_at_a_fifth_of_the_rate(tmp_path)
         cells=tmp_path / "cells",
     )
     field = load_field(job.field)
-    (bout,) = read_drive_comparisons(job, field)
-    assert bout.contest.rate_hz == 2.0
+    (comparison,) = read_drive_comparisons(job, field)
+    assert comparison.clip.rate_hz == 2.0
     whole = read_drive(job.decimated[0])
-    assert [f.digest() for f in bout.contest.frames] == [f.digest() for f in whole.frames[::5]]
-    assert [c.world_from_cam for c in bout.seen.cameras] == [
+    assert [f.digest() for f in comparison.clip.frames] == [f.digest() for f in whole.frames[::5]]
+    assert [c.world_from_cam for c in comparison.rendered.cameras] == [
         c.world_from_cam.rounded() for c in whole.cameras[::5]
     ]
 

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from rfcore.image import I420
-from rfedge.experiments.clips import CodedClip
-from rfedge.experiments.compare.measure import Clip, Performance, break_even_row, curve_rows
+from rfedge.experiments.clips import Clip, CodedClip
+from rfedge.experiments.compare.measure import break_even_row, curve_rows
+from rfedge.experiments.performance import Performance
 
 PLANE = np.zeros((2, 2), np.uint8)
 FRAME = I420(PLANE, PLANE[:1, :1], PLANE[:1, :1])
-CONTEST = Clip("street", 10.0, [FRAME] * 10, "digest", 27.5)
+CLIP = Clip("street", 10.0, [FRAME] * 10, "digest", 27.5)
 
 
 def performance(name, frame_bytes):
@@ -26,7 +27,7 @@ OURS, RIVAL = performance("ours", 400), performance("x264", 1000)
 
 
 def test_the_field_is_paid_for_by_whole_passes():
-    row = break_even_row(CONTEST, OURS, RIVAL, field_bytes=20_000)
+    row = break_even_row(CLIP, OURS, RIVAL, field_bytes=20_000)
     assert row["saved_bytes_per_pass"] == pytest.approx(6000)
     assert row["passes_to_break_even"] == 4
     after = row["saving_percent_after"]
@@ -35,12 +36,12 @@ def test_the_field_is_paid_for_by_whole_passes():
 
 
 def test_a_method_that_saves_nothing_never_pays_for_its_field():
-    row = break_even_row(CONTEST, RIVAL, OURS, field_bytes=20_000)
+    row = break_even_row(CLIP, RIVAL, OURS, field_bytes=20_000)
     assert row["passes_to_break_even"] is None
 
 
 def test_curves_run_from_the_lowest_quality_to_the_highest_with_their_points():
-    ours, rival = curve_rows(CONTEST, [OURS], {"x264-lowdelay": [RIVAL]})
+    ours, rival = curve_rows(CLIP, [OURS], {"x264-lowdelay": [RIVAL]})
     assert (ours["family"], rival["family"]) == ("", "x264-lowdelay")
     assert ours["point"] == [6, 5, 4, 3, 2, 1, 0]
     assert ours["psnr_db"] == sorted(ours["psnr_db"])

@@ -5,13 +5,14 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfedge.experiments.clips import Clip
 from rfedge.experiments.compare.foreground import (
     ForegroundCoder,
     by_macroblock,
     foreground_mask,
     foreground_row,
 )
-from rfedge.experiments.compare.measure import Clip, perform
+from rfedge.experiments.performance import perform
 
 SIZE = (96, 64)
 CHROMA = np.full((SIZE[1] // 2, SIZE[0] // 2), 128, np.uint8)
@@ -62,9 +63,9 @@ def test_no_rate_lifts_the_whole_picture_above_its_background():
 
 def test_against_itself_the_foreground_costs_the_same_and_the_ceiling_is_said():
     coder = ForegroundCoder.of("veryfast", MASKS, [RENDER] * 3, "test")
-    contest = Clip("street", 10.0, FRAMES, "digest", None)
-    clips = perform(contest, coder, NoStore()).clips
-    row = foreground_row(contest, clips, clips, MASKS)
+    clip = Clip("street", 10.0, FRAMES, "digest", None)
+    clips = perform(clip, coder, NoStore()).clips
+    row = foreground_row(clip, clips, clips, MASKS)
     assert row["bd_rate_percent"] == pytest.approx(0)
     assert row["whole_picture_ceiling_db"] == pytest.approx(
         10 * np.log10(255**2 / (36 * (~MASKS[0]).mean())), abs=0.2
@@ -73,7 +74,7 @@ def test_against_itself_the_foreground_costs_the_same_and_the_ceiling_is_said():
 
 def test_a_drive_without_foreground_is_refused():
     coder = ForegroundCoder.of("veryfast", MASKS, [RENDER] * 3, "test")
-    contest = Clip("street", 10.0, FRAMES, "digest", None)
-    clips = perform(contest, coder, NoStore()).clips
+    clip = Clip("street", 10.0, FRAMES, "digest", None)
+    clips = perform(clip, coder, NoStore()).clips
     with pytest.raises(InvalidInput, match="no frame differs"):
-        foreground_row(contest, clips, clips, [np.zeros_like(MASKS[0])] * 3)
+        foreground_row(clip, clips, clips, [np.zeros_like(MASKS[0])] * 3)

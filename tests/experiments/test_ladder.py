@@ -6,10 +6,14 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.ladder import Rung, read_ladder
 from rfcore.errors import InvalidInput
-from rfcore.field import Quality
+from rfcore.field import Quality, load_field
+from rfedge.experiments.clips import read_drive
+from rfedge.experiments.field_coder import FieldCoder, render_clip
 from rfedge.experiments.ladder import run
+from rfedge.experiments.ladder.measure import measure_rung, time_renders
 from rfedge.experiments.ladder.page import ladder_page, write_ladder_figure
 from rfedge.experiments.ladder.run import LadderJob, fronts, rate_percents, run_ladder, rungs_for
 
@@ -96,6 +100,61 @@ def test_a_ladder_is_measured_written_drawn_and_read_by_an_agent(tmp_path, monke
     page = ladder_page(result, {"run": {"curve": [[25, 26.0], [300, 28.97]]}})
     assert "| splats 10% render-only ultrafast crf28 | yes |" in page
     assert "| run | 300 | 28.97 |" in page
+
+
+@pytest.fixture(scope="module")
+def measured(thumbnail):
+    """Two rungs on the thumbnail at CRF 28: all there is, and the render alone."""
+    drive, field = read_drive(thumbnail.drive), load_field(thumbnail.field)
+    seen = time_renders(field, drive, Quality())
+    return {
+        references: measure_rung(drive, seen, Rung(references=references, preset="ultrafast"), 28.0)
+        for references in (3, 0)
+    }
+
+
+def test_a_rungs_time_is_the_sum_of_its_stages_at_both_ends(measured):
+    for row in measured.values():
+        assert row["sender_ms"] == pytest.approx(sum(row["sender_stage_ms"].values()))
+        assert row["receiver_ms"] == pytest.approx(sum(row["receiver_stage_ms"].values()))
+        assert list(row["sender_stage_ms"]) == [
+            "convert",
+            "render",
+            "references",
+            "encode",
+            "closed_loop",
+        ]
+        assert list(row["receiver_stage_ms"]) == ["render", "references", "splice", "decode"]
+        assert row["sender_stage_ms"]["render"] == row["receiver_stage_ms"]["render"]
+
+
+def test_references_are_counted_over_all_frames_but_the_first(measured):
+    assert measured[0]["references_used"] == {"render": 4}
+    assert sum(measured[3]["references_used"].values()) == 4
+    assert set(measured[3]["references_used"]) != {"render"}
+
+
+def test_bits_of_a_rung_are_those_of_whole_messages_in_the_steady_state(measured, thumbnail):
+    """The same as the coder of clips says, which codes in another order."""
+    drive, field = read_drive(thumbnail.drive), load_field(thumbnail.field)
+    coder = FieldCoder(
+        render_clip(field, drive.cameras),
+        "ours",
+        "test",
+        preset="ultrafast",
+        references=RENDER_ONLY,
+    )
+    clip = coder.code(drive.frames, 10, 28.0)
+    alone = measured[0]
+    assert alone["psnr_db"] == pytest.approx(clip.psnr_db())
+    # A rung without photometric search says nothing of light; the coder may.
+    assert alone["bits_per_frame"] == pytest.approx(8 * clip.bytes_per_frame(), rel=0.2)
+
+
+def test_a_quick_ladder_is_a_part_of_the_whole():
+    for kind in ("splats", "ngp"):
+        quick, whole = (set(rungs_for(kind, quick=quick)) for quick in (True, False))
+        assert quick < whole
 
 
 @pytest.mark.parametrize(

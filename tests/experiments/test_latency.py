@@ -78,6 +78,106 @@ def test_the_requirement_takes_three_hundred_thousand_frames():
     assert 299_000 < FRAMES_FOR_REQUIREMENT < 300_000
 
 
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 30.0])
+def test_on_a_link_that_is_quick_enough_nothing_waits_and_nothing_is_dropped(rate_hz):
+    sizes = [500, 2000, 800] * 20
+    played = play(sizes, rate_hz, constant(8 * 2000 * rate_hz))
+    assert played.dropped == 0
+    np.testing.assert_allclose(played.network_ms, played.tau_ms, rtol=1e-9)
+
+
+def test_twice_the_rate_halves_tau():
+    sizes = [500, 2000, 800]
+    slow, fast = (play(sizes, 1, constant(rate)).tau_ms for rate in (1e6, 2e6))
+    np.testing.assert_allclose(slow, 2 * fast)
+
+
+def test_no_latency_is_below_its_transmission_and_propagation():
+    rng = np.random.default_rng(3)
+    sizes = rng.integers(100, 6000, 300).tolist()
+    played = play(sizes, 20, constant(4e5, 0.01))
+    assert played.dropped > 0
+    assert played.frames == 300
+    assert (played.network_ms >= played.tau_ms + 10 - 1e-9).all()
+
+
+def test_shares_and_quantiles_agree():
+    sizes = np.random.default_rng(4).integers(100, 6000, 300).tolist()
+    played = play(sizes, 10, constant(4e5))
+    for share in (0.1, 0.5, 0.9):
+        assert played.share_within(played.quantile_ms(share)) >= share
+        assert played.share_within(played.quantile_ms(share) - 1e-6) <= share
+
+
+@pytest.fixture(scope="module")
+def latency(thumbnail, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("latency")
+    # One packet of 1500 bytes every 12 ms: 1 Mbit/s, in Mahimahi's format.
+    (folder / "steady.up").write_text("\n".join(str(12 * k) for k in range(1, 2000)))
+    job = LatencyJob(
+        thumbnail.field,
+        [thumbnail.drive],
+        [folder / "steady.up"],
+        "ultrafast",
+        36.0,
+        folder / "latency.json",
+        folder / "cells",
+        quick=True,
+    )
+    return job, run_latency(job, Console(quiet=True))
+
+
+def test_both_methods_are_played_at_the_same_quality_over_every_link(latency):
+    _, result = latency
+    assert len(result["needed"]) == 2
+    for row in result["needed"]:
+        assert 36.0 <= row["psnr_db"] < 37.5
+    links = {row["link"] for row in result["rows"]}
+    assert len(result["rows"]) == 2 * len(links) == 2 * 10
+    assert "steady" in links
+
+
+def test_a_quicker_link_takes_no_longer(latency):
+    _, result = latency
+    for method in {row["method"] for row in result["rows"]}:
+        rows = [r for r in result["rows"] if r["method"] == method and "Mbit" in r["link"]]
+        rows.sort(key=lambda row: row["rate_bps"])
+        taus = [row["tau_ms"]["mean"] for row in rows]
+        assert taus == sorted(taus, reverse=True)
+        shares = [row["share_within"]["10"] for row in rows]
+        assert shares == sorted(shares)
+
+
+def test_a_recorded_link_of_a_constant_rate_takes_about_as_long_as_the_rate(latency):
+    _, result = latency
+    for method in {row["method"] for row in result["rows"]}:
+        recorded, constant_rate = (
+            next(r for r in result["rows"] if (r["method"], r["link"]) == (method, link))
+            for link in ("steady", "1 Mbit/s")
+        )
+        assert recorded["rate_bps"] == pytest.approx(1e6, rel=1e-3)
+        # A packet leaves at the next of its link's ticks: at most 12 ms later.
+        wait_ms = recorded["network_ms"]["p50"] - constant_rate["network_ms"]["p50"]
+        assert -0.01 <= wait_ms <= 12.01
+
+
+def test_the_uplink_that_is_needed_sends_99_percent_in_time(latency):
+    job, result = latency
+    for row in result["needed"]:
+        five, ten = (row["uplink_bps_p99_within"][budget] for budget in ("5", "10"))
+        assert five > ten
+        assert ten >= 0.99 * 8 * row["largest_kbit"] / 8 * 1e3 / 0.01
+    assert json.loads(job.out.read_text()) == result
+
+
+def test_what_both_ends_compute_is_told_stage_by_stage(latency):
+    _, result = latency
+    ours, theirs = (row["stage_ms"] for row in result["needed"])
+    assert {"sender render", "sender encode", "receiver render", "receiver decode"} <= ours.keys()
+    assert theirs.keys() == {"sender encode"}
+    assert all(ms >= 0 for ms in (*ours.values(), *theirs.values()))
+
+
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_quick_run_writes_rows_figures_and_a_section(tmp_path):

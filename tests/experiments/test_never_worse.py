@@ -1,5 +1,6 @@
 """The never-worse table: its controls are what they say, and a useless field is noticed."""
 
+import io
 import json
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from rfcore.native.yuv import i420_from_colour
 from rfcore.raster.gaussians import Gaussians
 from rfcore.views import PosedPicture
 from rfedge.experiments.cells import CellStore
-from rfedge.experiments.clips import DriveFrames, DriveName
+from rfedge.experiments.clips import Drive, DriveName
 from rfedge.experiments.never_worse.measure import (
     CONTROLS,
     NeverWorse,
@@ -53,7 +54,7 @@ def drive():
         PosedPicture(str(k), camera, lambda: np.zeros((96, 160, 3), np.uint8))
         for k, camera in enumerate(CAMERAS)
     ]
-    return DriveFrames(DriveName("wall", 10.0, Path("wall.json")), pictures, frames)
+    return Drive(DriveName("wall", 10.0, Path("wall.json")), pictures, frames)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +88,7 @@ def test_a_row_tells_excess_without_header_and_whether_it_holds(tmp_path, seen):
         )
         for f in drive().frames
     ]
-    table = NeverWorse(DriveFrames(drive().name, drive().pictures, noisy), seen, "veryfast", "test")
+    table = NeverWorse(Drive(drive().name, drive().pictures, noisy), seen, "veryfast", "test")
     rows = list(table.rows(CellStore(tmp_path)))
     assert [(row["control"], row["at_db"]) for row in rows] == [
         (control, db) for control in CONTROLS for db in (31.0, 33.0, 35.0)
@@ -105,6 +106,53 @@ def test_a_row_tells_excess_without_header_and_whether_it_holds(tmp_path, seen):
 def test_a_job_without_drives_is_refused():
     with pytest.raises(InvalidInput, match="drives"):
         NeverWorseJob(Path("f.rff"), (), (), "veryfast", Path("o.json"), Path("cells"))
+
+
+@pytest.fixture(scope="module")
+def on_the_thumbnail(thumbnail, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("never-worse")
+    job = NeverWorseJob(
+        field=thumbnail.field,
+        drives=(thumbnail.drive,),
+        decimated=(),
+        preset="ultrafast",
+        out=folder / "never.json",
+        cells=folder / "cells",
+        quick=True,
+    )
+    console = Console(record=True, file=io.StringIO(), width=160)
+    return job, run_never_worse(job, console), console.export_text()
+
+
+def test_a_run_has_a_row_for_every_control_and_quality(on_the_thumbnail):
+    job, result, printed = on_the_thumbnail
+    rows = result["rows"]
+    assert [(row["control"], row["at_db"]) for row in rows] == [
+        (control, db) for control in CONTROLS for db in (31.0, 33.0, 35.0)
+    ]
+    assert json.loads(job.out.read_text())["rows"] == rows
+    assert printed.startswith("1 drives, about ")
+    assert all(f"{row['excess_percent']:.1f}" in printed for row in rows)
+
+
+def test_only_the_right_field_is_predicted_from(on_the_thumbnail):
+    _, result, _ = on_the_thumbnail
+    for row in result["rows"]:
+        assert ("render" in row["references"]) == (row["control"] == "right")
+
+
+def test_the_right_field_costs_less_than_none(on_the_thumbnail):
+    _, result, _ = on_the_thumbnail
+    at = {(row["control"], row["at_db"]): row["bytes"] for row in result["rows"]}
+    for db in (31.0, 33.0, 35.0):
+        assert at["right", db] < at["black", db]
+
+
+def test_a_run_that_is_finished_is_taken_from_its_cells(on_the_thumbnail):
+    job, result, _ = on_the_thumbnail
+    cells = {path: path.read_bytes() for path in job.cells.iterdir()}
+    assert run_never_worse(job, Console(quiet=True))["rows"] == result["rows"]
+    assert {path: path.read_bytes() for path in job.cells.iterdir()} == cells
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from rfedge.experiments.paper.figures import (
     write_paper_figures,
     write_views,
 )
-from rfedge.experiments.paper.run import PaperJob, named_path, run_paper
+from rfedge.experiments.paper.run import PaperJob, named_path, run_paper, views_of
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 ROW_KEYS = {
@@ -85,6 +85,92 @@ def test_every_figure_has_its_numbers_beside_it(tmp_path):
 def test_a_field_without_a_name_is_refused(text):
     with pytest.raises(InvalidInput, match="NAME=PATH"):
         named_path(text)
+
+
+@pytest.fixture(scope="module")
+def paper(thumbnail, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("paper")
+    drive = thumbnail.empty.partition("=")[2]
+    job = PaperJob(
+        fields=[f"3dgs={thumbnail.field}"],
+        drives=[f"wall={drive}"],
+        sizes_px=[(96, 64), (48, 32)],
+        out=folder / "paper.json",
+        cells=folder / "cells",
+        quick=True,
+    )
+    return job, run_paper(job, Console(quiet=True))
+
+
+def test_every_frame_is_coded_at_every_setting_with_both_controls_beside_it(paper):
+    _, result = paper
+    rows = result["rows"]
+    assert all(set(row) >= ROW_KEYS for row in rows)
+    full = [r for r in rows if r["field"] == "3dgs" and r["width"] == 96]
+    small = [r for r in rows if r["field"] == "3dgs" and r["width"] == 48]
+    # Two frames at three presets and three CRFs; at the small size rendered both ways.
+    assert (len(full), len(small)) == (2 * 9, 2 * 9 * 2)
+    controls = {row["field"] for row in rows} - {"3dgs"}
+    assert controls == {"3dgs:behind", "3dgs:grey"}
+    assert len(rows) == len(full) + len(small) + 2 * 2 * 2
+
+
+def test_the_field_saves_more_than_what_knows_nothing(paper):
+    _, result = paper
+    means = {(mean.field, mean.size_px[0], mean.making): mean for mean in means_of(result["rows"])}
+    for width in (96, 48):
+        field = means["3dgs", width, "downscaled"].savings_percent
+        assert field > means["3dgs:grey", width, "downscaled"].savings_percent
+        assert field > means["3dgs:behind", width, "downscaled"].savings_percent
+
+
+def test_the_published_figure_is_that_of_the_bytes_beside_it(paper):
+    _, result = paper
+    for row in result["rows"]:
+        expected = 100 * row["i_bytes"] / (row["i_bytes"] + row["p_bytes"])
+        assert row["savings_percent"] == pytest.approx(expected)
+
+
+def test_a_run_stopped_after_a_cell_goes_on_from_it(paper):
+    job, result = paper
+    cells = sorted(job.cells.iterdir())
+    times = [path.stat().st_mtime_ns for path in cells[1:]]
+    cells[0].unlink()
+    again = run_paper(job, Console(quiet=True))
+    assert again["rows"] == result["rows"]
+    assert [path.stat().st_mtime_ns for path in cells[1:]] == times
+    assert cells[0].exists()
+
+
+def test_the_first_frame_of_each_drive_is_shown_as_camera_and_field_see_it(paper):
+    job, _ = paper
+    views = dict(views_of(job))
+    assert list(views) == ["wall: camera", "wall: 3dgs"]
+    camera, render = views.values()
+    assert camera.shape == render.shape == (64, 96, 3)
+    assert np.abs(camera.astype(int) - render).mean() < 6, "the camera has noise of 3 levels"
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"fields": []}, "at least one field"),
+        ({"drives": []}, "at least one field, one drive"),
+        ({"sizes_px": []}, "one size"),
+        ({"every": 0}, "every"),
+        ({"out": Path("x.csv")}, "out"),
+    ],
+)
+def test_a_job_that_cannot_be_done_is_refused_by_name(change, named):
+    given = {
+        "fields": ["a=b"],
+        "drives": ["c=d"],
+        "sizes_px": [(96, 64)],
+        "out": Path("p.json"),
+        "cells": Path("cells"),
+    }
+    with pytest.raises(InvalidInput, match=named):
+        PaperJob(**(given | change))
 
 
 @pytest.mark.slow

@@ -1,8 +1,12 @@
 """Curves whose BD-rate is known by algebra, and the published implementation as an oracle."""
 
+from itertools import pairwise
+
 import bjontegaard
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from rfcore.errors import InvalidInput
 from rfedge.experiments.clips import CodedClip
@@ -102,6 +106,106 @@ def test_the_interval_holds_the_figure_and_repeats_with_its_seed():
     curves = rate_curve(anchor, slice(1, None)), rate_curve(test, slice(1, None))
     assert low < bd_rate_percent(*curves, window) < high
     assert (low, high) == bd_rate_interval(anchor, test, window, np.random.default_rng(1))
+
+
+def test_the_first_frame_is_never_drawn():
+    """Bytes that differ in the first frame alone leave the interval of a ratio at that ratio."""
+    test = [
+        CodedClip(
+            clip.point,
+            np.concatenate([clip.frame_bytes[:1] * 1000, clip.frame_bytes[1:]]),
+            clip.luma_mse,
+            clip.ssim,
+            1.0,
+        )
+        for clip in clips(0.5)
+    ]
+    interval = bd_rate_interval(clips(1), test, (30, 36), np.random.default_rng(1))
+    assert interval == pytest.approx((-50, -50), abs=1e-2)
+
+
+def test_another_seed_gives_another_interval_around_the_same_figure():
+    anchor, test = clips(1, seed=3), clips(0.7, seed=4)
+    several = {
+        bd_rate_interval(anchor, test, (30, 36), np.random.default_rng(seed)) for seed in range(3)
+    }
+    assert len(several) == 3
+    lows, highs = zip(*several, strict=True)
+    assert max(lows) < min(highs)
+
+
+def test_more_frames_narrow_the_interval():
+    def width(frames):
+        anchor, test = clips(1, frames, seed=3), clips(0.7, frames, seed=4)
+        low, high = bd_rate_interval(anchor, test, (30, 36), np.random.default_rng(1))
+        return high - low
+
+    assert width(400) < 0.5 * width(12)
+
+
+def test_an_interval_that_most_draws_leave_is_refused():
+    uneven = [
+        CodedClip(c.point, c.frame_bytes, c.luma_mse * np.linspace(0.2, 1.8, 12), c.ssim, 1.0)
+        for c in clips(1)
+    ]
+    window = (float(rate_curve(uneven, slice(1, None)).psnr_db[0]) + 0.01, 35.0)
+    with pytest.raises(InvalidInput, match=r"only \d+ of 400 resampled clips span"):
+        bd_rate_interval(uneven, uneven, window, np.random.default_rng(1))
+
+
+increments = st.lists(st.floats(0.3, 4.0), min_size=7, max_size=7)
+factors = st.floats(0.05, 20.0)
+
+
+def curve_of(decibel_steps, log_steps):
+    return RateCurve(28 + np.cumsum(decibel_steps), np.exp(5 + np.cumsum(log_steps) / 4))
+
+
+@settings(max_examples=30)
+@given(increments, increments)
+def test_a_curve_against_itself_is_nought(decibels, logs):
+    curve = curve_of(decibels, logs)
+    window = (float(curve.psnr_db[0]), float(curve.psnr_db[-1]))
+    assert bd_rate_percent(curve, curve, window) == 0
+
+
+@settings(max_examples=30)
+@given(increments, increments, factors)
+def test_times_k_the_bytes_are_k_minus_one_more_in_any_window(decibels, logs, factor):
+    curve = curve_of(decibels, logs)
+    test = RateCurve(curve.psnr_db, factor * curve.bytes_per_frame)
+    low, high = float(curve.psnr_db[0]), float(curve.psnr_db[-1])
+    for window in ((low, high), (low, (low + high) / 2), (curve.psnr_db[2], curve.psnr_db[3])):
+        assert bd_rate_percent(curve, test, window) == pytest.approx(100 * (factor - 1), rel=1e-6)
+
+
+@settings(max_examples=30)
+@given(increments, increments, increments)
+def test_the_figure_of_a_window_lies_between_those_of_its_halves(decibels, logs, other):
+    anchor, test = curve_of(decibels, logs), curve_of(decibels, other)
+    low, high = float(anchor.psnr_db[0]), float(anchor.psnr_db[-1])
+    middle = (low + high) / 2
+    halves = [bd_rate_percent(anchor, test, w) for w in ((low, middle), (middle, high))]
+    assert min(halves) - 1e-6 <= bd_rate_percent(anchor, test, (low, high)) <= max(halves) + 1e-6
+
+
+@settings(max_examples=30)
+@given(increments, increments, increments)
+def test_any_curves_have_the_published_implementations_figure(decibels, logs, other):
+    anchor, test = curve_of(decibels, logs), curve_of(decibels, other)
+    window = (float(anchor.psnr_db[0]), float(anchor.psnr_db[-1]))
+    theirs = bjontegaard.bd_rate(
+        anchor.bytes_per_frame, anchor.psnr_db, test.bytes_per_frame, test.psnr_db, method="pchip"
+    )
+    assert bd_rate_percent(anchor, test, window) == pytest.approx(theirs, rel=1e-6, abs=1e-6)
+
+
+@settings(max_examples=30)
+@given(increments, increments)
+def test_a_better_quality_never_takes_fewer_bytes_where_points_do_not(decibels, logs):
+    curve = curve_of(decibels, logs)
+    at = [curve.bytes_at(db) for db in np.linspace(curve.psnr_db[0], curve.psnr_db[-1], 50)]
+    assert all(a <= b * (1 + 1e-12) for a, b in pairwise(at))
 
 
 def test_points_of_one_quality_count_once_at_the_fewest_bytes():

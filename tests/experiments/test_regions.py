@@ -9,7 +9,7 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420
 from rfcore.views import FieldView
 from rfedge.experiments.compare.bit_split import KINDS, SplitClip, macroblock_kinds, split_rows
-from rfedge.experiments.field_coder import SeenClip
+from rfedge.experiments.field_coder import RenderedClip
 
 SIZE = (96, 64)
 INTRINSICS = Intrinsics(*SIZE, 64.0, 64.0, 48.0, 32.0)
@@ -64,7 +64,7 @@ def test_bits_go_where_the_frame_differs_from_the_field():
     noisy = [FLAT.y.copy() for _ in range(3)]
     for luma in noisy:
         luma[moving] = rng.integers(30, 220, moving.sum())
-    seen = SeenClip((wall(),) * 3, (EVERYWHERE,) * 3, "field", 0.0)
+    seen = RenderedClip((wall(),) * 3, (EVERYWHERE,) * 3, "field", 0.0)
     rows = split_rows(SplitClip([picture(y) for y in noisy], seen, [moving] * 3, "veryfast", 26.0))
     shares = {row["shows"]: row for row in rows}
     assert shares["moving"]["slice_percent"] > 90

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from rfcore.errors import InvalidInput
+from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
+from rfedge.experiments.compare.drives import rival_families
 from rfedge.experiments.rivals import (
+    Rival,
     svtav1_lowdelay,
     x264_for_psnr,
     x264_lowdelay,
@@ -77,3 +79,102 @@ def test_tuning_for_psnr_changes_the_stream(plain, tuned):
     clip = panning_clip()
     coded = [rival.code(clip, 10, 30.0).frame_bytes.tolist() for rival in (plain, tuned)]
     assert coded[0] != coded[1]
+
+
+def options_of(rival):
+    """Return the options that the encoder says it runs with; ``no-x`` is x = no."""
+    text = rival.effective_options.split("options: ")[1]
+    words = [word.split("=", 1) for word in text.split()]
+    return {
+        word[0].removeprefix("no-"): word[1]
+        if len(word) == 2
+        else ("no" if word[0].startswith("no-") else "yes")
+        for word in words
+    }
+
+
+# Of every H.264 and H.265 rival, what decides how strong it is. Taken from the encoders' own SEI
+# messages (x264 core 165, x265 4.2), presets as documented by `x264 --fullhelp`.
+X264 = {
+    "cabac": "1",
+    "bframes": "0",
+    "8x8dct": "1",
+    "deblock": "1:0:0",
+    "scenecut": "0",
+    "threads": "1",
+    "sliced_threads": "0",
+    "rc": "crf",
+    "mbtree": "0",
+    "keyint": "infinite",
+    "intra_refresh": "0",
+}
+VERYFAST = X264 | {"ref": "1", "me": "hex", "subme": "2", "trellis": "0", "weightp": "1"}
+PLAIN = VERYFAST | {"psy": "1", "psy_rd": "1.00:0.00", "aq": "1:1.00"}
+FOR_PSNR = {"psy": "0", "aq": "0"}
+MEDIUM = X264 | {"ref": "3", "me": "hex", "subme": "7", "trellis": "1", "weightp": "2"}
+VERYSLOW = X264 | {"ref": "16", "me": "umh", "subme": "9", "trellis": "2", "me_range": "24"}
+X265 = {"bframes": "0", "scenecut": "0", "rc": "crf", "rc-lookahead": "0", "deblock": "0:0"}
+X265_VERYFAST = X265 | {"ref": "2", "rd": "2", "subme": "1", "max-merge": "2", "signhide": "yes"}
+X265_MEDIUM = X265 | {"ref": "3", "rd": "3", "subme": "2", "max-merge": "3", "signhide": "yes"}
+X265_PLAIN = {"psy-rd": "2.00", "aq-mode": "2", "aq-strength": "1.00"}
+X265_FOR_PSNR = {"psy-rd": "0.00", "psy-rdoq": "0.00", "aq-mode": "0"}
+PINNED = {
+    "x264-lowdelay-veryfast": PLAIN,
+    "x264-lowdelay-psnr-veryfast": VERYFAST | FOR_PSNR,
+    "x264-lowdelay-psnr-medium": MEDIUM | FOR_PSNR,
+    "x264-lowdelay-psnr-veryslow": VERYSLOW | FOR_PSNR,
+    "x264-keyint-10-veryfast": PLAIN | {"keyint": "10"},
+    "x264-keyint-30-veryfast": PLAIN | {"keyint": "30"},
+    "x264-keyint-250-veryfast": PLAIN | {"keyint": "250"},
+    "x264-intra-refresh-10-veryfast": PLAIN | {"keyint": "10", "intra_refresh": "1"},
+    "x265-lowdelay-veryfast": X265_VERYFAST | X265_PLAIN,
+    "x265-lowdelay-psnr-veryfast": X265_VERYFAST | X265_FOR_PSNR,
+    "x265-lowdelay-psnr-medium": X265_MEDIUM | X265_FOR_PSNR,
+}
+BY_NAME = {
+    rival.name: rival
+    for family in rival_families("veryfast", quick=False).values()
+    for rival in family
+}
+
+
+@pytest.mark.parametrize("name", PINNED)
+def test_a_rival_runs_with_the_options_it_is_named_for(name):
+    found = options_of(BY_NAME[name])
+    assert {key: found.get(key) for key in PINNED[name]} == PINNED[name]
+
+
+def test_every_rival_whose_options_can_be_read_is_pinned():
+    readable = {name for name, rival in BY_NAME.items() if "options: " in rival.effective_options}
+    assert readable == set(PINNED)
+
+
+def test_av1_rivals_run_with_low_delay_at_their_presets():
+    av1 = {name: rival for name, rival in BY_NAME.items() if rival.encoder == "libsvtav1"}
+    assert [rival.options["preset"] for rival in av1.values()] == ["10", "8", "6", "4"]
+    for rival in av1.values():
+        assert rival.options["svtav1-params"] == "pred-struct=1:keyint=-1:lp=1:rc=0"
+
+
+def test_the_families_are_the_anchors_and_what_is_stronger():
+    families = rival_families("veryfast", quick=False)
+    names = {family: [rival.name for rival in rivals] for family, rivals in families.items()}
+    assert names["x264-lowdelay"] == ["x264-lowdelay-veryfast"]
+    assert names["x264-lowdelay-psnr"] == ["x264-lowdelay-psnr-veryfast"]
+    assert names["x264-stronger"] == ["x264-lowdelay-psnr-medium", "x264-lowdelay-psnr-veryslow"]
+    assert len(names["x265-lowdelay"]) == 3
+    assert len(names["svtav1-lowdelay"]) == 4
+    assert rival_families("veryfast", quick=True).keys() <= families.keys()
+
+
+def test_another_option_is_another_version():
+    plain = x264_lowdelay("veryfast")
+    weaker = x264_lowdelay("veryfast", plain.name, subme="0")
+    assert plain.version != weaker.version
+    assert plain.version == x264_lowdelay("veryfast").version
+    assert svtav1_lowdelay(8).version != svtav1_lowdelay(6).version
+
+
+def test_an_encoder_that_refuses_its_options_is_named():
+    with pytest.raises(CodecError, match="nobody"):
+        Rival("nobody", "libx264", "h264", {"preset": "nosuch"}).code(panning_clip(1), 10, 23.0)

@@ -13,6 +13,95 @@ from rfedge.experiments.robust.run import RobustJob, run_robust
 SAMPLES = Path(__file__).parents[2] / "samples"
 
 
+QUALITY_DB = 40.0
+
+
+@pytest.fixture(scope="module")
+def robust(thumbnail, tmp_path_factory):
+    """A quick run on the thumbnail, its own drive standing for those of another lane and light."""
+    folder = tmp_path_factory.mktemp("robust")
+    job = RobustJob(
+        thumbnail.field,
+        thumbnail.drive,
+        thumbnail.drive.replace("wall@", "dusk@"),
+        thumbnail.drive.replace("wall@", "lane@"),
+        "ultrafast",
+        QUALITY_DB,
+        5,
+        folder / "robust.json",
+        folder / "cells",
+        quick=True,
+    )
+    return job, run_robust(job, Console(quiet=True))
+
+
+def test_every_method_crosses_every_link_at_every_rate_factor(robust):
+    _, result = robust
+    crossed = [(r["method"], r["rtt_ms"], r["loss_percent"], r["crf"]) for r in result["crossings"]]
+    assert len(set(crossed)) == len(crossed) == (2 * 3 + 5 * 2) * 2 * 2
+    for row in result["crossings"]:
+        assert row["frames"] == 4
+        assert 0 <= row["not_new"] <= 4
+        assert row["ssim_p5"] <= row["ssim"] <= 1
+
+
+def test_without_loss_every_frame_of_ours_is_new(robust):
+    _, result = robust
+    lossless = [r for r in result["crossings"] if r["loss_percent"] == 0]
+    assert [r["not_new"] for r in lossless] == [0] * len(lossless)
+
+
+def test_a_finer_rate_factor_takes_more_and_shows_more(robust):
+    _, result = robust
+    for method in ("last-sent", "x264-intra-refresh"):
+        rows = sorted(
+            (
+                r
+                for r in result["crossings"]
+                if (r["method"], r["rtt_ms"], r["loss_percent"]) == (method, 20, 0)
+            ),
+            key=lambda r: r["crf"],
+        )
+        rates = [r["kbps"] for r in rows]
+        assert rates == sorted(rates, reverse=True)
+        assert rows[0]["ssim"] > rows[-1]["ssim"]
+
+
+def test_methods_are_compared_at_a_rate_that_all_of_them_reach(robust):
+    _, result = robust
+    for row in result["rows"]:
+        rates = [
+            r["kbps"]
+            for r in result["crossings"]
+            if all(r[key] == row[key] for key in ("method", "rtt_ms", "loss_percent"))
+        ]
+        assert min(rates) <= result["equal_rate_kbps"] <= max(rates)
+    assert len(result["rows"]) == 5 * 2 * 2
+
+
+def test_what_disturbs_is_compared_with_what_does_not(robust):
+    _, result = robust
+    rows = {(r["condition"], r["level"]): r for r in result["disturbances"]}
+    noise = [r for r in result["disturbances"] if r["condition"] == "pose noise"]
+    assert noise[0]["more_percent"] == 0
+    assert noise[1]["more_percent"] > 5, "10 cm and 0.1 degrees of 4 m"
+    lane = rows["lane offset", "lane"]
+    assert lane["kbit"] == pytest.approx(noise[0]["kbit"]), "it is the same drive here"
+    assert lane["against_x264_percent"] == pytest.approx(
+        100 * (lane["kbit"] / lane["x264_kbit"] - 1)
+    )
+    assert {("light", "uncorrected"), ("light", "photometric")} <= rows.keys()
+
+
+def test_a_run_that_is_finished_gives_the_same_rows_from_its_cells(robust):
+    job, result = robust
+    again = run_robust(job, Console(quiet=True))
+    assert {key: again[key] for key in ("rows", "crossings", "disturbances")} == {
+        key: result[key] for key in ("rows", "crossings", "disturbances")
+    }
+    assert json.loads(job.out.read_text())["crossings"] == result["crossings"]
+
+
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_quick_run_writes_rows_a_figure_and_a_section_and_goes_on(tmp_path):

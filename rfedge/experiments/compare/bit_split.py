@@ -1,16 +1,15 @@
 """Where the bits of a drive go, by what each macroblock of a frame shows.
 
-The bits of a kind are those a frame is shorter by when its macroblocks of that kind show exactly
-what reference 0 shows there, so that nothing is left to send. That is a measurement by x264 itself,
-not an estimate; neighbours lean on each other, so the parts are scaled to the sum of the slice.
-
-What each macroblock of a frame shows, by what the sender and the receiver could know of it.
-
-Per pixel, in this order: *off-map*, where the field shows nothing; *moving*, where the camera
+A pixel shows, in this order: *off-map*, where the field has nothing; *moving*, where the camera
 differs from the same drive through the empty street (parked objects count too: what is not in the
 field); *entering*, where the field's surface was outside the previous view; *disoccluded*, where it
 was inside but behind another surface; and *static*, all else. A macroblock is of the first kind
 that covers a quarter of it.
+
+The bits of a kind are measured with x264: by how much the frame's slice becomes shorter when its
+macroblocks of that kind show exactly what reference 0 shows there, so that nothing is left to send.
+Neighbouring macroblocks predict each other, so these parts do not add up to the slice; they are
+scaled to its size.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from rfcore.codec.state import EncoderState
 from rfcore.image import I420
 from rfcore.views import FieldView
 from rfedge.experiments.compare.foreground import by_macroblock, composed
-from rfedge.experiments.field_coder import SeenClip
+from rfedge.experiments.field_coder import RenderedClip
 
 __all__ = ["KINDS", "SplitClip", "macroblock_kinds", "split_rows"]
 
@@ -97,7 +96,7 @@ class SplitClip:
     """A clip to look into; ``foregrounds`` bool [H, W] a frame, what is not in the field."""
 
     frames: Sequence[I420]
-    seen: SeenClip
+    rendered: RenderedClip
     foregrounds: Sequence[NDArray[np.bool_]]
     preset: str
     crf: float
@@ -125,15 +124,15 @@ def split_rows(clip: SplitClip) -> list[dict[str, Any]]:
 def _frames(clip: SplitClip) -> Iterator[tuple[F64, F64]]:
     """Yield macroblocks and slice bytes by kind for every frame but the first."""
     encoder = DeltaEncoder(CodecConfig(*clip.frames[0].size_px, preset=clip.preset, crf=clip.crf))
-    state, seen = encoder.start(1), clip.seen
+    state, rendered = encoder.start(1), clip.rendered
     for index, frame in enumerate(clip.frames):
-        coding = _Coding(encoder, state, seen.views[index])
+        coding = _Coding(encoder, state, rendered.views[index])
         made = coding.of(frame)
         if index:
             kinds = macroblock_kinds(
-                seen.views[index - 1],
-                seen.views[index],
-                seen.covered[index],
+                rendered.views[index - 1],
+                rendered.views[index],
+                rendered.covered[index],
                 clip.foregrounds[index],
             )
             yield (

@@ -1,14 +1,18 @@
-"""One drive of a comparison with everybody who codes it, read and rendered before anything runs.
+"""What is compared on each drive: our codec, families of rival settings, codecs a user brings.
 
-Who is compared with: families of encoder settings, and codecs that a user brings.
+Drives are read and rendered, and users' codecs loaded, before anything is coded.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +21,12 @@ from rfcore.codec.references import RENDER_ONLY
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
 from rfcore.train import mean_psnr_db
-from rfedge.experiments.clips import DECIMATION, ClipCoder, DriveFrames, DriveName, read_drive
+from rfedge.experiments.cells import program_version
+from rfedge.experiments.clips import DECIMATION, Clip, ClipCoder, Drive, DriveName, read_drive
 from rfedge.experiments.compare.foreground import ForegroundCoder, foreground_mask
-from rfedge.experiments.compare.measure import Clip
-from rfedge.experiments.field_coder import FieldCoder, SeenClip, see_clip
+from rfedge.experiments.compare.measure import WINDOWS_DB
+from rfedge.experiments.field_coder import FieldCoder, RenderedClip, render_clip
+from rfedge.experiments.rate_curve import Window
 from rfedge.experiments.rivals import (
     Rival,
     svtav1_lowdelay,
@@ -29,7 +35,7 @@ from rfedge.experiments.rivals import (
     x265_for_psnr,
     x265_lowdelay,
 )
-from rfedge.results import check_result_path, revision
+from rfedge.results import check_result_path
 
 __all__ = [
     "CompareJob",
@@ -80,16 +86,52 @@ def _with_intra_refresh(preset: str) -> Rival:
 
 
 def foreign_coder(text: str) -> ClipCoder:
-    """Return an instance of ``package.module:Class``; raise ``InvalidInput`` if there is none."""
-    module, _, name = text.partition(":")
+    """Return an instance of ``package.module:Class``, from the working folder or an installed
+    package; raise ``InvalidInput`` saying what was looked for if there is none."""
+    module_name, colon, class_name = text.partition(":")
+    if not (module_name and colon and class_name):
+        raise InvalidInput("method", f"{text!r} is not MODULE:CLASS, as mjpeg_rival:MotionJpeg")
+    module = _imported(text, module_name)
+    made = getattr(module, class_name, None)
+    if made is None:
+        where = getattr(module, "__file__", None) or "which is built in"
+        raise InvalidInput("method", f"{text!r}: {module_name} ({where}) has no {class_name!r}")
     try:
-        coder: ClipCoder = getattr(importlib.import_module(module), name)()
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise InvalidInput("method", f"{text!r} is no package.module:Class ({error})") from error
+        coder: ClipCoder = made()
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InvalidInput(
+            "method", f"{text!r} cannot be called without arguments: {error}"
+        ) from error
     missing = [key for key in ("name", "points", "version", "code") if not hasattr(coder, key)]
     if missing:
         raise InvalidInput("method", f"{text!r} lacks {', '.join(missing)} of a ClipCoder")
     return coder
+
+
+def _imported(text: str, module_name: str) -> ModuleType:
+    try:
+        with _working_folder_on_path():
+            return importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and f"{module_name}.".startswith(f"{error.name}."):
+            file = f"{module_name.replace('.', '/')}.py"
+            why = f"there is neither {Path.cwd() / file} nor an installed module {module_name!r}"
+            raise InvalidInput("method", f"{text!r}: {why}") from error
+        raise InvalidInput("method", f"{text!r}: {module_name} needs {error.name!r}") from error
+    except (ImportError, ValueError, TypeError) as error:
+        raise InvalidInput("method", f"{text!r} cannot be imported: {error}") from error
+
+
+@contextmanager
+def _working_folder_on_path() -> Iterator[None]:
+    """Let modules of the working folder be found, as ``python -m`` does, and no longer."""
+    folder = str(Path.cwd())
+    sys.path.insert(0, folder)
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        sys.path.remove(folder)
 
 
 QUICK_FRAMES = 8
@@ -109,11 +151,20 @@ class CompareJob:
     methods: Sequence[str] = ()
     quick: bool = False
     retime: bool = False
+    window_db: Window | None = None
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
         if not (self.drives or self.decimated):
             raise InvalidInput("drives", "there is none")
+        low_db, high_db = self.windows_db[0]
+        if not 0 < low_db < high_db < math.inf:
+            raise InvalidInput("window", f"{low_db:g} {high_db:g} are not two rising decibels")
+
+    @property
+    def windows_db(self) -> tuple[Window, ...]:
+        """The qualities asked about, the one that must be spanned first."""
+        return WINDOWS_DB if self.window_db is None else (self.window_db,)
 
 
 @dataclass(frozen=True)
@@ -124,8 +175,8 @@ class DriveComparison:
     drive shows that; else nothing. ``background``: its digest.
     """
 
-    contest: Clip
-    seen: SeenClip
+    clip: Clip
+    rendered: RenderedClip
     foregrounds: Sequence[NDArray[np.bool_]]
     background: str | None
     methods: Sequence[FieldCoder]
@@ -133,15 +184,20 @@ class DriveComparison:
     foreground_only: ForegroundCoder | None
 
     @property
+    def compared(self) -> list[ClipCoder]:
+        """Everybody who takes part in the BD-rates, ours first."""
+        rivals = (coder for family in self.families.values() for coder in family)
+        return [*self.methods, *rivals]
+
+    @property
     def coders(self) -> list[ClipCoder]:
         """All of them, ours first."""
-        rivals = (coder for family in self.families.values() for coder in family)
         last = [] if self.foreground_only is None else [self.foreground_only]
-        return [*self.methods, *rivals, *last]
+        return [*self.compared, *last]
 
 
 def read_drive_comparisons(job: CompareJob, field: RadianceField) -> list[DriveComparison]:
-    """Return a bout per drive.
+    """Return a comparison per drive.
 
     Raises ``InvalidInput`` for a background that does not fit its drive, and as ``read_drive``.
     """
@@ -151,12 +207,12 @@ def read_drive_comparisons(job: CompareJob, field: RadianceField) -> list[DriveC
     if unknown:
         raise InvalidInput("background", f"there is no drive {sorted(unknown)} to stand behind")
     slow = [read_drive(text).every(DECIMATION) for text in job.decimated]
-    bouts = [_drive_comparison(job, drive, None, field) for drive in slow]
+    comparisons = [_drive_comparison(job, drive, None, field) for drive in slow]
     for text in job.drives:
         behind = backgrounds.get(_name(text))
         background = None if behind is None else read_drive(behind, limit)
-        bouts.append(_drive_comparison(job, read_drive(text, limit), background, field))
-    return bouts
+        comparisons.append(_drive_comparison(job, read_drive(text, limit), background, field))
+    return comparisons
 
 
 def _name(text: str) -> tuple[str, float]:
@@ -165,20 +221,21 @@ def _name(text: str) -> tuple[str, float]:
 
 
 def _drive_comparison(
-    job: CompareJob, drive: DriveFrames, background: DriveFrames | None, field: RadianceField
+    job: CompareJob, drive: Drive, background: Drive | None, field: RadianceField
 ) -> DriveComparison:
-    name, quality_db = drive.name, mean_psnr_db(field, drive.pictures)
-    contest = Clip(name.scene, name.rate_hz, drive.frames, drive.digest, quality_db)
+    clip = drive.clip(field_psnr_db=mean_psnr_db(field, drive.pictures))
     families = rival_families(job.preset, quick=job.quick)
     families |= {coder.name: [coder] for coder in map(foreign_coder, job.methods)}
-    seen = see_clip(field, drive.cameras)
+    rendered = render_clip(field, drive.cameras)
     foregrounds = _foregrounds(drive, background)
     behind = None if background is None else background.digest
-    stamp = revision() if behind is None else f"{revision()}-before-{behind[:16]}"
+    stamp = program_version()
+    if behind is not None:
+        stamp += f", before {behind[:16]}"
     coders = [
         FieldCoder(
-            seen,
-            f"{name}-{job.preset}-{seen.field_id[:12]}",
+            rendered,
+            f"{name}-{job.preset}-{rendered.field_id[:12]}",
             stamp,
             preset=job.preset,
             references=references,
@@ -188,12 +245,12 @@ def _drive_comparison(
     ]
     rival = None
     if behind is not None:
-        rival_stamp = f"{stamp}-{seen.field_id}"
-        rival = ForegroundCoder.of(job.preset, foregrounds, seen.renders, rival_stamp)
-    return DriveComparison(contest, seen, foregrounds, behind, coders, families, rival)
+        rival_stamp = f"{stamp}, field {rendered.field_id}"
+        rival = ForegroundCoder.of(job.preset, foregrounds, rendered.renders, rival_stamp)
+    return DriveComparison(clip, rendered, foregrounds, behind, coders, families, rival)
 
 
-def _foregrounds(drive: DriveFrames, background: DriveFrames | None) -> list[NDArray[np.bool_]]:
+def _foregrounds(drive: Drive, background: Drive | None) -> list[NDArray[np.bool_]]:
     if background is None:
         return [np.zeros(frame.y.shape, bool) for frame in drive.frames]
     if len(background.frames) != len(drive.frames):

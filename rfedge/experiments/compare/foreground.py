@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfedge.experiments.clips import CodedClip, luma_mse, luma_sse
-from rfedge.experiments.compare.measure import STEADY, Clip
+from rfedge.experiments.clips import STEADY, Clip, CodedClip, luma_mse, luma_sse, psnr_of_mse
 from rfedge.experiments.picture_quality import luma_ssim
 from rfedge.experiments.rate_curve import RateCurve, bd_rate_percent
 from rfedge.experiments.rivals import Rival, x264_for_psnr
@@ -35,7 +34,6 @@ MACROBLOCK_PX = 16
 DIFFERENT_LEVELS = 12
 IDR_EACH_FRAMES = 10
 GROUND_LEVEL = 128
-PEAK = 255.0
 MIN_WINDOW_DB = 1.0
 Mask = NDArray[np.bool_]
 
@@ -70,11 +68,17 @@ class ForegroundCoder:
     masks: Sequence[Mask]
     renders: Sequence[I420]
     rival: Rival
-    version: str
+    stamp: str
+    """What the result depends on besides the rival's options: the field, the background, ours."""
+
+    @property
+    def version(self) -> str:
+        """The stamp and the rival's version."""
+        return f"{self.stamp}; {self.rival.version}"
 
     @staticmethod
     def of(
-        preset: str, masks: Sequence[Mask], renders: Sequence[I420], version: str
+        preset: str, masks: Sequence[Mask], renders: Sequence[I420], stamp: str
     ) -> ForegroundCoder:
         """Return one at x264's ``preset``; the frames of a clip must be those of the masks."""
         plain = x264_for_psnr(preset)
@@ -82,7 +86,7 @@ class ForegroundCoder:
             "keyint=infinite", f"keyint={IDR_EACH_FRAMES}"
         )
         rival = replace(plain, options={**plain.options, "x264-params": params})
-        return ForegroundCoder(f"rfdvc-style-{preset}", masks, renders, rival, version)
+        return ForegroundCoder(f"rfdvc-style-{preset}", masks, renders, rival, stamp)
 
     @property
     def points(self) -> Sequence[float]:
@@ -117,7 +121,7 @@ class ForegroundCoder:
 
 
 def foreground_row(
-    contest: Clip, ours: Sequence[CodedClip], theirs: Sequence[CodedClip], masks: Sequence[Mask]
+    clip: Clip, ours: Sequence[CodedClip], theirs: Sequence[CodedClip], masks: Sequence[Mask]
 ) -> dict[str, Any]:
     """Return both on the foreground's quality, over the window both span, and the rival's ceiling.
 
@@ -126,21 +130,19 @@ def foreground_row(
     """
     pixels = np.array([mask.sum() for mask in masks], np.float64)
     if not pixels[STEADY].any():
-        raise InvalidInput("background", f"{contest.scene}: no frame differs from it")
+        raise InvalidInput("background", f"{clip.scene}: no frame differs from it")
     curves = [_foreground_curve(clips, pixels) for clips in (ours, theirs)]
     low = max(float(curve.psnr_db[0]) for curve in curves)
     high = min(float(curve.psnr_db[-1]) for curve in curves)
     shared = high - low >= MIN_WINDOW_DB
     return {
-        "scene": contest.scene,
-        "hz": contest.rate_hz,
+        "scene": clip.scene,
+        "hz": clip.rate_hz,
         "mask": f"macroblocks where |camera - empty street| > {DIFFERENT_LEVELS} levels",
         "foreground_percent": 100 * float(np.mean([mask.mean() for mask in masks])),
         "window_db": [low, high] if shared else None,
         "bd_rate_percent": bd_rate_percent(curves[1], curves[0], (low, high)) if shared else None,
-        "whole_picture_ceiling_db": max(
-            _psnr_db(float(clip.luma_mse[STEADY].mean())) for clip in theirs
-        ),
+        "whole_picture_ceiling_db": max(coded.psnr_db() for coded in theirs),
         "ours": _points(curves[0]),
         "rfdvc_style": _points(curves[1]),
     }
@@ -148,10 +150,10 @@ def foreground_row(
 
 def _foreground_curve(clips: Sequence[CodedClip], pixels: NDArray[np.float64]) -> RateCurve:
     points = []
-    for clip in clips:
-        errors = np.array(clip.notes["foreground_sse"], np.float64)
+    for coded in clips:
+        errors = np.array(coded.notes["foreground_sse"], np.float64)
         mse = errors[STEADY].sum() / pixels[STEADY].sum()
-        points.append((_psnr_db(float(mse)), float(clip.frame_bytes[STEADY].mean())))
+        points.append((psnr_of_mse(float(mse)), coded.bytes_per_frame()))
     psnr_db, rates = zip(*sorted(points), strict=True)
     return RateCurve(np.array(psnr_db), np.array(rates))
 
@@ -161,10 +163,6 @@ def _points(curve: RateCurve) -> dict[str, list[float]]:
         "foreground_psnr_db": curve.psnr_db.tolist(),
         "bytes_per_frame": curve.bytes_per_frame.tolist(),
     }
-
-
-def _psnr_db(mse: float) -> float:
-    return float(10 * np.log10(PEAK * PEAK / mse))
 
 
 def _on_flat_ground(frame: I420, block: Mask) -> I420:

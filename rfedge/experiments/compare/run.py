@@ -1,4 +1,8 @@
-"""Run a comparison: drives and a field in, one result file out, the cost said before it starts."""
+"""Run a comparison: drives and a field in, one result file out.
+
+What it will do and what that will take is said before it starts. The ends of every curve are coded
+first, so that a window that cannot be spanned ends the run before its long part.
+"""
 
 from __future__ import annotations
 
@@ -9,21 +13,14 @@ from rich.console import Console
 from rich.table import Table
 
 from rfcore.field import load_field
-from rfedge.experiments.cells import CellStore
+from rfedge.experiments.cells import CellStore, clip_key
 from rfedge.experiments.clips import ClipCoder, DriveName
 from rfedge.experiments.compare.bit_split import SplitClip, split_rows
 from rfedge.experiments.compare.drives import CompareJob, DriveComparison, read_drive_comparisons
 from rfedge.experiments.compare.foreground import foreground_row
-from rfedge.experiments.compare.measure import (
-    BEST,
-    MIDDLE_DB,
-    Performance,
-    break_even_row,
-    compare_rows,
-    curve_rows,
-    perform,
-    seconds_left,
-)
+from rfedge.experiments.compare.measure import BEST, break_even_row, compare_rows, curve_rows
+from rfedge.experiments.performance import Performance, perform, seconds_left, spanning_points
+from rfedge.experiments.rate_curve import Window
 from rfedge.results import provenance, revision, write_result
 
 __all__ = ["run_compare"]
@@ -35,19 +32,20 @@ Row = dict[str, Any]
 def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
     """Code every drive with every coder, write ``job.out`` and print the rows.
 
-    Raises ``InvalidInput`` or ``DatasetError`` before anything is coded if an input is wrong.
+    Raises ``InvalidInput`` or ``DatasetError`` before anything is coded if an input is wrong, and
+    ``InvalidInput`` after the ends of the curves if one cannot span the window.
     """
     for text in (*job.drives, *job.decimated, *job.backgrounds):
         DriveName.parse(text)
     field = load_field(job.field)
-    bouts = read_drive_comparisons(job, field)
+    comparisons = read_drive_comparisons(job, field)
     store = CellStore(job.cells)
-    left_s = sum(seconds_left(bout.contest, bout.coders, store) for bout in bouts)
-    cells = sum(len(coder.points) for bout in bouts for coder in bout.coders)
-    console.print(f"{cells} clips to code, about {left_s / 60:.1f} minutes of them left to do")
+    _announce(job, comparisons, store, console)
+    for comparison in comparisons:
+        _check_window(job, comparison, store, console)
     tables: dict[str, list[Row]] = {}
-    for bout in bouts:
-        for name, rows in _tables(job, bout, store, console).items():
+    for comparison in comparisons:
+        for name, rows in _tables(job, comparison, store, console).items():
             tables.setdefault(name, []).extend(rows)
     result = {
         "case": "compare",
@@ -55,7 +53,7 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
         "quick": job.quick,
         "field_id": field.field_id,
         "field_bytes": job.field.stat().st_size,
-        "frames": {f"{b.contest.scene}@{b.contest.rate_hz:g}": _frames(b) for b in bouts},
+        "frames": {f"{b.clip.scene}@{b.clip.rate_hz:g}": _frames(b) for b in comparisons},
         **tables,
     }
     write_result(job.out, result)
@@ -63,41 +61,90 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
     return result
 
 
+def _announce(
+    job: CompareJob,
+    comparisons: Sequence[DriveComparison],
+    store: CellStore,
+    console: Console,
+) -> None:
+    left_s = sum(seconds_left(c.clip, c.coders, store) for c in comparisons)
+    clips = sum(len(coder.points) for c in comparisons for coder in c.coders)
+    headline, *wider = map(_in_words, job.windows_db)
+    also = f" (and {', '.join(wider)} where it is spanned)" if wider else ""
+    console.print(
+        f"BD-rates over {headline}{also}: {clips} clips to code, about {left_s / 60:.1f} minutes "
+        "of them left to do. Points are added where a curve does not span the window: the ends of "
+        "all curves are coded first."
+    )
+
+
+def _check_window(
+    job: CompareJob, comparison: DriveComparison, store: CellStore, console: Console
+) -> None:
+    """Code the ends of every curve, ours first: the field decides how low it can reach."""
+    clip, window = comparison.clip, job.windows_db[0]
+    for coder in comparison.compared:
+        points = spanning_points(clip, coder, store, window)
+        added = [f"{point:g}" for point in points if point not in coder.points]
+        if added:
+            console.print(
+                f"  {clip.scene} {clip.rate_hz:g} Hz: {coder.name} also at {', '.join(added)}, to "
+                f"span {_in_words(window)}"
+            )
+
+
+def _in_words(window_db: Window) -> str:
+    low_db, high_db = window_db
+    return f"{low_db:g}..{high_db:g} dB"
+
+
 def _tables(
-    job: CompareJob, bout: DriveComparison, store: CellStore, console: Console
+    job: CompareJob, comparison: DriveComparison, store: CellStore, console: Console
 ) -> dict[str, list[Row]]:
-    contest = bout.contest
+    clip, window = comparison.clip, job.windows_db[0]
 
     def performed(coder: ClipCoder) -> Performance:
-        console.print(f"  {contest.scene} {contest.rate_hz:g} Hz: {coder.name}")
-        return perform(contest, coder, store, retime=job.retime)
+        console.print(f"  {clip.scene} {clip.rate_hz:g} Hz: {coder.name}")
+        return perform(clip, coder, store, window_db=window, retime=job.retime)
 
-    families = {n: [performed(c) for c in family] for n, family in bout.families.items()}
-    methods = [performed(coder) for coder in bout.methods]
+    families = {n: [performed(c) for c in family] for n, family in comparison.families.items()}
+    methods = [performed(coder) for coder in comparison.methods]
     anchor, field_bytes = families[ANCHOR][0], job.field.stat().st_size
     foreground = []
-    if bout.foreground_only is not None:
-        theirs = performed(bout.foreground_only).clips
-        foreground = [foreground_row(contest, methods[0].clips, theirs, bout.foregrounds)]
+    if comparison.foreground_only is not None:
+        # Its whole picture has a ceiling below any window: it is not asked to span one.
+        theirs = perform(clip, comparison.foreground_only, store, retime=job.retime).clips
+        foreground = [foreground_row(clip, methods[0].clips, theirs, comparison.foregrounds)]
     return {
-        "rows": [row for method in methods for row in compare_rows(contest, method, families)],
-        "break_even": [break_even_row(contest, m, anchor, field_bytes) for m in methods],
-        "bits": _bits(job, bout, methods[0], store),
+        "rows": [
+            row
+            for method in methods
+            for row in compare_rows(clip, method, families, job.windows_db)
+        ],
+        "break_even": [break_even_row(clip, m, anchor, field_bytes) for m in methods],
+        "bits": _bits(job, comparison, methods[0], store),
         "foreground": foreground,
-        "curves": curve_rows(contest, methods, families),
+        "curves": curve_rows(clip, methods, families),
     }
 
 
-def _bits(job: CompareJob, bout: DriveComparison, ours: Performance, store: CellStore) -> list[Row]:
-    contest, crf = bout.contest, ours.nearest(MIDDLE_DB).point
-    clip = SplitClip(contest.frames, bout.seen, bout.foregrounds, job.preset, crf)
-    key = {**contest.cell_key(bout.methods[0], crf), "split": 1, "background": bout.background}
-    same = {"scene": contest.scene, "hz": contest.rate_hz, "method": ours.name, "crf": crf}
-    return [same | row for row in store.rows(key, lambda: split_rows(clip))]
+def _bits(
+    job: CompareJob, comparison: DriveComparison, ours: Performance, store: CellStore
+) -> list[Row]:
+    clip, middle_db = comparison.clip, sum(job.windows_db[0]) / 2
+    crf = ours.nearest(middle_db).point
+    split = SplitClip(clip.frames, comparison.rendered, comparison.foregrounds, job.preset, crf)
+    key = {
+        **clip_key(clip, comparison.methods[0], crf),
+        "split": 1,
+        "background": comparison.background,
+    }
+    same = {"scene": clip.scene, "hz": clip.rate_hz, "method": ours.name, "crf": crf}
+    return [same | row for row in store.rows(key, lambda: split_rows(split))]
 
 
-def _frames(bout: DriveComparison) -> dict[str, Any]:
-    return {"count": len(bout.contest.frames), "sha256": bout.contest.frames_digest}
+def _frames(comparison: DriveComparison) -> dict[str, Any]:
+    return {"count": len(comparison.clip.frames), "sha256": comparison.clip.frames_digest}
 
 
 def _print(rows: Sequence[Row], console: Console) -> None:

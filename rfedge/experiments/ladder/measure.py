@@ -10,7 +10,6 @@ rendered again for every rung.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,70 +18,46 @@ from typing import Any
 
 import numpy as np
 
-from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.references import RENDER_ONLY, references_name
-from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
+from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.sender.ladder import Rung
-from rfcore.dataset import Dataset
 from rfcore.errors import CodecError
 from rfcore.field import Quality, RadianceField, render_field_view
-from rfcore.image import I420, Rgb
+from rfcore.image import I420
 from rfcore.metrics import ssim
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView
-from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.messages import Frame
-from rfedge.experiments.clips import luma_mse
+from rfedge.experiments.clips import Drive, luma_mse, psnr_of_mse
+from rfedge.experiments.field_coder import message_bytes
+from rfedge.offline import CodedFrame, FrameInput, decode_promised, encode_frames
 
-__all__ = ["LadderClip", "Rendered", "measure_rung", "render_clip"]
+__all__ = ["TimedRenders", "measure_rung", "time_renders"]
 
 SENDER_STAGES = ("references", "encode", "closed_loop")
 RECEIVER_STAGES = ("references", "splice", "decode")
 Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class LadderClip:
-    """A drive's pictures in memory, with their cameras as a vehicle rounds them."""
-
-    cameras: tuple[Camera, ...]
-    pictures: tuple[Rgb, ...]
-    frames: tuple[I420, ...]
-
-    @staticmethod
-    def of(dataset: Dataset, count: int | None) -> LadderClip:
-        """Read the first ``count`` pictures of a drive."""
-        posed = dataset.pictures[:count]
-        cameras = [picture.camera.rounded() for picture in posed]
-        pictures = tuple(picture.read() for picture in posed)
-        return LadderClip(tuple(cameras), pictures, tuple(map(i420_from_rgb, pictures)))
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 over the frames' digests."""
-        return hashlib.sha256(b"".join(frame.digest() for frame in self.frames)).hexdigest()
-
-
-class Marks:
-    """A clock for codec objects that notes both times whenever it is looked at."""
+class StageClock:
+    """A clock for codec objects that keeps processor and wall time of every reading."""
 
     def __init__(self) -> None:
-        self._seen: list[tuple[int, int]] = []
+        self._readings: list[tuple[int, int]] = []
 
     def __call__(self) -> int:
-        self._seen.append((process_time_ns(), perf_counter_ns()))
-        return self._seen[-1][0]
+        self._readings.append((process_time_ns(), perf_counter_ns()))
+        return self._readings[-1][0]
 
     def spent_ms(self) -> list[tuple[float, float]]:
-        """Return (cpu, wall) between the looks since last asked, and forget them."""
-        seen, self._seen = self._seen, []
-        return [((b[0] - a[0]) / 1e6, (b[1] - a[1]) / 1e6) for a, b in pairwise(seen)]
+        """Return (cpu, wall) between the readings since the last call, and forget them."""
+        readings, self._readings = self._readings, []
+        return [((b[0] - a[0]) / 1e6, (b[1] - a[1]) / 1e6) for a, b in pairwise(readings)]
 
 
 @dataclass(frozen=True)
-class Rendered:
+class TimedRenders:
     """A clip's views at one quality, with what a frame took to render and to convert: (cpu, wall)
     in milliseconds, lower quartiles."""
 
@@ -91,52 +66,52 @@ class Rendered:
     convert_ms: tuple[float, float]
 
 
-def render_clip(field: RadianceField, clip: LadderClip, quality: Quality) -> Rendered:
-    """Render every pose of ``clip``, after one that makes what is made lazily."""
+def time_renders(field: RadianceField, drive: Drive, quality: Quality) -> TimedRenders:
+    """Render every pose of ``drive``, after one that makes what is made lazily."""
+    pictures = [picture.read() for picture in drive.pictures]
+    cameras = drive.cameras
     field.prepare(quality)
-    render_field_view(field, clip.cameras[0], quality)
-    marks = Marks()
+    render_field_view(field, cameras[0], quality)
+    clock = StageClock()
     views, render_ms, convert_ms = [], [], []
-    for camera, picture in zip(clip.cameras, clip.pictures, strict=True):
-        marks()
+    for camera, picture in zip(cameras, pictures, strict=True):
+        clock()
         views.append(render_field_view(field, camera, quality))
-        marks()
+        clock()
         i420_from_rgb(picture)
-        marks()
-        rendering, converting = marks.spent_ms()
+        clock()
+        rendering, converting = clock.spent_ms()
         render_ms.append(rendering)
         convert_ms.append(converting)
-    return Rendered(tuple(views), _quartile(render_ms), _quartile(convert_ms))
+    return TimedRenders(tuple(views), _quartile(render_ms), _quartile(convert_ms))
 
 
-def measure_rung(clip: LadderClip, seen: Rendered, rung: Rung, crf: float) -> Row:
-    """Code and decode ``clip`` on ``rung``; return times, bits of whole messages, and quality.
+def measure_rung(drive: Drive, rendered: TimedRenders, rung: Rung, crf: float) -> Row:
+    """Code and decode ``drive`` on ``rung``; return times, bits of whole messages, and quality.
 
     Raises ``CodecError`` if the receiver does not see what the sender promised.
     """
     sender, receiver = _Stages(SENDER_STAGES), _Stages(RECEIVER_STAGES)
-    encoder = DeltaEncoder(CodecConfig(*clip.frames[0].size_px, rung.preset, crf), sender.marks)
-    decoder = DeltaDecoder(encoder.header, clock_ns=receiver.marks)
-    sending, receiving = encoder.start(1), decoder.start(1)
+    config = CodecConfig(*drive.frames[0].size_px, rung.preset, crf)
+    encoder = DeltaEncoder(config, sender.clock)
+    decoder = DeltaDecoder(encoder.header, clock_ns=receiver.clock)
     choice = _choice(rung)
-    coded: list[Encoded] = []
+    inputs = (
+        FrameInput(*given, choice) for given in zip(drive.frames, rendered.views, strict=True)
+    )
+    coded: list[CodedFrame] = []
     shown: list[I420] = []
-    for index, frame in enumerate(clip.frames):
-        view = seen.views[index]
-        made = encoder.encode(sending, frame, view, choice)
+    # Nothing is collected in between, so that a frame is decoded before the next one is coded.
+    for frame, picture in decode_promised(decoder, encode_frames(encoder, inputs)):
         sender.frame_ended()
-        got = decoder.decode(receiving, made.packet, view)
         receiver.frame_ended()
-        if got.frame.digest() != made.reconstruction.digest():
-            raise CodecError(f"frame {index} decodes to another picture than was promised")
-        sending, receiving = made.state, got.state
-        coded.append(made)
-        shown.append(got.frame)
-    sizes = [_message_bytes(clip, rung, k, made) for k, made in enumerate(coded)]
-    pairs = list(zip(shown, clip.frames, strict=True))[1:]
+        coded.append(frame)
+        shown.append(picture)
+    sizes = [message_bytes(frame.arrival, rung.quality) for frame in coded]
+    pairs = list(zip(shown, drive.frames, strict=True))[1:]
     mse = float(np.mean([luma_mse(*pair) for pair in pairs]))
-    sender_ms = {"convert": seen.convert_ms, "render": seen.render_ms, **sender.quartiles()}
-    receiver_ms = {"render": seen.render_ms, **receiver.quartiles()}
+    sender_ms = {"convert": rendered.convert_ms, "render": rendered.render_ms, **sender.quartiles()}
+    receiver_ms = {"render": rendered.render_ms, **receiver.quartiles()}
     return {
         "sender_ms": sum(cpu for cpu, _ in sender_ms.values()),
         "receiver_ms": sum(cpu for cpu, _ in receiver_ms.values()),
@@ -145,22 +120,22 @@ def measure_rung(clip: LadderClip, seen: Rendered, rung: Rung, crf: float) -> Ro
         "sender_stage_ms": _cpu(sender_ms),
         "receiver_stage_ms": _cpu(receiver_ms),
         "bits_per_frame": 8 * float(np.mean(sizes[1:])),
-        "psnr_db": float(10 * np.log10(255.0**2 / mse)),
+        "psnr_db": psnr_of_mse(mse),
         "ssim": float(np.mean([ssim(ours.y, theirs.y) for ours, theirs in pairs])),
         "references_used": _counts(coded[1:]),
     }
 
 
 class _Stages:
-    """(cpu, wall) of each stage of each frame; the codec looks at the clock between them."""
+    """(cpu, wall) of each stage of each frame; the codec reads the clock between them."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        self.marks = Marks()
+        self.clock = StageClock()
         self._names = names
         self._frames: list[list[tuple[float, float]]] = []
 
     def frame_ended(self) -> None:
-        spent = self.marks.spent_ms()
+        spent = self.clock.spent_ms()
         if len(spent) != len(self._names):
             raise CodecError(f"{len(spent)} stages where {', '.join(self._names)} are expected")
         self._frames.append(spent)
@@ -179,14 +154,8 @@ def _choice(rung: Rung) -> FrameChoice:
     )
 
 
-def _message_bytes(clip: LadderClip, rung: Rung, index: int, made: Encoded) -> int:
-    pose = clip.cameras[index].world_from_cam
-    frame = Frame("front", 1_700_000_000_000_000_000, pose, b"", made.packet, rung.quality)
-    return len(client_message_to_bytes(frame))
-
-
-def _counts(coded: Sequence[Encoded]) -> dict[str, int]:
-    names = [references_name(made.packet.references) for made in coded]
+def _counts(coded: Sequence[CodedFrame]) -> dict[str, int]:
+    names = [references_name(frame.encoded.packet.references) for frame in coded]
     return {name: names.count(name) for name in dict.fromkeys(names)}
 
 

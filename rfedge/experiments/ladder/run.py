@@ -1,9 +1,9 @@
-"""Measure a ladder: fields and a drive in, ``ladder.json`` out, the cost said before it starts.
+"""Measure a ladder: fields and a drive in, ``ladder.json`` out.
 
-Which rungs are measured, and what a rung is worth against the first.
-
-For splats: every detail with three, one and no temporal references at three presets, and from the
-full rung one further knob at a time. For hash grids: samples along a ray, and the picture's scale.
+A rung is one setting of the sender. Measured are, for splats, every level of detail with three, one
+and no temporal references at three presets, and each other setting alone against the full rung; for
+hash grids, samples along a ray and the picture's scale. A rung is judged by its bits at equal
+quality against the first one, and by whether another beats it in both time and bits.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import numpy as np
 from rich.console import Console
 
 from rfcore.codec.sender.ladder import Rung
-from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.field.interface import NGP, SPLATS
 from rfcore.field.quality import DETAILS, Quality
-from rfedge.experiments.cells import CellKey, CellStore
-from rfedge.experiments.ladder.measure import LadderClip, Rendered, measure_rung, render_clip
+from rfedge.experiments.cells import CellKey, CellStore, program_version
+from rfedge.experiments.clips import Drive, DriveName, read_drive
+from rfedge.experiments.ladder.measure import TimedRenders, measure_rung, time_renders
 from rfedge.results import check_result_path, provenance, revision, write_result
 
 __all__ = ["CRFS", "LadderJob", "fronts", "rate_percents", "run_ladder", "rungs_for"]
@@ -128,6 +128,8 @@ def _beats(other: RungRow, row: RungRow) -> bool:
 
 QUICK_FRAMES = 4
 PROBE_FRAMES = 3
+NOMINAL_RATE_HZ = 10.0
+"""A drive has a rate; bits and times of a rung do not depend on it."""
 Row = dict[str, Any]
 
 
@@ -152,11 +154,11 @@ class LadderJob:
 
 @dataclass(frozen=True)
 class Contender:
-    """One field with the rungs it is measured on, and its clip's renders as they are needed."""
+    """One field with the rungs it is measured on, and its drive's renders as they are needed."""
 
     field: RadianceField
-    clip: LadderClip
-    revision: str
+    drive: Drive
+    program: str
     quick: bool
 
     @cached_property
@@ -165,25 +167,25 @@ class Contender:
         return rungs_for(self.field.metadata.kind, quick=self.quick)
 
     @cached_property
-    def _seen(self) -> dict[Quality, Rendered]:
+    def _kept(self) -> dict[Quality, TimedRenders]:
         return {}
 
-    def seen(self, quality: Quality) -> Rendered:
-        """Return the clip rendered at ``quality``; the last one asked for is kept."""
-        if quality not in self._seen:
-            self._seen.clear()
-            self._seen[quality] = render_clip(self.field, self.clip, quality)
-        return self._seen[quality]
+    def rendered(self, quality: Quality) -> TimedRenders:
+        """Return the drive rendered at ``quality``; the last one asked for is kept."""
+        if quality not in self._kept:
+            self._kept.clear()
+            self._kept[quality] = time_renders(self.field, self.drive, quality)
+        return self._kept[quality]
 
     def key(self, rung: Rung, crf: float) -> CellKey:
         """Name the cell of a rung at a CRF."""
         return {
             "verb": "ladder",
             "field": self.field.field_id,
-            "frames": self.clip.digest,
+            "frames": self.drive.digest,
             "rung": rung.name,
             "crf": crf,
-            "revision": self.revision,
+            "program": self.program,
         }
 
     def measured(self, rung: Rung, crf: float) -> Row:
@@ -203,7 +205,7 @@ class Contender:
                 "rough": rung.fast_unsent,
                 "crf": crf,
             },
-            **measure_rung(self.clip, self.seen(quality), rung, crf),
+            **measure_rung(self.drive, self.rendered(quality), rung, crf),
         }
 
 
@@ -212,10 +214,12 @@ def run_ladder(job: LadderJob, console: Console) -> Row:
 
     Raises ``InvalidInput`` or ``DatasetError`` before anything is measured if an input is wrong.
     """
-    dataset = read_dataset(job.drive)
-    clip = LadderClip.of(dataset, QUICK_FRAMES if job.quick else job.frames)
+    name = DriveName(job.drive.stem, NOMINAL_RATE_HZ, job.drive)
+    drive = read_drive(name, QUICK_FRAMES if job.quick else job.frames)
     at = revision()
-    contenders = [Contender(load_field(path), clip, at, job.quick) for path in job.fields]
+    contenders = [
+        Contender(load_field(path), drive, program_version(), job.quick) for path in job.fields
+    ]
     store = CellStore(job.cells)
     _say_cost(contenders, store, console)
     curves = [
@@ -229,7 +233,7 @@ def run_ladder(job: LadderJob, console: Console) -> Row:
         **provenance(at),
         "quick": job.quick,
         "threads": 1,
-        "size_px": list(clip.frames[0].size_px),
+        "size_px": list(drive.frames[0].size_px),
         "fields": [
             {
                 "kind": c.field.metadata.kind,
@@ -239,7 +243,7 @@ def run_ladder(job: LadderJob, console: Console) -> Row:
             }
             for c in contenders
         ],
-        "frames": {"drive": str(job.drive), "count": len(clip.frames), "sha256": clip.digest},
+        "frames": {"drive": str(job.drive), "count": len(drive.frames), "sha256": drive.digest},
         "rows": rows,
     }
     write_result(job.out, result)
@@ -278,20 +282,14 @@ def _say_cost(contenders: Sequence[Contender], store: CellStore, console: Consol
         missing = sum(not store.has(key) for key in keys)
         cells, left = cells + len(keys), left + missing
         if missing:
-            probe = _shortened(contender.clip)
+            probe = contender.drive.first(PROBE_FRAMES)
             began_s = monotonic()
             first = contender.rungs[0]
-            seen = render_clip(contender.field, probe, first.quality)
+            rendered = time_renders(contender.field, probe, first.quality)
             rendered_s = monotonic()
-            measure_rung(probe, seen, first, CRFS[1])
-            per_frame = len(contender.clip.frames) / PROBE_FRAMES
+            measure_rung(probe, rendered, first, CRFS[1])
+            per_frame = len(contender.drive.frames) / PROBE_FRAMES
             qualities = len({rung.quality for rung in contender.rungs})
             seconds += per_frame * qualities * (rendered_s - began_s)
             seconds += per_frame * missing * (monotonic() - rendered_s)
     console.print(f"{cells} rungs to measure, {left} of them left: at most {seconds / 60:.1f} min")
-
-
-def _shortened(clip: LadderClip) -> LadderClip:
-    return LadderClip(
-        clip.cameras[:PROBE_FRAMES], clip.pictures[:PROBE_FRAMES], clip.frames[:PROBE_FRAMES]
-    )

@@ -1,14 +1,12 @@
-"""Run the latency experiment: drives and a field in, ``latency.json`` out.
+"""How long frames take over links, on a virtual clock: drives and a field in, one result out.
 
 Ours and low-delay x264 of the same preset are coded to the same quality (the CRF is searched in
-steps of a half), then played over constant rates and over recorded links.
-
-How long a frame takes over a link, on a virtual clock: the paper's tau, and what users feel.
+steps of a half), then sent over constant rates and over recorded links.
 
 ``tau`` is a message's own transmission time. The network latency adds waiting behind earlier
-frames and the link's propagation; end to end adds what both ends compute. A clip is played again
-and again (its first frame once), captured at its rate. As the product does, at most ``WINDOW``
-frames are under way: a frame that finds more is dropped before it is coded, and counts as late.
+frames and the link's propagation; end to end adds what both ends compute. A clip is sent again and
+again without its first frame, captured at its rate. As the product does, at most ``WINDOW`` frames
+are under way: a frame that finds more is dropped before it is coded, and counts as late.
 """
 
 from __future__ import annotations
@@ -26,16 +24,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from rfcore.codec.sender.ladder import Rung
-from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.link import DirectionPlan, LinkProfile
 from rfcore.link.trace import read_mahimahi
-from rfedge.experiments.cells import CellStore
-from rfedge.experiments.clips import ClipCoder, CodedClip, DriveName
-from rfedge.experiments.compare.measure import Clip
-from rfedge.experiments.field_coder import FieldCoder, see_clip
-from rfedge.experiments.ladder.measure import LadderClip, measure_rung, render_clip
+from rfedge.experiments.cells import CellStore, clip_key, program_version
+from rfedge.experiments.clips import Clip, ClipCoder, CodedClip, Drive, DriveName, read_drive
+from rfedge.experiments.field_coder import FieldCoder, render_clip
+from rfedge.experiments.ladder.measure import measure_rung, time_renders
 from rfedge.experiments.rivals import x264_lowdelay
 from rfedge.results import check_result_path, provenance, revision, write_result
 
@@ -169,21 +165,20 @@ class LatencyJob:
 class Sender:
     """A method at one quality: its frames, and what both ends compute, stage by stage."""
 
-    contest: Clip
+    clip: Clip
     method: str
-    clip: CodedClip
+    coded: CodedClip
     stage_ms: dict[str, float]
 
     @property
     def facts(self) -> Row:
         """What every row says about the sender."""
-        mse = float(self.clip.luma_mse[1:].mean())
         return {
-            "scene": self.contest.scene,
-            "hz": self.contest.rate_hz,
+            "scene": self.clip.scene,
+            "hz": self.clip.rate_hz,
             "method": self.method,
-            "crf": self.clip.point,
-            "psnr_db": float(10 * np.log10(255.0**2 / mse)),
+            "crf": self.coded.point,
+            "psnr_db": self.coded.psnr_db(),
         }
 
 
@@ -204,8 +199,8 @@ def run_latency(job: LatencyJob, console: Console) -> Row:
         **provenance(revision()),
         "quick": job.quick,
         "field_id": field.field_id,
-        "field_psnr_db": {s.contest.scene: s.contest.field_psnr_db for s in senders},
-        "frames": {s.contest.scene: s.contest.frames_digest for s in senders},
+        "field_psnr_db": {s.clip.scene: s.clip.field_psnr_db for s in senders},
+        "frames": {s.clip.scene: s.clip.frames_digest for s in senders},
         "traces": {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in job.traces},
         "played_frames": PLAYED_FRAMES,
         "requirement": {"share": REQUIREMENT, "frames_needed": FRAMES_FOR_REQUIREMENT},
@@ -227,49 +222,48 @@ def _links(traces: Sequence[Path]) -> Iterator[tuple[str, DirectionPlan]]:
 def _senders(
     job: LatencyJob, name: DriveName, field: RadianceField, console: Console
 ) -> Iterator[Sender]:
-    clip = LadderClip.of(read_dataset(name.dataset), QUICK_FRAMES if job.quick else None)
-    seen = see_clip(field, clip.cameras)
-    contest = Clip(name.scene, name.rate_hz, clip.frames, clip.digest, None)
+    drive = read_drive(name, QUICK_FRAMES if job.quick else None)
+    rendered, clip = render_clip(field, drive.cameras), drive.clip()
     store = CellStore(job.cells)
-    ours = FieldCoder(seen, f"rfedge-{job.preset}", revision(), preset=job.preset)
-    coded = _at_quality(contest, ours, job.quality_db, store)
-    yield Sender(contest, ours.name, coded, _own_stages(job, clip, field, coded.point))
+    ours = FieldCoder(rendered, f"rfedge-{job.preset}", program_version(), preset=job.preset)
+    coded = _at_quality(clip, ours, job.quality_db, store)
+    yield Sender(clip, ours.name, coded, _own_stages(job, drive, field, coded.point))
     rival = x264_lowdelay(job.preset)
-    coded = _at_quality(contest, rival, job.quality_db, store)
+    coded = _at_quality(clip, rival, job.quality_db, store)
     stages = {"sender encode": coded.cpu_ms / len(coded.frame_bytes)}
-    yield Sender(contest, rival.name, coded, stages)
+    yield Sender(clip, rival.name, coded, stages)
     console.print(f"  {name.scene} {name.rate_hz:g} Hz")
 
 
 def _own_stages(
-    job: LatencyJob, clip: LadderClip, field: RadianceField, crf: float
+    job: LatencyJob, drive: Drive, field: RadianceField, crf: float
 ) -> dict[str, float]:
     """Return the milliseconds of both ends, from the ladder's measurement of the full rung."""
     rung = Rung(preset=job.preset)
-    row = measure_rung(clip, render_clip(field, clip, rung.quality), rung, crf)
+    row = measure_rung(drive, time_renders(field, drive, rung.quality), rung, crf)
     ours = {f"sender {name}": ms for name, ms in row["sender_stage_ms"].items()}
     return ours | {f"receiver {name}": ms for name, ms in row["receiver_stage_ms"].items()}
 
 
-def _at_quality(contest: Clip, coder: ClipCoder, quality_db: float, store: CellStore) -> CodedClip:
+def _at_quality(clip: Clip, coder: ClipCoder, quality_db: float, store: CellStore) -> CodedClip:
     """Return the clip at the highest CRF, in steps of a half, that is not below ``quality_db``."""
 
     def coded(crf: float) -> CodedClip:
-        key = contest.cell_key(coder, crf)
-        return store.clip(key, lambda: coder.code(contest.frames, contest.rate_hz, crf))
+        key = clip_key(clip, coder, crf)
+        return store.clip(key, lambda: coder.code(clip.frames, clip.rate_hz, crf))
 
     low, high = LOWEST_CRF, HIGHEST_CRF
     crf = FIRST_CRF
     while high - low > CRF_STEP:
-        good = 10 * np.log10(255.0**2 / coded(crf).luma_mse[1:].mean()) >= quality_db
+        good = coded(crf).psnr_db() >= quality_db
         low, high = (crf, high) if good else (low, crf)
         crf = low + CRF_STEP * max(1, round((high - low) / 2 / CRF_STEP))
     return coded(low)
 
 
 def _row(sender: Sender, name: str, plan: DirectionPlan) -> Row:
-    sizes = repeated(sender.clip.frame_bytes.tolist(), PLAYED_FRAMES)
-    played = play(sizes, sender.contest.rate_hz, plan)
+    sizes = repeated(sender.coded.frame_bytes.tolist(), PLAYED_FRAMES)
+    played = play(sizes, sender.clip.rate_hz, plan)
     computing_ms = sum(sender.stage_ms.values())
     curve = [played.quantile_ms(share) for share in np.linspace(0, 1, CURVE_POINTS)]
     return {
@@ -289,13 +283,13 @@ def _row(sender: Sender, name: str, plan: DirectionPlan) -> Row:
 
 
 def _needed(sender: Sender) -> Row:
-    sizes = repeated(sender.clip.frame_bytes.tolist(), PLAYED_FRAMES)
-    rate_hz = sender.contest.rate_hz
+    sizes = repeated(sender.coded.frame_bytes.tolist(), PLAYED_FRAMES)
+    rate_hz = sender.clip.rate_hz
     return {
         **sender.facts,
-        "kbit_per_frame": 8e-3 * float(sender.clip.frame_bytes[1:].mean()),
-        "largest_kbit": 8e-3 * float(sender.clip.frame_bytes[1:].max()),
-        "first_frame_kbit": 8e-3 * float(sender.clip.frame_bytes[0]),
+        "kbit_per_frame": 8e-3 * sender.coded.bytes_per_frame(),
+        "largest_kbit": 8e-3 * float(sender.coded.frame_bytes[1:].max()),
+        "first_frame_kbit": 8e-3 * float(sender.coded.frame_bytes[0]),
         "uplink_bps_p99_within": {
             f"{ms:g}": needed_rate_bps(sizes, rate_hz, ms) for ms in BUDGETS_MS
         },

@@ -3,9 +3,7 @@
 At 31, 33 and 35 dB a frame may cost at most 2 % more than x264 with low delay at the same preset,
 its header apart. Two controls make the field useless: ``wrong-street`` is the field seen a quarter
 turn to the left, depth and picture alike, and ``black`` is a black picture at depth 0. Both ends
-believe them; what saves the sender is that it notices.
-
-Run the never-worse table over drives, with every fifth frame of some as a slow camera.
+predict from them; the sender must notice by itself that they are of no use.
 """
 
 from __future__ import annotations
@@ -24,10 +22,10 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
 from rfcore.views import FieldView
-from rfedge.experiments.cells import CellStore
-from rfedge.experiments.clips import DECIMATION, ClipCoder, DriveFrames, DriveName, read_drive
-from rfedge.experiments.compare.measure import Clip, Performance, perform, seconds_left
-from rfedge.experiments.field_coder import FieldCoder, SeenClip, see_clip
+from rfedge.experiments.cells import CellStore, program_version
+from rfedge.experiments.clips import DECIMATION, Clip, ClipCoder, Drive, DriveName, read_drive
+from rfedge.experiments.field_coder import FieldCoder, RenderedClip, render_clip
+from rfedge.experiments.performance import Performance, perform, seconds_left
 from rfedge.experiments.rivals import x264_for_psnr, x264_lowdelay
 from rfedge.results import check_result_path, provenance, revision, write_result
 
@@ -53,14 +51,14 @@ BLACK_YUV = (16, 128, 128)
 Row = dict[str, Any]
 
 
-def controls_of(field: RadianceField, drive: DriveFrames) -> Mapping[str, SeenClip]:
+def controls_of(field: RadianceField, drive: Drive) -> Mapping[str, RenderedClip]:
     """Return what both ends believe to see along ``drive``, by the names in ``CONTROLS``."""
-    right = see_clip(field, drive.cameras)
+    right = render_clip(field, drive.cameras)
     turned = [
         Camera(camera.intrinsics, camera.world_from_cam.compose(QUARTER_TURN))
         for camera in right.cameras
     ]
-    elsewhere = see_clip(field, turned)
+    elsewhere = render_clip(field, turned)
     moved = (
         replace(view, camera=camera)
         for camera, view in zip(right.cameras, elsewhere.views, strict=True)
@@ -69,7 +67,7 @@ def controls_of(field: RadianceField, drive: DriveFrames) -> Mapping[str, SeenCl
     return dict(zip(CONTROLS, (right, wrong, _black(right)), strict=True))
 
 
-def _black(right: SeenClip) -> SeenClip:
+def _black(right: RenderedClip) -> RenderedClip:
     covered = tuple(np.zeros_like(mask) for mask in right.covered)
     return replace(right, views=tuple(map(_black_view, right.views)), covered=covered)
 
@@ -82,31 +80,30 @@ def _black_view(view: FieldView) -> FieldView:
 
 @dataclass(frozen=True)
 class NeverWorse:
-    """One drive under all controls, at one preset; ``version`` names the program's revision."""
+    """One drive under all controls, at one preset; ``program`` names what codes."""
 
-    drive: DriveFrames
-    seen: Mapping[str, SeenClip]
+    drive: Drive
+    rendered: Mapping[str, RenderedClip]
     preset: str
-    version: str
+    program: str
 
     @property
-    def contest(self) -> Clip:
-        """The drive as a contest; the field's quality is not of interest here."""
-        name = self.drive.name
-        return Clip(name.scene, name.rate_hz, self.drive.frames, self.drive.digest, None)
+    def clip(self) -> Clip:
+        """What every coder gets; the field's own quality is not of interest here."""
+        return self.drive.clip()
 
     @property
     def coders(self) -> dict[str, ClipCoder]:
         """Ours by control, then the anchors."""
         ours: dict[str, ClipCoder] = {
             control: FieldCoder(
-                seen,
-                f"rfedge-{control}-{self.preset}-{seen.field_id[:12]}",
-                self.version,
+                rendered,
+                f"rfedge-{control}-{self.preset}-{rendered.field_id[:12]}",
+                self.program,
                 preset=self.preset,
                 points=POINTS,
             )
-            for control, seen in self.seen.items()
+            for control, rendered in self.rendered.items()
         }
         return ours | {
             "plain": replace(x264_lowdelay(self.preset), points=POINTS),
@@ -120,10 +117,10 @@ class NeverWorse:
         no cheaper picture. Raises ``InvalidInput`` where an anchor does not reach a quality.
         """
         done = {
-            name: perform(self.contest, coder, store, retime=retime)
+            name: perform(self.clip, coder, store, retime=retime)
             for name, coder in self.coders.items()
         }
-        for control in self.seen:
+        for control in self.rendered:
             for db in AT_DB:
                 yield self._row(control, done[control], done["plain"], done["psnr"], db)
 
@@ -194,9 +191,10 @@ def run_never_worse(job: NeverWorseJob, console: Console) -> dict[str, Any]:
     field, stamp = load_field(job.field), revision()
     store = CellStore(job.cells)
     tables = [
-        NeverWorse(drive, controls_of(field, drive), job.preset, stamp) for drive in _drives(job)
+        NeverWorse(drive, controls_of(field, drive), job.preset, program_version())
+        for drive in _drives(job)
     ]
-    left_s = sum(seconds_left(table.contest, table.coders.values(), store) for table in tables)
+    left_s = sum(seconds_left(table.clip, table.coders.values(), store) for table in tables)
     console.print(f"{len(tables)} drives, about {left_s / 60:.1f} minutes left to do")
     rows = [row for table in tables for row in table.rows(store, retime=job.retime)]
     result = {
@@ -211,7 +209,7 @@ def run_never_worse(job: NeverWorseJob, console: Console) -> dict[str, Any]:
     return result
 
 
-def _drives(job: NeverWorseJob) -> list[DriveFrames]:
+def _drives(job: NeverWorseJob) -> list[Drive]:
     limit = QUICK_FRAMES if job.quick else None
     slow = [read_drive(text).every(DECIMATION) for text in job.decimated]
     return [*slow, *(read_drive(text, limit) for text in job.drives)]

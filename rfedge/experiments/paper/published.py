@@ -1,23 +1,16 @@
-"""The published experiment, frame by frame: rows of sizes and qualities as its tables need them.
+"""The experiment as published: savings of a two-frame clip, and rows as its tables need them.
 
-Each camera frame and the render at its pose are coded as the two-frame clip of
-``rfedge.experiments.paper.published`` (one frame a second, x264's default tune, the same CRF for
-both), at every size, preset and CRF; the camera alone, coded so, says what an I picture of it
-costs. Nothing here is our own coding. Qualities are PSNRs of RGB, and SSIM of RGB, on the true
-size.
+A clip of two frames, the render and then the camera's, goes through x264 with the preset's own
+defaults: one frame a second, the same CRF for both, picture types left to the encoder. The figure
+is ``100 I / (I + P)`` in bytes of the slices, parameter sets and SEI left out. It says little about
+bytes saved: it divides by a picture nobody sends, so P = I reads 50 %, and spending more on the
+unsent picture raises it. ``rfedge.demo.measure`` has the figure at equal quality.
 
-``downscaled`` renders and frames are made at the drive's size and reduced together, as published;
-``native`` renders are made at the small size, which is what a vehicle would do.
-
-The savings figure as the method was published, for comparison with the published tables.
-
-A two-frame clip, render then camera frame, goes through x264 with the preset's own defaults: one
-frame a second, the same CRF for both, picture types left to the encoder. The figure is
-``100 I / (I + P)`` in bytes of the slices, parameter sets and SEI left out.
-
-It says little about bytes saved: it divides by a picture nobody sends, so P = I reads 50 %, and
-spending more on the unsent picture raises it. ``rfedge.demo.measure`` has the figure at
-equal quality.
+``published_rows`` codes one frame so at every size, preset and CRF; the camera frame alone, coded
+the same way, says what an I picture of it costs. Nothing here is our own coding. PSNR and SSIM are
+of RGB, without the encoder's padding. ``downscaled`` renders and frames are made at the drive's
+size and reduced together, as published; ``native`` renders are made at the small size, which is
+what a vehicle would do.
 """
 
 from __future__ import annotations
@@ -163,13 +156,13 @@ class Setting:
 
 def published_rows(frame: PublishedFrame, settings: Sequence[Setting]) -> Iterator[dict[str, Any]]:
     """Yield a row per setting. Raises ``InvalidInput`` for a size larger than the frame."""
-    seen: dict[tuple[Size, Making], _Seen] = {}
+    pairs: dict[tuple[Size, Making], _Pair] = {}
     alone: dict[tuple[Size, str, float], tuple[int, float]] = {}
     for setting in settings:
-        look = (setting.size_px, setting.making)
-        if look not in seen:
-            seen[look] = _seen(frame, *look)
-        camera, render, quality = seen[look]
+        made = (setting.size_px, setting.making)
+        if made not in pairs:
+            pairs[made] = _pair(frame, *made)
+        camera, render, quality = pairs[made]
         coding = (setting.size_px, setting.preset, setting.crf)
         if coding not in alone:
             alone[coding] = _alone(camera, setting)
@@ -189,10 +182,10 @@ def published_rows(frame: PublishedFrame, settings: Sequence[Setting]) -> Iterat
         }
 
 
-_Seen = tuple[Rgb, Rgb, RenderQuality]
+_Pair = tuple[Rgb, Rgb, RenderQuality]
 
 
-def _seen(frame: PublishedFrame, size_px: Size, making: Making) -> _Seen:
+def _pair(frame: PublishedFrame, size_px: Size, making: Making) -> _Pair:
     camera, render = reduced(frame.camera, size_px), frame.render(size_px, making)
     return camera, render, render_quality(render, camera)
 

@@ -23,7 +23,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.image import Rgb
 from rfcore.views import PosedPicture
-from rfedge.experiments.cells import CellStore, Rows
+from rfedge.experiments.cells import CellStore, Rows, program_version
 from rfedge.experiments.paper.published import (
     PUBLISHED_CRFS,
     PUBLISHED_PRESETS,
@@ -94,8 +94,8 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
     fields = [(name, load_field(path)) for name, path in map(named_path, job.fields)]
     pieces = list(_pieces(job, fields))
     store, stamp = CellStore(job.cells), revision()
-    _say_cost(pieces, store, stamp, console)
-    rows = [row for piece in pieces for row in store.rows(_key(piece, stamp), _maker(piece))]
+    _say_cost(pieces, store, console)
+    rows = [row for piece in pieces for row in store.rows(_key(piece), _maker(piece))]
     result = {
         "case": "paper",
         **provenance(stamp),
@@ -130,7 +130,7 @@ def _pieces(job: PaperJob, fields: Sequence[tuple[str, RadianceField]]) -> Itera
                     yield Piece(name, field, scene, picture, size_px)
 
 
-def _key(piece: Piece, stamp: str) -> dict[str, str | float | int | None]:
+def _key(piece: Piece) -> dict[str, str | float | int | None]:
     pixels = piece.picture.read()
     pose = repr(piece.picture.camera).encode()
     return {
@@ -141,7 +141,7 @@ def _key(piece: Piece, stamp: str) -> dict[str, str | float | int | None]:
         "input": hashlib.sha256(pixels.tobytes() + pose).hexdigest(),
         "width": piece.size_px[0],
         "height": piece.size_px[1],
-        "revision": stamp,
+        "program": program_version(),
     }
 
 
@@ -156,20 +156,22 @@ def _rows(piece: Piece) -> Iterator[dict[str, Any]]:
         for preset in PUBLISHED_PRESETS
         for crf in PUBLISHED_CRFS
     ]
-    seen = _seen(piece, piece.picture.camera)
+    frame = _published_frame(piece, piece.picture.camera)
     size_px = piece.size_px
-    difference = flip(seen.render(size_px, "downscaled"), reduced(seen.camera, size_px))
-    for row in _labelled(piece, piece.field_name, seen, settings):
+    difference = flip(frame.render(size_px, "downscaled"), reduced(frame.camera, size_px))
+    for row in _labelled(piece, piece.field_name, frame, settings):
         yield row if row["render"] == "native" else {**row, "rf_flip": difference}
     control = [Setting(piece.size_px, "downscaled", CONTROL_PRESET, CONTROL_CRF)]
     camera = piece.picture.camera
     behind = Camera(camera.intrinsics, camera.world_from_cam.compose(TURNED_ROUND))
-    yield from _labelled(piece, f"{piece.field_name}:behind", _seen(piece, behind), control)
+    yield from _labelled(
+        piece, f"{piece.field_name}:behind", _published_frame(piece, behind), control
+    )
     grey = np.full((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), 128, np.uint8)
-    blind = PublishedFrame(
+    without_field = PublishedFrame(
         piece.picture.name, piece.picture.read(), lambda size_px, _making: reduced(grey, size_px)
     )
-    yield from _labelled(piece, f"{piece.field_name}:grey", blind, control)
+    yield from _labelled(piece, f"{piece.field_name}:grey", without_field, control)
 
 
 def _makings(piece: Piece) -> Sequence[Making]:
@@ -184,7 +186,7 @@ def _labelled(piece: Piece, label: str, frame: PublishedFrame, settings: Sequenc
     ]
 
 
-def _seen(piece: Piece, camera: Camera) -> PublishedFrame:
+def _published_frame(piece: Piece, camera: Camera) -> PublishedFrame:
     full = _render(piece.field, camera)
 
     def render(size_px: Size, making: Making) -> Rgb:
@@ -203,13 +205,13 @@ def _render(field: RadianceField, camera: Camera) -> Rgb:
     return pixels
 
 
-def _say_cost(pieces: Sequence[Piece], store: CellStore, stamp: str, console: Console) -> None:
+def _say_cost(pieces: Sequence[Piece], store: CellStore, console: Console) -> None:
     """Do the first piece that is not there, and say what the others will take by their pixels."""
-    left = [piece for piece in pieces if not store.has(_key(piece, stamp))]
+    left = [piece for piece in pieces if not store.has(_key(piece))]
     estimate = "nothing left to do"
     if left:
         began_s = monotonic()
-        store.rows(_key(left[0], stamp), _maker(left[0]))
+        store.rows(_key(left[0]), _maker(left[0]))
         per_pixel_s = (monotonic() - began_s) / _pixels(left[0])
         total_s = sum(map(_pixels, left[1:])) * per_pixel_s
         estimate = f"{len(left)} left, about {total_s / 60:.1f} minutes"

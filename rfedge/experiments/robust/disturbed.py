@@ -1,8 +1,8 @@
-"""What a wrong pose or another light costs: bits at equal quality, with and without it.
+"""Pose noise, its refinement, and bits at one quality, which say what a disturbance costs.
 
-Pose noise is independent from frame to frame, normal in each axis of translation and rotation, in
-the camera's own axes; both ends render at the noisy pose, for it is the one that is sent. Unless it
-is refined first, as a sender that may take its time would.
+Noise is independent from frame to frame, normal in each axis of translation and rotation, in the
+camera's own axes. Both ends render at the noisy pose, since it is the one that is sent; or the
+sender first refines it, with as much time as that takes.
 """
 
 from __future__ import annotations
@@ -82,13 +82,7 @@ def refined_cameras(
 def kbit_at(clips: Sequence[CodedClip], quality_db: float) -> float:
     """Return kilobits a frame at a luma PSNR, log(bits) linear in dB between the clips' points,
     the first frame left out. Raises ``InvalidInput`` when they do not span the quality."""
-    points = sorted(
-        (
-            10 * math.log10(255.0**2 / float(clip.luma_mse[1:].mean())),
-            math.log(8e-3 * float(clip.frame_bytes[1:].mean())),
-        )
-        for clip in clips
-    )
+    points = sorted((clip.psnr_db(), math.log(8e-3 * clip.bytes_per_frame())) for clip in clips)
     qualities = [db for db, _ in points]
     if not qualities[0] <= quality_db <= qualities[-1]:
         raise InvalidInput(

@@ -1,11 +1,9 @@
-"""A link that loses datagrams, and who predicts from what over it: machines on a virtual clock.
+"""A clip over a link that loses datagrams, by our codec and by x264, on a virtual clock.
 
 Losses come in bursts (Gilbert 1960, Elliott 1963: a good state that delivers, a bad one that does
 not). A frame is cut into datagrams of 1200 bytes and is lost if one of them is; no repetition, no
 forward error correction. What became of a frame is known to the sender one round trip after it was
 sent, and what was lost, one frame later, when the next one shows the gap. Answers are not lost.
-
-A clip over a lossy link, by our codec and by x264: what a viewer sees, and what it cost.
 
 The viewer sees the last picture that was decoded. Our receiver refuses what it cannot decode to the
 bit and keeps the picture before; x264's is FFmpeg, which shows what it can make of it (damage that
@@ -14,7 +12,7 @@ fades as the refresh passes, or until the next IDR picture).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from fractions import Fraction
@@ -32,13 +30,12 @@ from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.state import EncoderState, Past
-from rfcore.errors import CodecError, InvalidInput, PacketRejected
+from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfcore.metrics import ssim
-from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.messages import Frame
-from rfedge.experiments.field_coder import SeenClip
+from rfedge.experiments.field_coder import RenderedClip, message_bytes
 from rfedge.experiments.rivals import picture, video_frame
+from rfedge.offline import Arrival, decode_frames
 
 __all__ = [
     "DATAGRAM_BYTES",
@@ -49,7 +46,7 @@ __all__ = [
     "Lossy",
     "Outcome",
     "Policy",
-    "own_crossing",
+    "delta_crossing",
     "x264_crossing",
 ]
 
@@ -195,8 +192,10 @@ class FrameCoder:
     Crossings share what they have in common: all that was sent before the first loss.
     """
 
-    def __init__(self, clip: Sequence[I420], seen: SeenClip, preset: str, crf: float) -> None:
-        self.seen = seen
+    def __init__(
+        self, clip: Sequence[I420], rendered: RenderedClip, preset: str, crf: float
+    ) -> None:
+        self.rendered = rendered
         self._clip = clip
         self._encoder = DeltaEncoder(CodecConfig(*clip[0].size_px, preset, crf))
         self._made: dict[tuple[int, bytes, bool], Encoded] = {}
@@ -212,41 +211,49 @@ class FrameCoder:
         if key not in self._made:
             choice = FrameChoice(references=RENDER_ONLY if render_only else None)
             state = EncoderState(1, index, past)
-            view = self.seen.views[index]
+            view = self.rendered.views[index]
             self._made[key] = self._encoder.encode(state, self._clip[index], view, choice)
         return self._made[key]
 
-    def message_bytes(self, index: int, made: Encoded) -> int:
-        """Return the size of the message that carries the frame."""
-        pose = self.seen.views[index].camera.world_from_cam
-        return len(client_message_to_bytes(Frame("front", 1 << 60, pose, b"", made.packet)))
+    def arrival(self, index: int, made: Encoded) -> Arrival:
+        """Return the frame as a receiver gets it, if it gets it."""
+        return Arrival(made.packet, self.rendered.views[index])
 
 
-def own_crossing(crossing: Crossing, coder: FrameCoder, policy: Policy) -> Outcome:
-    """Send the clip by our codec; the first frame always arrives, as after a handshake."""
-    decoder = DeltaDecoder(coder.header)
-    receiving = decoder.start(1)
-    feedback = Feedback(crossing.rate_hz, crossing.rtt_s)
-    link, pasts = crossing.link(), dict[int | None, Past | None]()
-    sizes, new, shown = [], [], list[I420]()
-    for index in range(len(crossing.frames)):
-        base = pasts.get(feedback.base(policy))
-        made = coder.code(index, base, render_only=policy is Policy.RENDER_ONLY)
-        pasts[index] = made.state.past
-        size_bytes = coder.message_bytes(index, made)
-        good = link.delivers(size_bytes) or index == 0
-        if good:
-            try:
-                got = decoder.decode(receiving, made.packet, coder.seen.views[index])
-                receiving = got.state
-                shown.append(got.frame)
-            except PacketRejected:
-                good = False
-        feedback.sent(good)
-        sizes.append(size_bytes)
-        new.append(good)
-        shown += shown[-1:] * (index + 1 - len(shown))
-    return Outcome(tuple(sizes), tuple(new), _ssims(shown, crossing.frames))
+class LossySender:
+    """Our sender on a crossing: codes from what ``feedback`` knows of the frames before."""
+
+    def __init__(self, crossing: Crossing, coder: FrameCoder, policy: Policy) -> None:
+        self.feedback = Feedback(crossing.rate_hz, crossing.rtt_s)
+        self.frame_bytes: list[int] = []
+        self._crossing = crossing
+        self._coder = coder
+        self._policy = policy
+
+    def arrivals(self) -> Iterator[Arrival | None]:
+        """Yield what comes out of the link, None for a lost frame; the first one always arrives, as
+        after a handshake. ``feedback`` must be told of a frame before the next is asked for."""
+        link, pasts = self._crossing.link(), dict[int | None, Past | None]()
+        render_only = self._policy is Policy.RENDER_ONLY
+        for index in range(len(self._crossing.frames)):
+            base = pasts.get(self.feedback.base(self._policy))
+            made = self._coder.code(index, base, render_only=render_only)
+            pasts[index] = made.state.past
+            arrival = self._coder.arrival(index, made)
+            self.frame_bytes.append(message_bytes(arrival))
+            delivered = link.delivers(self.frame_bytes[-1])
+            yield arrival if delivered or index == 0 else None
+
+
+def delta_crossing(crossing: Crossing, coder: FrameCoder, policy: Policy) -> Outcome:
+    """Send the clip by our codec."""
+    sender, decoder = LossySender(crossing, coder, policy), DeltaDecoder(coder.header)
+    new, shown = [], list[I420]()
+    for decoded in decode_frames(decoder, sender.arrivals(), skip_rejected=True):
+        sender.feedback.sent(decoded is not None)
+        new.append(decoded is not None)
+        shown.append(shown[-1] if decoded is None else decoded)
+    return Outcome(tuple(sender.frame_bytes), tuple(new), _ssims(shown, crossing.frames))
 
 
 def x264_crossing(crossing: Crossing, *, idr_on_nack: bool) -> Outcome:

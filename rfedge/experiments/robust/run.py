@@ -19,14 +19,12 @@ from rich.console import Console
 
 from rfcore.camera import Camera
 from rfcore.codec.photometric import Photometric
-from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
-from rfedge.experiments.cells import CellStore
-from rfedge.experiments.clips import ClipCoder, DriveName
-from rfedge.experiments.compare.measure import Clip, perform
-from rfedge.experiments.field_coder import FieldCoder, see_clip
-from rfedge.experiments.ladder.measure import LadderClip
+from rfedge.experiments.cells import CellStore, program_version
+from rfedge.experiments.clips import Clip, ClipCoder, Drive, read_drive
+from rfedge.experiments.field_coder import FieldCoder, render_clip
+from rfedge.experiments.performance import perform
 from rfedge.experiments.rivals import x264_lowdelay
 from rfedge.experiments.robust.disturbed import (
     NOISES,
@@ -40,7 +38,7 @@ from rfedge.experiments.robust.lossy_link import (
     Crossing,
     FrameCoder,
     Policy,
-    own_crossing,
+    delta_crossing,
     x264_crossing,
 )
 from rfedge.results import check_result_path, provenance, revision, write_result
@@ -49,7 +47,7 @@ __all__ = ["RobustJob", "run_robust"]
 
 RTTS_S = (0.02, 0.05, 0.1)
 LOSSES = (0.0, 0.01, 0.05)
-OWN_CRFS, X264_CRFS = (20.0, 27.0), (22.0, 27.0, 33.0, 39.0, 45.0)
+DELTA_CRFS, X264_CRFS = (20.0, 27.0), (22.0, 27.0, 33.0, 39.0, 45.0)
 DISTURBED_CRFS, RIVAL_CRFS = (23.0, 28.0, 33.0), (20.0, 25.0, 30.0, 35.0)
 QUICK_FRAMES = 8
 SEED = 5
@@ -77,29 +75,10 @@ class RobustJob:
             raise InvalidInput("frames", f"{self.frames} must be at least 4")
 
 
-@dataclass(frozen=True)
-class Drive:
-    """A drive in memory."""
-
-    name: DriveName
-    clip: LadderClip
-
-    @staticmethod
-    def read(text: str, count: int) -> Drive:
-        """Read the first ``count`` frames of ``NAME@HZ=DATASET``."""
-        name = DriveName.parse(text)
-        return Drive(name, LadderClip.of(read_dataset(name.dataset), count))
-
-    def contest(self, condition: str) -> Clip:
-        """Name the drive under a condition, as cells are keyed."""
-        scene = f"{self.name.scene} {condition}".strip()
-        return Clip(scene, self.name.rate_hz, self.clip.frames, self.clip.digest, None)
-
-
 def run_robust(job: RobustJob, console: Console) -> Row:
     """Do what is not done yet, write ``job.out``, and return its content."""
     count = QUICK_FRAMES if job.quick else job.frames
-    drive = Drive.read(job.drive, count)
+    drive = read_drive(job.drive, count)
     field = load_field(job.field)
     bench = Bench(job, field, drive, CellStore(job.cells), console, revision())
     scenarios = bench.scenarios()
@@ -113,7 +92,7 @@ def run_robust(job: RobustJob, console: Console) -> Row:
         "quick": job.quick,
         "seed": SEED,
         "field_id": field.field_id,
-        "frames": {"drive": job.drive, "count": count, "sha256": drive.clip.digest},
+        "frames": {"drive": job.drive, "count": count, "sha256": drive.digest},
         "quality_db": job.quality_db,
         "crossings": crossed,
         **_at_equal_rate(crossed),
@@ -142,29 +121,29 @@ class Bench:
         losses = (LOSSES[0], LOSSES[-1]) if self.job.quick else LOSSES
         own = [str(policy) for policy in Policy]
         rivals = ["x264-intra-refresh", "x264-idr-on-nack"]
-        ours = product(OWN_CRFS, own, rtts, losses)
+        ours = product(DELTA_CRFS, own, rtts, losses)
         theirs = product(X264_CRFS, rivals, rtts, losses)
         return [(method, rtt_s, loss, crf) for crf, method, rtt_s, loss in (*ours, *theirs)]
 
     def crossed(self, method: str, rtt_s: float, loss: float, crf: float) -> Row:
         """Return the row of one crossing."""
-        clip, rate_hz = self.drive.clip, self.drive.name.rate_hz
+        drive, rate_hz = self.drive, self.drive.name.rate_hz
         facts: Row = {
             "method": method,
             "rtt_ms": 1e3 * rtt_s,
             "loss_percent": 100 * loss,
             "crf": crf,
         }
-        crossing = Crossing(clip.frames, rate_hz, self.job.preset, crf, Bursts(loss), rtt_s, SEED)
+        crossing = Crossing(drive.frames, rate_hz, self.job.preset, crf, Bursts(loss), rtt_s, SEED)
         key: dict[str, str | float | int | None] = {
             **facts,
             "verb": "robust",
             "field": self.field.field_id,
-            "frames": clip.digest,
+            "frames": drive.digest,
             "hz": rate_hz,
             "preset": self.job.preset,
             "seed": SEED,
-            "revision": self.revision,
+            "program": program_version(),
         }
         (row,) = self.store.rows(key, lambda: [self._outcome(method, crossing)])
         return {**facts, **row}
@@ -173,7 +152,7 @@ class Bench:
         if method.startswith("x264"):
             made = x264_crossing(crossing, idr_on_nack=method.endswith("nack"))
         else:
-            made = own_crossing(crossing, self._coder(crossing.crf), Policy(method))
+            made = delta_crossing(crossing, self._coder(crossing.crf), Policy(method))
         row = made.row(crossing.rate_hz)
         self.console.print(
             f"  {method} {1e3 * crossing.rtt_s:.0f} ms {100 * crossing.bursts.share:g} %: "
@@ -189,9 +168,8 @@ class Bench:
         """Return the coder of all crossings at ``crf``; the last one asked for is kept."""
         if crf not in self._coders:
             self._coders.clear()
-            clip = self.drive.clip
-            seen = see_clip(self.field, clip.cameras)
-            self._coders[crf] = FrameCoder(clip.frames, seen, self.job.preset, crf)
+            rendered = render_clip(self.field, self.drive.cameras)
+            self._coders[crf] = FrameCoder(self.drive.frames, rendered, self.job.preset, crf)
         return self._coders[crf]
 
     # --- pose and light
@@ -204,11 +182,11 @@ class Bench:
         """Return what noise of each size costs, and what is left of it after refinement."""
         drive, rival = self.drive, self._rival(self.drive)
         still, *noises = self.noises()
-        kbit = self._own(drive, f"pose noise {still}", drive.clip.cameras)
+        kbit = self._own(drive, f"pose noise {still}", drive.cameras)
         rows = [self._row("pose noise", str(still), kbit, None, rival)]
         for noise in noises:
-            measured = noisy_cameras(drive.clip.cameras, noise, SEED)
-            refined = refined_cameras(self.field, drive.clip.frames, measured)
+            measured = noisy_cameras(drive.cameras, noise, SEED)
+            refined = refined_cameras(self.field, drive.frames, measured)
             for condition, cameras in (("pose noise", measured), ("refined pose noise", refined)):
                 kbit = self._own(drive, f"{condition} {noise}", cameras)
                 rows.append(self._row(condition, str(noise), kbit, rows[0], rival))
@@ -219,8 +197,8 @@ class Bench:
         if self.job.lane is None:
             why = "no drive with a lane offset was given (--lane NAME@HZ=DATASET)"
             return {"condition": "lane offset", "level": "n/a", "reason": why}
-        drive = Drive.read(self.job.lane, len(self.drive.clip.frames))
-        kbit = self._own(drive, "lane", drive.clip.cameras)
+        drive = read_drive(self.job.lane, len(self.drive.frames))
+        kbit = self._own(drive, "lane", drive.cameras)
         return self._row("lane offset", drive.name.scene, kbit, None, self._rival(drive))
 
     def light_rows(self) -> list[Row]:
@@ -228,10 +206,10 @@ class Bench:
         if self.job.dusk is None:
             why = "no drive in another light was given (--dusk NAME@HZ=DATASET)"
             return [{"condition": "light", "level": "n/a", "reason": why}]
-        drive = Drive.read(self.job.dusk, len(self.drive.clip.frames))
+        drive = read_drive(self.job.dusk, len(self.drive.frames))
         rival, rows = self._rival(drive), list[Row]()
         for level, choice in (("uncorrected", ()), ("photometric", None)):
-            kbit = self._own(drive, level, drive.clip.cameras, photometric=choice)
+            kbit = self._own(drive, level, drive.cameras, photometric=choice)
             rows.append(self._row("light", level, kbit, rows[0] if rows else None, rival))
         return rows
 
@@ -244,21 +222,23 @@ class Bench:
     ) -> float:
         """Return kilobits a frame at the quality asked for, rendered from ``cameras``."""
         coder = FieldCoder(
-            see_clip(self.field, cameras),
+            render_clip(self.field, cameras),
             f"rfedge-{self.job.preset}-{self.field.field_id}",
-            self.revision,
+            program_version(),
             preset=self.job.preset,
             photometric=photometric,
             points=DISTURBED_CRFS,
         )
-        return self._kbit(drive.contest(condition), coder)
+        return self._kbit(drive.clip(condition), coder)
 
     def _rival(self, drive: Drive) -> float:
         coder = replace(x264_lowdelay(self.job.preset), points=RIVAL_CRFS)
-        return self._kbit(drive.contest(""), coder)
+        return self._kbit(drive.clip(""), coder)
 
-    def _kbit(self, contest: Clip, coder: ClipCoder) -> float:
-        return kbit_at(perform(contest, coder, self.store).clips, self.job.quality_db)
+    def _kbit(self, clip: Clip, coder: ClipCoder) -> float:
+        at_db = self.job.quality_db
+        coded = perform(clip, coder, self.store, window_db=(at_db, at_db))
+        return kbit_at(coded.clips, at_db)
 
     def _row(
         self, condition: str, level: str, kbit: float, base: Row | None, rival_kbit: float
