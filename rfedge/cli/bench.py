@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
+
+from rfedge.arguments import FIELD
 
 __all__ = ["Bench"]
 
@@ -20,17 +22,19 @@ class Bench:
     rows: Literal["all", "native", "modes"] = "all"
     """`native` leaves out the timing of the slow torch reference; `modes` shows what SH degree,
     antialiasing, depth and opacity cost, as ratios (raster only)."""
-    field: Path | None = None
+    field: Annotated[Path | None, FIELD] = None
     """A trained hash grid of the sample street to time, instead of one learnt on the spot (ngp
     only)."""
-    json: str | None = None
+    json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
     """Write one JSON object to this file; `-` is standard output."""
 
     def run(self) -> None:
         """Run one case and print its rows."""
         from rfedge.bench import print_rows, run_case, write_json
+        from rfedge.fields.find import field_path
 
-        result = run_case(self.case, rows=self.rows, field=self.field)
+        field = field_path(self.field) if self.field is not None else None
+        result = run_case(self.case, rows=self.rows, field=field)
         if self.json is None:
             print_rows(result)
         else:

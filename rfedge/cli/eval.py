@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from tyro.conf import subcommand
+from tyro.conf import arg, subcommand
 
 from rfedge.experiments.compare import EvalCompare
 from rfedge.experiments.ladder import EvalLadder
@@ -21,14 +21,15 @@ __all__ = ["Eval"]
 class Eval:
     """Run an experiment; results are JSON with command, revision, host and input digests."""
 
-    verb: (
+    verb: Annotated[
         Annotated[EvalCompare, subcommand("compare")]
         | Annotated[EvalLadder, subcommand("ladder")]
         | Annotated[EvalNeverWorse, subcommand("never-worse")]
         | Annotated[EvalLatency, subcommand("latency")]
         | Annotated[EvalPaper, subcommand("paper")]
-        | Annotated[EvalRobust, subcommand("robust")]
-    )
+        | Annotated[EvalRobust, subcommand("robust")],
+        arg(name=""),
+    ]
 
     def run(self) -> None:
         """Run the verb."""

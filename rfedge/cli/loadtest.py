@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import FlagCreatePairsOff
+from tyro.conf import arg
+
+from rfedge.arguments import DATASET, FIELD, FOLDER, JSON
 
 __all__ = ["LoadTest"]
 
@@ -25,7 +27,7 @@ class LoadTest:
     """Cameras of each vehicle."""
     size: int = 4096
     """Bytes of payload of a frame in transport mode; otherwise the drive's own."""
-    link: Path | None = None
+    link: Annotated[Path | None, arg(metavar="FILE.toml")] = None
     """Link profile (TOML, see samples/links), a link for each vehicle; default: loopback."""
     duration: float = 20.0
     """Seconds that are counted."""
@@ -35,28 +37,29 @@ class LoadTest:
     """From the moment a picture is due to its Ack."""
     vehicle_ms: float = 0.0
     """What a canned vehicle waits before sending, for the time a real one needs to encode."""
-    live: Annotated[bool, FlagCreatePairsOff] = False
+    live: bool = False
     """Vehicles that render and encode (cav-agent processes), instead of coded packets."""
-    admission: Annotated[bool, FlagCreatePairsOff] = False
+    admission: bool = False
     """Let the server refuse vehicles or lower their rate; the verdict is about those let in."""
-    find_limit: Annotated[bool, FlagCreatePairsOff] = False
+    find_limit: bool = False
     """Look for the largest number that holds."""
-    field: Path = Path("samples/fields/street.rff")
+    field: Annotated[Path, FIELD] = Path("samples/fields/street.rff")
     """Field archive, the only one in its folder."""
-    drive: Path = Path("samples/street/transforms_drive_vehicles.json")
+    drive: Annotated[Path, DATASET] = Path("samples/street/transforms_drive_vehicles.json")
     """Drive whose pictures the vehicles send."""
     workers: int = 2
     """Frames the server reconstructs at once, and threads of a render."""
-    out: Path = Path("out/loadtest")
+    out: Annotated[Path, FOLDER] = Path("out/loadtest")
     """Folder for report.html, result.json and vehicles_vs_uplink.svg."""
-    cache: Path = Path("out/cache/loadtest")
+    cache: Annotated[Path, FOLDER] = Path("out/cache/loadtest")
     """Folder that keeps coded drives between runs."""
-    record: Path | None = None
+    record: Annotated[Path | None, JSON] = None
     """Put the rows into this result file, too."""
 
     def run(self) -> None:
         """Run, write the report, print the rows; fail if the asked number is not held."""
         from rfcore.errors import RfedgeError
+        from rfedge.fields.find import field_path
         from rfedge.loadtest.command import Command
         from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
         from rfedge.loadtest.run import TestBed
@@ -75,7 +78,9 @@ class LoadTest:
             admission=self.admission,
             bounds=Bounds(deadline_ms=self.deadline_ms),
         )
-        bed = TestBed(self.field, self.drive, self.workers, self.cache, self.out / "work")
+        bed = TestBed(
+            field_path(self.field), self.drive, self.workers, self.cache, self.out / "work"
+        )
         result = Command(load, bed, self.out, self.record).run(find_limit=self.find_limit)
         if not self.find_limit and not result.most_held:
             raise RfedgeError("not held: " + "; ".join(result.runs[0].verdict.broken))

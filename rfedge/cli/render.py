@@ -6,28 +6,36 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
+
+from rfedge.arguments import DATASET, FIELD
 
 __all__ = ["Render"]
+
+OTHER_FILES = (
+    *(".gif", ".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"),
+    *(".mov", ".avi", ".mkv", ".webm", ".m4v"),
+)
+"""Pictures and videos that people ask for and that are not written."""
 
 
 @dataclass(frozen=True)
 class Render:
     """Render a field along a path, as PNG files or one MP4."""
 
-    field: Annotated[Path, Positional]
-    """The field archive (.rff), or the name it was imported under."""
-    out: Path
+    field: Annotated[Path, Positional, FIELD]
+    """The field: an archive (.rff), or a name."""
+    out: Annotated[Path, arg(metavar="FOLDER|FILE.mp4")]
     """Folder for the PNG files, or a file ending in .mp4."""
     path: Literal["orbit", "drive"] | None = None
     """Once around the field, or the poses of a drive (default: drive if there is one)."""
-    drive: Path | None = None
+    drive: Annotated[Path | None, DATASET] = None
     """A dataset with the poses; its pictures are used only to print PSNR."""
     psnr: bool = False
     """Print the PSNR of each render against the drive's picture, dB."""
     frames: int = 96
     """Pictures of an orbit."""
-    size: tuple[int, int] = (960, 540)
+    size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (960, 540)
     """Width and height of an orbit's pictures, px."""
     up: Literal["z", "y", "-y"] = "z"
     """Where up is in the field's frame (orbit)."""
@@ -57,6 +65,7 @@ class Render:
         )
         from rfedge.video import write_mp4
 
+        self._check_out()
         quality = Quality(self.detail, self.sh_degree)
         field = open_field(self.field, threads=self.threads, isa=self.isa)
         if self.path == "orbit" or (self.path is None and self.drive is None):
@@ -73,3 +82,14 @@ class Render:
             print(f"{self.out}: {count} pictures")
         else:
             write_pictures(self.out, pictures, self.psnr)
+
+    def _check_out(self) -> None:
+        """Refuse what looks like a file of another format: it would become a folder's name."""
+        from rfcore.errors import InvalidInput
+
+        if self.out.suffix.lower() in OTHER_FILES:
+            raise InvalidInput(
+                "out",
+                f"{self.out}: {self.out.suffix} is not written; name a video ending in .mp4, "
+                "or a folder for PNG files",
+            )
