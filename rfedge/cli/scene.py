@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
 from rfedge.arguments import DATASET, FOLDER, SIZE
 from rfedge.cli.scene_street import SceneBuild, ScenePlan, SceneSheet, SceneSizes
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 __all__ = ["Scene", "SceneConvert", "ScenePoses", "SceneRecordCarla"]
 
@@ -69,6 +74,10 @@ class ScenePoses:
 
     def run(self) -> None:
         """Place the pictures and write the dataset; say which ones could not be placed."""
+        import signal
+
+        from rich.console import Console
+
         from rfcore.errors import BackendUnavailable
 
         try:
@@ -88,7 +97,21 @@ class ScenePoses:
             threads=self.threads,
             seed=self.seed,
         )
-        print(pose_dataset(self.images, self.out, self.register_to, settings))
+        # COLMAP's own handler would print a C++ stack and leave its folder behind.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with _shown(Console(stderr=True)) as tell:
+            line = pose_dataset(self.images, self.out, self.register_to, settings, tell)
+        print(line)
+
+
+@contextmanager
+def _shown(console: Console) -> Iterator[Callable[[str], None]]:
+    """Show what is told: in one changing line on a terminal, line by line in a log."""
+    if not console.is_terminal:
+        yield lambda text: console.print(f"  {text}", highlight=False)
+        return
+    with console.status("reading pictures") as status:
+        yield status.update
 
 
 @dataclass(frozen=True)

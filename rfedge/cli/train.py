@@ -81,7 +81,8 @@ class Train:
     json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
     """Write the result as JSON to this file, or to standard output for "-"."""
     report: Annotated[Path | None, arg(metavar="FILE.html")] = None
-    """Write a page with held-out pictures and the curve of quality over time (.html)."""
+    """Write a page with held-out pictures and the curve of quality over time; needs --holdout or
+    --held-out."""
     kind: Literal["splats", "ngp"] = "splats"
     """3D Gaussians, or the hash grid of Instant-NGP, which takes none of their settings."""
 
@@ -97,6 +98,12 @@ class Train:
 
         if self.out.suffix != ".rff":
             raise InvalidInput("out", f"{self.out} must end in .rff")
+        if self.report is not None and self.holdout is None and self.held_out is None:
+            raise InvalidInput(
+                "report",
+                "shows pictures that were not trained on, and none are held out: add --holdout 8 "
+                "(every 8th picture) or --held-out DATASET",
+            )
         console = Console(stderr=self.json == "-")
         job = self._job()
         trained = train(job, console)

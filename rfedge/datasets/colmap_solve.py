@@ -7,7 +7,7 @@ Alone, COLMAP's incremental mapping finds a world of its own, whose scale is not
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -24,13 +24,17 @@ from rfedge.datasets.colmap_features import (
     Workplace,
     add_known,
     add_new,
+    cancellable,
     match,
     pose_from_colmap,
     rigid_of,
     source_camera,
 )
 
-__all__ = ["Solution", "solve_poses"]
+__all__ = ["Solution", "Tell", "solve_poses"]
+
+Tell = Callable[[str], None]
+"""Told in words what is being done, for whoever waits."""
 
 ANY_FORWARD_MOTION = 1.0
 """A drive moves forward; COLMAP's default, 0.95, would refuse every pair to start from."""
@@ -46,7 +50,11 @@ class Solution:
 
 
 def solve_poses(
-    root: Path, names: Sequence[str], known: Sequence[SourcePicture], settings: PoseSettings
+    root: Path,
+    names: Sequence[str],
+    known: Sequence[SourcePicture],
+    settings: PoseSettings,
+    tell: Tell,
 ) -> Solution:
     """Place the pictures ``root / name``; with ``known`` pictures, in their world.
 
@@ -56,27 +64,63 @@ def solve_poses(
     place = Workplace(root)
     origin = chosen_origin(known) if known else TileOrigin()
     if known:
+        tell(f"features of the dataset's {len(known)} pictures")
         add_known(place, known, settings)
+    tell(f"features of {len(names)} new pictures")
     add_new(place, names, settings)
+    tell(f"matching {len(known) + len(names)} pictures ({settings.matching})")
     match(place, settings)
-    model = _registered(place, known, origin, settings) if known else _alone(place, settings)
+    placing = _Placing(tell, len(known) + len(names))
+    if known:
+        model = _registered(place, known, origin, settings, placing)
+    else:
+        model = _alone(place, settings, placing)
     return _solution(model, names, origin)
 
 
-def _alone(place: Workplace, settings: PoseSettings) -> pycolmap.Reconstruction:
+class _Placing:
+    """Counts the pictures that COLMAP has placed and tells it."""
+
+    def __init__(self, tell: Tell, total: int) -> None:
+        self.tell = tell
+        self._total, self._placed = total, 0
+
+    def start_from(self, placed: int) -> None:
+        """Take ``placed`` pictures as placed already."""
+        self._placed = placed
+
+    def one_more(self) -> None:
+        """Take one more picture as placed."""
+        self._placed += 1
+        self.tell(f"placing pictures: {self._placed} of {self._total}")
+
+
+def _alone(place: Workplace, settings: PoseSettings, placing: _Placing) -> pycolmap.Reconstruction:
     folder = place.root / "model"
     folder.mkdir()
     options = _options(settings)
     options.ba_refine_focal_length = options.ba_refine_extra_params = not settings.parameters
     options.mapper.init_max_forward_motion = ANY_FORWARD_MOTION
-    models = pycolmap.incremental_mapping(place.database, place.root, folder, options)
+    models = cancellable(
+        pycolmap.incremental_mapping,
+        place.database,
+        place.root,
+        folder,
+        options,
+        initial_image_pair_callback=lambda: placing.start_from(2),
+        next_image_callback=placing.one_more,
+    )
     if not models:
         raise DatasetError("no two pictures share enough to start from; take them closer together")
     return max(models.values(), key=lambda model: model.num_reg_images())
 
 
 def _registered(
-    place: Workplace, known: Sequence[SourcePicture], origin: TileOrigin, settings: PoseSettings
+    place: Workplace,
+    known: Sequence[SourcePicture],
+    origin: TileOrigin,
+    settings: PoseSettings,
+    placing: _Placing,
 ) -> pycolmap.Reconstruction:
     given = _given_poses(place, known, origin)
     held = set(given.cameras)
@@ -87,11 +131,26 @@ def _registered(
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
     for name in ("given", "model"):
         (place.root / name).mkdir()
-    pycolmap.triangulate_points(
-        given, place.database, place.root, place.root / "given", True, options, False
+    placing.tell("points of the dataset's pictures at their given poses")
+    placing.start_from(len(known))
+    cancellable(
+        pycolmap.triangulate_points,
+        given,
+        place.database,
+        place.root,
+        place.root / "given",
+        True,
+        options,
+        False,
     )
-    models = pycolmap.incremental_mapping(
-        place.database, place.root, place.root / "model", options, place.root / "given"
+    models = cancellable(
+        pycolmap.incremental_mapping,
+        place.database,
+        place.root,
+        place.root / "model",
+        options,
+        place.root / "given",
+        next_image_callback=placing.one_more,
     )
     if not models:
         raise DatasetError("the dataset's own pictures do not match at their given poses")

@@ -97,17 +97,18 @@ def check_field(
 ) -> Fit:
     """Return the convention under which ``field`` shows four of ``pictures`` best.
 
-    The others are tried only when the field does not fit as it is; splats are then drawn in both
-    modes. Raises ``InvalidInput`` when there are no pictures.
+    Splats are drawn in both modes. Other conventions are tried only when the field fits as it is
+    in neither. Raises ``InvalidInput`` when there are no pictures.
     """
     if not pictures:
         raise InvalidInput("drive", "has no pictures")
     view, seen = _FieldInDrive(field), _spread(pictures, PAIRS)
-    as_given_db = _psnr_db(view, seen, AS_GIVEN)
-    best, best_db, tried = AS_GIVEN, as_given_db, 1
-    if as_given_db < FITS_DB:
+    best, tried = AS_GIVEN, 1
+    as_given_db = best_db = _psnr_db(view, seen, AS_GIVEN)
+    mode = _mode_fit(field, seen, best, best_db)
+    if (best_db if mode is None else mode.psnr_db) < FITS_DB:
         best, best_db, tried = _best_convention(view, seen, nerfstudio)
-    mode = _mode_fit(field, seen, best, best_db) if isinstance(field, SplatField) else None
+        mode = _mode_fit(field, seen, best, best_db)
     psnr_db = best_db if mode is None else mode.psnr_db
     fits = psnr_db >= FITS_DB or psnr_db >= as_given_db + GAIN_DB
     return Fit(best, psnr_db, as_given_db, fits, tried, mode)
@@ -221,8 +222,11 @@ def _best_convention(
 
 
 def _mode_fit(
-    field: SplatField, seen: Sequence[PosedPicture], convention: Convention, stated_db: float
-) -> ModeFit:
+    field: RadianceField, seen: Sequence[PosedPicture], convention: Convention, stated_db: float
+) -> ModeFit | None:
+    """Return how both modes fit; ``stated_db`` is the PSNR in the one the field states."""
+    if not isinstance(field, SplatField):
+        return None
     stated = field.metadata.antialiased
     other = _FieldInDrive(drawn_antialiased(field, not stated))
     other_db = _psnr_db(other, seen, convention)

@@ -34,7 +34,7 @@ def field_path(name: Path | str) -> Path:
     )
 
 
-def open_field(name: Path | str, *, threads: int, isa: str | None = None) -> RadianceField:
+def open_field(name: Path | str, *, threads: int = 1, isa: str | None = None) -> RadianceField:
     """Load a field by path or name.
 
     Raises ``InvalidInput`` as ``field_path`` does and ``FieldFormatError`` for a damaged file.

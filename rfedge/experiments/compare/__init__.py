@@ -50,9 +50,10 @@ class EvalCompare:
 
         from rfedge.experiments.compare.drives import CompareJob
         from rfedge.experiments.compare.run import run_compare
+        from rfedge.fields.find import field_path
 
         job = CompareJob(
-            field=self.field,
+            field=field_path(self.field),
             drives=self.drives,
             preset=self.preset,
             out=self.out,

@@ -50,9 +50,10 @@ class EvalLatency:
 
         from rfedge.experiments.latency.report import write_latency_figures
         from rfedge.experiments.latency.run import LatencyJob, run_latency
+        from rfedge.fields.find import field_path
 
         job = LatencyJob(
-            field=self.field,
+            field=field_path(self.field),
             drives=self.drives,
             traces=self.traces,
             preset=self.preset,

@@ -42,9 +42,10 @@ class EvalNeverWorse:
         from rich.console import Console
 
         from rfedge.experiments.never_worse.measure import NeverWorseJob, run_never_worse
+        from rfedge.fields.find import field_path
 
         job = NeverWorseJob(
-            field=self.field,
+            field=field_path(self.field),
             drives=self.drives,
             decimated=self.decimated,
             preset=self.preset,

@@ -48,9 +48,10 @@ class EvalRobust:
 
         from rfedge.experiments.robust.report import write_robust_figure
         from rfedge.experiments.robust.run import RobustJob, run_robust
+        from rfedge.fields.find import field_path
 
         job = RobustJob(
-            field=self.field,
+            field=field_path(self.field),
             drive=self.drive,
             dusk=self.dusk,
             lane=self.lane,
