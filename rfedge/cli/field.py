@@ -69,16 +69,25 @@ class FieldImport:
         if out.exists() and not self.replace:
             raise InvalidInput("name", f"{out} is there already: take another name, or --replace")
         origin = TileOrigin(*self.tile_origin)
-        antialiased = self.antialiased or bool(read_ply_antialiased(self.ply))
+        stated = read_ply_antialiased(self.ply)
+        antialiased = self.antialiased or stated is True
         metadata = FieldMetadata(self.name, origin, antialiased=antialiased)
         field = SplatField(self._splats(origin), metadata, threads=self.threads)
         field = field if self.raw else field.compressed()
         out.parent.mkdir(parents=True, exist_ok=True)
         field_id = save_field(field, out)
-        mode = "antialiased" if antialiased else "not antialiased"
         print(f"{out}: field {field_id}, {field.primitives:,} splats, {size_mb(field):.2f} MB")
-        print(f"drawn {mode}; rfedge field check {self.name} --drive DATASET tries both")
+        print(self._mode_line(stated))
         print_rungs(Console(), field, look_around(field, 1280, 720))
+
+    def _mode_line(self, stated: bool | None) -> str:
+        """Say how the splats are drawn and why; ``stated`` is what the file says."""
+        if self.antialiased:
+            return "drawn antialiased, as --antialiased asks"
+        if stated is None:
+            tries = f"`rfedge field check {self.name} --drive DATASET` tries both"
+            return f"not drawn antialiased: the file does not say whether to; {tries}"
+        return f"{'drawn' if stated else 'not drawn'} antialiased, as the file says"
 
     def _splats(self, origin: TileOrigin) -> Gaussians:
         """Return the file's splats in the tile's frame, the most important first."""
@@ -226,12 +235,15 @@ def _print_fit(fit: Fit) -> None:
     mode = fit.mode
     if mode is None:
         return
-    line = f"drawn antialiased {mode.antialiased_db:.2f} dB, not {mode.default_db:.2f} dB: "
+    print(
+        f"antialiased {mode.antialiased_db:.2f} dB, not antialiased {mode.default_db:.2f} dB: ",
+        end="",
+    )
     if mode.antialiased == mode.stated_antialiased:
-        print(f"{line}the field's mode fits")
+        print("the field's mode fits")
     else:
         wanted = "antialiased" if mode.antialiased else "not antialiased"
-        print(f"{line}it was trained to be drawn {wanted}; --fix FILE.rff writes it so")
+        print(f"it was trained to be drawn {wanted}; --fix FILE.rff writes it so")
 
 
 @dataclass(frozen=True)
