@@ -1,9 +1,7 @@
-"""How much of a field is drawn: the knobs that trade accuracy for time, on both ends alike.
+"""How much of a field is drawn: settings that trade accuracy for time, on both ends alike.
 
-A quality is a value that both ends of a session can name; the same field, camera and quality give
-the same bytes everywhere. Each kind of field reads the knobs it has and ignores the others.
-
-Which splats a quality draws.
+A ``Quality`` is a value that both ends of a session can name; the same field, camera and quality
+give the same bytes everywhere. Each kind of field reads the settings it has and ignores the others.
 
 Rung ``detail`` of N splats is the first ``ceil(detail * N)`` of them in the archive's order, so
 that every rung is a prefix of the next; the product is taken in whole numbers. Where the archive
@@ -37,7 +35,7 @@ __all__ = [
 
 DETAILS = (1.0, 0.5, 0.25, 0.1)
 """The shares of a field's splats that can be drawn. A fixed list, so that every rung has one
-definition (``rfcore.field.quality``) and a field keeps at most four sets."""
+definition and a field keeps at most four sets."""
 SCALES = (1.0, 0.5)
 """The sides a picture can be rendered at, of its own (``rfcore.field.scale``)."""
 MAX_SH_DEGREE = 3

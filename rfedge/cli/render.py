@@ -58,8 +58,8 @@ class Render:
         from rfedge.fields.find import open_field
         from rfedge.fields.viewpoints import (
             OrbitSettings,
-            drive_stops,
-            orbit_stops,
+            drive_viewpoints,
+            orbit_viewpoints,
             pictures_along,
             write_pictures,
         )
@@ -69,13 +69,13 @@ class Render:
         quality = Quality(self.detail, self.sh_degree)
         field = open_field(self.field, threads=self.threads, isa=self.isa)
         if self.path == "orbit" or (self.path is None and self.drive is None):
-            stops = orbit_stops(field, OrbitSettings(self.frames, *self.size, up=self.up))
+            viewpoints = orbit_viewpoints(field, OrbitSettings(self.frames, *self.size, up=self.up))
         elif self.drive is None:
             raise InvalidInput("drive", "--path drive needs --drive, a dataset with the poses")
         else:
             origin = field.metadata.tile_origin
-            stops = drive_stops(read_dataset(self.drive, tile_origin=origin).pictures)
-        pictures = pictures_along(field, stops, quality)
+            viewpoints = drive_viewpoints(read_dataset(self.drive, tile_origin=origin).pictures)
+        pictures = pictures_along(field, viewpoints, quality)
         if self.out.suffix == ".mp4":
             self.out.parent.mkdir(parents=True, exist_ok=True)
             count = write_mp4(self.out, (rgb for _, rgb in pictures), self.rate_hz)

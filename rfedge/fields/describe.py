@@ -1,6 +1,6 @@
 """A field in words and figures, as ``rfedge field info`` prints it.
 
-What a frame of a field takes on this machine.
+The figures are what the header states and what a frame of each rung takes on this machine.
 """
 
 from __future__ import annotations

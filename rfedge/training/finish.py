@@ -1,8 +1,7 @@
-"""From a trained field to the one that is written: lower rungs, compression, held-out quality.
+"""From a trained field to the one that is written, and the run as one JSON object.
 
-The quality in the header is that of the field as it will be read, not as it was trained.
-
-One training run as one JSON object: quality, time, size, and how to repeat it.
+Written fields have lower rungs, are compressed, and state the held-out quality of the field as it
+will be read, not as it was trained. The JSON has quality, time, size and how to repeat the run.
 """
 
 from __future__ import annotations
@@ -50,6 +49,7 @@ def finish_field(
 def fit_rungs(
     field: SplatField, cameras: list[Camera], config: RungConfig, console: Console
 ) -> SplatField:
+    """Return the field with lower rungs fitted to what ``cameras`` see, showing progress."""
     columns = (TextColumn("rungs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as bar:
         task = bar.add_task("rungs", total=None)
