@@ -30,8 +30,8 @@ class Bench:
 
     def run(self) -> None:
         """Run one case and print its rows."""
+        from rfedge.arguments import field_path
         from rfedge.bench import print_rows, run_case, write_json
-        from rfedge.fields.find import field_path
 
         field = field_path(self.field) if self.field is not None else None
         result = run_case(self.case, rows=self.rows, field=field)

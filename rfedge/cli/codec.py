@@ -43,7 +43,7 @@ class Encode:
         from rfcore.codec.sender.steering import SteeringSettings
         from rfcore.dataset import read_dataset
         from rfcore.wire.drive_file import write_drive
-        from rfedge.fields.find import open_field
+        from rfedge.arguments import open_field
         from rfedge.offline import CodingSettings, encode_drive
 
         field = open_field(self.field, threads=self.threads)
@@ -78,7 +78,7 @@ class Decode:
         from rfcore.image import write_png
         from rfcore.native.yuv import rgb_from_i420
         from rfcore.wire.drive_file import read_drive
-        from rfedge.fields.find import open_field
+        from rfedge.arguments import open_field
         from rfedge.offline import decode_drive
 
         drive = read_drive(self.coded)

@@ -60,8 +60,8 @@ class FieldImport:
         from rfcore.camera import TileOrigin
         from rfcore.errors import InvalidInput
         from rfcore.field import FieldMetadata, SplatField, read_ply_antialiased, save_field
+        from rfedge.arguments import IMPORTED
         from rfedge.fields.describe import print_rungs, size_mb
-        from rfedge.fields.find import IMPORTED
         from rfedge.fields.viewpoints import look_around
 
         out = self.out if self.out is not None else IMPORTED / f"{self.name}.rff"
@@ -121,7 +121,7 @@ class FieldExport:
         """Load and export."""
         from rfcore.field import Quality, write_ply
         from rfcore.field.quality import splats_of_rung
-        from rfedge.fields.find import open_splats
+        from rfedge.arguments import open_splats
 
         _check_out(self.out, ".ply")
         detail = Quality(self.detail).detail
@@ -151,8 +151,8 @@ class FieldInfo:
 
         from rfcore.dataset import read_dataset
         from rfcore.field import SplatField
+        from rfedge.arguments import open_field
         from rfedge.fields.describe import describe_field, frame_ms, print_rungs
-        from rfedge.fields.find import open_field
         from rfedge.fields.viewpoints import look_around
 
         console = Console()
@@ -194,8 +194,8 @@ class FieldCheck:
         from rfcore.errors import InvalidData
         from rfcore.field import SplatField, save_field
         from rfcore.field.similarity import read_field_from_world
+        from rfedge.arguments import open_field
         from rfedge.fields.check import check_field, drawn_antialiased, in_drive_world
-        from rfedge.fields.find import open_field
 
         field = open_field(self.field, threads=self.threads)
         nerfstudio = read_field_from_world(self.transform) if self.transform else None
@@ -269,7 +269,7 @@ class FieldSlim:
     def run(self) -> None:
         """Slim and write."""
         from rfcore.train.rungs import RungConfig
-        from rfedge.fields.find import open_splats
+        from rfedge.arguments import open_splats
         from rfedge.fields.slim import slimmed
 
         _check_out(self.out, ".rff")
@@ -302,7 +302,7 @@ class FieldRungs:
         from rich.console import Console
 
         from rfcore.train.rungs import RungConfig
-        from rfedge.fields.find import open_splats
+        from rfedge.arguments import open_splats
         from rfedge.training.finish import fit_rungs
 
         _check_out(self.out, ".rff")

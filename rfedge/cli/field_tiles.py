@@ -35,7 +35,7 @@ class FieldPublish:
         from datetime import UTC, datetime
 
         from rfcore.wire.tiles import Area
-        from rfedge.fields.find import field_path
+        from rfedge.arguments import field_path
         from rfedge.fields.publish import Ground, publish
 
         area = None

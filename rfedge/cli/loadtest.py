@@ -59,7 +59,7 @@ class LoadTest:
     def run(self) -> None:
         """Run, write the report, print the rows; fail if the asked number is not held."""
         from rfcore.errors import RfedgeError
-        from rfedge.fields.find import field_path
+        from rfedge.arguments import field_path
         from rfedge.loadtest.command import Command
         from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
         from rfedge.loadtest.run import TestBed

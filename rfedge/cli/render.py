@@ -55,7 +55,7 @@ class Render:
         from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidInput
         from rfcore.field import Quality
-        from rfedge.fields.find import open_field
+        from rfedge.arguments import open_field
         from rfedge.fields.viewpoints import (
             OrbitSettings,
             drive_viewpoints,

@@ -14,6 +14,7 @@ from rfcore.field import FieldMetadata, SplatField, load_field, read_ply, save_f
 from rfcore.field.similarity import Similarity, moved
 from rfcore.image import read_rgb, write_png
 from rfcore.raster.gaussians import Gaussians
+from rfedge.arguments import field_path
 from rfedge.cli.codec import Decode, Encode
 from rfedge.cli.field import (
     FieldCheck,
@@ -24,7 +25,6 @@ from rfedge.cli.field import (
     FieldSlim,
 )
 from rfedge.cli.render import Render
-from rfedge.fields.find import field_path
 
 HALF = float(np.sqrt(0.5))
 NERFSTUDIO = Similarity(Pose((0.3, -0.2, 0.1), (HALF, 0.0, HALF, 0.0)), 0.05)

@@ -48,9 +48,9 @@ class EvalCompare:
         """Run what is not there yet and write the rows."""
         from rich.console import Console
 
+        from rfedge.arguments import field_path
         from rfedge.experiments.compare.drives import CompareJob
         from rfedge.experiments.compare.run import run_compare
-        from rfedge.fields.find import field_path
 
         job = CompareJob(
             field=field_path(self.field),

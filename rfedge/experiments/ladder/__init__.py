@@ -39,9 +39,9 @@ class EvalLadder:
         from rich.console import Console
         from rich.table import Table
 
+        from rfedge.arguments import field_path
         from rfedge.experiments.ladder.page import middle_rows, write_ladder_figure
         from rfedge.experiments.ladder.run import LadderJob, run_ladder
-        from rfedge.fields.find import field_path
 
         console = Console()
         fields = tuple(field_path(name) for name in self.fields)

@@ -48,9 +48,9 @@ class EvalLatency:
         from rich.console import Console
         from rich.table import Table
 
+        from rfedge.arguments import field_path
         from rfedge.experiments.latency.report import write_latency_figures
         from rfedge.experiments.latency.run import LatencyJob, run_latency
-        from rfedge.fields.find import field_path
 
         job = LatencyJob(
             field=field_path(self.field),

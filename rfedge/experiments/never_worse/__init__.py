@@ -41,8 +41,8 @@ class EvalNeverWorse:
         """Run what is not there yet and write the rows."""
         from rich.console import Console
 
+        from rfedge.arguments import field_path
         from rfedge.experiments.never_worse.measure import NeverWorseJob, run_never_worse
-        from rfedge.fields.find import field_path
 
         job = NeverWorseJob(
             field=field_path(self.field),

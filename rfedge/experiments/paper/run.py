@@ -23,6 +23,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
 from rfcore.image import Rgb
 from rfcore.views import PosedPicture
+from rfedge.arguments import open_field
 from rfedge.experiments.cells import CellStore, Rows
 from rfedge.experiments.paper.published import (
     PUBLISHED_CRFS,
@@ -35,7 +36,6 @@ from rfedge.experiments.paper.published import (
     reduced,
 )
 from rfedge.experiments.picture_quality import BANDS, flip
-from rfedge.fields.find import open_field
 from rfedge.results import check_result_path, provenance, revision, write_result
 
 __all__ = ["CONTROLS", "PaperJob", "named_path", "run_paper", "views_of"]

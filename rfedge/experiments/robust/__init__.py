@@ -46,9 +46,9 @@ class EvalRobust:
         """Do what is not done yet, write rows and figure, print what came out."""
         from rich.console import Console
 
+        from rfedge.arguments import field_path
         from rfedge.experiments.robust.report import write_robust_figure
         from rfedge.experiments.robust.run import RobustJob, run_robust
-        from rfedge.fields.find import field_path
 
         job = RobustJob(
             field=field_path(self.field),

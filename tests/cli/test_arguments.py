@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.fields.find import field_path
+from rfedge.arguments import field_path
 
 
 @pytest.fixture(autouse=True)
