@@ -23,12 +23,10 @@ from tyro.conf import (
 )
 
 from rfcore.errors import RfedgeError
-from rfedge.cli.bench import Bench
 from rfedge.cli.codec import Decode, Encode
 from rfedge.cli.demo import Demo
-from rfedge.cli.eval import Eval
 from rfedge.cli.field import Field
-from rfedge.cli.loadtest import LoadTest
+from rfedge.cli.measure import Bench, Eval, LoadTest
 from rfedge.cli.render import Render
 from rfedge.cli.scene import Scene
 from rfedge.cli.services import Certs, Link, Watch

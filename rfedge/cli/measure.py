@@ -1,4 +1,4 @@
-"""``rfedge loadtest``: how many vehicles a server carries."""
+"""Verbs that measure: ``rfedge bench``, ``rfedge loadtest`` and ``rfedge eval``."""
 
 from __future__ import annotations
 
@@ -6,11 +6,45 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg, subcommand
 
 from rfedge.arguments import DATASET, FIELD, FOLDER, JSON
+from rfedge.experiments.compare import EvalCompare
+from rfedge.experiments.ladder import EvalLadder
+from rfedge.experiments.latency import EvalLatency
+from rfedge.experiments.never_worse import EvalNeverWorse
+from rfedge.experiments.paper import EvalPaper
+from rfedge.experiments.robust import EvalRobust
 
-__all__ = ["LoadTest"]
+__all__ = ["Bench", "Eval", "LoadTest"]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Check a part against its definition, then time it: medians of at least 20 repetitions."""
+
+    case: Annotated[Literal["raster", "train", "codec", "ngp", "decoders"], Positional]
+    """What to measure."""
+    rows: Literal["all", "native", "modes"] = "all"
+    """`native` leaves out the timing of the slow torch reference; `modes` shows what SH degree,
+    antialiasing, depth and opacity cost, as ratios (raster only)."""
+    field: Annotated[Path | None, FIELD] = None
+    """A trained hash grid of the sample street to time, instead of one learnt on the spot (ngp
+    only)."""
+    json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
+    """Write one JSON object to this file; `-` is standard output."""
+
+    def run(self) -> None:
+        """Run one case and print its rows."""
+        from rfedge.arguments import field_path
+        from rfedge.bench import print_rows, run_case, write_json
+
+        field = field_path(self.field) if self.field is not None else None
+        result = run_case(self.case, rows=self.rows, field=field)
+        if self.json is None:
+            print_rows(result)
+        else:
+            write_json(result, self.json)
 
 
 @dataclass(frozen=True)
@@ -84,3 +118,22 @@ class LoadTest:
         result = Command(load, bed, self.out, self.record).run(find_limit=self.find_limit)
         if not self.find_limit and not result.most_held:
             raise RfedgeError("not held: " + "; ".join(result.runs[0].verdict.broken))
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Run an experiment; results are JSON with command, revision, host and input digests."""
+
+    verb: Annotated[
+        Annotated[EvalCompare, subcommand("compare")]
+        | Annotated[EvalLadder, subcommand("ladder")]
+        | Annotated[EvalNeverWorse, subcommand("never-worse")]
+        | Annotated[EvalLatency, subcommand("latency")]
+        | Annotated[EvalPaper, subcommand("paper")]
+        | Annotated[EvalRobust, subcommand("robust")],
+        arg(name=""),
+    ]
+
+    def run(self) -> None:
+        """Run the verb."""
+        self.verb.run()
