@@ -37,6 +37,7 @@ __all__ = [
     "SAMPLES",
     "SCENE",
     "SIZE",
+    "check_folder",
     "field_path",
     "open_field",
     "open_splats",
@@ -60,6 +61,8 @@ IMPORTED = Path("out/fields")
 """Where ``rfedge field import`` puts what it reads."""
 SAMPLES = Path("samples/fields")
 SUFFIX = ".rff"
+PICTURES = (".gif", ".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 
 
 def field_path(name: Path | str) -> Path:
@@ -101,6 +104,15 @@ def _candidates(name: Path) -> Iterator[Path]:
     if len(name.parts) == 1:
         file = name if name.suffix == SUFFIX else Path(f"{name}{SUFFIX}")
         yield from (folder / file for folder in (IMPORTED, SAMPLES))
+
+
+def check_folder(path: Path, wanted: str) -> None:
+    """Raise ``InvalidInput`` for a folder to write that is named as a picture or a video.
+
+    ``wanted`` says what to name instead.
+    """
+    if path.suffix.lower() in (*PICTURES, *VIDEOS):
+        raise InvalidInput("out", f"{path}: no {path.suffix} file is written; name {wanted}")
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import Annotated
 
 import tyro
@@ -75,6 +74,8 @@ def main() -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):  # a log file gets cost and progress as they come
         sys.stdout.reconfigure(line_buffering=True)
     if sys.argv[1:] == ["--version"]:
+        from importlib.metadata import version
+
         print(f"rfedge {version('rfedge')}")
         return 0
     verb = parse()

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import DATASET, FIELD, FOLDER
+from rfedge.arguments import DATASET, FIELD, FOLDER, check_folder, open_field
 
 __all__ = ["Decode", "Encode"]
 
@@ -43,7 +43,6 @@ class Encode:
         from rfcore.codec.sender.steering import SteeringSettings
         from rfcore.dataset import read_dataset
         from rfcore.wire.drive_file import write_drive
-        from rfedge.arguments import open_field
         from rfedge.offline import CodingSettings, encode_drive
 
         field = open_field(self.field, threads=self.threads)
@@ -78,9 +77,9 @@ class Decode:
         from rfcore.image import write_png
         from rfcore.native.yuv import rgb_from_i420
         from rfcore.wire.drive_file import read_drive
-        from rfedge.arguments import open_field
         from rfedge.offline import decode_drive
 
+        check_folder(self.out, "a folder for PNG files")
         drive = read_drive(self.coded)
         field = open_field(self.field, threads=self.threads)
         self.out.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
-from rfedge.arguments import DATASET, FIELD, PLY, RFF
+from rfedge.arguments import DATASET, FIELD, IMPORTED, PLY, RFF, open_field, open_splats
 from rfedge.cli.field_tiles import FieldList, FieldPublish, FieldRollback
 
 if TYPE_CHECKING:
@@ -60,7 +60,6 @@ class FieldImport:
         from rfcore.camera import TileOrigin
         from rfcore.errors import InvalidInput
         from rfcore.field import FieldMetadata, SplatField, read_ply_antialiased, save_field
-        from rfedge.arguments import IMPORTED
         from rfedge.fields.describe import print_rungs, size_mb
         from rfedge.fields.viewpoints import look_around
 
@@ -121,7 +120,6 @@ class FieldExport:
         """Load and export."""
         from rfcore.field import Quality, write_ply
         from rfcore.field.quality import splats_of_rung
-        from rfedge.arguments import open_splats
 
         _check_out(self.out, ".ply")
         detail = Quality(self.detail).detail
@@ -151,7 +149,6 @@ class FieldInfo:
 
         from rfcore.dataset import read_dataset
         from rfcore.field import SplatField
-        from rfedge.arguments import open_field
         from rfedge.fields.describe import describe_field, frame_ms, print_rungs
         from rfedge.fields.viewpoints import look_around
 
@@ -194,7 +191,6 @@ class FieldCheck:
         from rfcore.errors import InvalidData
         from rfcore.field import SplatField, save_field
         from rfcore.field.similarity import read_field_from_world
-        from rfedge.arguments import open_field
         from rfedge.fields.check import check_field, drawn_antialiased, in_drive_world
 
         field = open_field(self.field, threads=self.threads)
@@ -269,7 +265,6 @@ class FieldSlim:
     def run(self) -> None:
         """Slim and write."""
         from rfcore.train.rungs import RungConfig
-        from rfedge.arguments import open_splats
         from rfedge.fields.slim import slimmed
 
         _check_out(self.out, ".rff")
@@ -302,7 +297,6 @@ class FieldRungs:
         from rich.console import Console
 
         from rfcore.train.rungs import RungConfig
-        from rfedge.arguments import open_splats
         from rfedge.training.finish import fit_rungs
 
         _check_out(self.out, ".rff")

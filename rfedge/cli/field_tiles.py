@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import FIELD, FOLDER
+from rfedge.arguments import FIELD, FOLDER, field_path
 
 __all__ = ["FieldList", "FieldPublish", "FieldRollback"]
 
@@ -35,7 +35,6 @@ class FieldPublish:
         from datetime import UTC, datetime
 
         from rfcore.wire.tiles import Area
-        from rfedge.arguments import field_path
         from rfedge.fields.publish import Ground, publish
 
         area = None

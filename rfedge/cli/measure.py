@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from rfedge.arguments import DATASET, FIELD, FOLDER, JSON
+from rfedge.arguments import DATASET, FIELD, FOLDER, JSON, field_path
 from rfedge.experiments.compare import EvalCompare
 from rfedge.experiments.ladder import EvalLadder
 from rfedge.experiments.latency import EvalLatency
@@ -36,7 +36,6 @@ class Bench:
 
     def run(self) -> None:
         """Run one case and print its rows."""
-        from rfedge.arguments import field_path
         from rfedge.bench import print_rows, run_case, write_json
 
         field = field_path(self.field) if self.field is not None else None
@@ -93,7 +92,6 @@ class LoadTest:
     def run(self) -> None:
         """Run, write the report, print the rows; fail if the asked number is not held."""
         from rfcore.errors import RfedgeError
-        from rfedge.arguments import field_path
         from rfedge.loadtest.command import Command
         from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
         from rfedge.loadtest.run import TestBed

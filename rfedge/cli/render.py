@@ -8,15 +8,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import DATASET, FIELD
+from rfedge.arguments import DATASET, FIELD, check_folder, open_field
 
 __all__ = ["Render"]
-
-OTHER_FILES = (
-    *(".gif", ".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"),
-    *(".mov", ".avi", ".mkv", ".webm", ".m4v"),
-)
-"""Pictures and videos that people ask for and that are not written."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +49,6 @@ class Render:
         from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidInput
         from rfcore.field import Quality
-        from rfedge.arguments import open_field
         from rfedge.fields.viewpoints import (
             OrbitSettings,
             drive_viewpoints,
@@ -65,7 +58,9 @@ class Render:
         )
         from rfedge.video import write_mp4
 
-        self._check_out()
+        film = self.out.suffix.lower() == ".mp4"
+        if not film:
+            check_folder(self.out, "a folder for PNG files, or a video ending in .mp4")
         quality = Quality(self.detail, self.sh_degree)
         field = open_field(self.field, threads=self.threads, isa=self.isa)
         if self.path == "orbit" or (self.path is None and self.drive is None):
@@ -76,20 +71,9 @@ class Render:
             origin = field.metadata.tile_origin
             viewpoints = drive_viewpoints(read_dataset(self.drive, tile_origin=origin).pictures)
         pictures = pictures_along(field, viewpoints, quality)
-        if self.out.suffix == ".mp4":
+        if film:
             self.out.parent.mkdir(parents=True, exist_ok=True)
             count = write_mp4(self.out, (rgb for _, rgb in pictures), self.rate_hz)
             print(f"{self.out}: {count} pictures")
         else:
             write_pictures(self.out, pictures, self.psnr)
-
-    def _check_out(self) -> None:
-        """Refuse what looks like a file of another format: it would become a folder's name."""
-        from rfcore.errors import InvalidInput
-
-        if self.out.suffix.lower() in OTHER_FILES:
-            raise InvalidInput(
-                "out",
-                f"{self.out}: {self.out.suffix} is not written; name a video ending in .mp4, "
-                "or a folder for PNG files",
-            )

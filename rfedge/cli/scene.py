@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from rfedge.arguments import DATASET, FOLDER, SIZE
+from rfedge.arguments import DATASET, FOLDER, SIZE, parse_size
 from rfedge.cli.scene_street import SceneBuild, ScenePlan, SceneSheet, SceneSizes
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ class SceneConvert:
 
     def run(self) -> None:
         """Convert; the folder appears when all of it is there."""
-        from rfedge.arguments import parse_size
         from rfedge.datasets.convert import convert_dataset
 
         size_px = parse_size(self.size) if self.size is not None else None
@@ -149,7 +148,6 @@ class SceneRecordCarla:
         """Connect, record, and write the dataset."""
         from rfcore.errors import BackendUnavailable, RfedgeError
         from rfcore.files import whole_folder
-        from rfedge.arguments import parse_size
         from rfedge.datasets.carla import Recorder, RecordSettings
         from rfedge.datasets.rig import mounts_named
 

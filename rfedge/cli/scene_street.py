@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import FOLDER, JSON, SCENE, SIZE
+from rfedge.arguments import FOLDER, JSON, SCENE, SIZE, parse_size
 
 if TYPE_CHECKING:
     from rfedge.street.scene_file import Scene
@@ -48,7 +48,6 @@ class SceneBuild:
         """Build."""
         from rich.console import Console
 
-        from rfedge.arguments import parse_size
         from rfedge.street import load_scene
         from rfedge.street.render.backend import require_renderer
         from rfedge.street.shots import Selection

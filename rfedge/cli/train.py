@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import DATASET, FOLDER, PLY, RFF, SIZE
+from rfedge.arguments import DATASET, FOLDER, PLY, RFF, SIZE, parse_size
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -136,7 +136,6 @@ class Train:
         return TrainingJob(self.name, dataset, held_out, config, self.seed, limits, self.resume)
 
     def _views(self) -> tuple[Dataset, Dataset | None]:
-        from rfedge.arguments import parse_size
         from rfedge.training.views import ViewChoice, read_views
 
         choice = ViewChoice(

@@ -54,10 +54,10 @@ def fit_rungs(
     with Progress(*columns, console=console) as bar:
         task = bar.add_task("rungs", total=None)
 
-        def moved(done: int, total: int) -> None:
+        def show(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        return with_rungs(field, cameras, config, moved)
+        return with_rungs(field, cameras, config, show)
 
 
 def training_result(

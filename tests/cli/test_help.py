@@ -22,7 +22,7 @@ EMPTY_STREET = str(Path(__file__).parents[2] / "samples/scenes/street-empty.toml
 SAMPLES = Path(__file__).parents[2] / "samples"
 FIELD = str(SAMPLES / "fields/street.rff")
 TRAIN_VIEWS = str(SAMPLES / "street/transforms_train.json")
-HEAVY = ("torch", "cv2", "matplotlib", "av", "grpc", "cryptography")
+HEAVY = ("numpy", "torch", "cv2", "matplotlib", "av", "grpc", "cryptography")
 
 
 def rfedge(*arguments: str) -> subprocess.CompletedProcess[str]:
