@@ -7,6 +7,7 @@ them is ambiguous: the file itself is to be named.
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from rfcore.camera import TileOrigin
@@ -65,9 +66,9 @@ def refuse_video(path: Path) -> None:
     if path.suffix.lower() in VIDEOS:
         raise DatasetError(
             f"{path}: is a video, which has no poses; take pictures out of it and find theirs: "
-            f"mkdir frames && ffmpeg -i {path} -vf fps=2 -q:v 2 frames/%05d.jpg && "
-            "rfedge scene poses frames --matching sequential --out DATASET; or, with a trajectory, "
-            "describe it in a camera.toml (docs/data.md)"
+            f"mkdir frames && ffmpeg -i {shlex.quote(str(path))} -vf fps=2 -q:v 2 "
+            "frames/%05d.jpg && rfedge scene poses frames --matching sequential --out DATASET; or, "
+            "with a trajectory, describe it in a camera.toml (docs/data.md)"
         )
 
 

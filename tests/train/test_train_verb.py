@@ -97,6 +97,13 @@ def test_a_video_is_no_dataset_and_the_error_says_how_to_make_one(tmp_path: Path
         SceneConvert(video, tmp_path / "out").run()
 
 
+def test_the_command_for_a_video_can_be_pasted_whatever_its_name(tmp_path: Path) -> None:
+    video = tmp_path / "my phone.mp4"
+    video.touch()
+    with pytest.raises(DatasetError, match=r"ffmpeg -i '.*/my phone\.mp4' -vf"):
+        SceneConvert(video, tmp_path / "out").run()
+
+
 def test_a_picture_is_no_dataset_and_the_error_says_what_is(wall: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"0\.png: is no file that describes.*transforms\.json"):
         verb(wall / "0.png", tmp_path / "a.rff").run()
