@@ -13,8 +13,8 @@ from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import read_rgb, write_png
 from rfcore.lens import BrownLens
+from rfedge.arguments import parse_size
 from rfedge.datasets.convert import convert_dataset
-from rfedge.units import parse_size
 
 LENS = BrownLens(k1=-0.1)
 K = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)

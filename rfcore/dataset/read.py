@@ -7,6 +7,7 @@ them is ambiguous: the file itself is to be named.
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from rfcore.camera import TileOrigin
@@ -19,8 +20,9 @@ from rfcore.dataset.source import Source
 from rfcore.dataset.transforms import read_transforms_source, transforms_file
 from rfcore.errors import DatasetError
 
-__all__ = ["read_dataset", "read_source"]
+__all__ = ["read_dataset", "read_source", "refuse_video"]
 
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
 EXPECTED = (
     "transforms.json, sparse/0 of COLMAP, calib.txt of KITTI, cameras.json of INRIA, camera.toml"
 )
@@ -47,13 +49,27 @@ def read_source(path: Path) -> Source:
         return _read_folder(path)
     if not path.exists():
         raise DatasetError(f"{path}: cannot be read (it does not exist)")
+    refuse_video(path)
     if path.suffix == ".toml":
         return read_recording_source(path)
     if path.name == "calib.txt":
         return read_kitti_source(path.parent)
     if path.suffix in (".bin", ".txt"):
         return read_colmap_source(path.parent)
+    if path.suffix != ".json":
+        raise DatasetError(f"{path}: is no file that describes a dataset ({EXPECTED})")
     return read_inria_source(path) if path.name == "cameras.json" else read_transforms_source(path)
+
+
+def refuse_video(path: Path) -> None:
+    """Raise ``DatasetError`` for a video, saying how pictures with poses are made of it."""
+    if path.suffix.lower() in VIDEOS:
+        raise DatasetError(
+            f"{path}: is a video, which has no poses; take pictures out of it and find theirs: "
+            f"mkdir frames && ffmpeg -i {shlex.quote(str(path))} -vf fps=2 -q:v 2 "
+            "frames/%05d.jpg && rfedge scene poses frames --matching sequential --out DATASET; or, "
+            "with a trajectory, describe it in a camera.toml (docs/data.md)"
+        )
 
 
 def _read_folder(folder: Path) -> Source:

@@ -8,7 +8,7 @@ from rfcore.field.interface import (
     render_field_view,
 )
 from rfcore.field.ngp import NgpField
-from rfcore.field.ply import read_ply, write_ply
+from rfcore.field.ply import read_ply, read_ply_antialiased, write_ply
 from rfcore.field.quality import FULL, Quality
 from rfcore.field.splats import SplatField
 from rfcore.field.store import FieldStore, load_field, save_field
@@ -25,6 +25,7 @@ __all__ = [
     "SplatField",
     "load_field",
     "read_ply",
+    "read_ply_antialiased",
     "render_field_view",
     "save_field",
     "write_ply",

@@ -56,7 +56,12 @@ def encode_columns(values: Integers) -> tuple[dict[str, list[int]], NDArray[np.u
     )
     stream = lzma.compress(planes, lzma.FORMAT_RAW, filters=FILTERS)
     if len(planes) > MAX_INFLATION * len(stream):
-        raise InvalidInput("field", "compresses like a decompression bomb; save it uncompressed")
+        raise InvalidInput(
+            "field",
+            f"its numbers are so alike that they compress over {MAX_INFLATION}-fold, which readers "
+            "refuse as a decompression bomb; save it uncompressed (rfedge train --plain, rfedge "
+            "field --raw)",
+        )
     return {"lowest": lowest.tolist(), "bytes": widths}, np.frombuffer(stream, np.uint8)
 
 

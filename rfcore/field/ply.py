@@ -6,6 +6,11 @@ coefficients of red, then green, then blue. Normals and other properties are ign
 normals are written as zeros because viewers ask for them. So write INRIA's trainer, gsplat,
 nerfstudio, OpenSplat, Brush, Postshot and SuperSplat, each in an order of its own.
 
+How splats are to be drawn is a comment of the header, ``SplatRenderMode: mip`` (antialiased: a
+splat smaller than a pixel is made fainter) or ``SplatRenderMode: default``, as gsplat (pull request
+1036), nerfstudio (3773) and Brush write it. The last such comment counts, in any letter case.
+Postshot's ``antialiased 0`` or ``1`` is read as well.
+
 Two properties that change what the others mean are refused by name rather than ignored:
 ``filter_3D`` of Mip-Splatting (its own ``create_fused_ply.py`` fuses it in), and two scales
 instead of three (2D Gaussian Splatting's discs).
@@ -21,10 +26,10 @@ from numpy.typing import NDArray
 
 from rfcore.camera import TileOrigin
 from rfcore.errors import FieldFormatError, InvalidInput
-from rfcore.field.ply_table import Table, read_vertices, write_vertices
+from rfcore.field.ply_table import Table, read_comments, read_vertices, write_vertices
 from rfcore.raster.gaussians import Gaussians
 
-__all__ = ["read_ply", "write_ply"]
+__all__ = ["read_ply", "read_ply_antialiased", "write_ply"]
 
 XYZ = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
@@ -34,8 +39,12 @@ ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 REST_COUNTS = (0, 9, 24, 45)
 """3 ((D + 1)^2 - 1) coefficients beyond the first band for SH degree D = 0..3."""
 
-OTHER_FORMATS = (".splat", ".ksplat", ".spz", ".sog", ".sogs", ".gltf", ".glb")
-"""Formats of splats that lose precision or order; every tool that writes them also writes .ply."""
+CONVERTED = (".splat", ".ksplat", ".spz", ".sog")
+"""Formats that keep fewer bits than .ply and that splat-transform converts."""
+OTHERS = (".sogs", ".gltf", ".glb")
+MODES = {"splatrendermode:mip": True, "splatrendermode:default": False}
+"""Comments without their spaces, in lower case, and whether splats are drawn antialiased."""
+POSTSHOT_MODES = {"antialiased1": True, "antialiased0": False}
 
 F32 = NDArray[np.float32]
 
@@ -64,8 +73,30 @@ def read_ply(path: Path, tile_origin: TileOrigin | None = None) -> Gaussians:
         raise FieldFormatError(f"{path}: {error}") from error
 
 
-def write_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians as the reference implementation does; float32 survives exactly."""
+def read_ply_antialiased(path: Path) -> bool | None:
+    """Return how the header says its splats are to be drawn, ``None`` where it does not say.
+
+    Raises ``FieldFormatError`` when the header cannot be read or names a mode there is not.
+    """
+    _check_suffix(path)
+    stated = None
+    for comment in read_comments(path):
+        text = "".join(comment.lower().split())
+        if text in MODES or text in POSTSHOT_MODES:
+            stated = {**MODES, **POSTSHOT_MODES}[text]
+        elif text.startswith("splatrendermode:"):
+            raise FieldFormatError(
+                f"{path}: its comment '{comment}' names neither mode, mip or default; "
+                "correct it in the header"
+            )
+    return stated
+
+
+def write_ply(path: Path, gaussians: Gaussians, *, antialiased: bool | None = None) -> None:
+    """Write Gaussians as the reference implementation does; float32 survives exactly.
+
+    ``antialiased`` becomes the ``SplatRenderMode`` comment; ``None`` writes no such comment.
+    """
     rest_count = 3 * (gaussians.sh.shape[1] - 1)
     rest = tuple(f"f_rest_{i}" for i in range(rest_count))
     names = (*XYZ, *NORMALS, *DC, *rest, "opacity", *SCALES, *ROTATION)
@@ -79,12 +110,20 @@ def write_ply(path: Path, gaussians: Gaussians) -> None:
         gaussians.quaternions,
     ]
     rows = np.concatenate(parts, axis=1).astype("<f4")
-    write_vertices(path, rows.view([(name, "<f4") for name in names])[:, 0])
+    comments = {None: (), True: ("SplatRenderMode: mip",), False: ("SplatRenderMode: default",)}
+    table = rows.view([(name, "<f4") for name in names])[:, 0]
+    write_vertices(path, table, comments[antialiased])
 
 
 def _check_suffix(path: Path) -> None:
-    if path.suffix.lower() in OTHER_FORMATS:
-        raise FieldFormatError(f"{path}: {path.suffix} is another format; export it as .ply")
+    suffix = path.suffix.lower()
+    if suffix in OTHERS:
+        raise FieldFormatError(f"{path}: {suffix} is not read; export the splats as .ply")
+    if suffix in CONVERTED:
+        raise FieldFormatError(
+            f"{path}: {suffix} is not read; convert it first (npm package @playcanvas/"
+            f"splat-transform): splat-transform {path.name} {path.stem}.ply"
+        )
 
 
 def _rest_names(path: Path, table: Table) -> tuple[str, ...]:

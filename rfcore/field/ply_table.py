@@ -1,13 +1,9 @@
-"""The vertex table of a PLY file, by property name; its header is ``rfcore.field.ply_table``.
+"""The header and the vertex table of a PLY file (G. Turk, "The PLY Polygon File Format", 1994).
 
-The row count is checked against the size of the file before anything is allocated. Rows of text
-are one a line, with as many numbers as there are properties; text of nine digits gives back the
-float32 it was written from.
-
-The header of a PLY file: how many vertices there are and what a row of them holds.
-
-PLY as described by G. Turk, "The PLY Polygon File Format", 1994. Read here: any of its three
-formats, ``element vertex`` first, scalar properties in any order; further elements are ignored.
+Read: any of the three formats, ``element vertex`` first, scalar properties in any order; further
+elements are ignored, comments are kept. The row count is checked against the size of the file
+before anything is allocated. Rows of text are one a line, with as many numbers as there are
+properties; text of nine digits gives back the float32 it was written from.
 """
 
 from __future__ import annotations
@@ -23,7 +19,15 @@ from numpy.typing import NDArray
 from rfcore.errors import FieldFormatError
 from rfcore.files import whole_file
 
-__all__ = ["ASCII", "Header", "Table", "read_header", "read_vertices", "write_vertices"]
+__all__ = [
+    "ASCII",
+    "Header",
+    "Table",
+    "read_comments",
+    "read_header",
+    "read_vertices",
+    "write_vertices",
+]
 
 
 MAX_HEADER_BYTES = 65_536
@@ -50,6 +54,8 @@ class Header:
     format: str
     count: int
     dtype: np.dtype[Any]
+    comments: tuple[str, ...] = ()
+    """The text after ``comment`` of each such line, in the order of the file."""
 
 
 def read_header(path: Path, file: BinaryIO) -> Header:
@@ -59,6 +65,7 @@ def read_header(path: Path, file: BinaryIO) -> Header:
     """
     lines = _lines(path, file)
     words = [line.split() for line in lines[1:-1]]
+    comments = tuple(" ".join(line[1:]) for line in words if line[:1] == ["comment"])
     words = [line for line in words if line and line[0] not in ("comment", "obj_info")]
     if not words or words[0][:1] != ["format"] or words[0][1:] not in [[f, "1.0"] for f in ORDERS]:
         found = " ".join(words[0]) if words else "nothing"
@@ -69,7 +76,8 @@ def read_header(path: Path, file: BinaryIO) -> Header:
     _check_first_element(path, words, elements)
     end = elements[1] if len(elements) > 1 else len(words)
     form = words[0][1]
-    return Header(form, _row_count(path, words[1]), _row_dtype(path, words[2:end], ORDERS[form]))
+    count, dtype = _row_count(path, words[1]), _row_dtype(path, words[2:end], ORDERS[form])
+    return Header(form, count, dtype, comments)
 
 
 def _lines(path: Path, file: BinaryIO) -> list[str]:
@@ -90,7 +98,8 @@ def _check_first_element(path: Path, words: list[list[str]], elements: list[int]
     first = words[elements[0]][1:2] if elements else []
     if first == ["chunk"]:
         raise FieldFormatError(
-            f"{path}: a compressed .ply of PlayCanvas or SuperSplat; export it there as plain .ply"
+            f"{path}: a compressed .ply of PlayCanvas or SuperSplat; convert it first: "
+            "splat-transform IN.compressed.ply OUT.ply"
         )
     if not elements or elements[0] != 1 or first != ["vertex"]:
         raise FieldFormatError(f"{path}: the first element must be 'vertex'")
@@ -143,12 +152,25 @@ def read_vertices(path: Path, required: Sequence[str]) -> Table:
         raise FieldFormatError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def write_vertices(path: Path, table: Table) -> None:
-    """Write a structured array of little-endian float32 and uint8 columns as PLY, atomically."""
+def read_comments(path: Path) -> tuple[str, ...]:
+    """Return the comments of a PLY file's header; raise ``FieldFormatError`` as above."""
+    try:
+        with path.open("rb") as file:
+            return read_header(path, file).comments
+    except OSError as error:
+        raise FieldFormatError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def write_vertices(path: Path, table: Table, comments: Sequence[str] = ()) -> None:
+    """Write a structured array of little-endian float32 and uint8 columns as PLY, atomically.
+
+    ``comments`` are ASCII text of one line each.
+    """
     columns: list[tuple[str, np.dtype[Any]]] = [
         (name, table.dtype[name]) for name in table.dtype.names or ()
     ]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
+    lines += [f"element vertex {len(table)}"]
     lines += [f"property {NAMES[dtype]} {name}" for name, dtype in columns]
     with whole_file(path) as file:
         file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))

@@ -1,16 +1,12 @@
-"""Splats as the content of an archive.
+"""Splats as the content of an archive: raw, or compressed and decoded to the same bytes everywhere.
 
-Raw float32 arrays by the names of ``Gaussians``; what a lower level has of its own follows as
-``detail_50.log_scales`` and ``detail_50.opacity_logits``, likewise for 25 and 10. Where the header
-has an ``encoding``, ``rfcore.field.splat_archive`` says what the arrays are.
+Raw: float32 arrays by the names of ``Gaussians``; what a lower level has of its own follows as
+``detail_50.log_scales`` and ``detail_50.opacity_logits``, likewise for 25 and 10.
 
-Compressed splats: a smaller archive of the same kind, decoded to the same bytes everywhere.
-
-The header's ``encoding`` is {"name": "grid-1", "count", "sh_degree", "steps", "streams"}; each
-array of the archive is one stream of ``rfcore.field.integers``, holding the numbers of
-``rfcore.field.splat_grid``. The field id is of the archive, so both ends decode one set of splats.
-
-Splats are stored along a Morton curve within each band of detail (the first tenth, up to a
+Compressed: the header has an ``encoding``, {"name": "grid-1", "count", "sh_degree", "steps",
+"streams"}; each array of the archive is one stream of ``rfcore.field.integers``, holding the
+numbers of ``rfcore.field.splat_grid``. The field id is of the archive, so both ends decode one set
+of splats. They are stored along a Morton curve within each band of detail (the first tenth, up to a
 quarter, up to half, the rest), so every level keeps its splats and neighbours share a block.
 
 Measured on the first sample (150k splats, SH 3, three levels): 3.03 MB, 20.2 bytes a splat, 8.1 %

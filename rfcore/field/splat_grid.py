@@ -123,7 +123,8 @@ def _rounded(name: str, values: F32, bits: int | NDArray[np.int64]) -> Integers:
     if scaled.size and np.abs(scaled).max() >= LIMIT // 4:
         raise InvalidInput(
             f"gaussians.{name}",
-            f"{np.abs(values).max():g} is too large for a compressed archive; save it uncompressed",
+            f"{np.abs(values).max():g} is too large for a compressed archive; save it "
+            "uncompressed (rfedge train --plain, rfedge field --raw)",
         )
     return scaled.astype(np.int32)
 

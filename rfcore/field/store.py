@@ -1,11 +1,11 @@
-"""A directory of field archives, addressed by field id.
+"""Field files of every kind, and a directory of them addressed by field id.
 
-A file named ``<field id>.rff`` is listed by its name; any other ``.rff`` file by its SHA-256, so
-that ``street.rff`` may simply be put there. Contents are checked when a field is added or loaded.
+``decode_field`` makes a field that renders out of an archive's bytes, ``encode_field`` the reverse;
+``READERS`` is the one place that knows which kinds of field there are.
 
-Field files of every kind: bytes in, a field that renders out, and back.
-
-``READERS`` is the one place that knows which kinds there are.
+In a directory (``FieldStore``) a file named ``<field id>.rff`` is listed by its name, any other
+``.rff`` file by its SHA-256, so that ``street.rff`` may simply be put there. Contents are checked
+when a field is added or loaded.
 """
 
 from __future__ import annotations

@@ -1,17 +1,16 @@
 """Training of radiance fields from posed pictures."""
 
 from rfcore.train.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from rfcore.train.density import DensityControl
 from rfcore.train.ngp import NgpModel, NgpSchedule, NgpTrainer, NgpTrainingConfig
-from rfcore.train.protocol import (
+from rfcore.train.schedule import Bands, DensityControl, RateSchedule, Regularisation
+from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
+from rfcore.train.trainer import (
     FieldTrainer,
     HeldOut,
     TrainingProgress,
     held_out_quality,
     mean_psnr_db,
 )
-from rfcore.train.schedule import Bands, RateSchedule, Regularisation
-from rfcore.train.splats import SplatTrainer, SplatTrainingConfig
 
 __all__ = [
     "Bands",

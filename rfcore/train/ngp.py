@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import InvalidInput
-from rfcore.field import FieldMetadata, NgpField
+from rfcore.field import NgpField
 from rfcore.field.interface import NGP
 from rfcore.ngp.shape import (
     HashGrid,
@@ -31,10 +31,9 @@ from rfcore.ngp.shape import (
 )
 from rfcore.ngp.trainable import MAX_BLOCK_RAYS, NgpRates, TrainableNgp
 from rfcore.train.checkpoint import Checkpoint
-from rfcore.train.divergence import DivergenceWatch
 from rfcore.train.ngp_space import cells_near, occupancy_cells, space_around
-from rfcore.train.protocol import HeldOut, TrainingProgress
 from rfcore.train.targets import RaySampler, load_targets
+from rfcore.train.trainer import FieldTrainer, HeldOut, settings_of
 from rfcore.views import PointCloud, PosedPicture
 
 __all__ = ["NgpModel", "NgpSchedule", "NgpTrainer", "NgpTrainingConfig"]
@@ -130,7 +129,7 @@ class _Groups:
     matrices: NDArray[np.float32]
 
 
-class NgpTrainer:
+class NgpTrainer(FieldTrainer):
     """One training run.
 
     ``points``, where there are any, say which cells can be occupied. Every picture is read into
@@ -153,10 +152,9 @@ class NgpTrainer:
         self._sampler = RaySampler(targets, seed)
         shape = _shape(self.config.model, [target.camera for target in targets], points)
         initial, peaks = _start(shape, points, self.config.schedule.threshold, seed)
-        self._digest = self._training_digest(pictures_digest, points, seed)
-        self._done = 0
+        digest = _training_digest(pictures_digest, points, self.config, seed)
+        super().__init__(self.config.iterations, digest)
         self._samples_per_ray = FIRST_SAMPLES_PER_RAY
-        self._watch = DivergenceWatch()
         self._trainable = TrainableNgp(
             initial, peaks, threads=self.config.threads, isa=self.config.isa
         )
@@ -164,51 +162,9 @@ class NgpTrainer:
         self._trainable.rebuild_occupancy(self.config.schedule.threshold)
 
     @property
-    def training_digest(self) -> str:
-        """SHA-256 of pictures, points, settings and seed, in hex; known before the first step."""
-        return self._digest
-
-    @property
-    def iteration(self) -> int:
-        """How many iterations have been done."""
-        return self._done
-
-    @property
-    def total(self) -> int:
-        """How many iterations the settings ask for."""
-        return self.config.iterations
-
-    @property
     def primitives(self) -> int:
         """How many numbers are being learned."""
         return self._numbers
-
-    @property
-    def finished(self) -> bool:
-        """Whether every iteration has been done."""
-        return self._done >= self.config.iterations
-
-    def step(self, progress: float | None = None) -> TrainingProgress:
-        """Do one iteration.
-
-        Raises ``InvalidInput`` when the run is finished, ``TrainingDiverged`` when it no longer
-        gets anywhere.
-        """
-        if self.finished:
-            raise InvalidInput("training", f"all {self.config.iterations} iterations are done")
-        if progress is None:
-            progress = self._done / self.config.iterations
-        loss = self._descend(progress)
-        self._done += 1
-        if self._done % REBUILD_EVERY == 0:
-            self._trainable.rebuild_occupancy(self.config.schedule.threshold)
-        self._watch.see(self._done, loss, self._groups)
-        return TrainingProgress(self._done, self.config.iterations, loss)
-
-    def steps(self) -> Iterator[TrainingProgress]:
-        """Do the iterations that are left, one at a time."""
-        while not self.finished:
-            yield self.step()
 
     def field(
         self,
@@ -217,53 +173,51 @@ class NgpTrainer:
         held_out: HeldOut | None = None,
     ) -> NgpField:
         """Return what has been learnt so far as a field."""
-        metadata = FieldMetadata(
-            name=name,
-            tile_origin=tile_origin if tile_origin is not None else TileOrigin(),
-            training_digest=self._digest,
-            held_out_psnr_db=held_out.psnr_db if held_out is not None else None,
-            held_out_ssim=held_out.ssim if held_out is not None else None,
-            kind=NGP,
-        )
+        metadata = self._metadata(name, tile_origin, held_out)
         numbers, config = self._trainable.parameters(), self.config
         return NgpField(numbers, metadata, threads=config.threads, isa=config.isa)
 
     def checkpoint(self) -> Checkpoint:
         """Return what ``restore`` of a trainer made of the same things goes on from."""
         values = {"samples_per_ray": self._samples_per_ray, "watch": self._watch.values()}
-        return Checkpoint(self.kind, self._digest, self._done, values, self._trainable.state())
+        state = self._trainable.state()
+        return Checkpoint(self.kind, self.training_digest, self.iteration, values, state)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on after ``checkpoint``. Raises ``InvalidInput`` when it is of another run."""
-        checkpoint.check(self.kind, self._digest)
+        checkpoint.check(self.kind, self.training_digest)
         self._trainable.restore(checkpoint.arrays)
         self._samples_per_ray = float(checkpoint.values["samples_per_ray"])
         self._watch.restore(checkpoint.values["watch"])
-        self._done = checkpoint.iteration
+        self.iteration = checkpoint.iteration
 
     def _descend(self, progress: float) -> float:
         """Do one step of Adam on a batch of about ``batch_samples``; return its loss."""
         wanted = int(self.config.batch_samples / BLOCKS / self._samples_per_ray)
         rays = min(max(wanted, 1), MAX_BLOCK_RAYS)
-        batch = self._sampler.batch(self._done, rays, BLOCKS, MAX_SAMPLES // rays)
+        batch = self._sampler.batch(self.iteration, rays, BLOCKS, MAX_SAMPLES // rays)
         loss = self._trainable.accumulate(batch)
         self._trainable.update(self.config.schedule.at(progress))
         seen = max(self._trainable.samples / (rays * BLOCKS), 1.0)
         self._samples_per_ray += 0.1 * (seen - self._samples_per_ray)
         return loss
 
-    def _groups(self) -> _Groups:
+    def _after_iteration(self, progress: float) -> None:  # noqa: ARG002 - whatever the progress
+        if self.iteration % REBUILD_EVERY == 0:
+            self._trainable.rebuild_occupancy(self.config.schedule.threshold)
+
+    def _parameters(self) -> _Groups:
         numbers = self._trainable.parameters()
         return _Groups(numbers.table, numbers.matrices)
 
-    def _training_digest(self, pictures: str, points: PointCloud | None, seed: int) -> str:
-        """Leave out what does not change the result: threads and instruction set."""
-        kept = [f for f in fields(self.config) if f.name not in ("threads", "isa")]
-        settings = [(f.name, getattr(self.config, f.name)) for f in kept]
-        digest = hashlib.sha256(repr((NGP, pictures, settings, seed)).encode())
-        if points is not None:
-            digest.update(points.xyz_m.tobytes())
-        return digest.hexdigest()
+
+def _training_digest(
+    pictures: str, points: PointCloud | None, config: NgpTrainingConfig, seed: int
+) -> str:
+    digest = hashlib.sha256(repr((NGP, pictures, settings_of(config), seed)).encode())
+    if points is not None:
+        digest.update(points.xyz_m.tobytes())
+    return digest.hexdigest()
 
 
 def _shape(model: NgpModel, cameras: Sequence[Camera], points: PointCloud | None) -> NgpShape:

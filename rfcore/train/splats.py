@@ -11,7 +11,7 @@ a run limited by time passes its own, and then repeats itself only as well as it
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from itertools import islice
 from typing import Any
@@ -21,17 +21,22 @@ from numpy.typing import NDArray
 
 from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput, TrainingDiverged
-from rfcore.field import FieldMetadata, SplatField
+from rfcore.field import SplatField
+from rfcore.field.interface import SPLATS
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
 from rfcore.raster.trainable import TrainableRasterizer, TrainingState
 from rfcore.train.checkpoint import Checkpoint
-from rfcore.train.density import DensityControl, control_density
-from rfcore.train.divergence import DivergenceWatch
-from rfcore.train.exposure import ExposureModel
-from rfcore.train.protocol import HeldOut, TrainingProgress
-from rfcore.train.schedule import Bands, RateSchedule, Regularisation, view_order
+from rfcore.train.schedule import (
+    Bands,
+    DensityControl,
+    RateSchedule,
+    Regularisation,
+    control_density,
+    view_order,
+)
 from rfcore.train.start import gaussians_from_points
-from rfcore.train.targets import load_targets
+from rfcore.train.targets import ExposureModel, load_targets
+from rfcore.train.trainer import FieldTrainer, HeldOut, settings_of
 from rfcore.views import PointCloud, PosedPicture
 
 __all__ = ["SplatTrainer", "SplatTrainingConfig"]
@@ -69,7 +74,7 @@ class SplatTrainingConfig:
             raise InvalidInput("training.initial_scale", f"{self.initial_scale} not in 0.01..10")
 
 
-class SplatTrainer:
+class SplatTrainer(FieldTrainer):
     """One training run.
 
     ``start`` is the points to start from, or Gaussians to go on with. Every picture is read into
@@ -77,7 +82,7 @@ class SplatTrainer:
     ``DatasetError`` on pictures that cannot be read.
     """
 
-    kind = "splats"
+    kind = SPLATS
 
     def __init__(
         self,
@@ -93,57 +98,15 @@ class SplatTrainer:
         initial = self._initial(start, np.random.default_rng(seed))
         self._order = view_order(len(self._targets), self._order_rng())
         self._unit_m = float(np.median(np.exp(initial.log_scales.astype(np.float64))))
-        self._digest = self._training_digest(pictures_digest, initial, seed)
-        self._done = 0
-        self._watch = DivergenceWatch()
+        digest = _training_digest(pictures_digest, initial, self.config, seed)
+        super().__init__(self.config.iterations, digest)
         self._exposure = ExposureModel(len(self._targets)) if self.config.exposure else None
         self._rasterizer = self._rasterizer_of(initial)
-
-    @property
-    def training_digest(self) -> str:
-        """SHA-256 of pictures, start, settings and seed, in hex; known before the first step."""
-        return self._digest
-
-    @property
-    def iteration(self) -> int:
-        """How many iterations have been done."""
-        return self._done
-
-    @property
-    def total(self) -> int:
-        """How many iterations the settings ask for."""
-        return self.config.iterations
 
     @property
     def primitives(self) -> int:
         """How many Gaussians there are now."""
         return len(self._rasterizer)
-
-    @property
-    def finished(self) -> bool:
-        """Whether every iteration has been done."""
-        return self._done >= self.config.iterations
-
-    def step(self, progress: float | None = None) -> TrainingProgress:
-        """Do one iteration.
-
-        Raises ``InvalidInput`` when the run is finished, ``TrainingDiverged`` when it no longer
-        gets anywhere.
-        """
-        if self.finished:
-            raise InvalidInput("training", f"all {self.config.iterations} iterations are done")
-        if progress is None:
-            progress = self._done / self.config.iterations
-        loss = self._descend(next(self._order), progress)
-        self._done += 1
-        self._watch.see(self._done, loss, self.gaussians)
-        control_density(self._rasterizer, self.config.density, self._done, progress, self._seed)
-        return TrainingProgress(self._done, self.config.iterations, loss)
-
-    def steps(self) -> Iterator[TrainingProgress]:
-        """Do the iterations that are left, one at a time."""
-        while not self.finished:
-            yield self.step()
 
     def gaussians(self) -> Gaussians:
         """Return the parameters as they are now."""
@@ -157,14 +120,7 @@ class SplatTrainer:
     ) -> SplatField:
         """Return what has been learnt so far as a field."""
         config = self.config
-        metadata = FieldMetadata(
-            name=name,
-            tile_origin=tile_origin if tile_origin is not None else TileOrigin(),
-            training_digest=self._digest,
-            held_out_psnr_db=held_out.psnr_db if held_out is not None else None,
-            held_out_ssim=held_out.ssim if held_out is not None else None,
-            antialiased=config.antialiased,
-        )
+        metadata = self._metadata(name, tile_origin, held_out, antialiased=config.antialiased)
         return SplatField(self.gaussians(), metadata, threads=config.threads, isa=config.isa)
 
     def checkpoint(self) -> Checkpoint:
@@ -175,7 +131,8 @@ class SplatTrainer:
         try:
             state = self._rasterizer.state()
         except InvalidInput as error:
-            raise TrainingDiverged(self._done, error.field.split(".")[-1], str(error)) from error
+            group = error.field.split(".")[-1]
+            raise TrainingDiverged(self.iteration, group, str(error)) from error
         arrays: dict[str, NDArray[Any]] = {"scores": state.scores}
         for part in STATE_PARTS:
             values = getattr(state, part)
@@ -183,11 +140,11 @@ class SplatTrainer:
         values = {"beta_powers": list(state.beta_powers), "watch": self._watch.values()}
         if self._exposure is not None:
             arrays |= self._exposure.arrays()
-        return Checkpoint(self.kind, self._digest, self._done, values, arrays)
+        return Checkpoint(self.kind, self.training_digest, self.iteration, values, arrays)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on after ``checkpoint``. Raises ``InvalidInput`` when it is of another run."""
-        checkpoint.check(self.kind, self._digest)
+        checkpoint.check(self.kind, self.training_digest)
         arrays = checkpoint.arrays
         parts = {
             part: Gaussians(**{f.name: arrays[f"{part}.{f.name}"] for f in fields(Gaussians)})
@@ -205,13 +162,14 @@ class SplatTrainer:
         self._order = view_order(len(self._targets), self._order_rng())
         for _ in islice(self._order, checkpoint.iteration):
             pass
-        self._done = checkpoint.iteration
+        self.iteration = checkpoint.iteration
 
     def _order_rng(self) -> np.random.Generator:
         return np.random.default_rng([self._seed, 1])
 
-    def _descend(self, view: int, progress: float) -> float:
-        """Do one step of Adam on a view; return the loss."""
+    def _descend(self, progress: float) -> float:
+        """Do one step of Adam on the next view; return the loss."""
+        view = next(self._order)
         config, target = self.config, self._targets[view]
         rates = config.regularisation.added_to(
             config.rates.at(progress, self._unit_m), len(self._rasterizer)
@@ -227,6 +185,13 @@ class SplatTrainer:
         if self._exposure is not None and exposure is not None:
             self._exposure.step(view, exposure.gradient, config.rates.factor(progress))
         return loss
+
+    def _after_iteration(self, progress: float) -> None:
+        control = self.config.density
+        control_density(self._rasterizer, control, self.iteration, progress, self._seed)
+
+    def _parameters(self) -> Gaussians:
+        return self.gaussians()
 
     def _initial(self, start: PointCloud | Gaussians, rng: np.random.Generator) -> Gaussians:
         if isinstance(start, Gaussians):
@@ -244,11 +209,11 @@ class SplatTrainer:
         rasterizer.keep_scores(config.density.limit > 0 and config.density.drawn_by == "gradient")
         return rasterizer
 
-    def _training_digest(self, pictures: str, initial: Gaussians, seed: int) -> str:
-        """Leave out what does not change the result: threads and instruction set."""
-        kept = [f for f in fields(self.config) if f.name not in ("threads", "isa")]
-        settings = [(f.name, getattr(self.config, f.name)) for f in kept]
-        digest = hashlib.sha256(repr((pictures, settings, seed)).encode())
-        for array in fields(initial):
-            digest.update(getattr(initial, array.name).data)
-        return digest.hexdigest()
+
+def _training_digest(
+    pictures: str, initial: Gaussians, config: SplatTrainingConfig, seed: int
+) -> str:
+    digest = hashlib.sha256(repr((pictures, settings_of(config), seed)).encode())
+    for array in fields(initial):
+        digest.update(getattr(initial, array.name).data)
+    return digest.hexdigest()

@@ -1,10 +1,7 @@
-"""Points to start from when a dataset brings none: from depth maps, or from nothing.
+"""The Gaussians a training run starts from, and points for them when a dataset brings none.
 
-Both give a ``PointCloud``, which ``rfcore.train.start`` turns into Gaussians.
-
-The Gaussians a training run starts from.
-
-One isotropic Gaussian a point, as wide as its neighbourhood (3DGS, section 5.1: the mean distance
+Points come from the dataset, from depth maps, or are drawn at random along the cameras' rays. Each
+becomes one isotropic Gaussian, as wide as its neighbourhood (3DGS, section 5.1: the mean distance
 to the three nearest neighbours), half opaque, of the point's colour from every side.
 """
 

@@ -1,15 +1,14 @@
-"""The pictures a field is trained on, held in memory as 8-bit pixels.
+"""The pictures a field is trained on: their pixels, random rays through them, their exposure.
 
-Random pixels of the training pictures as rays with their colours.
-
-The n-th batch of a seed is always the same: a run that goes on from a checkpoint needs no state.
-Rays are computed in float64 with elementwise operations only (no BLAS), then rounded once.
+Pictures are held in memory as 8-bit pixels. The n-th batch of rays of a seed is always the same, so
+a run that goes on from a checkpoint needs no state of it; rays are computed in float64 with
+elementwise operations only (no BLAS), then rounded once.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +18,16 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
 from rfcore.ngp.trainable import RayBatch
+from rfcore.raster.trainable import Exposure
 from rfcore.views import PosedPicture
 
-__all__ = ["RaySampler", "Target", "load_targets"]
+__all__ = ["ExposureModel", "RaySampler", "Target", "load_targets"]
+
+F64 = NDArray[np.float64]
+EXPOSURE_RATE = 3e-3
+"""Adam's, at the start of the run: a stop of exposure within some hundred visits."""
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-12
+NO_CHANGE = np.eye(3, 4)
 
 
 @dataclass(frozen=True)
@@ -87,3 +93,46 @@ class RaySampler:
         m = self._rotation[view]
         turned = m[:, :, 0] * x[:, None] + m[:, :, 1] * y[:, None] + m[:, :, 2]
         return np.ascontiguousarray(turned / length[:, None], dtype=np.float32)
+
+
+class ExposureModel:
+    """Per-picture exposure: one affine map of colours [3, 4] a picture, learned with the field.
+
+    Only for datasets that declare it. A picture's map moves when the picture is visited. The maps'
+    mean over the pictures is kept at "no change", so the field itself shows the mean picture and is
+    rendered without any map.
+    """
+
+    def __init__(self, views: int) -> None:
+        self._maps = np.tile(NO_CHANGE, (views, 1, 1))
+        self._first, self._second = np.zeros_like(self._maps), np.zeros_like(self._maps)
+        self._visits = np.zeros(views)
+
+    def of_view(self, view: int) -> Exposure:
+        """Return the map of a picture, with room for its gradient."""
+        affine = self._maps[view] - self._maps.mean(axis=0) + NO_CHANGE
+        return Exposure(np.ascontiguousarray(affine, np.float32), np.zeros((3, 4)))
+
+    def step(self, view: int, gradient: F64, factor: float) -> None:
+        """Do one step of Adam at ``factor`` times the rate."""
+        self._visits[view] += 1
+        first, second = self._first[view], self._second[view]
+        first += (1 - BETA1) * (gradient - first)
+        second += (1 - BETA2) * (gradient * gradient - second)
+        # Multiplied out: two C libraries' pow() need not agree.
+        powers = np.multiply.reduce(np.tile([BETA1, BETA2], (int(self._visits[view]), 1)))
+        mean, square = first / (1 - powers[0]), second / (1 - powers[1])
+        self._maps[view] -= EXPOSURE_RATE * factor * mean / (np.sqrt(square) + EPSILON)
+
+    def arrays(self) -> dict[str, F64]:
+        """Return what ``restore`` goes on from."""
+        parts = {"maps": self._maps, "first": self._first, "second": self._second}
+        copies = {f"exposure.{name}": array.copy() for name, array in parts.items()}
+        return copies | {"exposure.visits": self._visits.copy()}
+
+    def restore(self, arrays: Mapping[str, F64]) -> None:
+        """Go on from ``arrays``."""
+        self._maps = arrays["exposure.maps"].copy()
+        self._first = arrays["exposure.first"].copy()
+        self._second = arrays["exposure.second"].copy()
+        self._visits = arrays["exposure.visits"].copy()

@@ -1,7 +1,7 @@
-"""The ``rfedge`` command: one module a verb.
+"""The ``rfedge`` command line.
 
-A verb module holds one frozen dataclass, the verb's options (its docstrings are the ``--help``),
-with a ``run`` method. Heavy imports happen inside ``run``, so that ``rfedge --help`` is immediate.
+A verb is one frozen dataclass, its options (their docstrings are the ``--help``), with a ``run``
+method. Heavy imports happen inside ``run``, so that ``rfedge --help`` is immediate.
 A user's mistake ends in one line on stderr and exit status 2, never in a traceback.
 """
 
@@ -9,26 +9,29 @@ from __future__ import annotations
 
 import io
 import sys
+from collections.abc import Sequence
 from typing import Annotated
 
 import tyro
-from tyro.conf import OmitSubcommandPrefixes, subcommand
+from tyro.conf import (
+    DisallowNone,
+    FlagCreatePairsOff,
+    OmitSubcommandPrefixes,
+    PositionalMetavarFromFieldName,
+    subcommand,
+)
 
 from rfcore.errors import RfedgeError
-from rfedge.cli.bench import Bench
-from rfedge.cli.certs import Certs
 from rfedge.cli.codec import Decode, Encode
 from rfedge.cli.demo import Demo
-from rfedge.cli.eval import Eval
 from rfedge.cli.field import Field
-from rfedge.cli.link import Link
-from rfedge.cli.loadtest import LoadTest
+from rfedge.cli.measure import Bench, Eval, LoadTest
 from rfedge.cli.render import Render
 from rfedge.cli.scene import Scene
+from rfedge.cli.services import Certs, Link, Watch
 from rfedge.cli.train import Train
-from rfedge.cli.watch import Watch
 
-__all__ = ["main"]
+__all__ = ["main", "parse"]
 
 Verb = (
     Annotated[Demo, subcommand("demo")]
@@ -47,14 +50,35 @@ Verb = (
 )
 
 DESCRIPTION = """Distributed radiance fields for edge video: H.264 deltas against a shared render,
-from vehicle to roadside server. Start with `rfedge demo`."""
+from vehicle to roadside server. Start with `rfedge demo`; `rfedge --version` prints the version."""
+CONFIG = (
+    OmitSubcommandPrefixes,
+    DisallowNone,
+    FlagCreatePairsOff,
+    PositionalMetavarFromFieldName,
+)
+"""Options are named as their fields, flags have one form, and help shows neither None nor PATH
+where a word says more."""
+
+
+def parse(arguments: Sequence[str] | None = None) -> Verb:
+    """Return the verb that ``arguments`` ask for, by default those of the process.
+
+    Prints help or what is wrong, and raises ``SystemExit``, where they ask for none.
+    """
+    return tyro.cli(Verb, prog="rfedge", description=DESCRIPTION, args=arguments, config=CONFIG)
 
 
 def main() -> int:
     """Parse the command line, run one verb, and return its exit status."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # a log file gets cost and progress as they come
         sys.stdout.reconfigure(line_buffering=True)
-    verb = tyro.cli(Verb, prog="rfedge", description=DESCRIPTION, config=(OmitSubcommandPrefixes,))
+    if sys.argv[1:] == ["--version"]:
+        from importlib.metadata import version
+
+        print(f"rfedge {version('rfedge')}")
+        return 0
+    verb = parse()
     try:
         verb.run()
     except (RfedgeError, OSError) as error:

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import arg
+
+from rfedge.arguments import FOLDER
 
 __all__ = ["Demo"]
 
@@ -12,11 +17,11 @@ __all__ = ["Demo"]
 class Demo:
     """Take or train a field, run server, link and vehicle on two drives, and report."""
 
-    sample: Path = Path("samples/street")
+    sample: Annotated[Path, FOLDER] = Path("samples/street")
     """Dataset folder: training views, points, and the drives `empty` and `vehicles`."""
-    out: Path = Path("out/demo")
+    out: Annotated[Path, FOLDER] = Path("out/demo")
     """Folder for report.html, reconstructed.mp4 and result.json; replaced on every run."""
-    cache: Path = Path("out/cache")
+    cache: Annotated[Path, FOLDER] = Path("out/cache")
     """Folder that keeps the trained field between runs."""
     train: bool = False
     """Train the field anew; without this, and without settings of your own, the field that ships
@@ -31,7 +36,7 @@ class Demo:
     """Throughput of the link in either direction, bit/s."""
     link_delay_ms: float = 20.0
     """One-way delay of the link, ms."""
-    preset: str = "medium"
+    preset: Annotated[str, arg(metavar="PRESET")] = "medium"
     """x264 preset of the P pictures."""
     crf: float = 23.0
     """x264 constant rate factor, 1 (best) to 51."""

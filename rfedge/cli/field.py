@@ -1,119 +1,355 @@
-"""``rfedge field``: fields as files. One module a sub-verb.
-
-``rfedge field publish``: the next version of a tile.
-
-``rfedge field list``: the tiles of a folder and their versions.
-
-``rfedge field rollback``: an earlier version of a tile again.
-"""
+"""``rfedge field``: import, look into, check, reduce, export and publish fields."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, subcommand
+from tyro.conf import Positional, arg, subcommand
 
-from rfedge.cli.field_files import FieldCheck, FieldExport, FieldImport, FieldInfo
-from rfedge.cli.field_reduce import FieldRungs, FieldSlim
+from rfedge.arguments import DATASET, FIELD, IMPORTED, PLY, RFF, open_field, open_splats
+from rfedge.cli.field_tiles import FieldList, FieldPublish, FieldRollback
 
-__all__ = ["Field", "FieldList", "FieldPublish", "FieldRollback"]
+if TYPE_CHECKING:
+    from rfcore.camera import Camera, TileOrigin
+    from rfcore.field import RadianceField, SplatField
+    from rfcore.raster.gaussians import Gaussians
+    from rfcore.views import PosedPicture
+    from rfedge.fields.check import Fit
 
-
-@dataclass(frozen=True)
-class FieldPublish:
-    """Publish a field as the next version of a tile; running servers take it up."""
-
-    field: Annotated[Path, Positional]
-    """The archive (.rff)."""
-    folder: Path
-    """The server's folder of fields (mec-server --fields)."""
-    tile: str = "street"
-    """The tile whose field it is."""
-    area: tuple[float, float, float, float] | None = None
-    """West, south, east, north side of the ground it is for, m; as before, at first everywhere."""
-    margin_m: float | None = None
-    """How far beyond its ground the field serves where a neighbour does not; at first 0."""
-
-    def run(self) -> None:
-        """Publish, and say what is current."""
-        from datetime import UTC, datetime
-
-        from rfcore.wire.tiles import Area
-        from rfedge.fields.publish import Ground, publish
-
-        area = None
-        if self.area is not None:
-            west_m, south_m, east_m, north_m = self.area
-            area = Area((west_m, south_m), (east_m, north_m))
-        ground = Ground(area, self.margin_m)
-        tile = publish(self.folder, self.tile, self.field, ground, datetime.now(UTC))
-        print(f"{tile.name} is version {tile.version}, field {tile.field_id}")
+__all__ = [
+    "Field",
+    "FieldCheck",
+    "FieldExport",
+    "FieldImport",
+    "FieldInfo",
+    "FieldLevels",
+    "FieldSlim",
+]
 
 
 @dataclass(frozen=True)
-class FieldList:
-    """List the tiles that a folder publishes, with all their versions."""
+class FieldImport:
+    """Read a .ply of INRIA, gsplat, nerfstudio, OpenSplat, Brush or SuperSplat."""
 
-    folder: Annotated[Path, Positional]
-    """The server's folder of fields (mec-server --fields)."""
+    ply: Annotated[Path, Positional, PLY]
+    """The file; properties are found by name, text and binary alike."""
+    name: Annotated[str, arg(metavar="NAME")]
+    """What to call the field; every command that takes a field knows it by this name."""
+    out: Annotated[Path | None, RFF] = None
+    """The archive to write (default: out/fields/NAME.rff)."""
+    replace: bool = False
+    """Replace an archive that is there already."""
+    transform: Path | None = None
+    """nerfstudio's dataparser_transforms.json, to bring the field back to its world."""
+    tile_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """East, north and up of the tile, m, taken off in float64."""
+    antialiased: bool = False
+    """The field was trained with antialiased rasterization (gsplat, Mip-Splatting), and the file's
+    SplatRenderMode comment does not say so."""
+    raw: bool = False
+    """Keep every float32 as it is instead of compressing to about a tenth."""
+    threads: int = 2
+    """Threads of the renderer that predicts the time of a frame."""
 
     def run(self) -> None:
-        """Print a line a version; the current one has a star."""
-        from rfcore.wire.tile_manifest import read_publication
+        """Import, print what it is, and how long a frame of it takes here."""
+        from rich.console import Console
 
-        publication = read_publication(self.folder)
-        if not publication.tiles:
-            print(f"{self.folder} publishes no tiles")
-        for name, tile in sorted(publication.tiles.items()):
-            ground = "everywhere"
-            if tile.area is not None:
-                low, high = tile.area.low_m, tile.area.high_m
-                ground = f"{low[0]:g}, {low[1]:g} to {high[0]:g}, {high[1]:g} m"
-            print(f"{name}: {ground}, margin {tile.margin_m:g} m")
-            for number, field_id in enumerate(tile.field_ids, 1):
-                mark = "*" if number == tile.current else " "
-                print(f"{mark} {number:3}  {tile.times[number - 1]}  {field_id}")
+        from rfcore.camera import TileOrigin
+        from rfcore.errors import InvalidInput
+        from rfcore.field import FieldMetadata, SplatField, read_ply_antialiased, save_field
+        from rfedge.fields.describe import print_levels, size_mb
+        from rfedge.fields.viewpoints import look_around
+
+        out = self.out if self.out is not None else IMPORTED / f"{self.name}.rff"
+        _check_out(out, ".rff")
+        if out.exists() and not self.replace:
+            raise InvalidInput("name", f"{out} is there already: take another name, or --replace")
+        origin = TileOrigin(*self.tile_origin)
+        stated = read_ply_antialiased(self.ply)
+        antialiased = self.antialiased or stated is True
+        metadata = FieldMetadata(self.name, origin, antialiased=antialiased)
+        field = SplatField(self._splats(origin), metadata, threads=self.threads)
+        field = field if self.raw else field.compressed()
+        out.parent.mkdir(parents=True, exist_ok=True)
+        field_id = save_field(field, out)
+        print(f"{out}: field {field_id}, {field.primitives:,} splats, {size_mb(field):.2f} MB")
+        print(self._mode_line(stated))
+        print_levels(Console(), field, look_around(field, 1280, 720))
+
+    def _mode_line(self, stated: bool | None) -> str:
+        """Say how the splats are drawn and why; ``stated`` is what the file says."""
+        if self.antialiased:
+            return "drawn antialiased, as --antialiased asks"
+        if stated is None:
+            tries = f"`rfedge field check {self.name} --drive DATASET` tries both"
+            return f"not drawn antialiased: the file does not say whether to; {tries}"
+        return f"{'drawn' if stated else 'not drawn'} antialiased, as the file says"
+
+    def _splats(self, origin: TileOrigin) -> Gaussians:
+        """Return the file's splats in the tile's frame, the most important first."""
+        from rfcore.errors import InvalidInput
+        from rfcore.field import read_ply
+        from rfcore.field.importance import most_important_first, reordered, visible_area
+        from rfcore.field.similarity import moved, read_field_from_world
+
+        back = read_field_from_world(self.transform).inverse() if self.transform else None
+        splats = read_ply(self.ply, origin if back is None else None)
+        if not len(splats):
+            raise InvalidInput("ply", f"{self.ply} holds no splats")
+        if back is not None:
+            splats = moved(splats, back.localised(origin))
+        return reordered(splats, most_important_first(visible_area(splats)))
 
 
 @dataclass(frozen=True)
-class FieldRollback:
-    """Make an earlier version of a tile current again; running servers take it up."""
+class FieldExport:
+    """Write a field's splats in the property order of the reference implementation."""
 
-    folder: Path
-    """The server's folder of fields (mec-server --fields)."""
-    tile: str = "street"
-    """The tile to take back."""
-    to: int | None = None
-    """The version that was good; the one before the current without it."""
+    field: Annotated[Path, Positional, FIELD]
+    """The archive (.rff), or the field's name."""
+    out: Annotated[Path, PLY]
+    """The file to write; positions are relative to the tile's origin. A SplatRenderMode comment
+    says how the splats are to be drawn."""
+    detail: float = 1.0
+    """Share of the splats: 1, 0.5, 0.25 or 0.1."""
 
     def run(self) -> None:
-        """Roll back, and say what is current."""
-        from rfedge.fields.publish import roll_back
+        """Load and export."""
+        from rfcore.field import Quality, write_ply
+        from rfcore.field.quality import splats_at_detail
 
-        tile = roll_back(self.folder, self.tile, self.to)
-        print(f"{tile.name} is version {tile.version}, field {tile.field_id}")
+        _check_out(self.out, ".ply")
+        detail = Quality(self.detail).detail
+        field = open_splats(self.field, threads=1)
+        splats = splats_at_detail(field.gaussians, field.levels, detail)
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        write_ply(self.out, splats, antialiased=field.metadata.antialiased)
+        print(f"{self.out}: {len(splats):,} splats of SH degree {splats.sh_degree}")
 
 
-SubVerb = (
-    Annotated[FieldImport, subcommand("import")]
-    | Annotated[FieldInfo, subcommand("info")]
-    | Annotated[FieldCheck, subcommand("check")]
-    | Annotated[FieldSlim, subcommand("slim")]
-    | Annotated[FieldRungs, subcommand("rungs")]
-    | Annotated[FieldExport, subcommand("export")]
-    | Annotated[FieldPublish, subcommand("publish")]
-    | Annotated[FieldList, subcommand("list")]
-    | Annotated[FieldRollback, subcommand("rollback")]
-)
+@dataclass(frozen=True)
+class FieldInfo:
+    """Print what is known about a field, and what a frame of each level of detail takes here."""
+
+    field: Annotated[Path, Positional, FIELD]
+    """The archive (.rff), or the field's name."""
+    size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (1280, 720)
+    """Width and height of the frames measured, px (without --drive)."""
+    drive: Annotated[Path | None, DATASET] = None
+    """Posed pictures to measure every level of detail against, in dB and in ms."""
+    threads: int = 2
+    """Threads of the renderer."""
+
+    def run(self) -> None:
+        """Load, describe, measure."""
+        from rich.console import Console
+
+        from rfcore.dataset import read_dataset
+        from rfcore.field import SplatField
+        from rfedge.fields.describe import describe_field, frame_ms, print_levels
+        from rfedge.fields.viewpoints import look_around
+
+        console = Console()
+        field = open_field(self.field, threads=self.threads)
+        for name, value in describe_field(field):
+            console.print(f"{name:>13}  {value}", highlight=False)
+        pictures: tuple[PosedPicture, ...] = ()
+        cameras = look_around(field, *self.size)
+        if self.drive is not None:
+            origin = field.metadata.tile_origin
+            pictures = read_dataset(self.drive, tile_origin=origin).pictures
+            cameras = [picture.camera for picture in pictures]
+        if isinstance(field, SplatField):
+            print_levels(console, field, cameras, pictures)
+        else:
+            console.print(f"{'frame':>13}  {frame_ms(field, cameras, rounds=1):.1f} ms")
+
+
+@dataclass(frozen=True)
+class FieldCheck:
+    """Show four camera pictures beside the field's renders; say which frame and mode fit."""
+
+    field: Annotated[Path, Positional, FIELD]
+    """The archive (.rff), or the field's name."""
+    drive: Annotated[Path, DATASET]
+    """The drive: any dataset of posed pictures."""
+    transform: Path | None = None
+    """nerfstudio's dataparser_transforms.json, if the field was trained there."""
+    out: Annotated[Path, arg(metavar="FILE.png")] = Path("out/field-check.png")
+    """The four pairs, as PNG."""
+    fix: Annotated[Path | None, RFF] = None
+    """Where to write the field in the frame and mode that fit."""
+    threads: int = 2
+    """Threads of the renderer."""
+
+    def run(self) -> None:
+        """Check; a field that does not fit is an error."""
+        from rfcore.dataset import read_dataset
+        from rfcore.errors import InvalidData
+        from rfcore.field import SplatField, save_field
+        from rfcore.field.similarity import read_field_from_world
+        from rfedge.fields.check import check_field, drawn_antialiased, in_drive_world
+
+        field = open_field(self.field, threads=self.threads)
+        nerfstudio = read_field_from_world(self.transform) if self.transform else None
+        pictures = read_dataset(self.drive, tile_origin=field.metadata.tile_origin).pictures
+        fit = check_field(field, pictures, nerfstudio)
+        if isinstance(field, SplatField) and fit.mode is not None:
+            field = drawn_antialiased(field, fit.mode.antialiased)
+        self._write_pairs(field, pictures, fit)
+        if not fit.fits:
+            raise InvalidData(
+                f"none of {fit.tried} conventions fits: {fit.as_given_db:.2f} dB as it is, at best "
+                f"{fit.psnr_db:.2f} dB. Is it the same place? A field trained in nerfstudio needs "
+                "--transform dataparser_transforms.json"
+            )
+        _print_fit(fit)
+        if self.fix is not None:
+            fixed = in_drive_world(field, fit.convention)
+            print(f"{self.fix}: field {save_field(fixed, self.fix)}")
+
+    def _write_pairs(
+        self, field: RadianceField, pictures: tuple[PosedPicture, ...], fit: Fit
+    ) -> None:
+        from rfcore.image import write_png
+        from rfedge.fields.check import pairs_picture
+
+        pairs, values_db = pairs_picture(field, pictures, fit.convention)
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        write_png(self.out, pairs)
+        shown = ", ".join(f"{value:.2f}" for value in values_db)
+        print(f"{self.out}: camera | render, {shown} dB under: {fit.convention.name}")
+
+
+def _print_fit(fit: Fit) -> None:
+    """Say which convention fits, and which mode of drawing splats."""
+    instead = f" instead of {fit.as_given_db:.2f} dB" if fit.psnr_db != fit.as_given_db else ""
+    print(f"fits {fit.convention.name}: {fit.psnr_db:.2f} dB{instead}")
+    mode = fit.mode
+    if mode is None:
+        return
+    print(
+        f"antialiased {mode.antialiased_db:.2f} dB, not antialiased {mode.default_db:.2f} dB: ",
+        end="",
+    )
+    if mode.antialiased == mode.stated_antialiased:
+        print("the field's mode fits")
+    else:
+        wanted = "antialiased" if mode.antialiased else "not antialiased"
+        print(f"it was trained to be drawn {wanted}; --fix FILE.rff writes it so")
+
+
+@dataclass(frozen=True)
+class FieldSlim:
+    """Keep the splats that matter most, and let them fill the gaps."""
+
+    field: Annotated[Path, Positional, FIELD]
+    """The archive (.rff), or the field's name."""
+    keep: int
+    """How many splats to keep."""
+    out: Annotated[Path, RFF]
+    """The archive to write."""
+    drive: Annotated[Path | None, DATASET] = None
+    """Posed pictures whose cameras the field is to serve; their pixels are not read. Without this,
+    opacity and area decide what matters."""
+    iterations: int = 240
+    """Iterations of fitting the survivors to the full field's renders (with --drive)."""
+    raw: bool = False
+    """Write float32 instead of the compressed form."""
+    threads: int = 2
+    """Threads of the renderer."""
+
+    def run(self) -> None:
+        """Slim and write."""
+        from rfcore.train.levels import LevelFitConfig
+        from rfedge.fields.slim import slimmed
+
+        _check_out(self.out, ".rff")
+        field = open_splats(self.field, threads=self.threads)
+        cameras = _cameras_of(self.drive, field) if self.drive is not None else []
+        config = LevelFitConfig(iterations=self.iterations, threads=self.threads)
+        small = slimmed(field, self.keep, cameras, config)
+        _write_reduced(field, small, self.out, raw=self.raw)
+
+
+@dataclass(frozen=True)
+class FieldLevels:
+    """Order a field's splats by what cameras see of them, and fit 50, 25 and 10 % to the whole."""
+
+    field: Annotated[Path, Positional, FIELD]
+    """The archive (.rff), or the field's name."""
+    drive: Annotated[Path, DATASET]
+    """Posed pictures whose cameras the field is to serve; their pixels are not read."""
+    out: Annotated[Path, RFF]
+    """The archive to write."""
+    iterations: int = 240
+    """Iterations of fitting, per level."""
+    raw: bool = False
+    """Write float32 instead of the compressed form."""
+    threads: int = 2
+    """Threads of the renderer."""
+
+    def run(self) -> None:
+        """Fit and write."""
+        from rich.console import Console
+
+        from rfcore.train.levels import LevelFitConfig
+        from rfedge.training.finish import fit_levels
+
+        _check_out(self.out, ".rff")
+        field = open_splats(self.field, threads=self.threads)
+        config = LevelFitConfig(iterations=self.iterations, threads=self.threads)
+        refined = fit_levels(field, _cameras_of(self.drive, field), config, Console())
+        _write_reduced(field, refined, self.out, raw=self.raw)
+
+
+def _cameras_of(drive: Path, field: SplatField) -> list[Camera]:
+    from rfcore.dataset import read_dataset
+
+    pictures = read_dataset(drive, tile_origin=field.metadata.tile_origin).pictures
+    return [picture.camera for picture in pictures]
+
+
+def _write_reduced(before: SplatField, after: SplatField, out: Path, *, raw: bool) -> None:
+    from rfcore.field import save_field
+    from rfedge.fields.describe import size_mb
+
+    written = after if raw else after.compressed()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    field_id = save_field(written, out)
+    print(
+        f"{out}: field {field_id}, {written.primitives:,} of {before.primitives:,} splats, "
+        f"{size_mb(written):.2f} MB"
+    )
+
+
+def _check_out(out: Path, suffix: str) -> None:
+    """Raise ``InvalidInput`` unless ``out`` is named as the format it will hold."""
+    from rfcore.errors import InvalidInput
+
+    if out.suffix != suffix:
+        raise InvalidInput("out", f"{out} must end in {suffix}")
 
 
 @dataclass(frozen=True)
 class Field:
     """Import, inspect, check, slim, refine, export and publish radiance fields."""
 
-    verb: SubVerb
+    verb: Annotated[
+        Annotated[FieldImport, subcommand("import")]
+        | Annotated[FieldInfo, subcommand("info")]
+        | Annotated[FieldCheck, subcommand("check")]
+        | Annotated[FieldSlim, subcommand("slim")]
+        | Annotated[FieldLevels, subcommand("levels")]
+        | Annotated[FieldExport, subcommand("export")]
+        | Annotated[FieldPublish, subcommand("publish")]
+        | Annotated[FieldList, subcommand("list")]
+        | Annotated[FieldRollback, subcommand("rollback")],
+        arg(name=""),
+    ]
 
     def run(self) -> None:
         """Run the sub-verb."""

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
+
+from rfedge.arguments import DATASET, FIELD, check_folder, open_field
 
 __all__ = ["Render"]
 
@@ -15,19 +17,19 @@ __all__ = ["Render"]
 class Render:
     """Render a field along a path, as PNG files or one MP4."""
 
-    field: Annotated[Path, Positional]
-    """The field archive (.rff), or the name it was imported under."""
-    out: Path
+    field: Annotated[Path, Positional, FIELD]
+    """The field: an archive (.rff), or a name."""
+    out: Annotated[Path, arg(metavar="FOLDER|FILE.mp4")]
     """Folder for the PNG files, or a file ending in .mp4."""
     path: Literal["orbit", "drive"] | None = None
     """Once around the field, or the poses of a drive (default: drive if there is one)."""
-    drive: Path | None = None
+    drive: Annotated[Path | None, DATASET] = None
     """A dataset with the poses; its pictures are used only to print PSNR."""
     psnr: bool = False
     """Print the PSNR of each render against the drive's picture, dB."""
     frames: int = 96
     """Pictures of an orbit."""
-    size: tuple[int, int] = (960, 540)
+    size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")] = (960, 540)
     """Width and height of an orbit's pictures, px."""
     up: Literal["z", "y", "-y"] = "z"
     """Where up is in the field's frame (orbit)."""
@@ -47,27 +49,29 @@ class Render:
         from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidInput
         from rfcore.field import Quality
-        from rfedge.fields.find import open_field
         from rfedge.fields.viewpoints import (
             OrbitSettings,
-            drive_stops,
-            orbit_stops,
+            drive_viewpoints,
+            orbit_viewpoints,
             pictures_along,
             write_pictures,
         )
         from rfedge.video import write_mp4
 
+        film = self.out.suffix.lower() == ".mp4"
+        if not film:
+            check_folder(self.out, "a folder for PNG files, or a video ending in .mp4")
         quality = Quality(self.detail, self.sh_degree)
         field = open_field(self.field, threads=self.threads, isa=self.isa)
         if self.path == "orbit" or (self.path is None and self.drive is None):
-            stops = orbit_stops(field, OrbitSettings(self.frames, *self.size, up=self.up))
+            viewpoints = orbit_viewpoints(field, OrbitSettings(self.frames, *self.size, up=self.up))
         elif self.drive is None:
             raise InvalidInput("drive", "--path drive needs --drive, a dataset with the poses")
         else:
             origin = field.metadata.tile_origin
-            stops = drive_stops(read_dataset(self.drive, tile_origin=origin).pictures)
-        pictures = pictures_along(field, stops, quality)
-        if self.out.suffix == ".mp4":
+            viewpoints = drive_viewpoints(read_dataset(self.drive, tile_origin=origin).pictures)
+        pictures = pictures_along(field, viewpoints, quality)
+        if film:
             self.out.parent.mkdir(parents=True, exist_ok=True)
             count = write_mp4(self.out, (rgb for _, rgb in pictures), self.rate_hz)
             print(f"{self.out}: {count} pictures")

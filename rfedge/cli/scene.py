@@ -1,21 +1,20 @@
-"""``rfedge scene``: datasets made from what users own, one module a verb.
-
-``rfedge scene convert``: any dataset into plain pictures with a transforms.json.
-
-``rfedge scene poses``: a folder of pictures into a dataset, by structure from motion.
-
-``rfedge scene record-carla``: the rig of 18 cameras in a running CARLA server.
-"""
+"""``rfedge scene``: datasets rendered, converted, posed by structure from motion, or recorded."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional, subcommand
+from tyro.conf import Positional, arg, subcommand
 
+from rfedge.arguments import DATASET, FOLDER, SIZE, parse_size
 from rfedge.cli.scene_street import SceneBuild, ScenePlan, SceneSheet, SceneSizes
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 __all__ = ["Scene", "SceneConvert", "ScenePoses", "SceneRecordCarla"]
 
@@ -24,12 +23,12 @@ __all__ = ["Scene", "SceneConvert", "ScenePoses", "SceneRecordCarla"]
 class SceneConvert:
     """Write a dataset of any format as undistorted PNG pictures and a transforms.json, once."""
 
-    dataset: Annotated[Path, Positional]
+    dataset: Annotated[Path, Positional, DATASET]
     """A folder with transforms.json, a COLMAP model, a KITTI sequence, INRIA's cameras.json or a
     recording's camera.toml; or that file itself."""
-    out: Path
+    out: Annotated[Path, FOLDER]
     """The folder to make."""
-    size: str | None = None
+    size: Annotated[str | None, SIZE] = None
     """Reduce pictures to WIDTHxHEIGHT px by averaging areas; default: as they are."""
     every: int = 1
     """Take each n-th picture."""
@@ -39,7 +38,6 @@ class SceneConvert:
     def run(self) -> None:
         """Convert; the folder appears when all of it is there."""
         from rfedge.datasets.convert import convert_dataset
-        from rfedge.units import parse_size
 
         size_px = parse_size(self.size) if self.size is not None else None
         chosen = slice(self.offset, None, self.every)
@@ -50,17 +48,17 @@ class SceneConvert:
 class ScenePoses:
     """Find the poses of pictures with COLMAP, in a new world or in a dataset's own."""
 
-    images: Annotated[Path, Positional]
+    images: Annotated[Path, Positional, FOLDER]
     """Folder of pictures (PNG, JPEG, WebP), in order of their names."""
-    out: Path
+    out: Annotated[Path, FOLDER]
     """The folder to make: pictures, points and transforms.json."""
-    register_to: Path | None = None
+    register_to: Annotated[Path | None, DATASET] = None
     """A dataset whose world the poses shall be in; its poses and cameras are held."""
     camera: Literal["dataset", "estimate"] = "dataset"
     """With --register-to: take the dataset's camera, or estimate the intrinsics."""
-    camera_model: str = "SIMPLE_RADIAL"
+    camera_model: Annotated[str, arg(metavar="MODEL")] = "SIMPLE_RADIAL"
     """COLMAP camera model of the new pictures, where it is not the dataset's camera."""
-    parameters: tuple[float, ...] = ()
+    parameters: Annotated[tuple[float, ...], arg(metavar="NUMBER ...")] = ()
     """Its known parameters in COLMAP's order, which are held; default: estimated."""
     matching: Literal["exhaustive", "sequential"] = "exhaustive"
     """Match all pairs, or neighbours in a long drive."""
@@ -75,6 +73,10 @@ class ScenePoses:
 
     def run(self) -> None:
         """Place the pictures and write the dataset; say which ones could not be placed."""
+        import signal
+
+        from rich.console import Console
+
         from rfcore.errors import BackendUnavailable
 
         try:
@@ -94,20 +96,34 @@ class ScenePoses:
             threads=self.threads,
             seed=self.seed,
         )
-        print(pose_dataset(self.images, self.out, self.register_to, settings))
+        # COLMAP's own handler would print a C++ stack and leave its folder behind.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with _shown(Console(stderr=True)) as tell:
+            line = pose_dataset(self.images, self.out, self.register_to, settings, tell)
+        print(line)
+
+
+@contextmanager
+def _shown(console: Console) -> Iterator[Callable[[str], None]]:
+    """Show what is told: in one changing line on a terminal, line by line in a log."""
+    if not console.is_terminal:
+        yield lambda text: console.print(f"  {text}", highlight=False)
+        return
+    with console.status("reading pictures") as status:
+        yield status.update
 
 
 @dataclass(frozen=True)
 class SceneRecordCarla:
     """Drive 18 cameras along a street of a running CARLA server, both ways, into a dataset."""
 
-    out: Path
+    out: Annotated[Path, FOLDER]
     """The folder to make: pictures and transforms.json."""
-    host: str = "127.0.0.1"
+    host: Annotated[str, arg(metavar="HOST")] = "127.0.0.1"
     """Where the server runs."""
-    port: int = 2000
+    port: Annotated[int, arg(metavar="PORT")] = 2000
     """Its RPC port."""
-    town: str | None = None
+    town: Annotated[str | None, arg(metavar="MAP")] = None
     """Load this map first, such as Town10HD; default: the one that is running."""
     spawn: int = 0
     """Start at this spawn point of the map."""
@@ -119,9 +135,9 @@ class SceneRecordCarla:
     """Drive back on the lane of the other direction."""
     keep_parked: bool = False
     """Keep the map's own parked vehicles in the pictures."""
-    cameras: str = "all"
+    cameras: Annotated[str, arg(metavar="NAME,...")] = "all"
     """`all`, or names from the rig, separated by commas; a drive is `mid_front`."""
-    size: str = "1920x1080"
+    size: Annotated[str, SIZE] = "1920x1080"
     """Size of the pictures, WIDTHxHEIGHT px."""
     fov_deg: float = 90.0
     """Horizontal field of view, degrees."""
@@ -134,7 +150,6 @@ class SceneRecordCarla:
         from rfcore.files import whole_folder
         from rfedge.datasets.carla import Recorder, RecordSettings
         from rfedge.datasets.rig import mounts_named
-        from rfedge.units import parse_size
 
         settings = RecordSettings(
             spawn=self.spawn,
@@ -166,15 +181,16 @@ class SceneRecordCarla:
 class Scene:
     """Make datasets: render a street, convert recordings, find poses, record a simulator."""
 
-    verb: (
+    verb: Annotated[
         Annotated[SceneBuild, subcommand("build")]
         | Annotated[SceneConvert, subcommand("convert")]
         | Annotated[ScenePoses, subcommand("poses")]
         | Annotated[ScenePlan, subcommand("plan")]
         | Annotated[SceneSheet, subcommand("sheet")]
         | Annotated[SceneSizes, subcommand("sizes")]
-        | Annotated[SceneRecordCarla, subcommand("record-carla")]
-    )
+        | Annotated[SceneRecordCarla, subcommand("record-carla")],
+        arg(name=""),
+    ]
 
     def run(self) -> None:
         """Run the verb."""

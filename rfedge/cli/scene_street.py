@@ -1,10 +1,7 @@
-"""``rfedge scene build``: a declared street into pictures, depth, classes and poses.
+"""``rfedge scene build``, ``plan``, ``sheet`` and ``sizes``: declared streets, rendered.
 
-``rfedge scene plan``: what a scene declares, and what its effects cost.
-
-``rfedge scene sheet``: built scenes on one page, to be looked at.
-
-``rfedge scene sizes``: how many bytes built scenes' pictures take as I pictures.
+A scene file becomes pictures, depth, classes and poses; the others say what a scene declares and
+what its effects cost, put built scenes on one page, and count the bytes of their I pictures.
 """
 
 from __future__ import annotations
@@ -13,7 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
+
+from rfedge.arguments import FOLDER, JSON, SCENE, SIZE, parse_size
 
 if TYPE_CHECKING:
     from rfedge.street.scene_file import Scene
@@ -29,19 +28,19 @@ class SceneBuild:
     same pictures, whatever the number of workers.
     """
 
-    scene: Annotated[str, Positional]
+    scene: Annotated[str, Positional, SCENE]
     """A ready-made scene by name (samples/scenes), or a scene file (.toml)."""
-    out: Path
+    out: Annotated[Path, FOLDER]
     """The folder to make, or to go on with."""
-    size: str | None = None
+    size: Annotated[str | None, SIZE] = None
     """WIDTHxHEIGHT px of all pictures; default: what the scene says for each split."""
     spp: int = 16
     """Samples a pixel, a square number."""
     workers: int = 1
     """Processes. One uses all cores; more share them and take 1 to 2.5 GB each."""
-    frames: str | None = None
+    frames: Annotated[str | None, arg(metavar="A:B")] = None
     """Only frames a:b of the chosen splits, counted through drive, train, eval in that order."""
-    split: str = "default"
+    split: Annotated[str, arg(metavar="SPLIT")] = "default"
     """drive, train, eval, a list of them with commas, or all; default: all, but without train where
     the scene's field was trained on another scene."""
 
@@ -52,7 +51,6 @@ class SceneBuild:
         from rfedge.street import load_scene
         from rfedge.street.render.backend import require_renderer
         from rfedge.street.shots import Selection
-        from rfedge.units import parse_size
 
         require_renderer()
         from rfedge.street.build.run import Settings, build_scene
@@ -67,15 +65,15 @@ class SceneBuild:
 class ScenePlan:
     """Check scene files; print their pictures and the effects that will run, with measured cost."""
 
-    scenes: Annotated[tuple[str, ...], Positional]
+    scenes: Annotated[tuple[str, ...], Positional, arg(metavar="SCENE ...")]
     """Ready-made scenes by name (samples/scenes), or scene files (.toml)."""
 
     render: bool = False
     """Render the street small, with and without each effect, and say what share of a frame each
     takes; needs rfedge[scene] and up to a minute for each effect."""
-    json: Path | None = None
+    json: Annotated[Path | None, JSON] = None
     """With --render: also write what was measured into this file."""
-    page: Path | None = None
+    page: Annotated[Path | None, arg(metavar="FILE.md")] = None
     """With --render: also put it as a table into this page, between its marks."""
 
     def run(self) -> None:
@@ -132,10 +130,10 @@ def _print_plans(scenes: list[Scene]) -> None:
 class SceneSheet:
     """Write a contact sheet of built scenes; docs/scenes-contact-sheet.jpg is made with it."""
 
-    scenes: Annotated[tuple[Path, ...], Positional]
+    scenes: Annotated[tuple[Path, ...], Positional, arg(metavar="FOLDER ...")]
     """Folders that `rfedge scene build` made."""
-    out: Path
-    """The picture to write (.jpg)."""
+    out: Annotated[Path, arg(metavar="FILE.jpg")]
+    """The picture to write."""
     columns: int = 4
     """Pictures of each scene, evenly chosen among those that there are."""
     width_px: int = 1280
@@ -157,13 +155,13 @@ class SceneSheet:
 class SceneSizes:
     """Code each picture of built scenes alone by x264; real driving video has 120 to 250 kB."""
 
-    scenes: Annotated[tuple[Path, ...], Positional]
+    scenes: Annotated[tuple[Path, ...], Positional, arg(metavar="FOLDER ...")]
     """Folders that `rfedge scene build` made."""
     crf: float = 23.0
     """x264's constant rate factor."""
     rate_hz: int = 10
     """Pictures a second that x264 is told: it spends more on a picture that is shown for longer."""
-    json: Path | None = None
+    json: Annotated[Path | None, JSON] = None
     """Also write the figures into this file."""
 
     def run(self) -> None:

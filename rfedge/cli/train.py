@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
+
+from rfedge.arguments import DATASET, FOLDER, PLY, RFF, SIZE, parse_size
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,21 +35,21 @@ class Train:
     interrupted or not; one limited by --minutes depends on the machine.
     """
 
-    dataset: Annotated[Path, Positional]
+    dataset: Annotated[Path, Positional, DATASET]
     """A dataset's folder, or the file that describes it (transforms.json, COLMAP, KITTI, ...)."""
-    out: Path
-    """The field archive to write (.rff)."""
-    held_out: Path | None = None
+    out: Annotated[Path, RFF]
+    """The field archive to write."""
+    held_out: Annotated[Path | None, DATASET] = None
     """Another dataset of the same place to measure on, never trained on."""
-    holdout: int | None = None
+    holdout: Annotated[int | None, arg(metavar="N")] = None
     """Measure on every Nth picture of the dataset, and do not train on those."""
     views_percent: float = 100.0
     """Train on this share of the pictures, evenly spread."""
-    points: Path | None = None
+    points: Annotated[Path | None, PLY] = None
     """A .ply of coloured surface points, when the dataset does not name one."""
-    depths: Path | None = None
+    depths: Annotated[Path | None, FOLDER] = None
     """A folder of depth maps to take points from: NAME.npy in metres or 16-bit NAME.png in mm."""
-    size: str | None = None
+    size: Annotated[str | None, SIZE] = None
     """Reduce pictures to WIDTHxHEIGHT, in pixels."""
     undistort: bool = False
     """Take a lens's distortion out of the pictures; without this such pictures are refused."""
@@ -68,7 +70,7 @@ class Train:
     """Seed of every random choice."""
     threads: int = 2
     """Threads of the rasterizer."""
-    name: str = "field"
+    name: Annotated[str, arg(metavar="NAME")] = "field"
     """A name kept in the archive's header."""
     plain: bool = False
     """Write parameters as they were trained: no lower levels of detail, no compression."""
@@ -76,10 +78,11 @@ class Train:
     """Write OUT.ckpt every so many iterations; 0: never."""
     resume: bool = False
     """Go on after OUT.ckpt."""
-    json: str | None = None
+    json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
     """Write the result as JSON to this file, or to standard output for "-"."""
-    report: Path | None = None
-    """Write a page with held-out pictures and the curve of quality over time (.html)."""
+    report: Annotated[Path | None, arg(metavar="FILE.html")] = None
+    """Write a page with held-out pictures and the curve of quality over time; needs --holdout or
+    --held-out."""
     kind: Literal["splats", "ngp"] = "splats"
     """3D Gaussians, or the hash grid of Instant-NGP, which takes none of their settings."""
 
@@ -95,6 +98,12 @@ class Train:
 
         if self.out.suffix != ".rff":
             raise InvalidInput("out", f"{self.out} must end in .rff")
+        if self.report is not None and self.holdout is None and self.held_out is None:
+            raise InvalidInput(
+                "report",
+                "shows pictures that were not trained on, and none are held out: add --holdout 8 "
+                "(every 8th picture) or --held-out DATASET",
+            )
         console = Console(stderr=self.json == "-")
         job = self._job()
         trained = train(job, console)
@@ -128,7 +137,6 @@ class Train:
 
     def _views(self) -> tuple[Dataset, Dataset | None]:
         from rfedge.training.views import ViewChoice, read_views
-        from rfedge.units import parse_size
 
         choice = ViewChoice(
             dataset=self.dataset,

@@ -4,12 +4,11 @@ The server runs in synchronous mode; the car, without physics, is set down on th
 ``spacing_m`` and, on the way back, on the lane of the other direction. Poses are those which the
 images carry, not those that were asked for. This is the only module that talks to a server.
 
-From CARLA's left-handed axes to ours.
-
-CARLA (Unreal) has x forward, y right, z up, in the world as in a sensor, which looks along its x;
-``Transform.get_matrix`` is world_from_sensor. Our world is the same with y negated, p = S p_carla
-with S = diag(1, -1, 1), so that it is right-handed with z up. A camera's OpenCV axes are right = y,
-down = -z, forward = x of the sensor, the columns of P below, hence R = S R_carla P.
+CARLA (Unreal) has left-handed axes: x forward, y right, z up, in the world as in a sensor, which
+looks along its x; ``Transform.get_matrix`` is world_from_sensor. Our world is the same with y
+negated, p = S p_carla with S = diag(1, -1, 1), so that it is right-handed with z up. A camera's
+OpenCV axes are right = y, down = -z, forward = x of the sensor, the columns of P below, hence
+R = S R_carla P.
 """
 
 from __future__ import annotations

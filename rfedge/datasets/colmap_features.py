@@ -1,37 +1,29 @@
-"""Features and matches of all pictures, in a COLMAP database.
+"""Features and matches of all pictures, in a COLMAP database; what can be chosen about them.
 
 Pictures lie under one root: those of the dataset in ``known``, as PNG, the new ones in ``new``.
-
-Cameras and poses between this project and COLMAP: the same axes, the same pixel centres.
-
-What can be chosen about poses from pictures.
+COLMAP's cameras and poses have the same axes and pixel centres as ours; its poses are
+cam_from_world, its quaternions x, y, z, w.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
+import pycolmap
 
 from rfcore.camera import Pose
 from rfcore.dataset.colmap import camera_of, parameter_count
-from rfcore.dataset.source import SourceCamera
-from rfcore.errors import InvalidInput
-from rfcore.lens import BrownLens, FisheyeLens
-
-if TYPE_CHECKING:
-    import pycolmap
-from collections.abc import Sequence
-from pathlib import Path
-
-import pycolmap
-
 from rfcore.dataset.picture_file import picture_size_px
-from rfcore.dataset.source import SourcePicture
-from rfcore.errors import DatasetError
+from rfcore.dataset.source import SourceCamera, SourcePicture
+from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import write_png
+from rfcore.lens import BrownLens, FisheyeLens
 
 __all__ = [
     "Matching",
@@ -41,11 +33,15 @@ __all__ = [
     "add_known",
     "add_new",
     "camera_parameters",
+    "cancellable",
     "match",
     "pose_from_colmap",
     "rigid_of",
     "source_camera",
 ]
+
+
+T = TypeVar("T")
 
 
 class Matching(StrEnum):
@@ -64,19 +60,21 @@ class SharedCamera(StrEnum):
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """``max_side_px``: pictures are reduced to it to find features; ``features``: at most so many
-    a picture; ``model``: the camera model of new pictures, ``parameters`` its values in COLMAP's
-    order where they are known, which are then held; ``seed`` of RANSAC.
-    """
+    """How poses are found."""
 
     matching: Matching = Matching.EXHAUSTIVE
     camera: SharedCamera = SharedCamera.DATASET
     model: str = "SIMPLE_RADIAL"
+    """COLMAP's name of the camera model of new pictures."""
     parameters: tuple[float, ...] = ()
+    """Its values in COLMAP's order, which are then held; empty: estimated."""
     max_side_px: int = 1600
+    """Pictures are reduced to this longest side to find features."""
     features: int = 8192
+    """At most so many features a picture."""
     threads: int = 2
     seed: int = 1
+    """Of RANSAC."""
 
     def __post_init__(self) -> None:
         needed = parameter_count("model", self.model)
@@ -108,9 +106,7 @@ def source_camera(camera: pycolmap.Camera) -> SourceCamera:
 
 
 def rigid_of(world_from_cam: Pose) -> pycolmap.Rigid3d:
-    """Return COLMAP's cam_from_world; its quaternions are x, y, z, w."""
-    import pycolmap
-
+    """Return COLMAP's cam_from_world."""
     pose = world_from_cam.inverse()
     w, x, y, z = pose.rotation
     rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
@@ -165,11 +161,30 @@ def match(place: Workplace, settings: PoseSettings) -> None:
     """Match features and keep what two-view geometry confirms."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu, options.num_threads = False, settings.threads
-    pycolmap.set_random_seed(settings.seed)
-    if settings.matching is Matching.SEQUENTIAL:
-        pycolmap.match_sequential(place.database, options, device=pycolmap.Device.cpu)
-    else:
-        pycolmap.match_exhaustive(place.database, options, device=pycolmap.Device.cpu)
+    sequential = settings.matching is Matching.SEQUENTIAL
+
+    def seeded(*arguments: Any, **named: Any) -> None:
+        pycolmap.set_random_seed(settings.seed)  # of the thread that matches
+        run = pycolmap.match_sequential if sequential else pycolmap.match_exhaustive
+        run(*arguments, **named)
+
+    cancellable(seeded, place.database, options, device=pycolmap.Device.cpu)
+
+
+def cancellable(call: Callable[..., T], *arguments: Any, **named: Any) -> T:
+    """Return what a long call of COLMAP returns; a signal's exception ends it at once.
+
+    COLMAP does not look for signals, so it runs in a thread of its own and is told to stop when
+    the waiting main thread is interrupted.
+    """
+    token = pycolmap.CancellationToken()
+    with ThreadPoolExecutor(1) as worker:
+        result = worker.submit(call, *arguments, **named, cancellation_token=token)
+        try:
+            return result.result()
+        except BaseException:
+            token.cancel()
+            raise
 
 
 def _shared_camera(
@@ -200,7 +215,8 @@ def _extract(
     options.use_gpu, options.num_threads = False, settings.threads
     options.max_image_size = settings.max_side_px
     options.sift.max_num_features = settings.features
-    pycolmap.extract_features(
+    cancellable(
+        pycolmap.extract_features,
         place.database,
         place.root,
         list(names),

@@ -1,29 +1,66 @@
-"""From a folder of pictures to a dataset with poses."""
+"""From a folder of pictures to a dataset with poses, in a new world or in a dataset's own.
+
+To register, points are triangulated from the dataset's pictures at their given poses; the new
+pictures are then resected against them and refined, while every given pose and camera is held.
+Alone, COLMAP's incremental mapping finds a world of its own, whose scale is not metres.
+"""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
+import pycolmap
+
+from rfcore.camera import Pose, TileOrigin
+from rfcore.dataset.assemble import chosen_origin
 from rfcore.dataset.picture_file import SUFFIXES
-from rfcore.dataset.read import read_source
+from rfcore.dataset.read import read_source, refuse_video
+from rfcore.dataset.source import SourceCamera, SourcePicture, SourcePoints
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import DatasetError
 from rfcore.files import whole_folder
-from rfedge.datasets.colmap_features import PoseSettings
-from rfedge.datasets.colmap_solve import Solution, solve_poses
+from rfedge.datasets.colmap_features import (
+    PoseSettings,
+    SharedCamera,
+    Workplace,
+    add_known,
+    add_new,
+    cancellable,
+    match,
+    pose_from_colmap,
+    rigid_of,
+    source_camera,
+)
 
-__all__ = ["pose_dataset"]
+__all__ = ["Solution", "Tell", "pose_dataset", "solve_poses"]
 
+Tell = Callable[[str], None]
+"""Told in words what is being done, for whoever waits."""
 MIN_PICTURES = 3
+ANY_FORWARD_MOTION = 1.0
+"""A drive moves forward; COLMAP's default, 0.95, would refuse every pair to start from."""
 
 
-def pose_dataset(images: Path, out: Path, register_to: Path | None, settings: PoseSettings) -> str:
+def _nobody(_: str) -> None:
+    """Tell nobody."""
+
+
+def pose_dataset(
+    images: Path,
+    out: Path,
+    register_to: Path | None,
+    settings: PoseSettings,
+    tell: Tell = _nobody,
+) -> str:
     """Write ``out`` with the pictures that could be placed; return one line about it.
 
-    Raises ``DatasetError`` when nothing can be placed, ``InvalidInput`` when ``out`` exists.
+    ``tell`` is called with what is being done. Raises ``DatasetError`` when nothing can be
+    placed, ``InvalidInput`` when ``out`` exists.
     """
     paths = _pictures(images, 1 if register_to is not None else MIN_PICTURES)
     known = read_source(register_to).pictures if register_to is not None else ()
@@ -33,13 +70,18 @@ def pose_dataset(images: Path, out: Path, register_to: Path | None, settings: Po
         for path in paths:
             shutil.copyfile(path, root / "new" / path.name)
         names = [f"new/{path.name}" for path in paths]
-        solution = solve_poses(root, names, known, settings)
+        solution = solve_poses(root, names, known, settings, tell)
         _write(folder, root, names, solution)
     return _summary(out, solution)
 
 
 def _pictures(images: Path, at_least: int) -> Sequence[Path]:
-    paths = sorted(path for path in images.glob("*") if path.suffix in SUFFIXES)
+    refuse_video(images)
+    found = sorted(images.glob("*"))
+    paths = [path for path in found if path.suffix in SUFFIXES]
+    if not paths:
+        for path in found:
+            refuse_video(path)
     if len(paths) < at_least:
         raise DatasetError(
             f"{images}: holds {len(paths)} pictures ({', '.join(SUFFIXES[:4])}), "
@@ -65,3 +107,165 @@ def _summary(out: Path, solution: Solution) -> str:
     if not solution.lost:
         return line
     return f"{line}; not placed: {', '.join(Path(name).name for name in solution.lost)}"
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Cameras and world_from_cam by name for the pictures that were placed, and the points."""
+
+    placed: Mapping[str, tuple[SourceCamera, Pose]]
+    lost: tuple[str, ...]
+    points: SourcePoints
+
+
+def solve_poses(
+    root: Path,
+    names: Sequence[str],
+    known: Sequence[SourcePicture],
+    settings: PoseSettings,
+    tell: Tell,
+) -> Solution:
+    """Place the pictures ``root / name``; with ``known`` pictures, in their world.
+
+    Raises ``DatasetError`` when fewer than two pictures, or none of the new ones, can be placed.
+    """
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    place = Workplace(root)
+    origin = chosen_origin(known) if known else TileOrigin()
+    if known:
+        tell(f"features of the dataset's {len(known)} pictures")
+        add_known(place, known, settings)
+    tell(f"features of {len(names)} new pictures")
+    add_new(place, names, settings)
+    tell(f"matching {len(known) + len(names)} pictures ({settings.matching})")
+    match(place, settings)
+    placing = _Placing(tell, len(known) + len(names))
+    if known:
+        model = _registered(place, known, origin, settings, placing)
+    else:
+        model = _alone(place, settings, placing)
+    return _solution(model, names, origin)
+
+
+class _Placing:
+    """Counts the pictures that COLMAP has placed and tells it."""
+
+    def __init__(self, tell: Tell, total: int) -> None:
+        self.tell = tell
+        self._total, self._placed = total, 0
+
+    def start_from(self, placed: int) -> None:
+        """Take ``placed`` pictures as placed already."""
+        self._placed = placed
+
+    def one_more(self) -> None:
+        """Take one more picture as placed."""
+        self._placed += 1
+        self.tell(f"placing pictures: {self._placed} of {self._total}")
+
+
+def _alone(place: Workplace, settings: PoseSettings, placing: _Placing) -> pycolmap.Reconstruction:
+    folder = place.root / "model"
+    folder.mkdir()
+    options = _options(settings)
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not settings.parameters
+    options.mapper.init_max_forward_motion = ANY_FORWARD_MOTION
+    models = cancellable(
+        pycolmap.incremental_mapping,
+        place.database,
+        place.root,
+        folder,
+        options,
+        initial_image_pair_callback=lambda: placing.start_from(2),
+        next_image_callback=placing.one_more,
+    )
+    if not models:
+        raise DatasetError("no two pictures share enough to start from; take them closer together")
+    return max(models.values(), key=lambda model: model.num_reg_images())
+
+
+def _registered(
+    place: Workplace,
+    known: Sequence[SourcePicture],
+    origin: TileOrigin,
+    settings: PoseSettings,
+    placing: _Placing,
+) -> pycolmap.Reconstruction:
+    given = _given_poses(place, known, origin)
+    held = set(given.cameras)
+    options = _options(settings)
+    options.fix_existing_frames = True
+    options.constant_cameras = held
+    if settings.camera is SharedCamera.DATASET or settings.parameters:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    for name in ("given", "model"):
+        (place.root / name).mkdir()
+    placing.tell("points of the dataset's pictures at their given poses")
+    placing.start_from(len(known))
+    cancellable(
+        pycolmap.triangulate_points,
+        given,
+        place.database,
+        place.root,
+        place.root / "given",
+        True,
+        options,
+        False,
+    )
+    models = cancellable(
+        pycolmap.incremental_mapping,
+        place.database,
+        place.root,
+        place.root / "model",
+        options,
+        place.root / "given",
+        next_image_callback=placing.one_more,
+    )
+    if not models:
+        raise DatasetError("the dataset's own pictures do not match at their given poses")
+    return models[min(models)]
+
+
+def _given_poses(
+    place: Workplace, known: Sequence[SourcePicture], origin: TileOrigin
+) -> pycolmap.Reconstruction:
+    """The dataset's cameras and poses under the ids the database gave them."""
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(place.database) as database:
+        cameras, images = database.read_all_cameras(), database.read_all_images()
+    poses = {f"known/{i:06d}.png": picture.world_from_cam for i, picture in enumerate(known)}
+    given = [image for image in images if image.name in poses]
+    used = {image.camera_id for image in given}
+    for camera in cameras:
+        if camera.camera_id in used:
+            model.add_camera_with_trivial_rig(camera)
+    for image in given:
+        bare = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+        model.add_image_with_trivial_frame(bare, rigid_of(origin.localise(poses[image.name])))
+    return model
+
+
+def _options(settings: PoseSettings) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = settings.threads, settings.seed
+    return options
+
+
+def _solution(model: pycolmap.Reconstruction, names: Sequence[str], origin: TileOrigin) -> Solution:
+    placed = {}
+    for image in model.images.values():
+        if image.has_pose and image.name in names:
+            local = pose_from_colmap(image.cam_from_world())
+            camera = source_camera(model.cameras[image.camera_id])
+            placed[image.name] = (camera, origin.globalise(local))
+    if not placed:
+        raise DatasetError(f"none of the {len(names)} pictures could be placed; do they overlap?")
+    lost = tuple(name for name in names if name not in placed)
+    return Solution(placed, lost, _points(model, origin))
+
+
+def _points(model: pycolmap.Reconstruction, origin: TileOrigin) -> SourcePoints:
+    points = list(model.points3D.values())
+    xyz_m = np.array([point.xyz for point in points]).reshape(-1, 3)
+    rgb = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
+    return SourcePoints(xyz_m + np.array(astuple(origin)), rgb)

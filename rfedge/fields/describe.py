@@ -1,6 +1,7 @@
 """A field in words and figures, as ``rfedge field info`` prints it.
 
-What a frame of a field takes on this machine.
+The figures are what the header states and what a frame of each level of detail takes on this
+machine.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Cameras for a field nobody gave cameras for: an orbit around it, and a look around inside it.
+"""A field seen from viewpoints: along a drive, around it, or from its middle.
 
-A field's box reaches as far as its sky; the middle is therefore the median of its splats, and its
-radius the distance that three quarters of them lie within.
-
-A field seen along a path: the stops, and the pictures taken there.
+An orbit and a look around need no given cameras. A field's box reaches as far as its sky; its
+middle is therefore the median of its splats, and its radius the distance that three quarters of
+them lie within.
 """
 
 from __future__ import annotations
@@ -27,16 +26,15 @@ from rfedge.fields.check import to_rgb
 __all__ = [
     "UPS",
     "OrbitSettings",
-    "Stop",
-    "drive_stops",
+    "Viewpoint",
+    "drive_viewpoints",
     "look_around",
     "looking_at",
     "orbit",
-    "orbit_stops",
+    "orbit_viewpoints",
     "pictures_along",
     "write_pictures",
 ]
-
 
 F64 = NDArray[np.float64]
 UPS = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
@@ -126,39 +124,41 @@ def _across(up: F64) -> tuple[F64, F64]:
 
 
 @dataclass(frozen=True)
-class Stop:
-    """Where a picture is taken; ``seen`` is what a camera saw there, if one did."""
+class Viewpoint:
+    """A camera that a field is rendered for; ``seen`` is the picture a real one took there."""
 
     name: str
     camera: Camera
     seen: PosedPicture | None = None
 
 
-def orbit_stops(field: RadianceField, settings: OrbitSettings) -> list[Stop]:
-    """Return the stops of one turn around the field."""
+def orbit_viewpoints(field: RadianceField, settings: OrbitSettings) -> list[Viewpoint]:
+    """Return the viewpoints of one turn around the field."""
     cameras = orbit(field, settings)
-    return [Stop(f"{number:05d}", camera) for number, camera in enumerate(cameras)]
+    return [Viewpoint(f"{number:05d}", camera) for number, camera in enumerate(cameras)]
 
 
-def drive_stops(pictures: Iterable[PosedPicture]) -> list[Stop]:
-    """Return the poses of a drive, named as its pictures."""
-    return [Stop(Path(p.name).stem, p.camera, p) for p in pictures]
+def drive_viewpoints(pictures: Iterable[PosedPicture]) -> list[Viewpoint]:
+    """Return the viewpoints of a drive, named as its pictures."""
+    return [Viewpoint(Path(p.name).stem, p.camera, p) for p in pictures]
 
 
 def pictures_along(
-    field: RadianceField, stops: Iterable[Stop], quality: Quality
-) -> Iterator[tuple[Stop, Rgb]]:
-    """Yield what the field shows at each stop."""
-    for stop in stops:
-        yield stop, to_rgb(field.render_colour(stop.camera, quality))
+    field: RadianceField, viewpoints: Iterable[Viewpoint], quality: Quality
+) -> Iterator[tuple[Viewpoint, Rgb]]:
+    """Yield what the field shows at each viewpoint."""
+    for viewpoint in viewpoints:
+        yield viewpoint, to_rgb(field.render_colour(viewpoint.camera, quality))
 
 
-def write_pictures(folder: Path, pictures: Iterable[tuple[Stop, Rgb]], with_psnr: bool) -> None:
+def write_pictures(
+    folder: Path, pictures: Iterable[tuple[Viewpoint, Rgb]], with_psnr: bool
+) -> None:
     """Write PNG files and print their names, with the PSNR where a camera saw something."""
     folder.mkdir(parents=True, exist_ok=True)
-    for stop, rgb in pictures:
-        path = folder / f"{stop.name}.png"
+    for viewpoint, rgb in pictures:
+        path = folder / f"{viewpoint.name}.png"
         write_png(path, rgb)
-        seen = stop.seen if with_psnr else None
+        seen = viewpoint.seen if with_psnr else None
         note = f"  {psnr(rgb, seen.read()):.2f} dB" if seen is not None else ""
         print(f"{path}{note}")

@@ -1,8 +1,8 @@
-"""From a trained field to the one written: levels of detail, compression, held-out quality.
+"""From a trained field to the one that is written, and the run as one JSON object.
 
-The quality in the header is that of the field as it will be read, not as it was trained.
-
-One training run as one JSON object: quality, time, size, and how to repeat it.
+Written fields have lower levels of detail, are compressed, and state the held-out quality of the
+field as it will be read, not as it was trained. The JSON has quality, time, size and how to repeat
+the run.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ def finish_field(
 def fit_levels(
     field: SplatField, cameras: list[Camera], config: LevelFitConfig, console: Console
 ) -> SplatField:
+    """Return the field with lower levels of detail fitted to ``cameras``, showing progress."""
     columns = (
         TextColumn("levels of detail"),
         BarColumn(),
@@ -59,10 +60,10 @@ def fit_levels(
     with Progress(*columns, console=console) as bar:
         task = bar.add_task("levels", total=None)
 
-        def moved(done: int, total: int) -> None:
+        def show(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        return with_levels(field, cameras, config, moved)
+        return with_levels(field, cameras, config, show)
 
 
 def training_result(

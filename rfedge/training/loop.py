@@ -1,9 +1,8 @@
-"""The loop around a trainer: time, measurements, checkpoints.
+"""The loop around a trainer: time, measurements, checkpoints, progress on the console.
 
 Any ``FieldTrainer`` will do. Seconds are those of training: neither the time measuring takes nor
-that of reading the pictures counts, and a resumed run goes on counting where it stopped.
-
-How far a training is: a bar on a terminal, a line at each twentieth in a log.
+that of reading the pictures counts, and a resumed run goes on counting where it stopped. Progress
+is a bar on a terminal and a line at each twentieth of the run in a log.
 """
 
 from __future__ import annotations
@@ -18,10 +17,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField
 from rfcore.train import FieldTrainer, read_checkpoint, write_checkpoint
-from rfedge.units import time_text
+from rfedge.arguments import time_text
 
 __all__ = ["LoopLimits", "LoopStatus", "TrainingLoop", "run_showing"]
-
 
 Measure = Callable[[RadianceField], float]
 MAX_MINUTES = 7 * 24 * 60.0

@@ -1,6 +1,6 @@
-"""The page of one training run: held-out pictures beside their renders, quality over time.
+"""The page of one training run, and the section of the results page about all of them.
 
-The section of the results page about training runs.
+The page shows held-out pictures beside their renders and the curve of quality over time.
 """
 
 from __future__ import annotations

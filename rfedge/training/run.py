@@ -1,9 +1,8 @@
 """Train a field with progress on the console, and measure it on pictures it never saw.
 
-How much memory a training run takes, said before it starts.
-
-The estimate is the sum of what is allocated, for the largest set the run may grow to. The one run
-that tests/train/test_training_memory.py measures stays within 15 % of it.
+How much memory a run takes is printed before it starts: the sum of what is allocated, for the
+largest set the run may grow to. The one run that tests/train/test_training_memory.py measures stays
+within 15 % of the estimate.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from rfcore.dataset import Dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
 from rfcore.image import Rgb
-from rfcore.metrics import psnr
 from rfcore.ngp.shape import FEATURES
 from rfcore.train import (
     FieldTrainer,
@@ -32,6 +30,7 @@ from rfcore.train import (
     SplatTrainer,
     SplatTrainingConfig,
     held_out_quality,
+    mean_psnr_db,
 )
 from rfcore.train.start import random_points
 from rfcore.views import PosedPicture
@@ -49,7 +48,6 @@ __all__ = [
     "train_field",
     "training_config",
 ]
-
 
 BASE_BYTES = 350 << 20
 """The interpreter, numpy, OpenCV and the report's libraries."""
@@ -123,7 +121,7 @@ class TrainingJob:
     dataset: Dataset
     held_out: Dataset | None
     config: SplatTrainingConfig | NgpTrainingConfig
-    """Whose it is says what is trained."""
+    """Its class says which kind of field is trained."""
     seed: int
     limits: LoopLimits = field(default_factory=partial(LoopLimits, measurements=0))
     resume: bool = False
@@ -170,7 +168,9 @@ def train(job: TrainingJob, console: Console) -> Trained:
     """
     _announce(job, console)
     trainer = _trainer(job)
-    measure = _psnr_meter(job.held_out.pictures) if job.held_out is not None else None
+    measure = None
+    if job.held_out is not None:
+        measure = partial(mean_psnr_db, pictures=_in_memory(job.held_out.pictures))
     loop = TrainingLoop(trainer, job.limits, measure, monotonic)
     if job.resume:
         loop.resume()
@@ -232,23 +232,12 @@ def _quality(trainer: FieldTrainer, job: TrainingJob) -> HeldOut | None:
     return held_out_quality(trainer.field(), job.held_out.pictures)
 
 
-class _psnr_meter:  # noqa: N801 - a function that remembers the pictures it has read
-    """Measures the mean PSNR of fields on the same pictures, read once."""
-
-    def __init__(self, pictures: Sequence[PosedPicture]) -> None:
-        if not pictures:
-            raise InvalidInput("held_out", "holds no pictures to measure on")
-        self._pictures = pictures
-        self._pixels: list[Rgb] = []
-
-    def __call__(self, field: RadianceField) -> float:
-        """Return the mean over pictures of the RGB PSNR."""
-        if not self._pixels:
-            self._pixels = [picture.read() for picture in self._pictures]
-        pairs = zip(self._pictures, self._pixels, strict=True)
-        return float(np.mean([_psnr_db(field, picture, rgb) for picture, rgb in pairs]))
+def _in_memory(pictures: Sequence[PosedPicture]) -> list[PosedPicture]:
+    """Return the pictures already read, since they are measured on many times."""
+    if not pictures:
+        raise InvalidInput("held_out", "holds no pictures to measure on")
+    return [replace(picture, read=partial(_identity, picture.read())) for picture in pictures]
 
 
-def _psnr_db(field: RadianceField, picture: PosedPicture, rgb: Rgb) -> float:
-    colour = np.clip(field.render_colour(picture.camera).astype(np.float64), 0.0, 1.0)
-    return psnr(colour, rgb / 255.0, peak=1.0)
+def _identity(rgb: Rgb) -> Rgb:
+    return rgb

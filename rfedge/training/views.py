@@ -1,9 +1,8 @@
 """Which pictures a run trains on, which are held out, and which points it starts from.
 
-Points to start from out of depth maps beside a dataset's pictures.
-
-One file a picture, named as the picture with another suffix: ``.npy``, float32 [H, W] metres, or
-``.png``, 16 bits, millimetres (nerfstudio's and Record3D's). 0 means unknown.
+Points can come from depth maps beside a dataset's pictures: one file a picture, named as the
+picture with another suffix, ``.npy``, float32 [H, W] metres, or ``.png``, 16 bits, millimetres
+(nerfstudio's and Record3D's). 0 means unknown.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ __all__ = [
     "share_of_views",
     "split_every",
 ]
-
 
 POINTS = 300_000
 """About as many are made, twice what a run draws by default."""

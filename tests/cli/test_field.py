@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,20 @@ import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import FieldFormatError, InvalidData, InvalidInput
-from rfcore.field import SplatField, load_field, read_ply, save_field, write_ply
+from rfcore.field import FieldMetadata, SplatField, load_field, read_ply, save_field, write_ply
 from rfcore.field.similarity import Similarity, moved
 from rfcore.image import read_rgb, write_png
 from rfcore.raster.gaussians import Gaussians
-from rfedge.cli.field_files import FieldCheck, FieldExport, FieldImport, FieldInfo
-from rfedge.cli.field_reduce import FieldRungs, FieldSlim
+from rfedge.arguments import field_path
+from rfedge.cli.codec import Decode, Encode
+from rfedge.cli.field import (
+    FieldCheck,
+    FieldExport,
+    FieldImport,
+    FieldInfo,
+    FieldLevels,
+    FieldSlim,
+)
 from rfedge.cli.render import Render
 
 HALF = float(np.sqrt(0.5))
@@ -46,7 +55,11 @@ def splats() -> Gaussians:
 @pytest.fixture
 def drive(here: Path, splats: Gaussians) -> Path:
     """A transforms file with five pictures of the splats."""
-    field, frames = SplatField(splats), []
+    return drive_of(here, SplatField(splats))
+
+
+def drive_of(here: Path, field: SplatField) -> Path:
+    frames = []
     for number in range(5):
         pose = Pose((number / 5 - 0.4, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
         camera = Camera(Intrinsics(*SIZE, 30.0, 30.0, 24.0, 18.0), pose)
@@ -133,7 +146,7 @@ def test_a_field_is_slimmed_with_and_without_cameras(
 
 def test_levels_are_fitted_to_a_drives_cameras(here: Path, splats: Gaussians, drive: Path) -> None:
     save_field(SplatField(splats), here / "a.rff")
-    FieldRungs(here / "a.rff", drive, here / "b.rff", iterations=5).run()
+    FieldLevels(here / "a.rff", drive, here / "b.rff", iterations=5).run()
     field = load_field(here / "b.rff")
     assert isinstance(field, SplatField)
     assert set(field.levels) == {0.5, 0.25, 0.1}
@@ -160,12 +173,15 @@ def test_a_field_is_looked_at_around_and_along_a_drive(
     ("verb", "error", "named"),
     [
         (FieldImport(Path("none.ply"), "a"), FieldFormatError, r"none\.ply: cannot be read"),
-        (FieldImport(Path("a.splat"), "a"), FieldFormatError, "another format"),
+        (FieldImport(Path("a.splat"), "a"), FieldFormatError, r"splat-transform a\.splat a\.ply"),
         (FieldImport(Path("empty.ply"), "a"), InvalidInput, "holds no splats"),
         (FieldImport(Path("empty.ply"), "a", out=Path("a.ply")), InvalidInput, r"end in \.rff"),
         (FieldExport(Path("a.rff"), Path("a.txt")), InvalidInput, r"end in \.ply"),
         (FieldExport(Path("a.rff"), Path("b.ply"), detail=0.3), InvalidInput, "none of 1, 0.5"),
-        (FieldInfo(Path("nowhere")), FieldFormatError, "nowhere: cannot be read"),
+        (FieldInfo(Path("nowhere")), InvalidInput, "'nowhere' is no field.*out/fields/nowhere.rff"),
+        (Encode(Path("drive"), Path("no"), Path("o.rfv")), InvalidInput, "'no' is no field"),
+        (Render(Path("a.rff"), Path("o.gif")), InvalidInput, r"no \.gif file .*\.mp4"),
+        (Decode(Path("a.rfv"), Path("a.rff"), Path("o.MP4")), InvalidInput, "a folder for PNG"),
         (FieldSlim(Path("a.rff"), 9999, Path("b.rff")), InvalidInput, r"outside 1\.\.200"),
         (Render(Path("a.rff"), Path("o"), path="drive"), InvalidInput, "needs --drive"),
         (Render(Path("a.rff"), Path("o"), frames=0), InvalidInput, "frames"),
@@ -179,3 +195,74 @@ def test_a_mistake_is_named_and_leaves_nothing_behind(
     with pytest.raises(error, match=named):
         verb.run()
     assert sorted(p.name for p in here.iterdir()) == ["a.rff", "empty.ply"]
+
+
+def said_by_check(field: str, drive: Path, capsys: pytest.CaptureFixture[str], **more: Path) -> str:
+    capsys.readouterr()
+    FieldCheck(Path(field), drive, **more).run()
+    return capsys.readouterr().out
+
+
+def faint_drive(here: Path, splats: Gaussians) -> tuple[Path, Gaussians]:
+    """Pictures of splats smaller than a pixel, as they look antialiased."""
+    tiny = replace(splats, log_scales=splats.log_scales - 2.5)
+    field = SplatField(tiny, FieldMetadata(antialiased=True))
+    return drive_of(here, field), tiny
+
+
+def test_how_splats_are_drawn_survives_export_and_import(
+    here: Path, splats: Gaussians, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive, tiny = faint_drive(here, splats)
+    save_field(SplatField(tiny, FieldMetadata(antialiased=True)), here / "a.rff")
+    FieldExport(Path("a.rff"), here / "a.ply").run()
+    assert b"\ncomment SplatRenderMode: mip\n" in (here / "a.ply").read_bytes()
+    FieldImport(here / "a.ply", "back", raw=True).run()
+    said = said_by_check("back", drive, capsys)
+    assert "the field's mode fits" in said
+    assert load_field(field_path("back")).metadata.antialiased
+
+
+def test_a_field_in_the_wrong_mode_is_found_out_and_put_right(
+    here: Path, splats: Gaussians, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive, tiny = faint_drive(here, splats)
+    write_ply(here / "a.ply", tiny)
+    FieldImport(here / "a.ply", "a", raw=True).run()
+    said = said_by_check("a", drive, capsys, fix=here / "fixed.rff")
+    assert "it was trained to be drawn antialiased" in said
+    assert "fits as it is" in said
+    gained = re.search(r"fits as it is: (\S+) dB instead of (\S+) dB", said)
+    assert gained is not None
+    assert float(gained[1]) > float(gained[2]) + 3
+    assert "the field's mode fits" in said_by_check("fixed.rff", drive, capsys)
+
+
+def test_an_import_does_not_overwrite_a_field_without_being_told(
+    here: Path, splats: Gaussians
+) -> None:
+    write_ply(here / "a.ply", splats)
+    FieldImport(here / "a.ply", "mine").run()
+    before = (here / "out/fields/mine.rff").read_bytes()
+    write_ply(here / "b.ply", splats_without_half(splats))
+    with pytest.raises(InvalidInput, match=r"out/fields/mine\.rff is there already.*--replace"):
+        FieldImport(here / "b.ply", "mine").run()
+    assert (here / "out/fields/mine.rff").read_bytes() == before
+    FieldImport(here / "b.ply", "mine", replace=True).run()
+    assert load_field(here / "out/fields/mine.rff").primitives == 100
+
+
+def splats_without_half(splats: Gaussians) -> Gaussians:
+    return Gaussians(*(np.ascontiguousarray(array[:100]) for array in vars(splats).values()))
+
+
+def test_a_name_means_the_same_field_to_encode_and_decode(
+    here: Path, splats: Gaussians, drive: Path
+) -> None:
+    write_ply(here / "a.ply", splats)
+    FieldImport(here / "a.ply", "mine").run()
+    Encode(drive, Path("mine"), here / "by-name.rfv").run()
+    Encode(drive, here / "out/fields/mine.rff", here / "by-path.rfv").run()
+    assert (here / "by-name.rfv").read_bytes() == (here / "by-path.rfv").read_bytes()
+    Decode(here / "by-name.rfv", Path("mine"), here / "pictures").run()
+    assert len(list((here / "pictures").iterdir())) == 5

@@ -1,7 +1,10 @@
 """The commands say what they take, fast, and turn mistakes into one line."""
 
+import re
 import subprocess
 import sys
+from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -11,24 +14,75 @@ EVAL_VERBS = ("eval compare", "eval never-worse", "eval paper", "eval robust")
 CERTS_VERBS = ("certs init", "certs show")
 SCENE_VERBS = ("scene build", "scene convert", "scene poses", "scene record-carla")
 FIELD_VERBS = tuple(
-    f"field {verb}" for verb in ("import", "info", "check", "slim", "rungs", "export")
+    f"field {verb}" for verb in ("import", "info", "check", "slim", "levels", "export")
 )
+GROUPS = ("field", "scene", "eval", "certs")
+MOST_VERBS = 14
 EMPTY_STREET = str(Path(__file__).parents[2] / "samples/scenes/street-empty.toml")
-HEAVY = ("torch", "cv2", "matplotlib", "av", "grpc", "cryptography")
+SAMPLES = Path(__file__).parents[2] / "samples"
+FIELD = str(SAMPLES / "fields/street.rff")
+TRAIN_VIEWS = str(SAMPLES / "street/transforms_train.json")
+HEAVY = ("numpy", "torch", "cv2", "matplotlib", "av", "grpc", "cryptography")
 
 
 def rfedge(*arguments: str) -> subprocess.CompletedProcess[str]:
-    code = "import sys; from rfedge.cli import main; sys.exit(main())"
     return subprocess.run(
-        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "rfedge", *arguments], capture_output=True, text=True, check=False
     )
 
 
-@pytest.mark.parametrize("verb", VERBS + SCENE_VERBS + FIELD_VERBS + EVAL_VERBS + CERTS_VERBS)
-def test_every_verb_has_help_with_defaults(verb: str) -> None:
+@cache
+def help_of(verb: str) -> str:
     done = rfedge(*verb.split(), "--help")
     assert done.returncode == 0, done.stderr
-    assert "default" in done.stdout
+    return done.stdout
+
+
+def in_one_line(text: str) -> str:
+    return " ".join(text.replace("│", " ").split())
+
+
+@pytest.mark.parametrize("verb", VERBS + SCENE_VERBS + FIELD_VERBS + EVAL_VERBS + CERTS_VERBS)
+def test_every_verb_has_help_with_defaults_and_says_once_what_it_does(verb: str) -> None:
+    text = help_of(verb)
+    assert "default" in text
+    assert in_one_line(text).count(in_one_line(text.split("\n\n")[1])) == 1
+
+
+@pytest.mark.parametrize(
+    ("verb", "shown"),
+    [
+        ("train", "DATASET"),
+        ("train", "--held-out DATASET"),
+        ("train", "--size WIDTHxHEIGHT"),
+        ("encode", "--field FIELD"),
+        ("encode", "--out FILE.rfv"),
+        ("render", "FIELD"),
+        ("scene build", "SCENE"),
+        ("scene poses", "--register-to DATASET"),
+        ("watch", "HOST:PORT"),
+        ("link", "--to HOST:PORT"),
+        ("field info", "FIELD"),
+        ("eval compare", "FIELD"),
+    ],
+)
+def test_placeholders_say_what_they_want(verb: str, shown: str) -> None:
+    text = in_one_line(help_of(verb))
+    assert f" {shown} " in text
+    assert "{None}" not in text
+
+
+def test_the_version_is_that_of_the_distribution() -> None:
+    done = rfedge("--version")
+    assert (done.returncode, done.stdout) == (0, f"rfedge {version('rfedge')}\n")
+
+
+def test_there_are_few_enough_verbs_to_read() -> None:
+    listed = re.search(r"\{([a-z,-]+)\}", help_of(""))
+    assert listed is not None
+    verbs = listed[1].split(",")
+    assert set(VERBS) | set(GROUPS) == set(verbs)
+    assert len(verbs) <= MOST_VERBS
 
 
 def test_the_help_loads_nothing_heavy() -> None:
@@ -60,7 +114,10 @@ def test_the_help_loads_nothing_heavy() -> None:
         (("watch", "127.0.0.1:1", "--tls-cert", "c.pem"), "belong together"),
         (("certs", "show", "nowhere"), "nowhere"),
         (("certs", "init", "--vehicles", "a/b"), "'a/b' must be"),
-        (("eval", "compare", "field.rff", "drive.json"), "NAME@HZ=DATASET"),
+        (("eval", "compare", FIELD, "drive.json"), "NAME@HZ=DATASET"),
+        (("eval", "ladder", "nowhere"), "'nowhere' is no field"),
+        (("bench", "ngp", "--field", "nowhere"), "'nowhere' is no field"),
+        (("train", TRAIN_VIEWS, "--out", "f.rff", "--report", "r.html"), "add --holdout 8"),
         (("scene", "convert", "nowhere", "--out", "o"), "nowhere"),
         (("scene", "convert", "nowhere", "--out", "o", "--size", "big"), "'big' is not WIDTHx"),
         (("scene", "poses", "nowhere", "--out", "o"), "nowhere: holds 0 pictures"),

@@ -20,8 +20,8 @@ from rfcore.dataset import read_dataset
 from rfcore.link.profile_file import read_link
 from rfcore.wire.tls import TlsFiles
 from rfedge.cli import Verb
-from rfedge.cli.certs import CertsInit
-from rfedge.cli.field import FieldPublish
+from rfedge.cli.field_tiles import FieldPublish
+from rfedge.cli.services import CertsInit
 from rfedge.link.proxy import ProxySettings
 
 ROOT = Path(__file__).parents[2]

@@ -10,8 +10,6 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-import tyro
-from tyro.conf import OmitSubcommandPrefixes
 
 from rfcore.camera import Pose
 from rfcore.dataset import read_dataset
@@ -19,7 +17,7 @@ from rfcore.dataset.recording import SECTIONS
 from rfcore.dataset.source import SourcePoints
 from rfcore.dataset.write import write_points
 from rfcore.views import PosedPicture
-from rfedge.cli import Verb
+from rfedge.cli import parse
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
@@ -42,7 +40,7 @@ def commands(language: str) -> Iterator[list[str]]:
 
 @pytest.mark.parametrize("command", [*commands("sh"), *commands("text")], ids=" ".join)
 def test_every_command_of_the_page_is_one(command: list[str]) -> None:
-    assert tyro.cli(Verb, args=command, config=(OmitSubcommandPrefixes,)) is not None
+    assert parse(command) is not None
 
 
 def test_the_toml_of_the_page_has_only_keys_that_are_read() -> None:
@@ -69,7 +67,7 @@ def test_the_commands_lead_from_recordings_to_a_decoded_drive(
         small = ["96x54" if word == "640x360" else word for word in command]
         if small[0] == "train":
             small += ["--iterations", "40", "--gaussians", "2000", "--threads", "1"]
-        tyro.cli(Verb, args=small, config=(OmitSubcommandPrefixes,)).run()
+        parse(small).run()
     assert len(list(Path("out/renders").glob("*.png"))) == 8
     decoded = sorted(Path("out/decoded").glob("*.png"))
     drive = read_dataset(Path("out/drive")).pictures

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rfcore.camera import TileOrigin
 from rfcore.errors import FieldFormatError
-from rfcore.field.ply import read_ply, write_ply
+from rfcore.field.ply import read_ply, read_ply_antialiased, write_ply
 from rfcore.field.ply_table import read_vertices, write_vertices
 from rfcore.raster.gaussians import Gaussians
 
@@ -220,10 +220,73 @@ def test_text_that_is_not_rows_of_numbers_is_refused_by_name(
         read_ply(tmp_path / "b.ply")
 
 
-@pytest.mark.parametrize("suffix", ["splat", "ksplat", "spz", "sog"])
-def test_other_formats_of_splats_are_refused_by_their_name(tmp_path: Path, suffix: str) -> None:
-    with pytest.raises(FieldFormatError, match=f"{suffix} is another format; export it as .ply"):
+@pytest.mark.parametrize("suffix", ["splat", "ksplat", "spz", "sog", "SPZ"])
+@pytest.mark.parametrize("read", [read_ply, read_ply_antialiased])
+def test_other_formats_of_splats_are_refused_with_the_command_that_converts_them(
+    tmp_path: Path, suffix: str, read
+) -> None:
+    with pytest.raises(FieldFormatError, match=rf"splat-transform a\.{suffix} a\.ply$"):
+        read(tmp_path / f"a.{suffix}")
+
+
+@pytest.mark.parametrize("suffix", ["gltf", "glb"])
+def test_formats_that_nothing_converts_are_refused_all_the_same(
+    tmp_path: Path, suffix: str
+) -> None:
+    with pytest.raises(FieldFormatError, match=r"export the splats as \.ply"):
         read_ply(tmp_path / f"a.{suffix}")
+
+
+@pytest.mark.parametrize("antialiased", [True, False, None])
+def test_how_splats_are_drawn_survives_a_ply_and_changes_no_splat(
+    make_gaussians, tmp_path: Path, antialiased: bool | None
+) -> None:
+    gaussians = make_gaussians(3, 1)
+    write_ply(tmp_path / "a.ply", gaussians, antialiased=antialiased)
+    assert read_ply_antialiased(tmp_path / "a.ply") is antialiased
+    assert_equal(read_ply(tmp_path / "a.ply"), gaussians)
+
+
+def test_the_comment_is_spelled_as_other_tools_read_it(make_gaussians, tmp_path: Path) -> None:
+    for antialiased, line in ((True, b"mip"), (False, b"default")):
+        write_ply(tmp_path / "a.ply", make_gaussians(1, 0), antialiased=antialiased)
+        header = (tmp_path / "a.ply").read_bytes().split(b"\n")
+        assert header[2] == b"comment SplatRenderMode: " + line
+
+
+@pytest.mark.parametrize(
+    ("comments", "stated"),
+    [
+        (["SplatRenderMode: mip"], True),
+        (["splatrendermode:MIP"], True),
+        (["Exported from Brush", "SplatRenderMode: default"], False),
+        (["SplatRenderMode: default", "SplatRenderMode: mip"], True),
+        (["antialiased 1"], True),
+        (["antialiased 0"], False),
+        (["antialiased by hand"], None),
+        (["mip"], None),
+        ([], None),
+    ],
+)
+def test_every_spelling_in_use_is_read_and_the_last_counts(
+    make_gaussians, tmp_path: Path, comments: list[str], stated: bool | None
+) -> None:
+    write_ply(tmp_path / "a.ply", make_gaussians(1, 0))
+    lines = "".join(f"comment {text}\n" for text in comments)
+    edited(tmp_path / "a.ply", "element vertex", f"{lines}element vertex")
+    assert read_ply_antialiased(tmp_path / "a.ply") is stated
+
+
+def test_a_mode_there_is_not_is_refused_by_name(make_gaussians, tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", make_gaussians(1, 0), antialiased=True)
+    edited(tmp_path / "a.ply", "SplatRenderMode: mip", "SplatRenderMode: 2dgs")
+    with pytest.raises(FieldFormatError, match="'SplatRenderMode: 2dgs' names neither mode"):
+        read_ply_antialiased(tmp_path / "a.ply")
+
+
+def test_the_header_of_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FieldFormatError, match=r"none\.ply: cannot be read"):
+        read_ply_antialiased(tmp_path / "none.ply")
 
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])

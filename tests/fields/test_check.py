@@ -7,11 +7,18 @@ import pytest
 
 from rfcore.camera import Camera, Pose
 from rfcore.errors import InvalidInput
-from rfcore.field import SplatField
+from rfcore.field import FieldMetadata, SplatField
 from rfcore.field.similarity import Similarity, moved
 from rfcore.raster.gaussians import Gaussians
 from rfcore.views import PosedPicture
-from rfedge.fields.check import check_field, in_drive_world, pairs_picture
+from rfedge.fields.check import (
+    ModeFit,
+    check_field,
+    drawn_antialiased,
+    in_drive_world,
+    pairs_picture,
+    to_rgb,
+)
 from rfedge.fields.conventions import AS_GIVEN, AS_OPENGL, known_conventions
 
 HALF = np.sqrt(0.5)
@@ -130,3 +137,58 @@ def test_pairs_show_the_camera_beside_the_render(place) -> None:
 def test_a_drive_without_pictures_is_refused(place) -> None:
     with pytest.raises(InvalidInput, match="has no pictures"):
         check_field(place.field, [])
+
+
+def tiny_splats(place, *, antialiased: bool) -> SplatField:
+    """The cloud with splats smaller than a pixel, which both modes draw very differently."""
+    splats = replace(place.field.gaussians, log_scales=place.field.gaussians.log_scales - 2.5)
+    return SplatField(splats, FieldMetadata(antialiased=antialiased, held_out_psnr_db=30.0))
+
+
+def pictures_of(field: SplatField, pictures: list[PosedPicture]) -> list[PosedPicture]:
+    renders = [to_rgb(field.render_colour(picture.camera)) for picture in pictures]
+    return [
+        replace(picture, read=lambda rgb=rgb: rgb)
+        for picture, rgb in zip(pictures, renders, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("antialiased", [True, False])
+@pytest.mark.parametrize("stated", [True, False])
+def test_the_mode_that_the_pictures_were_drawn_in_fits(
+    place, antialiased: bool, stated: bool
+) -> None:
+    pictures = pictures_of(tiny_splats(place, antialiased=antialiased), place.pictures)
+    fit = check_field(tiny_splats(place, antialiased=stated), pictures)
+    assert fit.mode is not None
+    assert fit.mode.antialiased == antialiased
+    assert (fit.convention, fit.fits, fit.tried) == (AS_GIVEN, True, 1)
+    assert (fit.psnr_db == fit.as_given_db) == (antialiased == stated)
+    assert fit.psnr_db == (fit.mode.antialiased_db if antialiased else fit.mode.default_db)
+
+
+@pytest.mark.parametrize(
+    ("stated", "antialiased_db", "default_db", "fits"),
+    [
+        (False, 30.4, 30.0, False),
+        (False, 30.6, 30.0, True),
+        (True, 30.0, 30.4, True),
+        (True, 30.0, 30.6, False),
+        (True, 30.0, 20.0, True),
+    ],
+)
+def test_the_stated_mode_is_believed_unless_the_other_is_clearly_better(
+    stated: bool, antialiased_db: float, default_db: float, fits: bool
+) -> None:
+    mode = ModeFit(stated, antialiased_db, default_db)
+    assert mode.antialiased is fits
+    assert mode.psnr_db == (antialiased_db if fits else default_db)
+
+
+def test_a_field_in_another_mode_forgets_what_was_measured_in_its_own(place) -> None:
+    field = tiny_splats(place, antialiased=False)
+    assert drawn_antialiased(field, False) is field
+    other = drawn_antialiased(field, True)
+    assert other.metadata.antialiased
+    assert other.metadata.held_out_psnr_db is None
+    np.testing.assert_array_equal(other.gaussians.means, field.gaussians.means)

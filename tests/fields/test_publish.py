@@ -12,7 +12,7 @@ from rfcore.field import SplatField, save_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.tile_manifest import MANIFEST, read_publication
 from rfcore.wire.tiles import Area
-from rfedge.cli.field import FieldList, FieldPublish, FieldRollback
+from rfedge.cli.field_tiles import FieldList, FieldPublish, FieldRollback
 from rfedge.fields.publish import Ground, publish, roll_back
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)

@@ -2,10 +2,14 @@
 
 import math
 import shutil
+import signal
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from rfcore.camera import Pose
@@ -15,7 +19,7 @@ from rfcore.dataset.source import SourcePicture
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import write_png
-from rfedge.datasets.colmap_features import PoseSettings
+from rfedge.datasets.colmap_features import PoseSettings, cancellable
 from rfedge.datasets.poses import pose_dataset
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "street"
@@ -58,7 +62,15 @@ def test_half_of_a_drive_is_placed_among_the_other_half(
 ) -> None:
     """A pixel is 0.18 degrees here; the true poses are those the street was rendered with."""
     known, new = half_of(drive, tmp_path / "known"), others_of(drive, tmp_path / "new")
-    line = pose_dataset(new, tmp_path / "out", known, SETTINGS)
+    told: list[str] = []
+    line = pose_dataset(new, tmp_path / "out", known, SETTINGS, told.append)
+    assert told[:4] == [
+        "features of the dataset's 4 pictures",
+        "features of 4 new pictures",
+        "matching 8 pictures (exhaustive)",
+        "points of the dataset's pictures at their given poses",
+    ]
+    assert told[4:] == [f"placing pictures: {count} of 8" for count in (5, 6, 7, 8)]
     assert line.startswith(f"{tmp_path / 'out'}: 4 pictures placed")
     placed = read_dataset(tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
@@ -111,6 +123,45 @@ def relative(a: SourcePicture, b: SourcePicture) -> Pose:
     return a.world_from_cam.inverse().compose(b.world_from_cam)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
+def test_sigterm_ends_it_in_one_line_and_leaves_nothing(
+    drive: tuple[SourcePicture, ...], tmp_path: Path
+) -> None:
+    """In the middle of COLMAP's own work, which does not look for signals."""
+    known, new = half_of(drive, tmp_path / "known"), others_of(drive, tmp_path / "new")
+    command = [sys.executable, "-m", "rfedge", "scene", "poses", str(new), "--register-to"]
+    command += [str(known), "--threads", "1", "--out", str(tmp_path / "out")]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline() == "  features of the dataset's 4 pictures\n"
+        process.send_signal(signal.SIGTERM)
+        said = process.stderr.read()
+    assert (process.returncode, said) == (130, "rfedge: interrupted\n")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["known", "new"]
+
+
+def test_an_exception_of_the_waiting_thread_cancels_colmaps_work() -> None:
+    """What a signal handler raises, without a signal."""
+    tokens = []
+
+    def work(*, cancellation_token: pycolmap.CancellationToken) -> None:
+        tokens.append(cancellation_token)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cancellable(work)
+    assert tokens[0].is_cancelled
+
+
+def test_a_call_of_colmap_returns_what_it_returns() -> None:
+    def work(a: int, *, b: int, cancellation_token: pycolmap.CancellationToken) -> int:
+        assert not cancellation_token.is_cancelled
+        return a - b
+
+    assert cancellable(work, 7, b=3) == 4
+
+
 def test_parameters_belong_to_their_model() -> None:
     with pytest.raises(InvalidInput, match="PINHOLE has 4, not 3"):
         PoseSettings(model="PINHOLE", parameters=(1.0, 2.0, 3.0))
@@ -121,6 +172,15 @@ def test_parameters_belong_to_their_model() -> None:
 def test_too_few_pictures_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="holds 0 pictures"):
         pose_dataset(tmp_path, tmp_path / "out", None, SETTINGS)
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_a_video_is_refused_with_the_commands_that_help(tmp_path: Path, folder: bool) -> None:
+    video = tmp_path / "phone.MOV"
+    video.write_bytes(b"\0\0\0 ftypqt")
+    with pytest.raises(DatasetError, match=r"phone\.MOV: is a video.*ffmpeg -i .*scene poses"):
+        pose_dataset(tmp_path if folder else video, tmp_path / "out", None, SETTINGS)
+    assert not (tmp_path / "out").exists()
 
 
 def test_pictures_that_share_nothing_leave_nothing_behind(tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ import pytest
 
 from rfcore.errors import InvalidInput, TrainingDiverged
 from rfcore.raster.gaussians import Gaussians
-from rfcore.train.density import DensityControl
-from rfcore.train.divergence import WINDOW, DivergenceWatch
+from rfcore.train.schedule import DensityControl
+from rfcore.train.trainer import WINDOW, DivergenceWatch
 
 
 def gaussians(scale: float = 1.0) -> Gaussians:

@@ -8,7 +8,7 @@ import pytest
 from rfcore.errors import InvalidInput
 from rfcore.raster.trainable import Exposure, LearningRates, TrainableRasterizer
 from rfcore.train import Bands, SplatTrainer, SplatTrainingConfig, mean_psnr_db
-from rfcore.train.exposure import ExposureModel
+from rfcore.train.targets import ExposureModel
 
 CONFIG = SplatTrainingConfig(gaussians=400, iterations=600, bands=Bands(degree=0))
 

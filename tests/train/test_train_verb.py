@@ -12,6 +12,7 @@ from rfcore.dataset import read_dataset
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.field import load_field, save_field
 from rfcore.train import NgpModel, NgpTrainingConfig
+from rfedge.cli.scene import SceneConvert
 from rfedge.cli.train import Train
 from rfedge.training.finish import training_result
 from rfedge.training.loop import LoopLimits
@@ -64,11 +65,48 @@ def test_it_writes_a_field_a_result_and_a_page(wall: Path, tmp_path: Path) -> No
     assert "dB on pictures never seen" in text
 
 
-def test_without_held_out_pictures_there_is_a_page_and_no_quality(wall, tmp_path) -> None:
-    out, result, page = (tmp_path / name for name in ("a.rff", "a.json", "a.html"))
-    verb(wall, out, json=str(result), report=page, holdout=None, iterations=5).run()
+def test_without_held_out_pictures_there_is_no_quality(wall: Path, tmp_path: Path) -> None:
+    out, result = (tmp_path / name for name in ("a.rff", "a.json"))
+    verb(wall, out, json=str(result), holdout=None, iterations=5).run()
     assert json.loads(result.read_text())["held_out"] == {"psnr_db": None, "ssim": None, "views": 0}
-    assert "<svg" not in page.read_text()
+
+
+def test_a_page_without_held_out_pictures_is_refused_before_training(
+    wall: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(InvalidInput, match="none are held out: add --holdout 8"):
+        verb(wall, tmp_path / "a.rff", report=tmp_path / "a.html", holdout=None).run()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_field_too_alike_to_compress_names_the_option_that_helps(
+    wall: Path, tmp_path: Path
+) -> None:
+    """After one iteration all Gaussians still have one opacity."""
+    with pytest.raises(InvalidInput, match=r"save it uncompressed .*train --plain"):
+        verb(wall, tmp_path / "a.rff", iterations=1, gaussians=40_000, plain=False).run()
+
+
+def test_a_video_is_no_dataset_and_the_error_says_how_to_make_one(tmp_path: Path) -> None:
+    video = tmp_path / "phone.mp4"
+    video.write_bytes(b"\0\0\0 ftypisom")
+    helps = r"phone\.mp4: is a video.*ffmpeg -i .*rfedge scene poses frames.*camera\.toml"
+    with pytest.raises(DatasetError, match=helps):
+        verb(video, tmp_path / "a.rff").run()
+    with pytest.raises(DatasetError, match=helps):
+        SceneConvert(video, tmp_path / "out").run()
+
+
+def test_the_command_for_a_video_can_be_pasted_whatever_its_name(tmp_path: Path) -> None:
+    video = tmp_path / "my phone.mp4"
+    video.touch()
+    with pytest.raises(DatasetError, match=r"ffmpeg -i '.*/my phone\.mp4' -vf"):
+        SceneConvert(video, tmp_path / "out").run()
+
+
+def test_a_picture_is_no_dataset_and_the_error_says_what_is(wall: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"0\.png: is no file that describes.*transforms\.json"):
+        verb(wall / "0.png", tmp_path / "a.rff").run()
 
 
 def test_an_interrupted_run_ends_with_the_same_bytes(wall: Path, tmp_path: Path) -> None:

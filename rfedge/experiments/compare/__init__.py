@@ -51,11 +51,12 @@ class EvalCompare:
         """Run what is not there yet and write the rows."""
         from rich.console import Console
 
+        from rfedge.arguments import field_path
         from rfedge.experiments.compare.drives import CompareJob
         from rfedge.experiments.compare.run import run_compare
 
         job = CompareJob(
-            field=self.field,
+            field=field_path(self.field),
             drives=self.drives,
             preset=self.preset,
             out=self.out,

@@ -39,11 +39,13 @@ class EvalLadder:
         from rich.console import Console
         from rich.table import Table
 
+        from rfedge.arguments import field_path
         from rfedge.experiments.ladder.page import middle_rows, write_ladder_figure
         from rfedge.experiments.ladder.run import LadderJob, run_ladder
 
         console = Console()
-        job = LadderJob(self.fields, self.drive, self.out, self.cells, self.frames, self.quick)
+        fields = tuple(field_path(name) for name in self.fields)
+        job = LadderJob(fields, self.drive, self.out, self.cells, self.frames, self.quick)
         result = run_ladder(job, console)
         table = Table("rung", "sender ms", "receiver ms", "kbit", "PSNR dB", "rate %")
         for row in sorted(middle_rows(result), key=lambda row: float(row["sender_ms"])):

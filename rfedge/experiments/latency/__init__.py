@@ -48,11 +48,12 @@ class EvalLatency:
         from rich.console import Console
         from rich.table import Table
 
+        from rfedge.arguments import field_path
         from rfedge.experiments.latency.report import write_latency_figures
         from rfedge.experiments.latency.run import LatencyJob, run_latency
 
         job = LatencyJob(
-            field=self.field,
+            field=field_path(self.field),
             drives=self.drives,
             traces=self.traces,
             preset=self.preset,

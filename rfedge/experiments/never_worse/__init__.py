@@ -41,10 +41,11 @@ class EvalNeverWorse:
         """Run what is not there yet and write the rows."""
         from rich.console import Console
 
+        from rfedge.arguments import field_path
         from rfedge.experiments.never_worse.measure import NeverWorseJob, run_never_worse
 
         job = NeverWorseJob(
-            field=self.field,
+            field=field_path(self.field),
             drives=self.drives,
             decimated=self.decimated,
             preset=self.preset,

@@ -37,9 +37,9 @@ class EvalPaper:
         """Run what is not there yet, write rows and figures, print the means."""
         from rich.console import Console
 
+        from rfedge.arguments import parse_size
         from rfedge.experiments.paper.figures import paper_table, write_paper_figures, write_views
         from rfedge.experiments.paper.run import PaperJob, run_paper, views_of
-        from rfedge.units import parse_size
 
         sizes_px = [parse_size(size) for size in self.sizes]
         job = PaperJob(

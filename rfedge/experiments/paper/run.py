@@ -20,9 +20,10 @@ from rich.console import Console
 from rfcore.camera import Camera, Pose
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
-from rfcore.field import RadianceField, load_field
+from rfcore.field import RadianceField
 from rfcore.image import Rgb
 from rfcore.views import PosedPicture
+from rfedge.arguments import open_field
 from rfedge.experiments.cells import CellStore, Rows, program_version
 from rfedge.experiments.paper.published import (
     PUBLISHED_CRFS,
@@ -91,7 +92,7 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
     Raises ``InvalidInput``, ``DatasetError`` or ``FieldFormatError`` before anything is coded if an
     input is wrong.
     """
-    fields = [(name, load_field(path)) for name, path in map(named_path, job.fields)]
+    fields = [(name, open_field(path)) for name, path in map(named_path, job.fields)]
     pieces = list(_pieces(job, fields))
     store, stamp = CellStore(job.cells), revision()
     _say_cost(pieces, store, console)
@@ -116,7 +117,7 @@ def views_of(job: PaperJob) -> list[tuple[str, Rgb]]:
         picture = read_dataset(path).pictures[0]
         views.append((f"{scene}: camera", picture.read()))
         for name, field_path in map(named_path, job.fields):
-            views.append((f"{scene}: {name}", _render(load_field(field_path), picture.camera)))
+            views.append((f"{scene}: {name}", _render(open_field(field_path), picture.camera)))
     return views
 
 

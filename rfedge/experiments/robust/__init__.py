@@ -46,11 +46,12 @@ class EvalRobust:
         """Do what is not done yet, write rows and figure, print what came out."""
         from rich.console import Console
 
+        from rfedge.arguments import field_path
         from rfedge.experiments.robust.report import write_robust_figure
         from rfedge.experiments.robust.run import RobustJob, run_robust
 
         job = RobustJob(
-            field=self.field,
+            field=field_path(self.field),
             drive=self.drive,
             dusk=self.dusk,
             lane=self.lane,

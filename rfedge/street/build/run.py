@@ -31,6 +31,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from rfcore.errors import InvalidInput, RfedgeError
+from rfedge.arguments import time_text
 from rfedge.results import host, revision
 from rfedge.street.build.listing import claim_folder, list_dataset, origin_of
 from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
@@ -38,7 +39,6 @@ from rfedge.street.build.shot_files import ShotFiles
 from rfedge.street.render.backend import Backend, chosen_backend
 from rfedge.street.render.renderer import Quality
 from rfedge.street.shots import Selection, Shot
-from rfedge.units import time_text
 
 __all__ = ["Settings", "build_scene", "cost_line", "show_progress", "take_all"]
 

@@ -1,0 +1,253 @@
+"""What every training run has, whatever it trains: iterations, a digest, metadata, divergence.
+
+A trainer of a kind of field is a ``FieldTrainer`` that says how one iteration is done and what its
+parameters are. How well a field shows pictures it was not trained on is measured here too.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import TileOrigin
+from rfcore.errors import InvalidInput, TrainingDiverged
+from rfcore.field import FieldMetadata, RadianceField
+from rfcore.metrics import psnr, ssim
+from rfcore.train.checkpoint import Checkpoint
+from rfcore.views import PosedPicture
+
+__all__ = [
+    "WINDOW",
+    "DivergenceWatch",
+    "FieldTrainer",
+    "HeldOut",
+    "TrainingProgress",
+    "held_out_quality",
+    "mean_psnr_db",
+    "settings_of",
+]
+
+WINDOW = 100
+"""Iterations whose mean loss is judged."""
+TOLERATED_RISE = 1.5
+NOT_OF_THE_RESULT = ("threads", "isa")
+"""Settings that change how long a run takes, and no byte of the field."""
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """What one iteration did: ``iteration`` counts from 1 to ``total``."""
+
+    iteration: int
+    total: int
+    loss: float
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Quality on pictures never trained on: means over them of RGB PSNR and SSIM."""
+
+    psnr_db: float
+    ssim: float | None = None
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.psnr_db):
+            raise InvalidInput("held_out.psnr_db", f"{self.psnr_db} must be finite")
+
+
+class FieldTrainer(ABC):
+    """One training run, an iteration at a time.
+
+    ``training_digest`` is the SHA-256, in hex, of everything the result depends on; it is known
+    before the first iteration.
+    """
+
+    kind: ClassVar[str]
+    """``splats`` or ``ngp``."""
+
+    def __init__(self, iterations: int, training_digest: str) -> None:
+        self.training_digest = training_digest
+        self.total = iterations
+        """How many iterations the settings ask for."""
+        self.iteration = 0
+        """How many have been done."""
+        self._watch = DivergenceWatch()
+
+    @property
+    def finished(self) -> bool:
+        """Whether every iteration has been done."""
+        return self.iteration >= self.total
+
+    def step(self, progress: float | None = None) -> TrainingProgress:
+        """Do one iteration; ``progress`` 0..1 replaces the share of iterations done.
+
+        Raises ``InvalidInput`` when the run is finished, ``TrainingDiverged`` when it no longer
+        gets anywhere.
+        """
+        if self.finished:
+            raise InvalidInput("training", f"all {self.total} iterations are done")
+        if progress is None:
+            progress = self.iteration / self.total
+        loss = self._descend(progress)
+        self.iteration += 1
+        self._watch.see(self.iteration, loss, self._parameters)
+        self._after_iteration(progress)
+        return TrainingProgress(self.iteration, self.total, loss)
+
+    def steps(self) -> Iterator[TrainingProgress]:
+        """Do the iterations that are left, one at a time."""
+        while not self.finished:
+            yield self.step()
+
+    @property
+    @abstractmethod
+    def primitives(self) -> int:
+        """How many Gaussians, or numbers of a hash grid, are being learned."""
+
+    @abstractmethod
+    def field(
+        self,
+        name: str = "",
+        tile_origin: TileOrigin | None = None,
+        held_out: HeldOut | None = None,
+    ) -> RadianceField:
+        """Return what has been learned so far."""
+
+    @abstractmethod
+    def checkpoint(self) -> Checkpoint:
+        """Return what ``restore`` of a trainer made of the same things goes on from."""
+
+    @abstractmethod
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on after ``checkpoint``. Raises ``InvalidInput`` when it is of another run."""
+
+    @abstractmethod
+    def _descend(self, progress: float) -> float:
+        """Do one step of descent; return its loss."""
+
+    @abstractmethod
+    def _after_iteration(self, progress: float) -> None:
+        """Do what is done between two iterations, ``iteration`` of which are done."""
+
+    @abstractmethod
+    def _parameters(self) -> Any:
+        """Return the groups of parameters, the arrays of a dataclass."""
+
+    def _metadata(
+        self,
+        name: str,
+        tile_origin: TileOrigin | None,
+        held_out: HeldOut | None,
+        *,
+        antialiased: bool = False,
+    ) -> FieldMetadata:
+        """Return the metadata of the field learned so far."""
+        return FieldMetadata(
+            name=name,
+            tile_origin=tile_origin if tile_origin is not None else TileOrigin(),
+            training_digest=self.training_digest,
+            held_out_psnr_db=held_out.psnr_db if held_out is not None else None,
+            held_out_ssim=held_out.ssim if held_out is not None else None,
+            antialiased=antialiased,
+            kind=self.kind,
+        )
+
+
+def settings_of(config: Any) -> list[tuple[str, Any]]:
+    """Return the settings of a configuration that the result depends on, as (name, value)."""
+    kept = [f.name for f in fields(config) if f.name not in NOT_OF_THE_RESULT]
+    return [(name, getattr(config, name)) for name in kept]
+
+
+class DivergenceWatch:
+    """Notices that a run no longer gets anywhere.
+
+    A run that learns has a falling mean loss over ``WINDOW`` iterations. One whose mean rises above
+    ``TOLERATED_RISE`` times its lowest, and above where it began, has diverged; the group of
+    parameters whose size grew most since the first window is named.
+    """
+
+    def __init__(self) -> None:
+        self._sum = 0.0
+        self._first: float | None = None
+        self._lowest = math.inf
+        self._sizes: dict[str, float] = {}
+
+    def see(self, iteration: int, loss: float, parameters: Callable[[], Any]) -> None:
+        """Take the loss of one iteration; raise ``TrainingDiverged`` if the run is lost."""
+        if not math.isfinite(loss):
+            raise TrainingDiverged(iteration, self._grown(parameters()), f"the loss is {loss}")
+        self._sum += loss
+        if iteration % WINDOW:
+            return
+        mean, self._sum = self._sum / WINDOW, 0.0
+        if self._first is None:
+            self._first, self._sizes = mean, _sizes(parameters())
+        self._lowest = min(self._lowest, mean)
+        if mean > max(TOLERATED_RISE * self._lowest, self._first):
+            raise TrainingDiverged(
+                iteration,
+                self._grown(parameters()),
+                f"a mean loss of {mean:.3g} after {self._lowest:.3g}; lower the group's rate",
+            )
+
+    def values(self) -> dict[str, Any]:
+        """Return what ``restore`` needs, as JSON."""
+        lowest = self._lowest if math.isfinite(self._lowest) else None
+        return {"sum": self._sum, "first": self._first, "lowest": lowest, "sizes": self._sizes}
+
+    def restore(self, values: dict[str, Any]) -> None:
+        """Go on from ``values``."""
+        self._sum, self._first = values["sum"], values["first"]
+        self._lowest = math.inf if values["lowest"] is None else values["lowest"]
+        self._sizes = values["sizes"]
+
+    def _grown(self, parameters: Any) -> str:
+        growth = {
+            name: size / max(self._sizes.get(name, size), 1e-9)
+            for name, size in _sizes(parameters).items()
+        }
+        return max(growth, key=lambda name: growth[name])
+
+
+def _sizes(parameters: Any) -> dict[str, float]:
+    """Return the root of the mean square of every group, the arrays of a dataclass."""
+    arrays = {f.name: getattr(parameters, f.name) for f in fields(parameters)}
+    return {
+        name: float(np.sqrt(np.mean(np.square(array, dtype=np.float64)))) if array.size else 0.0
+        for name, array in arrays.items()
+    }
+
+
+def mean_psnr_db(field: RadianceField, pictures: Sequence[PosedPicture]) -> float:
+    """Return the mean over pictures of the RGB PSNR of the field's view, clipped to 0..1."""
+    _check(pictures)
+    return float(np.mean([psnr(*_pair(field, p), peak=1.0) for p in pictures]))
+
+
+def held_out_quality(field: RadianceField, pictures: Sequence[PosedPicture]) -> HeldOut:
+    """Return the means over pictures of RGB PSNR and SSIM of the field's view."""
+    _check(pictures)
+    pairs = [_pair(field, picture) for picture in pictures]
+    return HeldOut(
+        psnr_db=float(np.mean([psnr(*pair, peak=1.0) for pair in pairs])),
+        ssim=float(np.mean([ssim(*pair, peak=1.0) for pair in pairs])),
+    )
+
+
+def _check(pictures: Sequence[PosedPicture]) -> None:
+    if not pictures:
+        raise InvalidInput("pictures", "at least one is needed to measure a field")
+
+
+def _pair(
+    field: RadianceField, picture: PosedPicture
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    colour = np.clip(field.render_colour(picture.camera).astype(np.float64), 0.0, 1.0)
+    return colour, picture.read() / 255.0

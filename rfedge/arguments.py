@@ -1,0 +1,135 @@
+"""What commands take on the command line: placeholders, fields by path or name, sizes, durations.
+
+The placeholders stand in a verb's help where a type's name (PATH, STR) would say nothing::
+
+    field: Annotated[Path, Positional, FIELD]
+
+``field_path`` is the one resolver of every command that takes a field. A name is what the field was
+imported under (``out/fields/NAME.rff``) or a sample's (``samples/fields/NAME.rff``), in this order;
+a file of that path comes before both.
+
+This module is imported for every ``--help`` and therefore imports nothing heavy itself.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import arg
+
+from rfcore.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from rfcore.field import RadianceField, SplatField
+
+__all__ = [
+    "ADDRESS",
+    "DATASET",
+    "FIELD",
+    "FOLDER",
+    "IMPORTED",
+    "JSON",
+    "PLY",
+    "RFF",
+    "SAMPLES",
+    "SCENE",
+    "SIZE",
+    "check_folder",
+    "field_path",
+    "open_field",
+    "open_splats",
+    "parse_size",
+    "time_text",
+]
+
+FIELD = arg(metavar="FIELD")
+"""An archive's path, or a field's name."""
+DATASET = arg(metavar="DATASET")
+"""A dataset's folder, or the file that describes it (docs/data.md)."""
+SCENE = arg(metavar="SCENE")
+ADDRESS = arg(metavar="HOST:PORT")
+SIZE = arg(metavar="WIDTHxHEIGHT")
+FOLDER = arg(metavar="FOLDER")
+RFF = arg(metavar="FILE.rff")
+PLY = arg(metavar="FILE.ply")
+JSON = arg(metavar="FILE.json")
+
+IMPORTED = Path("out/fields")
+"""Where ``rfedge field import`` puts what it reads."""
+SAMPLES = Path("samples/fields")
+SUFFIX = ".rff"
+PICTURES = (".gif", ".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+
+
+def field_path(name: Path | str) -> Path:
+    """Return the file of a field; raise ``InvalidInput`` listing what was tried and what exists."""
+    tried = list(_candidates(Path(name)))
+    found = next((path for path in tried if path.is_file()), None)
+    if found is not None:
+        return found
+    names = sorted({path.stem for folder in (IMPORTED, SAMPLES) for path in folder.glob("*.rff")})
+    raise InvalidInput(
+        "field",
+        f"'{name}' is no field: there is no file {', '.join(map(str, tried))}; "
+        f"names known here: {', '.join(names) or 'none (rfedge field import makes one)'}",
+    )
+
+
+def open_field(name: Path | str, *, threads: int = 1, isa: str | None = None) -> RadianceField:
+    """Load a field by path or name.
+
+    Raises ``InvalidInput`` as ``field_path`` does and ``FieldFormatError`` for a damaged file.
+    """
+    from rfcore.field import load_field
+
+    return load_field(field_path(name), threads=threads, isa=isa)
+
+
+def open_splats(name: Path | str, *, threads: int) -> SplatField:
+    """Load a field that must be made of splats; raise ``InvalidInput`` for another kind."""
+    from rfcore.field import SplatField
+
+    field = open_field(name, threads=threads)
+    if not isinstance(field, SplatField):
+        raise InvalidInput("field", f"{name} is of kind '{field.metadata.kind}', not splats")
+    return field
+
+
+def _candidates(name: Path) -> Iterator[Path]:
+    yield name
+    if len(name.parts) == 1:
+        file = name if name.suffix == SUFFIX else Path(f"{name}{SUFFIX}")
+        yield from (folder / file for folder in (IMPORTED, SAMPLES))
+
+
+def check_folder(path: Path, wanted: str) -> None:
+    """Raise ``InvalidInput`` for a folder to write that is named as a picture or a video.
+
+    ``wanted`` says what to name instead.
+    """
+    if path.suffix.lower() in (*PICTURES, *VIDEOS):
+        raise InvalidInput("out", f"{path}: no {path.suffix} file is written; name {wanted}")
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Return (width, height) in pixels; raise ``InvalidInput`` for anything but ``640x360``."""
+    from rfcore.camera import MAX_SIDE_PX
+
+    match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text, re.ASCII)
+    if match is None:
+        raise InvalidInput("size", f"'{text}' is not WIDTHxHEIGHT, such as 640x360")
+    width_px, height_px = int(match[1]), int(match[2])
+    if max(width_px, height_px) > MAX_SIDE_PX:
+        raise InvalidInput("size", f"{text} is over the limit of {MAX_SIDE_PX} px")
+    return width_px, height_px
+
+
+def time_text(seconds: float) -> str:
+    """Return a duration in the unit that fits it."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,90 @@
+"""``rfedge field publish``, ``list`` and ``rollback``: versions of the tiles a server offers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from rfedge.arguments import FIELD, FOLDER, field_path
+
+__all__ = ["FieldList", "FieldPublish", "FieldRollback"]
+
+
+@dataclass(frozen=True)
+class FieldPublish:
+    """Publish a field as the next version of a tile; running servers take it up."""
+
+    field: Annotated[Path, Positional, FIELD]
+    """The archive (.rff), or the field's name."""
+    folder: Annotated[Path, FOLDER]
+    """The server's folder of fields (mec-server --fields)."""
+    tile: Annotated[str, arg(metavar="NAME")] = "street"
+    """The tile whose field it is."""
+    area: Annotated[
+        tuple[float, float, float, float] | None, arg(metavar="WEST SOUTH EAST NORTH")
+    ] = None
+    """West, south, east, north side of the ground it is for, m; as before, at first everywhere."""
+    margin_m: float | None = None
+    """How far beyond its ground the field serves where a neighbour does not; at first 0."""
+
+    def run(self) -> None:
+        """Publish, and say what is current."""
+        from datetime import UTC, datetime
+
+        from rfcore.wire.tiles import Area
+        from rfedge.fields.publish import Ground, publish
+
+        area = None
+        if self.area is not None:
+            west_m, south_m, east_m, north_m = self.area
+            area = Area((west_m, south_m), (east_m, north_m))
+        ground = Ground(area, self.margin_m)
+        tile = publish(self.folder, self.tile, field_path(self.field), ground, datetime.now(UTC))
+        print(f"{tile.name} is version {tile.version}, field {tile.field_id}")
+
+
+@dataclass(frozen=True)
+class FieldList:
+    """List the tiles that a folder publishes, with all their versions."""
+
+    folder: Annotated[Path, Positional, FOLDER]
+    """The server's folder of fields (mec-server --fields)."""
+
+    def run(self) -> None:
+        """Print a line a version; the current one has a star."""
+        from rfcore.wire.tile_manifest import read_publication
+
+        publication = read_publication(self.folder)
+        if not publication.tiles:
+            print(f"{self.folder} publishes no tiles")
+        for name, tile in sorted(publication.tiles.items()):
+            ground = "everywhere"
+            if tile.area is not None:
+                low, high = tile.area.low_m, tile.area.high_m
+                ground = f"{low[0]:g}, {low[1]:g} to {high[0]:g}, {high[1]:g} m"
+            print(f"{name}: {ground}, margin {tile.margin_m:g} m")
+            for number, field_id in enumerate(tile.field_ids, 1):
+                mark = "*" if number == tile.current else " "
+                print(f"{mark} {number:3}  {tile.times[number - 1]}  {field_id}")
+
+
+@dataclass(frozen=True)
+class FieldRollback:
+    """Make an earlier version of a tile current again; running servers take it up."""
+
+    folder: Annotated[Path, FOLDER]
+    """The server's folder of fields (mec-server --fields)."""
+    tile: Annotated[str, arg(metavar="NAME")] = "street"
+    """The tile to take back."""
+    to: int | None = None
+    """The version that was good; the one before the current without it."""
+
+    def run(self) -> None:
+        """Roll back, and say what is current."""
+        from rfedge.fields.publish import roll_back
+
+        tile = roll_back(self.folder, self.tile, self.to)
+        print(f"{tile.name} is version {tile.version}, field {tile.field_id}")

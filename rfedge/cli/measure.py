@@ -1,0 +1,137 @@
+"""Verbs that measure: ``rfedge bench``, ``rfedge loadtest`` and ``rfedge eval``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg, subcommand
+
+from rfedge.arguments import DATASET, FIELD, FOLDER, JSON, field_path
+from rfedge.experiments.compare import EvalCompare
+from rfedge.experiments.ladder import EvalLadder
+from rfedge.experiments.latency import EvalLatency
+from rfedge.experiments.never_worse import EvalNeverWorse
+from rfedge.experiments.paper import EvalPaper
+from rfedge.experiments.robust import EvalRobust
+
+__all__ = ["Bench", "Eval", "LoadTest"]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Check a part against its definition, then time it: medians of at least 20 repetitions."""
+
+    case: Annotated[Literal["raster", "train", "codec", "ngp", "decoders"], Positional]
+    """What to measure."""
+    rows: Literal["all", "native", "modes"] = "all"
+    """`native` leaves out the timing of the slow torch reference; `modes` shows what SH degree,
+    antialiasing, depth and opacity cost, as ratios (raster only)."""
+    field: Annotated[Path | None, FIELD] = None
+    """A trained hash grid of the sample street to time, instead of one learnt on the spot (ngp
+    only)."""
+    json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
+    """Write one JSON object to this file; `-` is standard output."""
+
+    def run(self) -> None:
+        """Run one case and print its rows."""
+        from rfedge.bench import print_rows, run_case, write_json
+
+        field = field_path(self.field) if self.field is not None else None
+        result = run_case(self.case, rows=self.rows, field=field)
+        if self.json is None:
+            print_rows(result)
+        else:
+            write_json(result, self.json)
+
+
+@dataclass(frozen=True)
+class LoadTest:
+    """Put a number of vehicles, each on its own link, on a server, and say whether it holds."""
+
+    vehicles: int = 4
+    """How many; with --find-limit, how many to begin with."""
+    mode: Literal["transport", "receiver", "full"] = "full"
+    """What the server does: nothing with the pictures, decode against kept renders, everything."""
+    hz: float = 10.0
+    """Pictures per second of each camera."""
+    cameras: int = 1
+    """Cameras of each vehicle."""
+    size: int = 4096
+    """Bytes of payload of a frame in transport mode; otherwise the drive's own."""
+    link: Annotated[Path | None, arg(metavar="FILE.toml")] = None
+    """Link profile (TOML, see samples/links), a link for each vehicle; default: loopback."""
+    duration: float = 20.0
+    """Seconds that are counted."""
+    warm_up: float = 5.0
+    """Seconds before them that are not."""
+    deadline_ms: float = 100.0
+    """From the moment a picture is due to its Ack."""
+    vehicle_ms: float = 0.0
+    """What a canned vehicle waits before sending, for the time a real one needs to encode."""
+    live: bool = False
+    """Vehicles that render and encode (cav-agent processes), instead of coded packets."""
+    admission: bool = False
+    """Let the server refuse vehicles or lower their rate; the verdict is about those let in."""
+    find_limit: bool = False
+    """Look for the largest number that holds."""
+    field: Annotated[Path, FIELD] = Path("samples/fields/street.rff")
+    """Field archive, the only one in its folder."""
+    drive: Annotated[Path, DATASET] = Path("samples/street/transforms_drive_vehicles.json")
+    """Drive whose pictures the vehicles send."""
+    workers: int = 2
+    """Frames the server reconstructs at once, and threads of a render."""
+    out: Annotated[Path, FOLDER] = Path("out/loadtest")
+    """Folder for report.html, result.json and vehicles_vs_uplink.svg."""
+    cache: Annotated[Path, FOLDER] = Path("out/cache/loadtest")
+    """Folder that keeps coded drives between runs."""
+    record: Annotated[Path | None, JSON] = None
+    """Put the rows into this result file, too."""
+
+    def run(self) -> None:
+        """Run, write the report, print the rows; fail if the asked number is not held."""
+        from rfcore.errors import RfedgeError
+        from rfedge.loadtest.command import Command
+        from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
+        from rfedge.loadtest.run import TestBed
+
+        load = Load(
+            mode=Mode(self.mode),
+            vehicles=self.vehicles,
+            hz=self.hz,
+            duration_s=self.duration,
+            warm_up_s=self.warm_up,
+            cameras=self.cameras,
+            size_bytes=self.size,
+            link=self.link,
+            kind=Vehicles.LIVE if self.live else Vehicles.CANNED,
+            vehicle_ms=self.vehicle_ms,
+            admission=self.admission,
+            bounds=Bounds(deadline_ms=self.deadline_ms),
+        )
+        bed = TestBed(
+            field_path(self.field), self.drive, self.workers, self.cache, self.out / "work"
+        )
+        result = Command(load, bed, self.out, self.record).run(find_limit=self.find_limit)
+        if not self.find_limit and not result.most_held:
+            raise RfedgeError("not held: " + "; ".join(result.runs[0].verdict.broken))
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Run an experiment; results are JSON with command, revision, host and input digests."""
+
+    verb: Annotated[
+        Annotated[EvalCompare, subcommand("compare")]
+        | Annotated[EvalLadder, subcommand("ladder")]
+        | Annotated[EvalNeverWorse, subcommand("never-worse")]
+        | Annotated[EvalLatency, subcommand("latency")]
+        | Annotated[EvalPaper, subcommand("paper")]
+        | Annotated[EvalRobust, subcommand("robust")],
+        arg(name=""),
+    ]
+
+    def run(self) -> None:
+        """Run the verb."""
+        self.verb.run()

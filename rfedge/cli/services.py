@@ -1,0 +1,192 @@
+"""What runs beside the services: ``rfedge link``, ``rfedge watch`` and ``rfedge certs``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg, subcommand
+
+from rfedge.arguments import ADDRESS, FOLDER, JSON
+
+__all__ = ["Certs", "CertsInit", "CertsShow", "Link", "Watch"]
+
+PEM = arg(metavar="FILE.pem")
+
+
+@dataclass(frozen=True)
+class Link:
+    """Forward TCP between a vehicle and a server at a limited throughput and with a delay."""
+
+    to: Annotated[str, ADDRESS]
+    """Where to connect for each accepted connection, HOST:PORT."""
+    listen: Annotated[str, ADDRESS] = "127.0.0.1:0"
+    """Where to accept connections, HOST:PORT; port 0 takes a free one."""
+    also: Annotated[tuple[str, ...], arg(metavar="LISTEN=TO ...")] = ()
+    """Further servers over the same link, each LISTEN=TO: a radio link shared by several paths."""
+    profile: Annotated[Path | None, arg(metavar="FILE.toml")] = None
+    """Link profile (TOML, see samples/links): traces, jitter, outages, lost connections."""
+    uplink_bps: float | None = None
+    """Throughput from the accepting side to `--to`, bit/s; 4e6 without a profile."""
+    downlink_bps: float | None = None
+    """Throughput of the way back, bit/s; 4e6 without a profile."""
+    delay_ms: float | None = None
+    """One-way delay in either direction, ms; 20 without a profile."""
+    metrics_port: Annotated[int | None, arg(metavar="PORT")] = None
+    """Port for Prometheus; 0 takes a free one, none are served without it."""
+    metrics_host: Annotated[str, arg(metavar="HOST")] = "127.0.0.1"
+    """Address the metrics are served on."""
+    report: Annotated[Path | None, JSON] = None
+    """Write bytes, busy time and timing error here as JSON."""
+    ready_file: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Write HOST:PORT here once listening."""
+    allow_insecure: bool = False
+    """Forward plaintext to or from other machines."""
+
+    def run(self) -> None:
+        """Forward until SIGTERM or SIGINT."""
+        from rfedge.link.proxy import ProxySettings, run_proxy
+
+        run_proxy(
+            ProxySettings(
+                listen=self.listen,
+                to=self.to,
+                also=self.also,
+                uplink_bps=self.uplink_bps,
+                downlink_bps=self.downlink_bps,
+                delay_ms=self.delay_ms,
+                profile=self.profile,
+                metrics_port=self.metrics_port,
+                metrics_host=self.metrics_host,
+                report=self.report,
+                ready_file=self.ready_file,
+                allow_insecure=self.allow_insecure,
+            )
+        )
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Print, and if asked keep, the pictures a server reconstructs, until it stops or Ctrl-C."""
+
+    address: Annotated[str, Positional, ADDRESS]
+    """Where mec-server listens."""
+    vehicle: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
+    """Only these vehicles; default: all."""
+    dir: Annotated[Path | None, FOLDER] = None
+    """Keep pictures as DIR/VEHICLE/CAMERA/SEQUENCE.png (or .jpg) beside an index.jsonl."""
+    mp4: Annotated[Path | None, arg(metavar="FILE.mp4")] = None
+    """Keep one camera, the first that is seen, as a video; its times are those of capture."""
+    encoding: Literal["none", "i420", "jpeg", "png"] | None = None
+    """How pictures travel; default: i420 (exact) for a video, jpeg for a folder, else none."""
+    pictures: int | None = None
+    """Stop after so many pictures."""
+    tls_cert: Annotated[Path | None, PEM] = None
+    """Certificate of this consumer (PEM), for a server that has one."""
+    tls_key: Annotated[Path | None, PEM] = None
+    """Its private key."""
+    tls_ca: Annotated[Path | None, PEM] = None
+    """Certificate of the authority that vouches for the server."""
+    allow_insecure: bool = False
+    """Watch a server on another machine in plaintext."""
+
+    def run(self) -> None:
+        """Watch until the server ends the stream, enough was seen, SIGINT or SIGTERM."""
+        import signal
+        from contextlib import suppress
+
+        from rfcore.wire.tls import TlsFiles
+        from rfedge.watch import WatchSettings, watch
+
+        settings = WatchSettings(
+            address=self.address,
+            vehicle_ids=frozenset(self.vehicle),
+            folder=self.dir,
+            video=self.mp4,
+            encoding=self.encoding,
+            pictures=self.pictures,
+            tls=TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca),
+            allow_insecure=self.allow_insecure,
+        )
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with suppress(KeyboardInterrupt):  # the usual end; files are closed on the way
+            watch(settings)
+
+
+@dataclass(frozen=True)
+class CertsInit:
+    """Make a folder of certificates: an authority, servers, vehicles, consumers of the twin."""
+
+    out: Annotated[Path, FOLDER] = Path("out/certs")
+    """The folder to make: ca.pem, server.pem, vehicle-NAME.pem, consumer-NAME.pem, each with its
+    .key, which only the owner may read."""
+    vehicles: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("cav-1",)
+    """Vehicles; each certificate is good for that name (cav-agent --vehicle) only."""
+    consumers: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("watch",)
+    """Who may watch the twin and ask for the server's health, without being a vehicle."""
+    hosts: Annotated[tuple[str, ...], arg(metavar="HOST ...")] = ("localhost", "127.0.0.1", "::1")
+    """Names and addresses by which vehicles reach the server."""
+    days: int = 365
+    """How long the certificates are good."""
+    replace: bool = False
+    """Replace the certificates in OUT; those signed before are then worth nothing."""
+
+    def run(self) -> None:
+        """Make them and say what is where."""
+        from datetime import UTC, datetime
+
+        from rfedge.certs import require_cryptography
+
+        require_cryptography()
+        from rfedge.certs.authority import Members, certify, write_certificates
+
+        members = Members(self.vehicles, self.consumers, self.hosts)
+        issued = certify(members, datetime.now(UTC), self.days)
+        write_certificates(self.out, issued, replace=self.replace)
+        for certificate in issued:
+            print(f"{self.out / certificate.name}.pem  {certificate.identity}")
+        print(f"keep {self.out / 'ca.key'} away from servers and vehicles")
+
+
+@dataclass(frozen=True)
+class CertsShow:
+    """Print what each certificate in a folder says; one that is no longer good is an error."""
+
+    folder: Annotated[Path, Positional, FOLDER] = Path("out/certs")
+    """The folder of `rfedge certs init`."""
+    within_days: int = 0
+    """Also call those an error that run out within so many days."""
+
+    def run(self) -> None:
+        """Read, print, judge."""
+        from datetime import UTC, datetime, timedelta
+
+        from rfcore.errors import InvalidData
+        from rfedge.certs import require_cryptography
+
+        require_cryptography()
+        from rfedge.certs.authority import read_certificates
+
+        soon = datetime.now(UTC) + timedelta(days=self.within_days)
+        ending = []
+        for name, says in read_certificates(self.folder).items():
+            print(f"{name}  until {says.until:%Y-%m-%d %H:%M} UTC  {', '.join(says.names)}")
+            if says.until <= soon:
+                ending.append(name)
+        if ending:
+            raise InvalidData(f"{', '.join(ending)}: make new ones (rfedge certs init --replace)")
+
+
+@dataclass(frozen=True)
+class Certs:
+    """Certificates for mec-server, vehicles and consumers."""
+
+    verb: Annotated[
+        Annotated[CertsInit, subcommand("init")] | Annotated[CertsShow, subcommand("show")],
+        arg(name=""),
+    ]
+
+    def run(self) -> None:
+        """Run the sub-verb."""
+        self.verb.run()
