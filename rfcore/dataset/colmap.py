@@ -43,12 +43,13 @@ from rfcore.dataset.keys import (
     lens_of,
     pose_of_quaternion,
     read_file,
-    shortened,
+    table_at,
     text_lines,
 )
 from rfcore.dataset.picture_file import check_size, find_picture, read_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
 from rfcore.errors import DatasetError, InvalidInput
+from rfcore.tables import shortened
 
 __all__ = [
     "MODEL_IDS",
@@ -118,7 +119,7 @@ def camera_of(
         intrinsics = Intrinsics(*size_px, fx_px, fy_px, cx_px, cy_px)
     except InvalidInput as error:
         raise DatasetError(f"{where}: {error}") from error
-    return SourceCamera(intrinsics, lens_of(where, model, lens))
+    return SourceCamera(intrinsics, lens_of(where, model, table_at(where, lens)))
 
 
 def image_of(where: str, name: str, camera_id: int, numbers: Sequence[float]) -> ColmapImage:

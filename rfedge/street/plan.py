@@ -20,7 +20,7 @@ import numpy as np
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfedge.street.assembly import plain_world
-from rfedge.street.effects import EFFECTS, Effect, Stage, rng_of
+from rfedge.street.effects import EFFECTS, Effect, EffectKind, rng_of
 from rfedge.street.frame import LinearFrame
 from rfedge.street.geometry.world import World
 from rfedge.street.scene_file import Drive, Geometry, Rig, Scene
@@ -47,7 +47,7 @@ class PlannedEffect:
     """
 
     name: str
-    stage: Stage
+    kind: EffectKind
     why: str
     settings: object
     cost_ms: float
@@ -111,7 +111,7 @@ def _changed(
 
 def _planned(scene: Scene, effect: Effect, cost_ms: float) -> PlannedEffect:
     settings = scene.effects[effect.name]
-    return PlannedEffect(effect.name, effect.stage, effect.why, settings, cost_ms, effect.on_frames)
+    return PlannedEffect(effect.name, effect.kind, effect.why, settings, cost_ms, effect.on_frames)
 
 
 def plain_frame(width_px: int, height_px: int, fov_deg: float) -> LinearFrame:

@@ -143,7 +143,7 @@ def effect_lines(planned: Sequence[PlannedEffect], cost: RenderCost | None) -> l
     if not planned:
         lines.append("  effects     none: pictures are as rendered")
     lines += [
-        f"  {effect.stage:<11} {effect.name}: {effect.why}; {_cost(effect, on_frames_ms, cost)}"
+        f"  {effect.kind:<11} {effect.name}: {effect.why}; {_cost(effect, on_frames_ms, cost)}"
         for effect in planned
     ]
     return lines

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rfcore.errors import InvalidInput
-from rfedge.street.effects import EFFECTS, Stage, load_effect
-from rfedge.street.schema import OneOf, Range, TomlFile
+from rfcore.tables import Range
+from rfedge.street.effects import EFFECTS, EffectKind, load_effect
+from rfedge.street.schema import OneOf, TomlFile, read_record
 
 __all__ = ["Drive", "Evaluation", "Geometry", "PoseNoise", "Rig", "Scene", "Training", "load_scene"]
 
@@ -127,21 +128,19 @@ def load_scene(name_or_path: str) -> Scene:
     that the scene declares are imported.
     """
     file = TomlFile(_path(name_or_path))
-    file.require_known("", file.content, {"name", "field", "effects", *PARTS})
-    for key in ("name", "field"):
-        if not isinstance(file.content.get(key, "") or None, str):
-            raise file.error(key, "is missing or not a string")
-    declared = file.table("effects")
-    file.require_known("effects", declared, {effect.name for effect in EFFECTS})
+    top = file.top
+    top.require_known(sorted({"name", "field", "effects", *PARTS}))
+    declared = top.table("effects", {})
+    declared.require_known(sorted(effect.name for effect in EFFECTS))
     order = [effect for effect in EFFECTS if effect.name in declared]
-    lights = [effect.name for effect in order if effect.stage is Stage.LIGHT]
+    lights = [effect.name for effect in order if effect.kind is EffectKind.LIGHT]
     if len(lights) > 1:
-        raise file.error(f"effects.{lights[1]}", f"is a second light beside {lights[0]}")
+        raise declared.error(lights[1], f"is a second light beside {lights[0]}")
     return Scene(
-        name=file.content["name"],
-        field=file.content["field"],
-        effects={e.name: file.read(f"effects.{e.name}", load_effect(e)) for e in order},
-        **{key: file.read(key, kind) for key, kind in PARTS.items()},
+        name=top.text("name"),
+        field=top.text("field"),
+        effects={e.name: read_record(declared.table(e.name), load_effect(e)) for e in order},
+        **{key: read_record(top.table(key, {}), kind) for key, kind in PARTS.items()},
     )
 
 

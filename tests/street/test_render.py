@@ -13,8 +13,8 @@ from rfedge.street.geometry.mesh import Label
 from rfedge.street.geometry.solids import Stuff, boxes
 from rfedge.street.geometry.world import Mover, Sky, World
 from rfedge.street.render.backend import PROBE, Backend, chosen_backend
+from rfedge.street.render.mitsuba_scene import with_sun
 from rfedge.street.render.renderer import Quality, Renderer
-from rfedge.street.render.stage import with_sun
 from rfedge.street.trajectory import looking
 
 SCALAR = Backend("scalar_rgb")

@@ -12,7 +12,7 @@ import pytest
 from rfcore.errors import InvalidInput
 from rfcore.native import _native
 from rfedge.street import load_scene
-from rfedge.street.effects import EFFECTS, Stage, load_effect
+from rfedge.street.effects import EFFECTS, EffectKind, load_effect
 from rfedge.street.effects.dusk import Dusk
 from rfedge.street.effects.overcast import Overcast
 from rfedge.street.effects.parked import ParkedVehicles
@@ -160,7 +160,7 @@ def test_a_scene_has_one_light(tmp_path: Path) -> None:
 
 
 def test_the_stages_follow_one_another() -> None:
-    stages = [list(Stage).index(effect.stage) for effect in EFFECTS]
+    stages = [list(EffectKind).index(effect.kind) for effect in EFFECTS]
     assert stages == sorted(stages)
 
 

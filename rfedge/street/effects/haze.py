@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.lens import LensCamera
+from rfcore.tables import Range
 from rfedge.street.frame import F32, LinearFrame
-from rfedge.street.schema import Range
 
 __all__ = ["Haze"]
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput
 from rfcore.lens import BrownLens, LensCamera
+from rfcore.tables import Range
 from rfedge.street.frame import F32, LinearFrame, sampled
-from rfedge.street.schema import Range
 
 __all__ = ["LensDistortion"]
 

@@ -11,8 +11,8 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.frame import LinearFrame, sampled
-from rfedge.street.schema import Range
 
 __all__ = ["RollingShutter"]
 

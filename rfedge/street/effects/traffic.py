@@ -8,12 +8,12 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.geometry.layout import BEYOND_M, LANE_M
 from rfedge.street.geometry.mesh import F64
 from rfedge.street.geometry.vehicle import Vehicle, vehicle, world_from_vehicle
 from rfedge.street.geometry.vehicle_material import vehicle_materials
 from rfedge.street.geometry.world import Mover, Part, World
-from rfedge.street.schema import Range
 
 __all__ = ["Traffic"]
 

@@ -12,10 +12,10 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.geometry.grain import fractal
 from rfedge.street.geometry.mesh import F32, Colour, Material, Texture
 from rfedge.street.geometry.world import World
-from rfedge.street.schema import Range
 
 __all__ = ["WetRoad"]
 

@@ -24,7 +24,7 @@ import numpy as np
 from rfedge.street.geometry.mesh import F32, F64, I32, Material, Mesh, joined, placed
 from rfedge.street.geometry.world import Sky, World
 
-__all__ = ["Stage", "environment", "surface", "with_sun"]
+__all__ = ["MitsubaScene", "environment", "surface", "with_sun"]
 
 
 ROWS = 512
@@ -120,7 +120,7 @@ def _roughness(mi: Any, material: Material) -> Any:
     return {"type": "bitmap", "bitmap": bitmap, "raw": True}
 
 
-class Stage:
+class MitsubaScene:
     """A loaded scene. ``at`` moves what moves; ``labels`` says what each shape counts as."""
 
     def __init__(self, mi: Any, world: World) -> None:
