@@ -69,7 +69,7 @@ OPTIONAL = ("points",)
 
 
 @dataclass(frozen=True)
-class Shot:
+class TimedPicture:
     """A picture before its pose is known; ``time_ns`` on the pictures' own clock."""
 
     name: str
@@ -82,21 +82,21 @@ def read_recording_source(file: Path) -> Source:
     content = _load(file)
     where = f"{file}: [camera]"
     camera = _camera(where, content["camera"])
-    shots = _shots(file, content["pictures"], camera.intrinsics)
+    timed = _timed_pictures(file, content["pictures"], camera.intrinsics)
     poses = _Poses.of(file, content["trajectory"])
     pictures = tuple(
         SourcePicture(
-            where=f"{file}: {shot.name}",
-            name=shot.name,
+            where=f"{file}: {picture.name}",
+            name=picture.name,
             camera=camera,
-            world_from_cam=poses.at(f"{file}: {shot.name}", poses.time_ns(shot)),
-            read=shot.read,
-            time_ns=poses.time_ns(shot),
+            world_from_cam=poses.at(f"{file}: {picture.name}", poses.time_ns(picture)),
+            read=picture.read,
+            time_ns=poses.time_ns(picture),
         )
-        for shot in shots
-        if poses.wanted(shot)
+        for picture in timed
+        if poses.wanted(picture)
     )
-    return Source(file, pictures, _points(file, content), len(shots) - len(pictures))
+    return Source(file, pictures, _points(file, content), len(timed) - len(pictures))
 
 
 @dataclass(frozen=True)
@@ -127,11 +127,11 @@ class _Poses:
             body_from_cam=body_from_cam,
         )
 
-    def time_ns(self, shot: Shot) -> int:
-        return shot.time_ns + self.offset_ns
+    def time_ns(self, picture: TimedPicture) -> int:
+        return picture.time_ns + self.offset_ns
 
-    def wanted(self, shot: Shot) -> bool:
-        return not self.drop_outside or self.trajectory.covers(self.time_ns(shot))
+    def wanted(self, picture: TimedPicture) -> bool:
+        return not self.drop_outside or self.trajectory.covers(self.time_ns(picture))
 
     def at(self, where: str, time: int) -> Pose:
         world_from_body = self.trajectory.pose_at(where, time, self.max_gap_ns)
@@ -176,25 +176,29 @@ def _camera(where: str, keys: Table) -> SourceCamera:
     return SourceCamera(intrinsics, lens_of(where, keys.value("model", "PINHOLE"), keys))
 
 
-def _shots(file: Path, keys: Table, intrinsics: Intrinsics) -> Sequence[Shot]:
+def _timed_pictures(file: Path, keys: Table, intrinsics: Intrinsics) -> Sequence[TimedPicture]:
     where = f"{file}: [pictures]"
     if ("video" in keys) == ("folder" in keys):
         raise DatasetError(f"{where}: name either a 'video' or a 'folder'")
     every = keys.whole("every", Range(1), 1)
-    shots = _video_shots if "video" in keys else _folder_shots
-    return shots(where, file.parent, keys, intrinsics)[::every]
+    timed = _video_pictures if "video" in keys else _folder_pictures
+    return timed(where, file.parent, keys, intrinsics)[::every]
 
 
-def _video_shots(where: str, folder: Path, keys: Table, intrinsics: Intrinsics) -> list[Shot]:
+def _video_pictures(
+    where: str, folder: Path, keys: Table, intrinsics: Intrinsics
+) -> list[TimedPicture]:
     video = Video(inside(where, folder, keys.text("video")), intrinsics)
     stem = video.file.stem
     return [
-        Shot(f"{stem}_{i:06d}", time, partial(video.read, i))
+        TimedPicture(f"{stem}_{i:06d}", time, partial(video.read, i))
         for i, time in enumerate(video.times_ns)
     ]
 
 
-def _folder_shots(where: str, folder: Path, keys: Table, intrinsics: Intrinsics) -> list[Shot]:
+def _folder_pictures(
+    where: str, folder: Path, keys: Table, intrinsics: Intrinsics
+) -> list[TimedPicture]:
     pictures = inside(where, folder, keys.text("folder"))
     paths = sorted(path for path in pictures.glob("*") if path.suffix in SUFFIXES)
     if not paths:
@@ -203,7 +207,7 @@ def _folder_shots(where: str, folder: Path, keys: Table, intrinsics: Intrinsics)
     for path in paths:
         check_size(path, intrinsics)
     return [
-        Shot(path.name, time, partial(read_picture, path, intrinsics))
+        TimedPicture(path.name, time, partial(read_picture, path, intrinsics))
         for path, time in zip(paths, times_ns, strict=True)
     ]
 

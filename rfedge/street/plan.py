@@ -1,13 +1,10 @@
-"""What a scene will run, and what each effect costs, measured here and now.
+"""What a scene will run, and what each effect costs, measured on this machine.
 
-Effects on frames are run on a plain one of the drive's size. Those that change the street run once,
-before the first frame; they are run on the scene's own street, made only if there is one.
-
-What rendering costs, with and without each effect on the street, by small renders in one run.
-
-The street is rendered plain, then again after each effect is added; what a frame then takes more is
-that effect's. It may be less than nothing: a sky without a sun takes fewer decisions. Scenes of the
-same street share its plain render.
+Effects on frames are timed on a plain frame of the drive's size. Effects on the street run once,
+before the first frame; they are timed on the scene's own street, which is made only if there are
+any. What an effect on the street adds to rendering is the difference between small renders before
+and after it; the difference can be negative (a sky without a sun needs fewer samples of light).
+Scenes with the same street share the plain render.
 """
 
 from __future__ import annotations
@@ -180,7 +177,7 @@ def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> Callable[[World
     not scaled.
     """
     from rfedge.street.render.backend import chosen_backend
-    from rfedge.street.render.renderer import Quality, Renderer
+    from rfedge.street.render.renderer import Renderer, Sampling
     from rfedge.street.shots import Split, shots_of
 
     shots = shots_of(scene, Split.DRIVE, SIZE_PX)[: FRAMES + 1]
@@ -189,7 +186,7 @@ def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> Callable[[World
     backend = chosen_backend()
 
     def frame_ms(world: World) -> float:
-        renderer = Renderer(world, Quality(SAMPLES), backend, threads=1)
+        renderer = Renderer(world, Sampling(SAMPLES), backend, threads=1)
         times_s = []
         for shot in shots:
             start_s = cpu_s()

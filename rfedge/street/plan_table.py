@@ -1,8 +1,6 @@
-"""Measured plans of several scenes: rows of a result file, and a table in a page.
+"""Plans of scenes as text: lines for the terminal, rows of a result file, and a table in a page.
 
-The table stands between two marks, so that its figures are generated, never typed.
-
-A scene's plan in words: its pictures, its effects in their order, and what they cost.
+The table stands between two marks in the page, so that its figures are generated, never typed.
 """
 
 from __future__ import annotations

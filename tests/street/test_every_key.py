@@ -22,7 +22,7 @@ from rfedge.street.scene_file import (
     Drive,
     Evaluation,
     Geometry,
-    PoseNoise,
+    LocalisationNoise,
     Rig,
     Scene,
     Training,
@@ -125,14 +125,14 @@ def frame_digest(settings: Any, effect: Any) -> str:
     ("kind", "key"),
     [
         pair
-        for kind in (Geometry, Rig, Training, Evaluation, Drive, PoseNoise)
+        for kind in (Geometry, Rig, Training, Evaluation, Drive, LocalisationNoise)
         for pair in keys_of(kind)
     ],
     ids=lambda value: value if isinstance(value, str) else value.__name__,
 )
 def test_a_key_of_a_part_changes_the_street_or_its_pictures(kind: type[Any], key: str) -> None:
-    if kind is PoseNoise:
-        noise = PoseNoise(0.1, 1.0)
+    if kind is LocalisationNoise:
+        noise = LocalisationNoise(0.1, 1.0)
         pose = shots_of(SHORT, Split.DRIVE)[1].camera.world_from_cam
         assert measured_pose(pose, noise, 1) != measured_pose(pose, changed(noise, key), 1)
         return

@@ -172,10 +172,10 @@ import rfedge
 from rfedge.street import load_scene
 from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
 from rfedge.street.render.backend import chosen_backend
-from rfedge.street.render.renderer import Quality
+from rfedge.street.render.renderer import Sampling
 from rfedge.street.shots import Split, shots_of
 scene = load_scene(sys.argv[1])
-renderer = SceneRenderer(RenderJob(scene, Path(sys.argv[2]), Quality(1), chosen_backend(), 2))
+renderer = SceneRenderer(RenderJob(scene, Path(sys.argv[2]), Sampling(1), chosen_backend(), 2))
 renderer.take(shots_of(scene, Split.DRIVE, (64, 36))[0])
 files = sorted(path for path in Path(sys.argv[2]).rglob("*") if path.is_file())
 print(*(hashlib.sha256(path.read_bytes()).hexdigest() for path in files))

@@ -1,4 +1,4 @@
-"""Dusk: the sun a hand above the houses' feet, long shadows, warm light under a blue sky."""
+"""Dusk: a sun 6 degrees above the horizon, long shadows, and warm light under a blue sky."""
 
 from __future__ import annotations
 

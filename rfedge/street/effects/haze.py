@@ -1,7 +1,7 @@
-"""Haze: Koschmieder's law, light is lost with distance and replaced by the air's own.
+"""Haze: light is absorbed over distance and replaced by the colour of the air (Koschmieder's law).
 
-The haze is a level layer: who looks up leaves it after ``layer_m / sin(elevation)``, so that the
-sky overhead keeps some of its looks and the horizon none.
+The haze is a level layer of height ``layer_m``: a ray at elevation e leaves it after
+``layer_m / sin(e)``, so that the zenith stays partly visible and the horizon does not.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Where things are in the street: a plan, drawn from the scene's geometry and seed alone.
+"""Where things are in the street: a plan computed from the scene's geometry and seed alone.
 
-The street runs along x, centred on 0; traffic keeps right, so the lane of who drives along +x lies
-at y < 0. ``side`` is +1 for the left edge of the road (y > 0) and -1 for the right one. From the
-middle outwards: lane, parking bay, kerb, lamps and trees, pavement, facades.
+The street runs along x, centred on 0; traffic keeps right, so the lane towards +x lies at y < 0.
+``side`` is +1 for the left edge of the road (y > 0) and -1 for the right one. From the middle
+outwards: lane, parking bay, kerb, lamps and trees, pavement, facades.
 """
 
 from __future__ import annotations

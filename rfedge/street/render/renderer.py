@@ -1,9 +1,7 @@
 """One frame of a world: path-traced, denoised, with depth and classes.
 
-Depth and class of what lies exactly behind the middle of each pixel.
-
 Mitsuba's own depth is a distance along rays through random places of a pixel. Here one ray goes
-through the pixel's centre, and its distance becomes z by the cosine to the optical axis.
+through each pixel's centre, and its distance times the cosine to the optical axis is z.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from rfedge.street.geometry.world import World
 from rfedge.street.render.backend import Backend, load_mitsuba
 from rfedge.street.render.mitsuba_scene import MitsubaScene
 
-__all__ = ["Quality", "RenderedView", "Renderer", "cast_pixel_rays"]
+__all__ = ["RenderedView", "Renderer", "Sampling", "cast_pixel_rays"]
 
 
 def cast_pixel_rays(
@@ -87,7 +85,7 @@ NEAR_M, FAR_M = 0.05, 1000.0
 
 
 @dataclass(frozen=True)
-class Quality:
+class Sampling:
     """``samples`` a pixel, a square number for stratification, and the ``seed`` that places them.
 
     The seed is one for all frames: what does not move is then the same in every frame, to the bit.
@@ -115,10 +113,10 @@ class RenderedView:
 class Renderer:
     """Renders views of a world."""
 
-    def __init__(self, world: World, quality: Quality, backend: Backend, threads: int) -> None:
+    def __init__(self, world: World, sampling: Sampling, backend: Backend, threads: int) -> None:
         self._mi = load_mitsuba(backend, threads)
         self._backend = backend
-        self._quality = quality
+        self._sampling = sampling
         self._exposure = np.float32(world.sky.exposure)
         self._loaded = MitsubaScene(self._mi, world)
         self._light = self._mi.load_dict(
@@ -135,7 +133,7 @@ class Renderer:
         """Return what the camera sees at that time."""
         self.at(time_s)
         sensor = self._mi.load_dict(_sensor(self._mi, camera))
-        noisy = self._pass(sensor, self._light, self._quality.samples)[..., :3]
+        noisy = self._pass(sensor, self._light, self._sampling.samples)[..., :3]
         guides = self._pass(sensor, self._guides, GUIDE_SAMPLES)[..., -6:]
         depth_m, labels = cast_pixel_rays(self._mi, self._backend, self._loaded, camera)
         colour = _denoised(noisy, np.clip(guides[..., :3], 0, 1), guides[..., 3:])
@@ -147,7 +145,7 @@ class Renderer:
             sensor=sensor,
             integrator=integrator,
             spp=samples,
-            seed=self._quality.seed,
+            seed=self._sampling.seed,
         )
         return np.nan_to_num(np.array(rendered, np.float32), posinf=0.0, neginf=0.0)
 
