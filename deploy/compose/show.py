@@ -136,9 +136,9 @@ def draw(panel: Panel, curves: list[Curve], axes: Any) -> None:
     axes.set_ylabel(SYMBOL[panel.unit], fontsize=8)
     axes.tick_params(labelsize=8)
     axes.set_ylim(bottom=0)
-    if shown:
+    if any(curve.name for curve in shown):
         axes.legend(fontsize=7, loc="best", framealpha=0.6)
-    else:
+    if not shown:
         axes.text(0.5, 0.5, "nothing happened", ha="center", transform=axes.transAxes, fontsize=8)
 
 
@@ -294,8 +294,9 @@ def main() -> None:
     for dashboard in DASHBOARDS:
         curves = {panel.title: curves_of(panel, now_s) for panel in dashboard.panels}
         dashboards.append(DashboardData(dashboard, curves))
-        plot(dashboards[-1], ROOT / f"docs/figures/{dashboard.uid}.svg")
     result = measured(dashboards)
+    for data in dashboards:
+        plot(data, ROOT / f"docs/figures/{data.dashboard.uid}.svg")
     (ROOT / "deploy/compose/measured.json").write_text(json.dumps(result, indent=1) + "\n")
     page = ROOT / "docs/operations.md"
     before, _, rest = page.read_text().partition(BEGIN)
