@@ -1,17 +1,11 @@
 r"""Posed pictures from a COLMAP model and the folder ``images`` it was made from.
 
-The model lies in ``sparse/0``, ``sparse`` or the folder itself, in text or binary form (binary goes
-first, as in COLMAP). Pictures come out in the order of their names.
+The model lies in ``sparse/0``, ``sparse`` or the folder itself, in text or binary form (binary is
+preferred, as in COLMAP). Pictures are in the order of their names. Poses are cam_from_world with
+OpenCV camera axes, quaternions w, x, y, z; pixel centres are at +0.5 as here. Both forms are
+described in COLMAP's documentation, "Output Format".
 
-A COLMAP model as tables: cameras, posed images, points.
-
-Poses are cam_from_world with OpenCV camera axes, quaternions w, x, y, z; pixel centres are at +0.5
-as here. Described in COLMAP's documentation, "Output Format"; the parsers of its two encodings are
-``rfcore.dataset.colmap`` and ``rfcore.dataset.colmap``.
-
-COLMAP's binary model: ``cameras.bin``, ``images.bin``, ``points3D.bin``, little-endian.
-
-::
+Binary, little-endian (``cameras.bin``, ``images.bin``, ``points3D.bin``)::
 
     cameras   uint64 n;  n times  uint32 id, int32 model, uint64 width, uint64 height, float64 ...
     images    uint64 n;  n times  uint32 id, float64 qw qx qy qz tx ty tz, uint32 camera, name\0,
@@ -19,10 +13,8 @@ COLMAP's binary model: ``cameras.bin``, ``images.bin``, ``points3D.bin``, little
     points3D  uint64 n;  n times  uint64 id, float64 x y z, uint8 r g b, float64 error,
                                   uint64 m, m times (uint32 image, uint32 index)
 
-COLMAP's text model: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
-
-Lines that start with ``#`` are comments. An image takes two lines; the second, its 2D points, may
-be empty and is skipped.
+Text (``cameras.txt``, ``images.txt``, ``points3D.txt``): lines that start with ``#`` are comments.
+An image takes two lines; the second, its 2D points, may be empty and is skipped.
 """
 
 from __future__ import annotations

@@ -15,8 +15,7 @@ from typing import Any
 from rfcore.camera import Intrinsics
 from rfcore.dataset.keys import load_json, pose_of_rows, table_at
 from rfcore.dataset.picture_file import check_size, find_picture, read_picture
-from rfcore.dataset.points import read_points
-from rfcore.dataset.source import Source, SourceCamera, SourcePicture
+from rfcore.dataset.source import Source, SourceCamera, SourcePicture, read_points
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.tables import Table
 

@@ -49,8 +49,7 @@ from rfcore.dataset.keys import (
     text_lines,
 )
 from rfcore.dataset.picture_file import SUFFIXES, check_size, inside, read_picture
-from rfcore.dataset.points import read_points
-from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
+from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
 from rfcore.dataset.trajectory import NS_PER_S, Trajectory, read_trajectory, time_ns
 from rfcore.dataset.video import Video
 from rfcore.errors import DatasetError, InvalidInput

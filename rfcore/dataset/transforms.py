@@ -26,8 +26,7 @@ import numpy as np
 from rfcore.camera import Intrinsics, Pose
 from rfcore.dataset.keys import POSE_SHAPES, lens_of, load_json, pose_of_rows, table_at
 from rfcore.dataset.picture_file import check_size, find_picture, inside, picture_file, read_picture
-from rfcore.dataset.points import read_points
-from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
+from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.tables import Range, Table
 

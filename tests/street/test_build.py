@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from rfcore.dataset import read_dataset, verify_manifest
-from rfcore.dataset.points import read_points
+from rfcore.dataset.source import read_points
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.street.build import run
 from rfedge.street.build import run as workers

@@ -22,8 +22,7 @@ import numpy as np
 import rfedge.street
 from rfcore.camera import Pose
 from rfcore.dataset import write_manifest
-from rfcore.dataset.points import read_points
-from rfcore.dataset.source import SourceCamera, SourcePoints
+from rfcore.dataset.source import SourceCamera, SourcePoints, read_points
 from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, write_points
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
