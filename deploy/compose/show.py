@@ -9,6 +9,7 @@ docs/operations.md between its two marks. Nothing in these is typed by hand.
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -232,6 +233,7 @@ def measured(dashboards: list[DashboardData]) -> dict[str, Any]:
         "command": "python deploy/compose/show.py",
         "revision": revision(),
         "host": host(),
+        "load_average": round(os.getloadavg()[1], 1),
         "docker": docker,
         "images_bytes": image_sizes() if docker else {},
         "settings": dict(
@@ -256,7 +258,8 @@ def section(result: dict[str, Any]) -> str:
         f"Measured by `make operations-figures` over {SPAN_S / 60:.0f} minutes, on "
         f"{result['host']['cores']} cores of {result['host']['cpu']} ({running}): "
         f"{len(result['vehicles'])} vehicles, {settings['PICTURE_SIZE']} at "
-        f"{settings['RATE_HZ']} Hz. Everything is in "
+        f"{settings['RATE_HZ']} Hz. The machine's load average was {result['load_average']:g}. "
+        "Everything is in "
         "[deploy/compose/measured.json](../deploy/compose/measured.json).",
         "",
         "| vehicle | link | pictures/s | p50 to Ack | p99 to Ack | of all captured, in 150 ms |",
