@@ -19,8 +19,9 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfedge.street.assembly import plain_world
 from rfedge.street.effects import EFFECTS, Effect, EffectKind, rng_of
 from rfedge.street.frame import LinearFrame
+from rfedge.street.geometry.layout import Geometry
 from rfedge.street.geometry.world import World
-from rfedge.street.scene_file import Drive, Geometry, Rig, Scene
+from rfedge.street.scene_file import Drive, Rig, Scene
 
 __all__ = [
     "PlainStreets",

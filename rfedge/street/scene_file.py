@@ -21,11 +21,11 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 from rfcore.errors import InvalidInput
 from rfcore.tables import Range, Table
 from rfedge.street.effects import EFFECTS, EffectKind, load_effect
+from rfedge.street.geometry.layout import Geometry
 
 __all__ = [
     "Drive",
     "Evaluation",
-    "Geometry",
     "LocalisationNoise",
     "OneOf",
     "Rig",
@@ -128,18 +128,6 @@ Size = Annotated[tuple[int, int], Range(16, 8192)]
 
 
 @dataclass(frozen=True)
-class Geometry:
-    """The street. ``tiles`` of ``length_m`` each follow one another."""
-
-    length_m: Annotated[float, Range(20, 1000)] = 120.0
-    tiles: Annotated[int, Range(1, 20)] = 1
-    seed: Annotated[int, Range(0, 2**31)] = 1
-    trees: bool = True
-    signs: bool = True
-    wires: bool = True
-
-
-@dataclass(frozen=True)
 class Rig:
     """The cameras of the car that takes the training and evaluation views."""
 
@@ -206,7 +194,7 @@ class Scene:
 
     name: str
     field: str
-    geometry: Geometry = Geometry()
+    geometry: Geometry = with_factory(default_factory=Geometry)
     rig: Rig = Rig()
     train: Training = Training()
     evaluation: Evaluation = Evaluation()

@@ -12,21 +12,13 @@ import pytest
 from rfedge.street.assembly import plain_world
 from rfedge.street.effects import EFFECTS, load_effect, rng_of
 from rfedge.street.frame import LinearFrame
-from rfedge.street.geometry.layout import Layout
+from rfedge.street.geometry.layout import Geometry, Layout
 from rfedge.street.geometry.mesh import Label, Material
 from rfedge.street.geometry.sky import Daylight, overcast_sky, sunny_sky
 from rfedge.street.geometry.solids import Stuff, boxes
 from rfedge.street.geometry.world import Part, Sky, World
 from rfedge.street.plan import plain_frame
-from rfedge.street.scene_file import (
-    Drive,
-    Evaluation,
-    Geometry,
-    LocalisationNoise,
-    Rig,
-    Scene,
-    Training,
-)
+from rfedge.street.scene_file import Drive, Evaluation, LocalisationNoise, Rig, Scene, Training
 from rfedge.street.shots import Split, shots_of, thinned_indices
 from rfedge.street.trajectory import measured_pose
 

@@ -10,7 +10,7 @@ from rfcore.errors import InvalidInput
 from rfedge.street.effects.noise import SensorNoise
 from rfedge.street.effects.overcast import Overcast
 from rfedge.street.effects.wet_road import WetRoad
-from rfedge.street.geometry.layout import Layout
+from rfedge.street.geometry.layout import Geometry, Layout
 from rfedge.street.geometry.road import road
 from rfedge.street.geometry.world import Sky, World
 from rfedge.street.plan import EffectKind, PlainStreets, PlannedEffect, RenderCost, measured_render
@@ -22,7 +22,7 @@ from rfedge.street.plan_table import (
     write_page,
     write_rows,
 )
-from rfedge.street.scene_file import Geometry, Scene
+from rfedge.street.scene_file import Scene
 
 ROOT = Path(__file__).parents[2]
 SMALL = Geometry(length_m=20.0)

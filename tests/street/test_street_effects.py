@@ -18,11 +18,10 @@ from rfedge.street.effects.overcast import Overcast
 from rfedge.street.effects.parked import ParkedVehicles
 from rfedge.street.effects.traffic import Traffic
 from rfedge.street.effects.wet_road import WetRoad
-from rfedge.street.geometry.layout import Layout
+from rfedge.street.geometry.layout import Geometry, Layout
 from rfedge.street.geometry.mesh import Label, Mesh, placed
 from rfedge.street.geometry.road import road
 from rfedge.street.geometry.world import Sky, World
-from rfedge.street.scene_file import Geometry
 from rfedge.street.shots import Split, shots_of
 
 ROOT = Path(__file__).parents[2]

@@ -10,12 +10,11 @@ from rfedge.street.geometry.building import bricks, buildings
 from rfedge.street.geometry.facade import BuildingStyle, facade, wall_around
 from rfedge.street.geometry.furniture import lamps, railings, wires
 from rfedge.street.geometry.grain import fractal
-from rfedge.street.geometry.layout import BAY_LENGTH_M, FACADE_M, FASCIA_M, Layout
+from rfedge.street.geometry.layout import BAY_LENGTH_M, FACADE_M, FASCIA_M, Geometry, Layout
 from rfedge.street.geometry.mesh import Label, Mesh, joined
 from rfedge.street.geometry.road import road, slabs
 from rfedge.street.geometry.solids import Stuff
 from rfedge.street.geometry.world import Part
-from rfedge.street.scene_file import Geometry
 
 LAYOUT = Layout(Geometry(length_m=60.0))
 PARTS = (road, buildings, lamps, railings, wires)
