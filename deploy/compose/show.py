@@ -281,8 +281,8 @@ def section(result: dict[str, Any]) -> str:
             for row in result["services"]
         ),
         "",
-        "Decoder processes are not in a server's cores and memory. Quantiles are interpolated within "
-        "a histogram's bucket: 100 to 150 ms is one.",
+        "Decoder processes are not in a server's cores and memory. Quantiles are interpolated "
+        "within a histogram's bucket: 100 to 150 ms is one.",
         "",
         *(f"- image {name}: {size / 1e6:.0f} MB" for name, size in result["images_bytes"].items()),
         *([""] if result["images_bytes"] else []),
