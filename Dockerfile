@@ -23,7 +23,7 @@ FROM python AS runtime
 COPY deploy/healthy.sh /usr/local/bin/healthy
 # Volumes mounted here for the first time belong to the user that the services run as.
 RUN useradd --uid 10001 --no-create-home --home-dir /nonexistent rfedge \
-	&& install -d -o rfedge -g rfedge /fields /certs /cache
+	&& install -d -o rfedge -g rfedge /fields /certs /cache /pictures
 COPY --from=runtime-packages /opt/rfedge /opt/rfedge
 ENV PATH=/opt/rfedge/bin:$PATH PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1
 USER rfedge

@@ -1,12 +1,11 @@
-"""From what a reader found to what trainers and vehicles take: pinhole pictures around an origin.
+"""Turn what a reader found into pinhole pictures around an origin, for trainers and vehicles.
 
-The tile's origin is subtracted in float64. A lens is never dropped silently: either the caller
-chose ``Distortion.UNDISTORT``, and every read resamples the picture once, or it is refused.
+The tile's origin is subtracted in float64. A lens is never dropped silently: with
+``Distortion.UNDISTORT`` every read resamples the picture once, otherwise it is refused.
 
-Smaller pictures by area averaging.
-
-Each output pixel is the mean of the rectangle of the input it covers, so that nothing aliases; the
-intrinsics that belong to it are ``Intrinsics.resized``, exactly, because pixel centres are at +0.5.
+Pictures are reduced by area averaging: each output pixel is the mean of the input rectangle it
+covers, so that nothing aliases. Its intrinsics are exactly ``Intrinsics.resized``, because pixel
+centres are at +0.5.
 """
 
 from __future__ import annotations

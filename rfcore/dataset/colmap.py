@@ -1,17 +1,11 @@
 r"""Posed pictures from a COLMAP model and the folder ``images`` it was made from.
 
-The model lies in ``sparse/0``, ``sparse`` or the folder itself, in text or binary form (binary goes
-first, as in COLMAP). Pictures come out in the order of their names.
+The model lies in ``sparse/0``, ``sparse`` or the folder itself, in text or binary form (binary is
+preferred, as in COLMAP). Pictures are in the order of their names. Poses are cam_from_world with
+OpenCV camera axes, quaternions w, x, y, z; pixel centres are at +0.5 as here. Both forms are
+described in COLMAP's documentation, "Output Format".
 
-A COLMAP model as tables: cameras, posed images, points.
-
-Poses are cam_from_world with OpenCV camera axes, quaternions w, x, y, z; pixel centres are at +0.5
-as here. Described in COLMAP's documentation, "Output Format"; the parsers of its two encodings are
-``rfcore.dataset.colmap`` and ``rfcore.dataset.colmap``.
-
-COLMAP's binary model: ``cameras.bin``, ``images.bin``, ``points3D.bin``, little-endian.
-
-::
+Binary, little-endian (``cameras.bin``, ``images.bin``, ``points3D.bin``)::
 
     cameras   uint64 n;  n times  uint32 id, int32 model, uint64 width, uint64 height, float64 ...
     images    uint64 n;  n times  uint32 id, float64 qw qx qy qz tx ty tz, uint32 camera, name\0,
@@ -19,10 +13,8 @@ COLMAP's binary model: ``cameras.bin``, ``images.bin``, ``points3D.bin``, little
     points3D  uint64 n;  n times  uint64 id, float64 x y z, uint8 r g b, float64 error,
                                   uint64 m, m times (uint32 image, uint32 index)
 
-COLMAP's text model: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
-
-Lines that start with ``#`` are comments. An image takes two lines; the second, its 2D points, may
-be empty and is skipped.
+Text (``cameras.txt``, ``images.txt``, ``points3D.txt``): lines that start with ``#`` are comments.
+An image takes two lines; the second, its 2D points, may be empty and is skipped.
 """
 
 from __future__ import annotations
@@ -43,12 +35,13 @@ from rfcore.dataset.keys import (
     lens_of,
     pose_of_quaternion,
     read_file,
-    shortened,
+    table_at,
     text_lines,
 )
 from rfcore.dataset.picture_file import check_size, find_picture, read_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
 from rfcore.errors import DatasetError, InvalidInput
+from rfcore.tables import shortened
 
 __all__ = [
     "MODEL_IDS",
@@ -118,7 +111,7 @@ def camera_of(
         intrinsics = Intrinsics(*size_px, fx_px, fy_px, cx_px, cy_px)
     except InvalidInput as error:
         raise DatasetError(f"{where}: {error}") from error
-    return SourceCamera(intrinsics, lens_of(where, model, lens))
+    return SourceCamera(intrinsics, lens_of(where, model, table_at(where, lens)))
 
 
 def image_of(where: str, name: str, camera_id: int, numbers: Sequence[float]) -> ColmapImage:

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from rfcore.camera import Intrinsics
-from rfcore.dataset.keys import load_json, matrix_rows, number, pose_of_rows, side_px, text
+from rfcore.dataset.keys import load_json, pose_of_rows, table_at
 from rfcore.dataset.picture_file import check_size, find_picture, read_picture
-from rfcore.dataset.points import read_points
-from rfcore.dataset.source import Source, SourceCamera, SourcePicture
+from rfcore.dataset.source import Source, SourceCamera, SourcePicture, read_points
 from rfcore.errors import DatasetError, InvalidInput
+from rfcore.tables import Table
 
 __all__ = ["read_inria_source", "trained_ply"]
 
@@ -44,13 +44,12 @@ def trained_ply(folder: Path) -> Path:
 
 def _picture(file: Path, index: int, entry: Any) -> SourcePicture:
     where = f"{file}: [{index}]"
-    if not isinstance(entry, dict):
-        raise DatasetError(f"{where}: is {entry!r}, not an object")
-    name = text(where, entry, "img_name")
+    name = table_at(where, entry).text("img_name")
     where = f"{where} ({name})"
-    camera = _camera(where, entry)
-    position = _position(where, entry)
-    rotation = matrix_rows(where, entry, "rotation", columns=3)
+    keys = table_at(where, entry)
+    camera = _camera(where, keys)
+    position = keys.numbers("position", 3)
+    rotation = keys.matrix("rotation", ((3, 3),))
     rows = [[*row, t] for row, t in zip(rotation, position, strict=True)]
     path = find_picture(where, file.parent / "images", name)
     check_size(path, camera.intrinsics)
@@ -63,24 +62,17 @@ def _picture(file: Path, index: int, entry: Any) -> SourcePicture:
     )
 
 
-def _camera(where: str, entry: dict[str, Any]) -> SourceCamera:
-    width_px, height_px = side_px(where, entry, "width"), side_px(where, entry, "height")
+def _camera(where: str, keys: Table) -> SourceCamera:
+    width_px, height_px = keys.whole("width"), keys.whole("height")
     try:
         intrinsics = Intrinsics(
             width_px=width_px,
             height_px=height_px,
-            fx_px=number(where, entry, "fx"),
-            fy_px=number(where, entry, "fy"),
+            fx_px=keys.number("fx"),
+            fy_px=keys.number("fy"),
             cx_px=width_px / 2,
             cy_px=height_px / 2,
         )
     except InvalidInput as error:
         raise DatasetError(f"{where}: {error}") from error
     return SourceCamera(intrinsics)
-
-
-def _position(where: str, entry: dict[str, Any]) -> list[float]:
-    position = entry.get("position")
-    if not isinstance(position, list) or len(position) != 3:
-        raise DatasetError(f"{where}: key 'position' is missing or not three numbers")
-    return [number(f"{where}: position", {str(i): v}, str(i)) for i, v in enumerate(position)]

@@ -1,48 +1,44 @@
-"""Values of a JSON or TOML table or of a line of text, checked one by one.
+"""What the files of a dataset hold: JSON, tables of keys, lines of numbers, poses and lenses.
 
-``where`` is the file and the place in it; every error starts with it and names the key.
+``where`` is the file and the place in it; every error is a ``DatasetError`` that starts with it.
+Tables are checked key by key by ``rfcore.tables``.
 
-The lens of a camera as tables name it: a camera model and coefficients k1, k2, p1, ...
-
-Models are COLMAP's names, which nerfstudio shares. Coefficients of zero are no lens,
-except of a fisheye, which is one even then. A coefficient that the model does not have, and a model
-that is not known, raise ``DatasetError``.
+Lenses are named by a camera model and coefficients k1, k2, p1, ... Models are COLMAP's names, which
+nerfstudio shares. Coefficients of zero are no lens, except of a fisheye, which is one even then. A
+coefficient that the model does not have, and a model that is not known, are errors.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rfcore.camera import Pose
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.lens import BrownLens, FisheyeLens, Lens
+from rfcore.tables import Table
 
 __all__ = [
     "LENS_KEYS",
-    "Table",
+    "POSE_SHAPES",
     "finite_numbers",
     "lens_of",
     "load_json",
-    "matrix_rows",
-    "number",
     "pose_of_quaternion",
     "pose_of_rows",
     "read_file",
-    "shortened",
-    "side_px",
-    "text",
+    "table_at",
     "text_lines",
 ]
 
 
+POSE_SHAPES = ((3, 4), (4, 4))
+"""Rows and columns of a pose's matrix; what a fourth row holds is checked with the pose."""
 FILE_NORM_TOLERANCE = 1e-3
 """Trajectories are printed with as few as four decimals."""
-MAX_SHOWN = 60
-Table = Mapping[str, Any]
 
 
 def read_file(file: Path) -> bytes:
@@ -61,53 +57,13 @@ def load_json(file: Path) -> Any:
         raise DatasetError(f"{file}: not JSON ({error})") from error
 
 
-def number(where: str, keys: Table, key: str, minimum: float = -math.inf) -> float:
-    """Return a finite number of at least ``minimum``."""
-    if key not in keys:
-        raise DatasetError(f"{where}: key '{key}' is missing")
-    value = keys[key]
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise DatasetError(f"{where}: key '{key}' is {shortened(value)}, not a number")
-    if not math.isfinite(_float(value)):
-        raise DatasetError(f"{where}: key '{key}' is {shortened(value)}, must be finite")
-    if value < minimum:
-        raise DatasetError(f"{where}: key '{key}' is {value}, must be at least {minimum:g}")
-    return float(value)
+def table_at(where: str, values: object) -> Table:
+    """Return a table whose errors are ``DatasetError`` and begin with ``where``."""
 
+    def fail(key: str, problem: str) -> DatasetError:
+        return DatasetError(f"{where}: key '{key}' {problem}" if key else f"{where}: {problem}")
 
-def side_px(where: str, keys: Table, key: str) -> int:
-    """Return a whole number of pixels."""
-    value = number(where, keys, key)
-    if value != int(value):
-        raise DatasetError(f"{where}: key '{key}' is {value}, not a whole number of pixels")
-    return int(value)
-
-
-def text(where: str, keys: Table, key: str) -> str:
-    """Return a string that is not empty and can be printed."""
-    value = keys.get(key)
-    if not isinstance(value, str) or not value:
-        raise DatasetError(f"{where}: key '{key}' is missing or not a string")
-    if not value.isprintable():
-        raise DatasetError(f"{where}: key '{key}' is {shortened(value)}, which is not printable")
-    return value
-
-
-def matrix_rows(where: str, keys: Table, key: str, columns: int = 4) -> list[Sequence[float]]:
-    """Return the rows of a matrix of 3 or 4 rows and ``columns`` finite numbers each."""
-    matrix = keys.get(key)
-    if not isinstance(matrix, list) or len(matrix) not in (3, columns):
-        raise DatasetError(f"{where}: key '{key}' is missing or not {columns}x{columns}")
-    if any(not isinstance(row, list) or len(row) != columns for row in matrix):
-        raise DatasetError(f"{where}: key '{key}' is missing or not {columns}x{columns}")
-    for i, row in enumerate(matrix):
-        for j, value in enumerate(row):
-            is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not is_number or not math.isfinite(_float(value)):
-                raise DatasetError(
-                    f"{where}: {key}[{i}][{j}] is {shortened(value)}, not a finite number"
-                )
-    return matrix
+    return Table(values, fail)
 
 
 def pose_of_rows(where: str, key: str, rows: Sequence[Sequence[float]]) -> Pose:
@@ -151,23 +107,6 @@ def text_lines(file: Path) -> list[str]:
         raise DatasetError(f"{file}: not a text file ({error.reason})") from error
 
 
-def shortened(value: object) -> str:
-    """Return a value as an error shows it: on one line, and not a page of digits."""
-    try:
-        shown = repr(value)
-    except ValueError:
-        return "a number of more digits than are printed"
-    return shown if len(shown) <= MAX_SHOWN else shown[:MAX_SHOWN] + "..."
-
-
-def _float(value: float) -> float:
-    """A whole number beyond every float is infinite."""
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf
-
-
 LENS_KEYS = {
     "PINHOLE": (),
     "SIMPLE_PINHOLE": (),
@@ -183,7 +122,7 @@ def lens_of(where: str, model: object, keys: Table) -> Lens | None:
     """Return the lens, ``None`` for a pinhole."""
     if not isinstance(model, str) or model not in LENS_KEYS:
         raise DatasetError(f"{where}: camera_model {model!r} is none of {', '.join(LENS_KEYS)}")
-    given = {key: number(where, keys, key) for key in DISTORTION_KEYS if key in keys}
+    given = {key: keys.number(key) for key in DISTORTION_KEYS if key in keys}
     known = LENS_KEYS[model]
     for key, value in given.items():
         if value != 0.0 and key not in known:

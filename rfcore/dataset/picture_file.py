@@ -11,9 +11,9 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from rfcore.camera import MAX_SIDE_PX, Intrinsics
-from rfcore.dataset.keys import shortened
 from rfcore.errors import DatasetError
 from rfcore.image import Rgb, read_rgb
+from rfcore.tables import shortened
 
 __all__ = [
     "check_size",

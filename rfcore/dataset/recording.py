@@ -38,26 +38,23 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.dataset.keys import (
+    POSE_SHAPES,
     lens_of,
-    matrix_rows,
-    number,
     pose_of_rows,
     read_file,
-    side_px,
-    text,
+    table_at,
     text_lines,
 )
 from rfcore.dataset.picture_file import SUFFIXES, check_size, inside, read_picture
-from rfcore.dataset.points import read_points
-from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
+from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
 from rfcore.dataset.trajectory import NS_PER_S, Trajectory, read_trajectory, time_ns
 from rfcore.dataset.video import Video
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import Rgb
+from rfcore.tables import Range, Table
 
 __all__ = ["read_recording_source"]
 
@@ -69,11 +66,9 @@ SECTIONS = {
 }
 OPTIONAL = ("points",)
 
-Table = Mapping[str, Any]
-
 
 @dataclass(frozen=True)
-class Shot:
+class TimedPicture:
     """A picture before its pose is known; ``time_ns`` on the pictures' own clock."""
 
     name: str
@@ -86,21 +81,21 @@ def read_recording_source(file: Path) -> Source:
     content = _load(file)
     where = f"{file}: [camera]"
     camera = _camera(where, content["camera"])
-    shots = _shots(file, content["pictures"], camera.intrinsics)
+    timed = _timed_pictures(file, content["pictures"], camera.intrinsics)
     poses = _Poses.of(file, content["trajectory"])
     pictures = tuple(
         SourcePicture(
-            where=f"{file}: {shot.name}",
-            name=shot.name,
+            where=f"{file}: {picture.name}",
+            name=picture.name,
             camera=camera,
-            world_from_cam=poses.at(f"{file}: {shot.name}", poses.time_ns(shot)),
-            read=shot.read,
-            time_ns=poses.time_ns(shot),
+            world_from_cam=poses.at(f"{file}: {picture.name}", poses.time_ns(picture)),
+            read=picture.read,
+            time_ns=poses.time_ns(picture),
         )
-        for shot in shots
-        if poses.wanted(shot)
+        for picture in timed
+        if poses.wanted(picture)
     )
-    return Source(file, pictures, _points(file, content), len(shots) - len(pictures))
+    return Source(file, pictures, _points(file, content), len(timed) - len(pictures))
 
 
 @dataclass(frozen=True)
@@ -116,28 +111,26 @@ class _Poses:
     @staticmethod
     def of(file: Path, keys: Table) -> _Poses:
         where = f"{file}: [trajectory]"
-        outside = keys.get("outside", "refuse")
-        if outside not in ("refuse", "drop"):
-            raise DatasetError(f'{where}: key \'outside\' is {outside!r}, not "refuse" or "drop"')
+        outside = keys.choice("outside", ("refuse", "drop"), "refuse")
         body_from_cam = Pose.identity()
         if "body_from_cam" in keys:
-            rows = matrix_rows(where, keys, "body_from_cam")
+            rows = keys.matrix("body_from_cam", POSE_SHAPES)
             body_from_cam = pose_of_rows(where, "body_from_cam", rows)
-        offset_s = number(where, {"time_offset_s": 0.0, **keys}, "time_offset_s")
-        max_gap_s = number(where, {"max_gap_s": 1.0, **keys}, "max_gap_s", minimum=0.0)
+        offset_s = keys.number("time_offset_s", default=0.0)
+        max_gap_s = keys.number("max_gap_s", Range(0.0), 1.0)
         return _Poses(
-            trajectory=read_trajectory(inside(where, file.parent, text(where, keys, "file"))),
+            trajectory=read_trajectory(inside(where, file.parent, keys.text("file"))),
             offset_ns=round(offset_s * NS_PER_S),
             max_gap_ns=round(max_gap_s * NS_PER_S),
             drop_outside=outside == "drop",
             body_from_cam=body_from_cam,
         )
 
-    def time_ns(self, shot: Shot) -> int:
-        return shot.time_ns + self.offset_ns
+    def time_ns(self, picture: TimedPicture) -> int:
+        return picture.time_ns + self.offset_ns
 
-    def wanted(self, shot: Shot) -> bool:
-        return not self.drop_outside or self.trajectory.covers(self.time_ns(shot))
+    def wanted(self, picture: TimedPicture) -> bool:
+        return not self.drop_outside or self.trajectory.covers(self.time_ns(picture))
 
     def at(self, where: str, time: int) -> Pose:
         world_from_body = self.trajectory.pose_at(where, time, self.max_gap_ns)
@@ -145,6 +138,7 @@ class _Poses:
 
 
 def _load(file: Path) -> dict[str, Table]:
+    """Return the file's sections, each with no other keys than it may have."""
     try:
         content = tomllib.loads(read_file(file).decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -152,58 +146,59 @@ def _load(file: Path) -> dict[str, Table]:
     for section in content:
         if section not in SECTIONS:
             raise DatasetError(f"{file}: section [{section}] is none of {', '.join(SECTIONS)}")
+    tables = {}
     for section, known in SECTIONS.items():
-        if section in OPTIONAL and section not in content:
-            continue
-        if not isinstance(content.get(section), dict):
+        if section in content:
+            tables[section] = table_at(f"{file}: [{section}]", content[section])
+            tables[section].require_known(known.split())
+        elif section not in OPTIONAL:
             raise DatasetError(f"{file}: section [{section}] is missing")
-        for key in content[section]:
-            if key not in known.split():
-                raise DatasetError(f"{file}: [{section}]: key '{key}' is none of {known}")
-    return content
+    return tables
 
 
 def _points(file: Path, content: Mapping[str, Table]) -> SourcePoints | None:
     if "points" not in content:
         return None
     where = f"{file}: [points]"
-    return read_points(inside(where, file.parent, text(where, content["points"], "file")))
+    return read_points(inside(where, file.parent, content["points"].text("file")))
 
 
 def _camera(where: str, keys: Table) -> SourceCamera:
-    width_px, height_px = side_px(where, keys, "width_px"), side_px(where, keys, "height_px")
-    fx_px = number(where, keys, "fx_px")
+    width_px, height_px = keys.whole("width_px"), keys.whole("height_px")
+    fx_px = keys.number("fx_px")
     defaults = {"fy_px": fx_px, "cx_px": width_px / 2, "cy_px": height_px / 2}
-    given = {key: number(where, {**defaults, **keys}, key) for key in defaults}
+    given = {key: keys.number(key, default=default) for key, default in defaults.items()}
     try:
         intrinsics = Intrinsics(width_px, height_px, fx_px, **given)
     except InvalidInput as error:
         raise DatasetError(f"{where}: {error}") from error
-    return SourceCamera(intrinsics, lens_of(where, keys.get("model", "PINHOLE"), keys))
+    return SourceCamera(intrinsics, lens_of(where, keys.value("model", "PINHOLE"), keys))
 
 
-def _shots(file: Path, keys: Table, intrinsics: Intrinsics) -> Sequence[Shot]:
+def _timed_pictures(file: Path, keys: Table, intrinsics: Intrinsics) -> Sequence[TimedPicture]:
     where = f"{file}: [pictures]"
     if ("video" in keys) == ("folder" in keys):
         raise DatasetError(f"{where}: name either a 'video' or a 'folder'")
-    every = number(where, {"every": 1, **keys}, "every", minimum=1)
-    if every != int(every):
-        raise DatasetError(f"{where}: key 'every' is {every}, not a whole number")
-    shots = _video_shots if "video" in keys else _folder_shots
-    return shots(where, file.parent, keys, intrinsics)[:: int(every)]
+    every = keys.whole("every", Range(1), 1)
+    timed = _video_pictures if "video" in keys else _folder_pictures
+    return timed(where, file.parent, keys, intrinsics)[::every]
 
 
-def _video_shots(where: str, folder: Path, keys: Table, intrinsics: Intrinsics) -> list[Shot]:
-    video = Video(inside(where, folder, text(where, keys, "video")), intrinsics)
+def _video_pictures(
+    where: str, folder: Path, keys: Table, intrinsics: Intrinsics
+) -> list[TimedPicture]:
+    video = Video(inside(where, folder, keys.text("video")), intrinsics)
     stem = video.file.stem
     return [
-        Shot(f"{stem}_{i:06d}", time, partial(video.read, i))
+        TimedPicture(f"{stem}_{i:06d}", time, partial(video.read, i))
         for i, time in enumerate(video.times_ns)
     ]
 
 
-def _folder_shots(where: str, folder: Path, keys: Table, intrinsics: Intrinsics) -> list[Shot]:
-    pictures = inside(where, folder, text(where, keys, "folder"))
+def _folder_pictures(
+    where: str, folder: Path, keys: Table, intrinsics: Intrinsics
+) -> list[TimedPicture]:
+    pictures = inside(where, folder, keys.text("folder"))
     paths = sorted(path for path in pictures.glob("*") if path.suffix in SUFFIXES)
     if not paths:
         raise DatasetError(f"{where}: folder {pictures} holds no pictures ({', '.join(SUFFIXES)})")
@@ -211,7 +206,7 @@ def _folder_shots(where: str, folder: Path, keys: Table, intrinsics: Intrinsics)
     for path in paths:
         check_size(path, intrinsics)
     return [
-        Shot(path.name, time, partial(read_picture, path, intrinsics))
+        TimedPicture(path.name, time, partial(read_picture, path, intrinsics))
         for path, time in zip(paths, times_ns, strict=True)
     ]
 
@@ -220,11 +215,11 @@ def _folder_times_ns(where: str, folder: Path, keys: Table, count: int) -> list[
     if ("rate_hz" in keys) == ("times" in keys):
         raise DatasetError(f"{where}: a folder needs either 'rate_hz' or 'times'")
     if "rate_hz" in keys:
-        rate_hz = number(where, keys, "rate_hz")
+        rate_hz = keys.number("rate_hz")
         if rate_hz <= 0:
-            raise DatasetError(f"{where}: key 'rate_hz' is {rate_hz}, must be above 0")
+            raise keys.error("rate_hz", f"is {rate_hz}, must be above 0")
         return [round(i * NS_PER_S / rate_hz) for i in range(count)]
-    file = inside(where, folder, text(where, keys, "times"))
+    file = inside(where, folder, keys.text("times"))
     rows = [(i, line) for i, line in enumerate(text_lines(file), start=1) if line.strip()]
     if len(rows) != count:
         raise DatasetError(f"{file}: holds {len(rows)} times for {count} pictures")

@@ -1,4 +1,4 @@
-"""What a reader finds on disk, before anything is changed.
+"""What a reader finds on disk, before anything is changed: cameras, pictures, points.
 
 Poses are world_from_cam with OpenCV camera axes, float64, in the dataset's own world; pictures have
 the lens they were taken with. ``rfcore.dataset.assemble`` makes a ``Dataset`` of it.
@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.errors import InvalidInput
+from rfcore.errors import DatasetError, FieldFormatError, InvalidInput
+from rfcore.field.ply_table import Table, read_vertices
 from rfcore.image import Rgb
 from rfcore.lens import Lens
 
-__all__ = ["Source", "SourceCamera", "SourcePicture", "SourcePoints"]
+__all__ = ["Source", "SourceCamera", "SourcePicture", "SourcePoints", "read_points"]
 
 
 @dataclass(frozen=True)
@@ -73,3 +74,23 @@ class Source:
     points: SourcePoints | None = None
     sorted_out: int = 0
     exposure_varies: bool = False
+
+
+def read_points(path: Path) -> SourcePoints:
+    """Read x, y, z in metres and red, green, blue 0..255 of every vertex.
+
+    Raises ``DatasetError`` naming the file.
+    """
+    try:
+        table = read_vertices(path, ("x", "y", "z", "red", "green", "blue"))
+        xyz_m = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        return SourcePoints(xyz_m, _rgb(path, table))
+    except (FieldFormatError, InvalidInput) as error:
+        raise DatasetError(f"points of {path}: {error}") from error
+
+
+def _rgb(path: Path, table: Table) -> NDArray[np.uint8]:
+    colours = [table[name] for name in ("red", "green", "blue")]
+    if any(colour.dtype != np.uint8 for colour in colours):
+        raise DatasetError(f"points of {path}: red, green, blue must be uchar, 0..255")
+    return np.stack(colours, axis=1)

@@ -24,20 +24,11 @@ from typing import Any
 import numpy as np
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.dataset.keys import (
-    Table,
-    lens_of,
-    load_json,
-    matrix_rows,
-    number,
-    pose_of_rows,
-    side_px,
-    text,
-)
+from rfcore.dataset.keys import POSE_SHAPES, lens_of, load_json, pose_of_rows, table_at
 from rfcore.dataset.picture_file import check_size, find_picture, inside, picture_file, read_picture
-from rfcore.dataset.points import read_points
-from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints
+from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
 from rfcore.errors import DatasetError, InvalidInput
+from rfcore.tables import Range, Table
 
 __all__ = ["read_transforms_source", "transforms_file"]
 
@@ -67,19 +58,18 @@ class Applied:
 def read_transforms_source(file: Path) -> Source:
     """Read a transforms file. Raises ``DatasetError`` naming the file, the key and the value."""
     content = load_json(file)
-    if not isinstance(content, dict):
-        raise DatasetError(f"{file}: holds {type(content).__name__}, not an object with 'frames'")
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise DatasetError(f"{file}: key 'frames' must list at least one frame")
-    applied = _applied(str(file), content)
+    top = table_at(str(file), content)
+    frames = top.items("frames")
+    if not frames:
+        raise top.error("frames", "must list at least one frame")
+    applied = _applied(str(file), top)
     kept = [(i, frame) for i, frame in enumerate(frames) if not _sorted_out(file, i, frame)]
     pictures = tuple(_picture(file, content, i, frame) for i, frame in kept)
-    points = _points(file, content)
+    points = _points(file, top)
     if applied is not None:
         pictures = tuple(_moved(picture, applied) for picture in pictures)
         points = applied.undo_points(points) if points is not None else None
-    return Source(file, pictures, points, len(frames) - len(kept), _exposure_varies(file, content))
+    return Source(file, pictures, points, len(frames) - len(kept), _exposure_varies(top))
 
 
 def transforms_file(folder: Path) -> Path | None:
@@ -98,17 +88,16 @@ def _sorted_out(file: Path, index: int, frame: Any) -> bool:
     if not isinstance(frame, dict) or "sharpness" not in frame:
         return False
     where = f"{file}: frames[{index}]"
-    return picture_file(where, file.parent, text(where, frame, "file_path")) is None
+    return picture_file(where, file.parent, table_at(where, frame).text("file_path")) is None
 
 
-def _picture(file: Path, content: Table, index: int, frame: Any) -> SourcePicture:
+def _picture(file: Path, content: dict[str, Any], index: int, frame: Any) -> SourcePicture:
     where = f"{file}: frames[{index}]"
-    if not isinstance(frame, dict):
-        raise DatasetError(f"{where}: is {frame!r}, not an object")
-    name = text(where, frame, "file_path")
+    name = table_at(where, frame).text("file_path")
     where = f"{where} ({name})"
-    camera = _camera(where, ChainMap(frame, dict(content)))
-    rows = matrix_rows(where, frame, "transform_matrix")
+    keys = table_at(where, frame)
+    camera = _camera(where, table_at(where, ChainMap(frame, content)))
+    rows = keys.matrix("transform_matrix", POSE_SHAPES)
     path = find_picture(where, file.parent, name)
     check_size(path, camera.intrinsics)
     opencv_rows = [[r[0], -r[1], -r[2], r[3]] for r in rows]
@@ -118,44 +107,44 @@ def _picture(file: Path, content: Table, index: int, frame: Any) -> SourcePictur
         camera=camera,
         world_from_cam=pose_of_rows(where, "transform_matrix", opencv_rows),
         read=partial(read_picture, path, camera.intrinsics),
-        time_ns=round(number(where, frame, "time", minimum=0.0) * 1e9) if "time" in frame else None,
+        time_ns=round(keys.number("time", Range(0.0)) * 1e9) if "time" in keys else None,
     )
 
 
 def _camera(where: str, keys: Table) -> SourceCamera:
-    width_px, height_px = side_px(where, keys, "w"), side_px(where, keys, "h")
-    fx_px = _focal(where, keys, "fl_x", "camera_angle_x", width_px)
+    width_px, height_px = keys.whole("w"), keys.whole("h")
+    fx_px = _focal(keys, "fl_x", "camera_angle_x", width_px)
     has_fy = "fl_y" in keys or "camera_angle_y" in keys
     try:
         intrinsics = Intrinsics(
             width_px=width_px,
             height_px=height_px,
             fx_px=fx_px,
-            fy_px=_focal(where, keys, "fl_y", "camera_angle_y", height_px) if has_fy else fx_px,
-            cx_px=number(where, keys, "cx") if "cx" in keys else width_px / 2,
-            cy_px=number(where, keys, "cy") if "cy" in keys else height_px / 2,
+            fy_px=_focal(keys, "fl_y", "camera_angle_y", height_px) if has_fy else fx_px,
+            cx_px=keys.number("cx", default=width_px / 2),
+            cy_px=keys.number("cy", default=height_px / 2),
         )
     except InvalidInput as error:
         raise DatasetError(f"{where}: {error}") from error
-    return SourceCamera(intrinsics, lens_of(where, _model(where, keys), keys))
+    return SourceCamera(intrinsics, lens_of(where, _model(keys), keys))
 
 
-def _model(where: str, keys: Table) -> object:
+def _model(keys: Table) -> object:
     for key in UNREAD_LENSES:
-        if keys.get(key):
-            raise DatasetError(f"{where}: key '{key}' names a lens that is not read here")
-    if keys.get("is_fisheye"):
+        if keys.value(key, None):
+            raise keys.error(key, "names a lens that is not read here")
+    if keys.value("is_fisheye", None):
         return "OPENCV_FISHEYE"
-    return keys.get("camera_model", "OPENCV")
+    return keys.value("camera_model", "OPENCV")
 
 
-def _focal(where: str, keys: Table, key: str, angle_key: str, side: int) -> float:
+def _focal(keys: Table, key: str, angle_key: str, side: int) -> float:
     """Return a focal length in pixels, stated or as the full field of view in radians."""
     if key in keys or angle_key not in keys:
-        return number(where, keys, key)
-    angle_rad = number(where, keys, angle_key)
+        return keys.number(key)
+    angle_rad = keys.number(angle_key)
     if not 0 < angle_rad < math.pi:
-        raise DatasetError(f"{where}: {angle_key} = {angle_rad} rad is outside 0..pi")
+        raise keys.error(angle_key, f"is {angle_rad} rad, outside 0..pi")
     return 0.5 * side / math.tan(0.5 * angle_rad)
 
 
@@ -164,11 +153,11 @@ def _applied(where: str, content: Table) -> Applied | None:
         return None
     turned_from_original = Pose.identity()
     if "applied_transform" in content:
-        rows = matrix_rows(where, content, "applied_transform")
+        rows = content.matrix("applied_transform", POSE_SHAPES)
         turned_from_original = pose_of_rows(where, "applied_transform", rows)
-    scale = number(where, content, "applied_scale") if "applied_scale" in content else 1.0
+    scale = content.number("applied_scale", default=1.0)
     if scale <= 0:
-        raise DatasetError(f"{where}: key 'applied_scale' is {scale}, must be above 0")
+        raise content.error("applied_scale", f"is {scale}, must be above 0")
     return Applied(turned_from_original.inverse(), scale)
 
 
@@ -176,14 +165,11 @@ def _moved(picture: SourcePicture, applied: Applied) -> SourcePicture:
     return replace(picture, world_from_cam=applied.undo(picture.world_from_cam))
 
 
-def _exposure_varies(file: Path, content: Table) -> bool:
-    value = content.get("exposure", "fixed")
-    if value not in ("auto", "fixed"):
-        raise DatasetError(f"{file}: key 'exposure' is {value!r}, neither 'auto' nor 'fixed'")
-    return bool(value == "auto")
+def _exposure_varies(content: Table) -> bool:
+    return content.choice("exposure", ("auto", "fixed"), "fixed") == "auto"
 
 
 def _points(file: Path, content: Table) -> SourcePoints | None:
-    if content.get("ply_file_path") is None:
+    if content.value("ply_file_path", None) is None:
         return None
-    return read_points(inside(str(file), file.parent, text(str(file), content, "ply_file_path")))
+    return read_points(inside(str(file), file.parent, content.text("ply_file_path")))

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from random import Random
 
 from rfcore.errors import InvalidInput
-from rfcore.link.section import Section
+from rfcore.tables import Range, Table
 
 __all__ = ["ConnectionLoss", "RandomLives", "parse"]
 
-LIFE_LIMITS_S = (0.05, 1e6)
+LIFE_S = Range(0.05, 1e6)
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,8 @@ class ConnectionLoss:
     mean_life_s: float
 
     def __post_init__(self) -> None:
-        lowest, highest = LIFE_LIMITS_S
-        if not lowest <= self.mean_life_s <= highest:
-            raise InvalidInput(
-                "connection_loss.mean_life_s",
-                f"{self.mean_life_s} is outside {lowest:g}..{highest:g} s",
-            )
+        if problem := LIFE_S.problem(self.mean_life_s):
+            raise InvalidInput("connection_loss.mean_life_s", f"{problem} s")
 
     def lives(self, random: Random) -> RandomLives:
         """Return the machine that says how long connections live."""
@@ -48,8 +44,8 @@ class RandomLives:
         return self._mean_life_s * self._random.expovariate(1.0)
 
 
-def parse(section: Section) -> ConnectionLoss:
-    """Return what a profile's section declares."""
-    loss = ConnectionLoss(section.number("mean_life_s", LIFE_LIMITS_S))
-    section.finish()
+def parse(table: Table) -> ConnectionLoss:
+    """Return what a profile's table declares."""
+    loss = ConnectionLoss(table.number("mean_life_s", LIFE_S))
+    table.finish()
     return loss

@@ -20,7 +20,7 @@ from random import Random
 from rfcore.errors import InvalidData
 from rfcore.link.plan import Parts
 from rfcore.link.profile import MAX_DELAY_S
-from rfcore.link.section import Section
+from rfcore.tables import Range, Table
 
 __all__ = ["DelayTrace", "parse", "read_cicv5g"]
 
@@ -94,8 +94,8 @@ def _sample(path: Path, number: int, line: str) -> tuple[float, float]:
     return sent, delay
 
 
-def parse(section: Section) -> DelayTrace:
-    """Return the stage that a profile's section declares."""
-    trace = read_cicv5g(section.path("file"), section.number("share", (0.0, 1.0), 0.5))
-    section.finish()
+def parse(table: Table, folder: Path) -> DelayTrace:
+    """Return the impairment of a profile's table; its file is looked for in ``folder``."""
+    trace = read_cicv5g(folder / table.text("file"), table.number("share", Range(0.0, 1.0), 0.5))
+    table.finish()
     return trace

@@ -15,7 +15,7 @@ from random import Random
 
 from rfcore.errors import InvalidInput
 from rfcore.link.plan import Parts
-from rfcore.link.section import Section
+from rfcore.tables import Range, Table
 
 __all__ = ["Distribution", "Jitter", "JitterDelay", "parse"]
 
@@ -64,13 +64,9 @@ class JitterDelay:
         return spread_s * min(LONGEST, self._random.expovariate(1.0))
 
 
-def parse(section: Section) -> Jitter:
-    """Return the stage that a profile's section declares."""
-    spread_s = section.number("spread_ms", (0.0, 1e3 * MAX_SPREAD_S)) / 1e3
-    named = section.take("distribution", "uniform")
-    if named not in tuple(Distribution):
-        raise InvalidInput(
-            f"{section.name}.distribution", f"{named!r} is none of {', '.join(Distribution)}"
-        )
-    section.finish()
+def parse(table: Table) -> Jitter:
+    """Return the impairment that a profile's table declares."""
+    spread_s = table.number("spread_ms", Range(0.0, 1e3 * MAX_SPREAD_S)) / 1e3
+    named = table.choice("distribution", Distribution, "uniform")
+    table.finish()
     return Jitter(spread_s, Distribution(named))

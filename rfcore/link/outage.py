@@ -18,8 +18,8 @@ from random import Random
 
 from rfcore.errors import InvalidInput
 from rfcore.link.plan import Parts
-from rfcore.link.section import Section
 from rfcore.link.shaper import Transmission
+from rfcore.tables import Range, Table, shortened
 
 __all__ = ["Outage", "OutageTransmission", "RandomOutage", "parse"]
 
@@ -27,6 +27,7 @@ Window = tuple[float, float]
 """(first second without the link, first second with it)"""
 
 MAX_S = 1e6
+LENGTH_S = Range(1e-3, MAX_S)
 
 
 @dataclass(frozen=True)
@@ -127,21 +128,18 @@ class OutageTransmission:
             yield window
 
 
-def parse(section: Section) -> Outage | RandomOutage:
-    """Return the stage that a profile's section declares."""
-    if "at_s" not in section:
-        up_s, down_s = (section.number(f"mean_{name}_s", (1e-3, MAX_S)) for name in ("up", "down"))
-        section.take("at_s", None)
-        section.finish()
+def parse(table: Table) -> Outage | RandomOutage:
+    """Return the impairment that a profile's table declares."""
+    if "at_s" not in table:
+        up_s, down_s = (table.number(f"mean_{name}_s", LENGTH_S) for name in ("up", "down"))
+        table.finish("at_s")
         return RandomOutage(up_s, down_s)
     windows = []
-    for pair in section.take("at_s"):
+    for index, pair in enumerate(table.items("at_s")):
         if not isinstance(pair, list) or len(pair) != 2:
-            raise InvalidInput(f"{section.name}.at_s", f"{pair!r} must be [from_s, for_s]")
-        begin_s = section.checked("at_s", pair[0], (0.0, MAX_S))
-        windows.append((begin_s, begin_s + section.checked("at_s", pair[1], (1e-3, MAX_S))))
-    repeat_s = section.take("repeat_s", None)
-    if repeat_s is not None:
-        repeat_s = section.checked("repeat_s", repeat_s, (1e-3, MAX_S))
-    section.finish()
+            raise table.error(f"at_s[{index}]", f"is {shortened(pair)}, not [from_s, for_s]")
+        begin_s = table.checked(f"at_s[{index}][0]", pair[0], Range(0.0, MAX_S))
+        windows.append((begin_s, begin_s + table.checked(f"at_s[{index}][1]", pair[1], LENGTH_S)))
+    repeat_s = table.number("repeat_s", LENGTH_S) if "repeat_s" in table else None
+    table.finish("repeat_s")
     return Outage(tuple(windows), repeat_s)

@@ -1,21 +1,34 @@
-"""What a link is made of: a profile for each direction, and the stages it names.
+"""What a link is made of, per direction (profile and impairments), and a run on a virtual clock.
 
-A stage changes how a link transmits (a trace, an outage) or adds to its delay (jitter, a recorded
-delay). Each is a module of its own that only a profile naming it imports. Chance comes from a seed:
-every stage of every direction draws from its own generator, so that adding one changes no other.
+An impairment changes how a link transmits (a trace, an outage) or adds to its delay (jitter, a
+recorded delay). Each is a module of its own that only a profile naming it imports. Randomness comes
+from a seed: every impairment of every direction draws from its own generator, so that adding one
+changes no other.
+
+``delivery_times`` runs a plan without waiting, for experiments. Its sizes are packet bytes (pose +
+header + payload), as the paper's tau has them; the proxy on real sockets counts wire bytes instead.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from random import Random
 from typing import Any, Protocol
 
+from rfcore.errors import InvalidInput
 from rfcore.link.profile import LinkProfile
 from rfcore.link.shaper import ConstantRate, Delay, Link, Transmission
 
-__all__ = ["ConnectionLife", "DirectionPlan", "LinkPlan", "Parts", "Stage"]
+__all__ = [
+    "Arrival",
+    "ConnectionLife",
+    "DirectionPlan",
+    "Impairment",
+    "LinkPlan",
+    "Parts",
+    "delivery_times",
+]
 
 UNBOUNDED_BYTES = 2**62
 
@@ -32,15 +45,15 @@ class Parts:
         return replace(self, delays=(*self.delays, delay))
 
 
-class Stage(Protocol):
+class Impairment(Protocol):
     """One impairment, as a profile declares it."""
 
     @property
     def name(self) -> str:
-        """Its section in a profile."""
+        """Its table in a profile."""
 
     def apply(self, parts: Parts, random: Random) -> Parts:
-        """Return the parts of a link with this impairment; all chance comes from ``random``."""
+        """Return the parts of a link with this impairment; all randomness comes from ``random``."""
 
 
 class ConnectionLife(Protocol):
@@ -59,17 +72,17 @@ class ConnectionLoss(Protocol):
 
 @dataclass(frozen=True)
 class DirectionPlan:
-    """One direction: ``stages`` are applied in order; ``seed`` names its chance."""
+    """One direction: ``impairments`` are applied in order, with generators made from ``seed``."""
 
     profile: LinkProfile
-    stages: tuple[Stage, ...] = ()
+    impairments: tuple[Impairment, ...] = ()
     seed: str = ""
 
     def link(self, origin_s: float = 0.0) -> Link[Any]:
         """Return the machine; traces, outages and the like begin at ``origin_s``."""
         parts = Parts(ConstantRate(self.profile.rate_bps))
-        for stage in self.stages:
-            parts = stage.apply(parts, Random(f"{self.seed}/{stage.name}"))
+        for impairment in self.impairments:
+            parts = impairment.apply(parts, Random(f"{self.seed}/{impairment.name}"))
         return Link(self.profile, parts.transmission, parts.delays, origin_s)
 
     def unbounded(self) -> DirectionPlan:
@@ -93,8 +106,31 @@ class LinkPlan:
             return None
         return self.connection_loss.lives(Random(f"{self.seed}/connection_loss"))
 
-    @property
-    def stage_names(self) -> Sequence[str]:
-        """What the profile names beside rates and delays."""
-        named = [stage.name for plan in (self.uplink, self.downlink) for stage in plan.stages]
-        return named + (["connection_loss"] if self.connection_loss else [])
+
+@dataclass(frozen=True)
+class Arrival:
+    """A packet handed to the link: ``at_s`` seconds on the virtual clock, ``size_bytes`` long."""
+
+    at_s: float
+    size_bytes: int
+
+
+def delivery_times(link: LinkProfile | DirectionPlan, schedule: Iterable[Arrival]) -> list[float]:
+    """Return the second at which each packet of ``schedule`` is delivered; traces begin at 0 s.
+
+    The queue is unbounded here: a schedule is a given, there is no sender to hold back. Raises
+    ``InvalidInput`` when the schedule is not in time order.
+    """
+    plan = DirectionPlan(link) if isinstance(link, LinkProfile) else link
+    machine = plan.unbounded().link()
+    times: list[float] = []
+    previous_s = float("-inf")
+    for index, arrival in enumerate(schedule):
+        if not arrival.at_s >= previous_s:
+            raise InvalidInput(
+                f"schedule[{index}].at_s", f"{arrival.at_s} s is before {previous_s} s; sort it"
+            )
+        previous_s = arrival.at_s
+        times.append(machine.push(index, arrival.size_bytes, arrival.at_s).due_s)
+        machine.pop_due(arrival.at_s)
+    return times

@@ -43,7 +43,3 @@ class LinkProfile:
             raise InvalidInput(
                 "link.queue_limit_bytes", f"{self.queue_limit_bytes} must be at least 1 byte"
             )
-
-    def transmission_s(self, size_bytes: int) -> float:
-        """Return tau, the seconds that ``size_bytes`` occupy the link."""
-        return size_bytes * 8 / self.rate_bps

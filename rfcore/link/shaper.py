@@ -1,22 +1,18 @@
-"""The link as a queue with three verbs: ``push``, ``pop_due``, ``next_event_at``.
+"""A link as a queue with three verbs (``push``, ``pop_due``, ``next_event_at``), and a busy meter.
 
 NetworkTX of the paper (send, wait tau = 8 * bytes / throughput), store and forward. A packet that
 finds the link busy is transmitted from the moment the previous one is *due* to end, never from the
 moment somebody looks: late drivers cause no drift. Within a busy period every end is computed from
-the period's start and an integer number of bits, so nothing accumulates but one rounding.
+the period's start and an integer number of bits, so rounding errors do not accumulate.
 
-How long transmission takes and what delays a packet beyond the profile's constant are parts that
-can be exchanged (``rfcore.link.plan``); whatever they do, packets keep their order.
+The transmission and the delays beyond the profile's constant are exchangeable parts
+(``rfcore.link.plan``); whatever they do, packets keep their order. Times are seconds on any clock
+of the caller's that does not run backwards; parts see the seconds since the link's origin.
 
-Times are seconds on any clock of the caller's that does not run backwards; parts see the seconds
-since the link's origin.
-
-How long a link was really busy, from the moments at which packets were really released.
-
-The union of the intervals from the start of a busy period to the release of its last packet, less
-what the packet spent in propagation. Against ``expected_s``, the time the link's machine gave those
-bytes (bytes over rate where the rate is constant), it says how true the driver was: a late release
-shows up as too much.
+``BusyMeter`` checks a real-time driver of the link: from the moments at which packets were really
+released it computes how long the link was busy (the union of the intervals from the start of a busy
+period to the release of its last packet, without propagation). Compared with ``expected_s``, the
+time the link's own schedule gave those bytes, an excess shows late releases.
 """
 
 from __future__ import annotations
@@ -61,7 +57,7 @@ class Delay(Protocol):
 
 
 class ConstantRate:
-    """``rate_bps`` bits per second, for ever.
+    """``rate_bps`` bits per second, constant.
 
     Within a busy period every end is computed from the period's start and an integer number of
     bytes.

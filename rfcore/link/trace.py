@@ -18,7 +18,7 @@ from random import Random
 
 from rfcore.errors import InvalidData
 from rfcore.link.plan import Parts
-from rfcore.link.section import Section
+from rfcore.tables import Table
 
 __all__ = ["OPPORTUNITY_BYTES", "Trace", "TraceTransmission", "parse", "read_mahimahi"]
 
@@ -134,8 +134,8 @@ def read_mahimahi(path: Path) -> Trace:
         raise InvalidData(f"{path}: {error}") from error
 
 
-def parse(section: Section) -> Trace:
-    """Return the stage that a profile's section declares."""
-    trace = read_mahimahi(section.path("file"))
-    section.finish()
+def parse(table: Table, folder: Path) -> Trace:
+    """Return the impairment of a profile's table; its file is looked for in ``folder``."""
+    trace = read_mahimahi(folder / table.text("file"))
+    table.finish()
     return trace

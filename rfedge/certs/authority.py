@@ -1,11 +1,10 @@
-"""A certificate authority that signs once: X.509 version 3 (RFC 5280), ECDSA on P-256.
+"""A certificate authority for one deployment: X.509 version 3 (RFC 5280), ECDSA on P-256.
 
-Each certificate names one identity (``rfcore.wire.identity``); a server's also its hosts. The
-authority may sign certificates only, and none of those may sign.
+Each certificate names one identity (``rfcore.wire.identity``), a server's also its hosts. The
+authority's own certificate may sign certificates only, and no certificate that it signed may sign.
 
-A folder of certificates and keys: there as a whole or not at all, keys for the owner's eyes.
-
-Reads certificates back, for people.
+``write_certificates`` writes a folder of certificates and keys as a whole or not at all, with keys
+readable by their owner only; ``read_certificates`` reads them back for display.
 """
 
 from __future__ import annotations
@@ -28,7 +27,14 @@ from rfcore.files import whole_folder
 from rfcore.wire.checks import shown
 from rfcore.wire.identity import Role, identity_uri
 
-__all__ = ["Issued", "Members", "Says", "certify", "read_certificates", "write_certificates"]
+__all__ = [
+    "CertificateInfo",
+    "Issued",
+    "Members",
+    "certify",
+    "read_certificates",
+    "write_certificates",
+]
 
 
 MAX_DAYS = 3650
@@ -106,7 +112,7 @@ def _authority(now: datetime, days: int) -> _Authority:
         decipher_only=False,
     )
     certificate = (
-        _begun(subject, key, now, days)
+        _builder(subject, key, now, days)
         .issuer_name(subject)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(signs, critical=True)
@@ -120,7 +126,7 @@ def _signed(authority: _Authority, name: str, names: list[x509.GeneralName]) -> 
     usage = ExtendedKeyUsageOID.SERVER_AUTH if name == "server" else ExtendedKeyUsageOID.CLIENT_AUTH
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
     certificate = (
-        _begun(_subject(name[:64]), key, authority.now, authority.days)
+        _builder(_subject(name[:64]), key, authority.now, authority.days)
         .issuer_name(authority.certificate.subject)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
@@ -131,7 +137,7 @@ def _signed(authority: _Authority, name: str, names: list[x509.GeneralName]) -> 
     return _issued(name, str(names[0].value), certificate, key)
 
 
-def _begun(
+def _builder(
     subject: x509.Name, key: ec.EllipticCurvePrivateKey, now: datetime, days: int
 ) -> x509.CertificateBuilder:
     """Return what every certificate has in common."""
@@ -208,22 +214,22 @@ def _write_key(path: Path, key: bytes) -> None:
 
 
 @dataclass(frozen=True)
-class Says:
+class CertificateInfo:
     """Until when a certificate is good, and its subject alternative names (an authority's none)."""
 
     until: datetime
     names: tuple[str, ...]
 
 
-def read_certificates(folder: Path) -> dict[str, Says]:
+def read_certificates(folder: Path) -> dict[str, CertificateInfo]:
     """Read every ``*.pem`` in ``folder``, by name. Raises ``InvalidInput``, ``InvalidData``."""
     paths = sorted(folder.glob("*.pem"))
     if not paths:
         raise InvalidInput("folder", f"{folder} holds no certificates")
-    return {path.name: _says(path) for path in paths}
+    return {path.name: _info_of(path) for path in paths}
 
 
-def _says(path: Path) -> Says:
+def _info_of(path: Path) -> CertificateInfo:
     try:
         certificate = x509.load_pem_x509_certificate(path.read_bytes())
     except ValueError as error:
@@ -231,5 +237,7 @@ def _says(path: Path) -> Says:
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
-        return Says(certificate.not_valid_after_utc, ())
-    return Says(certificate.not_valid_after_utc, tuple(str(name.value) for name in names))
+        return CertificateInfo(certificate.not_valid_after_utc, ())
+    return CertificateInfo(
+        certificate.not_valid_after_utc, tuple(str(name.value) for name in names)
+    )

@@ -2,6 +2,6 @@
 
     python -m rfedge.dashboards deploy/grafana/dashboards
 
-``panel`` is what a dashboard is made of, ``catalogue`` and ``catalogue_link`` say what there is,
-``grafana`` writes it as Grafana wants it.
+``grafana`` is what a dashboard is made of and writes it as Grafana wants it; ``catalogue`` (fleet,
+vehicle, server) and ``catalogue_link`` (link, codec) say what there is.
 """

@@ -1,10 +1,9 @@
-"""The dashboards: those of fleet and vehicle, and the list of all."""
+"""The dashboards of fleet, vehicle and server, and the list of all."""
 
 from __future__ import annotations
 
 from rfedge.dashboards.catalogue_link import CODEC, LINK
-from rfedge.dashboards.catalogue_server import CAPACITY
-from rfedge.dashboards.grafana import Dashboard, Look, Panel, Query, Unit, stages_of
+from rfedge.dashboards.grafana import Dashboard, Panel, PanelKind, Query, Unit, share_of, stages_of
 
 __all__ = ["DASHBOARDS"]
 
@@ -21,13 +20,13 @@ FLEET = Dashboard(
             "Vehicles that stream now, by server.",
             Unit.COUNT,
             (Query(f"rfedge_server_sessions{{{SERVER}}}"),),
-            Look.NUMBER,
+            PanelKind.NUMBER,
         ),
         Panel(
             "Age of the twin",
             "Seconds since the capture of the newest picture, of the vehicle where it is oldest.",
             Unit.SECONDS,
-            (Query(f"rfedge_twin_age_seconds{{{SERVER}}}"),),
+            (Query(f"rfedge_twin_age_seconds{{{SERVER}}}", "{{instance}} {{vehicle}}"),),
         ),
         Panel(
             "Frames by result",
@@ -77,7 +76,12 @@ FLEET = Dashboard(
             "Bytes received",
             "Coded frames of all vehicles: pose, header, and P slice.",
             Unit.BITS_PER_S,
-            (Query(f"8 * rate(rfedge_server_received_bytes_total{{{SERVER}}}[$__rate_interval])"),),
+            (
+                Query(
+                    "8 * sum by (instance) (rate(rfedge_server_received_bytes_total"
+                    f"{{{SERVER}}}[$__rate_interval]))"
+                ),
+            ),
         ),
         Panel(
             "Delivered",
@@ -92,7 +96,7 @@ FLEET = Dashboard(
             "other.",
             Unit.COUNT,
             (Query("count by (job, version, renderer_contract) (rfedge_build_info)", ""),),
-            Look.TABLE,
+            PanelKind.TABLE,
         ),
         Panel(
             "Fields in use",
@@ -102,7 +106,7 @@ FLEET = Dashboard(
                 Query("count by (job, field, kind) (rfedge_server_field_info)", ""),
                 Query("count by (job, field, kind) (rfedge_agent_field_info)", ""),
             ),
-            Look.TABLE,
+            PanelKind.TABLE,
         ),
     ),
 )
@@ -118,7 +122,7 @@ VEHICLE = Dashboard(
             "1 while a server has welcomed the vehicle.",
             Unit.COUNT,
             (Query("rfedge_agent_connected{instance=~'$instance'}"),),
-            Look.NUMBER,
+            PanelKind.NUMBER,
         ),
         Panel(
             "Connections lost",
@@ -129,7 +133,7 @@ VEHICLE = Dashboard(
                     "increase(rfedge_agent_connections_lost_total{instance=~'$instance'}[$__range])"
                 ),
             ),
-            Look.NUMBER,
+            PanelKind.NUMBER,
         ),
         Panel(
             "Pictures by end",
@@ -150,12 +154,27 @@ VEHICLE = Dashboard(
             Unit.SECONDS,
             tuple(
                 Query(
-                    f"histogram_quantile({share}, sum by (le) (rate("
+                    f"histogram_quantile({share}, sum by (instance, le) (rate("
                     "rfedge_agent_capture_to_ack_seconds_bucket"
                     "{instance=~'$instance'}[$__rate_interval])))",
-                    f"p{round(100 * share)}",
+                    f"{{{{instance}}}} p{round(100 * share)}",
                 )
                 for share in (0.5, 0.99)
+            ),
+        ),
+        Panel(
+            "Acknowledged within 150 ms",
+            "Of all pictures captured, dropped and lost ones included; wanted: 99 %.",
+            Unit.SHARE,
+            (
+                Query(
+                    share_of(
+                        "sum by (instance) (rate(rfedge_agent_capture_to_ack_seconds_bucket"
+                        "{le='0.15', instance=~'$instance'}[$__rate_interval]))",
+                        "sum by (instance) (rate(rfedge_agent_frames_total"
+                        "{instance=~'$instance'}[$__rate_interval]))",
+                    )
+                ),
             ),
         ),
         Panel(
@@ -198,6 +217,130 @@ VEHICLE = Dashboard(
                     "[$__rate_interval])"
                 ),
             ),
+        ),
+    ),
+)
+
+CAPACITY = Dashboard(
+    "rfedge-capacity",
+    "rfedge: server capacity",
+    "How much more a server can take, and what will break first.",
+    "mec-server",
+    (
+        Panel(
+            "Workers busy",
+            "Share of the workers that render, splice and decode; above 90 % everybody is late.",
+            Unit.SHARE,
+            (Query(f"instance:rfedge_server_workers_busy:ratio1m{{{SERVER}}}"),),
+        ),
+        Panel(
+            "Where the time goes",
+            "Mean time of a frame by stage; queue grows first when workers are short.",
+            Unit.SECONDS,
+            (Query(stages_of("rfedge_server_stage_seconds"), "{{stage}}"),),
+            stacked=True,
+        ),
+        Panel(
+            "Arrival to Ack",
+            "Half and 99 in 100 frames are answered within this time.",
+            Unit.SECONDS,
+            tuple(
+                Query(
+                    f"histogram_quantile({share}, sum by (le) (rate("
+                    f"rfedge_server_frame_seconds_bucket{{{SERVER}}}[$__rate_interval])))",
+                    f"p{round(100 * share)}",
+                )
+                for share in (0.5, 0.99)
+            ),
+        ),
+        Panel(
+            "Processor",
+            "Cores the server keeps busy.",
+            Unit.COUNT,
+            (
+                Query(
+                    f"rate(process_cpu_seconds_total{{job='mec-server', {SERVER}}}"
+                    "[$__rate_interval])"
+                ),
+            ),
+        ),
+        Panel(
+            "Memory",
+            "Resident memory; a slope that stays is a leak.",
+            Unit.BYTES,
+            (Query(f"process_resident_memory_bytes{{job='mec-server', {SERVER}}}"),),
+        ),
+        Panel(
+            "Open files",
+            "File descriptors as a share of what the process may have.",
+            Unit.SHARE,
+            (
+                Query(
+                    f"process_open_fds{{job='mec-server', {SERVER}}} "
+                    f"/ process_max_fds{{job='mec-server', {SERVER}}}"
+                ),
+            ),
+        ),
+        Panel(
+            "Consumers",
+            "Who watches the twin now.",
+            Unit.COUNT,
+            (Query(f"rfedge_twin_consumers{{{SERVER}}}"),),
+            PanelKind.NUMBER,
+        ),
+        Panel(
+            "Consumers by end",
+            "left is normal; slow took nothing for long; refused came beyond the limit.",
+            Unit.COUNT,
+            (
+                Query(
+                    f"sum by (reason) (increase(rfedge_twin_consumers_ended_total{{{SERVER}}}"
+                    "[$__range]))",
+                    "{{reason}}",
+                ),
+            ),
+            PanelKind.NUMBER,
+        ),
+        Panel(
+            "Pictures to consumers",
+            "Handed over, by encoding, and missed because the consumer was too slow.",
+            Unit.PER_S,
+            (
+                Query(
+                    f"sum by (encoding) (rate(rfedge_twin_pictures_sent_total{{{SERVER}}}"
+                    "[$__rate_interval]))",
+                    "{{encoding}}",
+                ),
+                Query(
+                    f"sum(rate(rfedge_twin_pictures_missed_total{{{SERVER}}}[$__rate_interval]))",
+                    "missed",
+                ),
+            ),
+        ),
+        Panel(
+            "Age at the consumer",
+            "99 in 100 pictures are younger than this when they are handed to a consumer.",
+            Unit.SECONDS,
+            (
+                Query(
+                    "histogram_quantile(0.99, sum by (le) (rate(rfedge_twin_sent_age_seconds_bucket"
+                    f"{{{SERVER}}}[$__rate_interval])))",
+                    "p99",
+                ),
+            ),
+        ),
+        Panel(
+            "Bytes to consumers",
+            "What watching the twin costs.",
+            Unit.BITS_PER_S,
+            (Query(f"8 * rate(rfedge_twin_sent_bytes_total{{{SERVER}}}[$__rate_interval])"),),
+        ),
+        Panel(
+            "Recording",
+            "1 while pictures are recorded; 0 when none are asked for or the disk refused.",
+            Unit.COUNT,
+            (Query(f"rfedge_server_recording{{{SERVER}}}"),),
+            PanelKind.NUMBER,
         ),
     ),
 )

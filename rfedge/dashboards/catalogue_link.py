@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rfedge.dashboards.grafana import Dashboard, Look, Panel, Query, Unit, share_of
+from rfedge.dashboards.grafana import Dashboard, Panel, PanelKind, Query, Unit, share_of
 
 __all__ = ["CODEC", "LINK"]
 
@@ -78,7 +78,7 @@ LINK = Dashboard(
                     "{{instance}} cut",
                 ),
             ),
-            Look.NUMBER,
+            PanelKind.NUMBER,
         ),
         Panel(
             "Latest release",

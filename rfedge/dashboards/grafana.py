@@ -18,8 +18,8 @@ from rfcore.errors import InvalidInput
 __all__ = [
     "DATASOURCE",
     "Dashboard",
-    "Look",
     "Panel",
+    "PanelKind",
     "Query",
     "Unit",
     "dashboard_text",
@@ -39,7 +39,7 @@ class Unit(StrEnum):
     SHARE = "percentunit"
 
 
-class Look(StrEnum):
+class PanelKind(StrEnum):
     """Grafana's names of panel types."""
 
     LINES = "timeseries"
@@ -63,7 +63,7 @@ class Panel:
     description: str
     unit: Unit
     queries: tuple[Query, ...]
-    look: Look = Look.LINES
+    kind: PanelKind = PanelKind.LINES
     stacked: bool = False
 
     def __post_init__(self) -> None:
@@ -145,7 +145,7 @@ def _panel(index: int, panel: Panel) -> dict[str, Any]:
     row, column = divmod(index, COLUMNS)
     return {
         "id": index + 1,
-        "type": str(panel.look),
+        "type": str(panel.kind),
         "title": panel.title,
         "description": panel.description,
         "datasource": DATASOURCE,
@@ -156,22 +156,22 @@ def _panel(index: int, panel: Panel) -> dict[str, Any]:
                 "datasource": DATASOURCE,
                 "expr": query.expr,
                 "legendFormat": query.legend,
-                "instant": panel.look is Look.TABLE,
-                "range": panel.look is not Look.TABLE,
-                "format": "table" if panel.look is Look.TABLE else "time_series",
+                "instant": panel.kind is PanelKind.TABLE,
+                "range": panel.kind is not PanelKind.TABLE,
+                "format": "table" if panel.kind is PanelKind.TABLE else "time_series",
             }
             for number, query in enumerate(panel.queries)
         ],
         "fieldConfig": {"defaults": _defaults(panel), "overrides": []},
         "options": {"legend": {"displayMode": "list", "placement": "bottom", "showLegend": True}}
-        if panel.look is Look.LINES
+        if panel.kind is PanelKind.LINES
         else {},
     }
 
 
 def _defaults(panel: Panel) -> dict[str, Any]:
     defaults: dict[str, Any] = {"unit": str(panel.unit), "min": 0}
-    if panel.look is Look.LINES:
+    if panel.kind is PanelKind.LINES:
         stacking = {"mode": "normal" if panel.stacked else "none"}
         defaults["custom"] = {"fillOpacity": 30 if panel.stacked else 0, "stacking": stacking}
     return defaults

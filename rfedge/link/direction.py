@@ -26,9 +26,9 @@ class Sender(Protocol):
     """Who pushes into a direction, and can be told to wait."""
 
     def hold(self, reason: str) -> None:
-        """Push nothing until ``go_on`` with the same reason."""
+        """Push nothing until ``resume`` with the same reason."""
 
-    def go_on(self, reason: str) -> None:
+    def resume(self, reason: str) -> None:
         """Push again, if no other reason holds."""
 
     def abort(self) -> None:
@@ -98,7 +98,7 @@ class Direction:
             if self._holding and not self._link.is_full(time.perf_counter()):
                 self._holding = False
                 for sender in self.senders:
-                    sender.go_on("link")
+                    sender.resume("link")
 
     def _next_event_at(self) -> float | None:
         """When a packet is due, or senders that are held may go on."""

@@ -39,7 +39,7 @@ class Side(asyncio.BufferedProtocol):
     def join(self, peer: Side) -> None:
         """Send what comes in here to ``peer``."""
         self.peer = peer
-        self.go_on("peer")
+        self.resume("peer")
 
     def hold(self, reason: str) -> None:
         """Stop reading until ``reason`` is gone."""
@@ -47,7 +47,7 @@ class Side(asyncio.BufferedProtocol):
             self.transport.pause_reading()
         self._held.add(reason)
 
-    def go_on(self, reason: str) -> None:
+    def resume(self, reason: str) -> None:
         """Read again if ``reason`` was the last one against it."""
         if self._held == {reason} and self.transport is not None:
             self.transport.resume_reading()
@@ -99,7 +99,7 @@ class Side(asyncio.BufferedProtocol):
     def resume_writing(self) -> None:
         """Our socket takes data again."""
         if self.peer is not None:
-            self.peer.go_on("receiver")
+            self.peer.resume("receiver")
 
     def _deliver(self, data: bytes) -> None:
         if self.peer is not None and self.peer.transport is not None:

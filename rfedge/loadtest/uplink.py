@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from rfcore.link import LinkProfile
-from rfcore.link.virtual import Arrival, delivery_times
+from rfcore.link.plan import Arrival, delivery_times
 
 __all__ = ["CLOSE", "RATES_MBPS", "Traffic", "largest_held", "on_time_share", "vehicles_carried"]
 

@@ -1,8 +1,7 @@
-"""A scene's world: the parts that its geometry asks for, then the effects that change the street.
+"""Assemble a scene: its world (geometry, then the effects on the street) and its frame effects.
 
-Each part and each effect has random numbers of its own, so that leaving one out moves no other.
-
-Running a scene's effects on a rendered frame, in the registry's order.
+Each part of the street and each effect has its own random generator, so that leaving one out
+changes no other.
 """
 
 from __future__ import annotations

@@ -1,13 +1,10 @@
-"""What a scene will run, and what each effect costs, measured here and now.
+"""What a scene will run, and what each effect costs, measured on this machine.
 
-Effects on frames are run on a plain one of the drive's size. Those that change the street run once,
-before the first frame; they are run on the scene's own street, made only if there is one.
-
-What rendering costs, with and without each effect on the street, by small renders in one run.
-
-The street is rendered plain, then again after each effect is added; what a frame then takes more is
-that effect's. It may be less than nothing: a sky without a sun takes fewer decisions. Scenes of the
-same street share its plain render.
+Effects on frames are timed on a plain frame of the drive's size. Effects on the street run once,
+before the first frame; they are timed on the scene's own street, which is made only if there are
+any. What an effect on the street adds to rendering is the difference between small renders before
+and after it; the difference can be negative (a sky without a sun needs fewer samples of light).
+Scenes with the same street share the plain render.
 """
 
 from __future__ import annotations
@@ -20,10 +17,11 @@ import numpy as np
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfedge.street.assembly import plain_world
-from rfedge.street.effects import EFFECTS, Effect, Stage, rng_of
+from rfedge.street.effects import EFFECTS, Effect, EffectKind, rng_of
 from rfedge.street.frame import LinearFrame
+from rfedge.street.geometry.layout import Geometry
 from rfedge.street.geometry.world import World
-from rfedge.street.scene_file import Drive, Geometry, Rig, Scene
+from rfedge.street.scene_file import Drive, Rig, Scene
 
 __all__ = [
     "PlainStreets",
@@ -47,7 +45,7 @@ class PlannedEffect:
     """
 
     name: str
-    stage: Stage
+    kind: EffectKind
     why: str
     settings: object
     cost_ms: float
@@ -111,7 +109,7 @@ def _changed(
 
 def _planned(scene: Scene, effect: Effect, cost_ms: float) -> PlannedEffect:
     settings = scene.effects[effect.name]
-    return PlannedEffect(effect.name, effect.stage, effect.why, settings, cost_ms, effect.on_frames)
+    return PlannedEffect(effect.name, effect.kind, effect.why, settings, cost_ms, effect.on_frames)
 
 
 def plain_frame(width_px: int, height_px: int, fov_deg: float) -> LinearFrame:
@@ -180,7 +178,7 @@ def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> Callable[[World
     not scaled.
     """
     from rfedge.street.render.backend import chosen_backend
-    from rfedge.street.render.renderer import Quality, Renderer
+    from rfedge.street.render.renderer import Renderer, Sampling
     from rfedge.street.shots import Split, shots_of
 
     shots = shots_of(scene, Split.DRIVE, SIZE_PX)[: FRAMES + 1]
@@ -189,7 +187,7 @@ def small_render_ms(scene: Scene, cpu_s: Callable[[], float]) -> Callable[[World
     backend = chosen_backend()
 
     def frame_ms(world: World) -> float:
-        renderer = Renderer(world, Quality(SAMPLES), backend, threads=1)
+        renderer = Renderer(world, Sampling(SAMPLES), backend, threads=1)
         times_s = []
         for shot in shots:
             start_s = cpu_s()

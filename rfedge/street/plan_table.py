@@ -1,8 +1,6 @@
-"""Measured plans of several scenes: rows of a result file, and a table in a page.
+"""Plans of scenes as text: lines for the terminal, rows of a result file, and a table in a page.
 
-The table stands between two marks, so that its figures are generated, never typed.
-
-A scene's plan in words: its pictures, its effects in their order, and what they cost.
+The table stands between two marks in the page, so that its figures are generated, never typed.
 """
 
 from __future__ import annotations
@@ -143,7 +141,7 @@ def effect_lines(planned: Sequence[PlannedEffect], cost: RenderCost | None) -> l
     if not planned:
         lines.append("  effects     none: pictures are as rendered")
     lines += [
-        f"  {effect.stage:<11} {effect.name}: {effect.why}; {_cost(effect, on_frames_ms, cost)}"
+        f"  {effect.kind:<11} {effect.name}: {effect.why}; {_cost(effect, on_frames_ms, cost)}"
         for effect in planned
     ]
     return lines

@@ -1,37 +1,130 @@
-"""A scene: what the street is, where cameras drive, which pictures are wanted, which effects run.
+"""Scene files: the street, where cameras drive, which pictures are taken, which effects run.
 
 ``samples/scenes/NAME.toml`` holds the ready-made ones. A scene runs exactly the effects it names in
-``[effects.<name>]``; what they are is ``rfedge.street.effects``.
+``[effects.<name>]`` (``rfedge.street.effects``).
+
+Each table of the file becomes a frozen dataclass (``read_record``). A field's type is ``bool``,
+``int``, ``float``, ``str`` or a tuple of numbers; ``Annotated`` metadata holds its ``Range`` or
+``OneOf``. Every error names the file, the line and the key; a key that no field has is an error.
 """
 
 from __future__ import annotations
 
+import re
+import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from dataclasses import field as with_factory
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from rfcore.errors import InvalidInput
-from rfedge.street.effects import EFFECTS, Stage, load_effect
-from rfedge.street.schema import OneOf, Range, TomlFile
+from rfcore.tables import Range, Table
+from rfedge.street.effects import EFFECTS, EffectKind, load_effect
+from rfedge.street.geometry.layout import Geometry
 
-__all__ = ["Drive", "Evaluation", "Geometry", "PoseNoise", "Rig", "Scene", "Training", "load_scene"]
+__all__ = [
+    "Drive",
+    "Evaluation",
+    "LocalisationNoise",
+    "OneOf",
+    "Rig",
+    "Scene",
+    "TomlFile",
+    "Training",
+    "load_scene",
+    "read_record",
+]
 
-SCENES = Path("samples/scenes")
-Size = Annotated[tuple[int, int], Range(16, 8192)]
+T = TypeVar("T")
+HEADER = re.compile(r"\s*\[+\s*([\w.\-\"]+)\s*\]+")
+KEY = re.compile(r"\s*([\w\-\"]+)\s*=")
+INDEX = re.compile(r"\[\d+\]$")
 
 
 @dataclass(frozen=True)
-class Geometry:
-    """The street. ``tiles`` of ``length_m`` each follow one another."""
+class OneOf:
+    """One of these strings."""
 
-    length_m: Annotated[float, Range(20, 1000)] = 120.0
-    tiles: Annotated[int, Range(1, 20)] = 1
-    seed: Annotated[int, Range(0, 2**31)] = 1
-    trees: bool = True
-    signs: bool = True
-    wires: bool = True
+    choices: tuple[str, ...]
+
+
+class TomlFile:
+    """A parsed TOML file that knows on which line each key stands; ``top`` is its own table."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            text = path.read_text(encoding="utf-8")
+            content = tomllib.loads(text)
+        except OSError as error:
+            raise InvalidInput("scene", f"{path}: cannot be read ({error.strerror})") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InvalidInput("scene", f"{path}: {error}") from error
+        self._lines = _lines_of_keys(text)
+        self.top = Table(content, self.error)
+
+    def error(self, key: str, problem: str) -> InvalidInput:
+        """Return an error at a dotted key, or at the table it would stand in."""
+        place = INDEX.sub("", key)
+        while place and place not in self._lines:
+            place = place.rpartition(".")[0]
+        line = self._lines.get(place, 1)
+        return InvalidInput("scene", f"{self.path}: line {line}: {key}: {problem}")
+
+
+def read_record(table: Table, kind: type[T]) -> T:
+    """Return a table as the dataclass ``kind``; raise the table's error for a wrong value."""
+    hints = get_type_hints(kind, include_extras=True)
+    kinds = fields(kind)  # type: ignore[arg-type]
+    table.require_known(sorted(field.name for field in kinds))
+    values = {}
+    for field in kinds:
+        optional = field.default is not MISSING or field.default_factory is not MISSING
+        if field.name in table or not optional:
+            values[field.name] = _value(table, field.name, hints[field.name])
+    try:
+        return kind(**values)
+    except InvalidInput as error:
+        raise table.error(error.field, error.problem) from error
+
+
+def _value(table: Table, key: str, hint: Any) -> Any:
+    kind, *rules = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    within = next((rule for rule in rules if isinstance(rule, Range)), Range())
+    if get_origin(kind) is tuple:
+        return _tuple(table, key, get_args(kind), within)
+    if kind is bool:
+        return table.flag(key)
+    if kind is str:
+        choices = [rule.choices for rule in rules if isinstance(rule, OneOf)]
+        return table.choice(key, choices[0]) if choices else table.text(key)
+    return table.whole(key, within) if kind is int else table.number(key, within)
+
+
+def _tuple(table: Table, key: str, kinds: tuple[Any, ...], within: Range) -> tuple[float, ...]:
+    """Return a list of numbers: ``(float, ...)`` has any length, ``(int, int)`` exactly two."""
+    items = table.items(key, None if Ellipsis in kinds else len(kinds))
+    check = table.checked_whole if kinds[0] is int else table.checked
+    numbers = (check(f"{key}[{i}]", item, within) for i, item in enumerate(items))
+    return tuple(kinds[0](number) for number in numbers)
+
+
+def _lines_of_keys(text: str) -> dict[str, int]:
+    """Where tables and keys begin; a key inside a multi-line string would be found too."""
+    found: dict[str, int] = {}
+    table = ""
+    for number, line in enumerate(text.splitlines(), start=1):
+        if header := HEADER.match(line):
+            table = header[1].replace('"', "")
+            found.setdefault(table, number)
+        elif key := KEY.match(line):
+            found.setdefault(".".join(filter(None, (table, key[1].replace('"', "")))), number)
+    return found
+
+
+SCENES = Path("samples/scenes")
+Size = Annotated[tuple[int, int], Range(16, 8192)]
 
 
 @dataclass(frozen=True)
@@ -84,7 +177,7 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class PoseNoise:
+class LocalisationNoise:
     """The measured pose, written beside the true one, differs by normal deviates."""
 
     position_m: Annotated[float, Range(0, 5)] = 0.0
@@ -101,12 +194,12 @@ class Scene:
 
     name: str
     field: str
-    geometry: Geometry = Geometry()
+    geometry: Geometry = with_factory(default_factory=Geometry)
     rig: Rig = Rig()
     train: Training = Training()
     evaluation: Evaluation = Evaluation()
     drive: Drive = Drive()
-    pose_noise: PoseNoise = PoseNoise()
+    pose_noise: LocalisationNoise = LocalisationNoise()
     effects: Mapping[str, Any] = with_factory(default_factory=dict)
 
 
@@ -116,7 +209,7 @@ PARTS = {
     "train": Training,
     "evaluation": Evaluation,
     "drive": Drive,
-    "pose_noise": PoseNoise,
+    "pose_noise": LocalisationNoise,
 }
 
 
@@ -127,21 +220,19 @@ def load_scene(name_or_path: str) -> Scene:
     that the scene declares are imported.
     """
     file = TomlFile(_path(name_or_path))
-    file.require_known("", file.content, {"name", "field", "effects", *PARTS})
-    for key in ("name", "field"):
-        if not isinstance(file.content.get(key, "") or None, str):
-            raise file.error(key, "is missing or not a string")
-    declared = file.table("effects")
-    file.require_known("effects", declared, {effect.name for effect in EFFECTS})
+    top = file.top
+    top.require_known(sorted({"name", "field", "effects", *PARTS}))
+    declared = top.table("effects", {})
+    declared.require_known(sorted(effect.name for effect in EFFECTS))
     order = [effect for effect in EFFECTS if effect.name in declared]
-    lights = [effect.name for effect in order if effect.stage is Stage.LIGHT]
+    lights = [effect.name for effect in order if effect.kind is EffectKind.LIGHT]
     if len(lights) > 1:
-        raise file.error(f"effects.{lights[1]}", f"is a second light beside {lights[0]}")
+        raise declared.error(lights[1], f"is a second light beside {lights[0]}")
     return Scene(
-        name=file.content["name"],
-        field=file.content["field"],
-        effects={e.name: file.read(f"effects.{e.name}", load_effect(e)) for e in order},
-        **{key: file.read(key, kind) for key, kind in PARTS.items()},
+        name=top.text("name"),
+        field=top.text("field"),
+        effects={e.name: read_record(declared.table(e.name), load_effect(e)) for e in order},
+        **{key: read_record(top.table(key, {}), kind) for key, kind in PARTS.items()},
     )
 
 

@@ -1,11 +1,9 @@
-"""Which pictures a scene wants: its splits as lists of posed shots.
+"""The pictures a scene consists of: its splits as lists of posed shots, and selections of them.
 
-* ``drive``: the moving camera at the full rate; lower rates are every n-th of it.
-* ``train``: cars with the rig go through the street, alternately in both directions; at each of
-  ``views`` places another of its cameras takes a picture.
-* ``eval``: ``stations`` of the whole rig between the places of ``train``.
-
-Which of a scene's shots a command asks for.
+* ``drive``: the moving camera at the full rate; lower rates are every n-th frame of it.
+* ``train``: cars with the camera rig pass through the street, alternately in both directions; at
+  each of ``views`` places the next camera of the rig takes one picture.
+* ``eval``: all cameras of the rig at ``stations`` between the places of ``train``.
 """
 
 from __future__ import annotations
@@ -22,17 +20,17 @@ from rfcore.errors import InvalidInput
 from rfedge.datasets.rig import RIG
 from rfedge.street.geometry.layout import Layout
 from rfedge.street.scene_file import Scene
-from rfedge.street.trajectory import Motion, drive_motion, drive_pose, mounted, on_lane
+from rfedge.street.trajectory import CameraMotion, drive_motion, drive_pose, mounted, on_lane
 
 __all__ = ["Selection", "Shot", "Split", "shots_of", "thinned_indices"]
 
 
 ENDS_M = 14.0
-"""Cars keep so far from where the facades end."""
+"""Distance that cars keep from the ends of the facades."""
 STRIDE = 7
-"""Cameras are taken in steps of it: it has no factor in common with 18."""
+"""Step between the rig cameras taken one after the other; coprime to their number, 18."""
 AHEAD_M, ASIDE_M, TURN_RAD = 0.3, 0.3, 0.03
-STANDING = Motion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+STANDING = CameraMotion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 class Split(StrEnum):
@@ -51,7 +49,7 @@ class Shot:
     index: int
     camera: Camera
     time_s: float = 0.0
-    motion: Motion = STANDING
+    motion: CameraMotion = STANDING
 
     @property
     def name(self) -> str:

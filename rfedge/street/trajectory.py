@@ -1,9 +1,7 @@
-"""How cars drive through the street, and where their cameras are then.
+"""How cars drive through the street, where their cameras are, and the pose that they measure.
 
-A car's axes are x forward, y left, z up, its origin on the road. It keeps right: towards +x it
-drives at y < 0. Camera axes are OpenCV's.
-
-The pose as a vehicle's localisation gives it: the true one with normal deviates.
+A car's axes are x forward, y left, z up, with the origin on the road. Traffic keeps right: cars
+driving towards +x are at y < 0. Camera axes are OpenCV's.
 """
 
 from __future__ import annotations
@@ -18,9 +16,17 @@ from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfedge.datasets.rig import Mount
 from rfedge.street.geometry.layout import LANE_M
 from rfedge.street.geometry.mesh import F64
-from rfedge.street.scene_file import Drive, PoseNoise
+from rfedge.street.scene_file import Drive, LocalisationNoise
 
-__all__ = ["Motion", "drive_motion", "drive_pose", "looking", "measured_pose", "mounted", "on_lane"]
+__all__ = [
+    "CameraMotion",
+    "drive_motion",
+    "drive_pose",
+    "looking",
+    "measured_pose",
+    "mounted",
+    "on_lane",
+]
 
 
 EYE_UP_M = 1.62
@@ -32,7 +38,7 @@ STEP_S = 1e-3
 
 
 @dataclass(frozen=True)
-class Motion:
+class CameraMotion:
     """How a camera moves, in its own axes."""
 
     velocity_mps: tuple[float, float, float]
@@ -54,7 +60,7 @@ def looking(position_m: F64, yaw_rad: float, pitch_rad: float) -> Pose:
 
 
 def on_lane(x_m: float, direction: int, left_m: float) -> tuple[F64, float]:
-    """Return place and heading of a car that drives along +1 or -1 x, so far left of its lane."""
+    """Return place and heading of a car driving along +x or -x, ``left_m`` beside its lane."""
     place = np.array([x_m, direction * (left_m - LANE_M), 0.0])
     return place, 0.0 if direction > 0 else float(np.pi)
 
@@ -69,7 +75,7 @@ def mounted(mount: Mount, place: F64, heading_rad: float) -> Pose:
 
 
 def drive_pose(drive: Drive, time_s: float) -> Pose:
-    """Return world_from_cam of the drive, whose middle is the street's: it sways as cars do."""
+    """Return world_from_cam of the drive, centred on the street, with a car's sway."""
     x_m = drive.speed_mps * (time_s - 0.5 * drive.duration_s)
     rate = 2 * np.pi / SWAY_PERIOD_S
     left_m = drive.lane_offset_m + SWAY_M * np.sin(rate * time_s)
@@ -81,21 +87,21 @@ def drive_pose(drive: Drive, time_s: float) -> Pose:
     return looking(place + np.array([0.0, 0.0, EYE_UP_M]), float(yaw), float(pitch))
 
 
-def drive_motion(drive: Drive, time_s: float) -> Motion:
+def drive_motion(drive: Drive, time_s: float) -> CameraMotion:
     """Return the drive's velocity and turn rate by differences over 2 ms."""
     before, after = (drive_pose(drive, time_s + step) for step in (-STEP_S, STEP_S))
     now = np.array(drive_pose(drive, time_s).rotation_matrix())
     moved = np.array(after.translation_m) - np.array(before.translation_m)
     turned = np.array(rotation_vector(before.inverse().compose(after).rotation))
     velocity = now.T @ moved / (2 * STEP_S)
-    return Motion(_triple(velocity), _triple(turned / (2 * STEP_S)))
+    return CameraMotion(_triple(velocity), _triple(turned / (2 * STEP_S)))
 
 
 def _triple(values: F64) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
 
 
-def measured_pose(world_from_cam: Pose, noise: PoseNoise, frame: int) -> Pose:
+def measured_pose(world_from_cam: Pose, noise: LocalisationNoise, frame: int) -> Pose:
     """Return the pose measured in a frame: the same for the same seed and frame.
 
     Each coordinate is off by ``position_m``, each angle about a camera axis by ``rotation_deg``

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rfcore.dataset import Dataset, Distortion, read_dataset
 from rfcore.dataset.assemble import localised
-from rfcore.dataset.points import read_points
+from rfcore.dataset.source import read_points
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.train.start import points_from_depth
 from rfcore.views import PointCloud, PosedPicture

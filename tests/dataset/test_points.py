@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from rfcore.dataset.points import read_points
+from rfcore.dataset.source import read_points
 from rfcore.errors import DatasetError
 
 HEADER = (

@@ -35,14 +35,14 @@ LASTING = [name for name in SERVICES if "healthcheck" in SERVICES[name]]
 
 def filled(text: str) -> str:
     """Return ``text`` with its variables as .env has them; a missing one is an error."""
-    return re.sub(r"\$\{(\w+)\}", lambda found: ENV[found[1]], text)
+    return re.sub(r"\$\{(\w+)\}", lambda found: ENV[found[1]], text).replace("$$", "$")
 
 
 def command(name: str) -> list[str]:
     """Return the words that a service runs; of a shell's line, those of the command of ours."""
     words = [filled(str(word)) for word in SERVICES[name]["command"]]
     if words[:2] == ["sh", "-c"]:
-        words = shlex.split(words[2].rpartition("|| ")[2])
+        words = shlex.split(words[2].rpartition("|| ")[2].partition(";")[0])
     return words
 
 
@@ -75,6 +75,7 @@ def config_of(
     """Return what a service's program makes of its command line."""
     words = [word.replace("/certs/demo", str(certificates)) for word in command(name)]
     words = [re.sub(r"=/(fields|cache)$", f"={tmp_path}", word) for word in words]
+    words = [re.sub(r"=/pictures/.*$", f"={tmp_path}", word) for word in words]
     configs: list[Any] = []
     start = "drive" if module is agent_command else "serve"
     monkeypatch.setattr(module, start, configs.append)
@@ -150,8 +151,27 @@ def test_every_vehicle_has_a_link_of_its_own_kind_and_a_drive_of_its_own() -> No
     links = [name for name in running("rfedge") if name.startswith("link-")]
     profiles = {word for name in links for word in command(name) if "--profile" in word}
     assert len(profiles) == len(links) == len(running("cav-agent")) == 4
-    drives = {host_path(name, "/drive/transforms.json") for name in running("cav-agent")}
+    drives = {host_path("pictures", f"/drives/{name}.json") for name in running("cav-agent")}
     assert len(drives) == 4
+
+
+def test_the_demo_is_as_large_and_as_fast_as_it_is_advertised() -> None:
+    width_px, height_px = map(int, ENV["PICTURE_SIZE"].split("x"))
+    assert width_px >= 320
+    assert height_px >= 180
+    assert float(ENV["RATE_HZ"]) >= 5
+
+
+def test_pictures_are_reduced_for_every_vehicle_and_each_drives_its_own() -> None:
+    line = filled(SERVICES["pictures"]["command"][2])
+    names, out = re.search(r"for vehicle in ([^;]*); do out=(\S+);", line).groups()  # type: ignore[union-attr]
+    assert line.startswith("set -e;"), "a drive that cannot be made stops the service"
+    assert set(names.split()) == set(running("cav-agent"))
+    for name in running("cav-agent"):
+        assert f"--drive={out.replace('$vehicle', name)}" in command(name)
+    words = shlex.split(line.rpartition("|| ")[2].partition(";")[0])
+    convert: Any = tyro.cli(Verb, args=words[1:], config=(OmitSubcommandPrefixes,))
+    assert convert.verb.size == ENV["PICTURE_SIZE"]
 
 
 @pytest.mark.sample
@@ -160,8 +180,8 @@ def test_a_drive_comes_back_to_where_it_began_and_its_pictures_are_there(
     name: str, tmp_path: Path
 ) -> None:
     for folder in ("drive_empty", "drive_vehicles"):
-        (tmp_path / folder).symlink_to(host_path(name, f"/drive/{folder}"))
-    transforms = host_path(name, "/drive/transforms.json")
+        (tmp_path / folder).symlink_to(host_path("pictures", f"/drives/{folder}"))
+    transforms = host_path("pictures", f"/drives/{name}.json")
     (tmp_path / "transforms.json").write_text(transforms.read_text())
     pictures = read_dataset(tmp_path).pictures
     east_m = [picture.camera.world_from_cam.translation_m[0] for picture in pictures]

@@ -83,3 +83,35 @@ def test_the_data_source_is_the_one_that_is_provisioned() -> None:
 def test_a_panel_without_a_description_is_refused() -> None:
     with pytest.raises(InvalidInput, match="needs a description"):
         Panel("Bytes", "", Unit.BYTES, (Query("up"),))
+
+
+def labels_of(expr: str) -> set[str]:
+    """Return what tells the series of an expression apart."""
+    if grouped := re.search(r"(?:sum|count) by \(([^)]*)\)", expr):
+        return {label.strip() for label in grouped[1].split(",")} - {"le"}
+    if re.match(r"(8 \* )?sum\(", expr):
+        return set()
+    labels = {"instance"}
+    for listed in families().values():
+        for family in listed:
+            if re.search(rf"\b{family.name}(_bucket|_sum|_count)?\b", expr):
+                labels |= set(family.labels)
+    return labels
+
+
+@pytest.mark.parametrize("panel", panels())
+def test_a_legend_tells_the_series_of_its_panel_apart(panel: dict[str, Any]) -> None:
+    """Two lines of one name cannot be read: a server's age of the twin is one line a vehicle."""
+    if panel["type"] == "table":
+        return
+    legends = [target["legendFormat"] for target in panel["targets"]]
+    assert len(set(legends)) == len(legends)
+    for target, legend in zip(panel["targets"], legends, strict=True):
+        assert labels_of(target["expr"]) <= set(re.findall(r"\{\{(\w+)\}\}", legend))
+
+
+def test_the_labels_of_an_expression_are_found() -> None:
+    assert labels_of("rfedge_twin_age_seconds{instance=~'$instance'}") == {"instance", "vehicle"}
+    assert labels_of("rate(rfedge_link_bytes_total[1m])") == {"instance", "direction"}
+    assert labels_of("histogram_quantile(0.5, sum by (instance, le) (rate(x[1m])))") == {"instance"}
+    assert labels_of("8 * sum(rate(rfedge_link_bytes_total[1m]))") == set()

@@ -15,7 +15,7 @@ from rfcore.link.connection_loss import ConnectionLoss
 from rfcore.link.delay_trace import DelayTrace, read_cicv5g
 from rfcore.link.jitter import Distribution, Jitter
 from rfcore.link.outage import Outage, RandomOutage
-from rfcore.link.plan import Parts, Stage
+from rfcore.link.plan import Impairment, Parts
 from rfcore.link.shaper import ConstantRate
 from rfcore.link.trace import Trace
 
@@ -27,7 +27,7 @@ MS = st.integers(0, 4_000).map(lambda ms: ms / 1e3)
 schedules = st.lists(
     st.builds(Arrival, at_s=MS, size_bytes=st.integers(1, 9_000)), min_size=1, max_size=30
 ).map(lambda arrivals: sorted(arrivals, key=lambda a: a.at_s))
-stages: st.SearchStrategy[Stage] = st.one_of(
+impairments: st.SearchStrategy[Impairment] = st.one_of(
     st.builds(Jitter, st.floats(0, 1), st.sampled_from(Distribution)),
     st.builds(RandomOutage, st.floats(0.01, 2), st.floats(0.01, 2)),
     st.just(Outage(((0.0, 0.1), (0.5, 1.5)), repeat_s=2.0)),
@@ -45,9 +45,9 @@ def within(seconds: float) -> float:
 # --- laws of any combination
 
 
-@given(st.lists(stages, max_size=3), schedules, st.text(max_size=3))
+@given(st.lists(impairments, max_size=3), schedules, st.text(max_size=3))
 def test_whatever_the_stages_every_packet_arrives_in_order_and_after_it_was_sent(
-    named: list[Stage], schedule: list[Arrival], seed: str
+    named: list[Impairment], schedule: list[Arrival], seed: str
 ) -> None:
     times = delivery_times(DirectionPlan(PROFILE, tuple(named), seed), schedule)
     assert len(times) == len(schedule)
@@ -57,17 +57,17 @@ def test_whatever_the_stages_every_packet_arrives_in_order_and_after_it_was_sent
         assert due_s >= arrival.at_s + PROFILE.delay_s - within(due_s)
 
 
-@given(st.lists(stages, max_size=3), schedules, st.text(max_size=3))
+@given(st.lists(impairments, max_size=3), schedules, st.text(max_size=3))
 def test_the_same_seed_gives_the_same_times(
-    named: list[Stage], schedule: list[Arrival], seed: str
+    named: list[Impairment], schedule: list[Arrival], seed: str
 ) -> None:
     plan = DirectionPlan(PROFILE, tuple(named), seed)
     assert delivery_times(plan, schedule) == delivery_times(plan, schedule)
 
 
-@given(st.lists(stages, max_size=3), schedules, st.integers(1, 50_000))
+@given(st.lists(impairments, max_size=3), schedules, st.integers(1, 50_000))
 def test_bytes_are_conserved_and_the_queue_never_holds_more_than_it_may(
-    named: list[Stage], schedule: list[Arrival], limit_bytes: int
+    named: list[Impairment], schedule: list[Arrival], limit_bytes: int
 ) -> None:
     link = DirectionPlan(LinkProfile(1e6, 0.02, limit_bytes), tuple(named), "s").link()
     pushed = popped = 0
@@ -83,8 +83,10 @@ def test_bytes_are_conserved_and_the_queue_never_holds_more_than_it_may(
     assert link.next_event_at() is None
 
 
-@given(st.lists(stages, min_size=1, max_size=2), schedules)
-def test_no_stage_makes_a_link_faster(named: list[Stage], schedule: list[Arrival]) -> None:
+@given(st.lists(impairments, min_size=1, max_size=2), schedules)
+def test_no_impairment_makes_a_link_faster(
+    named: list[Impairment], schedule: list[Arrival]
+) -> None:
     slower = [stage for stage in named if stage.name != "trace"]  # a trace is another rate
     plain = delivery_times(PROFILE, schedule)
     staged = delivery_times(DirectionPlan(PROFILE, tuple(slower), "s"), schedule)

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from rfedge.street.geometry.layout import Layout
+from rfedge.street.geometry.layout import Geometry, Layout
 from rfedge.street.geometry.mesh import Label, Material
 from rfedge.street.geometry.solids import Stuff, boxes, quads
 from rfedge.street.geometry.world import Part, Sky, World
-from rfedge.street.scene_file import Geometry
 
 
 @pytest.fixture(scope="session")

@@ -15,17 +15,22 @@ import pytest
 from rich.console import Console
 
 from rfcore.dataset import read_dataset, verify_manifest
-from rfcore.dataset.points import read_points
+from rfcore.dataset.source import read_points
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.street.build import run
 from rfedge.street.build import run as workers
 from rfedge.street.build.run import Settings, build_scene
-from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
-from rfedge.street.build.shot_files import ShotFiles, depth_mm, read_depth_m
+from rfedge.street.build.scene_renderer import (
+    RenderJob,
+    SceneRenderer,
+    ShotFiles,
+    depth_mm,
+    read_depth_m,
+)
 from rfedge.street.effects.lens import LensDistortion
 from rfedge.street.render.backend import Backend
 from rfedge.street.render.renderer import RenderedView
-from rfedge.street.scene_file import Drive, PoseNoise, Scene, Training
+from rfedge.street.scene_file import Drive, LocalisationNoise, Scene, Training
 from rfedge.street.shots import Selection, Shot
 
 SCENE = Scene("s", "s", drive=Drive(duration_s=0.5, thinned_hz=(10.0,)), train=Training(views=4))
@@ -49,8 +54,8 @@ class RoadRenderer:
 class QuickRenderer(SceneRenderer):
     """A renderer whose world need not be made."""
 
-    def __init__(self, order: RenderJob) -> None:
-        self._order = order
+    def __init__(self, job: RenderJob) -> None:
+        self._job = job
         self._renderer = RoadRenderer()  # type: ignore[assignment]
 
 
@@ -128,18 +133,18 @@ from importlib.util import module_from_spec, spec_from_file_location
 spec = spec_from_file_location("test_build", sys.argv[1])
 test = module_from_spec(spec)
 spec.loader.exec_module(test)
-from rfedge.street.build import run, shot_files
+from rfedge.street.build import run, scene_renderer
 from rfedge.street.render.backend import Backend
 run.SceneRenderer = test.QuickRenderer
 run.chosen_backend = lambda: Backend("llvm_ad_rgb", "libLLVM.so")
-write, seen = shot_files.write_points, []
+write, seen = scene_renderer.write_points, []
 def killing(path, points):
     write(path, points)
     seen.append(path)
     if len(seen) == 4:
         (path.parent.parent / "images" / "000003.png.part").write_bytes(b"half a pict")
         os.kill(os.getpid(), signal.SIGKILL)
-shot_files.write_points = killing
+scene_renderer.write_points = killing
 test.build(Path(sys.argv[2]), splits="drive", frames="0:6")
 """
 
@@ -190,7 +195,7 @@ def test_another_build_is_not_mixed_into_a_folder(tmp_path: Path) -> None:
 
 
 def test_measured_poses_stand_beside_the_true_ones(tmp_path: Path) -> None:
-    noisy = replace(SCENE, pose_noise=PoseNoise(position_m=0.1))
+    noisy = replace(SCENE, pose_noise=LocalisationNoise(position_m=0.1))
     build(tmp_path / "s", noisy, splits="drive", frames="0:4")
     true, measured = (
         json.loads((tmp_path / "s" / f"transforms_drive{suffix}.json").read_text())["frames"]

@@ -12,21 +12,13 @@ import pytest
 from rfedge.street.assembly import plain_world
 from rfedge.street.effects import EFFECTS, load_effect, rng_of
 from rfedge.street.frame import LinearFrame
-from rfedge.street.geometry.layout import Layout
+from rfedge.street.geometry.layout import Geometry, Layout
 from rfedge.street.geometry.mesh import Label, Material
 from rfedge.street.geometry.sky import Daylight, overcast_sky, sunny_sky
 from rfedge.street.geometry.solids import Stuff, boxes
 from rfedge.street.geometry.world import Part, Sky, World
 from rfedge.street.plan import plain_frame
-from rfedge.street.scene_file import (
-    Drive,
-    Evaluation,
-    Geometry,
-    PoseNoise,
-    Rig,
-    Scene,
-    Training,
-)
+from rfedge.street.scene_file import Drive, Evaluation, LocalisationNoise, Rig, Scene, Training
 from rfedge.street.shots import Split, shots_of, thinned_indices
 from rfedge.street.trajectory import measured_pose
 
@@ -125,14 +117,14 @@ def frame_digest(settings: Any, effect: Any) -> str:
     ("kind", "key"),
     [
         pair
-        for kind in (Geometry, Rig, Training, Evaluation, Drive, PoseNoise)
+        for kind in (Geometry, Rig, Training, Evaluation, Drive, LocalisationNoise)
         for pair in keys_of(kind)
     ],
     ids=lambda value: value if isinstance(value, str) else value.__name__,
 )
 def test_a_key_of_a_part_changes_the_street_or_its_pictures(kind: type[Any], key: str) -> None:
-    if kind is PoseNoise:
-        noise = PoseNoise(0.1, 1.0)
+    if kind is LocalisationNoise:
+        noise = LocalisationNoise(0.1, 1.0)
         pose = shots_of(SHORT, Split.DRIVE)[1].camera.world_from_cam
         assert measured_pose(pose, noise, 1) != measured_pose(pose, changed(noise, key), 1)
         return

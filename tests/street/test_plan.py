@@ -10,10 +10,10 @@ from rfcore.errors import InvalidInput
 from rfedge.street.effects.noise import SensorNoise
 from rfedge.street.effects.overcast import Overcast
 from rfedge.street.effects.wet_road import WetRoad
-from rfedge.street.geometry.layout import Layout
+from rfedge.street.geometry.layout import Geometry, Layout
 from rfedge.street.geometry.road import road
 from rfedge.street.geometry.world import Sky, World
-from rfedge.street.plan import PlainStreets, PlannedEffect, RenderCost, Stage, measured_render
+from rfedge.street.plan import EffectKind, PlainStreets, PlannedEffect, RenderCost, measured_render
 from rfedge.street.plan_table import (
     MeasuredPlan,
     effect_lines,
@@ -22,7 +22,7 @@ from rfedge.street.plan_table import (
     write_page,
     write_rows,
 )
-from rfedge.street.scene_file import Geometry, Scene
+from rfedge.street.scene_file import Scene
 
 ROOT = Path(__file__).parents[2]
 SMALL = Geometry(length_m=20.0)
@@ -69,8 +69,8 @@ def test_shares_are_of_the_whole_frame() -> None:
     shares = [cost.share_percent(part, 20.0) for part in (60.0, 20.0, 20.0)]
     assert sum(shares) == pytest.approx(100.0)
     planned = (
-        PlannedEffect("wet_road", Stage.SURFACE, "it is wet", None, 300.0, each_frame=False),
-        PlannedEffect("noise", Stage.SENSOR, "it is dark", None, 20.0),
+        PlannedEffect("wet_road", EffectKind.SURFACE, "it is wet", None, 300.0, each_frame=False),
+        PlannedEffect("noise", EffectKind.SENSOR, "it is dark", None, 20.0),
     )
     plain, wet, noise = effect_lines(planned, cost)
     assert "60 ms a frame without effects, 60 % of it" in plain
@@ -90,8 +90,8 @@ def test_a_scene_without_effects_says_so() -> None:
 def plan() -> MeasuredPlan:
     """A wet street, seen by a noisy sensor."""
     planned = (
-        PlannedEffect("wet_road", Stage.SURFACE, "it is wet", None, 300.0, each_frame=False),
-        PlannedEffect("noise", Stage.SENSOR, "it is dark", None, 20.0),
+        PlannedEffect("wet_road", EffectKind.SURFACE, "it is wet", None, 300.0, each_frame=False),
+        PlannedEffect("noise", EffectKind.SENSOR, "it is dark", None, 20.0),
     )
     return MeasuredPlan(Scene("wet", "x"), planned, RenderCost(60.0, {"wet_road": 20.0}))
 

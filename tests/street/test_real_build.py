@@ -21,7 +21,7 @@ from rfedge.street.build.run import Settings, build_scene
 from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
 from rfedge.street.effects import EFFECTS
 from rfedge.street.render.backend import chosen_backend
-from rfedge.street.render.renderer import Quality
+from rfedge.street.render.renderer import Sampling
 from rfedge.street.scene_file import Scene
 from rfedge.street.shots import Selection
 
@@ -55,8 +55,8 @@ def build(scene: Scene, out: Path, size_px: tuple[int, int], workers: int, frame
 @pytest.mark.slow
 def test_a_pose_looks_the_same_in_every_frame(standing: Scene, tmp_path: Path) -> None:
     """The same place in frames 0 and 7 of the drive, in full size: at least 42 dB apart."""
-    order = RenderJob(standing, tmp_path / "s", Quality(16), chosen_backend(), 2, (640, 360))
-    renderer = SceneRenderer(order)
+    job = RenderJob(standing, tmp_path / "s", Sampling(16), chosen_backend(), 2, (640, 360))
+    renderer = SceneRenderer(job)
     shot = Selection(standing, "drive", "0:1", (640, 360)).shots()[0]
     for index in (0, 7):
         renderer.take(replace(shot, index=index, time_s=index / 20))
@@ -105,10 +105,10 @@ import rfedge
 from rfedge.street import load_scene
 from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
 from rfedge.street.render.backend import chosen_backend
-from rfedge.street.render.renderer import Quality
+from rfedge.street.render.renderer import Sampling
 from rfedge.street.shots import Split, shots_of
 scene, out = load_scene(sys.argv[1]), Path(sys.argv[2])
-renderer = SceneRenderer(RenderJob(scene, out, Quality(4), chosen_backend(), 1))
+renderer = SceneRenderer(RenderJob(scene, out, Sampling(4), chosen_backend(), 1))
 renderer.take(shots_of(scene, Split.DRIVE, (64, 36))[0])
 loaded = [name for name in sys.modules if name.startswith("rfedge.street.effects.")]
 picture = (out / "drive" / "images" / "000000.png").read_bytes()

@@ -13,8 +13,8 @@ from rfedge.street.geometry.mesh import Label
 from rfedge.street.geometry.solids import Stuff, boxes
 from rfedge.street.geometry.world import Mover, Sky, World
 from rfedge.street.render.backend import PROBE, Backend, chosen_backend
-from rfedge.street.render.renderer import Quality, Renderer
-from rfedge.street.render.stage import with_sun
+from rfedge.street.render.mitsuba_scene import with_sun
+from rfedge.street.render.renderer import Renderer, Sampling
 from rfedge.street.trajectory import looking
 
 SCALAR = Backend("scalar_rgb")
@@ -32,7 +32,7 @@ def fastest() -> Backend:
 
 @pytest.fixture(scope="module")
 def renderer(yard: World, fastest: Backend) -> Renderer:
-    return Renderer(yard, Quality(16), fastest, 1)
+    return Renderer(yard, Sampling(16), fastest, 1)
 
 
 def test_a_known_point_lands_on_its_pixel_at_its_depth(renderer: Renderer) -> None:
@@ -65,8 +65,8 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
     yard: World, renderer: Renderer, fastest: Backend
 ) -> None:
     first, later = renderer.render(camera()), renderer.render(camera(), time_s=3.0)
-    two_threads = Renderer(yard, Quality(16), fastest, 2).render(camera())
-    other_seed = Renderer(yard, Quality(16, seed=2), fastest, 2).render(camera())
+    two_threads = Renderer(yard, Sampling(16), fastest, 2).render(camera())
+    other_seed = Renderer(yard, Sampling(16, seed=2), fastest, 2).render(camera())
     assert first.colour.tobytes() == later.colour.tobytes()
     assert first.colour.tobytes() == two_threads.colour.tobytes()
     assert first.colour.tobytes() != other_seed.colour.tobytes()
@@ -77,7 +77,7 @@ def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(
 def test_the_scalar_variant_shows_the_same(yard: World, renderer: Renderer) -> None:
     """The samples differ, so colours agree only to their noise; geometry agrees to rounding."""
     small = camera(32, 18)
-    one, other = renderer.render(small), Renderer(yard, Quality(16), SCALAR, 1).render(small)
+    one, other = renderer.render(small), Renderer(yard, Sampling(16), SCALAR, 1).render(small)
     np.testing.assert_array_equal(one.labels, other.labels)
     np.testing.assert_allclose(one.depth_m, other.depth_m, rtol=1e-5)
     assert abs(one.colour - other.colour).mean() < 0.03 * one.colour.mean()
@@ -102,7 +102,7 @@ def test_what_moves_is_where_it_is_at_that_time(yard: World, fastest: Backend) -
         return matrix
 
     ball = boxes(Stuff("lacquer", Label.OBJECT), (3, 0.0, 0.8), (3.4, 0.4, 1.2))
-    moving = Renderer(replace(yard, movers=(Mover((ball,), along_y),)), Quality(4), fastest, 1)
+    moving = Renderer(replace(yard, movers=(Mover((ball,), along_y),)), Sampling(4), fastest, 1)
     middles = []
     for time_s in (0.0, 0.5, 0.0):
         labels = moving.render(camera(), time_s).labels
@@ -133,7 +133,7 @@ def test_the_painted_sun_gives_the_light_of_its_disc(diameter_deg: float) -> Non
 @pytest.mark.parametrize("samples", [0, 15, 5000])
 def test_samples_that_are_no_square_are_refused(samples: int) -> None:
     with pytest.raises(InvalidInput, match="not a square number"):
-        Quality(samples)
+        Sampling(samples)
 
 
 def test_a_camera_off_its_middle_is_refused(renderer: Renderer) -> None:

@@ -11,7 +11,7 @@ from rfcore.camera import Pose
 from rfcore.errors import InvalidInput
 from rfedge.datasets.rig import RIG
 from rfedge.street import load_scene
-from rfedge.street.scene_file import Drive, PoseNoise, Rig, Scene
+from rfedge.street.scene_file import Drive, LocalisationNoise, Rig, Scene
 from rfedge.street.shots import Selection, Shot, Split, shots_of, thinned_indices
 from rfedge.street.trajectory import (
     drive_motion,
@@ -124,7 +124,7 @@ def test_the_rig_is_mounted_in_the_cars_axes() -> None:
 
 def test_measured_poses_are_off_by_what_is_declared() -> None:
     """900 deviates: their deviation is known to 1 / sqrt(2 n), 2.4 %; five of those are allowed."""
-    noise = PoseNoise(position_m=0.05, rotation_deg=0.2, seed=4)
+    noise = LocalisationNoise(position_m=0.05, rotation_deg=0.2, seed=4)
     true = looking(np.array([3.0, 2.0, 1.0]), 0.4, 0.1)
     measured = [measured_pose(true, noise, frame) for frame in range(300)]
     shift = np.array([m.translation_m for m in measured]) - true.translation_m
@@ -136,7 +136,7 @@ def test_measured_poses_are_off_by_what_is_declared() -> None:
 
 def test_no_noise_measures_the_true_pose() -> None:
     true = looking(np.array([3.0, 2.0, 1.0]), 0.4, 0.1)
-    measured = measured_pose(true, PoseNoise(), 3)
+    measured = measured_pose(true, LocalisationNoise(), 3)
     assert measured.translation_m == true.translation_m
     np.testing.assert_allclose(measured.rotation, true.rotation, atol=1e-15)
 

@@ -12,17 +12,16 @@ import pytest
 from rfcore.errors import InvalidInput
 from rfcore.native import _native
 from rfedge.street import load_scene
-from rfedge.street.effects import EFFECTS, Stage, load_effect
+from rfedge.street.effects import EFFECTS, EffectKind, load_effect
 from rfedge.street.effects.dusk import Dusk
 from rfedge.street.effects.overcast import Overcast
 from rfedge.street.effects.parked import ParkedVehicles
 from rfedge.street.effects.traffic import Traffic
 from rfedge.street.effects.wet_road import WetRoad
-from rfedge.street.geometry.layout import Layout
+from rfedge.street.geometry.layout import Geometry, Layout
 from rfedge.street.geometry.mesh import Label, Mesh, placed
 from rfedge.street.geometry.road import road
 from rfedge.street.geometry.world import Sky, World
-from rfedge.street.scene_file import Geometry
 from rfedge.street.shots import Split, shots_of
 
 ROOT = Path(__file__).parents[2]
@@ -160,7 +159,7 @@ def test_a_scene_has_one_light(tmp_path: Path) -> None:
 
 
 def test_the_stages_follow_one_another() -> None:
-    stages = [list(Stage).index(effect.stage) for effect in EFFECTS]
+    stages = [list(EffectKind).index(effect.kind) for effect in EFFECTS]
     assert stages == sorted(stages)
 
 
@@ -172,10 +171,10 @@ import rfedge
 from rfedge.street import load_scene
 from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
 from rfedge.street.render.backend import chosen_backend
-from rfedge.street.render.renderer import Quality
+from rfedge.street.render.renderer import Sampling
 from rfedge.street.shots import Split, shots_of
 scene = load_scene(sys.argv[1])
-renderer = SceneRenderer(RenderJob(scene, Path(sys.argv[2]), Quality(1), chosen_backend(), 2))
+renderer = SceneRenderer(RenderJob(scene, Path(sys.argv[2]), Sampling(1), chosen_backend(), 2))
 renderer.take(shots_of(scene, Split.DRIVE, (64, 36))[0])
 files = sorted(path for path in Path(sys.argv[2]).rglob("*") if path.is_file())
 print(*(hashlib.sha256(path.read_bytes()).hexdigest() for path in files))

@@ -7,16 +7,14 @@ import numpy as np
 import pytest
 
 from rfedge.street.geometry.building import bricks, buildings
-from rfedge.street.geometry.facade import Look, facade
+from rfedge.street.geometry.facade import BuildingStyle, facade, wall_around
 from rfedge.street.geometry.furniture import lamps, railings, wires
 from rfedge.street.geometry.grain import fractal
-from rfedge.street.geometry.layout import BAY_LENGTH_M, FACADE_M, FASCIA_M, Layout
+from rfedge.street.geometry.layout import BAY_LENGTH_M, FACADE_M, FASCIA_M, Geometry, Layout
 from rfedge.street.geometry.mesh import Label, Mesh, joined
-from rfedge.street.geometry.opening import wall_around
 from rfedge.street.geometry.road import road, slabs
 from rfedge.street.geometry.solids import Stuff
 from rfedge.street.geometry.world import Part
-from rfedge.street.scene_file import Geometry
 
 LAYOUT = Layout(Geometry(length_m=60.0))
 PARTS = (road, buildings, lamps, railings, wires)
@@ -106,7 +104,7 @@ def stuff(name: str) -> Stuff:
 def test_a_facade_leaves_the_fascia_bare(style: int) -> None:
     """But for the rain pipe at its left edge nothing stands out where a sign may hang."""
     plot = LAYOUT.plots[style % len(LAYOUT.plots)]
-    look = Look(stuff("wall"), stuff("frame"), stuff("door"))
+    look = BuildingStyle(stuff("wall"), stuff("frame"), stuff("door"))
     low, high = FASCIA_M
     for mesh in facade(plot, look, np.random.default_rng(style)):
         u, v, w = mesh.vertices.T

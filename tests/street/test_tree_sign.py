@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from rfedge.street.geometry.furniture import post_of, signs, traffic_light
-from rfedge.street.geometry.layout import PAVEMENT_UP_M, Layout
+from rfedge.street.geometry.layout import PAVEMENT_UP_M, Geometry, Layout
 from rfedge.street.geometry.mesh import Label, Mesh
-from rfedge.street.geometry.sign_face import FACES, NAMES, ROUND, face_picture, sign_materials
+from rfedge.street.geometry.signage import FACES, NAMES, ROUND, face_picture, sign_materials
 from rfedge.street.geometry.tree import KINDS, grown, trees
 from rfedge.street.geometry.world import Part
-from rfedge.street.scene_file import Geometry
 
 LAYOUT = Layout(Geometry(length_m=100.0))
 TREE_BUDGET = 70_000

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.street.geometry.lettering import Lettered, atlas, atlas_uv, board
 from rfedge.street.geometry.mesh import Label, Mesh
+from rfedge.street.geometry.signage import Lettered, atlas, atlas_uv, board
 from rfedge.street.geometry.vehicle import KINDS, Vehicle, standing, vehicle
 from rfedge.street.geometry.vehicle_body import surface_of
-from rfedge.street.geometry.vehicle_material import PAINTS, PLATES, vehicle_materials
 from rfedge.street.geometry.vehicle_shape import BODIES, BodyShape, curve
+from rfedge.street.geometry.vehicle_trim import PAINTS, PLATES, vehicle_materials
 
 SIZES_M = {
     "hatchback": (4.26, 1.79, 1.48),
@@ -183,3 +183,41 @@ def test_a_board_holds_its_lines() -> None:
     assert (uv[:, 1] > 0.5).all()
     assert uv[0, 1] > uv[3, 1]
     assert uv[1, 0] > uv[0, 0]
+
+
+STORED = {
+    "hatchback": (
+        (0.7, 0.861783240312, 0.970233375678, 1.29271746648, 1.46222398986, 1.47870622012),
+        (0.66, 0.801803620727, 0.88091317963, 0.902674487971, 0.921152670946, 0.938963360939),
+    ),
+    "saloon": (
+        (0.66, 0.853199499373, 0.944730137314, 1.25145370108, 1.42874956464, 1.4256238877),
+        (0.63, 0.791182862163, 0.865561221287, 0.891654227239, 0.913511686973, 0.93630186915),
+    ),
+    "cab": (
+        (1.1, 1.26343751224, 1.87358172254, 2.30256156037, 2.40245107933, 2.43652525472),
+        (1.02, 1.1809127673, 1.29161219399, 1.31098645841, 1.32061576333, 1.32669368512),
+    ),
+}
+"""Top and belt at the first six of nine even stations; rounded to 12 digits, written before
+SciPy drew the curves."""
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_the_curves_are_those_that_the_committed_scenes_were_built_with(name: str) -> None:
+    shape = BODIES[name]
+    at = np.linspace(-0.1, shape.length_m + 0.1, 9).round(3)[:6]
+    for knots, stored in zip((shape.top, shape.belt), STORED[name], strict=True):
+        np.testing.assert_allclose(curve(knots, at), stored, rtol=0, atol=5e-12)
+
+
+def test_a_curve_ends_with_the_slope_of_its_last_segment() -> None:
+    """SciPy's own end slopes take a third knot into account."""
+    knots = ((0.0, 0.0), (1.0, 1.0), (2.0, 4.0))
+    step = 1e-6
+    assert curve(knots, step) / step == pytest.approx(1.0, rel=1e-4)
+    assert (4.0 - curve(knots, 2.0 - step)) / step == pytest.approx(3.0, rel=1e-4)
+
+
+def test_two_knots_make_a_straight_line() -> None:
+    assert curve(((0.0, 1.0), (2.0, 3.0)), [0.0, 0.5, 2.0]).tolist() == [1.0, 1.5, 3.0]

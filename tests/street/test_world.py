@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.street.geometry.layout import Layout
+from rfedge.street.geometry.layout import Geometry, Layout
 from rfedge.street.geometry.mesh import Label, Material, Mesh, faceted, joined, placed
 from rfedge.street.geometry.world import Part, Sky, World
-from rfedge.street.scene_file import Geometry
 
 
 def triangle(material: str = "clay", label: Label = Label.OBJECT) -> Mesh:

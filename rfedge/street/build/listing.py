@@ -1,11 +1,10 @@
-"""What stands beside the pictures: transforms, points and the manifest.
+"""The files that describe a built dataset: transforms, points, manifest, and its origin.
 
 ``transforms_SPLIT.json`` lists the finished shots of a split, ``transforms_drive_RATEhz.json``
-those that a lower rate keeps, ``..._measured.json`` the same pictures with the poses as measured,
-where the scene declares noise. ``transforms.json`` is the training views' or, without any, that of
-the first split there is.
-
-What a dataset was built from: enough to tell whether a build can go on in its folder.
+those that a lower rate keeps, ``..._measured.json`` the same pictures with measured poses where the
+scene declares localisation noise. ``transforms.json`` is a copy of the training split's, or of the
+first split's without one. ``build.json`` identifies the build, so that it continues only in its own
+folder.
 """
 
 from __future__ import annotations
@@ -23,14 +22,12 @@ import numpy as np
 import rfedge.street
 from rfcore.camera import Pose
 from rfcore.dataset import write_manifest
-from rfcore.dataset.points import read_points
-from rfcore.dataset.source import SourceCamera, SourcePoints
+from rfcore.dataset.source import SourceCamera, SourcePoints, read_points
 from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, write_points
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfcore.lens import LensCamera
-from rfedge.street.build.scene_renderer import RenderJob, camera_of_pictures
-from rfedge.street.build.shot_files import ShotFiles
+from rfedge.street.build.scene_renderer import RenderJob, ShotFiles, camera_of_pictures
 from rfedge.street.scene_file import Scene
 from rfedge.street.shots import Shot, Split, shots_of, thinned_indices
 from rfedge.street.trajectory import measured_pose
@@ -38,62 +35,62 @@ from rfedge.street.trajectory import measured_pose
 __all__ = ["ORIGIN_NAME", "claim_folder", "list_dataset", "origin_of"]
 
 
-def list_dataset(order: RenderJob, about: dict[str, Any]) -> dict[str, int]:
+def list_dataset(job: RenderJob, about: dict[str, Any]) -> dict[str, int]:
     """Write transforms, points and manifest of what is finished; return how many of each split."""
-    finished = {split: _finished(order, split) for split in Split}
+    finished = {split: _finished(job, split) for split in Split}
     finished = {split: shots for split, shots in finished.items() if shots}
     if not finished:
         return {}
     first = Split.TRAIN if Split.TRAIN in finished else next(iter(finished))
-    write_points(order.folder / POINTS_NAME, _points(order.folder, finished[first]))
+    write_points(job.folder / POINTS_NAME, _points(job.folder, finished[first]))
     for split, shots in finished.items():
-        _list_split(order, split, shots)
+        _list_split(job, split, shots)
         if split is first:
-            _write(order.folder / "transforms.json", _written(order, shots, measured=False))
-    write_manifest(order.folder, about)
+            _write(job.folder / "transforms.json", _written(job, shots, measured=False))
+    write_manifest(job.folder, about)
     return {str(split): len(shots) for split, shots in finished.items()}
 
 
-def _finished(order: RenderJob, split: Split) -> list[Shot]:
-    shots = shots_of(order.scene, split, order.size_px)
-    return [shot for shot in shots if ShotFiles.of(order.folder, shot).done]
+def _finished(job: RenderJob, split: Split) -> list[Shot]:
+    shots = shots_of(job.scene, split, job.size_px)
+    return [shot for shot in shots if ShotFiles.of(job.folder, shot).done]
 
 
-def _list_split(order: RenderJob, split: Split, shots: Sequence[Shot]) -> None:
+def _list_split(job: RenderJob, split: Split, shots: Sequence[Shot]) -> None:
     kept = {"": shots}
     if split is Split.DRIVE:
-        for rate_hz in order.scene.drive.thinned_hz:
-            indices = thinned_indices(order.scene, rate_hz)
+        for rate_hz in job.scene.drive.thinned_hz:
+            indices = thinned_indices(job.scene, rate_hz)
             kept[f"_{rate_hz:g}hz"] = [shot for shot in shots if shot.index in indices]
-    noise = order.scene.pose_noise
+    noise = job.scene.pose_noise
     noisy = noise.position_m > 0 or noise.rotation_deg > 0
     for suffix, chosen in kept.items():
-        stem = order.folder / f"transforms_{split}{suffix}"
+        stem = job.folder / f"transforms_{split}{suffix}"
         if chosen:
-            _write(stem.with_suffix(".json"), _written(order, chosen, measured=False))
+            _write(stem.with_suffix(".json"), _written(job, chosen, measured=False))
         if chosen and noisy:
             measured = stem.with_name(f"{stem.name}_measured.json")
-            _write(measured, _written(order, chosen, measured=True))
+            _write(measured, _written(job, chosen, measured=True))
 
 
-def _written(order: RenderJob, shots: Sequence[Shot], measured: bool) -> list[WrittenPicture]:
-    seen_by = camera_of_pictures(order.scene, shots[0].camera)
+def _written(job: RenderJob, shots: Sequence[Shot], measured: bool) -> list[WrittenPicture]:
+    seen_by = camera_of_pictures(job.scene, shots[0].camera)
     lens = seen_by.lens if isinstance(seen_by, LensCamera) else None
     camera = SourceCamera(seen_by.intrinsics, lens)
     return [
         WrittenPicture(
-            file_path=ShotFiles.of(order.folder, shot).picture_name,
+            file_path=ShotFiles.of(job.folder, shot).picture_name,
             camera=camera,
-            world_from_cam=_pose(order, shot, measured),
+            world_from_cam=_pose(job, shot, measured),
             time_ns=round(shot.time_s * 1e9) if shot.split is Split.DRIVE else None,
         )
         for shot in shots
     ]
 
 
-def _pose(order: RenderJob, shot: Shot, measured: bool) -> Pose:
+def _pose(job: RenderJob, shot: Shot, measured: bool) -> Pose:
     true = shot.camera.world_from_cam
-    return measured_pose(true, order.scene.pose_noise, shot.number) if measured else true
+    return measured_pose(true, job.scene.pose_noise, shot.number) if measured else true
 
 
 def _write(file: Path, pictures: list[WrittenPicture]) -> None:
@@ -112,42 +109,42 @@ ORIGIN_NAME = "build.json"
 STREET = Path(rfedge.street.__file__).parent
 
 
-def origin_of(order: RenderJob) -> dict[str, Any]:
+def origin_of(job: RenderJob) -> dict[str, Any]:
     """Return scene, settings, versions and the digest of the generator's own code.
 
     The code of effects that the scene does not declare is no part of it.
     """
     return {
-        "scene": asdict(order.scene),
-        "size_px": order.size_px,
-        "samples": order.quality.samples,
-        "seed": order.quality.seed,
-        "renderer": order.backend.variant,
+        "scene": asdict(job.scene),
+        "size_px": job.size_px,
+        "samples": job.sampling.samples,
+        "seed": job.sampling.seed,
+        "renderer": job.backend.variant,
         "versions": {name: version(name) for name in ("rfedge", "mitsuba", "pyoidn")},
-        "generator_sha256": _code_digest(order.scene),
+        "generator_sha256": _code_digest(job.scene),
     }
 
 
-def claim_folder(order: RenderJob) -> None:
+def claim_folder(job: RenderJob) -> None:
     """Make the dataset's folder, or check that it holds the same build.
 
     Raises ``InvalidInput`` for a folder of another build, or of something else.
     """
-    origin = json.loads(json.dumps(origin_of(order)))
-    file = order.folder / ORIGIN_NAME
-    if not order.folder.exists() or not any(order.folder.iterdir()):
-        order.folder.mkdir(parents=True, exist_ok=True)
+    origin = json.loads(json.dumps(origin_of(job)))
+    file = job.folder / ORIGIN_NAME
+    if not job.folder.exists() or not any(job.folder.iterdir()):
+        job.folder.mkdir(parents=True, exist_ok=True)
         write_whole(file, json.dumps(origin, indent=1) + "\n")
         return
     try:
         found = json.loads(file.read_text())
     except (OSError, ValueError) as error:
-        raise InvalidInput("out", f"{order.folder} holds no build of a scene") from error
+        raise InvalidInput("out", f"{job.folder} holds no build of a scene") from error
     differing = [key for key in origin if found.get(key) != origin[key]]
     if differing:
         raise InvalidInput(
             "out",
-            f"{order.folder} holds another build (differs in {', '.join(differing)}); remove it or "
+            f"{job.folder} holds another build (differs in {', '.join(differing)}); remove it or "
             "name another folder",
         )
 

@@ -1,13 +1,7 @@
-"""A build from its command to its manifest: cost, progress, what is left to do.
+"""Run a build: estimate its cost, render missing shots in worker processes, report progress.
 
-What a build will take, from what frames took: processor time and room on the disk.
-
-Measured on a busy 2-core x86-64 machine (AVX-512, 2.5 GHz) with Mitsuba 3.9.1 and LLVM 19; other
-machines differ, which is why the progress bar's time left, not this, is to be believed later on.
-
-How far a build is: a bar with the time left on a terminal, a line at each tenth in a log.
-
-Taking shots in this process or in several at once.
+The estimate was measured on a busy 2-core x86-64 machine (AVX-512, 2.5 GHz) with Mitsuba 3.9.1 and
+LLVM 19; on other machines the progress bar's remaining time is the better figure.
 """
 
 from __future__ import annotations
@@ -34,10 +28,9 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.arguments import time_text
 from rfedge.results import host, revision
 from rfedge.street.build.listing import claim_folder, list_dataset, origin_of
-from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
-from rfedge.street.build.shot_files import ShotFiles
+from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer, ShotFiles
 from rfedge.street.render.backend import Backend, chosen_backend
-from rfedge.street.render.renderer import Quality
+from rfedge.street.render.renderer import Sampling
 from rfedge.street.shots import Selection, Shot
 
 __all__ = ["Settings", "build_scene", "cost_line", "show_progress", "take_all"]
@@ -46,17 +39,17 @@ __all__ = ["Settings", "build_scene", "cost_line", "show_progress", "take_all"]
 _renderer: SceneRenderer | None = None
 
 
-def take_all(order: RenderJob, shots: Sequence[Shot], workers: int) -> Iterator[Shot]:
+def take_all(job: RenderJob, shots: Sequence[Shot], workers: int) -> Iterator[Shot]:
     """Take the shots and yield each when its files are written.
 
     Raises ``RfedgeError`` naming the shot that could not be taken; those before it stay valid.
     """
-    taken = _take_here(order, shots) if workers == 1 else _take_apart(order, shots, workers)
+    taken = _take_here(job, shots) if workers == 1 else _take_apart(job, shots, workers)
     yield from taken
 
 
-def _take_here(order: RenderJob, shots: Sequence[Shot]) -> Iterator[Shot]:
-    renderer = SceneRenderer(order)
+def _take_here(job: RenderJob, shots: Sequence[Shot]) -> Iterator[Shot]:
+    renderer = SceneRenderer(job)
     for shot in shots:
         try:
             renderer.take(shot)
@@ -65,9 +58,9 @@ def _take_here(order: RenderJob, shots: Sequence[Shot]) -> Iterator[Shot]:
         yield shot
 
 
-def _take_apart(order: RenderJob, shots: Sequence[Shot], workers: int) -> Iterator[Shot]:
+def _take_apart(job: RenderJob, shots: Sequence[Shot], workers: int) -> Iterator[Shot]:
     pool = ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=_open_renderer, initargs=(order,)
+        workers, mp_context=get_context("spawn"), initializer=_open_renderer, initargs=(job,)
     )
     with pool:
         waiting = {pool.submit(_take, shot): shot for shot in shots}
@@ -83,11 +76,11 @@ def _take_apart(order: RenderJob, shots: Sequence[Shot], workers: int) -> Iterat
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _open_renderer(order: RenderJob) -> None:
+def _open_renderer(job: RenderJob) -> None:
     global _renderer
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _renderer = SceneRenderer(order)
+    _renderer = SceneRenderer(job)
 
 
 def _take(shot: Shot) -> None:
@@ -122,18 +115,18 @@ PIXEL_BYTES = 3.2
 
 
 def cost_line(
-    shots: Sequence[Shot], quality: Quality, backend: Backend, cores: int, workers: int
+    shots: Sequence[Shot], sampling: Sampling, backend: Backend, cores: int, workers: int
 ) -> str:
     """Return one line: how many frames, core time, time on so many cores, room on the disk."""
     pixels = sum(s.camera.intrinsics.width_px * s.camera.intrinsics.height_px for s in shots)
-    pixel_us = quality.samples * SAMPLE_US + PIXEL_US
+    pixel_us = sampling.samples * SAMPLE_US + PIXEL_US
     core_s = 1e-6 * pixels * pixel_us * (1.0 if backend.vectorised else SCALAR_TIMES)
     core_s += START_S * workers
     used = min(cores, workers if not backend.vectorised else cores)
     room_mb = pixels * PIXEL_BYTES / 1e6
     return (
-        f"{len(shots)} frames, {quality.samples} samples a pixel: about {time_text(core_s)} of one "
-        f"core, {time_text(core_s / used)} on {used}, {room_mb:.0f} MB"
+        f"{len(shots)} frames, {sampling.samples} samples a pixel: about {time_text(core_s)} of "
+        f"one core, {time_text(core_s / used)} on {used}, {room_mb:.0f} MB"
     )
 
 
@@ -181,37 +174,37 @@ class Settings:
 
 def build_scene(selection: Selection, settings: Settings, console: Console) -> None:
     """Take the shots that are not there yet, then list all that are."""
-    quality = Quality(settings.samples, selection.scene.geometry.seed)
+    sampling = Sampling(settings.samples, selection.scene.geometry.seed)
     backend = chosen_backend()
     if not backend.vectorised:
         console.print("no LLVM that Mitsuba can use (19 is known to work): scalar_rgb, 3-4x slower")
     cores = len(os.sched_getaffinity(0))
-    order = RenderJob(
+    job = RenderJob(
         scene=selection.scene,
         folder=settings.out,
-        quality=quality,
+        sampling=sampling,
         backend=backend,
         threads=max(cores // settings.workers, 1),
         size_px=selection.size_px,
     )
-    claim_folder(order)
+    claim_folder(job)
     shots = selection.shots()
-    missing = [shot for shot in shots if not ShotFiles.of(order.folder, shot).done]
+    missing = [shot for shot in shots if not ShotFiles.of(job.folder, shot).done]
     if len(missing) < len(shots):
         console.print(f"{len(shots) - len(missing)} of {len(shots)} frames are there already")
     if missing:
-        console.print(cost_line(missing, quality, backend, cores, settings.workers))
-        taken = take_all(order, missing, min(settings.workers, len(missing)))
+        console.print(cost_line(missing, sampling, backend, cores, settings.workers))
+        taken = take_all(job, missing, min(settings.workers, len(missing)))
         show_progress(taken, len(missing), console, time.monotonic)
-    counts = list_dataset(order, _about(order))
+    counts = list_dataset(job, _about(job))
     console.print(f"{settings.out}: " + ", ".join(f"{n} {split}" for split, n in counts.items()))
 
 
-def _about(order: RenderJob) -> dict[str, Any]:
+def _about(job: RenderJob) -> dict[str, Any]:
     command = ["rfedge", *sys.argv[1:]]
     return {
         "command": shlex.join(command),
         "revision": revision(),
         "host": host(),
-        "build": origin_of(order),
+        "build": origin_of(job),
     }

@@ -1,6 +1,9 @@
-"""Taking one shot: render, let the air and the sensor act, write the files.
+"""Render one shot and write its files: picture, depth, classes and surface points.
 
-Surface points that a view sees: pixels taken by chance, carried back to where they came from.
+``SPLIT/images/N.png`` is written last, so that an existing picture means a finished shot. Depth is
+z in millimetres, 16 bit, 0 for none or more than 65.535 m. Classes are the numbers of
+``rfedge.street.geometry.mesh.Label``. The 1000 points a shot are what a LiDAR at the camera would
+measure.
 """
 
 from __future__ import annotations
@@ -8,23 +11,108 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.dataset.source import SourcePoints
-from rfcore.image import Rgb
+from rfcore.dataset.write import write_points
+from rfcore.errors import DatasetError
+from rfcore.files import write_whole
+from rfcore.image import Rgb, write_png
 from rfcore.lens import LensCamera
 from rfedge.street.assembly import apply_effects, world_of
-from rfedge.street.build.shot_files import ShotFiles
 from rfedge.street.frame import LinearFrame, display_rgb
 from rfedge.street.geometry.mesh import F32, Label
 from rfedge.street.render.backend import Backend
-from rfedge.street.render.renderer import Quality, Renderer
+from rfedge.street.render.renderer import Renderer, Sampling
 from rfedge.street.scene_file import Scene
-from rfedge.street.shots import Shot
+from rfedge.street.shots import Shot, Split
 
-__all__ = ["POINTS_PER_VIEW", "RenderJob", "SceneRenderer", "camera_of_pictures", "seen_points"]
+__all__ = [
+    "POINTS_PER_VIEW",
+    "RenderJob",
+    "SceneRenderer",
+    "ShotFiles",
+    "camera_of_pictures",
+    "depth_mm",
+    "read_depth_m",
+    "seen_points",
+]
+
+FARTHEST_MM = 65535
+PLACES = ("images", "depth", "classes", "points")
+
+
+@dataclass(frozen=True)
+class ShotFiles:
+    """Where a shot's files lie."""
+
+    folder: Path
+    split: Split
+    name: str
+
+    @staticmethod
+    def of(folder: Path, shot: Shot) -> ShotFiles:
+        """Return a shot's files in the dataset's folder."""
+        return ShotFiles(folder, shot.split, shot.name)
+
+    @property
+    def picture(self) -> Path:
+        """8-bit RGB."""
+        return self._file("images", "png")
+
+    @property
+    def points(self) -> Path:
+        """Surface points."""
+        return self._file("points", "ply")
+
+    @property
+    def picture_name(self) -> str:
+        """The picture's path in the dataset."""
+        return f"{self.split}/images/{self.name}.png"
+
+    @property
+    def done(self) -> bool:
+        """Whether the shot is finished."""
+        return self.picture.is_file()
+
+    def write(
+        self, rgb: Rgb, depth_m: F32, labels: NDArray[np.uint8], points: SourcePoints
+    ) -> None:
+        """Write all files, each whole or not at all. Raises ``OSError``."""
+        for place in PLACES:
+            (self.folder / self.split / place).mkdir(parents=True, exist_ok=True)
+        write_whole(self._file("depth", "png"), _png_bytes(depth_mm(depth_m)))
+        write_whole(self._file("classes", "png"), _png_bytes(labels))
+        write_points(self.points, points)
+        write_png(self.picture, rgb)
+
+    def _file(self, place: str, suffix: str) -> Path:
+        return self.folder / self.split / place / f"{self.name}.{suffix}"
+
+
+def depth_mm(depth_m: F32) -> NDArray[np.uint16]:
+    """Return z in whole millimetres, 0 for what is farther than 65.535 m."""
+    rounded = np.floor(depth_m.astype(np.float64) * 1000 + 0.5)
+    return np.where(rounded <= FARTHEST_MM, rounded, 0).astype(np.uint16)
+
+
+def read_depth_m(path: Path) -> F32:
+    """Return z in metres float32 [H, W], infinite where the file has none.
+
+    Raises ``DatasetError`` naming the file.
+    """
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if stored is None or stored.dtype != np.uint16 or stored.ndim != 2:
+        raise DatasetError(f"{path}: no 16-bit picture of depths")
+    return np.where(stored == 0, np.inf, stored / 1000).astype(np.float32)
+
+
+def _png_bytes(values: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    _, encoded = cv2.imencode(".png", values)
+    return encoded.tobytes()
 
 
 POINTS_PER_VIEW = 1000
@@ -63,19 +151,19 @@ class RenderJob:
 
     scene: Scene
     folder: Path
-    quality: Quality
+    sampling: Sampling
     backend: Backend
     threads: int
     size_px: tuple[int, int] | None = None
 
 
 class SceneRenderer:
-    """A scene's world, ready to be photographed. One in a process."""
+    """A scene's world loaded into the renderer; a process holds one."""
 
-    def __init__(self, order: RenderJob) -> None:
-        self._order = order
-        world = world_of(order.scene)
-        self._renderer = Renderer(world, order.quality, order.backend, order.threads)
+    def __init__(self, job: RenderJob) -> None:
+        self._job = job
+        world = world_of(job.scene)
+        self._renderer = Renderer(world, job.sampling, job.backend, job.threads)
 
     def take(self, shot: Shot) -> None:
         """Write a shot's files. Raises ``OSError``, and then has left none that is not whole."""
@@ -89,11 +177,11 @@ class SceneRenderer:
             turn_radps=shot.motion.turn_radps,
             labels=view.labels,
         )
-        rng = np.random.default_rng([self._order.quality.seed, shot.number])
+        rng = np.random.default_rng([self._job.sampling.seed, shot.number])
         points = seen_points(shot.camera, display_rgb(rendered), view.depth_m, view.labels, rng)
-        frame = apply_effects(self._order.scene, rendered, shot.number)
+        frame = apply_effects(self._job.scene, rendered, shot.number)
         labels = view.labels if frame.labels is None else frame.labels
-        files = ShotFiles.of(self._order.folder, shot)
+        files = ShotFiles.of(self._job.folder, shot)
         files.write(display_rgb(frame), frame.depth_m, labels, points)
 
 

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["EFFECTS", "Effect", "Stage", "load_effect", "rng_of"]
+__all__ = ["EFFECTS", "Effect", "EffectKind", "load_effect", "rng_of"]
 
 
-class Stage(StrEnum):
+class EffectKind(StrEnum):
     """What an effect changes."""
 
     GEOMETRY = "geometry"
@@ -35,28 +35,28 @@ class Effect:
     """An entry of the registry: the module is ``rfedge.street.effects.<name>``."""
 
     name: str
-    stage: Stage
+    kind: EffectKind
     settings: str
     why: str
 
     @property
     def on_frames(self) -> bool:
         """Whether it changes rendered frames rather than the scene."""
-        return self.stage in (Stage.AIR, Stage.SENSOR)
+        return self.kind in (EffectKind.AIR, EffectKind.SENSOR)
 
 
 EFFECTS = (
-    Effect("parked", Stage.GEOMETRY, "ParkedVehicles", "vehicles stand in the parking bays"),
-    Effect("traffic", Stage.GEOMETRY, "Traffic", "vehicles drive on both lanes"),
-    Effect("dusk", Stage.LIGHT, "Dusk", "the sun is low"),
-    Effect("overcast", Stage.LIGHT, "Overcast", "clouds hide the sun"),
-    Effect("wet_road", Stage.SURFACE, "WetRoad", "water darkens the ground and mirrors"),
-    Effect("haze", Stage.AIR, "Haze", "distant things lose contrast"),
-    Effect("rain", Stage.AIR, "Rain", "falling drops streak over the picture"),
-    Effect("lens", Stage.SENSOR, "LensDistortion", "straight lines bend"),
-    Effect("rolling_shutter", Stage.SENSOR, "RollingShutter", "rows are exposed one by one"),
-    Effect("exposure", Stage.SENSOR, "ExposureDrift", "brightness drifts over a drive"),
-    Effect("noise", Stage.SENSOR, "SensorNoise", "photons and electrons are counted"),
+    Effect("parked", EffectKind.GEOMETRY, "ParkedVehicles", "vehicles stand in the parking bays"),
+    Effect("traffic", EffectKind.GEOMETRY, "Traffic", "vehicles drive on both lanes"),
+    Effect("dusk", EffectKind.LIGHT, "Dusk", "the sun is low"),
+    Effect("overcast", EffectKind.LIGHT, "Overcast", "clouds hide the sun"),
+    Effect("wet_road", EffectKind.SURFACE, "WetRoad", "water darkens the ground and mirrors"),
+    Effect("haze", EffectKind.AIR, "Haze", "distant things lose contrast"),
+    Effect("rain", EffectKind.AIR, "Rain", "falling drops streak over the picture"),
+    Effect("lens", EffectKind.SENSOR, "LensDistortion", "straight lines bend"),
+    Effect("rolling_shutter", EffectKind.SENSOR, "RollingShutter", "rows are exposed one by one"),
+    Effect("exposure", EffectKind.SENSOR, "ExposureDrift", "brightness drifts over a drive"),
+    Effect("noise", EffectKind.SENSOR, "SensorNoise", "photons and electrons are counted"),
 )
 
 

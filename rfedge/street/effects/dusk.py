@@ -1,4 +1,4 @@
-"""Dusk: the sun a hand above the houses' feet, long shadows, warm light under a blue sky."""
+"""Dusk: a sun 6 degrees above the horizon, long shadows, and warm light under a blue sky."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.geometry.sky import Daylight, sunny_sky
 from rfedge.street.geometry.world import World
-from rfedge.street.schema import Range
 
 __all__ = ["Dusk"]
 

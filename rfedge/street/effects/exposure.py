@@ -8,8 +8,8 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.frame import LinearFrame
-from rfedge.street.schema import Range
 
 __all__ = ["ExposureDrift"]
 

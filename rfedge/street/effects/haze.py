@@ -1,7 +1,7 @@
-"""Haze: Koschmieder's law, light is lost with distance and replaced by the air's own.
+"""Haze: light is absorbed over distance and replaced by the colour of the air (Koschmieder's law).
 
-The haze is a level layer: who looks up leaves it after ``layer_m / sin(elevation)``, so that the
-sky overhead keeps some of its looks and the horizon none.
+The haze is a level layer of height ``layer_m``: a ray at elevation e leaves it after
+``layer_m / sin(e)``, so that the zenith stays partly visible and the horizon does not.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.lens import LensCamera
+from rfcore.tables import Range
 from rfedge.street.frame import F32, LinearFrame
-from rfedge.street.schema import Range
 
 __all__ = ["Haze"]
 

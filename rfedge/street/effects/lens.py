@@ -1,7 +1,7 @@
-"""Lens distortion: the frame as a lens would show it, with the camera that belongs to it.
+"""Lens distortion: resamples a pinhole frame as a lens would show it, with the matching camera.
 
-The frame is rendered by a pinhole; the lens's focal length is scaled up until every pixel has a
-source in it, so that there are no blank edges.
+The lens's focal length is scaled up until every output pixel has a source in the pinhole frame, so
+that no edges stay blank.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput
 from rfcore.lens import BrownLens, LensCamera
+from rfcore.tables import Range
 from rfedge.street.frame import F32, LinearFrame, sampled
-from rfedge.street.schema import Range
 
 __all__ = ["LensDistortion"]
 

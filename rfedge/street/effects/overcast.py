@@ -7,9 +7,9 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.geometry.sky import overcast_sky
 from rfedge.street.geometry.world import World
-from rfedge.street.schema import Range
 
 __all__ = ["Overcast"]
 

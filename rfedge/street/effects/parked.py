@@ -7,12 +7,12 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.geometry.layout import BAY_LENGTH_M, Place
 from rfedge.street.geometry.mesh import Mesh
 from rfedge.street.geometry.vehicle import Vehicle, standing, vehicle
-from rfedge.street.geometry.vehicle_material import vehicle_materials
+from rfedge.street.geometry.vehicle_trim import vehicle_materials
 from rfedge.street.geometry.world import Part, World
-from rfedge.street.schema import Range
 
 __all__ = ["ParkedVehicles"]
 

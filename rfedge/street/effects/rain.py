@@ -1,4 +1,4 @@
-"""Rain: drops nearer than what is behind them, drawn as streaks as long as they fall in a frame."""
+"""Rain: streaks of falling drops, as long as the drops fall while the shutter is open."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.frame import F32, LinearFrame
-from rfedge.street.schema import Range
 
 __all__ = ["Rain"]
 
@@ -32,9 +32,9 @@ class Rain:
     brightness: Annotated[float, Range(0, 2)] = 0.6
 
     def apply(self, frame: LinearFrame, rng: np.random.Generator) -> LinearFrame:
-        """Draw the drops over the frame; farther ones first does not matter, they add up.
+        """Draw the drops over the frame; they add up, so their order does not matter.
 
-        As many are at each distance as there is room in the picture: by its square.
+        The number of drops at a distance grows with its square, as the visible volume does.
         """
         height, width = frame.depth_m.shape
         cover = np.zeros((height, width), np.float32)

@@ -1,7 +1,7 @@
-"""Rolling shutter: row by row the camera has moved on.
+"""Rolling shutter: the rows of a picture are exposed one after the other while the camera moves.
 
-To first order in the readout time: what row v shows at its own time is where the point behind the
-pixel stood in the frame, given its depth and the camera's velocity and turn rate at mid-frame.
+First-order model in the readout time: row v shows the point of each pixel where it was at the row's
+own time, given its depth and the camera's velocity and turn rate at mid-frame.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.frame import LinearFrame, sampled
-from rfedge.street.schema import Range
 
 __all__ = ["RollingShutter"]
 

@@ -1,4 +1,4 @@
-"""Moving vehicles: they keep right, hold their speed, and come again when they have left."""
+"""Moving vehicles: they keep right, hold their speed, and re-enter the street after leaving it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.geometry.layout import BEYOND_M, LANE_M
 from rfedge.street.geometry.mesh import F64
 from rfedge.street.geometry.vehicle import Vehicle, vehicle, world_from_vehicle
-from rfedge.street.geometry.vehicle_material import vehicle_materials
+from rfedge.street.geometry.vehicle_trim import vehicle_materials
 from rfedge.street.geometry.world import Mover, Part, World
-from rfedge.street.schema import Range
 
 __all__ = ["Traffic"]
 
@@ -23,7 +23,7 @@ class Traffic:
     """Vehicles by their places at time 0, along x from the middle of the street.
 
     Those of ``along_m`` drive towards +x, as the drive's camera does, those of ``oncoming_m``
-    towards -x. Who puts one where a camera is gets pictures from inside it: nothing brakes.
+    towards -x. Vehicles do not brake: one at the camera's place is seen from inside.
     """
 
     along_m: Annotated[tuple[float, ...], Range(-1000, 1000)] = (-29.0, 17.2, 40.0)

@@ -1,8 +1,8 @@
-"""Wet ground: water darkens it, and where it stands it mirrors the street.
+"""Wet ground: water darkens it, and standing water mirrors the street.
 
-Between full and dry the surface is rough or smooth by patches, because ground is uneven.
-Water in its pores makes stone about half as bright (Lekner and Dorf, "Why some things are darker
-when wet", Applied Optics 1988).
+Smoothness varies in patches between wet and dry, because ground is uneven. Water in its pores makes
+stone about half as bright (Lekner and Dorf, "Why some things are darker when wet", Applied Optics
+1988).
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.geometry.grain import fractal
 from rfedge.street.geometry.mesh import F32, Colour, Material, Texture
 from rfedge.street.geometry.world import World
-from rfedge.street.schema import Range
 
 __all__ = ["WetRoad"]
 

@@ -1,6 +1,6 @@
 """The houses: facades along the street and across its ends, roofs, gables and chimneys.
 
-Walls: bricks in running bond, rendered plaster with streaks of rain, cut stone, roof tiles.
+Wall textures are brick in running bond, plaster with rain streaks, cut stone, and roof tiles.
 """
 
 from __future__ import annotations
@@ -10,11 +10,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from rfedge.street.geometry.facade import Look, facade
+from rfedge.street.geometry.facade import BuildingStyle, facade, rooms
 from rfedge.street.geometry.grain import enlarged, fractal, texture, tinted
 from rfedge.street.geometry.layout import BEYOND_M, Layout, Plot
 from rfedge.street.geometry.mesh import F32, F64, Colour, Label, Material, Mesh, Texture, placed
-from rfedge.street.geometry.opening import rooms
 from rfedge.street.geometry.solids import Stuff, boxes, quads
 from rfedge.street.geometry.world import Part
 
@@ -109,16 +108,16 @@ def buildings(layout: Layout, rng: np.random.Generator) -> Part:
 
 def _house(plot: Plot, world_from_facade: F64) -> list[Mesh]:
     rng = np.random.default_rng(plot.style)
-    look = Look(
+    style = BuildingStyle(
         wall=Stuff(f"wall{rng.integers(0, WALLS)}", Label.BUILDING, WALL_TILE_M),
         frame=Stuff(f"frame{rng.integers(0, len(FRAMES))}", Label.BUILDING),
         door=Stuff(f"door{rng.integers(0, len(DOORS))}", Label.BUILDING),
     )
-    meshes = [*facade(plot, look, rng), *_shell(plot, look), *_roof(plot, rng)]
+    meshes = [*facade(plot, style, rng), *_shell(plot, style), *_roof(plot, rng)]
     return [placed(mesh, world_from_facade) for mesh in meshes]
 
 
-def _shell(plot: Plot, look: Look) -> list[Mesh]:
+def _shell(plot: Plot, style: BuildingStyle) -> list[Mesh]:
     """The gable walls, which show where a neighbour is lower or away, and the back."""
     w, h, d = plot.width_m, plot.height_m, HOUSE_DEPTH_M
     corners = np.array(
@@ -129,10 +128,10 @@ def _shell(plot: Plot, look: Look) -> list[Mesh]:
         ]
     )
     along = corners[..., [2]] + corners[..., [0]]
-    uv = np.concatenate([along, -corners[..., [1]]], axis=2) / look.wall.tile_m
+    uv = np.concatenate([along, -corners[..., [1]]], axis=2) / style.wall.tile_m
     gables = np.array([[(x, h, 0), (x, h + 3, -d / 2), (x, h, -d), (x, h, -d)] for x in (0, w)])
-    gable_uv = np.stack([gables[..., 2], -gables[..., 1]], axis=2) / look.wall.tile_m
-    return [quads(look.wall, corners, uv), quads(look.wall, gables, gable_uv)]
+    gable_uv = np.stack([gables[..., 2], -gables[..., 1]], axis=2) / style.wall.tile_m
+    return [quads(style.wall, corners, uv), quads(style.wall, gables, gable_uv)]
 
 
 def _roof(plot: Plot, rng: np.random.Generator) -> list[Mesh]:

@@ -1,12 +1,10 @@
-"""A layer of cumulus: a block of droplets that repeats over the land, lit through itself.
+"""A layer of cumulus clouds: a periodic block of droplet density and the light scattered in it.
 
-The block is [X, Y, Z] cells over ``EXTENT_M`` of land and ``THICKNESS_M`` of height. It holds a
-smooth field whose positive part is cloud, so that edges stay sharp between cells. Its light is
-found once for the whole block by walking layer by layer towards the sun; a view ray then costs only
-look-ups. Scattering follows Wrenninge, "Oz: the great and volumetric" (SIGGRAPH 2013): later orders
-see a thinner cloud and a rounder phase function.
-
-Looking up values that repeat over the land: fields on cells, sampled between them.
+The block is [X, Y, Z] cells over ``EXTENT_M`` of land and ``THICKNESS_M`` of height and repeats
+over the land. It stores a smooth field whose positive part is cloud, so that edges stay sharp
+between cells. The sun's light is computed once for the whole block, layer by layer towards the sun;
+a view ray then costs only look-ups. Scattering follows Wrenninge, "Oz: the great and volumetric"
+(SIGGRAPH 2013): later orders see a thinner cloud and a rounder phase function.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""Thin things over the street: lamp posts with arms, wires between them and across, railings.
+"""Street furniture: lamp posts, wires, railings and bollards, traffic signs and traffic lights.
 
-Traffic signs, street names and traffic lights, all on posts that reach into the ground.
-
-Each kind of sign hangs on its own post at one of the layout's places, towards who drives up to it.
-Traffic lights stand before the crossings, one over the pavement and one on an arm over the lane.
+Each sign has its own post at one of the layout's places and faces oncoming drivers. Traffic lights
+stand before the crossings, one at the pavement and one on an arm over the lane.
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ import numpy as np
 
 from rfedge.street.geometry.layout import FACADE_M, PAVEMENT_UP_M, SIDES, Layout, Place
 from rfedge.street.geometry.mesh import F32, F64, Label, Material, Mesh, placed
-from rfedge.street.geometry.sign_face import FACES, NAMES, ROUND, face_uv, name_uv, sign_materials
+from rfedge.street.geometry.signage import FACES, NAMES, ROUND, face_uv, name_uv, sign_materials
 from rfedge.street.geometry.solids import Stuff, boxes, disc, quads, tube
 from rfedge.street.geometry.world import Part
 

@@ -1,19 +1,20 @@
-"""Where things are in the street: a plan, drawn from the scene's geometry and seed alone.
+"""Where things are in the street: a plan computed from the scene's geometry and seed alone.
 
-The street runs along x, centred on 0; traffic keeps right, so the lane of who drives along +x lies
-at y < 0. ``side`` is +1 for the left edge of the road (y > 0) and -1 for the right one. From the
-middle outwards: lane, parking bay, kerb, lamps and trees, pavement, facades.
+The street runs along x, centred on 0; traffic keeps right, so the lane towards +x lies at y < 0.
+``side`` is +1 for the left edge of the road (y > 0) and -1 for the right one. From the middle
+outwards: lane, parking bay, kerb, lamps and trees, pavement, facades.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
+from rfcore.tables import Range
 from rfedge.street.geometry.mesh import F64
-from rfedge.street.scene_file import Geometry
 
 __all__ = [
     "BAY_LENGTH_M",
@@ -26,6 +27,7 @@ __all__ = [
     "PAVEMENT_UP_M",
     "ROAD_HALF_M",
     "SIDES",
+    "Geometry",
     "Layout",
     "Place",
     "Plot",
@@ -46,6 +48,18 @@ FASCIA_M = (3.35, 3.95)
 BEYOND_M = 40.0
 """How far road and pavement go on behind the last facades."""
 SIDES = (1, -1)
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """The street. ``tiles`` of ``length_m`` each follow one another."""
+
+    length_m: Annotated[float, Range(20, 1000)] = 120.0
+    tiles: Annotated[int, Range(1, 20)] = 1
+    seed: Annotated[int, Range(0, 2**31)] = 1
+    trees: bool = True
+    signs: bool = True
+    wires: bool = True
 
 
 @dataclass(frozen=True)

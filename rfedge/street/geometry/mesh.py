@@ -1,14 +1,12 @@
-"""Triangle meshes in the street's world frame, and what each of them is.
+"""Triangle meshes in the street's world frame, their classes, and renderer-independent materials.
 
-The world is right-handed and in metres: x along the street, y to the left of who looks along x,
-z up, the road's surface at z = 0. Faces turn anticlockwise seen from outside. ``uv`` is in units of
+The world is right-handed and in metres: x along the street, y to the left when looking along x, z
+up, the road's surface at z = 0. Faces are anticlockwise seen from outside. ``uv`` is in units of
 the texture, which repeats; v = 0 is its first row.
 
-What surfaces are made of, without saying by which renderer.
-
-Colours are linear reflectances; textures are 8-bit with the sRGB curve, as painted. ``gloss`` is a
-clear, perfectly smooth layer over the colour: panes, car paint, enamel. It is what mirrors the
-street without noise, where a rough surface of low roughness would need many samples.
+Colours are linear reflectances; textures are 8-bit with the sRGB curve. ``gloss`` is a clear,
+perfectly smooth layer over the colour (panes, car paint, enamel): it mirrors the street without
+noise, where a surface of low roughness would need many samples.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Road, kerbs, pavements, markings and manholes.
+"""The ground: road, kerbs, pavements, markings and manholes, and their textures.
 
-What one walks and drives on: asphalt with cracks and patches, paving slabs, worn paint.
+Asphalt has cracks and patches, pavements are slabs, and paint is worn.
 """
 
 from __future__ import annotations

@@ -1,19 +1,14 @@
-"""The light over the street: a day with clouds, an evening, an overcast sky.
+"""The light over the street: clear skies with clouds, evenings, overcast skies.
 
-``exposure`` is fixed for each light, as a photographer would set it for the street, not found from
-pictures: frames of one drive stay comparable.
+Row i of a sky picture [H, 2 H, 3] looks (i + 0.5) / H pi away from the zenith, column j
+(j + 0.5) / H pi from x towards y. Radiance is in kcd/m^2, so that irradiance is in klux.
 
-The clear sky and the sun behind the air.
-
-Preetham, Shirley and Smits, "A practical analytic model for daylight", SIGGRAPH 1999: the sky's
-luminance and chromaticity are Perez functions of two angles, with coefficients linear in the
+The clear sky is Preetham, Shirley and Smits, "A practical analytic model for daylight", SIGGRAPH
+1999: luminance and chromaticity are Perez functions of two angles, with coefficients linear in the
 turbidity (2: mountain air, 3: clear, 6: hazy); the sun passes Rayleigh, aerosol and ozone layers.
 
-The dome over the street: which way each pixel of a sky picture looks, and the ground's share.
-
-Angles as in ``world.Sky``: row i of a picture [H, 2 H, 3] looks (i + 0.5) / H pi away from the
-zenith, column j (j + 0.5) / H pi from x towards y. Radiance is in kcd/m^2, so that irradiance is in
-klux.
+``exposure`` is fixed for each light, not derived from pictures, so that the frames of a drive stay
+comparable.
 """
 
 from __future__ import annotations

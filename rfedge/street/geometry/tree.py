@@ -1,9 +1,8 @@
-"""Street trees: a trunk with a flared foot, limbs that fork, and leaves along the last twigs.
+"""Street trees: a trunk with a flared foot, forking limbs, and leaves along the outermost twigs.
 
-A few trees are grown and each is placed several times, turned and scaled; a leaf is a quad bent
-along its midrib, so that it catches the light in two ways.
-
-Bark, leaves and soil, painted once.
+A few trees are grown and each is placed several times, turned and scaled. A leaf is a quad bent
+along its midrib, so that its halves are shaded differently. Bark, leaf and soil textures are
+painted once.
 """
 
 from __future__ import annotations

@@ -1,12 +1,15 @@
-"""The forms of vehicle bodies, as side and plan views are drawn: curves over the length.
+"""The shapes of vehicle bodies, as side and plan views give them: curves over the length.
 
 Stations run from the nose (0) to the tail (``length_m``), heights from the road, both in metres.
-Between the knots curves are monotone cubics (Fritsch and Butland 1984): a roof has no waves.
+Between the knots curves are monotone cubics (Fritsch and Butland 1984), so that they do not
+overshoot.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -61,24 +64,24 @@ class BodyShape:
 
 def curve(knots: Knots, at: ArrayLike) -> F64:
     """Evaluate a monotone cubic through the knots; constant beyond the ends."""
+    (first, _), (last, _) = knots[0], knots[-1]
+    return np.asarray(_spline(knots)(np.clip(np.asarray(at, np.float64), first, last)))
+
+
+@lru_cache(maxsize=64)
+def _spline(knots: Knots) -> Callable[[F64], F64]:
+    """Return SciPy's monotone cubic with the slope of the first and last segment at the ends.
+
+    ``PchipInterpolator`` itself ends with three-point slopes, which would bend noses and tails.
+    """
+    from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
+
     x, y = np.array(knots, np.float64).T
-    steps, slopes = np.diff(x), np.diff(y) / np.diff(x)
-    tangents = np.zeros_like(y)
-    same = slopes[1:] * slopes[:-1] > 0
-    before, after = 2 * steps[1:] + steps[:-1], steps[1:] + 2 * steps[:-1]
-    safe = [np.where(same, part, 1.0) for part in (slopes[:-1], slopes[1:])]
-    mean = (before + after) / (before / safe[0] + after / safe[1])
-    tangents[1:-1] = np.where(same, mean, 0.0)
-    tangents[0], tangents[-1] = slopes[0], slopes[-1]
-    place = np.clip(np.asarray(at, np.float64), x[0], x[-1])
-    i = np.clip(np.searchsorted(x, place, side="right") - 1, 0, len(x) - 2)
-    t, h = (place - x[i]) / steps[i], steps[i]
-    return np.asarray(
-        y[i] * (1 + 2 * t) * (1 - t) ** 2
-        + y[i + 1] * t**2 * (3 - 2 * t)
-        + h * tangents[i] * t * (1 - t) ** 2
-        - h * tangents[i + 1] * t**2 * (1 - t)
-    )
+    slopes = PchipInterpolator(x, y).derivative()(x)
+    segments = np.diff(y) / np.diff(x)
+    slopes[0], slopes[-1] = segments[0], segments[-1]
+    spline: Callable[[F64], F64] = CubicHermiteSpline(x, y, slopes)
+    return spline
 
 
 HATCHBACK = BodyShape(

@@ -1,14 +1,11 @@
-"""All of a street: what stands in it, what moves in it, and the light over it.
-
-What is agreed between the parts:
+"""The whole street: what stands in it, what moves in it, and the light over it.
 
 * A module of ``rfedge.street.geometry`` that adds something offers a function
-  ``(layout, rng) -> Part``: ``tree.trees``, ``sign.signs``, ``road.road``. The layout says where
-  things may stand; the generator is a part's own, so that parts do not disturb each other.
+  ``(layout, rng) -> Part`` (``tree.trees``, ``furniture.signs``, ``road.road``). The layout says
+  where things may stand; each part has its own generator, so that parts do not affect each other.
 * ``sky.clear_sky(rng) -> Sky`` is the light of a scene that names no other.
-* The settings of an effect of the stage geometry, light or surface have
-  ``change(world, rng) -> World``; those of a frame ``apply(frame, rng)``, as before. A ``Part``
-  brings its materials along; two materials of one name must be the same object.
+* The settings of an effect on geometry, light or surfaces have ``change(world, rng) -> World``. A
+  ``Part`` brings its materials along; two materials of one name must be the same object.
 """
 
 from __future__ import annotations

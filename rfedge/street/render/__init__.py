@@ -1,4 +1,4 @@
-"""Rendering a world with Mitsuba 3 and Open Image Denoise; nothing else here knows either.
+"""Render a world with Mitsuba 3 and Open Image Denoise; no other package imports either.
 
-Only the verb that renders imports this package's modules, which need ``rfedge[scene]``.
+Only the command that renders imports this package's modules, which need ``rfedge[scene]``.
 """

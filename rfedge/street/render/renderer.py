@@ -1,9 +1,7 @@
 """One frame of a world: path-traced, denoised, with depth and classes.
 
-Depth and class of what lies exactly behind the middle of each pixel.
-
 Mitsuba's own depth is a distance along rays through random places of a pixel. Here one ray goes
-through the pixel's centre, and its distance becomes z by the cosine to the optical axis.
+through each pixel's centre, and its distance times the cosine to the optical axis is z.
 """
 
 from __future__ import annotations
@@ -19,21 +17,21 @@ from rfcore.errors import InvalidInput
 from rfedge.street.geometry.mesh import F32, F64, Label
 from rfedge.street.geometry.world import World
 from rfedge.street.render.backend import Backend, load_mitsuba
-from rfedge.street.render.stage import Stage
+from rfedge.street.render.mitsuba_scene import MitsubaScene
 
-__all__ = ["Quality", "RenderedView", "Renderer", "cast_pixel_rays"]
+__all__ = ["RenderedView", "Renderer", "Sampling", "cast_pixel_rays"]
 
 
 def cast_pixel_rays(
-    mi: Any, backend: Backend, stage: Stage, camera: Camera
+    mi: Any, backend: Backend, loaded: MitsubaScene, camera: Camera
 ) -> tuple[F32, NDArray[np.uint8]]:
     """Return z in metres float32 [H, W], infinite in the sky, and labels uint8 [H, W]."""
     k = camera.intrinsics
     directions, length = _directions(k)
     turned = directions @ np.array(camera.world_from_cam.rotation_matrix()).T
     cast = _cast_together if backend.vectorised else _cast_one_by_one
-    distance_m, shape = cast(mi, stage, np.array(camera.world_from_cam.translation_m), turned)
-    labels = np.append(stage.labels, Label.SKY)[shape].astype(np.uint8)
+    distance_m, shape = cast(mi, loaded, np.array(camera.world_from_cam.translation_m), turned)
+    labels = np.append(loaded.labels, Label.SKY)[shape].astype(np.uint8)
     depth_m = np.where(labels == Label.SKY, np.inf, distance_m / length).astype(np.float32)
     return depth_m.reshape(k.height_px, k.width_px), labels.reshape(k.height_px, k.width_px)
 
@@ -49,7 +47,7 @@ def _directions(k: Intrinsics) -> tuple[F64, F64]:
 
 
 def _cast_together(
-    mi: Any, stage: Stage, origin: F64, towards: F64
+    mi: Any, loaded: MitsubaScene, origin: F64, towards: F64
 ) -> tuple[F64, NDArray[np.intp]]:
     import drjit
 
@@ -57,23 +55,23 @@ def _cast_together(
         mi.Point3f(*(mi.Float(np.full(len(towards), value, np.float32)) for value in origin)),
         mi.Vector3f(*(mi.Float(towards[:, axis].astype(np.float32)) for axis in range(3))),
     )
-    hit = stage.scene.ray_intersect_preliminary(rays, coherent=True)
+    hit = loaded.scene.ray_intersect_preliminary(rays, coherent=True)
     numbers = np.array(drjit.reinterpret_array(mi.UInt32, hit.shape))
-    known = np.array(drjit.reinterpret_array(mi.UInt32, stage.scene.shapes_dr()))
+    known = np.array(drjit.reinterpret_array(mi.UInt32, loaded.scene.shapes_dr()))
     index_of = np.full(max(known.max(), numbers.max()) + 1, len(known))
     index_of[known] = np.arange(len(known))
     return np.array(hit.t, np.float64), index_of[numbers]
 
 
 def _cast_one_by_one(
-    mi: Any, stage: Stage, origin: F64, towards: F64
+    mi: Any, loaded: MitsubaScene, origin: F64, towards: F64
 ) -> tuple[F64, NDArray[np.intp]]:
-    index_of = {shape.id(): i for i, shape in enumerate(stage.scene.shapes())}
+    index_of = {shape.id(): i for i, shape in enumerate(loaded.scene.shapes())}
     distance_m = np.full(len(towards), np.inf)
     index = np.full(len(towards), len(index_of))
     for i, direction in enumerate(towards):
         ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
-        hit = stage.scene.ray_intersect_preliminary(ray, coherent=True)
+        hit = loaded.scene.ray_intersect_preliminary(ray, coherent=True)
         if hit.is_valid():
             distance_m[i], index[i] = hit.t, index_of[hit.shape.id()]
     return distance_m, index
@@ -87,7 +85,7 @@ NEAR_M, FAR_M = 0.05, 1000.0
 
 
 @dataclass(frozen=True)
-class Quality:
+class Sampling:
     """``samples`` a pixel, a square number for stratification, and the ``seed`` that places them.
 
     The seed is one for all frames: what does not move is then the same in every frame, to the bit.
@@ -115,12 +113,12 @@ class RenderedView:
 class Renderer:
     """Renders views of a world."""
 
-    def __init__(self, world: World, quality: Quality, backend: Backend, threads: int) -> None:
+    def __init__(self, world: World, sampling: Sampling, backend: Backend, threads: int) -> None:
         self._mi = load_mitsuba(backend, threads)
         self._backend = backend
-        self._quality = quality
+        self._sampling = sampling
         self._exposure = np.float32(world.sky.exposure)
-        self._stage = Stage(self._mi, world)
+        self._loaded = MitsubaScene(self._mi, world)
         self._light = self._mi.load_dict(
             {"type": "path", "max_depth": PATH_DEPTH, "rr_depth": 2 * PATH_DEPTH}
         )
@@ -129,25 +127,25 @@ class Renderer:
     def at(self, time_s: float) -> None:
         """Put what moves where it is at that time; ``render`` does so by itself."""
         self._mi.set_variant(self._backend.variant)
-        self._stage.at(time_s)
+        self._loaded.at(time_s)
 
     def render(self, camera: Camera, time_s: float = 0.0) -> RenderedView:
         """Return what the camera sees at that time."""
         self.at(time_s)
         sensor = self._mi.load_dict(_sensor(self._mi, camera))
-        noisy = self._pass(sensor, self._light, self._quality.samples)[..., :3]
+        noisy = self._pass(sensor, self._light, self._sampling.samples)[..., :3]
         guides = self._pass(sensor, self._guides, GUIDE_SAMPLES)[..., -6:]
-        depth_m, labels = cast_pixel_rays(self._mi, self._backend, self._stage, camera)
+        depth_m, labels = cast_pixel_rays(self._mi, self._backend, self._loaded, camera)
         colour = _denoised(noisy, np.clip(guides[..., :3], 0, 1), guides[..., 3:])
         return RenderedView(np.maximum(colour, 0) * self._exposure, depth_m, labels)
 
     def _pass(self, sensor: Any, integrator: Any, samples: int) -> F32:
         rendered = self._mi.render(
-            self._stage.scene,
+            self._loaded.scene,
             sensor=sensor,
             integrator=integrator,
             spp=samples,
-            seed=self._quality.seed,
+            seed=self._sampling.seed,
         )
         return np.nan_to_num(np.array(rendered, np.float32), posinf=0.0, neginf=0.0)
 

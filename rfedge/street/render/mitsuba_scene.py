@@ -1,17 +1,14 @@
-"""A world as a Mitsuba scene: one shape for each material and label, never instances.
+"""A world as a Mitsuba scene: shapes, the sky as environment map, and reflectance models.
 
-83 instances of a tree made a frame seven times slower in the LLVM variant than the same triangles
-baked into one mesh.
+There is one shape for each material and label, never instances: 83 instances of a tree made a frame
+seven times slower in the LLVM variant than the same triangles baked into one mesh.
 
-The sky as Mitsuba's environment map, the sun painted into it.
+The sun is painted into the environment map instead of being a second emitter: the path tracer picks
+one emitter at random for each shadow ray, so that a separate sun would get half of them, whereas a
+map is sampled by its radiance, most of which is the sun's anyway.
 
-One emitter, not two: the path tracer picks an emitter by chance for each shadow ray, so that a
-separate sun would get half of them. A map is sampled by its radiance, which goes to the sun anyway.
-
-Materials as Mitsuba's reflectance models, each seen from both sides.
-
-``plastic`` is what makes glossy surfaces cheap: a mirror over paint needs no more samples than
-paint does, where ``principled`` at a low roughness flickers and looks like clay.
+Glossy surfaces use ``plastic``: a mirror over paint needs no more samples than paint does, where
+``principled`` at a low roughness is noisy.
 """
 
 from __future__ import annotations
@@ -24,7 +21,7 @@ import numpy as np
 from rfedge.street.geometry.mesh import F32, F64, I32, Material, Mesh, joined, placed
 from rfedge.street.geometry.world import Sky, World
 
-__all__ = ["Stage", "environment", "surface", "with_sun"]
+__all__ = ["MitsubaScene", "environment", "surface", "with_sun"]
 
 
 ROWS = 512
@@ -120,7 +117,7 @@ def _roughness(mi: Any, material: Material) -> Any:
     return {"type": "bitmap", "bitmap": bitmap, "raw": True}
 
 
-class Stage:
+class MitsubaScene:
     """A loaded scene. ``at`` moves what moves; ``labels`` says what each shape counts as."""
 
     def __init__(self, mi: Any, world: World) -> None:
