@@ -11,6 +11,7 @@ from rfcore.codec.sender import frame_costs
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.sender.frame_costs import FrameCosts, RateDistortion
 from rfcore.codec.sender.rate import RateModel, RateTarget, bits_curve, estimated_bits
+from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native.warp import BlockCosts
 from rfcore.views import FieldView
@@ -117,3 +118,10 @@ def test_the_estimate_at_one_quality_is_the_curve_there(pair: PairMaker) -> None
     for crf in (10.0, 23.0, 40.0):
         curve = bits_curve(costs, [view.render], crf)
         assert estimated_bits(costs, view.render, crf) == curve.bits[0]
+
+
+@pytest.mark.parametrize("crf", [0.5, 51.5, float("nan")])
+def test_a_quality_that_x264_has_not_is_refused(pair: PairMaker, crf: float) -> None:
+    frame, view = pair(32, 32)
+    with pytest.raises(InvalidInput, match=r"crf: .* is outside 1\.\.51"):
+        estimated_bits(FrameCosts(frame), view.render, crf)

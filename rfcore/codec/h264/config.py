@@ -6,12 +6,11 @@ Options are checked here against closed lists, because x264 ignores an option it
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["CRF_RANGE", "MAX_MACROBLOCKS", "MAX_SIDE_PX", "PRESETS", "CodecConfig"]
+__all__ = ["CRF_RANGE", "MAX_MACROBLOCKS", "MAX_SIDE_PX", "PRESETS", "CodecConfig", "check_crf"]
 
 PRESETS = (
     "ultrafast",
@@ -60,6 +59,13 @@ _LEVELS = (
 to the one before (2, 4.1) or need a constraint flag (1b)."""
 
 
+def check_crf(field: str, crf: float) -> None:
+    """Raise ``InvalidInput`` naming ``field`` unless ``crf`` is within ``CRF_RANGE``."""
+    low, high = CRF_RANGE
+    if not low <= crf <= high:
+        raise InvalidInput(field, f"{crf} is outside {low:g}..{high:g}")
+
+
 @dataclass(frozen=True)
 class CodecConfig:
     """One stream's size and quality. Raises ``InvalidInput`` naming the field that is wrong.
@@ -87,10 +93,7 @@ class CodecConfig:
             )
         if self.preset not in PRESETS:
             raise InvalidInput("codec.preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
-        if not (math.isfinite(self.crf) and CRF_RANGE[0] <= self.crf <= CRF_RANGE[1]):
-            raise InvalidInput(
-                "codec.crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}"
-            )
+        check_crf("codec.crf", self.crf)
 
     @property
     def size_px(self) -> tuple[int, int]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from rfcore.codec.block_means import block_mean_digest
-from rfcore.codec.h264.config import CRF_RANGE, PRESETS, REFERENCE_FRAMES, CodecConfig
+from rfcore.codec.h264.config import PRESETS, REFERENCE_FRAMES, CodecConfig, check_crf
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.h264.pcm_picture import without_zeros
 from rfcore.codec.h264.qp_map import QpMap, check_qp_map
@@ -73,8 +73,8 @@ class FrameChoice:
             raise InvalidInput("preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
         if self.references is not None:
             check_references(self.references)
-        if self.crf is not None and not CRF_RANGE[0] <= self.crf <= CRF_RANGE[1]:
-            raise InvalidInput("crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}")
+        if self.crf is not None:
+            check_crf("crf", self.crf)
         if self.limit_bytes is not None and self.limit_bytes < 1:
             raise InvalidInput("limit_bytes", f"{self.limit_bytes} must be at least 1")
         if not 1 <= self.max_references <= REFERENCE_FRAMES:

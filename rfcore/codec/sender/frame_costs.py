@@ -23,6 +23,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from rfcore.codec.h264.config import check_crf
 from rfcore.image import I420
 from rfcore.native.warp import BLOCK_PX, BlockCosts, block_costs
 
@@ -43,7 +44,8 @@ class RateDistortion:
 
     @staticmethod
     def at(crf: float) -> RateDistortion:
-        """Return the estimate for x264's ``crf``."""
+        """Return the estimate for x264's ``crf``; raise ``InvalidInput`` outside 1..51."""
+        check_crf("crf", crf)
         return RateDistortion(2 ** ((crf - 4) / 6), 0.57 * 2 ** ((crf - 12) / 3))
 
     def bits(self, satd: F64) -> F64:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.codec.h264.config import CRF_RANGE
+from rfcore.codec.h264.config import CRF_RANGE, check_crf
 from rfcore.codec.references import Reference, References
 from rfcore.codec.sender.frame_costs import FrameCosts, RateDistortion
 from rfcore.errors import InvalidInput
@@ -75,17 +75,18 @@ def bits_curve(costs: FrameCosts, pictures: Sequence[I420], lowest_crf: float) -
     Without pictures each block is predicted from its mean. Raises ``InvalidInput`` for a CRF
     outside 1..51.
     """
-    low, high = CRF_RANGE
-    if not low <= lowest_crf <= high:
-        raise InvalidInput("crf", f"{lowest_crf} is outside {low:g}..{high:g}")
-    crfs = np.append(np.arange(lowest_crf, high, CRF_STEP), high)
+    check_crf("crf", lowest_crf)
+    crfs = np.append(np.arange(lowest_crf, CRF_RANGE[1], CRF_STEP), CRF_RANGE[1])
     satd, ssd = _residual(costs, pictures)
     bits = np.array([_coded_bits(satd, ssd, crf) for crf in crfs])
     return BitsCurve(crfs, np.minimum.accumulate(LEAST_BITS + bits))
 
 
 def estimated_bits(costs: FrameCosts, picture: I420, crf: float) -> float:
-    """Estimate a frame's bits at ``crf`` when it is predicted from ``picture``."""
+    """Estimate a frame's bits at ``crf`` when it is predicted from ``picture``.
+
+    Raises ``InvalidInput`` for a CRF outside 1..51.
+    """
     return LEAST_BITS + _coded_bits(*_residual(costs, [picture]), crf)
 
 
