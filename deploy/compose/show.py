@@ -26,7 +26,7 @@ sys.path.insert(0, str(ROOT))
 from rfcore.errors import RfedgeError  # noqa: E402
 from rfedge.dashboards.catalogue import DASHBOARDS  # noqa: E402
 from rfedge.dashboards.grafana import Dashboard, Panel, Unit  # noqa: E402
-from rfedge.results import host, revision  # noqa: E402
+from rfedge.results import make_result, provenance, write_result  # noqa: E402
 
 __all__ = ["filled", "main", "section"]
 
@@ -192,10 +192,7 @@ def measured(shown: list[Shown]) -> dict[str, Any]:
         for one in shown
         for panel in one.dashboard.panels
     }
-    return {
-        "command": "python deploy/compose/show.py",
-        "revision": revision(),
-        "host": host(),
+    content = {
         "docker": said("docker", "version", "--format", "{{.Server.Version}}"),
         "images_bytes": sizes,
         "services": services(),
@@ -204,6 +201,7 @@ def measured(shown: list[Shown]) -> dict[str, Any]:
         "panels": panels,
         "log": log_lines(),
     }
+    return make_result("compose", provenance(command="python deploy/compose/show.py"), content)
 
 
 def section(result: dict[str, Any]) -> str:
@@ -249,7 +247,7 @@ def main() -> None:
         plot(one, ROOT / f"docs/figures/{dashboard.uid}.svg")
         shown.append(one)
     result = measured(shown)
-    (ROOT / "deploy/compose/measured.json").write_text(json.dumps(result, indent=1) + "\n")
+    write_result(ROOT / "deploy/compose/measured.json", result)
     page = ROOT / "docs/operations.md"
     before, _, rest = page.read_text().partition(BEGIN)
     _, _, after = rest.partition(END)

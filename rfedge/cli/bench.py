@@ -28,10 +28,11 @@ class Bench:
 
     def run(self) -> None:
         """Run one case and print its rows."""
-        from rfedge.bench import print_rows, run_case, write_json
+        from rfedge.bench import print_rows, run_case
+        from rfedge.results import write_result
 
         result = run_case(self.case, rows=self.rows, field=self.field)
         if self.json is None:
             print_rows(result)
         else:
-            write_json(result, self.json)
+            write_result(self.json, result)

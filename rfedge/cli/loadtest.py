@@ -34,9 +34,9 @@ class LoadTest:
     deadline_ms: float = 100.0
     """From the moment a picture is due to its Ack."""
     vehicle_ms: float = 0.0
-    """What a canned vehicle waits before sending, for the time a real one needs to encode."""
+    """How long a prerecorded vehicle waits before sending, in place of a real one's encoding."""
     live: Annotated[bool, FlagCreatePairsOff] = False
-    """Vehicles that render and encode (cav-agent processes), instead of coded packets."""
+    """Vehicles that render and encode (cav-agent processes), instead of prerecorded packets."""
     admission: Annotated[bool, FlagCreatePairsOff] = False
     """Let the server refuse vehicles or lower their rate; the verdict is about those let in."""
     find_limit: Annotated[bool, FlagCreatePairsOff] = False
@@ -52,7 +52,7 @@ class LoadTest:
     cache: Path = Path("out/cache/loadtest")
     """Folder that keeps coded drives between runs."""
     record: Path | None = None
-    """Put the rows into this result file, too."""
+    """Also put the rows into this result file, in place of those of the same load."""
 
     def run(self) -> None:
         """Run, write the report, print the rows; fail if the asked number is not held."""
@@ -70,7 +70,7 @@ class LoadTest:
             cameras=self.cameras,
             size_bytes=self.size,
             link=self.link,
-            kind=Vehicles.LIVE if self.live else Vehicles.CANNED,
+            kind=Vehicles.LIVE if self.live else Vehicles.PRERECORDED,
             vehicle_ms=self.vehicle_ms,
             admission=self.admission,
             bounds=Bounds(deadline_ms=self.deadline_ms),

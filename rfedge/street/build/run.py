@@ -13,9 +13,7 @@ Taking shots in this process or in several at once.
 from __future__ import annotations
 
 import os
-import shlex
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -31,7 +29,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from rfcore.errors import InvalidInput, RfedgeError
-from rfedge.results import host, revision
+from rfedge.results import as_json, provenance
 from rfedge.street.build.listing import claim_folder, list_dataset, origin_of
 from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer
 from rfedge.street.build.shot_files import ShotFiles
@@ -208,10 +206,4 @@ def build_scene(selection: Selection, settings: Settings, console: Console) -> N
 
 
 def _about(order: RenderJob) -> dict[str, Any]:
-    command = ["rfedge", *sys.argv[1:]]
-    return {
-        "command": shlex.join(command),
-        "revision": revision(),
-        "host": host(),
-        "build": origin_of(order),
-    }
+    return {**as_json(provenance()), "build": origin_of(order)}
