@@ -1,4 +1,4 @@
-"""The fleet of canned vehicles: one process, one stream (and connection) a vehicle.
+"""The fleet of prerecorded vehicles: one process, one stream (and connection) a vehicle.
 
 ``python -m rfedge.loadtest.fleet SPEC RESULT``: both are JSON. All vehicles connect before the
 first picture is due; their pictures are due at times spread evenly over a period, as those of
