@@ -14,7 +14,7 @@ NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 	load load-transport load-receiver load-full soak soak-short
 
 help:  ## show the targets
-	@awk -F':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: build  ## run the main job: two processes, one field, two drives; writes out/demo
 	$(BIN)/rfedge demo
@@ -82,12 +82,12 @@ operations-figures: build  ## plot every panel of what `make up` started, into d
 	$(BIN)/python deploy/compose/show.py
 
 LOADTEST = $(BIN)/rfedge loadtest --record results/loadtest.json
-load: load-transport load-receiver load-full  ## what two cores carry (`make -k load`; three minutes)
-load-transport: build  ## 100 streams at 30 Hz, pictures not looked at
+load: load-transport load-receiver load-full  ## what two cores carry (`make -k load`, 3 min); writes results/loadtest.json
+load-transport: build  ## 100 streams at 30 Hz, pictures not decoded; writes results/loadtest.json
 	$(LOADTEST) --mode transport --vehicles 100 --hz 30 --out out/loadtest/transport
-load-receiver: build  ## 8 vehicles at 10 Hz, decoded against kept renders
+load-receiver: build  ## 8 vehicles at 10 Hz, decoded against cached renders; writes results/loadtest.json
 	$(LOADTEST) --mode receiver --vehicles 8 --hz 10 --out out/loadtest/receiver
-load-full: build  ## 4 vehicles at 5 Hz, rendered and decoded
+load-full: build  ## 4 vehicles at 5 Hz, rendered and decoded; writes results/loadtest.json
 	$(LOADTEST) --mode full --vehicles 4 --hz 5 --out out/loadtest/full
 
 MINUTES ?= 30
@@ -118,9 +118,11 @@ bench: build  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench train
 	$(BIN)/rfedge bench codec
 
-figures: build  ## regenerate docs/results.md, docs/ladder.md, docs/metrics.md and the dashboards
-	$(BIN)/python -m rfedge.pages.results results > docs/results.md.part
-	mv docs/results.md.part docs/results.md
+results-%: build  ## record `rfedge eval NAME` in results/NAME.json; options in ARGS (docs/evaluation.md)
+	$(BIN)/rfedge eval $* $(ARGS) --out results/$*.json
+
+figures: build  ## redraw docs/ from results/: figures, results.md, ladder.md, metrics.md, dashboards
+	$(BIN)/python -m rfedge.pages.results results docs
 	$(BIN)/python -m rfedge.experiments.ladder.page results docs
 	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
 	mv docs/reliability.md.part docs/reliability.md

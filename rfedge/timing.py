@@ -1,4 +1,4 @@
-"""Medians of repeated calls on a monotonic clock."""
+"""Median durations of repeated calls, on a monotonic clock."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ sys.path.insert(0, str(ROOT))
 from rfcore.errors import RfedgeError  # noqa: E402
 from rfedge.dashboards.catalogue import DASHBOARDS  # noqa: E402
 from rfedge.dashboards.grafana import Dashboard, Panel, Unit  # noqa: E402
-from rfedge.results import host, revision  # noqa: E402
+from rfedge.results import make_result, provenance, write_result  # noqa: E402
 
 __all__ = ["filled", "legend_text", "main", "section"]
 
@@ -229,10 +229,7 @@ def measured(dashboards: list[DashboardData]) -> dict[str, Any]:
         for data in dashboards
         for panel in data.dashboard.panels
     }
-    return {
-        "command": "python deploy/compose/show.py",
-        "revision": revision(),
-        "host": host(),
+    content = {
         "load_average": round(os.getloadavg()[1], 1),
         "docker": docker,
         "images_bytes": image_sizes() if docker else {},
@@ -245,6 +242,7 @@ def measured(dashboards: list[DashboardData]) -> dict[str, Any]:
         "frames": ended_frames(),
         "panels": panels,
     }
+    return make_result("compose", provenance(command="python deploy/compose/show.py"), content)
 
 
 def section(result: dict[str, Any]) -> str:
@@ -301,7 +299,7 @@ def main() -> None:
     result = measured(dashboards)
     for data in dashboards:
         plot(data, ROOT / f"docs/figures/{data.dashboard.uid}.svg")
-    (ROOT / "deploy/compose/measured.json").write_text(json.dumps(result, indent=1) + "\n")
+    write_result(ROOT / "deploy/compose/measured.json", result)
     page = ROOT / "docs/operations.md"
     before, _, rest = page.read_text().partition(BEGIN)
     _, _, after = rest.partition(END)

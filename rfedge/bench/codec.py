@@ -29,7 +29,7 @@ from rfcore.raster.native import Rasterizer
 from rfcore.views import FieldView
 from rfedge.bench.street import street_camera, street_gaussians
 
-__all__ = ["codec_rows"]
+__all__ = ["CodecRow", "codec_rows"]
 
 T = TypeVar("T")
 
@@ -62,12 +62,23 @@ class CodecSetup:
         return field_view_from_view(self.rasterizer.render(camera), camera)
 
 
-def codec_rows() -> list[dict[str, Any]]:
-    """Return a row for each number of threads, size and number of references: medians in ms of both
-    ends' stages."""
+@dataclass(frozen=True)
+class CodecRow:
+    """One number of threads, size and number of references: median ms of each stage."""
+
+    threads: int
+    width: int
+    height: int
+    references: int
+    sender_ms: Mapping[str, float]
+    receiver_ms: Mapping[str, float]
+
+
+def codec_rows() -> list[CodecRow]:
+    """Return a row for each number of threads, size and number of references."""
     gaussians = street_gaussians()
     return [
-        {"threads": threads, **_row(_setup(rasterizer, threads, *size), references)}
+        _row(_setup(rasterizer, threads, *size), threads, references)
         for threads, rasterizer in ((n, Rasterizer(gaussians, threads=n)) for n in THREADS)
         for size in SIZES_PX
         for references in (ONE, THREE)
@@ -93,7 +104,7 @@ def _camera_frame(colour: np.ndarray[Any, np.dtype[np.float32]]) -> I420:
     return i420_from_rgb(np.clip(rgb, 0, 255).astype(np.uint8))
 
 
-def _row(setup: CodecSetup, references: References) -> dict[str, Any]:
+def _row(setup: CodecSetup, threads: int, references: References) -> CodecRow:
     sender: dict[str, list[float]] = {}
     receiver: dict[str, list[float]] = {}
     send_state, receive_state = setup.encoder.start(1), setup.decoder.start(1)
@@ -115,13 +126,14 @@ def _row(setup: CodecSetup, references: References) -> dict[str, Any]:
             _note(sender, render_ms, total_ms, encoded.stage_ns)
             _note(receiver, render_ms, decode_ms, decoded.stage_ns)
     k = setup.camera.intrinsics
-    return {
-        "width": k.width_px,
-        "height": k.height_px,
-        "references": len(references),
-        "sender_ms": {stage: statistics.median(ms) for stage, ms in sender.items()},
-        "receiver_ms": {stage: statistics.median(ms) for stage, ms in receiver.items()},
-    }
+    return CodecRow(
+        threads=threads,
+        width=k.width_px,
+        height=k.height_px,
+        references=len(references),
+        sender_ms={stage: statistics.median(ms) for stage, ms in sender.items()},
+        receiver_ms={stage: statistics.median(ms) for stage, ms in receiver.items()},
+    )
 
 
 def _timed(call: Callable[[], T]) -> tuple[float, T]:

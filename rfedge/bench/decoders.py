@@ -1,8 +1,9 @@
-"""What a decoder in a process of its own costs a frame: the sample drive, decoded side by side.
+"""Time the decoder in this process, in a child process, and in a child inside a sandbox.
 
-Every frame (640x360, the references the encoder chose) is decoded by each kind in turn against the
-same render, so that a difference is of two pictures decoded in the same moments; the decoder itself
-refuses a picture that is not the sender's. Times are of ``DeltaDecoder.decode``, renders apart.
+Every frame of the sample drive (640x360, the references that the encoder chose) is decoded by each
+kind in turn against the same render, so that a difference compares decodes under the same load of
+the machine; the decoder itself refuses a picture that is not the sender's. Times are of
+``DeltaDecoder.decode``, without the render.
 """
 
 from __future__ import annotations
@@ -10,9 +11,9 @@ from __future__ import annotations
 import statistics
 import tempfile
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter_ns
-from typing import Any
 
 from prometheus_client import CollectorRegistry
 
@@ -26,17 +27,27 @@ from rfcore.views import FieldView
 from rfcore.wire.messages import Frame
 from rfedge.loadtest.prerecorded import PrerecordedDrive, prerecorded_drive
 
-__all__ = ["decoder_rows"]
+__all__ = ["DecoderRow", "decoder_rows"]
 
 FIELD = Path("samples/fields/street.rff")
 DRIVE = Path("samples/street/transforms_drive_vehicles.json")
 KINDS = (DecoderKind.IN_PROCESS, DecoderKind.CHILD, DecoderKind.BUBBLEWRAP)
 LAPS = 5
-"""How often the drive is decoded, after once to warm up."""
+"""How many times the drive is decoded, after one pass to warm up."""
 
 
-def decoder_rows() -> list[dict[str, Any]]:
-    """Return a row for each place to decode: median ms, and the median difference to here."""
+@dataclass(frozen=True)
+class DecoderRow:
+    """One place to decode in; ``more_ms`` is the median difference to decoding in this process."""
+
+    decoder: str
+    frames: int
+    median_ms: float
+    more_ms: float
+
+
+def decoder_rows() -> list[DecoderRow]:
+    """Return a row for each place to decode in."""
     field = load_field(FIELD)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
         drive = PrerecordedDrive.read(prerecorded_drive(DRIVE, field, Path(folder)))
@@ -44,12 +55,12 @@ def decoder_rows() -> list[dict[str, Any]]:
         times_ms = _times(drive, field, decoders)
     here_ms = times_ms[DecoderKind.IN_PROCESS]
     return [
-        {
-            "decoder": str(kind),
-            "frames": len(ms),
-            "median_ms": statistics.median(ms),
-            "more_ms": statistics.median(a - b for a, b in zip(ms, here_ms, strict=True)),
-        }
+        DecoderRow(
+            decoder=str(kind),
+            frames=len(ms),
+            median_ms=statistics.median(ms),
+            more_ms=statistics.median(a - b for a, b in zip(ms, here_ms, strict=True)),
+        )
         for kind, ms in times_ms.items()
     ]
 

@@ -4,18 +4,13 @@ The field learns the sample street for a fixed number of iterations first, so th
 surfaces as in use; or it is a trained one of that street. Before anything is timed, a small picture
 must follow the reference in float64: every pixel within 2e-5, but for those where a sample rounds
 across the face of a cell.
-
-``samples_per_ray`` is what was evaluated, ``budget`` what was asked for (null: unhurried).
-``psnr_to_reference_db`` compares with the unhurried picture (null: it is that one), ``held_out_db``
-with pictures the field was not trained on. ``torch_ms_scaled`` is the reference's time on a crop,
-scaled to the picture by its pixels: an estimate, not a measurement.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter_ns
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +26,7 @@ from rfcore.train import NgpTrainer, NgpTrainingConfig
 from rfcore.views import PosedPicture
 from rfedge.timing import median_ms
 
-__all__ = ["check_against_reference", "ngp_rows"]
+__all__ = ["NgpRow", "check_against_reference", "ngp_rows"]
 
 STREET = Path("samples/street")
 ITERATIONS = 600
@@ -49,7 +44,29 @@ MAX_FLIPPED = 0.02
 HELD_OUT_EVERY = 8
 
 
-def ngp_rows(field: Path | None = None) -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class NgpRow:
+    """One picture size, number of threads and budget of samples along a ray."""
+
+    width: int
+    height: int
+    threads: int
+    frame_ms: float
+    """Median."""
+    samples_per_ray: float
+    """Mean of what was evaluated."""
+    psnr_to_reference_db: float | None
+    """Against the picture without a budget; None for that one, and for one that equals it."""
+    budget: int | None
+    """Samples along a ray that were asked for; None: as many as the field needs."""
+    isa: str
+    held_out_db: float
+    """PSNR against pictures the field was not trained on."""
+    torch_ms_scaled: float
+    """The reference's time on a small picture, scaled by the pixels: an estimate."""
+
+
+def ngp_rows(field: Path | None = None) -> list[NgpRow]:
     """Return a row per size, number of threads and budget, of ``field`` or of one made here.
 
     Raises ``DatasetError`` without the sample street (run it from the repository),
@@ -63,9 +80,9 @@ def ngp_rows(field: Path | None = None) -> list[dict[str, Any]]:
     quality_db = {n: _held_out_db(NgpRenderer(numbers, threads=2), held_out, n) for n in BUDGETS}
     rows = []
     for size, threads, budget in CASES:
-        row = _row(NgpRenderer(numbers, threads=threads), _resized(camera, size), budget)
         torch_ms = _torch_ms(numbers, _resized(camera, CHECK_SIZE_PX), size)
-        rows.append({**row, "held_out_db": quality_db[budget], "torch_ms_scaled": torch_ms})
+        renderer = NgpRenderer(numbers, threads=threads)
+        rows.append(_row(renderer, _resized(camera, size), budget, (quality_db[budget], torch_ms)))
     return rows
 
 
@@ -99,23 +116,30 @@ def _loaded(path: Path) -> NgpParameters:
     return field.numbers
 
 
-def _row(renderer: NgpRenderer, camera: Camera, budget: int | None) -> dict[str, Any]:
+def _row(
+    renderer: NgpRenderer, camera: Camera, budget: int | None, beside: tuple[float, float]
+) -> NgpRow:
+    """Time ``renderer``; ``beside`` holds ``held_out_db`` and ``torch_ms_scaled``."""
     size = camera.intrinsics
     picture = renderer.render_colour(camera, budget)
     samples = renderer.samples / (size.width_px * size.height_px)
     to_reference = None
     if budget is not None:
-        to_reference = psnr(_shown(picture), _shown(renderer.render_colour(camera)), peak=1.0)
-    return {
-        "width": size.width_px,
-        "height": size.height_px,
-        "threads": renderer.threads,
-        "frame_ms": median_ms(lambda: renderer.render_colour(camera, budget)),
-        "samples_per_ray": round(samples, 2),
-        "psnr_to_reference_db": to_reference,
-        "budget": budget,
-        "isa": renderer.isa,
-    }
+        exact = _shown(renderer.render_colour(camera))
+        same = np.array_equal(_shown(picture), exact)
+        to_reference = None if same else psnr(_shown(picture), exact, peak=1.0)
+    return NgpRow(
+        width=size.width_px,
+        height=size.height_px,
+        threads=renderer.threads,
+        frame_ms=median_ms(lambda: renderer.render_colour(camera, budget)),
+        samples_per_ray=round(samples, 2),
+        psnr_to_reference_db=to_reference,
+        budget=budget,
+        isa=renderer.isa,
+        held_out_db=beside[0],
+        torch_ms_scaled=beside[1],
+    )
 
 
 def _held_out_db(

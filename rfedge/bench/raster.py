@@ -3,22 +3,18 @@
 Before anything is timed, a small picture must follow the reference in float64: every pixel within
 1e-5, but for those where an alpha or a transmittance rounds across a threshold.
 
-Timed is the colour picture alone, what both ends of the codec predict from; depth and opacity on
-top of it take 7 % longer at 640x360 and 25 % at 1920x1080.
-
-What the specialisations of the renderer save and cost, as ratios within one run.
-
-Every mode is a kernel of its own: SH degree, antialiasing, depth and opacity are decided once a
-picture. The modes take turns, one picture each a round, so that a ratio is of pictures drawn in
-the same moments; ``ratio`` is to colour alone with all three degrees.
+``raster_rows`` times the colour picture alone, which is what both ends of the codec predict from;
+depth and opacity beside it take 7 % longer at 640x360 and 25 % at 1920x1080. ``mode_rows`` compares
+the kernels that are compiled for one setting each (SH degree, antialiasing, depth and opacity).
+They render in turns, one picture each a round, so that a ratio compares pictures rendered under the
+same load of the machine.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter_ns
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,33 +23,55 @@ from rfcore.camera import Camera
 from rfcore.errors import RfedgeError
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
-from rfedge.bench.results import Rows
+from rfedge.bench import Rows
 from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.timing import median_ms, medians_ms
 
-__all__ = ["BASELINE", "check_against_reference", "mode_rows", "raster_rows"]
+__all__ = [
+    "BASELINE",
+    "ModeRow",
+    "RasterRow",
+    "check_against_reference",
+    "mode_rows",
+    "raster_rows",
+]
 
 
 MODE_SIZES_PX = ((300, 168), (640, 360), (1920, 1080))
 BASELINE = "degree 3"
 
 
-def mode_rows(gaussians: Gaussians) -> list[dict[str, Any]]:
-    """Return one row per size and mode, on one thread."""
+@dataclass(frozen=True)
+class ModeRow:
+    """One kernel at one size, on one thread; times are medians."""
+
+    width: int
+    height: int
+    gaussians: int
+    isa: str
+    mode: str
+    native_ms: float
+    ratio: float
+    """``native_ms`` over that of colour alone with all three SH degrees."""
+
+
+def mode_rows() -> list[ModeRow]:
+    """Return one row per size and mode; raise ``RfedgeError`` when the renderer is wrong."""
+    gaussians = _checked_street()
     rasterizers = _rasterizers(gaussians)
     rows = []
     for width, height in MODE_SIZES_PX:
         medians = medians_ms(_modes(rasterizers, street_camera(width, height)))
         rows += [
-            {
-                "width": width,
-                "height": height,
-                "gaussians": len(gaussians),
-                "isa": rasterizers["plain"].isa,
-                "mode": mode,
-                "native_ms": native_ms,
-                "ratio": native_ms / medians[BASELINE],
-            }
+            ModeRow(
+                width=width,
+                height=height,
+                gaussians=len(gaussians),
+                isa=rasterizers["plain"].isa,
+                mode=mode,
+                native_ms=native_ms,
+                ratio=native_ms / medians[BASELINE],
+            )
             for mode, native_ms in medians.items()
         ]
     return rows
@@ -90,17 +108,29 @@ MAX_FLIPPED = 0.01
 """Share of pixels that may differ by more: each takes about 50 comparisons with a threshold."""
 
 
-def raster_rows(rows: Rows = "all") -> list[dict[str, Any]]:
-    """Return one row per size and number of threads; ``native`` leaves the reference out.
+@dataclass(frozen=True)
+class RasterRow:
+    """One size and number of threads; times are medians, None where the reference was not run."""
 
-    ``modes`` returns those of ``rfedge.bench.raster`` instead.
+    width: int
+    height: int
+    gaussians: int
+    visible: int
+    blends_per_px: float
+    threads: int
+    isa: str
+    native_ms: float
+    reference_ms: float | None
+    max_abs_error: float | None
+    """Largest difference of a colour from the reference, of a range of 0..1."""
+
+
+def raster_rows(rows: Rows = "all") -> list[RasterRow]:
+    """Return one row per size and number of threads; ``native`` leaves the reference out.
 
     Raises ``RfedgeError`` when the renderer is wrong.
     """
-    gaussians = street_gaussians()
-    check_against_reference(gaussians, street_camera(*CHECK_SIZE_PX))
-    if rows == "modes":
-        return mode_rows(gaussians)
+    gaussians = _checked_street()
     rasterizers = [Rasterizer(gaussians, threads=threads) for threads in THREADS]
     result = []
     for size in SIZES_PX:
@@ -109,8 +139,14 @@ def raster_rows(rows: Rows = "all") -> list[dict[str, Any]]:
             reference_ms, error = _against_reference(gaussians, rasterizers[0], size)
         for rasterizer in rasterizers:
             row = _native_row(rasterizer, size, len(gaussians))
-            result.append({**row, "reference_ms": reference_ms, "max_abs_error": error})
+            result.append(replace(row, reference_ms=reference_ms, max_abs_error=error))
     return result
+
+
+def _checked_street() -> Gaussians:
+    gaussians = street_gaussians()
+    check_against_reference(gaussians, street_camera(*CHECK_SIZE_PX))
+    return gaussians
 
 
 def check_against_reference(gaussians: Gaussians, camera: Camera) -> None:
@@ -136,19 +172,21 @@ def _reference_colour(gaussians: Gaussians, camera: Camera) -> NDArray[np.float6
     return picture
 
 
-def _native_row(rasterizer: Rasterizer, size: tuple[int, int], count: int) -> dict[str, Any]:
+def _native_row(rasterizer: Rasterizer, size: tuple[int, int], count: int) -> RasterRow:
     camera = street_camera(*size)
     statistics = rasterizer.statistics(camera)
-    return {
-        "width": size[0],
-        "height": size[1],
-        "gaussians": count,
-        "visible": statistics.visible,
-        "blends_per_px": round(statistics.blends_per_px, 3),
-        "threads": rasterizer.threads,
-        "isa": rasterizer.isa,
-        "native_ms": median_ms(lambda: rasterizer.render_colour(camera)),
-    }
+    return RasterRow(
+        width=size[0],
+        height=size[1],
+        gaussians=count,
+        visible=statistics.visible,
+        blends_per_px=round(statistics.blends_per_px, 3),
+        threads=rasterizer.threads,
+        isa=rasterizer.isa,
+        native_ms=median_ms(lambda: rasterizer.render_colour(camera)),
+        reference_ms=None,
+        max_abs_error=None,
+    )
 
 
 def _against_reference(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.timing import median_ms
 
-__all__ = ["check_gradients", "train_rows"]
+__all__ = ["TrainRow", "check_gradients", "train_rows"]
 
 SIZES_PX = ((640, 360),)
 THREADS = (1, 2)
@@ -26,7 +26,18 @@ TOLERANCE = 1e-3
 """Relative, in norm; a pixel on a threshold may take part. The tests hold 1e-4 without those."""
 
 
-def train_rows() -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class TrainRow:
+    """One picture size and number of threads; ``iteration_ms`` is a median."""
+
+    width: int
+    height: int
+    gaussians: int
+    threads: int
+    iteration_ms: float
+
+
+def train_rows() -> list[TrainRow]:
     """Return one row per size and number of threads; raise ``RfedgeError`` on wrong gradients."""
     check_gradients()
     gaussians = street_gaussians()
@@ -60,19 +71,19 @@ def check_gradients() -> None:
             )
 
 
-def _row(gaussians: Gaussians, size: tuple[int, int], threads: int) -> dict[str, Any]:
+def _row(gaussians: Gaussians, size: tuple[int, int], threads: int) -> TrainRow:
     trainable, camera, target = (
         TrainableRasterizer(gaussians, threads=threads),
         street_camera(*size),
         _target(size),
     )
-    return {
-        "width": size[0],
-        "height": size[1],
-        "gaussians": len(gaussians),
-        "threads": threads,
-        "iteration_ms": median_ms(lambda: trainable.iterate(camera, target, RATES)),
-    }
+    return TrainRow(
+        width=size[0],
+        height=size[1],
+        gaussians=len(gaussians),
+        threads=threads,
+        iteration_ms=median_ms(lambda: trainable.iterate(camera, target, RATES)),
+    )
 
 
 def _target(size: tuple[int, int]) -> F32:

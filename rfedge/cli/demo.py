@@ -48,7 +48,7 @@ class Demo:
         from rich.console import Console
 
         from rfedge.demo import DemoSettings, run_demo
-        from rfedge.demo.report import print_table, write_report
+        from rfedge.demo.report import print_summary, write_report
         from rfedge.training.run import training_config
 
         console = Console()
@@ -67,5 +67,5 @@ class Demo:
         )
         run = run_demo(settings, console)
         write_report(self.out / "report.html", run.result, run.pictures)
-        print_table(console, run.result, self.out)
+        print_summary(console, run.result, self.out)
         run.require_complete()

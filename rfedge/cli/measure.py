@@ -36,14 +36,15 @@ class Bench:
 
     def run(self) -> None:
         """Run one case and print its rows."""
-        from rfedge.bench import print_rows, run_case, write_json
+        from rfedge.bench import print_rows, run_case
+        from rfedge.results import write_result
 
         field = field_path(self.field) if self.field is not None else None
         result = run_case(self.case, rows=self.rows, field=field)
         if self.json is None:
             print_rows(result)
         else:
-            write_json(result, self.json)
+            write_result(self.json, result)
 
 
 @dataclass(frozen=True)
@@ -69,9 +70,9 @@ class LoadTest:
     deadline_ms: float = 100.0
     """From the moment a picture is due to its Ack."""
     vehicle_ms: float = 0.0
-    """What a canned vehicle waits before sending, for the time a real one needs to encode."""
+    """How long a prerecorded vehicle waits before sending, in place of a real one's encoding."""
     live: bool = False
-    """Vehicles that render and encode (cav-agent processes), instead of coded packets."""
+    """Vehicles that render and encode (cav-agent processes), instead of prerecorded packets."""
     admission: bool = False
     """Let the server refuse vehicles or lower their rate; the verdict is about those let in."""
     find_limit: bool = False
@@ -87,7 +88,7 @@ class LoadTest:
     cache: Annotated[Path, FOLDER] = Path("out/cache/loadtest")
     """Folder that keeps coded drives between runs."""
     record: Annotated[Path | None, JSON] = None
-    """Put the rows into this result file, too."""
+    """Also put the rows into this result file, in place of those of the same load."""
 
     def run(self) -> None:
         """Run, write the report, print the rows; fail if the asked number is not held."""
@@ -105,7 +106,7 @@ class LoadTest:
             cameras=self.cameras,
             size_bytes=self.size,
             link=self.link,
-            kind=Vehicles.LIVE if self.live else Vehicles.CANNED,
+            kind=Vehicles.LIVE if self.live else Vehicles.PRERECORDED,
             vehicle_ms=self.vehicle_ms,
             admission=self.admission,
             bounds=Bounds(deadline_ms=self.deadline_ms),

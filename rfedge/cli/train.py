@@ -92,7 +92,7 @@ class Train:
 
         from rfcore.errors import InvalidInput
         from rfcore.field import save_field
-        from rfedge.bench.results import write_json
+        from rfedge.results import write_result
         from rfedge.training.finish import training_result
         from rfedge.training.run import train
 
@@ -113,7 +113,7 @@ class Train:
         console.print(f"{self.out}: field {field_id}, {trained.primitives:,} primitives")
         result = training_result(job, trained, field, self.out)
         if self.json is not None:
-            write_json(result, self.json)
+            write_result(self.json, result)
         if self.report is not None:
             from rfedge.training.report import write_training_report
 

@@ -1,4 +1,4 @@
-"""The main job: a vehicle, a link and a roadside server as processes, on two drives."""
+"""The demo: a vehicle, a link and a roadside server as processes, on the two sample drives."""
 
 from rfedge.demo.run import DemoRun, DemoSettings, run_demo
 

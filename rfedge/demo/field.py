@@ -1,15 +1,8 @@
-"""The trained field that ships beside a sample, and how it is made: ``make sample-field``.
+"""The field of the demo: the one that ships beside the sample, or one trained anew and kept.
 
-Beside ``samples/street`` lie ``samples/fields/street.rff``, ``street.json``, the record of what
-made it from what, and ``manifest.json``, the digests of both.
-
-``make sample-field``: train the field of a sample and put it beside the sample.
-
-The demo's field: the one that ships with the sample, or one trained anew and kept.
-
-A sample ``samples/street`` may have a field ``samples/fields/street.rff``, with a manifest and a
-record of how it was made (``rfedge.demo.field``). It is used unless the user asks for
-training or for settings of their own.
+Beside ``samples/street`` lie ``samples/fields/street.rff``, ``street.json``, the record of how the
+field was made, and ``manifest.json``, the digests of both; ``make sample-field`` makes them. The
+shipped field is used unless the user asks for training, or for settings of their own.
 """
 
 from __future__ import annotations
@@ -18,7 +11,7 @@ import hashlib
 import json
 import os
 import sys
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from time import monotonic
 from typing import Annotated, Any
@@ -34,14 +27,13 @@ from rfcore.files import write_whole
 from rfcore.train import DensityControl, SplatTrainingConfig
 from rfcore.train.levels import LevelFitConfig
 from rfedge.demo.make_sample import run_maker
-from rfedge.results import host, revision
+from rfedge.results import Provenance, make_result, provenance, write_result
 from rfedge.training.finish import finish_field
 from rfedge.training.run import TrainingJob, train_field, training_config
 
 __all__ = [
     "FieldChoice",
     "MakeSampleField",
-    "Making",
     "cache_path",
     "check_sample_field",
     "choose_field",
@@ -77,17 +69,10 @@ def check_sample_field(sample: Path) -> None:
         raise DatasetError(f"{path}: made from another {sample}; run {COMMAND}, or use --train")
 
 
-@dataclass(frozen=True)
-class Making:
-    """How a field was made: by which command, at which revision, in how long."""
-
-    command: str
-    revision: str
-    seconds: int
-
-
-def write_sample_field(sample: Path, field: SplatField, making: Making) -> int:
+def write_sample_field(sample: Path, field: SplatField, made: Provenance, seconds: int) -> int:
     """Write the field, its record and the manifest; return the field's size in bytes.
+
+    ``made`` and ``seconds`` go into the record: how the field was made, and in what time.
 
     Raises ``InvalidData`` for one too large to ship, and leaves what was there.
     """
@@ -96,18 +81,16 @@ def write_sample_field(sample: Path, field: SplatField, making: Making) -> int:
         raise InvalidData(f"{path}: {len(data)} bytes are over the {MAX_BYTES} a sample may take")
     path.parent.mkdir(exist_ok=True)
     write_whole(path, data)
-    record = _record(sample, field, making) | {"bytes": len(data)}
-    write_whole(path.with_suffix(".json"), json.dumps(record, indent=1) + "\n")
+    record = {**_record(sample, field), "seconds": seconds, "bytes": len(data)}
+    write_result(path.with_suffix(".json"), make_result("sample-field", made, record))
     write_manifest(path.parent)
     return len(data)
 
 
-def _record(sample: Path, field: SplatField, making: Making) -> dict[str, Any]:
+def _record(sample: Path, field: SplatField) -> dict[str, Any]:
     metadata = field.metadata
     return {
         "field": f"splats {field.field_id}",
-        **asdict(making),
-        "host": host(),
         "sample_manifest_sha256": _manifest_digest(sample),
         "training_digest": metadata.training_digest,
         "held_out": {"psnr_db": metadata.held_out_psnr_db, "ssim": metadata.held_out_ssim},
@@ -137,10 +120,10 @@ class MakeSampleField:
     def run(self) -> None:
         """Make it; raise ``RfedgeError`` when the sample is damaged or the field too large."""
         verify_manifest(self.sample)
-        console, started_s, made_by = Console(), monotonic(), revision()
+        console, started_s, made = Console(), monotonic(), provenance(command=self._command())
         field = trained_field(self.sample, self._config(), console)
-        making = Making(self._command(), made_by, round(monotonic() - started_s))
-        size_bytes = write_sample_field(self.sample, field, making)
+        seconds = round(monotonic() - started_s)
+        size_bytes = write_sample_field(self.sample, field, made, seconds)
         path = sample_field_path(self.sample)
         print(f"{path}: {size_bytes / 1e6:.2f} MB, field {field.field_id}")
 

@@ -2,9 +2,8 @@
 
 The training views become JPEG files, whose loss a trainer does not notice; the drives stay lossless
 (WebP), because a lossily coded "camera" would flatter every coding figure. The manifest says which
-commands and revision rendered the pictures.
-
-The commands behind ``make sample`` and ``make sample-field``.
+commands and revision rendered the pictures. ``run_maker`` is the command line of this maker and of
+``make sample-field``.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
-"""Measure one drive of the demo: what the server showed against what the camera saw.
+"""Measure one drive of the demo: the server's pictures against the camera's.
 
 All PSNR and SSIM figures are means over pictures of the RGB metric on the true size, against the
-camera's own pixels, for the reconstruction, for the render, and for the intra baseline alike.
+camera's own pixels, for the reconstruction, for the render, and for what it is compared with.
 
-Savings at equal quality: what the camera frames cost as I pictures of the same PSNR.
-
-An intra curve holds the mean bytes and mean quality of frames coded as I pictures at several CRFs.
-Between its points, log(bytes) is interpolated linearly over the quality in decibels, as rate
-curves of video are close to straight there. Outside its points it says nothing.
+Two savings at equal PSNR are measured: against the camera frames coded as I pictures, and against
+low-delay x264 tuned for PSNR, which predicts each frame from the one before. Both rivals are coded
+at several CRFs; between these, log(bytes) is interpolated linearly over the quality in decibels,
+as rate curves of video are close to straight there. Nothing is said outside them.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,15 +27,19 @@ from rfcore.image import I420, Rgb
 from rfcore.metrics import psnr, ssim
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfedge.experiments.paper.published import paper_savings_percent, slice_nals
+from rfedge.experiments.rivals import Rival, x264_for_psnr
 
 __all__ = [
+    "DriveFigures",
     "DriveOutcome",
     "FrameAddress",
-    "IntraPoint",
+    "FrameFigures",
     "Pictures",
+    "RatePoint",
     "intra_curve",
     "luma_psnr_db",
     "measure_drive",
+    "rival_curve",
     "saving_at_equal_psnr",
 ]
 
@@ -45,8 +49,8 @@ Quality = Callable[[I420, I420], float]
 
 
 @dataclass(frozen=True)
-class IntraPoint:
-    """Means over the frames: slice bytes without start codes, and the quality in decibels."""
+class RatePoint:
+    """Means over the frames at one CRF: bytes, and the quality in decibels."""
 
     crf: float
     mean_bytes: float
@@ -60,19 +64,39 @@ def luma_psnr_db(a: I420, b: I420) -> float:
 
 def intra_curve(
     frames: Sequence[I420], preset: str, crfs: Sequence[float], quality: Quality = luma_psnr_db
-) -> tuple[IntraPoint, ...]:
+) -> tuple[RatePoint, ...]:
     """Code each frame as an I picture at each CRF; one point per CRF, best quality first.
 
-    ``quality`` compares (decoded, frame) in decibels and must be the measure the saving is asked
-    for. Raises ``InvalidInput`` without frames, or for what ``CodecConfig`` refuses.
+    Bytes are those of the slices, without start codes. ``quality`` compares (decoded, frame) in
+    decibels and must be the measure the saving is asked for.
+
+    Raises ``InvalidInput`` without frames, or for what ``CodecConfig`` refuses.
     """
     if not frames:
         raise InvalidInput("frames", "an intra curve needs at least one frame")
     return tuple(_point(frames, preset, crf, quality) for crf in sorted(crfs))
 
 
-def saving_at_equal_psnr(curve: Sequence[IntraPoint], coded_bytes: float, psnr_db: float) -> float:
-    """Return 100 (1 - coded_bytes / intra bytes at the same ``psnr_db``), in percent.
+def rival_curve(
+    frames: Sequence[I420], rival: Rival, rate_hz: float, crfs: Sequence[float], quality: Quality
+) -> tuple[RatePoint, ...]:
+    """Code the frames as one clip at each CRF, as ``intra_curve`` does; bytes are whole packets.
+
+    Raises ``InvalidInput`` without frames, ``CodecError`` if the encoder fails or delays a frame.
+    """
+    if not frames:
+        raise InvalidInput("frames", "a rate curve needs at least one frame")
+    points = []
+    for crf in sorted(crfs):
+        made = rival.pictures(frames, rate_hz, crf)
+        qualities = [quality(*pair) for pair in zip(made.decoded, frames, strict=True)]
+        point = RatePoint(crf, float(np.mean(made.frame_bytes)), float(np.mean(qualities)))
+        points.append(point)
+    return tuple(points)
+
+
+def saving_at_equal_psnr(curve: Sequence[RatePoint], coded_bytes: float, psnr_db: float) -> float:
+    """Return 100 (1 - coded_bytes / the curve's bytes at the same ``psnr_db``), in percent.
 
     Raises ``InvalidInput`` for fewer than 4 points, a curve that is not strictly rising in both
     bytes and quality, or a quality outside it.
@@ -90,13 +114,13 @@ def saving_at_equal_psnr(curve: Sequence[IntraPoint], coded_bytes: float, psnr_d
         raise InvalidInput(
             "psnr_db",
             f"{psnr_db:.2f} dB at {coded_bytes:g} bytes is outside the curve's "
-            f"{qualities[0]:.2f}..{qualities[-1]:.2f} dB; code I pictures at more CRFs",
+            f"{qualities[0]:.2f}..{qualities[-1]:.2f} dB; code the rival at more CRFs",
         )
-    intra_bytes = math.exp(float(np.interp(psnr_db, qualities, log_bytes)))
-    return 100.0 * (1.0 - coded_bytes / intra_bytes)
+    curve_bytes = math.exp(float(np.interp(psnr_db, qualities, log_bytes)))
+    return 100.0 * (1.0 - coded_bytes / curve_bytes)
 
 
-def _point(frames: Sequence[I420], preset: str, crf: float, quality: Quality) -> IntraPoint:
+def _point(frames: Sequence[I420], preset: str, crf: float, quality: Quality) -> RatePoint:
     config = CodecConfig(*frames[0].size_px, preset=preset, crf=crf)
     options = EncoderOptions(config.coded_size_px, preset, crf, params={"keyint": "1"})
     units = encode_pictures(options, [(frame, PictureKind.I) for frame in frames])
@@ -106,7 +130,7 @@ def _point(frames: Sequence[I420], preset: str, crf: float, quality: Quality) ->
         quality(_cropped(decoder.decode(unit), config), frame)
         for unit, frame in zip(units, frames, strict=True)
     ]
-    return IntraPoint(crf, float(np.mean(sizes)), float(np.mean(qualities)))
+    return RatePoint(crf, float(np.mean(sizes)), float(np.mean(qualities)))
 
 
 def _cropped(picture: I420, config: CodecConfig) -> I420:
@@ -117,6 +141,7 @@ def _cropped(picture: I420, config: CodecConfig) -> I420:
 FrameAddress = tuple[int, int]
 """(epoch, sequence)"""
 INTRA_CRFS = (14.0, 18.0, 22.0, 26.0, 30.0, 34.0)
+X264_CRFS = (10.0, *INTRA_CRFS, 38.0)
 
 
 @dataclass(frozen=True)
@@ -131,7 +156,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class DriveOutcome:
-    """What the processes reported of one drive.
+    """What the processes reported of one drive, and how it was coded.
 
     ``agent_rows``: one mapping a frame, in order, from the agent's report; ``server_digests``: the
     digest of each picture the server wrote; ``link``: the link's report;
@@ -146,45 +171,100 @@ class DriveOutcome:
     wrong_street: Rgb
     preset: str
     crf: float
+    rate_hz: float
 
 
-def measure_drive(outcome: DriveOutcome) -> dict[str, Any]:
-    """Return the drive's entry of ``result.json``."""
+@dataclass(frozen=True)
+class FrameFigures:
+    """One frame: bytes, quality of reconstruction and render, and where the time went."""
+
+    name: str
+    sequence: int
+    payload_bytes: int
+    packet_bytes: int
+    psnr_db: float
+    ssim: float
+    rf_psnr_db: float
+    """Of the render, as ``rf_psnr_db`` of a drive."""
+    latency_ms: float
+    """From the picture in memory to its Ack."""
+    stage_ms: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class DriveFigures:
+    """One drive. Bytes are sums, qualities means over the frames that were reconstructed."""
+
+    frames: int
+    frames_reconstructed: int
+    digest_matches: int
+    payload_bytes: int
+    packet_bytes: int
+    wire_bytes: int
+    """What the link carried from the vehicle."""
+    psnr_db: float
+    ssim: float
+    rf_psnr_db: float
+    paper_savings_percent: float
+    """100 I / (I + P) of a two-frame clip; below, with renders that know nothing of the place."""
+    paper_savings_percent_wrong_street: float
+    paper_savings_percent_grey: float
+    saving_vs_intra_percent: float
+    """At equal PSNR against I pictures."""
+    latency_ms: Mapping[str, float]
+    """By percentile, ``p50`` and ``p99``."""
+    link_tau_error_percent: float
+    stage_ms: Mapping[str, float]
+    """Medians."""
+    per_frame: Sequence[FrameFigures]
+    saving_vs_x264_percent: float | None = None
+    """At equal PSNR against low-delay x264; None in results from before it was measured."""
+    x264_setting: str | None = None
+
+
+def measure_drive(outcome: DriveOutcome) -> DriveFigures:
+    """Return the drive's entry of ``result.json``.
+
+    Raises ``InvalidInput`` when the reconstruction's quality is outside what a rival reaches.
+    """
     rows = {row["name"]: row for row in outcome.agent_rows}  # a lost picture is captured again
     frames = [_measure_frame(rows[pictures.name], pictures) for pictures in outcome.pictures]
-    packet_bytes = sum(frame["packet_bytes"] for frame in frames)
-    psnr_db = statistics.fmean(frame["psnr_db"] for frame in frames)
-    return {
-        "frames": len(rows),
-        "frames_reconstructed": len(outcome.pictures),
-        "digest_matches": _digest_matches(outcome),
-        "payload_bytes": sum(frame["payload_bytes"] for frame in frames),
-        "packet_bytes": packet_bytes,
-        "wire_bytes": outcome.link["uplink"]["bytes"],
-        "psnr_db": psnr_db,
-        "ssim": statistics.fmean(frame["ssim"] for frame in frames),
-        "rf_psnr_db": statistics.fmean(frame["rf_psnr_db"] for frame in frames),
+    packet_bytes = sum(frame.packet_bytes for frame in frames)
+    psnr_db = statistics.fmean(frame.psnr_db for frame in frames)
+    rivals = Rivals.of(outcome)
+    return DriveFigures(
+        frames=len(rows),
+        frames_reconstructed=len(outcome.pictures),
+        digest_matches=_digest_matches(outcome),
+        payload_bytes=sum(frame.payload_bytes for frame in frames),
+        packet_bytes=packet_bytes,
+        wire_bytes=outcome.link["uplink"]["bytes"],
+        psnr_db=psnr_db,
+        ssim=statistics.fmean(frame.ssim for frame in frames),
+        rf_psnr_db=statistics.fmean(frame.rf_psnr_db for frame in frames),
         **_published_metric(outcome),
-        "saving_vs_intra_percent": _saving_vs_intra(outcome, packet_bytes, psnr_db),
-        "latency_ms": _percentiles([frame["latency_ms"] for frame in frames]),
-        "link_tau_error_percent": outcome.link["uplink"]["tau_error_percent"],
-        "stage_ms": _median_stages(frames),
-        "per_frame": frames,
-    }
+        saving_vs_intra_percent=rivals.saving_vs_intra(packet_bytes / len(frames), psnr_db),
+        latency_ms=_percentiles([frame.latency_ms for frame in frames]),
+        link_tau_error_percent=outcome.link["uplink"]["tau_error_percent"],
+        stage_ms=_median_stages(frames),
+        per_frame=frames,
+        saving_vs_x264_percent=rivals.saving_vs_x264(packet_bytes / len(frames), psnr_db),
+        x264_setting=rivals.x264.name,
+    )
 
 
-def _measure_frame(row: Mapping[str, Any], pictures: Pictures) -> dict[str, Any]:
-    return {
-        "name": pictures.name,
-        "sequence": row["sequence"],
-        "payload_bytes": row["payload_bytes"],
-        "packet_bytes": row["packet_bytes"],
-        "psnr_db": psnr(pictures.reconstruction, pictures.camera),
-        "ssim": ssim(pictures.reconstruction, pictures.camera),
-        "rf_psnr_db": psnr(pictures.render, pictures.camera),
-        "latency_ms": row["latency_ms"],
-        "stage_ms": row["stage_ms"],
-    }
+def _measure_frame(row: Mapping[str, Any], pictures: Pictures) -> FrameFigures:
+    return FrameFigures(
+        name=pictures.name,
+        sequence=row["sequence"],
+        payload_bytes=row["payload_bytes"],
+        packet_bytes=row["packet_bytes"],
+        psnr_db=psnr(pictures.reconstruction, pictures.camera),
+        ssim=ssim(pictures.reconstruction, pictures.camera),
+        rf_psnr_db=psnr(pictures.render, pictures.camera),
+        latency_ms=row["latency_ms"],
+        stage_ms=row["stage_ms"],
+    )
 
 
 def _digest_matches(outcome: DriveOutcome) -> int:
@@ -216,27 +296,55 @@ def _published_metric(outcome: DriveOutcome) -> dict[str, float]:
     }
 
 
-def _saving_vs_intra(outcome: DriveOutcome, packet_bytes: int, psnr_db: float) -> float:
-    """Bytes saved against the camera coded as I pictures of the same mean RGB PSNR.
+@dataclass(frozen=True)
+class Rivals:
+    """The camera frames of a drive, coded by others at the drive's preset and rate."""
 
-    Ours are whole packets, theirs bare slices: no header is held against the I pictures.
-    """
-    cameras = {
-        i420_from_rgb(pictures.camera).digest(): pictures.camera for pictures in outcome.pictures
-    }
+    cameras: Sequence[Rgb]
+    preset: str
+    rate_hz: float
 
-    def rgb_psnr_db(decoded: I420, frame: I420) -> float:
-        return psnr(rgb_from_i420(decoded), cameras[frame.digest()])
+    @staticmethod
+    def of(outcome: DriveOutcome) -> Rivals:
+        """Return the rivals of what a drive sent."""
+        cameras = [pictures.camera for pictures in outcome.pictures]
+        return Rivals(cameras, outcome.preset, outcome.rate_hz)
 
-    frames = [i420_from_rgb(pictures.camera) for pictures in outcome.pictures]
-    curve = intra_curve(frames, outcome.preset, INTRA_CRFS, rgb_psnr_db)
-    return saving_at_equal_psnr(curve, packet_bytes / len(frames), psnr_db)
+    @property
+    def x264(self) -> Rival:
+        """Low-delay x264, tuned for the measure it is compared by."""
+        return x264_for_psnr(self.preset)
+
+    def saving_vs_intra(self, packet_bytes: float, psnr_db: float) -> float:
+        """Return the bytes saved against I pictures of the same mean RGB PSNR, in percent.
+
+        Ours are whole packets, theirs bare slices: no header is held against the I pictures.
+        """
+        curve = intra_curve(self._frames, self.preset, INTRA_CRFS, self._rgb_psnr_db)
+        return saving_at_equal_psnr(curve, packet_bytes, psnr_db)
+
+    def saving_vs_x264(self, packet_bytes: float, psnr_db: float) -> float:
+        """Return the bytes saved against x264 likewise; every frame counts, the first too."""
+        curve = rival_curve(self._frames, self.x264, self.rate_hz, X264_CRFS, self._rgb_psnr_db)
+        return saving_at_equal_psnr(curve, packet_bytes, psnr_db)
+
+    @cached_property
+    def _frames(self) -> list[I420]:
+        return [i420_from_rgb(camera) for camera in self.cameras]
+
+    @cached_property
+    def _camera_of(self) -> dict[bytes, Rgb]:
+        digests = (frame.digest() for frame in self._frames)
+        return dict(zip(digests, self.cameras, strict=True))
+
+    def _rgb_psnr_db(self, decoded: I420, frame: I420) -> float:
+        return psnr(rgb_from_i420(decoded), self._camera_of[frame.digest()])
 
 
-def _median_stages(frames: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+def _median_stages(frames: Sequence[FrameFigures]) -> dict[str, float]:
     return {
-        stage: statistics.median(frame["stage_ms"][stage] for frame in frames)
-        for stage in frames[0]["stage_ms"]
+        stage: statistics.median(frame.stage_ms[stage] for frame in frames)
+        for stage in frames[0].stage_ms
     }
 
 

@@ -1,8 +1,6 @@
-"""Fill the report's template: tables, charts and pictures, all inside one file.
+"""The report of a demo: one HTML file with tables, charts and pictures.
 
-The rows of a demo's tables, shared by the page, the terminal and the docs.
-
-The summary table on the terminal.
+Its tables are also what the terminal and the results page show of the same ``result.json``.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rfcore.files import write_whole
-from rfedge.demo.measure import Pictures
+from rfedge.demo.measure import DriveFigures, FrameFigures, Pictures
 from rfedge.report.charts import (
     DIFFERENCE_GAIN,
     amplified_difference,
@@ -26,86 +24,126 @@ from rfedge.report.charts import (
     quality_chart,
     stages_chart,
 )
+from rfedge.report.tables import heading
+from rfedge.report.tables import table as markdown_table
+from rfedge.results import Result, as_json, rows_of
 
-__all__ = ["METRIC", "SUMMARY", "print_table", "write_report"]
-
-
-Entry = Mapping[str, Any]
-
-
-def _frames(key: str) -> Callable[[Entry], str]:
-    return lambda entry: f"{entry[key]} of {entry['frames']}"
+__all__ = ["METRIC", "SUMMARY", "demo_section", "figures_of", "print_summary", "write_report"]
 
 
-def _kilobytes(entry: Entry) -> str:
-    return " / ".join(
-        f"{entry[key] / 1e3:.1f}" for key in ("payload_bytes", "packet_bytes", "wire_bytes")
-    )
+def figures_of(result: Result) -> dict[str, DriveFigures]:
+    """Return the figures of each drive in a demo's result; raises as ``rows_of``."""
+    sequences = result["sequences"]
+    drives = rows_of(DriveFigures, sequences.values())
+    return dict(zip(sequences, drives, strict=True))
 
 
-def _latency(entry: Entry) -> str:
-    return f"{entry['latency_ms']['p50']:.0f} / {entry['latency_ms']['p99']:.0f} ms"
+def _of_frames(count: int, drive: DriveFigures) -> str:
+    return f"{count} of {drive.frames}"
 
 
-SUMMARY: tuple[tuple[str, str, Callable[[Entry], str]], ...] = (
-    ("Frames reconstructed", "of those sent", _frames("frames_reconstructed")),
+def _kilobytes(drive: DriveFigures) -> str:
+    sizes = (drive.payload_bytes, drive.packet_bytes, drive.wire_bytes)
+    return " / ".join(f"{size / 1e3:.1f}" for size in sizes)
+
+
+def _latency(drive: DriveFigures) -> str:
+    return f"{drive.latency_ms['p50']:.0f} / {drive.latency_ms['p99']:.0f} ms"
+
+
+def _saving_vs_x264(drive: DriveFigures) -> str:
+    saving = drive.saving_vs_x264_percent
+    return "not measured" if saving is None else f"{saving:.1f} %"
+
+
+SUMMARY: tuple[tuple[str, str, Callable[[DriveFigures], str]], ...] = (
+    (
+        "Frames reconstructed",
+        "of those sent",
+        lambda drive: _of_frames(drive.frames_reconstructed, drive),
+    ),
     (
         "Digests that match",
         "server's picture = vehicle's closed loop, byte for byte",
-        _frames("digest_matches"),
+        lambda drive: _of_frames(drive.digest_matches, drive),
     ),
     (
         "Quality of the reconstruction",
         "mean RGB PSNR; SSIM",
-        lambda entry: f"{entry['psnr_db']:.2f} dB; {entry['ssim']:.3f}",
+        lambda drive: f"{drive.psnr_db:.2f} dB; {drive.ssim:.3f}",
     ),
-    (
-        "Quality of the render alone",
-        "mean RGB PSNR",
-        lambda entry: f"{entry['rf_psnr_db']:.2f} dB",
-    ),
+    ("Quality of the render alone", "mean RGB PSNR", lambda drive: f"{drive.rf_psnr_db:.2f} dB"),
     ("Payload / packet / wire", "kB over the drive", _kilobytes),
     (
         "Saving against I pictures",
         "at equal PSNR, whole packets",
-        lambda entry: f"{entry['saving_vs_intra_percent']:.1f} %",
+        lambda drive: f"{drive.saving_vs_intra_percent:.1f} %",
+    ),
+    (
+        "Saving against low-delay x264",
+        "at equal PSNR, whole packets, tuned for PSNR, same preset",
+        _saving_vs_x264,
     ),
     (
         "Savings as published",
         "100·I/(I+P) of a two-frame clip",
-        lambda entry: f"{entry['paper_savings_percent']:.1f} %",
+        lambda drive: f"{drive.paper_savings_percent:.1f} %",
     ),
     ("Latency", "picture in memory to acknowledged, p50 / p99", _latency),
     (
         "Link timing error",
         "measured busy time against bytes / throughput",
-        lambda entry: f"{entry['link_tau_error_percent']:+.2f} %",
+        lambda drive: f"{drive.link_tau_error_percent:+.2f} %",
     ),
 )
-METRIC: tuple[tuple[str, str], ...] = (
-    ("the field's render", "paper_savings_percent"),
-    ("a render of another place on the street", "paper_savings_percent_wrong_street"),
-    ("a grey picture", "paper_savings_percent_grey"),
+"""Label, note and value of each row of the summary."""
+METRIC: tuple[tuple[str, Callable[[DriveFigures], float]], ...] = (
+    ("the field's render", lambda drive: drive.paper_savings_percent),
+    (
+        "a render of another place on the street",
+        lambda drive: drive.paper_savings_percent_wrong_street,
+    ),
+    ("a grey picture", lambda drive: drive.paper_savings_percent_grey),
 )
+"""The published metric with renders that know ever less of the place."""
 
 
-def print_table(console: Console, result: Mapping[str, Any], out: Path) -> None:
-    """Print the report's summary table and where the files are."""
-    sequences = result["sequences"]
+def print_summary(console: Console, result: Result, out: Path) -> None:
+    """Print the summary and where the files are."""
+    drives = figures_of(result)
     table = Table(title="Vehicle to edge server", title_justify="left")
     table.add_column("")
-    for name in sequences:
+    for name in drives:
         table.add_column(name, justify="right")
     for label, note, show in SUMMARY:
-        table.add_row(f"{label}\n[dim]{note}[/]", *(show(entry) for entry in sequences.values()))
+        table.add_row(f"{label}\n[dim]{note}[/]", *(show(drive) for drive in drives.values()))
     console.print(table)
     for name in ("report.html", "reconstructed.mp4", "result.json"):
         console.print(f"  {out / name}")
 
 
-def write_report(
-    path: Path, result: Mapping[str, Any], pictures: Mapping[str, Sequence[Pictures]]
-) -> None:
+def demo_section(path: Path, result: Result) -> str:
+    """Return the summary and the published metric as a section of the results page."""
+    drives = figures_of(result)
+    rows = [
+        [f"{label} ({note})", *(show(drive) for drive in drives.values())]
+        for label, note, show in SUMMARY
+    ]
+    rows += [
+        [f"100·I/(I+P) with {label}", *(f"{show(drive):.1f} %" for drive in drives.values())]
+        for label, show in METRIC
+    ]
+    settings, field = result["settings"], result["field"]
+    facts = (
+        f"Field of {field['gaussians']:,} Gaussians, {field['held_out_psnr_db']:.2f} dB on the "
+        f"held-out empty drive; x264 {settings['preset']}, CRF {settings['crf']:g}, "
+        f"{settings['rate_hz']:g} Hz, link {settings['link_bps'] / 1e6:g} Mbit/s and "
+        f"{settings['link_delay_ms']:g} ms."
+    )
+    return "\n\n".join([heading(path, result), facts, markdown_table(["", *drives], rows), ""])
+
+
+def write_report(path: Path, result: Result, pictures: Mapping[str, Sequence[Pictures]]) -> None:
     """Write the page of one demo run.
 
     ``result`` is the content of ``result.json``; ``pictures`` the frames of each of its sequences.
@@ -113,56 +151,71 @@ def write_report(
     environment = Environment(
         loader=PackageLoader("rfedge.demo", "."), autoescape=True, undefined=StrictUndefined
     )
-    sequences = result["sequences"]
+    drives = figures_of(result)
     page = environment.get_template("report.html.j2").render(
-        headline=_headline(sequences),
+        headline=_headline(drives),
         result=result,
         summary=[
-            {"label": label, "note": note, "values": [show(s) for s in sequences.values()]}
+            {"label": label, "note": note, "values": [show(drive) for drive in drives.values()]}
             for label, note, show in SUMMARY
         ],
         metric_rows=[
-            {"label": label, "values": [f"{s[key]:.1f}" for s in sequences.values()]}
-            for label, key in METRIC
+            {"label": label, "values": [f"{show(drive):.1f}" for drive in drives.values()]}
+            for label, show in METRIC
         ],
-        sequences=[_sequence(name, sequences[name], pictures[name]) for name in sequences],
+        sequences=[_sequence(name, drive, pictures[name]) for name, drive in drives.items()],
         provenance=json.dumps(
-            {key: result[key] for key in ("command", "revision", "host", "settings", "field")},
+            {
+                key: result[key]
+                for key in ("command", "revision", "dirty", "host", "settings", "field")
+            },
             indent=2,
         ),
     )
     write_whole(path, page)
 
 
-def _headline(sequences: Mapping[str, Any]) -> str:
-    parts = [f"{s['saving_vs_intra_percent']:.0f} % ({name})" for name, s in sequences.items()]
-    return "Fewer bytes than I pictures at equal quality: " + ", ".join(parts)
+def _headline(drives: Mapping[str, DriveFigures]) -> str:
+    savings = (
+        ("I pictures", {name: d.saving_vs_intra_percent for name, d in drives.items()}),
+        ("low-delay x264", {name: d.saving_vs_x264_percent for name, d in drives.items()}),
+    )
+    parts = []
+    for rival, percent in savings:
+        known = [f"{value:.0f} % ({name})" for name, value in percent.items() if value is not None]
+        if known:
+            parts.append(f"than {rival}: {', '.join(known)}")
+    return "Fewer bytes at equal quality " + "; ".join(parts)
 
 
-def _sequence(name: str, entry: Mapping[str, Any], pictures: Sequence[Pictures]) -> dict[str, Any]:
-    frames = entry["per_frame"]
+def _sequence(name: str, drive: DriveFigures, pictures: Sequence[Pictures]) -> dict[str, Any]:
+    frames = rows_of(FrameFigures, as_json(drive.per_frame))
     return {
         "name": name,
-        "bytes_svg": bytes_chart(frames),
-        "quality_svg": quality_chart(frames),
-        "stages_svg": stages_chart(entry["stage_ms"]),
+        "bytes_svg": bytes_chart(
+            [frame.payload_bytes for frame in frames], [frame.packet_bytes for frame in frames]
+        ),
+        "quality_svg": quality_chart(
+            [frame.psnr_db for frame in frames], [frame.rf_psnr_db for frame in frames]
+        ),
+        "stages_svg": stages_chart(drive.stage_ms),
         "strips": [_strip(frames[i], pictures[i]) for i in _shown(frames)],
     }
 
 
-def _shown(frames: Sequence[Mapping[str, Any]]) -> list[int]:
+def _shown(frames: Sequence[FrameFigures]) -> list[int]:
     """First frame, the worst one, the last one."""
-    worst = min(range(len(frames)), key=lambda i: frames[i]["psnr_db"])
+    worst = min(range(len(frames)), key=lambda i: frames[i].psnr_db)
     return sorted({0, worst, len(frames) - 1})
 
 
-def _strip(frame: Mapping[str, Any], pictures: Pictures) -> dict[str, Any]:
+def _strip(frame: FrameFigures, pictures: Pictures) -> dict[str, Any]:
     difference = amplified_difference(pictures.reconstruction, pictures.camera)
     captions = (
         (f"camera, frame {pictures.name}", pictures.camera),
-        (f"render, {frame['rf_psnr_db']:.1f} dB", pictures.render),
+        (f"render, {frame.rf_psnr_db:.1f} dB", pictures.render),
         (
-            f"reconstruction, {frame['psnr_db']:.1f} dB, {frame['packet_bytes']:,} bytes",
+            f"reconstruction, {frame.psnr_db:.1f} dB, {frame.packet_bytes:,} bytes",
             pictures.reconstruction,
         ),
         (f"difference to the camera × {DIFFERENCE_GAIN}", difference),

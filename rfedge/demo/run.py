@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,19 @@ from rfcore.camera import Camera
 from rfcore.dataset import Dataset, read_dataset, verify_manifest
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField, load_field, render_field_view
-from rfcore.files import write_whole
 from rfcore.image import Rgb, read_rgb
 from rfcore.native.yuv import rgb_from_i420
 from rfcore.train import SplatTrainingConfig
 from rfedge.demo.field import FieldChoice, choose_field
-from rfedge.demo.measure import DriveOutcome, FrameAddress, Pictures, measure_drive
+from rfedge.demo.measure import (
+    DriveFigures,
+    DriveOutcome,
+    FrameAddress,
+    Pictures,
+    measure_drive,
+)
 from rfedge.demo.processes import command_of, run_to_end, service
-from rfedge.results import host, revision
+from rfedge.results import make_result, provenance, write_result
 from rfedge.video import write_mp4
 
 __all__ = ["DRIVES", "DemoRun", "DemoSettings", "run_demo"]
@@ -89,7 +93,7 @@ def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
     _empty_folder(settings.out)
     field = load_field(field_path, threads=settings.threads)
     wrong_street = _wrong_street(settings.sample, field)
-    sequences: dict[str, Any] = {}
+    sequences: dict[str, DriveFigures] = {}
     pictures: dict[str, list[Pictures]] = {}
     for drive in DRIVES:
         console.print(f"[bold]Drive[/] {drive}: server, link and vehicle as processes")
@@ -100,7 +104,7 @@ def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
     # Camera on the left, the server's reconstruction on the right.
     pairs = (np.hstack([p.camera, p.reconstruction]) for drive in pictures.values() for p in drive)
     write_mp4(settings.out / "reconstructed.mp4", pairs, settings.rate_hz)
-    write_whole(settings.out / "result.json", json.dumps(result, indent=2) + "\n")
+    write_result(settings.out / "result.json", result)
     return DemoRun(result, pictures)
 
 
@@ -144,6 +148,7 @@ def _drive_outcome(
         wrong_street=wrong_street,
         preset=settings.preset,
         crf=settings.crf,
+        rate_hz=settings.rate_hz,
     )
 
 
@@ -225,14 +230,11 @@ def _wrong_street(sample: Path, field: RadianceField) -> Rgb:
 
 
 def _result(
-    settings: DemoSettings, field: RadianceField, sequences: Mapping[str, Any]
+    settings: DemoSettings, field: RadianceField, sequences: Mapping[str, DriveFigures]
 ) -> dict[str, Any]:
-    return {
+    content = {
         "format": "rfedge-demo-1",
-        "command": " ".join(["rfedge", *sys.argv[1:]]),
-        "revision": revision(),
-        "host": host(),
-        "settings": {k: str(v) if isinstance(v, Path) else v for k, v in asdict(settings).items()},
+        "settings": settings,
         "field": {
             "id": field.field_id,
             "kind": field.metadata.kind,
@@ -241,3 +243,4 @@ def _result(
         },
         "sequences": sequences,
     }
+    return make_result("demo", provenance(), content)

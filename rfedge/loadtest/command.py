@@ -1,4 +1,4 @@
-"""What ``rfedge loadtest`` does: one run, or a search; then files and a table."""
+"""What ``rfedge loadtest`` runs: one load, or a search for the limit; then files and a table."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from rfedge.loadtest.plan import Load
-from rfedge.loadtest.result import LoadResult, record, write_result
+from rfedge.loadtest.result import LoadResult, print_runs, record, write_load_result
 from rfedge.loadtest.run import Run, TestBed, run_load
 from rfedge.loadtest.uplink import largest_held
 
@@ -18,7 +17,7 @@ __all__ = ["Command"]
 
 @dataclass(frozen=True)
 class Command:
-    """A load on a test bed; files go to ``out``, rows also to ``record``."""
+    """A load on a test bed; files go to ``out``, rows also to ``record`` if there is one."""
 
     load: Load
     bed: TestBed
@@ -26,7 +25,7 @@ class Command:
     record: Path | None = None
 
     def run(self, *, find_limit: bool) -> LoadResult:
-        """Run once, or look for the limit; return what came of it."""
+        """Run once, or search for the largest number of vehicles that is held."""
         console = Console()
         runs: list[Run] = []
 
@@ -41,10 +40,12 @@ class Command:
         else:
             held(self.load.vehicles)
         result = LoadResult(sorted(runs, key=lambda run: run.load.vehicles))
-        write_result(result, self.out)
+        write_load_result(result, self.out)
         if self.record is not None:
-            record(self.record, result.as_json())
-        _print(console, result, self.out)
+            record(self.record, result)
+        print_runs(console, result)
+        for name in ("report.html", "result.json", "vehicles_vs_uplink.svg"):
+            console.print(f"  {self.out / name}")
         return result
 
 
@@ -52,23 +53,3 @@ def _outcome(run: Run) -> str:
     verdict = run.verdict
     found = "held" if verdict.held else "not held: " + "; ".join(verdict.broken)
     return f"{found}; limit: {verdict.limited_by}"
-
-
-def _print(console: Console, result: LoadResult, out: Path) -> None:
-    table = Table(title=result.headline(), title_justify="left")
-    for name in ("vehicles", "held", "p50 ms", "p99 ms", "on time %", "server cores", "limit"):
-        table.add_column(name, justify="right")
-    for run in result.runs:
-        verdict = run.verdict
-        table.add_row(
-            str(run.load.vehicles),
-            "yes" if verdict.held else "no",
-            f"{verdict.p50_ms:.1f}",
-            f"{verdict.p99_ms:.1f}",
-            f"{verdict.on_time_percent:.2f}",
-            f"{run.row['server_cores']:.2f}",
-            verdict.limited_by,
-        )
-    console.print(table)
-    for name in ("report.html", "result.json", "vehicles_vs_uplink.svg"):
-        console.print(f"  {out / name}")

@@ -1,9 +1,8 @@
-"""Runs the fleet of canned vehicles as a process, and watches everybody meanwhile.
+"""Drive vehicles to a server, and measure what all processes of the test use meanwhile.
 
-Live vehicles: ``cav-agent`` processes that read, render, encode and send in real time.
-
-A picture counts from its capture; an agent whose event loop is late captures late, which the canned
-fleet would not.
+Prerecorded vehicles are one process, the fleet. Live ones are ``cav-agent`` processes that read,
+render, encode and send in real time. Their latencies count from the capture of a picture: an agent
+whose event loop is late captures late, whereas the fleet counts from when a picture was due.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ from rfedge.loadtest.plan import Load
 from rfedge.loadtest.run_measurements import RunMeasurements, VehicleReport
 from rfedge.loadtest.usage import Usage, Watcher
 
-__all__ = ["drive_canned", "drive_live", "vehicle_report"]
+__all__ = ["drive_live", "drive_prerecorded", "vehicle_report"]
 
 
 START_S = 60.0
-"""How long the fleet may take to start, and to write what it brought, on a busy machine."""
+"""How long the fleet may take to start, and to write its result, on a busy machine."""
 POLL_S = 0.02
 
 
-def drive_canned(
+def drive_prerecorded(
     load: Load, addresses: Sequence[str], pids: Mapping[str, int], work: Path, folder: Path
 ) -> RunMeasurements:
-    """Drive canned vehicles to ``addresses``; raise ``RfedgeError`` if the fleet fails."""
+    """Drive prerecorded vehicles to ``addresses``; raise ``RfedgeError`` if the fleet fails."""
     spec = FleetSpec(
         addresses=tuple(addresses),
         hz=load.hz,
@@ -160,6 +159,6 @@ def _await_first_pictures(
 
 
 def _together(usages: Sequence[Usage]) -> Usage:
-    """Return the vehicles as one: what they use, summed look by look."""
-    looks = zip(*(usage.samples for usage in usages), strict=False)
-    return Usage([sum(look[1:], look[0]) for look in looks])
+    """Return the vehicles as one: what they use, summed sample by sample."""
+    together = zip(*(usage.samples for usage in usages), strict=False)
+    return Usage([sum(samples[1:], samples[0]) for samples in together])

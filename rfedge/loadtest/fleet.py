@@ -1,4 +1,4 @@
-"""The fleet of canned vehicles: one process, one stream (and connection) a vehicle.
+"""The fleet of prerecorded vehicles: one process, one stream (and connection) a vehicle.
 
 ``python -m rfedge.loadtest.fleet SPEC RESULT``: both are JSON. All vehicles connect before the
 first picture is due; their pictures are due at times spread evenly over a period, as those of
@@ -33,7 +33,7 @@ SETTLE_S = 0.2
 class FleetSpec:
     """Where each vehicle connects, what it sends, and when.
 
-    ``drive``: the folder of a canned drive.
+    ``drive``: the folder of a prerecorded drive.
     """
 
     addresses: tuple[str, ...]
@@ -96,7 +96,7 @@ async def run_fleet(spec: FleetSpec, started: Callable[[], None]) -> dict[str, A
     drive = PrerecordedDrive.read(Path(spec.drive))
     hello = _hello(spec, drive)
     vehicles = [
-        PrerecordedVehicle(f"canned-{i}", address, hello, drive)
+        PrerecordedVehicle(f"prerecorded-{i}", address, hello, drive)
         for i, address in enumerate(spec.addresses)
     ]
     await asyncio.gather(*(vehicle.connect(CONNECT_S) for vehicle in vehicles))

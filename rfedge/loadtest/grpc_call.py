@@ -1,6 +1,6 @@
-"""One gRPC call over an HTTP/2 connection of its own, as bytes: what a canned vehicle needs.
+"""One gRPC call over an HTTP/2 connection of its own, as bytes: what a prerecorded vehicle needs.
 
-Sans-IO: ``receive`` takes what the socket brought and returns whole messages, ``data_to_send`` has
+Sans-IO: ``receive`` takes bytes from the socket and returns whole messages, ``data_to_send`` has
 what the socket is to be given. 100 vehicles at 30 Hz took 0.36 ms of CPU for a frame and its answer
 on grpc.aio and take 0.24 ms here; vehicles of a load test share the machine with the server they
 test. The server at the other end is gRPC's, unchanged. RFC 9113 and gRPC's PROTOCOL-HTTP2; no TLS,
@@ -171,7 +171,7 @@ class GrpcCall:
         return data
 
     def receive(self, data: bytes) -> list[bytes]:
-        """Take what the socket brought; return the messages that are whole now.
+        """Take the bytes that the socket received; return the messages that are whole now.
 
         Raises ``ProtocolError`` for what is not HTTP/2 as a gRPC server speaks it.
         """

@@ -1,4 +1,4 @@
-"""What a load test puts on a server, and when it counts as held."""
+"""The plan of a load test: what is put on a server, and the bounds within which it is held."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Mode(StrEnum):
     """How much of its work the server does for each frame.
 
     ``transport``: everything but the numerical work; frames are parsed, checked (order, CRC),
-    queued to a worker (there is one), acknowledged, counted. ``receiver``: all of it, with renders
-    that were kept from the first time a pose was seen. ``full``: ``mec-server`` as it is.
+    queued to a worker (there is one), acknowledged, counted. ``receiver``: decoding too, against
+    renders cached by pose. ``full``: ``mec-server`` as it is.
     """
 
     TRANSPORT = "transport"
@@ -26,9 +26,9 @@ class Mode(StrEnum):
 
 
 class Vehicles(StrEnum):
-    """``canned`` packets are replayed; ``live`` vehicles are processes that render and encode."""
+    """``prerecorded`` vehicles replay coded packets; ``live`` ones render and encode."""
 
-    CANNED = "canned"
+    PRERECORDED = "prerecorded"
     LIVE = "live"
 
 
@@ -39,7 +39,7 @@ class Bounds:
     Of all pictures that were due, ``on_time_percent`` are acknowledged within ``deadline_ms``; so
     are 99 % of those that were acknowledged; the worst vehicle has at least ``fairness`` of the
     best one's share in time; the server's memory grows less than ``growth_mb_per_minute``, beyond
-    ``settling_mb`` that allocators take when they like.
+    ``settling_mb`` that its allocators take at any time.
     """
 
     deadline_ms: float = 100.0
@@ -63,10 +63,10 @@ class Load:
 
     Pictures that are due in the first ``warm_up_s`` are sent and not counted. ``link``: a profile,
     of which each vehicle gets a link of its own; None: loopback. ``size_bytes``: payload of a frame
-    in transport mode; other modes send what the encoder made of the drive. ``vehicle_ms``: what a
-    canned vehicle waits before it sends a picture, for the time a real one needs to encode it.
-    ``admission``: let the server refuse vehicles or lower their rate, which it otherwise does not,
-    so that its limit can be seen.
+    in transport mode; other modes send what the encoder made of the drive. ``vehicle_ms``: how long
+    a prerecorded vehicle waits before it sends a picture, in place of the encoding time of a real
+    one. ``admission``: whether the server may refuse vehicles or lower their rate; it may not by
+    default, so that its limit can be seen.
     """
 
     mode: Mode
@@ -77,7 +77,7 @@ class Load:
     cameras: int = 1
     size_bytes: int = 4096
     link: Path | None = None
-    kind: Vehicles = Vehicles.CANNED
+    kind: Vehicles = Vehicles.PRERECORDED
     vehicle_ms: float = 0.0
     admission: bool = False
     bounds: Bounds = Bounds()
@@ -102,7 +102,7 @@ class Load:
     def _check_kind(self) -> None:
         if self.admission and self.mode is not Mode.FULL:
             raise InvalidInput("admission", f"needs mode full, not {self.mode}")
-        if self.kind is Vehicles.CANNED:
+        if self.kind is Vehicles.PRERECORDED:
             return
         if self.mode is not Mode.FULL:
             raise InvalidInput("live", f"live vehicles need mode full, not {self.mode}")

@@ -1,9 +1,9 @@
-"""Packets that are coded once and replayed: a drive of the sample, or payload of a given size.
+"""Prerecorded drives: packets that are coded once and replayed, or payload of a given size.
 
-A canned drive holds each picture twice: ``chain``, as a vehicle sends them, each predicted from the
-one before, and ``alone``, predicted from nothing but the render, for the pictures after one that
-was dropped. On disk they are two coded drives (``rfcore.wire.drive_file``), named by what made
-them.
+A prerecorded drive holds each picture twice: ``chain``, as a vehicle sends them, each predicted
+from the one before, and ``alone``, predicted from the render only, for the picture after one that
+was dropped. On disk they are two coded drives (``rfcore.wire.drive_file``), in a folder named by
+the digest of field, drive and settings.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rfcore.wire.messages import CameraDescription, Frame, FrameAddress, Hello, 
 __all__ = ["CAMERA", "PrerecordedDrive", "payload_drive", "prerecorded_drive"]
 
 CAMERA = "front"
-VEHICLE = "canned"
+VEHICLE = "prerecorded"
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class PrerecordedDrive:
 def prerecorded_drive(
     drive: Path, field: RadianceField, cache: Path, preset: str = "medium", crf: float = 23.0
 ) -> Path:
-    """Return the folder in ``cache`` of ``drive`` coded against ``field``; code it if need be."""
+    """Return the folder in ``cache`` of ``drive`` coded against ``field``; code it if it is new."""
     text = f"{RENDERER_CONTRACT} {field.field_id} {drive.resolve()} {preset} {crf}"
     folder = cache / hashlib.sha256(text.encode()).hexdigest()[:16]
     if not (folder / "alone.rfv").exists():
@@ -101,7 +101,7 @@ def _frame(pipeline: Pipeline, capture: Capture, epoch: int, after: int = -1) ->
 
 
 def payload_drive(field_id: str, size_bytes: int) -> PrerecordedDrive:
-    """Return frames of ``size_bytes`` of payload that say nothing, for transport mode."""
+    """Return a drive of one frame with ``size_bytes`` of random payload, for transport mode."""
     intrinsics = Intrinsics(640, 360, 320.0, 320.0, 320.0, 180.0)
     config = CodecConfig(intrinsics.width_px, intrinsics.height_px)
     header = DeltaEncoder(config, time.perf_counter_ns).header

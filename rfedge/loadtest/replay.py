@@ -1,4 +1,4 @@
-"""One camera of a canned vehicle: what is due when, what is sent, and how each picture ended.
+"""One camera of a prerecorded vehicle: what is due when, what is sent, and how each picture ended.
 
 Sans-IO; times are seconds on one monotonic clock. Pictures are due at ``start_s + i / hz`` whatever
 became of those before. As in the agent, the newest waits for credit and replaces the one that
@@ -143,14 +143,14 @@ class Replay:
             self._epoch += 1
             self._sequence = 0
             self._chained = position == 0
-        canned = (self._drive.chain if self._chained else self._drive.alone)[position]
+        coded = (self._drive.chain if self._chained else self._drive.alone)[position]
         frame = Frame(
             self._camera_id,
             self._wall_ns(shot.due_s),
-            canned.pose,
-            canned.field_id_prefix,
-            _numbered(canned.packet, self._epoch, self._sequence),
-            canned.quality,
+            coded.pose,
+            coded.field_id_prefix,
+            _numbered(coded.packet, self._epoch, self._sequence),
+            coded.quality,
         )
         self._sequence += 1
         self._pending[frame.address] = shot

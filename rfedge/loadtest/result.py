@@ -1,32 +1,46 @@
-"""The result of a load test as files: JSON, a page, a figure; and rows of a committed result.
+"""The result of a load test: JSON, report, figure, table, and its section of the results page.
 
-The load report's charts, as inline SVG.
-
-The load test's section of the generated figures.
+``record`` collects rows of several runs in one file, each with its own command and revision.
 """
 
 from __future__ import annotations
 
 import json
-import math
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from rich.console import Console
 
 from rfcore.files import write_whole
-from rfedge.loadtest.run import Run
+from rfedge.loadtest.plan import Mode, Vehicles
+from rfedge.loadtest.run import LoadRow, Run
 from rfedge.loadtest.uplink import MOST, RATES_MBPS, Traffic, vehicles_carried
 from rfedge.report.charts import GRID, INK, MUTED, PAYLOAD, RENDER, STYLE, new_axes, svg
-from rfedge.report.markdown_parts import Row, cell, heading, table
-from rfedge.results import host, revision
+from rfedge.report.tables import cell, heading, print_table, table
+from rfedge.results import (
+    Result,
+    make_result,
+    provenance,
+    read_result,
+    rows_of,
+    write_result,
+)
 
-__all__ = ["LoadResult", "latency_chart", "load_section", "record", "uplink_chart", "write_result"]
+__all__ = [
+    "LoadResult",
+    "latency_chart",
+    "load_section",
+    "print_runs",
+    "record",
+    "uplink_chart",
+    "write_load_result",
+]
 
 
 def latency_chart(latency_ms: Mapping[str, Sequence[float]], deadline_ms: float) -> str:
@@ -47,6 +61,7 @@ def latency_chart(latency_ms: Mapping[str, Sequence[float]], deadline_ms: float)
             color=RENDER,
         )
         axes.set(xlabel="ms from due to acknowledged", ylabel="% of frames", xscale="log")
+        axes.set_ylim(bottom=0)
         for set_formatter in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
             set_formatter(mpl.ticker.FormatStrFormatter("%g"))
         axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1), fontsize=9)
@@ -103,7 +118,7 @@ KEY = (
     "vehicle_ms",
     "admission",
 )
-"""What tells one row of a committed result from another."""
+"""Fields that tell one load from another: a recorded row is replaced by one that has the same."""
 
 
 @dataclass(frozen=True)
@@ -120,62 +135,69 @@ class LoadResult:
     def headline(self) -> str:
         """Return the result in a line."""
         load, row = self.runs[0].load, self.runs[0].row
-        what = f"{load.mode}, {row['width']}x{row['height']}, {load.hz:g} Hz"
+        what = f"{load.mode}, {row.width}x{row.height}, {load.hz:g} Hz"
         if len(self.runs) > 1:
             return f"{_vehicles(self.most_held)} held ({what})"
         held = "held" if self.most_held else "not held"
         return f"{_vehicles(load.vehicles)} {held} ({what})"
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the content of ``result.json``."""
-        return {
-            "case": "loadtest",
-            "command": " ".join(["rfedge", *sys.argv[1:]]),
-            "revision": revision(),
-            "host": host(),
-            "rows": [_finite(run.row) for run in self.runs],
-        }
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        """The content of ``result.json``."""
+        inputs = [] if self.runs[0].load.link is None else [self.runs[0].load.link]
+        rows = [run.row for run in self.runs]
+        return make_result("loadtest", provenance(inputs), {"rows": rows})
 
 
-def write_result(result: LoadResult, out: Path) -> None:
+def print_runs(console: Console, result: LoadResult) -> None:
+    """Print a row for each run."""
+    columns = ("vehicles", "held", "p50 ms", "p99 ms", "on time %", "server cores", "limit")
+    print_table(console, result.headline(), columns, [_printed(run) for run in result.runs])
+
+
+def _printed(run: Run) -> list[str]:
+    verdict = run.verdict
+    return [
+        str(run.load.vehicles),
+        "yes" if verdict.held else "no",
+        f"{verdict.p50_ms:.1f}",
+        f"{verdict.p99_ms:.1f}",
+        f"{verdict.on_time_percent:.2f}",
+        f"{run.row.server_cores:.2f}",
+        verdict.limited_by,
+    ]
+
+
+def write_load_result(result: LoadResult, out: Path) -> None:
     """Write ``result.json``, ``report.html`` and ``vehicles_vs_uplink.svg`` into ``out``."""
-    out.mkdir(parents=True, exist_ok=True)
-    content = result.as_json()
-    write_whole(out / "result.json", json.dumps(content, indent=1) + "\n")
+    write_result(out / "result.json", result.content)
     figure = _uplink(result)
     write_whole(out / "vehicles_vs_uplink.svg", figure + "\n")
-    write_whole(out / "report.html", _page(result, content, figure))
+    write_whole(out / "report.html", _page(result, figure))
 
 
-def record(path: Path, content: Mapping[str, Any]) -> None:
-    """Put the rows of ``content`` into the result at ``path``, in place of those of the same load.
+def record(path: Path, result: LoadResult) -> None:
+    """Put the rows of a result into the file at ``path``, in place of those of the same loads.
 
-    Each row keeps the command and revision it was made by.
+    Each row keeps the command and revision it was made by. Raises ``InvalidInput`` for a file that
+    holds no load test.
     """
-    old = json.loads(path.read_text())["rows"] if path.exists() else []
+    content = result.content
     made = {key: content[key] for key in ("command", "revision")}
-    new = [{**row, **made} for row in content["rows"]]
-    told = {_key(row) for row in new}
-    rows = sorted([row for row in old if _key(row) not in told] + new, key=_order)
-    whole = {**content, "command": "rfedge loadtest", "rows": rows}
-    write_whole(path, json.dumps(whole, indent=1) + "\n")
+    new = [replace(run.row, **made) for run in result.runs]
+    old = rows_of(LoadRow, read_result(path, "loadtest")["rows"]) if path.exists() else []
+    replaced = {_key(row) for row in new}
+    rows = sorted([row for row in old if _key(row) not in replaced] + new, key=_order)
+    whole = make_result("loadtest", provenance(command="rfedge loadtest"), {"rows": rows})
+    write_result(path, whole)
 
 
-def _key(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in KEY)
+def _key(row: LoadRow) -> tuple[Any, ...]:
+    return tuple(getattr(row, name) for name in KEY)
 
 
-def _order(row: Mapping[str, Any]) -> tuple[str, ...]:
-    order = ("transport", "receiver", "full")
-    return (str(order.index(row["mode"])), row["kind"], f"{row['hz']:9.3f}{row['vehicles']:6d}")
-
-
-def _finite(row: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON knows no infinity: what nothing was measured of is null."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in row.items()
-    }
+def _order(row: LoadRow) -> tuple[int, str, float, int]:
+    return list(Mode).index(Mode(row.mode)), row.kind, row.hz, row.vehicles
 
 
 def _vehicles(count: int) -> str:
@@ -191,12 +213,12 @@ def _uplink(result: LoadResult) -> str:
     return uplink_chart(carried, result.most_held or None, MOST)
 
 
-def _page(result: LoadResult, content: Mapping[str, Any], figure: str) -> str:
+def _page(result: LoadResult, figure: str) -> str:
     environment = Environment(
         loader=PackageLoader("rfedge.loadtest", "."), autoescape=True, undefined=StrictUndefined
     )
     environment.filters["ms"] = lambda value: "-" if value is None else f"{value:.1f}"
-    last = result.runs[-1]
+    last, content = result.runs[-1], result.content
     latency_ms = {_vehicles(run.load.vehicles): run.latency_ms for run in result.runs}
     return environment.get_template("loadtest.html.j2").render(
         headline=result.headline(),
@@ -205,11 +227,11 @@ def _page(result: LoadResult, content: Mapping[str, Any], figure: str) -> str:
         deadline_ms=last.load.bounds.deadline_ms,
         latency_svg=latency_chart(latency_ms, last.load.bounds.deadline_ms),
         uplink_svg=figure,
-        payload_bytes=last.row["payload_bytes"],
+        payload_bytes=last.row.payload_bytes,
         hz=last.load.hz,
         budget_ms=last.load.bounds.deadline_ms / 2,
         provenance=json.dumps(
-            {key: content[key] for key in ("command", "revision", "host")}, indent=2
+            {key: content[key] for key in ("command", "revision", "dirty", "host")}, indent=2
         ),
     )
 
@@ -219,14 +241,14 @@ def _what(run: Run) -> str:
     does = {
         "transport": "The server parses, checks, queues, acknowledges and counts; it neither "
         "renders nor decodes.",
-        "receiver": "The server decodes against renders that it kept: each pose is rendered once.",
+        "receiver": "The server decodes against cached renders: each pose is rendered once.",
         "full": "The server renders and decodes every frame, as always.",
     }[load.mode]
     link = f"a link of its own ({load.link.stem})" if load.link else "loopback"
     vehicles = (
-        "Canned vehicles replay packets that were coded before, so the vehicles' own time is not "
-        f"in the latency beyond {load.vehicle_ms:g} ms"
-        if load.kind == "canned"
+        "Prerecorded vehicles replay packets that were coded before; of a vehicle's own time the "
+        f"latency contains {load.vehicle_ms:g} ms"
+        if load.kind is Vehicles.PRERECORDED
         else "Live vehicles render and encode on this machine"
     )
     return (
@@ -255,22 +277,23 @@ COLUMNS = (
 )
 
 
-def load_section(path: Path, result: Row) -> str:
+def load_section(path: Path, result: Result) -> str:
     """Return a table of the runs, with what was not kept and the commands below it."""
-    rows = [[_shown(row, column) for column in COLUMNS] for row in result["rows"]]
-    notes = [_note(row) for row in result["rows"]]
-    return "\n\n".join([heading(path, result), table(COLUMNS, rows), "\n".join(notes), ""])
+    rows = rows_of(LoadRow, result["rows"])
+    cells = [[_shown(row, column) for column in COLUMNS] for row in rows]
+    notes = "\n".join(_note(row) for row in rows)
+    return "\n\n".join([heading(path, result), table(COLUMNS, cells), notes, ""])
 
 
-def _shown(row: Row, column: str) -> str:
+def _shown(row: LoadRow, column: str) -> str:
     if column == "link":
-        return row["link"] or "loopback"
+        return row.link or "loopback"
     if column == "held":
-        return "yes" if row["held"] else "no"
-    return cell(row[column])
+        return "yes" if row.held else "no"
+    return cell(getattr(row, column))
 
 
-def _note(row: Row) -> str:
-    broken = f" Not kept: {'; '.join(row['broken'])}." if row["broken"] else ""
-    size = f"{row['width']}x{row['height']}, {row['payload_bytes']:.0f} bytes of payload a frame"
-    return f"* `{row['command']}` at `{row['revision']}` ({row['kind']} vehicles, {size}).{broken}"
+def _note(row: LoadRow) -> str:
+    broken = f" Not kept: {'; '.join(row.broken)}." if row.broken else ""
+    size = f"{row.width}x{row.height}, {row.payload_bytes:.0f} bytes of payload a frame"
+    return f"* `{row.command}` at `{row.revision}` ({row.kind} vehicles, {size}).{broken}"

@@ -1,7 +1,8 @@
-"""One run: server, links and fleet as processes, watched while the counted part goes on."""
+"""One run: server, links and fleet as processes, measured over the counted part."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -11,27 +12,30 @@ from typing import Any
 
 from rfcore.field import load_field
 from rfedge.demo.processes import Service, command_of, service
-from rfedge.loadtest.drive import drive_canned, drive_live
+from rfedge.loadtest.drive import drive_live, drive_prerecorded
 from rfedge.loadtest.plan import Load, Mode, Vehicles
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
 from rfedge.loadtest.run_measurements import RunMeasurements, links_busy, measured
 from rfedge.loadtest.usage import Usage
 from rfedge.loadtest.verdict import Verdict, judge
 
-__all__ = ["Run", "TestBed", "run_load"]
+__all__ = ["LoadRow", "Run", "TestBed", "run_load"]
 
 
 @dataclass(frozen=True)
 class TestBed:
-    """What loads are run on: a field (the only one in its folder), a drive of pictures for it, a
-    server of so many workers, and folders for packets that were coded and for the processes' logs.
-    """
+    """What loads are run on."""
 
     field: Path
+    """The archive, the only one in its folder."""
     drive: Path
+    """The drive whose pictures are sent."""
     workers: int
+    """Threads of the server."""
     cache: Path
+    """Folder that keeps prerecorded drives."""
     work: Path
+    """Folder for the logs of the processes."""
     preset: str = "medium"
     crf: float = 23.0
 
@@ -39,12 +43,63 @@ class TestBed:
 
 
 @dataclass(frozen=True)
+class LoadRow:
+    """One load and what became of it. Latencies are None when nothing was acknowledged.
+
+    ``*_cores`` are CPU seconds per second; ``server_loop_cores`` those of the server's event loop.
+    """
+
+    mode: str
+    vehicles: int
+    hz: float
+    width: int
+    height: int
+    held: bool
+    p50_ms: float | None
+    p99_ms: float | None
+    on_time_percent: float
+    on_time_at_least_percent: float
+    """Lower end of the share's 95 % interval."""
+    fairness: float
+    """Share on time of the worst vehicle over that of the best."""
+    limited_by: str
+    broken: Sequence[str]
+    """The bounds that were not kept."""
+    kind: str
+    """``prerecorded`` or ``live`` vehicles."""
+    cameras: int
+    payload_bytes: float
+    """Mean of a frame."""
+    link: str | None
+    """Name of the link profile; None: loopback."""
+    duration_s: float
+    vehicle_ms: float
+    admission: bool
+    refused: int
+    failed: int
+    reduced: int
+    """Vehicles that were granted less than they asked for."""
+    nacked: int
+    server_cores: float
+    server_loop_cores: float
+    vehicles_cores: float
+    links_cores: float
+    others_cores: float
+    server_growth_mb: float
+    generator_lag_ms: float
+    """99th percentile of how late the generator's event loop was."""
+    command: str | None = None
+    """In a file of several runs, as ``revision``: how this row was made."""
+    revision: str | None = None
+
+
+@dataclass(frozen=True)
 class Run:
-    """One load with what it brought. ``row`` is its row of ``results/loadtest.json``."""
+    """One load, its verdict and its row of the result; latencies of all acknowledged frames."""
 
     load: Load
     verdict: Verdict
-    row: Mapping[str, Any]
+    row: LoadRow
     latency_ms: Sequence[float]
     payload_bytes: Sequence[int]
     usage: Mapping[str, Usage]
@@ -52,7 +107,7 @@ class Run:
 
 def run_load(load: Load, bed: TestBed) -> Run:
     """Run one load to its end; raise ``RfedgeError`` naming the process that failed."""
-    folder = _canned(load, bed)
+    folder = _recorded(load, bed)
     drive = PrerecordedDrive.read(folder)
     bed.work.mkdir(parents=True, exist_ok=True)
     with ExitStack() as processes:
@@ -64,19 +119,19 @@ def run_load(load: Load, bed: TestBed) -> Run:
             addresses = links.address.split("\n")
             pids["links"] = links.process.pid
         if load.kind is Vehicles.LIVE:
-            brought = drive_live(load, addresses, pids, bed.work, _agent(bed))
+            measurements = drive_live(load, addresses, pids, bed.work, _agent(bed))
         else:
-            brought = drive_canned(load, addresses, pids, bed.work, folder)
+            measurements = drive_prerecorded(load, addresses, pids, bed.work, folder)
     busy = links_busy(bed.work / "links.jsonl", load) if load.link is not None else 0.0
-    found = measured(load, brought, busy, _workers(load, bed))
+    found = measured(load, measurements, busy, _workers(load, bed))
     verdict = judge(found, load.bounds)
-    row = _row(load, drive, brought, verdict)
+    row = _row(load, drive, measurements, verdict)
     latency_ms = [ms for vehicle in found.vehicles for ms in vehicle.latency_ms]
     payload_bytes = [len(frame.packet.payload) for frame in drive.chain]
-    return Run(load, verdict, row, latency_ms, payload_bytes, brought.usage)
+    return Run(load, verdict, row, latency_ms, payload_bytes, measurements.usage)
 
 
-def _canned(load: Load, bed: TestBed) -> Path:
+def _recorded(load: Load, bed: TestBed) -> Path:
     field = load_field(bed.field)
     if load.mode is not Mode.TRANSPORT:
         return prerecorded_drive(bed.drive, field, bed.cache, bed.preset, bed.crf)
@@ -91,8 +146,8 @@ def _server(load: Load, bed: TestBed) -> Any:
         # Renders of one field follow one another: only threads within one use the other cores.
         command = [*command_of("mec-server"), "--fields", fields, "--workers", workers]
         command += ["--threads", workers]
-        let_in = () if load.admission else ("--max-load", "0")
-        return service("mec-server", [*command, "--listen", "127.0.0.1:0", *let_in], bed.work)
+        limits = () if load.admission else ("--max-load", "0")
+        return service("mec-server", [*command, "--listen", "127.0.0.1:0", *limits], bed.work)
     module = [sys.executable, "-m", "rfedge.loadtest.server"]
     return service("mec-server", [*module, load.mode, fields, workers], bed.work)
 
@@ -117,29 +172,34 @@ def _agent(bed: TestBed) -> Sequence[str]:
 
 
 def _row(
-    load: Load, drive: PrerecordedDrive, brought: RunMeasurements, verdict: Verdict
-) -> dict[str, Any]:
+    load: Load, drive: PrerecordedDrive, measurements: RunMeasurements, verdict: Verdict
+) -> LoadRow:
     k = drive.intrinsics
-    return {
-        "mode": str(load.mode),
-        "vehicles": load.vehicles,
-        "hz": load.hz,
-        "width": k.width_px,
-        "height": k.height_px,
-        "held": verdict.held,
-        "p50_ms": verdict.p50_ms,
-        "p99_ms": verdict.p99_ms,
-        "on_time_percent": verdict.on_time_percent,
-        "on_time_at_least_percent": verdict.on_time_at_least_percent,
-        "fairness": verdict.fairness,
-        "limited_by": verdict.limited_by,
-        "broken": list(verdict.broken),
-        "kind": str(load.kind),
-        "cameras": load.cameras,
-        "payload_bytes": drive.mean_payload_bytes,
-        "link": None if load.link is None else load.link.stem,
-        "duration_s": load.duration_s,
-        "vehicle_ms": load.vehicle_ms,
-        "admission": load.admission,
-        **brought.row(),
-    }
+    return LoadRow(
+        mode=str(load.mode),
+        vehicles=load.vehicles,
+        hz=load.hz,
+        width=k.width_px,
+        height=k.height_px,
+        held=verdict.held,
+        p50_ms=_finite(verdict.p50_ms),
+        p99_ms=_finite(verdict.p99_ms),
+        on_time_percent=verdict.on_time_percent,
+        on_time_at_least_percent=verdict.on_time_at_least_percent,
+        fairness=verdict.fairness,
+        limited_by=verdict.limited_by,
+        broken=verdict.broken,
+        kind=str(load.kind),
+        cameras=load.cameras,
+        payload_bytes=drive.mean_payload_bytes,
+        link=None if load.link is None else load.link.stem,
+        duration_s=load.duration_s,
+        vehicle_ms=load.vehicle_ms,
+        admission=load.admission,
+        **measurements.fields(),
+    )
+
+
+def _finite(ms: float) -> float | None:
+    """Return None for a percentile of nothing, which is infinite."""
+    return ms if math.isfinite(ms) else None

@@ -1,4 +1,4 @@
-"""What one run brought home, from processes and files, as what ``verdict`` judges."""
+"""Measurements of one run, from processes and files, as what ``verdict`` judges."""
 
 from __future__ import annotations
 
@@ -19,9 +19,12 @@ __all__ = ["RunMeasurements", "VehicleReport", "links_busy", "measured"]
 
 @dataclass(frozen=True)
 class VehicleReport:
-    """One vehicle: pictures due in the counted part, latencies of those acked, how many the server
-    refused; the rate it was granted (0: any); why it was kept out (``refused``) or fell out
-    (``failed``)."""
+    """One vehicle in the counted part of a run.
+
+    ``due``: pictures that were due; ``latency_ms``: of those acknowledged; ``nacked``: how many the
+    server refused; ``granted_hz``: the rate it admitted (0: any); ``refused``: why it did not admit
+    the vehicle, ``failed``: why the vehicle lost its stream (both empty if it did not).
+    """
 
     due: int
     latency_ms: Sequence[float]
@@ -33,7 +36,7 @@ class VehicleReport:
 
 @dataclass(frozen=True)
 class RunMeasurements:
-    """What the vehicles report, and what the processes used meanwhile.
+    """Reports of the vehicles, and use of the processes over the counted part.
 
     ``generator_lag_ms``: 99th percentile of how late the fleet's event loop was.
     """
@@ -46,12 +49,12 @@ class RunMeasurements:
 
     @property
     def others_cores(self) -> float:
-        """Cores that processes used which are not part of the test."""
+        """Cores used by processes that are not part of the test."""
         ours = sum(usage.cores for usage in self.usage.values())
         return max(0.0, self.machine_busy * (psutil.cpu_count() or 1) - ours)
 
-    def row(self) -> dict[str, Any]:
-        """Return what a result's row says of resources, in cores."""
+    def fields(self) -> dict[str, Any]:
+        """Return the fields of ``LoadRow`` that count vehicles and resources."""
         cores = {name: usage.cores for name, usage in self.usage.items()}
         return {
             "refused": sum(bool(vehicle.refused) for vehicle in self.vehicles),
@@ -68,27 +71,27 @@ class RunMeasurements:
         }
 
 
-def measured(load: Load, brought: RunMeasurements, link_busy: float, workers: int) -> Measured:
-    """Return what is judged: vehicles that were let in, and how busy everything was."""
+def measured(load: Load, run: RunMeasurements, link_busy: float, workers: int) -> Measured:
+    """Return what is judged: the vehicles that were admitted, and how busy everything was."""
     deadline_ms = load.bounds.deadline_ms
     counts = [
         VehicleCount(v.due, sum(ms <= deadline_ms for ms in v.latency_ms), v.latency_ms)
-        for v in brought.vehicles
+        for v in run.vehicles
         if not v.refused
     ]
-    server = brought.usage["server"]
-    is_canned = load.kind is Vehicles.CANNED
-    players = ["vehicles", "links"] if is_canned else ["links"]
-    generator = max((brought.usage[n].loop_cores for n in players if n in brought.usage), default=0)
+    server = run.usage["server"]
+    prerecorded = load.kind is Vehicles.PRERECORDED
+    generators = ["vehicles", "links"] if prerecorded else ["links"]
+    generator = max((run.usage[n].loop_cores for n in generators if n in run.usage), default=0)
     resources = Resources(
         server_loop=server.loop_cores,
         workers=(server.cores - server.loop_cores) / min(workers, psutil.cpu_count() or 1),
         link=link_busy,
         generator=generator,
-        machine=brought.machine_busy,
-        test=brought.machine_busy - brought.others_cores / (psutil.cpu_count() or 1),
-        others=brought.others_cores,
-        generator_lag_ms=brought.generator_lag_ms,
+        machine=run.machine_busy,
+        test=run.machine_busy - run.others_cores / (psutil.cpu_count() or 1),
+        others=run.others_cores,
+        generator_lag_ms=run.generator_lag_ms,
     )
     wanted = len(counts) if load.admission else load.vehicles
     return Measured(counts, wanted, server.growth_mb, server.minutes, resources)

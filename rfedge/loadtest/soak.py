@@ -1,14 +1,15 @@
 """A long run at half load: nothing may grow. ``python -m rfedge.loadtest.soak --minutes 30``
 
-Two canned vehicles at 5 Hz keep a server, as it is, half as busy as the load it must hold on two
-cores. Its memory must climb by less than 1 MB a minute (least squares over the counted part), it
-may end with no more descriptors, threads or processes than it began with, and no vehicle may fall
-out. Latency is not judged: others may use the machine.
+Two prerecorded vehicles at 5 Hz put half the load on ``mec-server`` that it must hold on two cores.
+Its memory must grow by less than 1 MB a minute (least squares over the counted part), it may end
+with no more descriptors, threads or processes than it began with, and no vehicle may lose its
+stream. Latency is not judged: others may use the machine.
 """
 
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,22 +19,21 @@ from typing import Any
 import tyro
 
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.files import write_whole
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.run import Run, TestBed, run_load
 from rfedge.loadtest.usage import Sample, slope_per_minute
-from rfedge.results import host, revision
+from rfedge.results import make_result, provenance, write_result
 
-__all__ = ["MAX_SLOPE_MB", "SoakSettings", "soak", "what_grew"]
+__all__ = ["MAX_SLOPE_MB", "SoakRow", "SoakSettings", "soak", "what_grew"]
 
 MAX_SLOPE_MB = 1.0
 """Per minute."""
 
 LEAST_SHARE = 0.5
-"""Of the frames; a machine with less to give says nothing about half load."""
+"""Of the frames that were due; with fewer reconstructed the server was not at half load."""
 
 QUARTER = 4
-"""Counts of the last quarter are compared with those of the first."""
+"""Counts in the last quarter of the run are compared with those in the first."""
 
 
 @dataclass(frozen=True)
@@ -60,25 +60,47 @@ class SoakSettings:
             raise InvalidInput("minutes", f"{self.minutes:g} is outside 0..1440")
 
 
+@dataclass(frozen=True)
+class SoakRow:
+    """One soak. ``*_first`` and ``*_last`` are the most in the first and the last quarter."""
+
+    minutes: float
+    vehicles: int
+    hz: float
+    held: bool
+    frames: int
+    slope_mb_per_minute: float
+    memory_mb: float
+    descriptors_first: int
+    threads_first: int
+    processes_first: int
+    descriptors_last: int
+    threads_last: int
+    processes_last: int
+    server_cores: float
+    p50_ms: float | None
+    p99_ms: float | None
+
+
 def soak(settings: SoakSettings) -> dict[str, Any]:
     """Run, write the result, return it; raise ``RfedgeError`` if anything grew."""
+    made = provenance([settings.field], command=_command())
     load = Load(Mode.FULL, settings.vehicles, settings.hz, 60 * settings.minutes, settings.warm_up)
     folder = settings.out.parent
     bed = TestBed(settings.field, settings.drive, 2, Path("out/cache/loadtest"), folder / "work")
     run = run_load(load, bed)
     samples = run.usage["server"].samples
-    problems = [*what_grew(samples), *_fallen_out(run)]
-    result = {
-        "case": "soak",
-        "command": " ".join(["python -m rfedge.loadtest.soak", *sys.argv[1:]]),
-        "revision": revision(),
-        "host": host(),
-        "rows": [_row(settings, run, samples, held=not problems)],
-    }
-    write_whole(settings.out, json.dumps(result, indent=1) + "\n")
+    problems = [*what_grew(samples), *_lost(run)]
+    row = _row(settings, run, samples, held=not problems)
+    result = make_result("soak", made, {"rows": [row]})
+    write_result(settings.out, result)
     if problems:
         raise RfedgeError(f"soak: {'; '.join(problems)} (see {settings.out})")
     return result
+
+
+def _command() -> str:
+    return shlex.join(["python", "-m", "rfedge.loadtest.soak", *sys.argv[1:]])
 
 
 def what_grew(samples: Sequence[Sample]) -> list[str]:
@@ -107,35 +129,37 @@ def _quarters(samples: Sequence[Sample], count: Callable[[Sample], int]) -> tupl
     return max(map(count, samples[:length])), max(map(count, samples[-length:]))
 
 
-def _fallen_out(run: Run) -> list[str]:
-    wanted = run.load.vehicles * run.load.hz * run.load.duration_s
-    idle = len(run.latency_ms) < LEAST_SHARE * wanted
-    said = f"{len(run.latency_ms)} of {wanted:.0f} frames were reconstructed: that was no load"
-    return [said] * idle + [
-        f"{run.row[what]} {text}"
-        for what, text in (("failed", "vehicles fell out"), ("nacked", "frames were refused"))
-        if run.row[what]
-    ]
+def _lost(run: Run) -> list[str]:
+    """Return what became of frames and vehicles that should have been served, in words."""
+    due = run.load.vehicles * run.load.hz * run.load.duration_s
+    problems = []
+    if len(run.latency_ms) < LEAST_SHARE * due:
+        problems.append(
+            f"{len(run.latency_ms)} of {due:.0f} frames were reconstructed, too few for half load"
+        )
+    if run.row.failed:
+        problems.append(f"{run.row.failed} vehicles lost their streams")
+    if run.row.nacked:
+        problems.append(f"{run.row.nacked} frames were refused")
+    return problems
 
 
-def _row(
-    settings: SoakSettings, run: Run, samples: Sequence[Sample], *, held: bool
-) -> dict[str, Any]:
+def _row(settings: SoakSettings, run: Run, samples: Sequence[Sample], *, held: bool) -> SoakRow:
     counts = {name: _quarters(samples, count) for name, count in COUNTED}
-    return {
-        "minutes": settings.minutes,
-        "vehicles": settings.vehicles,
-        "hz": settings.hz,
-        "held": held,
-        "frames": len(run.latency_ms),
-        "slope_mb_per_minute": slope_per_minute(samples),
-        "memory_mb": samples[-1].rss_mb,
+    return SoakRow(
+        minutes=settings.minutes,
+        vehicles=settings.vehicles,
+        hz=settings.hz,
+        held=held,
+        frames=len(run.latency_ms),
+        slope_mb_per_minute=slope_per_minute(samples),
+        memory_mb=samples[-1].rss_mb,
         **{f"{name}_first": first for name, (first, _) in counts.items()},
         **{f"{name}_last": last for name, (_, last) in counts.items()},
-        "server_cores": run.row["server_cores"],
-        "p50_ms": run.verdict.p50_ms,
-        "p99_ms": run.verdict.p99_ms,
-    }
+        server_cores=run.row.server_cores,
+        p50_ms=run.row.p50_ms,
+        p99_ms=run.row.p99_ms,
+    )
 
 
 def main() -> None:

@@ -1,9 +1,8 @@
-"""How many vehicles one uplink carries, on the virtual clock: exact, and at once.
+"""How many vehicles one uplink carries, computed on a virtual clock; and the search for a limit.
 
 Vehicles of a cell share its throughput. Each sends the drive's packets at its rate, at moments
-spread over a period; a packet that is transmitted later than the budget is late. What remains of
-the deadline after the uplink (server, way back, the vehicle's own time) is the caller's to take
-off.
+spread over a period; a packet that is transmitted later than the budget is late. The caller takes
+the rest of the deadline (server, way back, encoding) off the budget.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from rfcore.link.plan import Arrival, delivery_times
 __all__ = ["CLOSE", "RATES_MBPS", "Traffic", "largest_held", "on_time_share", "vehicles_carried"]
 
 CLOSE = 1.1
-"""Runs are short and machines noisy: within a tenth is as near as a repetition comes."""
+"""Ratio of bounds at which the search stops: short runs on a noisy machine repeat no closer."""
 
 
 def largest_held(first: int, held: Callable[[int], bool], most: int = 1000) -> int:

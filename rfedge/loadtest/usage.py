@@ -22,7 +22,7 @@ EVERY_S = 0.5
 
 @dataclass(frozen=True)
 class Sample:
-    """One look at a process and its children; CPU in seconds since its start."""
+    """One process with its children at one moment; CPU in seconds since its start."""
 
     at_s: float
     cpu_s: float
@@ -72,7 +72,7 @@ class Usage:
 
     @property
     def minutes(self) -> float:
-        """How long was looked."""
+        """Minutes from the first sample to the last."""
         return (self.samples[-1].at_s - self.samples[0].at_s) / 60 if self.samples else 0.0
 
     def _rate(self, values: Sequence[float]) -> float:
@@ -81,7 +81,7 @@ class Usage:
 
 
 class Watcher:
-    """Looks at ``pids`` every half second, on a thread, from ``start`` to ``stop``."""
+    """Samples the processes ``pids`` every half second, on a thread, from ``start`` to ``stop``."""
 
     def __init__(self, pids: Mapping[str, int]) -> None:
         self._processes = {name: psutil.Process(pid) for name, pid in pids.items()}
@@ -96,7 +96,7 @@ class Watcher:
         self._thread.start()
 
     def stop(self) -> Mapping[str, Usage]:
-        """End, and return what was seen of each process."""
+        """End, and return the samples of each process."""
         self._stopped.set()
         self._thread.join()
         self._machine_at_end = _machine_seconds()
@@ -114,7 +114,7 @@ class Watcher:
     def _run(self) -> None:
         while True:
             for name, process in self._processes.items():
-                with suppress(psutil.Error):  # it has ended; what was seen counts
+                with suppress(psutil.Error):  # it has ended; its samples so far count
                     self._samples[name].append(sample(process))
             if self._stopped.wait(EVERY_S):
                 return

@@ -1,4 +1,4 @@
-"""One canned vehicle on a connection of its own: replays pictures on time, counts the answers.
+"""One prerecorded vehicle on a connection of its own: replays pictures on time, counts the answers.
 
 Everything happens in calls of the event loop (bytes came, a picture is due): no task and no future
 a frame, so that one process plays a hundred vehicles in a small part of a core.

@@ -1,13 +1,11 @@
-"""Whether a load was held.
+"""The verdict on one run: whether the load was held, and which resource limits it.
 
 A frame is on time when its Ack was back within the deadline, counted from the moment the picture
 was due. Frames that were dropped, refused or unanswered were not on time.
 
-Which resource broke first in a run that was not held, or would in one that was, and its use.
-
-Each resource has a share that it can be used to before others wait for it. The generator comes
-first among those beyond it: where the test's own vehicles are the limit, nothing is said about the
-server.
+Every resource has a utilisation above which work queues up for it. If a bound was broken, the first
+resource above its own is named, else the one nearest to it. The load generator comes first: where
+the test's own vehicles are the limit, the run says nothing about the server.
 """
 
 from __future__ import annotations
@@ -28,18 +26,19 @@ __all__ = [
     "judge",
     "limit",
     "nearest",
-    "wilson_lower",
+    "share_at_least",
 ]
 
 
 BUSY = 0.85
-"""A core, a link or a worker that is busier than this makes others wait: at 85 % the mean queue of
-an M/D/1 server is already three services long."""
+"""Utilisation of a core, a link or a worker above which work queues up.
+
+At 85 % the mean queue of an M/D/1 server is already three services long."""
 MACHINE_BUSY = 0.95
 OTHERS = 0.3
-"""Cores; a run beside more than this says little about an idle machine."""
+"""Cores used by other processes above which a run is not that of an idle machine."""
 LAG_MS = 20.0
-"""A generator whose own event loop is later than this measures itself."""
+"""Lateness of the generator's event loop above which its own delays are what is measured."""
 
 
 @dataclass(frozen=True)
@@ -65,16 +64,16 @@ class Resources:
 
 @dataclass(frozen=True)
 class Use:
-    """What a resource was used to (``share``), of what it bears; ``said`` names both."""
+    """Utilisation of one resource, its limit, and both in words."""
 
-    said: str
+    text: str
     share: float
-    bearable: float
+    limit: float
 
     @property
     def is_over(self) -> bool:
-        """Whether others had to wait for it."""
-        return self.share > self.bearable
+        """Whether work queued up for it."""
+        return self.share > self.limit
 
 
 def limit(resources: Resources) -> str:
@@ -85,13 +84,13 @@ def limit(resources: Resources) -> str:
     )
     uses = (_lag(r), *_on_one_core(r), machine, _workers(r))
     over = next((use for use in uses if use.is_over), None)
-    return over.said if over is not None else f"nearest: {_fullest(uses)}"
+    return over.text if over is not None else f"nearest: {_fullest(uses)}"
 
 
 def nearest(resources: Resources) -> str:
     """Name the resource that a load which was held would break first, and its use.
 
-    What others use of the machine is left out: where they run behind the test, they fill it.
+    What other processes use of the machine is left out, since they are no part of the test.
     """
     r = resources
     machine = Use(f"CPU of the machine, at {_percent(r.test)}", r.test, MACHINE_BUSY)
@@ -99,7 +98,7 @@ def nearest(resources: Resources) -> str:
 
 
 def _fullest(uses: Sequence[Use]) -> str:
-    return max(uses, key=lambda use: use.share / use.bearable).said
+    return max(uses, key=lambda use: use.share / use.limit).text
 
 
 def _on_one_core(r: Resources) -> tuple[Use, ...]:
@@ -115,7 +114,7 @@ def _workers(r: Resources) -> Use:
 
 
 def _lag(r: Resources) -> Use:
-    """A generator that was late although there was a core for it."""
+    """Lateness of the generator, unless the whole machine was busy."""
     late = r.generator_lag_ms if r.machine < MACHINE_BUSY else 0.0
     return Use(f"vehicles of the test, {late:.0f} ms late themselves", late, LAG_MS)
 
@@ -128,12 +127,12 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-Z95 = 1.959963984540054
+CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class VehicleCount:
-    """One vehicle's pictures: how many were due, how many on time, the latencies of those acked."""
+    """One vehicle's pictures: how many were due and on time, and latencies of the acknowledged."""
 
     due: int
     on_time: int
@@ -142,7 +141,7 @@ class VehicleCount:
 
 @dataclass(frozen=True)
 class Measured:
-    """What one run brought. ``growth_mb``: of the server's memory, over ``minutes``."""
+    """What is judged of one run. ``growth_mb``: of the server's memory, over ``minutes``."""
 
     vehicles: Sequence[VehicleCount]
     wanted_vehicles: int
@@ -200,23 +199,23 @@ def judge(measured: Measured, bounds: Bounds) -> Verdict:
         p50_ms=p50_ms,
         p99_ms=p99_ms,
         on_time_percent=percent,
-        on_time_at_least_percent=100.0 * wilson_lower(on_time, due),
+        on_time_at_least_percent=100.0 * share_at_least(on_time, due),
         fairness=fairness,
         limited_by=(limit if broken else nearest)(measured.resources),
     )
 
 
-def wilson_lower(successes: int, trials: int, z: float = Z95) -> float:
-    """Return the lower end of Wilson's 95 % interval of a share (Wilson 1927).
+def share_at_least(successes: int, trials: int) -> float:
+    """Return the lower end of Wilson's 95 % interval of a share; 0 without trials.
 
     Frames of one vehicle are late together, so the true interval is wider.
     """
+    from scipy.stats import binomtest
+
     if not trials:
         return 0.0
-    share = successes / trials
-    centre = share + z * z / (2 * trials)
-    spread = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
-    return max(0.0, (centre - spread) / (1 + z * z / trials))
+    interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
+    return float(interval.low)
 
 
 def _percentiles(latency_ms: Sequence[float]) -> tuple[float, float]:

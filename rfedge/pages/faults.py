@@ -5,15 +5,28 @@ python -m rfedge.pages.faults results/faults.json > docs/reliability.md
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from rfcore.errors import InvalidInput
-from rfedge.report.markdown_parts import Row
+from rfedge.report.tables import table
+from rfedge.results import read_result, rows_of
 
-__all__ = ["faults_page"]
+__all__ = ["FaultRow", "faults_page"]
+
+
+@dataclass(frozen=True)
+class FaultRow:
+    """One fault. ``bound`` and ``measured`` are lists of the same length, split by ``; ``."""
+
+    fault: str
+    injected_with: str
+    bound: str
+    measured: str
+    passed: bool
+
 
 OPENING = """# What happens when things break
 
@@ -43,11 +56,9 @@ are skipped.
 
 def faults_page(path: Path) -> str:
     """Return the page; raise ``InvalidInput`` for a file of another kind."""
-    result = json.loads(path.read_text())
-    if result.get("format") != "rfedge-faults-1":
-        raise InvalidInput("results", f"{path} is no result of the fault suite")
-    rows = result["rows"]
-    passed, machine = sum(row["passed"] for row in rows), result["host"]
+    result = read_result(path, "faults")
+    rows = rows_of(FaultRow, result["rows"])
+    passed, machine = sum(row.passed for row in rows), result["host"]
     score = (
         f"## Scoreboard\n\n{passed} of {len(rows)} hold. `{result['command']}` at "
         f"`{result['revision']}`; {machine['cpu']}, {machine['cores']} cores, {machine['isa']}.\n"
@@ -55,13 +66,15 @@ def faults_page(path: Path) -> str:
     return "\n".join([OPENING, score, *_sections(rows)])
 
 
-def _sections(rows: list[Row]) -> Iterator[str]:
+def _sections(rows: list[FaultRow]) -> Iterator[str]:
     for row in rows:
-        verdict = "holds" if row["passed"] else "**does not hold**"
-        yield f"### {row['fault']}: {verdict}\n\n{row['injected_with']}\n"
-        yield "| what | measured |\n| --- | ---: |"
-        bounds, figures = row["bound"].split("; "), row["measured"].split("; ")
-        yield from (f"| {b} | {f} |" for b, f in zip(bounds, figures, strict=True))
+        verdict = "holds" if row.passed else "**does not hold**"
+        yield f"### {row.fault}: {verdict}\n\n{row.injected_with}\n"
+        bounds, figures = row.bound.split("; "), row.measured.split("; ")
+        if len(bounds) != len(figures):
+            counts = f"{len(bounds)} bounds and {len(figures)} figures"
+            raise InvalidInput("results", f"{row.fault}: {counts}; each bound needs its figure")
+        yield table(("what", "measured"), zip(bounds, figures, strict=True))
         yield ""
 
 

@@ -1,26 +1,33 @@
-"""Write ``docs/results.md`` from the result files: figures are generated, never typed.
+"""``docs/results.md`` and the figures of the experiments, from the result files: never typed.
 
-``python -m rfedge.pages.results results > docs/results.md`` (``make figures``). A test holds the
-committed page to the committed files.
+``python -m rfedge.pages.results results docs`` (``make figures``). A test holds the committed page
+to the committed files.
 """
 
 from __future__ import annotations
 
-import json
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from rfcore.errors import InvalidInput
-from rfedge.bench.results import flattened
-from rfedge.demo.report import METRIC, SUMMARY
-from rfedge.experiments.latency.report import latency_section
-from rfedge.experiments.robust.report import robust_section
+from rfcore.files import write_whole
+from rfedge.bench import bench_section
+from rfedge.demo.report import demo_section
+from rfedge.experiments.compare.figures import write_compare_figures
+from rfedge.experiments.compare.report import compare_section
+from rfedge.experiments.ladder.page import write_ladder_figure
+from rfedge.experiments.latency.report import latency_section, write_latency_figures
+from rfedge.experiments.never_worse.report import never_worse_section
+from rfedge.experiments.paper.figures import write_paper_figures
+from rfedge.experiments.paper.report import PaperRow, paper_section
+from rfedge.experiments.robust.report import robust_section, write_robust_figure
 from rfedge.loadtest.result import load_section
-from rfedge.pages.codec_evidence import compare_section, never_worse_section, paper_section
-from rfedge.report.markdown_parts import Row, cell, heading, table
+from rfedge.report.tables import heading
+from rfedge.results import Result, read_result, rows_of
 from rfedge.training.report import training_section
 
-__all__ = ["results_page"]
+__all__ = ["results_page", "write_figures"]
 
 INTRODUCTION = """# Measured figures
 
@@ -29,73 +36,73 @@ Machines are shared and noisy: compare within a table, not across hosts.
 """
 
 
-SECTIONS = {
+SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
+    "bench": bench_section,
     "compare": compare_section,
+    "demo": demo_section,
+    "faults": lambda path, result: _reference(path, result, "faults", "reliability"),
+    "ladder": lambda path, result: _reference(path, result, "rungs", "ladder"),
     "latency": latency_section,
+    "loadtest": load_section,
     "never-worse": never_worse_section,
     "paper": paper_section,
     "robust": robust_section,
+    "stability": lambda path, result: _reference(path, result, "cases", "stability"),
 }
+"""How each kind of result is shown; some have a page of their own."""
 
 
 def results_page(folder: Path) -> str:
     """Return the page of every result file in ``folder``, in the order of their names.
 
     Training runs, in ``folder/train``, share one table at the end. Raises ``InvalidInput`` for a
-    file that holds none of the known results.
+    folder without results, and for a file that holds none of the known kinds.
     """
     sections = [_section(path) for path in sorted(folder.glob("*.json"))]
     runs = sorted(folder.glob("train/*.json"))
     if runs:
         sections.append(training_section(runs))
+    if not sections:
+        raise InvalidInput("results", f"{folder} holds no result file (*.json, train/*.json)")
     return "\n".join([INTRODUCTION, *sections])
 
 
 def _section(path: Path) -> str:
-    result = json.loads(path.read_text())
-    if result.get("format") == "rfedge-demo-1":
-        return _demo(path, result)
-    if result.get("format") == "rfedge-stability-1":
-        return f"{heading(path, result)}\n\n{len(result['cases'])} cases: `docs/stability.md`.\n"
-    if result.get("case") == "ladder":
-        return f"{heading(path, result)}\n\n{len(result['rows'])} rungs: `docs/ladder.md`.\n"
-    if result.get("format") == "rfedge-faults-1":
-        return f"{heading(path, result)}\n\n{len(result['rows'])} faults: `docs/reliability.md`.\n"
-    if result.get("case") in SECTIONS:
-        return SECTIONS[result["case"]](path, result)
-    if result.get("case") == "loadtest":
-        return load_section(path, result)
-    if "case" in result:
-        return _bench(path, result)
-    raise InvalidInput("results", f"{path} is neither a demo nor a bench result")
+    result = read_result(path)
+    if result["kind"] not in SECTIONS:
+        known = ", ".join(SECTIONS)
+        raise InvalidInput("results", f"{path}: kind {result['kind']!r} is none of {known}")
+    return SECTIONS[result["kind"]](path, result)
 
 
-def _demo(path: Path, result: Row) -> str:
-    sequences = result["sequences"]
-    rows = [
-        [f"{label} ({note})", *(show(entry) for entry in sequences.values())]
-        for label, note, show in SUMMARY
-    ]
-    rows += [
-        [f"100·I/(I+P) with {label}", *(f"{s[key]:.1f} %" for s in sequences.values())]
-        for label, key in METRIC
-    ]
-    settings, field = result["settings"], result["field"]
-    facts = (
-        f"Field of {field['gaussians']:,} Gaussians, {field['held_out_psnr_db']:.2f} dB on the "
-        f"held-out empty drive; x264 {settings['preset']}, CRF {settings['crf']:g}, "
-        f"{settings['rate_hz']:g} Hz, link {settings['link_bps'] / 1e6:g} Mbit/s and "
-        f"{settings['link_delay_ms']:g} ms."
-    )
-    return "\n\n".join([heading(path, result), facts, table(["", *sequences], rows), ""])
+DRAWINGS: Mapping[str, Callable[[Result, Path], list[Path]]] = {
+    "compare": write_compare_figures,
+    "ladder": write_ladder_figure,
+    "latency": write_latency_figures,
+    "paper": lambda result, out: write_paper_figures(rows_of(PaperRow, result["rows"]), out),
+    "robust": write_robust_figure,
+}
+"""Figures of the kinds of results that have some."""
 
 
-def _bench(path: Path, result: Row) -> str:
-    rows = [flattened(row) for row in result["rows"]]
-    columns = list(rows[0])
-    cells = [[cell(row[column]) for column in columns] for row in rows]
-    return "\n\n".join([heading(path, result), table(columns, cells), ""])
+def write_figures(folder: Path, out: Path) -> list[Path]:
+    """Draw every result of ``folder`` that has figures into ``out``; return their paths."""
+    results = [read_result(path) for path in sorted(folder.glob("*.json"))]
+    drawn = [result for result in results if result["kind"] in DRAWINGS]
+    return [path for result in drawn for path in DRAWINGS[result["kind"]](result, out)]
+
+
+def _reference(path: Path, result: Result, noun: str, page: str) -> str:
+    """Return how many rows there are, and the page that shows them."""
+    rows = result["cases"] if noun == "cases" else result["rows"]
+    return f"{heading(path, result)}\n\n{len(rows)} {noun}: `docs/{page}.md`.\n"
+
+
+def main(results: Path, docs: Path) -> None:
+    """Write page and figures."""
+    write_whole(docs / "results.md", results_page(results))
+    write_figures(results, docs / "figures")
 
 
 if __name__ == "__main__":
-    sys.stdout.write(results_page(Path(sys.argv[1])))
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -1,10 +1,8 @@
-"""The demo report's charts, as inline SVG.
+"""Charts and pictures of reports and figures: one palette, one style.
 
-One palette, one axis per chart, direct labels where a legend would be read twice.
-
-Pictures side by side in a page, and how two of them differ.
-
-What every figure of an evaluation has: one look, and its numbers beside it as CSV.
+Charts for a page are inline SVG (``svg``); figures of an experiment are files, with their numbers
+beside them as CSV (``write_figure``). Equal input gives equal bytes: ids are salted and nothing is
+dated. Pictures are embedded as JPEG data.
 """
 
 from __future__ import annotations
@@ -21,6 +19,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
+from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfcore.image import Rgb, jpeg_bytes
 
@@ -53,6 +52,14 @@ mpl.use("svg")
 
 INK, MUTED, GRID = "#1c2733", "#6b7785", "#dfe4ea"
 PAYLOAD, HEADER, RECONSTRUCTION, RENDER = "#2563eb", "#93b4f5", "#2563eb", "#d97706"
+LINES = ("#2563eb", "#d97706", "#0f766e", "#be185d", "#6d28d9", "#4d7c0f")
+MARKERS = ("o", "s", "^", "D", "v", "P")
+"""A colour and a marker for each line of a plot, so that they differ in grey as well."""
+BLUE, GREY = LINES[0], "#aab4bf"
+DIFFERENCE_GAIN = 4
+"""Factor that small differences of pictures are made visible by."""
+Lines = list[list[str]]
+"""A CSV file: its header, then its lines."""
 STAGES = {
     "convert": "vehicle: camera to YUV",
     "render": "vehicle: render",
@@ -64,6 +71,7 @@ STAGES = {
     "server_splice": "server: splice",
     "server_decode": "server: decode",
 }
+"""Labels of the stages of a frame, in the order that it passes them."""
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "rfedge",
@@ -80,32 +88,37 @@ STYLE: dict[Any, Any] = {
     "grid.color": GRID,
     "axes.axisbelow": True,
 }
-Frame = Mapping[str, Any]
 
 
-def bytes_chart(frames: Sequence[Frame]) -> str:
-    """Return a bar chart of payload and header bytes of every frame."""
+def bytes_chart(payload_bytes: Sequence[int], packet_bytes: Sequence[int]) -> str:
+    """Return a bar chart of payload and header bytes of every frame.
+
+    Raises ``InvalidInput`` without frames, or for lists of different lengths.
+    """
+    _check_series(payload_bytes, packet_bytes)
     with mpl.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7.2, 2.4))
-        number = range(len(frames))
-        payload = [frame["payload_bytes"] for frame in frames]
-        header = [frame["packet_bytes"] - frame["payload_bytes"] for frame in frames]
-        axes.bar(number, payload, color=PAYLOAD, label="payload: the P slice")
-        axes.bar(number, header, bottom=payload, color=HEADER, label="pose and header")
+        number = range(len(packet_bytes))
+        header = [a - b for a, b in zip(packet_bytes, payload_bytes, strict=True)]
+        axes.bar(number, payload_bytes, color=PAYLOAD, label="payload: the P slice")
+        axes.bar(number, header, bottom=payload_bytes, color=HEADER, label="pose and header")
         axes.set(xlabel="frame", ylabel="bytes")
         axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
         return svg(figure)
 
 
-def quality_chart(frames: Sequence[Frame]) -> str:
-    """Return PSNR over frames, of the reconstruction and of the render it was predicted from."""
+def quality_chart(reconstruction_db: Sequence[float], render_db: Sequence[float]) -> str:
+    """Return PSNR over frames, of the reconstruction and of the render it was predicted from.
+
+    Raises ``InvalidInput`` without frames, or for lists of different lengths.
+    """
+    _check_series(reconstruction_db, render_db)
     with mpl.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7.2, 2.4))
-        for key, colour, label in (
-            ("psnr_db", RECONSTRUCTION, "reconstruction"),
-            ("rf_psnr_db", RENDER, "render alone"),
+        for values, colour, label in (
+            (reconstruction_db, RECONSTRUCTION, "reconstruction"),
+            (render_db, RENDER, "render alone"),
         ):
-            values = [frame[key] for frame in frames]
             axes.plot(values, color=colour, linewidth=2, marker="o", markersize=3)
             axes.annotate(
                 label,
@@ -121,7 +134,11 @@ def quality_chart(frames: Sequence[Frame]) -> str:
 
 
 def curve_chart(curve: Sequence[Sequence[float]]) -> str:
-    """Return PSNR in dB over seconds of training, from points of (seconds, dB)."""
+    """Return PSNR in dB over seconds of training, from points of (seconds, dB).
+
+    Raises ``InvalidInput`` without points.
+    """
+    _check_series(curve)
     with mpl.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7.2, 2.8))
         seconds, quality_db = zip(*curve, strict=True)
@@ -141,7 +158,13 @@ def curve_chart(curve: Sequence[Sequence[float]]) -> str:
 
 
 def stages_chart(stages_ms: Mapping[str, float]) -> str:
-    """Return the median milliseconds of each stage, in the order a frame goes through them."""
+    """Return the median milliseconds of each stage, in the order a frame goes through them.
+
+    Raises ``InvalidInput`` unless there is a value for each of ``STAGES``.
+    """
+    missing = [stage for stage in STAGES if stage not in stages_ms]
+    if missing:
+        raise InvalidInput("stages", f"there is no value for {', '.join(missing)}")
     stages_ms = {label: stages_ms[stage] for stage, label in STAGES.items()}
     with mpl.rc_context({**STYLE, "axes.grid.axis": "x"}):
         figure, axes = plt.subplots(figsize=(7.2, 0.42 * len(stages_ms) + 0.6))
@@ -159,6 +182,12 @@ def stages_chart(stages_ms: Mapping[str, float]) -> str:
         axes.invert_yaxis()
         axes.set_xlabel("ms, median over the drive")
         return svg(figure)
+
+
+def _check_series(*series: Sequence[object]) -> None:
+    lengths = {len(values) for values in series}
+    if len(lengths) != 1 or 0 in lengths:
+        raise InvalidInput("chart", f"series of {sorted(lengths)} values: give one or more of each")
 
 
 def new_axes(height_in: float = 2.8) -> tuple[Any, Any]:
@@ -181,9 +210,6 @@ def svg(figure: Any) -> str:
     return text[text.index("<svg") :]
 
 
-DIFFERENCE_GAIN = 4
-
-
 def amplified_difference(shown: Rgb, camera: Rgb) -> Rgb:
     """Return the absolute difference times ``DIFFERENCE_GAIN``, uint8 [H, W, 3]."""
     difference = np.abs(shown.astype(np.int16) - camera)
@@ -198,15 +224,13 @@ def embedded(captions: Iterable[tuple[str, Rgb]]) -> list[dict[str, str]]:
     ]
 
 
-LINES = ("#2563eb", "#d97706", "#0f766e", "#be185d", "#6d28d9", "#4d7c0f")
-"""Told apart in grey as well by their markers."""
-MARKERS = ("o", "s", "^", "D", "v", "P")
-BLUE, GREY = LINES[0], "#aab4bf"
-Lines = list[list[str]]
-
-
 def write_figure(stem: Path, figure: Figure, lines: Sequence[Sequence[str]]) -> list[Path]:
-    """Write ``stem.svg`` and ``stem.csv`` and close the figure; return their paths."""
+    """Write ``stem.svg`` and ``stem.csv`` and close the figure; return their paths.
+
+    Raises ``InvalidInput`` for lines of different lengths, or without one beside the header.
+    """
+    if len(lines) < 2 or len({len(line) for line in lines}) != 1:
+        raise InvalidInput("figure", f"{stem.name}: its CSV needs a header and lines as long as it")
     drawing, numbers = io.StringIO(), io.StringIO()
     with plt.rc_context(STYLE):  # the salt of the file's ids is in it: equal figures, equal files
         figure.savefig(drawing, format="svg", bbox_inches="tight", metadata={"Date": None})

@@ -8,8 +8,6 @@ shown for longer (four times as much at 1 Hz as at 30). Slices are counted, para
 from __future__ import annotations
 
 import json
-import shlex
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +16,10 @@ import numpy as np
 
 from rfcore.codec.h264.ffmpeg import EncoderOptions, PictureKind, encode_pictures
 from rfcore.errors import DatasetError, InvalidInput
-from rfcore.files import write_whole
 from rfcore.image import Rgb, read_rgb
 from rfcore.native.yuv import i420_from_rgb
 from rfedge.experiments.paper.published import slice_nals
-from rfedge.results import host, revision
+from rfedge.results import make_result, provenance, write_result
 
 __all__ = ["IntraCoding", "SceneSizes", "intra_bytes", "sizes_of", "write_sizes"]
 
@@ -99,11 +96,7 @@ def sizes_of(folders: Sequence[Path], coding: IntraCoding) -> Iterator[SceneSize
 
 def write_sizes(path: Path, scenes: Sequence[SceneSizes], coding: IntraCoding) -> None:
     """Write what was measured, with the command, the revision and the host."""
-    result = {
-        "case": "intra-size",
-        "command": shlex.join(["rfedge", *sys.argv[1:]]),
-        "revision": revision(),
-        "host": host(),
+    content = {
         "coding": {"preset": coding.preset, "crf": coding.crf, "rate_hz": coding.rate_hz},
         "rows": [
             {
@@ -116,8 +109,7 @@ def write_sizes(path: Path, scenes: Sequence[SceneSizes], coding: IntraCoding) -
             for scene in scenes
         ],
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, json.dumps(result, indent=1) + "\n")
+    write_result(path, make_result("intra-size", provenance(), content))
 
 
 def _build(folder: Path) -> tuple[str, int]:

@@ -5,9 +5,6 @@ The table stands between two marks in the page, so that its figures are generate
 
 from __future__ import annotations
 
-import json
-import shlex
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +12,7 @@ from typing import Any
 
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
-from rfedge.results import host, revision
+from rfedge.results import make_result, provenance, write_result
 from rfedge.street.plan import (
     PlainStreets,
     PlannedEffect,
@@ -85,15 +82,7 @@ def measured_plans(scenes: Sequence[Scene], cpu_s: Callable[[], float]) -> Itera
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
     """Write the rows with the command, the revision and the host that they come from."""
-    result = {
-        "case": "scene-plan",
-        "command": shlex.join(["rfedge", *sys.argv[1:]]),
-        "revision": revision(),
-        "host": host(),
-        "rows": list(rows),
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, json.dumps(result, indent=1) + "\n")
+    write_result(path, make_result("scene-plan", provenance(), {"rows": list(rows)}))
 
 
 def plan_table(rows: Sequence[Row]) -> str:

@@ -7,7 +7,6 @@ the run.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from rfcore.field import RadianceField, SplatField
 from rfcore.train import held_out_quality
 from rfcore.train.levels import LevelFitConfig, with_levels
 from rfcore.views import PosedPicture
-from rfedge.results import host, revision
+from rfedge.results import make_result, provenance
 from rfedge.training.run import Trained, TrainingJob
 
 __all__ = ["finish_field", "fit_levels", "training_result"]
@@ -75,7 +74,7 @@ def training_result(
     """
     k = job.dataset.pictures[0].camera.intrinsics
     metadata = written.metadata
-    return {
+    content = {
         "field": f"{metadata.kind} {written.field_id}",
         "views": len(job.dataset.pictures),
         "held_out": {
@@ -94,7 +93,5 @@ def training_result(
         "seed": job.seed,
         "settings": asdict(job.config),
         "training_digest": metadata.training_digest,
-        "command": " ".join(["rfedge", *sys.argv[1:]]),
-        "revision": revision(),
-        "host": host(),
     }
+    return make_result("training", provenance(), content)

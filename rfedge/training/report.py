@@ -20,7 +20,8 @@ from rfcore.image import Rgb
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
 from rfedge.report.charts import DIFFERENCE_GAIN, amplified_difference, curve_chart, embedded
-from rfedge.report.markdown_parts import Row, table
+from rfedge.report.tables import table
+from rfedge.results import Result, read_result
 
 __all__ = ["training_section", "write_training_report"]
 
@@ -103,7 +104,7 @@ RUN_COLUMNS = (
 
 def training_section(paths: Sequence[Path]) -> str:
     """Return a table of training runs, and the command of each."""
-    runs = {path.stem: json.loads(path.read_text()) for path in paths}
+    runs = {path.stem: read_result(path, "training") for path in paths}
     rows = [_run_cells(name, run) for name, run in runs.items()]
     commands = [
         f"* {name}: `{run['command']}` at `{run['revision']}`" for name, run in runs.items()
@@ -111,7 +112,7 @@ def training_section(paths: Sequence[Path]) -> str:
     return "\n\n".join(["## training", table(RUN_COLUMNS, rows), "\n".join(commands), ""])
 
 
-def _run_cells(name: str, run: Row) -> list[str]:
+def _run_cells(name: str, run: Result) -> list[str]:
     held_out = run["held_out"]
     psnr_db, ssim = held_out["psnr_db"], held_out["ssim"]
     return [

@@ -19,10 +19,11 @@ from rfcore.ngp.shape import (
     initial_parameters,
 )
 from rfedge.bench import ngp
+from rfedge.results import as_json
 
 KEYS = [
     *("width", "height", "threads", "frame_ms", "samples_per_ray", "psnr_to_reference_db"),
-    *("budget", "isa"),
+    *("budget", "isa", "held_out_db", "torch_ms_scaled"),
 ]
 CAMERA = Camera(Intrinsics(30, 20, 20.0, 20.0, 15.0, 10.0), Pose((0, 0, -0.5), (1.0, 0, 0, 0)))
 
@@ -40,13 +41,14 @@ def numbers() -> NgpParameters:
 
 def test_a_row_has_the_published_keys(numbers: NgpParameters) -> None:
     renderer = NgpRenderer(numbers, threads=2)
-    unhurried, hurried = (ngp._row(renderer, CAMERA, n) for n in (None, 4))
-    assert list(unhurried) == list(hurried) == KEYS
-    assert unhurried["psnr_to_reference_db"] is None
-    assert 10 < hurried["psnr_to_reference_db"] < 100
-    assert hurried["samples_per_ray"] < unhurried["samples_per_ray"]
-    assert (hurried["width"], hurried["height"], hurried["threads"]) == (30, 20, 2)
-    assert hurried["frame_ms"] > 0
+    unhurried, hurried = (ngp._row(renderer, CAMERA, n, (25.0, 1e3)) for n in (None, 4))
+    assert list(as_json(unhurried)) == list(as_json(hurried)) == KEYS
+    assert unhurried.psnr_to_reference_db is None
+    assert hurried.psnr_to_reference_db is not None
+    assert 10 < hurried.psnr_to_reference_db < 100
+    assert hurried.samples_per_ray < unhurried.samples_per_ray
+    assert (hurried.width, hurried.height, hurried.threads) == (30, 20, 2)
+    assert hurried.frame_ms > 0
 
 
 def test_a_wrong_renderer_is_not_timed(

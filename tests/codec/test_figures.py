@@ -10,15 +10,15 @@ import pytest
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.views import FieldView
-from rfedge.demo.measure import IntraPoint, intra_curve, luma_psnr_db, saving_at_equal_psnr
+from rfedge.demo.measure import RatePoint, intra_curve, luma_psnr_db, saving_at_equal_psnr
 from rfedge.experiments.paper.published import PaperSavings, paper_savings, paper_savings_percent
 
 PictureMaker = Callable[..., I420]
 PairMaker = Callable[..., tuple[I420, FieldView]]
 
 
-def curve_of(*points: tuple[float, float]) -> list[IntraPoint]:
-    return [IntraPoint(20.0 + i, b, q) for i, (b, q) in enumerate(points)]
+def curve_of(*points: tuple[float, float]) -> list[RatePoint]:
+    return [RatePoint(20.0 + i, b, q) for i, (b, q) in enumerate(points)]
 
 
 CURVE = curve_of((8000, 44), (4000, 41), (2000, 38), (1000, 35))
@@ -76,7 +76,7 @@ def test_between_points_bytes_are_interpolated_in_the_logarithm() -> None:
     ],
 )
 def test_a_saving_that_the_curve_cannot_tell_is_refused(
-    curve: list[IntraPoint], psnr_db: float, problem: str
+    curve: list[RatePoint], psnr_db: float, problem: str
 ) -> None:
     with pytest.raises(InvalidInput, match=problem):
         saving_at_equal_psnr(curve, 100, psnr_db)

@@ -19,8 +19,8 @@ def row(ms: float, rate: float, crf: float = 28.0, **knobs: Any) -> dict[str, An
     return {"settings": settings, "sender_ms": ms, "receiver_ms": 10.0, "rate_percent": rate}
 
 
-def write(path: Path, *rows: dict[str, Any], case: str = "ladder") -> Path:
-    path.write_text(json.dumps({"case": case, "rows": rows}))
+def write(path: Path, *rows: dict[str, Any], kind: str = "ladder") -> Path:
+    path.write_text(json.dumps({"kind": kind, "rows": rows}))
     return path
 
 
@@ -71,10 +71,10 @@ def test_a_ladder_is_read_for_its_kind_and_the_nearest_crf(tmp_path: Path) -> No
     [
         ("", "not a usable ladder"),
         ("[]", "not a usable ladder"),
-        (json.dumps({"case": "compare", "rows": []}), "another verb"),
-        (json.dumps({"case": "ladder", "rows": []}), "no rungs for splats"),
-        (json.dumps({"case": "ladder", "rows": [row(0, 0)]}), "must be above 0 ms"),
-        (json.dumps({"case": "ladder", "rows": [row(9, 0, detail=0.3)]}), "quality.detail"),
+        (json.dumps({"kind": "compare", "rows": []}), "another kind"),
+        (json.dumps({"kind": "ladder", "rows": []}), "no rungs for splats"),
+        (json.dumps({"kind": "ladder", "rows": [row(0, 0)]}), "must be above 0 ms"),
+        (json.dumps({"kind": "ladder", "rows": [row(9, 0, detail=0.3)]}), "quality.detail"),
     ],
 )
 def test_a_file_that_is_no_ladder_is_refused_by_name(

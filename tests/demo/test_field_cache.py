@@ -15,15 +15,16 @@ from rfedge.demo import field as make_sample_field
 from rfedge.demo import field as sample_field
 from rfedge.demo.field import (
     FieldChoice,
-    Making,
     cache_path,
     choose_field,
     sample_field_path,
     write_sample_field,
 )
+from rfedge.results import provenance
 
 CONFIG = SplatTrainingConfig(gaussians=100, iterations=3)
 SILENT = Console(quiet=True)
+BY_HAND = provenance(command="by hand", at="v1")
 
 
 def chosen(
@@ -76,9 +77,7 @@ def test_a_damaged_field_says_how_to_make_it_anew(tiny_sample: Path, tmp_path: P
 @pytest.fixture
 def shipped(tiny_sample: Path, tiny_gaussians: Gaussians) -> Path:
     """The field of the tiny sample, put where a shipped one lies."""
-    write_sample_field(
-        tiny_sample, SplatField(tiny_gaussians).compressed(), Making("by hand", "v1", 0)
-    )
+    write_sample_field(tiny_sample, SplatField(tiny_gaussians).compressed(), BY_HAND, 0)
     return sample_field_path(tiny_sample)
 
 
@@ -127,7 +126,7 @@ def test_a_field_too_large_to_ship_is_not_left_there(
 ) -> None:
     monkeypatch.setattr(sample_field, "MAX_BYTES", 1000)
     with pytest.raises(InvalidData, match="over the 1000"):
-        write_sample_field(tiny_sample, SplatField(tiny_gaussians), Making("by hand", "v1", 0))
+        write_sample_field(tiny_sample, SplatField(tiny_gaussians), BY_HAND, 0)
     assert not sample_field_path(tiny_sample).exists()
 
 

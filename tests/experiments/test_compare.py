@@ -43,45 +43,45 @@ FAMILIES = {
 @pytest.fixture(scope="module")
 def rows():
     return {
-        row["rival"]: row
+        row.rival: row
         for row in compare_rows(CLIP, OURS, FAMILIES)
-        if row["window_db"] == [32.0, 35.0]
+        if row.window_db == (32.0, 35.0)
     }
 
 
 def test_the_figure_is_the_ratio_of_rates(rows):
-    assert rows["x264-lowdelay"]["bd_rate_percent"] == pytest.approx(-50, abs=0.1)
+    assert rows["x264-lowdelay"].bd_rate_percent == pytest.approx(-50, abs=0.1)
 
 
 def test_a_family_is_represented_by_its_strongest_of_no_more_processor_time(rows):
-    assert rows["svtav1-lowdelay"]["rival_setting"] == "p8"
+    assert rows["svtav1-lowdelay"].rival_setting == "p8"
 
 
 def test_a_family_that_is_always_slower_is_represented_by_its_quickest(rows):
-    assert rows["x265-lowdelay"]["rival_setting"] == "fast"
+    assert rows["x265-lowdelay"].rival_setting == "fast"
 
 
 def test_the_best_comparable_rival_never_took_more_processor_time(rows):
     best = rows[BEST]
-    assert best["rival_setting"] == "p8"
-    assert best["bd_rate_percent"] == pytest.approx(100 * (0.5 / 0.8 - 1), abs=0.1)
-    assert best["rival_cpu_ms"] <= best["cpu_ms"]
+    assert best.rival_setting == "p8"
+    assert best.bd_rate_percent == pytest.approx(100 * (0.5 / 0.8 - 1), abs=0.1)
+    assert best.rival_cpu_ms <= best.cpu_ms
 
 
 def test_the_first_frame_is_told_apart_from_the_steady_state(rows):
     row = rows["x264-lowdelay"]
-    assert row["rival_first_frame_bytes"] == 2 * row["first_frame_bytes"]
-    assert row["saving_percent_at_db"]["33"] == pytest.approx(50, abs=0.1)
+    assert row.rival_first_frame_bytes == 2 * row.first_frame_bytes
+    assert row.saving_percent_at_db["33"] == pytest.approx(50, abs=0.1)
 
 
 def test_what_the_first_frame_takes_does_not_count_in_the_steady_state():
     """A stream sends it once: 40 times the bytes there change no figure but its own column."""
     heavy = {"x264-lowdelay": [performance("x264", 1.0, cpu_ms=10, first=40)]}
     (row, *_) = compare_rows(CLIP, OURS, heavy)
-    assert row["bd_rate_percent"] == pytest.approx(-50, abs=0.1)
-    assert row["ci95"] == pytest.approx([-50, -50], abs=0.1)
-    assert row["saving_percent_at_db"]["33"] == pytest.approx(50, abs=0.1)
-    assert row["rival_first_frame_bytes"] == pytest.approx(16 * row["first_frame_bytes"], rel=1e-3)
+    assert row.bd_rate_percent == pytest.approx(-50, abs=0.1)
+    assert row.ci95 == pytest.approx([-50, -50], abs=0.1)
+    assert row.saving_percent_at_db["33"] == pytest.approx(50, abs=0.1)
+    assert row.rival_first_frame_bytes == pytest.approx(16 * row.first_frame_bytes, rel=1e-3)
 
 
 def test_quality_of_the_first_frame_does_not_count_either():
@@ -96,7 +96,7 @@ def test_quality_of_the_first_frame_does_not_count_either():
 
 def test_a_window_that_is_asked_for_is_the_only_one():
     rows = compare_rows(CLIP, OURS, FAMILIES, [(36.0, 39.0)])
-    assert {tuple(row["window_db"]) for row in rows} == {(36.0, 39.0)}
+    assert {tuple(row.window_db) for row in rows} == {(36.0, 39.0)}
     assert len(rows) == len(FAMILIES) + 1
 
 
@@ -112,15 +112,15 @@ def test_a_family_of_nobody_is_an_error():
 
 def test_without_a_comparable_rival_there_is_no_best_one():
     slow = {"x265-lowdelay": [performance("slow", 0.3, 99)]}
-    assert BEST not in {row["rival"] for row in compare_rows(CLIP, OURS, slow)}
+    assert BEST not in {row.rival for row in compare_rows(CLIP, OURS, slow)}
 
 
 def test_a_wider_window_is_left_out_where_a_field_shows_more_before_a_bit_is_sent():
     good = Performance("good", tuple(clip for clip in OURS.clips if clip.luma_mse[0] < 42), 50)
     assert good.steady.psnr_db[0] > 30
     rows = compare_rows(CLIP, good, {"x264-lowdelay": FAMILIES["x264-lowdelay"]})
-    assert {tuple(row["window_db"]) for row in rows} == {(32.0, 35.0)}
-    assert set(rows[0]["saving_percent_at_db"]) == {"33", "35"}
+    assert {tuple(row.window_db) for row in rows} == {(32.0, 35.0)}
+    assert set(rows[0].saving_percent_at_db) == {"33", "35"}
 
 
 class Counting:

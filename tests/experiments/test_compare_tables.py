@@ -28,20 +28,20 @@ OURS, RIVAL = performance("ours", 400), performance("x264", 1000)
 
 def test_the_field_is_paid_for_by_whole_passes():
     row = break_even_row(CLIP, OURS, RIVAL, field_bytes=20_000)
-    assert row["saved_bytes_per_pass"] == pytest.approx(6000)
-    assert row["passes_to_break_even"] == 4
-    after = row["saving_percent_after"]
+    assert row.saved_bytes_per_pass == pytest.approx(6000)
+    assert row.passes_to_break_even == 4
+    after = row.saving_percent_after
     assert after["1"] == pytest.approx(100 * (1 - (4_000 + 20_000) / 10_000))
     assert after["100"] == pytest.approx(100 * (1 - (400_000 + 20_000) / 1_000_000))
 
 
 def test_a_method_that_saves_nothing_never_pays_for_its_field():
     row = break_even_row(CLIP, RIVAL, OURS, field_bytes=20_000)
-    assert row["passes_to_break_even"] is None
+    assert row.passes_to_break_even is None
 
 
 def test_curves_run_from_the_lowest_quality_to_the_highest_with_their_points():
     ours, rival = curve_rows(CLIP, [OURS], {"x264-lowdelay": [RIVAL]})
-    assert (ours["family"], rival["family"]) == ("", "x264-lowdelay")
-    assert ours["point"] == [6, 5, 4, 3, 2, 1, 0]
-    assert ours["psnr_db"] == sorted(ours["psnr_db"])
+    assert (ours.family, rival.family) == ("", "x264-lowdelay")
+    assert ours.point == [6, 5, 4, 3, 2, 1, 0]
+    assert ours.psnr_db == sorted(ours.psnr_db)

@@ -66,8 +66,8 @@ def test_against_itself_the_foreground_costs_the_same_and_the_ceiling_is_said():
     clip = Clip("street", 10.0, FRAMES, "digest", None)
     clips = perform(clip, coder, NoStore()).clips
     row = foreground_row(clip, clips, clips, MASKS)
-    assert row["bd_rate_percent"] == pytest.approx(0)
-    assert row["whole_picture_ceiling_db"] == pytest.approx(
+    assert row.bd_rate_percent == pytest.approx(0)
+    assert row.whole_picture_ceiling_db == pytest.approx(
         10 * np.log10(255**2 / (36 * (~MASKS[0]).mean())), abs=0.2
     )
 

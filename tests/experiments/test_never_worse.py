@@ -90,17 +90,17 @@ def test_a_row_tells_excess_without_header_and_whether_it_holds(tmp_path, seen):
     ]
     table = NeverWorse(Drive(drive().name, drive().pictures, noisy), seen, "veryfast", "test")
     rows = list(table.rows(CellStore(tmp_path)))
-    assert [(row["control"], row["at_db"]) for row in rows] == [
+    assert [(row.control, row.at_db) for row in rows] == [
         (control, db) for control in CONTROLS for db in (31.0, 33.0, 35.0)
     ]
-    by_control = {row["control"]: row for row in rows if row["at_db"] == 33.0}
-    assert by_control["right"]["excess_percent"] < by_control["black"]["excess_percent"]
+    by_control = {row.control: row for row in rows if row.at_db == 33.0}
+    assert by_control["right"].excess_percent < by_control["black"].excess_percent
     for row in rows:
-        slice_bytes = row["bytes"] - row["header_bytes"]
-        expected = 100 * (slice_bytes / row["rival_bytes"] - 1)
-        assert row["excess_percent"] == pytest.approx(expected)
-        assert row["holds"] == (row["excess_percent"] <= 2)
-        assert 60 < row["header_bytes"] < 300
+        slice_bytes = row.bytes - row.header_bytes
+        expected = 100 * (slice_bytes / row.rival_bytes - 1)
+        assert row.excess_percent == pytest.approx(expected)
+        assert row.holds == (row.excess_percent <= 2)
+        assert 60 < row.header_bytes < 300
 
 
 def test_a_job_without_drives_is_refused():

@@ -28,7 +28,7 @@ from integration.conftest import coded, raw_vehicle, street
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.dataset import read_dataset
 from rfcore.wire.messages import FrameAddress
-from rfedge.results import host, revision
+from rfedge.results import make_result, provenance, write_result
 
 __all__ = ["coded", "raw_vehicle", "street"]
 
@@ -49,14 +49,8 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     path = session.config.getoption("--faults-json")
     if path is None or not ROWS:
         return
-    result = {
-        "format": "rfedge-faults-1",
-        "command": "make test-fault",
-        "host": host(),
-        "revision": revision(),
-        "rows": ROWS,
-    }
-    path.write_text(json.dumps(result, indent=1) + "\n")
+    made = provenance(command="make test-fault")
+    write_result(path, make_result("faults", made, {"rows": ROWS}))
 
 
 async def appears(condition: Callable[[], Any], within_s: float = 60.0) -> Any:

@@ -4,7 +4,6 @@
 options (``pytest -m hard``) nothing is written.
 """
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from hard.cases import CASES
 from hard.cases.case import Case, Finding
 from hard.cases.page import Row, case_row, stability_page, stability_result, unmeasured
 from rfcore.files import write_whole
+from rfedge.results import write_result
 
 ROWS = pytest.StashKey[list[Row]]()
 
@@ -51,6 +51,6 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         )
     result = stability_result(rows)
     if json_path is not None:
-        write_whole(json_path, json.dumps(result, indent=1) + "\n")
+        write_result(json_path, result)
     if page_path is not None:
         write_whole(page_path, stability_page(result).rstrip() + "\n")

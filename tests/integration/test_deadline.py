@@ -26,7 +26,7 @@ def write_ladder(path: Path, full_ms: float, low_ms: float) -> Path:
         return {"settings": settings, "sender_ms": ms, "receiver_ms": 1.0, "rate_percent": rate}
 
     rows = [row(full_ms, 0.0), row(low_ms, 90.0, detail=0.1, sh_degree=0, references=0)]
-    path.write_text(json.dumps({"case": "ladder", "rows": rows}))
+    path.write_text(json.dumps({"kind": "ladder", "rows": rows}))
     return path
 
 

@@ -1,4 +1,4 @@
-"""Canned vehicles against real servers: their packets are decoded, and every picture counted."""
+"""Prerecorded vehicles against real servers: packets are decoded, and every picture counted."""
 
 import json
 from collections.abc import Callable
@@ -15,7 +15,6 @@ from rfedge.loadtest.command import Command
 from rfedge.loadtest.fleet import FleetSpec, run_fleet
 from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
-from rfedge.loadtest.result import record
 from rfedge.loadtest.run import TestBed
 from rfedge.loadtest.server import KeptRenders, passing, with_kept_renders
 
@@ -24,14 +23,14 @@ PATIENT = Bounds(deadline_ms=60_000.0, on_time_percent=0.0, fairness=0.0, settli
 
 
 @pytest.fixture(scope="session")
-def canned(street: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(street: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return prerecorded_drive(
-        street.drive, street.field, tmp_path_factory.mktemp("canned"), "ultrafast"
+        street.drive, street.field, tmp_path_factory.mktemp("recorded"), "ultrafast"
     )
 
 
-def test_canned_frames_decode_in_a_chain_and_alone(street: Any, canned: Path) -> None:
-    drive = PrerecordedDrive.read(canned)
+def test_prerecorded_frames_decode_in_a_chain_and_alone(street: Any, recorded: Path) -> None:
+    drive = PrerecordedDrive.read(recorded)
     for frames in (drive.chain, drive.alone):
         decoder = DeltaDecoder(drive.hello.cameras[0].codec)
         state = decoder.start(frames[0].packet.epoch)
@@ -46,10 +45,10 @@ def test_canned_frames_decode_in_a_chain_and_alone(street: Any, canned: Path) ->
     assert any(len(frame.packet.references) > 1 for frame in drive.chain)
 
 
-def test_a_coded_drive_is_coded_once(street: Any, canned: Path) -> None:
-    before = (canned / "chain.rfv").stat().st_mtime_ns
-    again = prerecorded_drive(street.drive, street.field, canned.parent, "ultrafast")
-    assert (again, (again / "chain.rfv").stat().st_mtime_ns) == (canned, before)
+def test_a_coded_drive_is_coded_once(street: Any, recorded: Path) -> None:
+    before = (recorded / "chain.rfv").stat().st_mtime_ns
+    again = prerecorded_drive(street.drive, street.field, recorded.parent, "ultrafast")
+    assert (again, (again / "chain.rfv").stat().st_mtime_ns) == (recorded, before)
 
 
 def spec_of(address: object, drive: Path, **changes: Any) -> FleetSpec:
@@ -67,9 +66,9 @@ def spec_of(address: object, drive: Path, **changes: Any) -> FleetSpec:
 
 @pytest.mark.parametrize("mode", list(Mode))
 async def test_a_fleet_counts_every_picture_and_the_server_refuses_none(
-    serve: Callable[..., Any], street: Any, canned: Path, tmp_path: Path, mode: Mode
+    serve: Callable[..., Any], street: Any, recorded: Path, tmp_path: Path, mode: Mode
 ) -> None:
-    drive, opened = canned, None
+    drive, opened = recorded, None
     if mode is Mode.TRANSPORT:
         payload_drive(street.field_id, 2000).write(tmp_path)
         drive, opened = tmp_path, passing
@@ -88,10 +87,10 @@ async def test_a_fleet_counts_every_picture_and_the_server_refuses_none(
 
 
 async def test_vehicles_that_reach_nobody_are_counted_as_failed(
-    canned: Path, monkeypatch: pytest.MonkeyPatch, free_port: int
+    recorded: Path, monkeypatch: pytest.MonkeyPatch, free_port: int
 ) -> None:
     monkeypatch.setattr("rfedge.loadtest.fleet.CONNECT_S", 0.2)
-    result = await run_fleet(spec_of(f"127.0.0.1:{free_port}", canned), lambda: None)
+    result = await run_fleet(spec_of(f"127.0.0.1:{free_port}", recorded), lambda: None)
     assert all(vehicle["failed"] for vehicle in result["vehicles"])
     assert all(vehicle["due"] == 10 for vehicle in result["vehicles"])
 
@@ -115,9 +114,9 @@ def test_kept_renders_are_rendered_once(street: Any) -> None:
 @pytest.mark.parametrize(
     ("mode", "kind", "link"),
     [
-        (Mode.TRANSPORT, Vehicles.CANNED, None),
-        (Mode.RECEIVER, Vehicles.CANNED, "samples/links/steady.toml"),
-        (Mode.FULL, Vehicles.CANNED, None),
+        (Mode.TRANSPORT, Vehicles.PRERECORDED, None),
+        (Mode.RECEIVER, Vehicles.PRERECORDED, "samples/links/steady.toml"),
+        (Mode.FULL, Vehicles.PRERECORDED, None),
         (Mode.FULL, Vehicles.LIVE, "samples/links/steady.toml"),
     ],
 )
@@ -141,24 +140,3 @@ def test_the_command_leaves_a_page_and_rows(
     assert "2 vehicles held" in page
     assert page.count("<svg") == 2
     assert (tmp_path / "out" / "vehicles_vs_uplink.svg").read_text().startswith("<svg")
-
-
-def test_a_committed_row_is_replaced_by_the_same_load_and_kept_beside_others(
-    tmp_path: Path,
-) -> None:
-    row = dict.fromkeys(("cameras", "width", "height", "link", "vehicle_ms", "admission"), 1)
-    row = {**row, "mode": "full", "kind": "canned", "vehicles": 4, "hz": 5.0, "held": False}
-    path = tmp_path / "loadtest.json"
-
-    def run(**changes: Any) -> None:
-        content = {"case": "loadtest", "command": "c", "revision": "r", "host": {}}
-        record(path, {**content, "rows": [{**row, **changes}]})
-
-    run()
-    run(held=True)
-    run(mode="transport", vehicles=100)
-    rows = json.loads(path.read_text())["rows"]
-    assert [(r["mode"], r["vehicles"], r["held"]) for r in rows] == [
-        ("transport", 100, False),
-        ("full", 4, True),
-    ]

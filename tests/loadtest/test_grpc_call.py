@@ -1,4 +1,4 @@
-"""The bytes of a canned vehicle's call are what gRPC's own server understands, and back."""
+"""The bytes of a prerecorded vehicle's call are what gRPC's own server understands, and back."""
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable

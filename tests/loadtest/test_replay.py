@@ -1,4 +1,4 @@
-"""A canned vehicle keeps its pace whatever the server does, and its packets stay decodable."""
+"""A prerecorded vehicle keeps its pace whatever the server does, and its packets stay decodable."""
 
 import zlib
 from dataclasses import replace
@@ -29,7 +29,7 @@ from rfedge.loadtest.replay import End, Replay, Schedule
 PICTURES = 4
 
 
-def canned_frame(payload: bytes) -> Frame:
+def prerecorded_frame(payload: bytes) -> Frame:
     digest = zlib.crc32(payload).to_bytes(16, "big")
     packet = DeltaPacket(0, 0, digest, b"", digest, payload, 0).sealed()
     return Frame("front", 0, Pose.identity(), b"", packet)
@@ -40,8 +40,8 @@ def drive() -> PrerecordedDrive:
     header = StreamHeader(CodecConfig(32, 16), b"\x67" * 20, b"\x68" * 5)
     camera = CameraDescription("front", Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0), header)
     hello = Hello("v", (camera,), ("ab" * 32,), RendererContract(RENDERER_CONTRACT, exact=True))
-    chain = tuple(canned_frame(f"chain {i}".encode()) for i in range(PICTURES))
-    alone = tuple(canned_frame(f"alone {i}".encode()) for i in range(PICTURES))
+    chain = tuple(prerecorded_frame(f"chain {i}".encode()) for i in range(PICTURES))
+    alone = tuple(prerecorded_frame(f"alone {i}".encode()) for i in range(PICTURES))
     return PrerecordedDrive(hello, chain, alone)
 
 

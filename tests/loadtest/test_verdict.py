@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from rfedge.loadtest.plan import Bounds
-from rfedge.loadtest.verdict import Measured, Resources, VehicleCount, judge, wilson_lower
+from rfedge.loadtest.verdict import Measured, Resources, VehicleCount, judge, share_at_least
 
 IDLE = Resources(0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.0, 1.0)
 
@@ -24,12 +24,12 @@ def run_of(*vehicles: VehicleCount, growth_mb: float = 0.0) -> Measured:
 )
 def test_wilsons_bound_is_the_published_one(successes: int, trials: int, lower: float) -> None:
     """Against tables of the score interval (Newcombe 1998)."""
-    assert wilson_lower(successes, trials) == pytest.approx(lower, abs=5e-5)
+    assert share_at_least(successes, trials) == pytest.approx(lower, abs=5e-5)
 
 
 def test_wilsons_bound_solves_its_equation() -> None:
     """The bound is the share p from which the observed one is 1.96 standard errors away."""
-    p = wilson_lower(870, 1000)
+    p = share_at_least(870, 1000)
     assert (0.87 - p) / math.sqrt(p * (1 - p) / 1000) == pytest.approx(1.959964, abs=1e-5)
 
 

@@ -1,14 +1,23 @@
 """The committed page of faults is what the committed scoreboard says."""
 
-import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.pages.faults import faults_page
+from rfedge.pages.faults import FaultRow, faults_page
+from rfedge.results import Provenance, make_result, write_result
 
 ROOT = Path(__file__).parents[2]
+HOST = {"cpu": "C", "cores": 2, "isa": "avx2"}
+MADE = Provenance("make test-fault", "abc", False, HOST, {})
+ROW = FaultRow("it breaks", "a hammer", "back <= 1 s; told so", "2.5 s; yes", passed=False)
+
+
+def scoreboard(path: Path, *rows: Any, kind: str = "faults") -> Path:
+    write_result(path, make_result(kind, MADE, {"rows": rows}))
+    return path
 
 
 def test_the_page_is_generated_from_the_scoreboard() -> None:
@@ -17,20 +26,44 @@ def test_the_page_is_generated_from_the_scoreboard() -> None:
 
 
 def test_a_row_shows_each_bound_beside_its_figure_and_a_miss_as_such(tmp_path: Path) -> None:
-    row = {"fault": "it breaks", "injected_with": "a hammer", "passed": False}
-    row |= {"bound": "back <= 1 s; told so", "measured": "2.5 s; yes"}
-    machine = {"cpu": "C", "cores": 2, "isa": "avx2"}
-    result = {"format": "rfedge-faults-1", "command": "make test-fault", "revision": "abc"}
-    path = tmp_path / "faults.json"
-    path.write_text(json.dumps({**result, "host": machine, "rows": [row]}))
-    page = faults_page(path)
+    page = faults_page(scoreboard(tmp_path / "faults.json", ROW))
     assert "0 of 1 hold. `make test-fault` at `abc`; C, 2 cores, avx2." in page
     assert "### it breaks: **does not hold**" in page
     assert "| back <= 1 s | 2.5 s |\n| told so | yes |" in page
 
 
+def test_every_row_appears_once_and_those_that_hold_are_counted(tmp_path: Path) -> None:
+    rows = [FaultRow(f"fault {k}", f"tool {k}", "b", f"{k} ms", passed=k % 3 > 0) for k in range(7)]
+    page = faults_page(scoreboard(tmp_path / "faults.json", *rows))
+    assert "4 of 7 hold." in page
+    assert page.count("### fault ") == 7
+    for k, row in enumerate(rows):
+        verdict = "holds" if row.passed else "**does not hold**"
+        assert f"### fault {k}: {verdict}\n\ntool {k}\n" in page
+        assert f"| b | {k} ms |" in page
+
+
+def test_the_bounds_of_a_row_cannot_break_its_table(tmp_path: Path) -> None:
+    row = FaultRow("a fault", "a | b", "x | y", "1 | 2", passed=True)
+    page = faults_page(scoreboard(tmp_path / "faults.json", row))
+    assert r"| x \| y | 1 \| 2 |" in page
+
+
+def test_a_bound_without_a_figure_is_refused_by_the_faults_name(tmp_path: Path) -> None:
+    row = FaultRow("it breaks", "a hammer", "back <= 1 s; told so", "2.5 s", passed=False)
+    with pytest.raises(InvalidInput, match="it breaks: 2 bounds and 1 figures"):
+        faults_page(scoreboard(tmp_path / "faults.json", row))
+
+
 def test_another_result_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "other.json"
-    path.write_text("{}")
-    with pytest.raises(InvalidInput, match="no result of the fault suite"):
-        faults_page(path)
+    with pytest.raises(InvalidInput, match="of kind 'ladder', not 'faults'"):
+        faults_page(scoreboard(tmp_path / "other.json", ROW, kind="ladder"))
+    (tmp_path / "empty.json").write_text("{}")
+    with pytest.raises(InvalidInput, match=r"empty\.json is no result file"):
+        faults_page(tmp_path / "empty.json")
+
+
+def test_a_row_that_lacks_its_verdict_is_refused(tmp_path: Path) -> None:
+    row = {"fault": "f", "injected_with": "i", "bound": "b", "measured": "m"}
+    with pytest.raises(InvalidInput, match="lacks passed"):
+        faults_page(scoreboard(tmp_path / "faults.json", row))

@@ -106,8 +106,8 @@ def read_ladder(path: Path, kind: str, crf: float) -> tuple[MeasuredRung, ...]:
     """
     try:
         result = json.loads(path.read_text())
-        if result["case"] != "ladder":
-            raise InvalidData("it is the result of another verb")
+        if result["kind"] != "ladder":
+            raise InvalidData("it is a result of another kind")
         rows = [row for row in result["rows"] if row["settings"]["kind"] == kind]
         if not rows:
             raise InvalidData(f"it has no rungs for {kind}")

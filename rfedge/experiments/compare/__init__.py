@@ -31,7 +31,7 @@ class EvalCompare:
     the field, for the split of the bits and for a rival that sends only the foreground."""
     preset: Preset = "veryfast"
     """x264 preset of ours and of the anchor."""
-    out: Path = Path("results/compare.json")
+    out: Path = Path("out/eval/compare.json")
     """The result file to write."""
     cells: Path = Path("out/eval/compare")
     """Folder of finished pieces."""

@@ -16,7 +16,6 @@ from __future__ import annotations
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfedge.experiments.clips import STEADY, Clip, CodedClip, luma_mse, luma_sse, psnr_of_mse
+from rfedge.experiments.compare.report import ForegroundRow
 from rfedge.experiments.picture_quality import luma_ssim
 from rfedge.experiments.rate_curve import RateCurve, bd_rate_percent
 from rfedge.experiments.rivals import Rival, x264_for_psnr
@@ -122,7 +122,7 @@ class ForegroundCoder:
 
 def foreground_row(
     clip: Clip, ours: Sequence[CodedClip], theirs: Sequence[CodedClip], masks: Sequence[Mask]
-) -> dict[str, Any]:
+) -> ForegroundRow:
     """Return both on the foreground's quality, over the window both span, and the rival's ceiling.
 
     ``bd_rate_percent`` is null where they share less than a decibel. Raises ``InvalidInput`` if the
@@ -135,17 +135,17 @@ def foreground_row(
     low = max(float(curve.psnr_db[0]) for curve in curves)
     high = min(float(curve.psnr_db[-1]) for curve in curves)
     shared = high - low >= MIN_WINDOW_DB
-    return {
-        "scene": clip.scene,
-        "hz": clip.rate_hz,
-        "mask": f"macroblocks where |camera - empty street| > {DIFFERENT_LEVELS} levels",
-        "foreground_percent": 100 * float(np.mean([mask.mean() for mask in masks])),
-        "window_db": [low, high] if shared else None,
-        "bd_rate_percent": bd_rate_percent(curves[1], curves[0], (low, high)) if shared else None,
-        "whole_picture_ceiling_db": max(coded.psnr_db() for coded in theirs),
-        "ours": _points(curves[0]),
-        "rfdvc_style": _points(curves[1]),
-    }
+    return ForegroundRow(
+        scene=clip.scene,
+        hz=clip.rate_hz,
+        mask=f"macroblocks where |camera - empty street| > {DIFFERENT_LEVELS} levels",
+        foreground_percent=100 * float(np.mean([mask.mean() for mask in masks])),
+        window_db=(low, high) if shared else None,
+        bd_rate_percent=bd_rate_percent(curves[1], curves[0], (low, high)) if shared else None,
+        whole_picture_ceiling_db=max(coded.psnr_db() for coded in theirs),
+        ours=_points(curves[0]),
+        rfdvc_style=_points(curves[1]),
+    )
 
 
 def _foreground_curve(clips: Sequence[CodedClip], pixels: NDArray[np.float64]) -> RateCurve:

@@ -11,25 +11,23 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
 from rfcore.errors import InvalidInput
 from rfedge.experiments.clips import STEADY, Clip, CodedClip, psnr_of_mse
+from rfedge.experiments.compare.report import BEST, BreakEvenRow, CompareRow, CurveRow
 from rfedge.experiments.performance import HEADLINE_DB, Performance
 from rfedge.experiments.rate_curve import Window, bd_rate_interval, bd_rate_percent
 
-__all__ = ["BEST", "PASSES", "WINDOWS_DB", "break_even_row", "compare_rows", "curve_rows"]
+__all__ = ["PASSES", "WINDOWS_DB", "break_even_row", "compare_rows", "curve_rows"]
 
 WINDOWS_DB: tuple[Window, ...] = (HEADLINE_DB, (30.0, 35.0))
 """The headline window first."""
 SAVING_AT_DB = (31.0, 33.0, 35.0)
-BEST = "best-comparable"
 BOOTSTRAP_SEED = 2026
 PASSES = (1, 10, 100)
 BREAK_EVEN_DB = 33.0
-Row = dict[str, Any]
 
 
 def compare_rows(
@@ -37,7 +35,7 @@ def compare_rows(
     method: Performance,
     families: Mapping[str, Sequence[Performance]],
     windows_db: Sequence[Window] = WINDOWS_DB,
-) -> list[Row]:
+) -> list[CompareRow]:
     """Return a row per window and family of rivals, and one against the best comparable rival.
 
     A family is one codec at several settings; the strongest that takes no more processor time than
@@ -57,7 +55,7 @@ def compare_rows(
 
 def _window_rows(
     clip: Clip, method: Performance, families: Mapping[str, Sequence[Performance]], window: Window
-) -> list[Row]:
+) -> list[CompareRow]:
     chosen = {name: _representative(method, rivals, window) for name, rivals in families.items()}
     able = [rival for rival in chosen.values() if _comparable(method, rival)]
     if able:
@@ -80,34 +78,36 @@ def _comparable(method: Performance, rival: Performance) -> bool:
     return rival.cpu_ms_per_frame <= method.cpu_ms_per_frame
 
 
-def _row(clip: Clip, method: Performance, family: str, rival: Performance, window: Window) -> Row:
+def _row(
+    clip: Clip, method: Performance, family: str, rival: Performance, window: Window
+) -> CompareRow:
     ours, theirs = method.steady, rival.steady
     rng = np.random.default_rng(BOOTSTRAP_SEED)
-    return {
-        "scene": clip.scene,
-        "hz": clip.rate_hz,
-        "method": method.name,
-        "rival": family,
-        "rival_setting": rival.name,
-        "window_db": list(window),
-        "bd_rate_percent": bd_rate_percent(theirs, ours, window),
-        "ci95": list(bd_rate_interval(rival.clips, method.clips, window, rng)),
-        "points": len(method.clips),
-        "saving_percent_at_db": {
+    return CompareRow(
+        scene=clip.scene,
+        hz=clip.rate_hz,
+        method=method.name,
+        rival=family,
+        rival_setting=rival.name,
+        window_db=window,
+        bd_rate_percent=bd_rate_percent(theirs, ours, window),
+        ci95=bd_rate_interval(rival.clips, method.clips, window, rng),
+        points=len(method.clips),
+        saving_percent_at_db={
             f"{db:g}": 100 * (1 - ours.bytes_at(db) / theirs.bytes_at(db))
             for db in SAVING_AT_DB
             if ours.spans((db, db)) and theirs.spans((db, db))
         },
-        "first_frame_bytes": _first_frame_bytes(method, window),
-        "rival_first_frame_bytes": _first_frame_bytes(rival, window),
-        "ssim": float(_middle(method, window).ssim.mean()),
-        "rival_ssim": float(_middle(rival, window).ssim.mean()),
-        "psnr_deviation_db": _deviation_db(_middle(method, window)),
-        "rival_psnr_deviation_db": _deviation_db(_middle(rival, window)),
-        "cpu_ms": method.cpu_ms_per_frame,
-        "rival_cpu_ms": rival.cpu_ms_per_frame,
-        "field_psnr_db": clip.field_psnr_db,
-    }
+        first_frame_bytes=_first_frame_bytes(method, window),
+        rival_first_frame_bytes=_first_frame_bytes(rival, window),
+        ssim=float(_middle(method, window).ssim.mean()),
+        rival_ssim=float(_middle(rival, window).ssim.mean()),
+        psnr_deviation_db=_deviation_db(_middle(method, window)),
+        rival_psnr_deviation_db=_deviation_db(_middle(rival, window)),
+        cpu_ms=method.cpu_ms_per_frame,
+        rival_cpu_ms=rival.cpu_ms_per_frame,
+        field_psnr_db=clip.field_psnr_db,
+    )
 
 
 def _middle(performance: Performance, window: Window) -> CodedClip:
@@ -124,28 +124,30 @@ def _deviation_db(clip: CodedClip) -> float:
 
 def curve_rows(
     clip: Clip, methods: Sequence[Performance], families: Mapping[str, Sequence[Performance]]
-) -> list[Row]:
+) -> list[CurveRow]:
     """Return the steady-state curve of everybody, from the lowest quality to the highest."""
     everybody = {"": methods, **families}
     return [_curve(clip, family, who) for family, those in everybody.items() for who in those]
 
 
-def _curve(clip: Clip, family: str, who: Performance) -> Row:
+def _curve(clip: Clip, family: str, who: Performance) -> CurveRow:
     coded = sorted(who.clips, key=CodedClip.psnr_db)
-    return {
-        "scene": clip.scene,
-        "hz": clip.rate_hz,
-        "family": family,
-        "setting": who.name,
-        "cpu_ms": who.cpu_ms_per_frame,
-        "point": [at.point for at in coded],
-        "psnr_db": [at.psnr_db() for at in coded],
-        "bytes_per_frame": [at.bytes_per_frame() for at in coded],
-        "ssim": [float(at.ssim[STEADY].mean()) for at in coded],
-    }
+    return CurveRow(
+        scene=clip.scene,
+        hz=clip.rate_hz,
+        family=family,
+        setting=who.name,
+        cpu_ms=who.cpu_ms_per_frame,
+        point=[at.point for at in coded],
+        psnr_db=[at.psnr_db() for at in coded],
+        bytes_per_frame=[at.bytes_per_frame() for at in coded],
+        ssim=[float(at.ssim[STEADY].mean()) for at in coded],
+    )
 
 
-def break_even_row(clip: Clip, method: Performance, rival: Performance, field_bytes: int) -> Row:
+def break_even_row(
+    clip: Clip, method: Performance, rival: Performance, field_bytes: int
+) -> BreakEvenRow:
     """Return what the field's own bytes leave of the saving after 1, 10 and 100 passes.
 
     A pass is the clip once; its first frame is counted with it. Bytes are those at 33 dB, or at the
@@ -160,17 +162,17 @@ def break_even_row(clip: Clip, method: Performance, rival: Performance, field_by
         for who in (method, rival)
     )
     saved = theirs - ours
-    return {
-        "scene": clip.scene,
-        "hz": clip.rate_hz,
-        "method": method.name,
-        "rival": rival.name,
-        "at_db": float(at_db),
-        "frames_per_pass": frames + 1,
-        "field_bytes": field_bytes,
-        "saved_bytes_per_pass": saved,
-        "passes_to_break_even": math.ceil(field_bytes / saved) if saved > 0 else None,
-        "saving_percent_after": {
+    return BreakEvenRow(
+        scene=clip.scene,
+        hz=clip.rate_hz,
+        method=method.name,
+        rival=rival.name,
+        at_db=float(at_db),
+        frames_per_pass=frames + 1,
+        field_bytes=field_bytes,
+        saved_bytes_per_pass=saved,
+        passes_to_break_even=math.ceil(field_bytes / saved) if saved > 0 else None,
+        saving_percent_after={
             str(n): 100 * (1 - (n * ours + field_bytes) / (n * theirs)) for n in PASSES
         },
-    }
+    )

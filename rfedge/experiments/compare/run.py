@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from rfcore.field import load_field
 from rfedge.experiments.cells import CellStore, clip_key
@@ -18,15 +17,15 @@ from rfedge.experiments.clips import ClipCoder, DriveName
 from rfedge.experiments.compare.bit_split import SplitClip, split_rows
 from rfedge.experiments.compare.drives import CompareJob, DriveComparison, read_drive_comparisons
 from rfedge.experiments.compare.foreground import foreground_row
-from rfedge.experiments.compare.measure import BEST, break_even_row, compare_rows, curve_rows
+from rfedge.experiments.compare.measure import break_even_row, compare_rows, curve_rows
+from rfedge.experiments.compare.report import BitShareRow, print_compared
 from rfedge.experiments.performance import Performance, perform, seconds_left, spanning_points
 from rfedge.experiments.rate_curve import Window
-from rfedge.results import provenance, revision, write_result
+from rfedge.results import make_result, provenance, rows_of, write_result
 
 __all__ = ["run_compare"]
 
 ANCHOR = "x264-lowdelay"
-Row = dict[str, Any]
 
 
 def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
@@ -39,25 +38,24 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
         DriveName.parse(text)
     field = load_field(job.field)
     comparisons = read_drive_comparisons(job, field)
-    store = CellStore(job.cells)
+    store, made = CellStore(job.cells), provenance([job.field])
     _announce(job, comparisons, store, console)
     for comparison in comparisons:
         _check_window(job, comparison, store, console)
-    tables: dict[str, list[Row]] = {}
+    tables: dict[str, list[Any]] = {}
     for comparison in comparisons:
         for name, rows in _tables(job, comparison, store, console).items():
             tables.setdefault(name, []).extend(rows)
-    result = {
-        "case": "compare",
-        **provenance(revision()),
+    content = {
         "quick": job.quick,
         "field_id": field.field_id,
         "field_bytes": job.field.stat().st_size,
         "frames": {f"{b.clip.scene}@{b.clip.rate_hz:g}": _frames(b) for b in comparisons},
         **tables,
     }
+    result = make_result("compare", made, content)
     write_result(job.out, result)
-    _print(tables["rows"], console)
+    print_compared(console, tables["rows"])
     return result
 
 
@@ -100,7 +98,7 @@ def _in_words(window_db: Window) -> str:
 
 def _tables(
     job: CompareJob, comparison: DriveComparison, store: CellStore, console: Console
-) -> dict[str, list[Row]]:
+) -> dict[str, list[Any]]:
     clip, window = comparison.clip, job.windows_db[0]
 
     def performed(coder: ClipCoder) -> Performance:
@@ -130,7 +128,7 @@ def _tables(
 
 def _bits(
     job: CompareJob, comparison: DriveComparison, ours: Performance, store: CellStore
-) -> list[Row]:
+) -> list[BitShareRow]:
     clip, middle_db = comparison.clip, sum(job.windows_db[0]) / 2
     crf = ours.nearest(middle_db).point
     split = SplitClip(clip.frames, comparison.rendered, comparison.foregrounds, job.preset, crf)
@@ -140,25 +138,9 @@ def _bits(
         "background": comparison.background,
     }
     same = {"scene": clip.scene, "hz": clip.rate_hz, "method": ours.name, "crf": crf}
-    return [same | row for row in store.rows(key, lambda: split_rows(split))]
+    rows = store.rows(key, lambda: split_rows(split))
+    return rows_of(BitShareRow, [same | row for row in rows])
 
 
 def _frames(comparison: DriveComparison) -> dict[str, Any]:
     return {"count": len(comparison.clip.frames), "sha256": comparison.clip.frames_digest}
-
-
-def _print(rows: Sequence[Row], console: Console) -> None:
-    table = Table("scene", "Hz", "method", "rival", "window dB", "BD-rate %", "95 %", "CPU ms")
-    for row in rows:
-        low, high = row["ci95"]
-        table.add_row(
-            row["scene"],
-            f"{row['hz']:g}",
-            row["method"].rsplit("-", 1)[0],
-            row["rival_setting"] + (" (best)" if row["rival"] == BEST else ""),
-            "{:g}..{:g}".format(*row["window_db"]),
-            f"{row['bd_rate_percent']:.1f}",
-            f"{low:.1f}..{high:.1f}",
-            f"{row['cpu_ms']:.0f} / {row['rival_cpu_ms']:.0f}",
-        )
-    console.print(table)

@@ -25,9 +25,9 @@ class EvalLadder:
     """The drive to code."""
     frames: int = 24
     """How many of its pictures."""
-    out: Path = Path("results/ladder.json")
+    out: Path = Path("out/eval/ladder.json")
     """The result file to write."""
-    figures: Path = Path("docs/figures")
+    figures: Path = Path("out/eval/figures")
     """Folder of the figure (SVG, and CSV with its numbers)."""
     cells: Path = Path("out/eval/ladder")
     """Folder of finished pieces."""
@@ -37,27 +37,15 @@ class EvalLadder:
     def run(self) -> None:
         """Measure what is not there yet, write rows and figure, print the front."""
         from rich.console import Console
-        from rich.table import Table
 
         from rfedge.arguments import field_path
-        from rfedge.experiments.ladder.page import middle_rows, write_ladder_figure
+        from rfedge.experiments.ladder.page import print_front, write_ladder_figure
         from rfedge.experiments.ladder.run import LadderJob, run_ladder
 
         console = Console()
         fields = tuple(field_path(name) for name in self.fields)
         job = LadderJob(fields, self.drive, self.out, self.cells, self.frames, self.quick)
         result = run_ladder(job, console)
-        table = Table("rung", "sender ms", "receiver ms", "kbit", "PSNR dB", "rate %")
-        for row in sorted(middle_rows(result), key=lambda row: float(row["sender_ms"])):
-            if row["on_front"]:
-                table.add_row(
-                    row["rung"],
-                    f"{row['sender_ms']:.1f}",
-                    f"{row['receiver_ms']:.1f}",
-                    f"{row['bits_per_frame'] / 1e3:.1f}",
-                    f"{row['psnr_db']:.2f}",
-                    f"{row['rate_percent']:+.1f}",
-                )
-        console.print(table)
+        print_front(console, result)
         for path in write_ladder_figure(result, self.figures):
             console.print(f"  {path}")

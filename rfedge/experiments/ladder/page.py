@@ -1,4 +1,4 @@
-"""``docs/ladder.md`` and the ladder's figure, from ``results/ladder.json``: generated, never typed.
+"""A ladder's rows, and what is made of them: ``docs/ladder.md``, the figure, the printed front.
 
 ``python -m rfedge.experiments.ladder.page results docs`` (``make figures``). The page shows one
 CRF, the middle one; the file has the others.
@@ -6,18 +6,55 @@ CRF, the middle one; the file has the others.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+
+from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
-from rfedge.report.markdown_parts import heading, table
+from rfedge.report.tables import heading, print_table, table
+from rfedge.results import Result, read_result, rows_of
 
-__all__ = ["ladder_page", "middle_rows", "write_ladder_figure"]
+__all__ = ["LadderRow", "ladder_page", "middle_rows", "print_front", "write_ladder_figure"]
 
-Row = Mapping[str, Any]
+
+@dataclass(frozen=True)
+class LadderRow:
+    """One rung at one CRF. Times are of the processor, in ms a frame, at one thread."""
+
+    rung: str
+    settings: Mapping[str, Any]
+    """What ``rfcore.codec.sender.ladder`` reads the rung from."""
+    sender_ms: float
+    receiver_ms: float
+    sender_wall_ms: float
+    """By the clock, as ``receiver_wall_ms``: other processes count."""
+    receiver_wall_ms: float
+    sender_stage_ms: Mapping[str, float]
+    receiver_stage_ms: Mapping[str, float]
+    bits_per_frame: float
+    psnr_db: float
+    ssim: float
+    references_used: Mapping[str, int]
+    """How many frames were predicted from what."""
+    rate_percent: float
+    """Bits at equal quality, more than the first rung's."""
+    on_front: bool
+
+    @property
+    def crf(self) -> float:
+        """Rate factor that the rung was measured at."""
+        return float(self.settings["crf"])
+
+    @property
+    def other_settings(self) -> dict[str, Any]:
+        """Everything but the CRF."""
+        return {name: value for name, value in self.settings.items() if name != "crf"}
+
 
 INTRODUCTION = """# What accuracy costs in time
 
@@ -60,51 +97,70 @@ COLUMNS = (
 )
 
 
-def ladder_page(result: Row, runs: Mapping[str, Row]) -> str:
-    """Return the page of a ladder and of training runs (by name), which are its offline side."""
-    rows = middle_rows(result)
-    front = sorted((r for r in rows if r["on_front"]), key=lambda r: r["sender_ms"])
+def ladder_page(result: Result, runs: Mapping[str, Result]) -> str:
+    """Return the page of a ladder and of training runs (by name), which are its offline side.
+
+    Raises ``InvalidInput`` for a ladder without rows.
+    """
+    every = rows_of(LadderRow, result["rows"])
+    rows = middle_rows(every)
     sections = [
         INTRODUCTION,
         heading(Path("ladder"), result).replace("## ladder", "## Where it was measured"),
         _fields(result),
         "![sender time against rate](figures/ladder_pareto.svg)",
-        f"## The front at CRF {_crf(rows):g}",
-        _table(front),
+        f"## The front at CRF {rows[0].crf:g}",
+        _table(_front(rows)),
         "## Every rung",
-        _table(sorted(rows, key=lambda r: (r["settings"]["kind"], r["rate_percent"]))),
+        _table(sorted(rows, key=lambda row: (row.settings["kind"], row.rate_percent))),
         "## CRF",
         "The first rung at each CRF:",
-        _table([r for r in result["rows"] if _without_crf(r) == _without_crf(rows[0])]),
+        _table([row for row in every if row.other_settings == rows[0].other_settings]),
         "## The offline side",
         _offline(runs),
     ]
     return "\n\n".join(section.strip("\n") for section in sections) + "\n"
 
 
-def middle_rows(result: Row) -> list[Row]:
-    """Return the rows at the middle CRF."""
-    crfs = sorted({row["settings"]["crf"] for row in result["rows"]})
-    middle = crfs[len(crfs) // 2]
-    return [row for row in result["rows"] if row["settings"]["crf"] == middle]
+def middle_rows(rows: Sequence[LadderRow]) -> list[LadderRow]:
+    """Return the rows at the middle CRF; raise ``InvalidInput`` if there is none."""
+    if not rows:
+        raise InvalidInput("result", "the ladder has no rows")
+    crfs = sorted({row.crf for row in rows})
+    return [row for row in rows if row.crf == crfs[len(crfs) // 2]]
 
 
-def write_ladder_figure(result: Row, folder: Path) -> list[Path]:
-    """Write ``ladder_pareto.svg`` and its numbers as CSV; return their paths."""
+def _front(rows: Sequence[LadderRow]) -> list[LadderRow]:
+    return sorted((row for row in rows if row.on_front), key=lambda row: row.sender_ms)
+
+
+def print_front(console: Console, result: Result) -> None:
+    """Print the rungs at the middle CRF that no other beats, the quickest first."""
+    columns = ("rung", "sender ms", "receiver ms", "kbit", "PSNR dB", "rate %")
+    shown = [COLUMNS.index(name) for name in columns]
+    front = [_cells(row) for row in _front(middle_rows(rows_of(LadderRow, result["rows"])))]
+    cells = [[row[k] for k in shown] for row in front]
+    print_table(console, "The front at the middle CRF", columns, cells)
+
+
+def write_ladder_figure(result: Result, folder: Path) -> list[Path]:
+    """Write ``ladder_pareto.svg`` and its numbers as CSV; return their paths.
+
+    Raises ``InvalidInput`` for a ladder without rows.
+    """
     from matplotlib import pyplot as plt
 
     from rfedge.report.charts import BLUE, GREY, LINES, STYLE, write_figure
 
-    rows = middle_rows(result)
+    rows = middle_rows(rows_of(LadderRow, result["rows"]))
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7.2, 3.6))
-        kinds = dict.fromkeys(row["settings"]["kind"] for row in rows)
+        kinds = dict.fromkeys(row.settings["kind"] for row in rows)
         for kind, colour in zip(kinds, (GREY, LINES[1]), strict=False):
-            of_kind = [row for row in rows if row["settings"]["kind"] == kind]
-            x, y = [r["sender_ms"] for r in of_kind], [r["rate_percent"] for r in of_kind]
+            of_kind = [row for row in rows if row.settings["kind"] == kind]
+            x, y = [r.sender_ms for r in of_kind], [r.rate_percent for r in of_kind]
             axes.scatter(x, y, s=14, color=colour, label=kind)
-        front = sorted((r for r in rows if r["on_front"]), key=lambda r: r["sender_ms"])
-        x, y = [r["sender_ms"] for r in front], [r["rate_percent"] for r in front]
+        x, y = [r.sender_ms for r in _front(rows)], [r.rate_percent for r in _front(rows)]
         axes.plot(x, y, color=BLUE, marker="o", markersize=4, linewidth=1.5, label="front")
         axes.set(
             xlabel="sender, ms of processor time a frame",
@@ -113,21 +169,21 @@ def write_ladder_figure(result: Row, folder: Path) -> list[Path]:
         )
         axes.legend(frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
     lines = [["rung", "sender_ms", "receiver_ms", "rate_percent", "kbit", "psnr_db", "on_front"]]
-    for row in sorted(rows, key=lambda r: r["sender_ms"]):
-        numbers = (row["sender_ms"], row["receiver_ms"], row["rate_percent"])
+    for row in sorted(rows, key=lambda row: row.sender_ms):
+        numbers = (row.sender_ms, row.receiver_ms, row.rate_percent)
         lines.append(
             [
-                row["rung"],
+                row.rung,
                 *(f"{number:.2f}" for number in numbers),
-                f"{row['bits_per_frame'] / 1e3:.2f}",
-                f"{row['psnr_db']:.3f}",
-                str(int(row["on_front"])),
+                f"{row.bits_per_frame / 1e3:.2f}",
+                f"{row.psnr_db:.3f}",
+                str(int(row.on_front)),
             ]
         )
     return write_figure(folder / "ladder_pareto", figure, lines)
 
 
-def _fields(result: Row) -> str:
+def _fields(result: Result) -> str:
     width, height = result["size_px"]
     parts = [
         f"{f['kind']} of {f['primitives']:,} primitives"
@@ -141,34 +197,25 @@ def _fields(result: Row) -> str:
     )
 
 
-def _table(rows: Sequence[Row]) -> str:
+def _table(rows: Sequence[LadderRow]) -> str:
     return table(COLUMNS, [_cells(row) for row in rows])
 
 
-def _cells(row: Row) -> list[str]:
-    stages = row["sender_stage_ms"]
+def _cells(row: LadderRow) -> list[str]:
     return [
-        row["rung"],
-        "yes" if row["on_front"] else "",
-        f"{row['sender_ms']:.1f}",
-        f"{row['receiver_ms']:.1f}",
-        f"{row['bits_per_frame'] / 1e3:.1f}",
-        f"{row['psnr_db']:.2f}",
-        f"{row['ssim']:.3f}",
-        f"{row['rate_percent']:+.1f}",
-        *(f"{stages[name]:.1f}" for name, _ in STAGES),
+        row.rung,
+        "yes" if row.on_front else "",
+        f"{row.sender_ms:.1f}",
+        f"{row.receiver_ms:.1f}",
+        f"{row.bits_per_frame / 1e3:.1f}",
+        f"{row.psnr_db:.2f}",
+        f"{row.ssim:.3f}",
+        f"{row.rate_percent:+.1f}",
+        *(f"{row.sender_stage_ms[name]:.1f}" for name, _ in STAGES),
     ]
 
 
-def _without_crf(row: Row) -> dict[str, Any]:
-    return {name: value for name, value in row["settings"].items() if name != "crf"}
-
-
-def _crf(rows: Sequence[Row]) -> float:
-    return float(rows[0]["settings"]["crf"])
-
-
-def _offline(runs: Mapping[str, Row]) -> str:
+def _offline(runs: Mapping[str, Result]) -> str:
     """Return quality over training time, of every run that kept its curve."""
     lines = [
         [name, f"{seconds:.0f}", f"{quality_db:.2f}"]
@@ -192,8 +239,8 @@ def _thinned(curve: Sequence[Sequence[float]]) -> Sequence[Sequence[float]]:
 
 def main(results: Path, docs: Path) -> None:
     """Write page and figure."""
-    result = json.loads((results / "ladder.json").read_text())
-    runs = {p.stem: json.loads(p.read_text()) for p in sorted(results.glob("train/*.json"))}
+    result = read_result(results / "ladder.json", "ladder")
+    runs = {p.stem: read_result(p, "training") for p in sorted(results.glob("train/*.json"))}
     write_whole(docs / "ladder.md", ladder_page(result, runs))
     write_ladder_figure(result, docs / "figures")
 

@@ -26,7 +26,8 @@ from rfcore.field.quality import DETAILS, Quality
 from rfedge.experiments.cells import CellKey, CellStore, program_version
 from rfedge.experiments.clips import Drive, DriveName, read_drive
 from rfedge.experiments.ladder.measure import TimedRenders, measure_rung, time_renders
-from rfedge.results import check_result_path, provenance, revision, write_result
+from rfedge.experiments.ladder.page import LadderRow
+from rfedge.results import check_result_path, make_result, provenance, rows_of, write_result
 
 __all__ = ["CRFS", "LadderJob", "fronts", "rate_percents", "run_ladder", "rungs_for"]
 
@@ -209,14 +210,14 @@ class Contender:
         }
 
 
-def run_ladder(job: LadderJob, console: Console) -> Row:
+def run_ladder(job: LadderJob, console: Console) -> dict[str, Any]:
     """Measure what is not measured yet, write ``job.out``, and return its content.
 
     Raises ``InvalidInput`` or ``DatasetError`` before anything is measured if an input is wrong.
     """
     name = DriveName(job.drive.stem, NOMINAL_RATE_HZ, job.drive)
     drive = read_drive(name, QUICK_FRAMES if job.quick else job.frames)
-    at = revision()
+    made = provenance(job.fields)
     contenders = [
         Contender(load_field(path), drive, program_version(), job.quick) for path in job.fields
     ]
@@ -228,12 +229,10 @@ def run_ladder(job: LadderJob, console: Console) -> Row:
         for rung in contender.rungs
     ]
     rows = _judged(curves)
-    result = {
-        "case": "ladder",
-        **provenance(at),
+    content = {
         "quick": job.quick,
         "threads": 1,
-        "size_px": list(drive.frames[0].size_px),
+        "size_px": drive.frames[0].size_px,
         "fields": [
             {
                 "kind": c.field.metadata.kind,
@@ -246,11 +245,12 @@ def run_ladder(job: LadderJob, console: Console) -> Row:
         "frames": {"drive": str(job.drive), "count": len(drive.frames), "sha256": drive.digest},
         "rows": rows,
     }
+    result = make_result("ladder", made, content)
     write_result(job.out, result)
     return result
 
 
-def _judged(curves: Sequence[Sequence[Row]]) -> list[Row]:
+def _judged(curves: Sequence[Sequence[Row]]) -> list[LadderRow]:
     """Add to every row what only the whole ladder can say: rate against its first rung, front."""
     rates = rate_percents(curves)
     rows = [
@@ -258,7 +258,8 @@ def _judged(curves: Sequence[Sequence[Row]]) -> list[Row]:
         for curve, rate in zip(curves, rates, strict=True)
         for row in curve
     ]
-    return [{**row, "on_front": on} for row, on in zip(rows, fronts(rows), strict=True)]
+    on_front = zip(rows, fronts(rows), strict=True)
+    return rows_of(LadderRow, [{**row, "on_front": on} for row, on in on_front])
 
 
 def _row(contender: Contender, rung: Rung, crf: float, store: CellStore, console: Console) -> Row:

@@ -34,9 +34,9 @@ class EvalLatency:
     """x264 preset of both."""
     quality_db: float = 33.0
     """Luma PSNR that both are coded to."""
-    out: Path = Path("results/latency.json")
+    out: Path = Path("out/eval/latency.json")
     """The result file to write."""
-    figures: Path = Path("docs/figures")
+    figures: Path = Path("out/eval/figures")
     """Folder of the figures (SVG, and CSV with their numbers)."""
     cells: Path = Path("out/eval/latency")
     """Folder of finished pieces."""
@@ -46,11 +46,15 @@ class EvalLatency:
     def run(self) -> None:
         """Code what is not there yet, play it, write rows and figures, print what is needed."""
         from rich.console import Console
-        from rich.table import Table
 
         from rfedge.arguments import field_path
-        from rfedge.experiments.latency.report import write_latency_figures
+        from rfedge.experiments.latency.report import (
+            NeededRow,
+            print_needed,
+            write_latency_figures,
+        )
         from rfedge.experiments.latency.run import LatencyJob, run_latency
+        from rfedge.results import rows_of
 
         job = LatencyJob(
             field=field_path(self.field),
@@ -64,18 +68,6 @@ class EvalLatency:
         )
         console = Console()
         result = run_latency(job, console)
-        table = Table("scene", "Hz", "method", "dB", "kbit", "p99 <= 5 ms", "p99 <= 10 ms, Mbit/s")
-        for row in result["needed"]:
-            uplink = row["uplink_bps_p99_within"]
-            table.add_row(
-                row["scene"],
-                f"{row['hz']:g}",
-                row["method"],
-                f"{row['psnr_db']:.2f}",
-                f"{row['kbit_per_frame']:.1f}",
-                f"{uplink['5'] / 1e6:.2f}",
-                f"{uplink['10'] / 1e6:.2f}",
-            )
-        console.print(table)
+        print_needed(console, rows_of(NeededRow, result["needed"]))
         for path in write_latency_figures(result, self.figures):
             console.print(f"  {path}")

@@ -1,16 +1,85 @@
-"""The latency experiment as figures and as a section of the results page."""
+"""The latency experiment's rows, as figures and as a section of the results page.
+
+``scene``, ``hz`` and ``method`` name a sender in every kind of row; ``crf`` and ``psnr_db`` are the
+operating point that its clip was coded at. Latencies are in milliseconds a frame.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rfedge.report.markdown_parts import heading, table
+from rich.console import Console
 
-__all__ = ["latency_section", "write_latency_figures"]
+from rfcore.errors import InvalidInput
+from rfedge.report.tables import heading, print_table, table
+from rfedge.results import Result, rows_of
 
-Row = Mapping[str, Any]
+__all__ = ["NeededRow", "PlayedRow", "latency_section", "print_needed", "write_latency_figures"]
+
+
+@dataclass(frozen=True)
+class NeededRow:
+    """What one sender's frames need: sizes, uplink, and computing at both ends."""
+
+    scene: str
+    hz: float
+    method: str
+    crf: float
+    psnr_db: float
+    kbit_per_frame: float
+    """Mean over all frames but the first."""
+    largest_kbit: float
+    first_frame_kbit: float
+    uplink_bps_p99_within: Mapping[str, float]
+    """Lowest constant rate at which 99 % of the frames are in time, by the budget in ms."""
+    stage_ms: Mapping[str, float]
+    """Processor time of each stage at one thread; of x264 the encoder's alone."""
+
+    @property
+    def sender(self) -> str:
+        """Drive and method in a few words."""
+        return _sender(self)
+
+
+@dataclass(frozen=True)
+class PlayedRow:
+    """One sender's frames over one link. None: that quantile of the frames never came."""
+
+    scene: str
+    hz: float
+    method: str
+    crf: float
+    psnr_db: float
+    link: str
+    rate_bps: float
+    frames: int
+    dropped: int
+    """Frames that were not sent because two were still under way."""
+    tau_ms: Mapping[str, float]
+    """Transmission time: mean, p50 and p99."""
+    network_ms: Mapping[str, float]
+    """From sending to arrival: waiting, transmission and delay."""
+    network_p99_ms: float | None
+    """Of all frames, dropped ones among them."""
+    end_to_end_p50_ms: float | None
+    end_to_end_p99_ms: float | None
+    share_within: Mapping[str, float]
+    """Share of the frames that came in time, by the budget in ms."""
+    network_quantiles_ms: Sequence[float | None]
+    """At equal steps of the share, from 0 to 1."""
+
+    @property
+    def sender(self) -> str:
+        """Drive and method in a few words."""
+        return _sender(self)
+
+
+def _sender(row: NeededRow | PlayedRow) -> str:
+    return f"{row.scene} {row.hz:g} Hz, {row.method.split('-')[0]}"
+
 
 CDF_RATE_BPS = 4e6
 """The rate whose distribution is drawn: the demo's link."""
@@ -41,7 +110,7 @@ PLAYED = (
 )
 
 
-def latency_section(path: Path, result: Row) -> str:
+def latency_section(path: Path, result: Result) -> str:
     """Return the tables: what uplink is needed, and what each link makes of the frames."""
     requirement = result["requirement"]
     notes = (
@@ -53,53 +122,63 @@ def latency_section(path: Path, result: Row) -> str:
         "End to end adds the processor time of both ends with one thread (of x264 the encoder's "
         "alone)."
     )
-    needed = [_needed_cells(row) for row in result["needed"]]
-    played = [_played_cells(row) for row in result["rows"]]
+    needed = [_needed_cells(row) for row in rows_of(NeededRow, result["needed"])]
+    played = [_played_cells(row) for row in rows_of(PlayedRow, result["rows"])]
     return "\n\n".join(
         [heading(path, result), notes, table(NEEDED, needed), table(PLAYED, played), ""]
     )
 
 
-def write_latency_figures(result: Row, folder: Path) -> list[Path]:
-    """Write ``tau_vs_throughput``, ``latency_cdf`` and ``stage_stack`` (SVG and CSV)."""
+def print_needed(console: Console, rows: Sequence[NeededRow]) -> None:
+    """Print what uplink each sender needs."""
+    columns = (*NEEDED[:4], "kbit", "p99 <= 5 ms, Mbit/s", "p99 <= 10 ms, Mbit/s")
+    cells = [[*_needed_cells(row)[:5], *_needed_cells(row)[-2:]] for row in rows]
+    print_table(console, "Uplink that 99 % of the frames need", columns, cells)
+
+
+def write_latency_figures(result: Result, folder: Path) -> list[Path]:
+    """Write ``tau_vs_throughput``, ``latency_cdf`` and ``stage_stack`` (SVG and CSV).
+
+    Raises ``InvalidInput`` for a result without rows.
+    """
+    played = rows_of(PlayedRow, result["rows"])
+    needed = rows_of(NeededRow, result["needed"])
+    if not (played and needed):
+        raise InvalidInput("result", "there is no row to draw")
     return [
-        *_tau_figure(result, folder / "tau_vs_throughput"),
-        *_cdf_figure(result, folder / "latency_cdf"),
-        *_stack_figure(result, folder / "stage_stack"),
+        *_tau_figure(played, folder / "tau_vs_throughput"),
+        *_cdf_figure(played, folder / "latency_cdf"),
+        *_stack_figure(needed, played, folder / "stage_stack"),
     ]
 
 
-def _label(row: Row) -> str:
-    return f"{row['scene']} {row['hz']:g} Hz, {row['method'].split('-')[0]}"
-
-
-def _needed_cells(row: Row) -> list[str]:
-    uplink = row["uplink_bps_p99_within"]
+def _needed_cells(row: NeededRow) -> list[str]:
+    uplink = row.uplink_bps_p99_within
     return [
-        row["scene"],
-        f"{row['hz']:g}",
-        row["method"],
-        f"{row['psnr_db']:.2f}",
-        f"{row['kbit_per_frame']:.1f}",
-        f"{row['largest_kbit']:.1f}",
-        f"{row['first_frame_kbit']:.1f}",
+        row.scene,
+        f"{row.hz:g}",
+        row.method,
+        f"{row.psnr_db:.2f}",
+        f"{row.kbit_per_frame:.1f}",
+        f"{row.largest_kbit:.1f}",
+        f"{row.first_frame_kbit:.1f}",
         *(f"{uplink[budget] / 1e6:.2f}" for budget in ("5", "10")),
     ]
 
 
-def _played_cells(row: Row) -> list[str]:
-    share = row["share_within"]
+def _played_cells(row: PlayedRow) -> list[str]:
+    share = row.share_within
     return [
-        row["scene"],
-        f"{row['hz']:g}",
-        row["method"],
-        row["link"],
-        f"{row['tau_ms']['mean']:.2f}",
-        f"{row['network_ms']['p50']:.2f}",
-        _ms(row["network_p99_ms"]),
-        _ms(row["end_to_end_p50_ms"]),
+        row.scene,
+        f"{row.hz:g}",
+        row.method,
+        row.link,
+        f"{row.tau_ms['mean']:.2f}",
+        f"{row.network_ms['p50']:.2f}",
+        _ms(row.network_p99_ms),
+        _ms(row.end_to_end_p50_ms),
         *(f"{100 * share[budget]:.1f}" for budget in ("5", "10")),
-        f"{100 * row['dropped'] / row['frames']:.1f}",
+        f"{100 * row.dropped / row.frames:.1f}",
     ]
 
 
@@ -107,14 +186,14 @@ def _ms(value: float | None) -> str:
     return "never" if value is None else f"{value:.2f}"
 
 
-def _by_sender(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    senders: dict[str, list[Row]] = {}
+def _by_sender(rows: Sequence[PlayedRow]) -> dict[str, list[PlayedRow]]:
+    senders: dict[str, list[PlayedRow]] = {}
     for row in rows:
-        senders.setdefault(_label(row), []).append(row)
+        senders.setdefault(row.sender, []).append(row)
     return senders
 
 
-def _tau_figure(result: Row, stem: Path) -> list[Path]:
+def _tau_figure(played: Sequence[PlayedRow], stem: Path) -> list[Path]:
     from matplotlib import pyplot as plt
 
     from rfedge.report.charts import LINES, MARKERS, STYLE, write_figure
@@ -122,11 +201,11 @@ def _tau_figure(result: Row, stem: Path) -> list[Path]:
     lines = [["sender", "Mbit/s", "mean tau ms"]]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7.2, 3.2))
-        senders = _by_sender([row for row in result["rows"] if row["link"].endswith("Mbit/s")])
+        senders = _by_sender([row for row in played if row.link.endswith("Mbit/s")])
         for number, (name, rows) in enumerate(senders.items()):
-            x = [row["rate_bps"] / 1e6 for row in rows]
-            y = [row["tau_ms"]["mean"] for row in rows]
-            style: Row = {"color": LINES[number % 6], "marker": MARKERS[number % 6]}
+            x = [row.rate_bps / 1e6 for row in rows]
+            y = [row.tau_ms["mean"] for row in rows]
+            style: dict[str, Any] = {"color": LINES[number % 6], "marker": MARKERS[number % 6]}
             axes.plot(x, y, label=name, linewidth=1.5, markersize=4, **style)
             lines += [[name, f"{a:g}", f"{b:.3f}"] for a, b in zip(x, y, strict=True)]
         axes.axhspan(5, 10, color="#dfe4ea", zorder=0)
@@ -135,7 +214,7 @@ def _tau_figure(result: Row, stem: Path) -> list[Path]:
     return write_figure(stem, figure, lines)
 
 
-def _cdf_figure(result: Row, stem: Path) -> list[Path]:
+def _cdf_figure(played: Sequence[PlayedRow], stem: Path) -> list[Path]:
     from matplotlib import pyplot as plt
 
     from rfedge.report.charts import LINES, STYLE, write_figure
@@ -143,29 +222,28 @@ def _cdf_figure(result: Row, stem: Path) -> list[Path]:
     lines = [["sender", "share", "network ms"]]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(7.2, 3.2))
-        drawn = [row for row in result["rows"] if row["rate_bps"] == CDF_RATE_BPS]
+        drawn = [row for row in played if row.rate_bps == CDF_RATE_BPS]
         for number, row in enumerate(drawn):
-            quantiles = row["network_quantiles_ms"]
+            quantiles = row.network_quantiles_ms
             arrived = [(ms, k / (len(quantiles) - 1)) for k, ms in enumerate(quantiles) if ms]
             x, y = zip(*arrived, strict=True)
-            axes.step(x, y, where="post", color=LINES[number % 6], label=_label(row))
-            lines += [[_label(row), f"{b:.2f}", f"{a:.3f}"] for a, b in arrived]
+            axes.step(x, y, where="post", color=LINES[number % 6], label=row.sender)
+            lines += [[row.sender, f"{b:.2f}", f"{a:.3f}"] for a, b in arrived]
         axes.axvspan(5, 10, color="#dfe4ea", zorder=0)
         axes.set(xlabel=f"network latency at {CDF_RATE_BPS / 1e6:g} Mbit/s, ms", ylabel="share")
         axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
     return write_figure(stem, figure, lines)
 
 
-def _stack_figure(result: Row, stem: Path) -> list[Path]:
+def _stack_figure(
+    needed: Sequence[NeededRow], played: Sequence[PlayedRow], stem: Path
+) -> list[Path]:
     from matplotlib import pyplot as plt
 
     from rfedge.report.charts import LINES, STYLE, write_figure
 
-    played = {_label(r): r for r in result["rows"] if r["rate_bps"] == CDF_RATE_BPS}
-    stacks = {
-        _label(row): {**row["stage_ms"], "network": played[_label(row)]["network_ms"]["p50"]}
-        for row in result["needed"]
-    }
+    network = {r.sender: r.network_ms["p50"] for r in played if r.rate_bps == CDF_RATE_BPS}
+    stacks = {row.sender: {**row.stage_ms, "network": network[row.sender]} for row in needed}
     stages = list(dict.fromkeys(stage for stack in stacks.values() for stage in stack))
     lines = [["sender", *stages]]
     with plt.rc_context({**STYLE, "axes.grid.axis": "x"}):

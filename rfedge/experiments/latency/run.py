@@ -32,8 +32,9 @@ from rfedge.experiments.cells import CellStore, clip_key, program_version
 from rfedge.experiments.clips import Clip, ClipCoder, CodedClip, Drive, DriveName, read_drive
 from rfedge.experiments.field_coder import FieldCoder, render_clip
 from rfedge.experiments.ladder.measure import measure_rung, time_renders
+from rfedge.experiments.latency.report import NeededRow, PlayedRow
 from rfedge.experiments.rivals import x264_lowdelay
-from rfedge.results import check_result_path, provenance, revision, write_result
+from rfedge.results import check_result_path, make_result, provenance, write_result
 
 __all__ = [
     "BUDGETS_MS",
@@ -139,7 +140,6 @@ CRF_STEP = 0.5
 FIRST_CRF, LOWEST_CRF, HIGHEST_CRF = 27.0, 14.0, 44.0
 QUICK_FRAMES, PLAYED_FRAMES = 6, 3000
 CURVE_POINTS = 101
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class Sender:
     stage_ms: dict[str, float]
 
     @property
-    def facts(self) -> Row:
+    def facts(self) -> dict[str, Any]:
         """What every row says about the sender."""
         return {
             "scene": self.clip.scene,
@@ -182,11 +182,11 @@ class Sender:
         }
 
 
-def run_latency(job: LatencyJob, console: Console) -> Row:
+def run_latency(job: LatencyJob, console: Console) -> dict[str, Any]:
     """Code, play, write ``job.out``, and return its content."""
     names = [DriveName.parse(text) for text in job.drives]
     links = list(_links(job.traces))
-    field = load_field(job.field)
+    field, made = load_field(job.field), provenance([job.field, *job.traces])
     console.print(
         f"{2 * len(names)} clips to code at about 5 CRFs each, {len(links)} links to play them over"
     )
@@ -194,9 +194,7 @@ def run_latency(job: LatencyJob, console: Console) -> Row:
     senders = [s for name in names for s in _senders(job, name, field, console)]
     console.print(f"coded in {monotonic() - began_s:.0f} s")
     rows = [_row(sender, name, plan) for sender in senders for name, plan in links]
-    result = {
-        "case": "latency",
-        **provenance(revision()),
+    content = {
         "quick": job.quick,
         "field_id": field.field_id,
         "field_psnr_db": {s.clip.scene: s.clip.field_psnr_db for s in senders},
@@ -207,6 +205,7 @@ def run_latency(job: LatencyJob, console: Console) -> Row:
         "needed": [_needed(sender) for sender in senders],
         "rows": rows,
     }
+    result = make_result("latency", made, content)
     write_result(job.out, result)
     return result
 
@@ -261,40 +260,38 @@ def _at_quality(clip: Clip, coder: ClipCoder, quality_db: float, store: CellStor
     return coded(low)
 
 
-def _row(sender: Sender, name: str, plan: DirectionPlan) -> Row:
+def _row(sender: Sender, name: str, plan: DirectionPlan) -> PlayedRow:
     sizes = repeated(sender.coded.frame_bytes.tolist(), PLAYED_FRAMES)
     played = play(sizes, sender.clip.rate_hz, plan)
     computing_ms = sum(sender.stage_ms.values())
     curve = [played.quantile_ms(share) for share in np.linspace(0, 1, CURVE_POINTS)]
-    return {
+    return PlayedRow(
         **sender.facts,
-        "link": name,
-        "rate_bps": plan.profile.rate_bps,
-        "frames": played.frames,
-        "dropped": played.dropped,
-        "tau_ms": _spread(played.tau_ms),
-        "network_ms": _spread(played.network_ms),
-        "network_p99_ms": _finite(played.quantile_ms(0.99)),
-        "end_to_end_p50_ms": _finite(played.quantile_ms(0.5) + computing_ms),
-        "end_to_end_p99_ms": _finite(played.quantile_ms(0.99) + computing_ms),
-        "share_within": {f"{ms:g}": played.share_within(ms) for ms in BUDGETS_MS},
-        "network_quantiles_ms": [_finite(ms) for ms in curve],
-    }
+        link=name,
+        rate_bps=plan.profile.rate_bps,
+        frames=played.frames,
+        dropped=played.dropped,
+        tau_ms=_spread(played.tau_ms),
+        network_ms=_spread(played.network_ms),
+        network_p99_ms=_finite(played.quantile_ms(0.99)),
+        end_to_end_p50_ms=_finite(played.quantile_ms(0.5) + computing_ms),
+        end_to_end_p99_ms=_finite(played.quantile_ms(0.99) + computing_ms),
+        share_within={f"{ms:g}": played.share_within(ms) for ms in BUDGETS_MS},
+        network_quantiles_ms=[_finite(ms) for ms in curve],
+    )
 
 
-def _needed(sender: Sender) -> Row:
+def _needed(sender: Sender) -> NeededRow:
     sizes = repeated(sender.coded.frame_bytes.tolist(), PLAYED_FRAMES)
     rate_hz = sender.clip.rate_hz
-    return {
+    return NeededRow(
         **sender.facts,
-        "kbit_per_frame": 8e-3 * sender.coded.bytes_per_frame(),
-        "largest_kbit": 8e-3 * float(sender.coded.frame_bytes[1:].max()),
-        "first_frame_kbit": 8e-3 * float(sender.coded.frame_bytes[0]),
-        "uplink_bps_p99_within": {
-            f"{ms:g}": needed_rate_bps(sizes, rate_hz, ms) for ms in BUDGETS_MS
-        },
-        "stage_ms": sender.stage_ms,
-    }
+        kbit_per_frame=8e-3 * sender.coded.bytes_per_frame(),
+        largest_kbit=8e-3 * float(sender.coded.frame_bytes[1:].max()),
+        first_frame_kbit=8e-3 * float(sender.coded.frame_bytes[0]),
+        uplink_bps_p99_within={f"{ms:g}": needed_rate_bps(sizes, rate_hz, ms) for ms in BUDGETS_MS},
+        stage_ms=sender.stage_ms,
+    )
 
 
 def _spread(values: Any) -> dict[str, float]:

@@ -28,7 +28,7 @@ class EvalNeverWorse:
     """The same for drives of which every fifth frame is taken, at a fifth of the rate."""
     preset: Preset = "veryfast"
     """x264 preset of ours and of the anchor."""
-    out: Path = Path("results/never-worse.json")
+    out: Path = Path("out/eval/never-worse.json")
     """The result file to write."""
     cells: Path = Path("out/eval/never-worse")
     """Folder of finished pieces."""

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from rfcore.camera import Camera, Pose
 from rfcore.errors import InvalidInput
@@ -25,9 +24,10 @@ from rfcore.views import FieldView
 from rfedge.experiments.cells import CellStore, program_version
 from rfedge.experiments.clips import DECIMATION, Clip, ClipCoder, Drive, DriveName, read_drive
 from rfedge.experiments.field_coder import FieldCoder, RenderedClip, render_clip
+from rfedge.experiments.never_worse.report import NeverWorseRow, print_never_worse
 from rfedge.experiments.performance import Performance, perform, seconds_left
 from rfedge.experiments.rivals import x264_for_psnr, x264_lowdelay
-from rfedge.results import check_result_path, provenance, revision, write_result
+from rfedge.results import check_result_path, make_result, provenance, write_result
 
 __all__ = [
     "ALLOWED_PERCENT",
@@ -48,7 +48,6 @@ POINTS = (18.0, 22.0, 26.0, 30.0, 34.0, 38.0, 42.0)
 QUARTER_TURN = Pose((0.0, 0.0, 0.0), (0.5**0.5, 0.0, -(0.5**0.5), 0.0))
 """About the camera's vertical axis."""
 BLACK_YUV = (16, 128, 128)
-Row = dict[str, Any]
 
 
 def controls_of(field: RadianceField, drive: Drive) -> Mapping[str, RenderedClip]:
@@ -110,7 +109,7 @@ class NeverWorse:
             "psnr": replace(x264_for_psnr(self.preset), points=POINTS),
         }
 
-    def rows(self, store: CellStore, *, retime: bool = False) -> Iterator[Row]:
+    def rows(self, store: CellStore, *, retime: bool = False) -> Iterator[NeverWorseRow]:
         """Yield a row per control and quality.
 
         A field that shows more than a quality before a bit is sent is taken at its lowest: it has
@@ -126,7 +125,7 @@ class NeverWorse:
 
     def _row(
         self, control: str, ours: Performance, plain: Performance, psnr: Performance, db: float
-    ) -> Row:
+    ) -> NeverWorseRow:
         at_db = max(db, float(ours.steady.psnr_db[0]))
         message_bytes = ours.steady.bytes_at(at_db)
         near = ours.nearest(at_db)
@@ -138,25 +137,25 @@ class NeverWorse:
             for name, anchor in (("plain", plain), ("psnr", psnr))
         }
         modes = [str(mode) for mode in near.notes["references"][1:]]
-        return {
-            "scene": self.drive.name.scene,
-            "hz": self.drive.name.rate_hz,
-            "frames": len(self.drive.frames),
-            "control": control,
-            "preset": self.preset,
-            "at_db": db,
-            "bytes": message_bytes,
-            "header_bytes": header_bytes,
-            "rival_bytes": plain.steady.bytes_at(db),
-            "excess_percent": excess["plain"],
-            "excess_percent_psnr_tuned": excess["psnr"],
-            "holds": excess["plain"] <= ALLOWED_PERCENT,
-            "first_frame_bytes": int(near.frame_bytes[0]),
-            "rival_first_frame_bytes": int(plain.nearest(at_db).frame_bytes[0]),
-            "references": max(set(modes), key=modes.count),
-            "cpu_ms": ours.cpu_ms_per_frame,
-            "rival_cpu_ms": plain.cpu_ms_per_frame,
-        }
+        return NeverWorseRow(
+            scene=self.drive.name.scene,
+            hz=self.drive.name.rate_hz,
+            frames=len(self.drive.frames),
+            control=control,
+            preset=self.preset,
+            at_db=db,
+            bytes=message_bytes,
+            header_bytes=header_bytes,
+            rival_bytes=plain.steady.bytes_at(db),
+            excess_percent=excess["plain"],
+            excess_percent_psnr_tuned=excess["psnr"],
+            holds=excess["plain"] <= ALLOWED_PERCENT,
+            first_frame_bytes=int(near.frame_bytes[0]),
+            rival_first_frame_bytes=int(plain.nearest(at_db).frame_bytes[0]),
+            references=max(set(modes), key=modes.count),
+            cpu_ms=ours.cpu_ms_per_frame,
+            rival_cpu_ms=plain.cpu_ms_per_frame,
+        )
 
 
 QUICK_FRAMES = 6
@@ -188,7 +187,7 @@ def run_never_worse(job: NeverWorseJob, console: Console) -> dict[str, Any]:
     """
     for text in (*job.drives, *job.decimated):
         DriveName.parse(text)
-    field, stamp = load_field(job.field), revision()
+    field, made = load_field(job.field), provenance([job.field])
     store = CellStore(job.cells)
     tables = [
         NeverWorse(drive, controls_of(field, drive), job.preset, program_version())
@@ -197,15 +196,11 @@ def run_never_worse(job: NeverWorseJob, console: Console) -> dict[str, Any]:
     left_s = sum(seconds_left(table.clip, table.coders.values(), store) for table in tables)
     console.print(f"{len(tables)} drives, about {left_s / 60:.1f} minutes left to do")
     rows = [row for table in tables for row in table.rows(store, retime=job.retime)]
-    result = {
-        "case": "never-worse",
-        **provenance(stamp),
-        "quick": job.quick,
-        "field_id": field.field_id,
-        "rows": rows,
-    }
+    frames = {f"{t.drive.name.scene}@{t.drive.name.rate_hz:g}": t.drive.digest for t in tables}
+    content = {"quick": job.quick, "field_id": field.field_id, "frames": frames, "rows": rows}
+    result = make_result("never-worse", made, content)
     write_result(job.out, result)
-    _print(rows, console)
+    print_never_worse(console, rows)
     return result
 
 
@@ -213,19 +208,3 @@ def _drives(job: NeverWorseJob) -> list[Drive]:
     limit = QUICK_FRAMES if job.quick else None
     slow = [read_drive(text).every(DECIMATION) for text in job.decimated]
     return [*slow, *(read_drive(text, limit) for text in job.drives)]
-
-
-def _print(rows: Sequence[Row], console: Console) -> None:
-    table = Table("scene", "Hz", "field", "dB", "excess %", "psnr-tuned", "holds", "references")
-    for row in rows:
-        table.add_row(
-            row["scene"],
-            f"{row['hz']:g}",
-            row["control"],
-            f"{row['at_db']:g}",
-            f"{row['excess_percent']:.1f}",
-            f"{row['excess_percent_psnr_tuned']:.1f}",
-            "yes" if row["holds"] else "NO",
-            row["references"],
-        )
-    console.print(table)

@@ -22,9 +22,9 @@ class EvalPaper:
     """SCENE=DATASET for each drive."""
     sizes: tuple[str, ...] = ("300x168", "500x280", "640x360")
     """Sizes that render and camera are reduced to, and rendered at."""
-    out: Path = Path("results/paper.json")
+    out: Path = Path("out/eval/paper.json")
     """The result file to write."""
-    figures: Path = Path("docs/figures")
+    figures: Path = Path("out/eval/figures")
     """Folder of the figures (SVG, and CSV with their numbers)."""
     cells: Path = Path("out/eval/paper")
     """Folder of finished pieces."""
@@ -38,8 +38,10 @@ class EvalPaper:
         from rich.console import Console
 
         from rfedge.arguments import parse_size
-        from rfedge.experiments.paper.figures import paper_table, write_paper_figures, write_views
+        from rfedge.experiments.paper.figures import write_paper_figures, write_views
+        from rfedge.experiments.paper.report import PaperRow, print_means
         from rfedge.experiments.paper.run import PaperJob, run_paper, views_of
+        from rfedge.results import rows_of
 
         sizes_px = [parse_size(size) for size in self.sizes]
         job = PaperJob(
@@ -53,7 +55,8 @@ class EvalPaper:
         )
         console = Console()
         result = run_paper(job, console)
-        console.print(paper_table(result["rows"]))
-        written = write_paper_figures(result["rows"], self.figures)
+        rows = rows_of(PaperRow, result["rows"])
+        print_means(console, rows)
+        written = write_paper_figures(rows, self.figures)
         for path in [*written, *write_views(views_of(job), self.figures)]:
             console.print(f"  {path}")

@@ -35,8 +35,9 @@ from rfedge.experiments.paper.published import (
     published_rows,
     reduced,
 )
+from rfedge.experiments.paper.report import PaperRow
 from rfedge.experiments.picture_quality import BANDS, flip
-from rfedge.results import check_result_path, provenance, revision, write_result
+from rfedge.results import check_result_path, make_result, provenance, write_result
 
 __all__ = ["CONTROLS", "PaperJob", "named_path", "run_paper", "views_of"]
 
@@ -94,18 +95,18 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
     """
     fields = [(name, open_field(path)) for name, path in map(named_path, job.fields)]
     pieces = list(_pieces(job, fields))
-    store, stamp = CellStore(job.cells), revision()
+    store = CellStore(job.cells)
+    made = provenance(path for _, path in map(named_path, (*job.fields, *job.drives)))
     _say_cost(pieces, store, console)
     rows = [row for piece in pieces for row in store.rows(_key(piece), _maker(piece))]
-    result = {
-        "case": "paper",
-        **provenance(stamp),
+    content = {
         "quick": job.quick,
         "field_ids": {name: field.field_id for name, field in fields},
         "lpips": "n/a: no weights",
-        "bands_cycles_per_px": [list(band) for band in BANDS],
-        "rows": rows,
+        "bands_cycles_per_px": BANDS,
+        "rows": [PaperRow.of(row) for row in rows],
     }
+    result = make_result("paper", made, content)
     write_result(job.out, result)
     return result
 

@@ -33,9 +33,9 @@ class EvalRobust:
     """Luma PSNR at which bits are compared where nothing is lost."""
     frames: int = 36
     """How many frames of the drive."""
-    out: Path = Path("results/robust.json")
+    out: Path = Path("out/eval/robust.json")
     """The result file to write."""
-    figures: Path = Path("docs/figures")
+    figures: Path = Path("out/eval/figures")
     """Folder of the figure (SVG, and CSV with its numbers)."""
     cells: Path = Path("out/eval/robust")
     """Folder of finished pieces."""
@@ -47,7 +47,7 @@ class EvalRobust:
         from rich.console import Console
 
         from rfedge.arguments import field_path
-        from rfedge.experiments.robust.report import write_robust_figure
+        from rfedge.experiments.robust.report import print_robust, write_robust_figure
         from rfedge.experiments.robust.run import RobustJob, run_robust
 
         job = RobustJob(
@@ -64,13 +64,6 @@ class EvalRobust:
         )
         console = Console()
         result = run_robust(job, console)
-        for row in result["rows"]:
-            console.print(
-                f"{row['method']:>20} {row['rtt_ms']:4.0f} ms {row['loss_percent']:g} %: "
-                f"SSIM {row['ssim']:.4f} at {result['equal_rate_kbps']:.0f} kbit/s"
-            )
-        for row in result["disturbances"]:
-            found = row.get("reason") or f"{row['kbit']:.1f} kbit ({row['more_percent']:+.1f} %)"
-            console.print(f"{row['condition']:>20} {row['level']}: {found}")
+        print_robust(console, result)
         for path in write_robust_figure(result, self.figures):
             console.print(f"  {path}")

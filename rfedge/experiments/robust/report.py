@@ -1,21 +1,74 @@
-"""The robustness experiment as a figure and as a section of the results page."""
+"""The robustness experiment's rows, as a figure and as a section of the results page."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from rfedge.report.markdown_parts import heading, table
+from rich.console import Console
 
-__all__ = ["robust_section", "write_robust_figure"]
+from rfcore.errors import InvalidInput
+from rfedge.report.tables import heading, print_table, table
+from rfedge.results import Result, rows_of
 
-Row = Mapping[str, Any]
+__all__ = [
+    "CrossingRow",
+    "DisturbanceRow",
+    "LossRow",
+    "print_robust",
+    "robust_section",
+    "write_robust_figure",
+]
+
+
+@dataclass(frozen=True)
+class CrossingRow:
+    """One method's clip at one CRF over the lossy link; its first frame is not counted."""
+
+    method: str
+    rtt_ms: float
+    loss_percent: float
+    crf: float
+    kbps: float
+    ssim: float
+    """Mean, of what a viewer sees against the camera."""
+    ssim_p5: float
+    """Fifth percentile over the frames."""
+    not_new: int
+    """Frames at which a viewer still saw an earlier picture."""
+    frames: int
+
+
+@dataclass(frozen=True)
+class LossRow:
+    """SSIM of one method at the rate that all are compared at, interpolated between CRFs."""
+
+    method: str
+    rtt_ms: float
+    loss_percent: float
+    ssim: float
+    ssim_p5: float
+
+
+@dataclass(frozen=True)
+class DisturbanceRow:
+    """Kilobits a frame at equal quality under one disturbance, or the reason why not."""
+
+    condition: str
+    level: str
+    reason: str | None = None
+    kbit: float | None = None
+    more_percent: float | None = None
+    """Against ours undisturbed."""
+    x264_kbit: float | None = None
+    against_x264_percent: float | None = None
+
+
 LOSS_COLUMNS = ("method", "loss %", "RTT ms", "SSIM", "worst 5 % of frames")
 REST_COLUMNS = ("condition", "level", "kbit a frame", "more %", "x264", "against x264 %")
 
 
-def robust_section(path: Path, result: Row) -> str:
+def robust_section(path: Path, result: Result) -> str:
     """Return the tables: SSIM over a lossy link at one rate, and bits under disturbed poses."""
     frames = result["frames"]
     notes = (
@@ -29,16 +82,12 @@ def robust_section(path: Path, result: Row) -> str:
         "against low-delay x264."
     )
     loss = [
-        [
-            row["method"],
-            f"{row['loss_percent']:g}",
-            f"{row['rtt_ms']:g}",
-            f"{row['ssim']:.4f}",
-            f"{row['ssim_p5']:.4f}",
-        ]
-        for row in sorted(result["rows"], key=lambda r: (r["loss_percent"], r["rtt_ms"]))
+        _loss_cells(row)
+        for row in sorted(
+            rows_of(LossRow, result["rows"]), key=lambda row: (row.loss_percent, row.rtt_ms)
+        )
     ]
-    disturbed = [_disturbed_cells(row) for row in result["disturbances"]]
+    disturbed = [_disturbed_cells(row) for row in rows_of(DisturbanceRow, result["disturbances"])]
     return "\n\n".join(
         [
             heading(path, result),
@@ -51,34 +100,54 @@ def robust_section(path: Path, result: Row) -> str:
     )
 
 
-def _disturbed_cells(row: Row) -> list[str]:
-    if "reason" in row:
-        return [row["condition"], f"n/a: {row['reason']}", *["n/a"] * 4]
+def print_robust(console: Console, result: Result) -> None:
+    """Print both tables."""
+    rate = f"SSIM over a lossy link, all at {result['equal_rate_kbps']:.0f} kbit/s"
+    loss = [_loss_cells(row) for row in rows_of(LossRow, result["rows"])]
+    print_table(console, rate, LOSS_COLUMNS, loss)
+    bits = f"Bits at {result['quality_db']:g} dB"
+    disturbed = [_disturbed_cells(row) for row in rows_of(DisturbanceRow, result["disturbances"])]
+    print_table(console, bits, REST_COLUMNS, disturbed)
+
+
+def _loss_cells(row: LossRow) -> list[str]:
+    numbers = (f"{row.loss_percent:g}", f"{row.rtt_ms:g}", f"{row.ssim:.4f}", f"{row.ssim_p5:.4f}")
+    return [row.method, *numbers]
+
+
+def _disturbed_cells(row: DisturbanceRow) -> list[str]:
+    if row.reason is not None:
+        return [row.condition, f"n/a: {row.reason}", *["n/a"] * 4]
     return [
-        row["condition"],
-        row["level"],
-        f"{row['kbit']:.1f}",
-        f"{row['more_percent']:+.1f}",
-        f"{row['x264_kbit']:.1f}",
-        f"{row['against_x264_percent']:+.1f}",
+        row.condition,
+        row.level,
+        f"{row.kbit:.1f}",
+        f"{row.more_percent:+.1f}",
+        f"{row.x264_kbit:.1f}",
+        f"{row.against_x264_percent:+.1f}",
     ]
 
 
-def write_robust_figure(result: Row, folder: Path) -> list[Path]:
-    """Write ``loss_ssim``: SSIM over loss, a line per method, a panel per round trip."""
+def write_robust_figure(result: Result, folder: Path) -> list[Path]:
+    """Write ``loss_ssim``: SSIM over loss, a line per method, a panel per round trip.
+
+    Raises ``InvalidInput`` for a result without rows.
+    """
     from matplotlib import pyplot as plt
 
     from rfedge.report.charts import LINES, MARKERS, STYLE, write_figure
 
-    rows = result["rows"]
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    rtts = list(dict.fromkeys(row["rtt_ms"] for row in rows))
+    rows = rows_of(LossRow, result["rows"])
+    if not rows:
+        raise InvalidInput("result", "there is no row to draw")
+    methods = list(dict.fromkeys(row.method for row in rows))
+    rtts = list(dict.fromkeys(row.rtt_ms for row in rows))
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(1, len(rtts), figsize=(7.2, 3.0), sharey=True, squeeze=False)
         for axes, rtt_ms in zip(panels[0], rtts, strict=True):
             for number, method in enumerate(methods):
-                chosen = [r for r in rows if (r["method"], r["rtt_ms"]) == (method, rtt_ms)]
-                x, y = [r["loss_percent"] for r in chosen], [r["ssim"] for r in chosen]
+                chosen = [r for r in rows if (r.method, r.rtt_ms) == (method, rtt_ms)]
+                x, y = [r.loss_percent for r in chosen], [r.ssim for r in chosen]
                 style = {"color": LINES[number % 6], "marker": MARKERS[number % 6]}
                 axes.plot(x, y, label=method, linewidth=1.5, markersize=4, **style)
             axes.set(xlabel="datagrams lost, %", title=f"round trip {rtt_ms:g} ms")
@@ -93,6 +162,6 @@ def write_robust_figure(result: Row, folder: Path) -> list[Path]:
         )
     lines = [["method", "rtt_ms", "loss_percent", "ssim", "ssim_p5"]]
     for row in rows:
-        numbers = (f"{row['rtt_ms']:g}", f"{row['loss_percent']:g}")
-        lines.append([row["method"], *numbers, f"{row['ssim']:.5f}", f"{row['ssim_p5']:.5f}"])
+        numbers = (f"{row.rtt_ms:g}", f"{row.loss_percent:g}")
+        lines.append([row.method, *numbers, f"{row.ssim:.5f}", f"{row.ssim_p5:.5f}"])
     return write_figure(folder / "loss_ssim", figure, lines)

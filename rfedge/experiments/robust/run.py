@@ -41,7 +41,8 @@ from rfedge.experiments.robust.lossy_link import (
     delta_crossing,
     x264_crossing,
 )
-from rfedge.results import check_result_path, provenance, revision, write_result
+from rfedge.experiments.robust.report import CrossingRow, DisturbanceRow, LossRow
+from rfedge.results import check_result_path, make_result, provenance, rows_of, write_result
 
 __all__ = ["RobustJob", "run_robust"]
 
@@ -51,7 +52,6 @@ DELTA_CRFS, X264_CRFS = (20.0, 27.0), (22.0, 27.0, 33.0, 39.0, 45.0)
 DISTURBED_CRFS, RIVAL_CRFS = (23.0, 28.0, 33.0), (20.0, 25.0, 30.0, 35.0)
 QUICK_FRAMES = 8
 SEED = 5
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -75,20 +75,19 @@ class RobustJob:
             raise InvalidInput("frames", f"{self.frames} must be at least 4")
 
 
-def run_robust(job: RobustJob, console: Console) -> Row:
+def run_robust(job: RobustJob, console: Console) -> dict[str, Any]:
     """Do what is not done yet, write ``job.out``, and return its content."""
     count = QUICK_FRAMES if job.quick else job.frames
     drive = read_drive(job.drive, count)
     field = load_field(job.field)
-    bench = Bench(job, field, drive, CellStore(job.cells), console, revision())
+    made = provenance([job.field])
+    bench = Bench(job, field, drive, CellStore(job.cells), console)
     scenarios = bench.scenarios()
     disturbances = 2 * len(bench.noises()) + 2
     console.print(f"{len(scenarios)} crossings and {disturbances} disturbances of {count} frames")
     crossed = [bench.crossed(*scenario) for scenario in scenarios]
     disturbed = [*bench.pose_rows(), bench.lane_row(), *bench.light_rows()]
-    result = {
-        "case": "robust",
-        **provenance(bench.revision),
+    content = {
         "quick": job.quick,
         "seed": SEED,
         "field_id": field.field_id,
@@ -98,6 +97,7 @@ def run_robust(job: RobustJob, console: Console) -> Row:
         **_at_equal_rate(crossed),
         "disturbances": disturbed,
     }
+    result = make_result("robust", made, content)
     write_result(job.out, result)
     return result
 
@@ -111,7 +111,6 @@ class Bench:
     drive: Drive
     store: CellStore
     console: Console
-    revision: str
 
     # --- loss
 
@@ -125,10 +124,10 @@ class Bench:
         theirs = product(X264_CRFS, rivals, rtts, losses)
         return [(method, rtt_s, loss, crf) for crf, method, rtt_s, loss in (*ours, *theirs)]
 
-    def crossed(self, method: str, rtt_s: float, loss: float, crf: float) -> Row:
+    def crossed(self, method: str, rtt_s: float, loss: float, crf: float) -> CrossingRow:
         """Return the row of one crossing."""
         drive, rate_hz = self.drive, self.drive.name.rate_hz
-        facts: Row = {
+        facts: dict[str, Any] = {
             "method": method,
             "rtt_ms": 1e3 * rtt_s,
             "loss_percent": 100 * loss,
@@ -146,9 +145,10 @@ class Bench:
             "program": program_version(),
         }
         (row,) = self.store.rows(key, lambda: [self._outcome(method, crossing)])
-        return {**facts, **row}
+        (crossed,) = rows_of(CrossingRow, [{**facts, **row}])
+        return crossed
 
-    def _outcome(self, method: str, crossing: Crossing) -> Row:
+    def _outcome(self, method: str, crossing: Crossing) -> dict[str, Any]:
         if method.startswith("x264"):
             made = x264_crossing(crossing, idr_on_nack=method.endswith("nack"))
         else:
@@ -178,7 +178,7 @@ class Bench:
         """Return the sizes of pose noise."""
         return (NOISES[0], NOISES[-2]) if self.job.quick else NOISES
 
-    def pose_rows(self) -> list[Row]:
+    def pose_rows(self) -> list[DisturbanceRow]:
         """Return what noise of each size costs, and what is left of it after refinement."""
         drive, rival = self.drive, self._rival(self.drive)
         still, *noises = self.noises()
@@ -192,22 +192,22 @@ class Bench:
                 rows.append(self._row(condition, str(noise), kbit, rows[0], rival))
         return rows
 
-    def lane_row(self) -> Row:
+    def lane_row(self) -> DisturbanceRow:
         """Return what driving in another lane than the training views costs."""
         if self.job.lane is None:
             why = "no drive with a lane offset was given (--lane NAME@HZ=DATASET)"
-            return {"condition": "lane offset", "level": "n/a", "reason": why}
+            return DisturbanceRow("lane offset", "n/a", why)
         drive = read_drive(self.job.lane, len(self.drive.frames))
         kbit = self._own(drive, "lane", drive.cameras)
         return self._row("lane offset", drive.name.scene, kbit, None, self._rival(drive))
 
-    def light_rows(self) -> list[Row]:
+    def light_rows(self) -> list[DisturbanceRow]:
         """Return what a drive at dusk costs with a field of noon, with and without the matrix."""
         if self.job.dusk is None:
             why = "no drive in another light was given (--dusk NAME@HZ=DATASET)"
-            return [{"condition": "light", "level": "n/a", "reason": why}]
+            return [DisturbanceRow("light", "n/a", why)]
         drive = read_drive(self.job.dusk, len(self.drive.frames))
-        rival, rows = self._rival(drive), list[Row]()
+        rival, rows = self._rival(drive), list[DisturbanceRow]()
         for level, choice in (("uncorrected", ()), ("photometric", None)):
             kbit = self._own(drive, level, drive.cameras, photometric=choice)
             rows.append(self._row("light", level, kbit, rows[0] if rows else None, rival))
@@ -241,36 +241,41 @@ class Bench:
         return kbit_at(coded.clips, at_db)
 
     def _row(
-        self, condition: str, level: str, kbit: float, base: Row | None, rival_kbit: float
-    ) -> Row:
-        undisturbed = kbit if base is None else base["kbit"]
-        return {
-            "condition": condition,
-            "level": level,
-            "kbit": kbit,
-            "more_percent": 100 * (kbit / undisturbed - 1),
-            "x264_kbit": rival_kbit,
-            "against_x264_percent": 100 * (kbit / rival_kbit - 1),
-        }
+        self,
+        condition: str,
+        level: str,
+        kbit: float,
+        base: DisturbanceRow | None,
+        rival_kbit: float,
+    ) -> DisturbanceRow:
+        undisturbed = kbit if base is None or base.kbit is None else base.kbit
+        return DisturbanceRow(
+            condition=condition,
+            level=level,
+            kbit=kbit,
+            more_percent=100 * (kbit / undisturbed - 1),
+            x264_kbit=rival_kbit,
+            against_x264_percent=100 * (kbit / rival_kbit - 1),
+        )
 
 
-def _at_equal_rate(crossed: Sequence[Row]) -> Row:
+def _at_equal_rate(crossed: Sequence[CrossingRow]) -> dict[str, Any]:
     """Return SSIM of every scenario at one rate: the lowest that all can be interpolated at."""
-    scenarios: dict[tuple[Any, ...], list[Row]] = {}
+    scenarios: dict[tuple[str, float, float], list[CrossingRow]] = {}
     for row in crossed:
-        scenarios.setdefault((row["method"], row["rtt_ms"], row["loss_percent"]), []).append(row)
-    low = max(min(row["kbps"] for row in rows) for rows in scenarios.values())
-    high = min(max(row["kbps"] for row in rows) for rows in scenarios.values())
+        scenarios.setdefault((row.method, row.rtt_ms, row.loss_percent), []).append(row)
+    low = max(min(row.kbps for row in rows) for rows in scenarios.values())
+    high = min(max(row.kbps for row in rows) for rows in scenarios.values())
     if low > high:
         raise InvalidInput("crf", f"no rate is reached by all: {low:.0f} > {high:.0f} kbit/s")
     rate = float(np.sqrt(low * high))
     rows = []
     for (method, rtt_ms, loss), points in scenarios.items():
-        points = sorted(points, key=lambda row: float(row["kbps"]))
-        log_rates = np.log([row["kbps"] for row in points])
-        at = {
-            name: float(np.interp(np.log(rate), log_rates, [row[name] for row in points]))
-            for name in ("ssim", "ssim_p5")
-        }
-        rows.append({"method": method, "rtt_ms": rtt_ms, "loss_percent": loss, **at})
+        points = sorted(points, key=lambda row: row.kbps)
+        log_rates = np.log([row.kbps for row in points])
+        ssim, ssim_p5 = (
+            float(np.interp(np.log(rate), log_rates, values))
+            for values in ([row.ssim for row in points], [row.ssim_p5 for row in points])
+        )
+        rows.append(LossRow(method, rtt_ms, loss, ssim, ssim_p5))
     return {"equal_rate_kbps": rate, "rows": rows}

@@ -7,9 +7,7 @@ LLVM 19; on other machines the progress bar's remaining time is the better figur
 from __future__ import annotations
 
 import os
-import shlex
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -26,7 +24,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.arguments import time_text
-from rfedge.results import host, revision
+from rfedge.results import as_json, provenance
 from rfedge.street.build.listing import claim_folder, list_dataset, origin_of
 from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer, ShotFiles
 from rfedge.street.render.backend import Backend, chosen_backend
@@ -201,10 +199,4 @@ def build_scene(selection: Selection, settings: Settings, console: Console) -> N
 
 
 def _about(job: RenderJob) -> dict[str, Any]:
-    command = ["rfedge", *sys.argv[1:]]
-    return {
-        "command": shlex.join(command),
-        "revision": revision(),
-        "host": host(),
-        "build": origin_of(job),
-    }
+    return {**as_json(provenance()), "build": origin_of(job)}

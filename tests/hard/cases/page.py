@@ -8,11 +8,9 @@ from itertools import groupby
 from typing import Any
 
 from hard.cases.case import Case, Finding
-from rfedge.results import host, revision
+from rfedge.results import make_result, provenance
 
-__all__ = ["FORMAT", "case_row", "stability_page", "stability_result", "unmeasured"]
-
-FORMAT = "rfedge-stability-1"
+__all__ = ["case_row", "stability_page", "stability_result", "unmeasured"]
 
 Row = Mapping[str, Any]
 
@@ -32,13 +30,7 @@ case without numbers is a yes or no.
 
 def stability_result(rows: Iterable[Row]) -> dict[str, Any]:
     """Return the result file of a run: the rows of its cases, with where they were taken."""
-    return {
-        "format": FORMAT,
-        "command": "make stability",
-        "host": host(),
-        "revision": revision(),
-        "cases": list(rows),
-    }
+    return make_result("stability", provenance(command="make stability"), {"cases": list(rows)})
 
 
 def case_row(case: Case, finding: Finding) -> Row:

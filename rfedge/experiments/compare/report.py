@@ -1,0 +1,267 @@
+"""The rows of a comparison's result, and its section of the results page.
+
+Bytes count the whole message of a frame, header included; savings and BD-rates are of all frames
+but the first. ``scene`` and ``hz`` name a drive in every kind of row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from rfedge.report.tables import heading, print_table, table
+from rfedge.results import Result, rows_of
+
+__all__ = [
+    "BEST",
+    "BitShareRow",
+    "BreakEvenRow",
+    "CompareRow",
+    "CurveRow",
+    "ForegroundRow",
+    "compare_section",
+    "print_compared",
+    "without_field",
+]
+
+BEST = "best-comparable"
+"""Named as a family: the strongest rival whose sender takes no more processor time than ours."""
+
+
+@dataclass(frozen=True)
+class CompareRow:
+    """One method against one rival over one window of quality. CPU is the sender's, a frame."""
+
+    scene: str
+    hz: float
+    method: str
+    rival: str
+    """The family of settings, such as ``x264-lowdelay``."""
+    rival_setting: str
+    """The setting that stands for its family."""
+    window_db: Sequence[float]
+    """Lowest and highest luma PSNR."""
+    bd_rate_percent: float
+    """Negative where the method needs fewer bytes."""
+    ci95: Sequence[float]
+    """Interval of the BD-rate from frames drawn with replacement."""
+    points: int
+    saving_percent_at_db: Mapping[str, float]
+    """A quality that a curve does not reach has no saving."""
+    first_frame_bytes: int
+    rival_first_frame_bytes: int
+    ssim: float
+    rival_ssim: float
+    psnr_deviation_db: float
+    rival_psnr_deviation_db: float
+    cpu_ms: float
+    rival_cpu_ms: float
+    field_psnr_db: float | None
+    """Of the field's own renders against the camera."""
+
+
+@dataclass(frozen=True)
+class BreakEvenRow:
+    """What the field's own bytes leave of the saving when a drive is driven again and again."""
+
+    scene: str
+    hz: float
+    method: str
+    rival: str
+    at_db: float
+    frames_per_pass: int
+    field_bytes: int
+    saved_bytes_per_pass: float
+    passes_to_break_even: int | None
+    """None: never."""
+    saving_percent_after: Mapping[str, float]
+    """By the number of passes."""
+
+
+@dataclass(frozen=True)
+class BitShareRow:
+    """How much of the picture, and of the bytes, one kind of macroblock takes at one CRF."""
+
+    scene: str
+    hz: float
+    method: str
+    crf: float
+    shows: str
+    area_percent: float
+    slice_percent: float
+    bytes_per_frame: float
+
+
+@dataclass(frozen=True)
+class ForegroundRow:
+    """Ours, the whole picture, against a rival that sends the foreground alone."""
+
+    scene: str
+    hz: float
+    mask: str
+    foreground_percent: float
+    window_db: Sequence[float] | None
+    bd_rate_percent: float | None
+    """None, as ``window_db``: the curves share less than a decibel."""
+    whole_picture_ceiling_db: float
+    ours: Mapping[str, Sequence[float]]
+    rfdvc_style: Mapping[str, Sequence[float]]
+
+
+@dataclass(frozen=True)
+class CurveRow:
+    """The curve of one coder, from its lowest quality to its highest."""
+
+    scene: str
+    hz: float
+    family: str
+    """Empty for ours."""
+    setting: str
+    cpu_ms: float
+    point: Sequence[float]
+    psnr_db: Sequence[float]
+    bytes_per_frame: Sequence[float]
+    ssim: Sequence[float]
+
+
+COMPARE_COLUMNS = (
+    "scene",
+    "Hz",
+    "method",
+    "rival",
+    "window dB",
+    "BD-rate %",
+    "95 %",
+    "saving at 31 / 33 / 35 dB, %",
+    "SSIM",
+    "rival's",
+    "deviation dB",
+    "rival's",
+    "first frame kB",
+    "rival's",
+    "CPU ms",
+    "rival's",
+    "field dB",
+)
+PRINTED = ("scene", "Hz", "method", "rival", "window dB", "BD-rate %", "95 %", "CPU ms")
+SAVING_AT_DB = ("31", "33", "35")
+BREAK_EVEN_COLUMNS = (
+    "scene",
+    "Hz",
+    "method",
+    "saved kB a pass",
+    "field MB",
+    "passes to break even",
+    "saving after 1 / 10 / 100 passes, %",
+)
+
+
+def without_field(method: str) -> str:
+    """Return a method's name without the digest of the field it ends in."""
+    return method.rsplit("-", 1)[0]
+
+
+def compare_section(path: Path, result: Result) -> str:
+    """Return the tables of a comparison; those that it did not measure are left out."""
+    compared = [_compare_cells(row) for row in rows_of(CompareRow, result["rows"])]
+    parts = [heading(path, result), table(COMPARE_COLUMNS, compared)]
+    break_even = rows_of(BreakEvenRow, result.get("break_even", ()))
+    if break_even:
+        parts += ["What the field's own bytes leave:"]
+        parts += [table(BREAK_EVEN_COLUMNS, map(_break_even_cells, break_even))]
+    bits = rows_of(BitShareRow, result.get("bits", ()))
+    if bits:
+        parts += ["Where the bits go, near 33.5 dB (bytes a frame; share of the macroblocks):"]
+        parts += [_bits_table(bits)]
+    parts += map(_foreground_line, rows_of(ForegroundRow, result.get("foreground", ())))
+    return "\n\n".join([*parts, ""])
+
+
+def print_compared(console: Console, rows: Sequence[CompareRow]) -> None:
+    """Print the BD-rates, each with the setting that stands for its family."""
+    print_table(console, "Ours against rivals", PRINTED, [_printed_cells(row) for row in rows])
+
+
+def _printed_cells(row: CompareRow) -> list[str]:
+    low, high = row.ci95
+    return [
+        row.scene,
+        f"{row.hz:g}",
+        without_field(row.method),
+        row.rival_setting + (" (best)" if row.rival == BEST else ""),
+        "{:g}..{:g}".format(*row.window_db),
+        f"{row.bd_rate_percent:.1f}",
+        f"{low:.1f}..{high:.1f}",
+        f"{row.cpu_ms:.0f} / {row.rival_cpu_ms:.0f}",
+    ]
+
+
+def _compare_cells(row: CompareRow) -> list[str]:
+    low, high = row.ci95
+    at_db = row.saving_percent_at_db
+    savings = " / ".join(f"{at_db[db]:.0f}" if db in at_db else "-" for db in SAVING_AT_DB)
+    return [
+        row.scene,
+        f"{row.hz:g}",
+        without_field(row.method),
+        f"{row.rival} ({row.rival_setting})",
+        "{:g}..{:g}".format(*row.window_db),
+        f"{row.bd_rate_percent:.1f}",
+        f"{low:.1f}..{high:.1f}",
+        savings,
+        f"{row.ssim:.3f}",
+        f"{row.rival_ssim:.3f}",
+        f"{row.psnr_deviation_db:.2f}",
+        f"{row.rival_psnr_deviation_db:.2f}",
+        f"{row.first_frame_bytes / 1000:.1f}",
+        f"{row.rival_first_frame_bytes / 1000:.1f}",
+        f"{row.cpu_ms:.0f}",
+        f"{row.rival_cpu_ms:.0f}",
+        "-" if row.field_psnr_db is None else f"{row.field_psnr_db:.2f}",
+    ]
+
+
+def _break_even_cells(row: BreakEvenRow) -> list[str]:
+    passes = row.passes_to_break_even
+    return [
+        row.scene,
+        f"{row.hz:g}",
+        without_field(row.method),
+        f"{row.saved_bytes_per_pass / 1000:.1f}",
+        f"{row.field_bytes / 1e6:.2f}",
+        "never" if passes is None else str(passes),
+        " / ".join(f"{saving:.0f}" for saving in row.saving_percent_after.values()),
+    ]
+
+
+def _bits_table(rows: Sequence[BitShareRow]) -> str:
+    kinds = list(dict.fromkeys(row.shows for row in rows))
+    drives = list(dict.fromkeys((row.scene, row.hz) for row in rows))
+    lines = []
+    for scene, hz in drives:
+        those = {row.shows: row for row in rows if (row.scene, row.hz) == (scene, hz)}
+        cells = [
+            f"{those[kind].bytes_per_frame:.0f} ({those[kind].area_percent:.0f} %)"
+            for kind in kinds
+        ]
+        lines.append([scene, f"{hz:g}", *cells])
+    return table(("scene", "Hz", *kinds), lines)
+
+
+def _foreground_line(row: ForegroundRow) -> str:
+    if row.bd_rate_percent is None or row.window_db is None:
+        against = "they share no window of a decibel"
+    else:
+        low, high = row.window_db
+        against = (
+            f"ours, the whole picture, has a BD-rate of {row.bd_rate_percent:+.0f} % at equal "
+            f"quality of the foreground ({low:.1f}..{high:.1f} dB)"
+        )
+    return (
+        f"Foreground only, RFDVC-style, {row.scene} at {row.hz:g} Hz "
+        f"({row.foreground_percent:.0f} % of the pixels; {row.mask}): the whole picture "
+        f"never passes {row.whole_picture_ceiling_db:.2f} dB; {against}."
+    )

@@ -1,0 +1,222 @@
+"""What the published experiment's rows say: means, savings frame by frame, and the page's section.
+
+The savings of a frame are its mean over presets and rate factors; spreads are over frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from rfcore.errors import InvalidInput
+from rfedge.report.tables import heading, print_table, table
+from rfedge.results import Result, rows_of
+
+__all__ = ["PaperMean", "PaperRow", "means_of", "paper_section", "print_means", "savings_by_frame"]
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """One frame coded after its render as the published two-frame clip, at one setting."""
+
+    field: str
+    """Name of the field; ``name:behind`` and ``name:grey`` are controls."""
+    scene: str
+    width: int
+    height: int
+    render: str
+    """``downscaled`` from the camera's size, as published, or ``native``: rendered at this one."""
+    preset: str
+    crf: float
+    frame: str
+    i_bytes: int
+    p_bytes: int
+    second_type: str
+    """``P``, unless x264 found an I picture cheaper."""
+    header_bytes: int
+    savings_percent: float
+    """100 I / (I + P)."""
+    i_psnr_db: float | None
+    """Of the I picture against the render; None where they are identical, as all PSNRs here."""
+    psnr_db: float | None
+    ssim: float
+    camera_i_bytes: int
+    """The camera frame coded by itself."""
+    camera_i_psnr_db: float | None
+    rf_psnr_db: float
+    """Of the render against the camera, as ``rf_ssim``, ``rf_residual_bands`` and ``rf_flip``."""
+    rf_ssim: float
+    rf_residual_bands: Sequence[float]
+    """Energy of the difference over the camera's, by band of spatial frequency."""
+    rf_flip: float | None = None
+    """Of neither controls nor native renders."""
+
+    @staticmethod
+    def of(row: Mapping[str, Any]) -> PaperRow:
+        """Return what ``published_rows`` yields, with None for an infinite PSNR."""
+        values = {
+            name: None if isinstance(value, float) and math.isinf(value) else value
+            for name, value in row.items()
+        }
+        (made,) = rows_of(PaperRow, [values])
+        return made
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.width, self.height
+
+    @property
+    def is_control(self) -> bool:
+        """Whether the render knows nothing of the place."""
+        return ":" in self.field
+
+
+@dataclass(frozen=True)
+class PaperMean:
+    """Means over frames for one field, scene, size and way of rendering.
+
+    ``ci95_percent`` is that of a normal mean. A P picture that x264 made an I picture counts as it
+    is; ``second_not_p`` is the share of such clips.
+    """
+
+    field: str
+    scene: str
+    size_px: tuple[int, int]
+    making: str
+    frames: int
+    savings_percent: float
+    sd_percent: float
+    ci95_percent: float
+    rf_psnr_db: float
+    rf_ssim: float
+    rf_flip: float | None
+    bands: tuple[float, ...]
+    second_not_p: float
+
+
+def means_of(rows: Sequence[PaperRow]) -> list[PaperMean]:
+    """Return a mean for every combination there is, in the order of the rows."""
+    groups: dict[tuple[Any, ...], list[PaperRow]] = {}
+    for row in rows:
+        groups.setdefault((row.field, row.scene, row.size_px, row.render), []).append(row)
+    return [_mean(group) for group in groups.values()]
+
+
+def savings_by_frame(
+    rows: Sequence[PaperRow], field: str, scene: str
+) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """Return for each size the savings of every frame, rendered as published, in frame order.
+
+    Raises ``InvalidInput`` without rows of this field and scene.
+    """
+    wanted = (field, scene, "downscaled")
+    kept = [row for row in rows if (row.field, row.scene, row.render) == wanted]
+    if not kept:
+        raise InvalidInput("rows", f"there is none of field {field!r} in scene {scene!r}")
+    sizes = dict.fromkeys(row.size_px for row in kept)
+    return {
+        size: _by_frame([(r.frame, r.savings_percent) for r in kept if r.size_px == size])
+        for size in sizes
+    }
+
+
+def _mean(group: Sequence[PaperRow]) -> PaperMean:
+    first = group[0]
+    savings = _by_frame([(row.frame, row.savings_percent) for row in group])
+    sd = float(np.std(savings, ddof=1)) if len(savings) > 1 else 0.0
+    flips = [(row.frame, row.rf_flip) for row in group if row.rf_flip is not None]
+    return PaperMean(
+        field=first.field,
+        scene=first.scene,
+        size_px=first.size_px,
+        making=first.render,
+        frames=len(savings),
+        savings_percent=float(np.mean(savings)),
+        sd_percent=sd,
+        ci95_percent=1.96 * sd / len(savings) ** 0.5,
+        rf_psnr_db=float(np.mean(_by_frame([(row.frame, row.rf_psnr_db) for row in group]))),
+        rf_ssim=float(np.mean(_by_frame([(row.frame, row.rf_ssim) for row in group]))),
+        rf_flip=float(np.mean(_by_frame(flips))) if flips else None,
+        bands=tuple(np.mean([row.rf_residual_bands for row in group], axis=0).tolist()),
+        second_not_p=float(np.mean([row.second_type != "P" for row in group])),
+    )
+
+
+def _by_frame(values: Sequence[tuple[str, float]]) -> NDArray[np.float64]:
+    """Return the mean of each frame's values, in the order of the frames."""
+    frames: dict[str, list[float]] = {}
+    for frame, value in values:
+        frames.setdefault(frame, []).append(value)
+    return np.array([np.mean(of_frame) for of_frame in frames.values()])
+
+
+COLUMNS = (
+    "field",
+    "scene",
+    "size",
+    "render",
+    "frames",
+    "100 I/(I+P) %",
+    "sd",
+    "95 %",
+    "RF dB",
+    "SSIM",
+    "LPIPS",
+    "FLIP",
+    "residual by band",
+)
+PRINTED = (*COLUMNS[:4], *COLUMNS[5:10], "FLIP")
+
+
+def paper_section(path: Path, result: Result) -> str:
+    """Return the published experiment's table; means over presets and CRFs, then over frames."""
+    means = means_of(rows_of(PaperRow, result["rows"]))
+    rows = [
+        [
+            *_cells(mean)[:4],
+            str(mean.frames),
+            *_cells(mean)[4:],
+            "n/a",
+            _flip(mean),
+            " / ".join(f"{ratio:.2f}" for ratio in mean.bands),
+        ]
+        for mean in means
+    ]
+    bands = ", ".join("{:.3g}..{:.3g}".format(*band) for band in result["bands_cycles_per_px"])
+    note = (
+        "`name:behind` and `name:grey` are controls (medium, CRF 23). Residual: luma energy of "
+        f"camera - render over the camera's, by cycles a pixel {bands}. LPIPS {result['lpips']}."
+    )
+    return "\n\n".join([heading(path, result), table(COLUMNS, rows), note, ""])
+
+
+def print_means(console: Console, rows: Sequence[PaperRow]) -> None:
+    """Print the means with their spread, and the quality of the render itself."""
+    cells = [[*_cells(mean), _flip(mean)] for mean in means_of(rows)]
+    print_table(console, "Published metric, means over frames", PRINTED, cells)
+
+
+def _cells(mean: PaperMean) -> list[str]:
+    return [
+        mean.field,
+        mean.scene,
+        "{}x{}".format(*mean.size_px),
+        mean.making,
+        f"{mean.savings_percent:.1f}",
+        f"{mean.sd_percent:.1f}",
+        f"±{mean.ci95_percent:.1f}",
+        f"{mean.rf_psnr_db:.2f}",
+        f"{mean.rf_ssim:.3f}",
+    ]
+
+
+def _flip(mean: PaperMean) -> str:
+    return "-" if mean.rf_flip is None else f"{mean.rf_flip:.3f}"

@@ -1,0 +1,253 @@
+"""A result says how it was made, and comes back from its file as it was."""
+
+import hashlib
+import itertools
+import json
+import math
+import re
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rfcore.errors import InvalidInput
+from rfedge import results
+from rfedge.results import (
+    Provenance,
+    as_json,
+    check_result_path,
+    make_result,
+    provenance,
+    read_result,
+    revision,
+    rows_of,
+    write_result,
+)
+
+MADE = Provenance("rfedge eval x", "abc123", False, {"cpu": "C"}, {})
+ROOT = Path(__file__).parents[1]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A kind of row with everything a field can be."""
+
+    name: str
+    bytes_per_frame: float
+    window_db: Sequence[float]
+    by_stage: Mapping[str, float]
+    measured: float | None
+    reason: str | None = None
+
+
+ROW = Row("a", 1.5, (32.0, 35.0), {"render": 2.0}, None)
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """Make a repository with a file of code and a result, both committed."""
+    (tmp_path / "results").mkdir()
+    for name in ("code.py", "results/figure.json"):
+        (tmp_path / name).write_text("1")
+    for command in ("init -q", "add .", "commit -q -m first"):
+        _git(tmp_path, command)
+    return tmp_path
+
+
+def _git(checkout: Path, command: str) -> None:
+    who = ["-c", "user.name=test", "-c", "user.email=test@localhost"]
+    subprocess.run(["git", "-C", str(checkout), *who, *command.split()], check=True)
+
+
+# --- how it was made
+
+
+def test_a_result_written_beside_does_not_make_the_code_dirty(checkout: Path) -> None:
+    clean = revision(checkout)
+    (checkout / "results" / "figure.json").write_text("2")
+    assert revision(checkout) == clean
+    assert len(clean) == 12
+
+
+def test_changed_code_makes_it_dirty(checkout: Path) -> None:
+    clean = revision(checkout)
+    (checkout / "code.py").write_text("2")
+    assert revision(checkout) == f"{clean}-dirty"
+
+
+def test_outside_a_checkout_it_is_unknown(tmp_path: Path) -> None:
+    assert revision(tmp_path) == "unknown"
+
+
+@pytest.mark.parametrize(("at", "dirty"), [("abc", False), ("abc-dirty", True), ("unknown", None)])
+def test_the_flag_says_whether_the_code_had_changes(at: str, dirty: bool | None) -> None:
+    assert provenance(at=at).dirty is dirty
+
+
+def test_the_command_can_be_pasted_into_a_shell(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/rfedge", "eval", "a b", "c'd"])
+    assert provenance(at="x").command == """rfedge eval 'a b' 'c'"'"'d'"""
+
+
+def test_inputs_are_named_as_given_with_their_digests_and_folders_left_out(tmp_path: Path) -> None:
+    file, folder = tmp_path / "f.rff", tmp_path / "drive"
+    file.write_bytes(b"field")
+    folder.mkdir()
+    expected = {str(file): hashlib.sha256(b"field").hexdigest()}
+    assert provenance([file, folder], at="x").inputs == expected
+
+
+def test_two_provenances_of_the_same_code_are_equal() -> None:
+    """Nothing in them depends on when or where in a run they are taken."""
+    assert provenance(at="x") == provenance(at="x")
+
+
+# --- writing and reading
+
+
+def test_a_row_comes_back_as_it_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "x.json"
+    write_result(path, make_result("test", MADE, {"rows": [ROW, replace(ROW, reason="none")]}))
+    result = read_result(path, "test")
+    assert list(result) == ["kind", "command", "revision", "dirty", "host", "inputs", "rows"]
+    assert "reason" not in result["rows"][0]
+    assert result["rows"][0]["measured"] is None
+    first, second = rows_of(Row, result["rows"])
+    assert as_json(first) == as_json(ROW)
+    assert second.reason == "none"
+
+
+def test_what_is_written_is_what_was_returned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = make_result("test", MADE, {"rows": [ROW], "out": Path("a/b")})
+    write_result(tmp_path / "x.json", result)
+    write_result("-", result)
+    assert json.loads((tmp_path / "x.json").read_text()) == result
+    assert json.loads(capsys.readouterr().out) == result
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+        max_leaves=8,
+    )
+)
+def test_json_holds_every_finite_value_and_no_other(value: Any) -> None:
+    if "Infinity" in json.dumps(value) and _has_infinity(value):
+        with pytest.raises(InvalidInput, match="not finite"):
+            as_json(value)
+    else:
+        assert json.loads(json.dumps(as_json(value), allow_nan=False)) == value
+
+
+def _has_infinity(value: Any) -> bool:
+    if isinstance(value, list):
+        return any(map(_has_infinity, value))
+    if isinstance(value, dict):
+        return any(map(_has_infinity, value.values()))
+    return isinstance(value, float) and math.isinf(value)
+
+
+@pytest.mark.parametrize(
+    ("content", "place"),
+    [
+        ({"rows": [{"psnr_db": math.nan}]}, r"result\.rows\[0\]\.psnr_db: nan is not finite"),
+        ({"rows": [replace(ROW, bytes_per_frame=math.inf)]}, r"rows\[0\]\.bytes_per_frame: inf"),
+        ({"made": {1, 2}}, r"result\.made: set has no form in JSON"),
+        ({"data": b"raw"}, r"result\.data: bytes has no form"),
+    ],
+)
+def test_what_json_cannot_hold_is_named_by_its_place(content: Any, place: str) -> None:
+    with pytest.raises(InvalidInput, match=place):
+        make_result("test", MADE, content)
+
+
+def test_a_measurement_cannot_pretend_to_have_been_made_otherwise() -> None:
+    with pytest.raises(InvalidInput, match="host, revision: reserved"):
+        make_result("test", MADE, {"revision": "another", "host": {}, "rows": []})
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("{", "is not JSON"),
+        ("[]", "it has no `kind`"),
+        ('{"case": "compare"}', "it has no `kind`"),
+        ('{"kind": 3}', "it has no `kind`"),
+        ('{"kind": "ladder"}', "holds a result of kind 'ladder', not 'compare'"),
+    ],
+)
+def test_another_file_is_refused_by_name(tmp_path: Path, text: str, problem: str) -> None:
+    path = tmp_path / "notes.json"
+    path.write_text(text)
+    with pytest.raises(InvalidInput, match=rf"notes\.json.*{problem}"):
+        read_result(path, "compare")
+
+
+def test_a_row_of_another_shape_is_named_with_what_is_wrong() -> None:
+    rows = [as_json(ROW), {**as_json(ROW), "colour": 1}]
+    del rows[1]["by_stage"]
+    with pytest.raises(InvalidInput, match="row 1 lacks by_stage and has unknown colour: Row does"):
+        rows_of(Row, rows)
+
+
+def test_a_result_is_a_json_file() -> None:
+    check_result_path(Path("out/x.json"))
+    with pytest.raises(InvalidInput, match=r"x\.csv must end in \.json"):
+        check_result_path(Path("out/x.csv"))
+
+
+# --- what is committed, and where verbs write
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("results/**/*.json")), ids=lambda path: path.stem)
+def test_a_committed_result_says_how_it_was_made(path: Path) -> None:
+    result = read_result(path)
+    json.dumps(result, allow_nan=False)
+    assert {"command", "revision", "host"} < set(result)
+    assert {"cpu", "cores", "isa"} <= set(result["host"])
+    assert "case" not in result or result["kind"] == "bench"
+
+
+def test_no_verb_of_eval_writes_over_a_tracked_file_unless_told_to() -> None:
+    """Everything a verb writes by default lies below ``out``, which is not tracked."""
+    from dataclasses import fields
+    from typing import get_args, get_type_hints
+
+    from rfedge.cli.eval import Eval
+
+    choices = get_args(get_type_hints(Eval, include_extras=True)["verb"])
+    verbs = [get_args(choice)[0] for choice in choices]
+    assert len(verbs) >= 6
+    for verb in verbs:
+        outputs = {f.name: f.default for f in fields(verb) if f.name in ("out", "figures", "cells")}
+        assert outputs["out"] == Path("out/eval") / outputs["out"].name
+        assert all(path is None or path.parts[0] == "out" for path in outputs.values())
+
+
+def test_the_host_is_described_without_a_clock() -> None:
+    assert set(results.host()) == {"cpu", "cores", "isa", "python", "os"}
+    assert results.host() == results.host()
+
+
+def test_a_make_target_that_writes_results_says_so_in_its_help() -> None:
+    """A target's recipe names the file after an option that writes, as --out or --record."""
+    lines = (ROOT / "Makefile").read_text().splitlines()
+    variables = dict(re.findall(r"^(\w+) *[:?]?= *(.*)$", "\n".join(lines), flags=re.MULTILINE))
+    writers = []
+    for number, line in enumerate(lines):
+        target = re.match(r"([a-z%-]+):(?!=).*", line)
+        recipe = itertools.takewhile(lambda text: text.startswith("\t"), lines[number + 1 :])
+        text = re.sub(r"\$\((\w+)\)", lambda name: variables.get(name[1], ""), "\n".join(recipe))
+        if target and re.search(r"--(out|record|[a-z]+-json) results/", text):
+            writers.append(target[1])
+            assert "results/" in line.partition("## ")[2], f"{target[1]} does not say so"
+    assert {"test-fault", "load-full", "results-%"} <= set(writers)
