@@ -8,11 +8,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import tyro
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field
 from rfedge.experiments.clips import DriveName, read_drive
+from rfedge.experiments.compare import EvalCompare
+from rfedge.experiments.compare import run as compare_run
 from rfedge.experiments.compare.drives import CompareJob, foreign_coder, read_drive_comparisons
 from rfedge.experiments.compare.measure import BEST
 from rfedge.experiments.compare.run import run_compare
@@ -188,6 +191,19 @@ def test_a_window_nobody_reaches_ends_the_comparison_before_its_long_part(thumbn
         run_compare(job, Console(quiet=True))
     assert len(list(job.cells.iterdir())) <= 8, "our own ends alone were coded"
     assert not job.out.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "window"), [((), None), (("--window", "30", "34.5"), (30.0, 34.5))]
+)
+def test_the_command_takes_a_window(tmp_path, monkeypatch, options, window):
+    monkeypatch.chdir(tmp_path)  # where the cells go
+    jobs = []
+    monkeypatch.setattr(compare_run, "run_compare", lambda job, _console: jobs.append(job))
+    command = tyro.cli(EvalCompare, args=["wall.rff", "wall@10=drive.json", *options])
+    command.run()
+    assert [job.window_db for job in jobs] == [window]
+    assert jobs[0].windows_db[0] == (window or (32.0, 35.0))
 
 
 def test_a_background_without_its_drive_is_refused(thumbnail, tmp_path):

@@ -9,6 +9,7 @@ from rfedge.experiments.clips import Clip
 from rfedge.experiments.compare.foreground import (
     ForegroundCoder,
     by_macroblock,
+    composed,
     foreground_mask,
     foreground_row,
 )
@@ -78,3 +79,57 @@ def test_a_drive_without_foreground_is_refused():
     clips = perform(clip, coder, NoStore()).clips
     with pytest.raises(InvalidInput, match="no frame differs"):
         foreground_row(clip, clips, clips, [np.zeros_like(MASKS[0])] * 3)
+
+
+@pytest.mark.parametrize("shape", [(64, 96), (33, 17), (16, 16), (1, 1)])
+def test_shares_of_macroblocks_count_every_pixel_once(shape):
+    mask = np.random.default_rng(1).random(shape) < 0.4
+    shares = by_macroblock(mask)
+    assert shares.shape == (-(-shape[0] // 16), -(-shape[1] // 16))
+    assert shares.sum() * 256 == mask.sum()
+
+
+def test_a_picture_is_composed_of_one_in_the_blocks_and_the_other_elsewhere():
+    block = np.zeros((4, 6), bool)
+    block[1:3, 2:4] = True
+    both = composed(FRAMES[0], RENDER, block)
+    np.testing.assert_array_equal(both.y[BOX], FRAMES[0].y[BOX])
+    outside = np.ones(SIZE[::-1], bool)
+    outside[BOX] = False
+    np.testing.assert_array_equal(both.y[outside], RENDER.y[outside])
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_all_blocks_or_none_give_one_of_the_two_pictures(whole):
+    made = composed(FRAMES[0], RENDER, np.full((4, 6), whole))
+    assert made.digest() == (FRAMES[0] if whole else RENDER).digest()
+
+
+def test_more_frames_than_masks_are_refused():
+    coder = ForegroundCoder.of("veryfast", MASKS[:2], [RENDER] * 2, "test")
+    with pytest.raises(InvalidInput, match="3 where there are 2 masks"):
+        coder.code(FRAMES, 10, 30.0)
+
+
+def test_a_mask_is_paid_for():
+    """The bytes of a frame are those of its slices and of its mask."""
+    coder = ForegroundCoder.of("veryfast", MASKS, [RENDER] * 3, "test")
+    flat = I420(np.full_like(STREET.y, 128), CHROMA, CHROMA)
+    alone = coder.rival.pictures(
+        [composed(f, flat, by_macroblock(MASKS[0]) > 0) for f in FRAMES], 10, 30.0
+    )
+    assert (coder.code(FRAMES, 10, 30.0).frame_bytes > np.array(alone.frame_bytes)).all()
+
+
+def test_another_stamp_or_option_is_another_version():
+    versions = {
+        ForegroundCoder.of(preset, MASKS, [RENDER] * 3, stamp).version
+        for preset, stamp in (("veryfast", "a"), ("veryfast", "b"), ("medium", "a"))
+    }
+    assert len(versions) == 3
+
+
+def test_an_idr_picture_comes_every_ten_frames():
+    coder = ForegroundCoder.of("veryfast", MASKS * 4, [RENDER] * 12, "test")
+    sizes = coder.code(FRAMES[:1] * 12, 10, 30.0).frame_bytes
+    assert set(np.flatnonzero(sizes > 3 * np.median(sizes))) == {0, 10}

@@ -9,7 +9,7 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420
 from rfcore.views import FieldView
 from rfedge.experiments.compare.bit_split import KINDS, SplitClip, macroblock_kinds, split_rows
-from rfedge.experiments.field_coder import RenderedClip
+from rfedge.experiments.field_coder import FieldCoder, RenderedClip
 
 SIZE = (96, 64)
 INTRINSICS = Intrinsics(*SIZE, 64.0, 64.0, 48.0, 32.0)
@@ -70,3 +70,36 @@ def test_bits_go_where_the_frame_differs_from_the_field():
     assert shares["moving"]["slice_percent"] > 90
     assert shares["moving"]["area_percent"] == pytest.approx(100 * 4 / 24)
     assert sum(row["slice_percent"] for row in rows) == pytest.approx(100)
+
+
+def test_without_anything_new_every_macroblock_is_of_one_kind():
+    kinds = macroblock_kinds(wall(), wall(), EVERYWHERE, NOWHERE)
+    assert kinds.shape == (4, 6)
+    assert len(np.unique(kinds)) == 1
+
+
+def test_a_field_that_covers_nothing_is_off_the_map_whatever_moves():
+    moving = NOWHERE.copy()
+    moving[:32] = True
+    assert names(wall(), wall(1.0), NOWHERE, moving) == [["off-map"] * 6] * 4
+
+
+@pytest.mark.parametrize(("rows", "kind"), [(3, "static"), (4, "moving")])
+def test_a_macroblock_is_of_a_kind_that_covers_a_quarter_of_it(rows, kind):
+    moving = NOWHERE.copy()
+    moving[:rows, :16] = True
+    assert names(wall(), wall(), EVERYWHERE, moving)[0][0] == kind
+
+
+def test_shares_are_whole_and_bytes_are_those_of_the_slices():
+    rng = np.random.default_rng(4)
+    frames = [picture(rng.integers(60, 200, SIZE[::-1]).astype(np.uint8)) for _ in range(3)]
+    still = picture(np.full(SIZE[::-1], 120, np.uint8))
+    views = (replace(wall(), render=still),) * 3
+    rendered = RenderedClip(views, (EVERYWHERE,) * 3, "field", 0.0)
+    rows = split_rows(SplitClip(frames, rendered, [NOWHERE] * 3, "ultrafast", 30.0))
+    assert sum(row["area_percent"] for row in rows) == pytest.approx(100)
+    assert sum(row["slice_percent"] for row in rows) == pytest.approx(100)
+    clip = FieldCoder(rendered, "ours", "test", preset="ultrafast").code(frames, 10, 30.0)
+    slices = np.array(clip.notes["slice_bytes"])[1:]
+    assert sum(row["bytes_per_frame"] for row in rows) == pytest.approx(slices.mean())
