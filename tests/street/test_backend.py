@@ -50,9 +50,10 @@ def test_a_library_that_aborts_the_process_is_passed_over(
     assert (chosen.variant, Path(chosen.llvm).name) == ("llvm_ad_rgb", "libLLVM-15.so")
 
 
-def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backend, "find_spec", lambda name: None if name == "pyoidn" else name)
+@pytest.mark.parametrize("missing", ["mitsuba", "pyoidn", "scipy"])
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
+    monkeypatch.setattr(backend, "find_spec", lambda name: None if name == missing else name)
     with pytest.raises(
-        BackendUnavailable, match=r"^pyoidn is missing: pip install 'rfedge\[scene\]'$"
+        BackendUnavailable, match=rf"^{missing} is missing: pip install 'rfedge\[scene\]'$"
     ):
         backend.require_renderer()

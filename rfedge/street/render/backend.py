@@ -55,7 +55,7 @@ class Backend:
 
 def require_renderer() -> None:
     """Raise ``BackendUnavailable`` where the extra is not installed."""
-    for name in ("mitsuba", "pyoidn"):
+    for name in ("mitsuba", "pyoidn", "scipy"):
         if find_spec(name) is None:
             raise BackendUnavailable(f"{name} is missing: pip install 'rfedge[scene]'")
 
