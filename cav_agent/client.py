@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+import uuid
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import suppress
@@ -24,7 +25,7 @@ from cav_agent.server_connection import ServerConnection
 from cav_agent.session import AgentSession, LinkState
 from rfcore.errors import ProtocolError, RfedgeError
 from rfcore.views import PosedPicture
-from rfcore.wire.conventions import RETRY_AFTER, STREAM_METHOD
+from rfcore.wire.conventions import AGENT_PROCESS, RETRY_AFTER, STREAM_METHOD
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import FieldNotice, Welcome
 
@@ -32,6 +33,9 @@ __all__ = ["CameraSource", "CameraTaken", "StreamClient", "StreamObserver"]
 
 log = structlog.get_logger()
 Stream = grpc.aio.StreamStreamCall[bytes, bytes]
+
+IDENTIFICATION = ((AGENT_PROCESS, uuid.uuid4().hex),)
+"""Tells a server which streams are of one process, so that no other sends the same camera."""
 
 FINAL = frozenset(
     {
@@ -254,7 +258,7 @@ class StreamClient:
     async def _one_stream(self) -> StreamEnd:
         """Open a stream and serve it to its end; return why it ended."""
         self._retry_after_s = 0.0
-        stream: Stream = self._server.channel.stream_stream(STREAM_METHOD)()
+        stream: Stream = self._server.channel.stream_stream(STREAM_METHOD)(metadata=IDENTIFICATION)
         self._stream = stream
         self._session.connected(time.monotonic())
         self._changed.set()

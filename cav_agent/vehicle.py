@@ -17,7 +17,7 @@ from functools import partial
 from typing import Any
 
 import structlog
-from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client import CollectorRegistry
 
 from cav_agent.client import CameraSource, StreamClient, StreamObserver
 from cav_agent.config import AgentConfig, PaceKind
@@ -34,6 +34,7 @@ from cav_agent.tile_stream import OpenStream
 from rfcore.camera import TileOrigin
 from rfcore.errors import RfedgeError
 from rfcore.wire.conventions import RENDERER_CONTRACT
+from rfcore.wire.instruments import MetricsEndpoint
 from rfcore.wire.messages import CameraDescription, Hello, RendererContract
 from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.tiles import Tile
@@ -199,11 +200,5 @@ def _serve_metrics(settings: MetricsSettings, registry: CollectorRegistry) -> No
     """Serve ``registry`` if a port is given; raise ``RfedgeError`` if it cannot be had."""
     if settings.port is None:
         return
-    try:
-        server, _ = start_http_server(settings.port, settings.host, registry)
-    except OSError as error:
-        raise RfedgeError(
-            f"cannot serve metrics on {settings.host}:{settings.port}: {error.strerror}; "
-            "give another --metrics-port, or 0 for a free one"
-        ) from error
-    log.info("metrics", port=server.server_port)
+    endpoint = MetricsEndpoint(registry, settings.host, settings.port)
+    log.info("metrics", port=endpoint.port)

@@ -1,151 +1,207 @@
-"""Who is let in, and at how many pictures per second, so that those who are in keep their service.
+"""Who is let in, and at how many pictures per second, so that admitted streams keep their service.
 
-Sans-IO: ``now`` is an argument. What there is to give is the workers' time; what a frame takes of
-it is measured while this server works, for each vehicle, and for newcomers by the pixel. Others
-that use the machine, or a field that is slow to render, make frames take longer and so less is
-given. Vehicles get what they ask for in the order in which they came; the last one gets what is
-left, and one for whom too little is left is asked to come again later. When frames become dearer or
-cheaper, or somebody leaves, rates are dealt out anew, in the same order; nobody is sent away.
+Sans-IO: ``now`` is an argument. What is shared out is the workers' time. What a frame takes of it
+is measured while the server works: for each stream, and per pixel for new ones. So when other
+processes use the machine, or a field is slow to render, frames take longer and lower rates are
+granted. Streams get what they ask for in the order in which they came; the last one gets what is
+left, and one for which too little is left is refused and told when to try again. When frames take
+longer or shorter, or a stream ends, rates are reallocated in the same order; no admitted stream is
+ended for it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from mec_server.config import AdmissionLimits
-from mec_server.quotas import Limit
+from mec_server.quotas import ActiveCameras, Allowance, CameraSender, Limit, Quotas
 from rfcore.errors import LimitExceeded
 from rfcore.wire.messages import Hello
 
-__all__ = ["ASSUMED_HZ", "Admission"]
+__all__ = ["ASSUMED_HZ", "Admission", "EntryControl", "StreamPermit"]
 
 ASSUMED_HZ = 10.0
-"""Of a vehicle that does not say how many pictures per second it would send."""
+"""Rate of a vehicle that does not state how many pictures per second it would send."""
 
 FIRST_S_PER_PIXEL = 1.5e-7
 """Before anything was measured: 35 ms for 640x360, as rendering a field of 200k Gaussians and
 decoding took one core of 2.5 GHz."""
 
-MEMORY = 1 / 32
+FRAME_WEIGHT = 1 / 32
 """Weight of a frame in the running means; at 10 Hz they follow within three seconds."""
 
-OUTLIER = 4.0
-"""A frame that took longer than so many usual ones counts as that many: once is an accident."""
+MAX_RELATIVE_COST = 4.0
+"""A frame that took longer than so many usual ones counts as that many: one may be an accident."""
 
 REVIEW_S = 1.0
-NOTICEABLE = 0.1
-"""Rates are dealt out once a second, and a vehicle is told of changes by more than a tenth."""
+MIN_RELATIVE_CHANGE = 0.1
+"""Rates are reallocated once a second, and a vehicle is told of changes by more than a tenth."""
 
 
 @dataclass
 class AdmittedStream:
-    """A vehicle that is in. ``cost_s``: worker time for each of its frames."""
+    """A stream that was let in. ``cost_s``: worker time for each of its frames."""
 
     pixels: int
     cameras: int
-    asked_hz: float
+    requested_hz: float
     cost_s: float
     granted_hz: float
-    says_rate: bool
+    states_rate: bool
 
     @property
     def promised(self) -> float:
-        """Workers that its granted rate keeps busy."""
+        """Return how many workers its granted rate keeps busy."""
         return self.granted_hz * self.cameras * self.cost_s
 
 
 class Admission:
-    """Deals out ``workers`` seconds of work a second, less what ``limits`` keeps back."""
+    """Shares out the time of ``workers``, less what ``limits`` keeps back."""
 
     def __init__(self, limits: AdmissionLimits, workers: int) -> None:
         self._limits = limits
         self._capacity = limits.load * workers
-        self._guests: dict[str, AdmittedStream] = {}
+        self._streams: dict[str, AdmittedStream] = {}
         self._s_per_pixel = FIRST_S_PER_PIXEL
         self._reviewed_s = float("-inf")
 
     @property
     def promised_share(self) -> float:
-        """What is promised, of what may be; above 1 when frames became dearer than they were."""
+        """Return what is promised, of what may be; above 1 when frames take longer than before."""
         if not self._capacity:
             return 0.0
-        return sum(guest.promised for guest in self._guests.values()) / self._capacity
+        return sum(stream.promised for stream in self._streams.values()) / self._capacity
 
     @property
     def reduced(self) -> int:
-        """How many vehicles have less than they asked for."""
-        return sum(guest.granted_hz < guest.asked_hz for guest in self._guests.values())
+        """Return how many streams have less than they asked for."""
+        return sum(stream.granted_hz < stream.requested_hz for stream in self._streams.values())
 
     def enter(self, session_id: str, hello: Hello) -> float:
-        """Return the rate for each camera of a newcomer, 0 for as many as it likes.
+        """Admit a stream; return the rate for each of its cameras, 0 for as many as it likes.
 
-        Raises ``LimitExceeded`` with the time after which to come again.
+        Raises ``LimitExceeded`` with the time after which to try again.
         """
-        guest = self._newcomer(hello)
+        stream = self._new_stream(hello)
         if not self._capacity:
             return 0.0
-        free = self._capacity - sum(other.promised for other in self._guests.values())
-        rate_hz = self._rate(guest, free)
-        if rate_hz < self._lowest_hz(guest) and self._guests:
-            raise self._full(guest, free)
-        guest.granted_hz = max(rate_hz, self._lowest_hz(guest))
-        self._guests[session_id] = guest
-        return self._said(guest)
+        free = self._capacity - sum(other.promised for other in self._streams.values())
+        rate_hz = self._affordable_hz(stream, free)
+        if rate_hz < self._lowest_hz(stream) and self._streams:
+            raise self._full(stream, free)
+        stream.granted_hz = max(rate_hz, self._lowest_hz(stream))
+        self._streams[session_id] = stream
+        return self._offered_rate(stream)
 
     def leave(self, session_id: str) -> None:
-        """A stream is over; what it had is for others at the next review."""
-        self._guests.pop(session_id, None)
+        """Forget a stream that ended; what it had is shared out at the next reallocation."""
+        self._streams.pop(session_id, None)
 
-    def worked(self, session_id: str, seconds: float) -> None:
-        """Take note that a frame of this session took a worker so long."""
-        guest = self._guests.get(session_id)
-        if guest is None:
+    def worked(self, session_id: str, worker_s: float) -> None:
+        """Note for how long a frame of this session kept a worker busy."""
+        stream = self._streams.get(session_id)
+        if stream is None:
             return
-        seconds = min(seconds, OUTLIER * guest.cost_s)
-        guest.cost_s += MEMORY * (seconds - guest.cost_s)
-        self._s_per_pixel += MEMORY * (seconds / guest.pixels - self._s_per_pixel)
+        worker_s = min(worker_s, MAX_RELATIVE_COST * stream.cost_s)
+        stream.cost_s += FRAME_WEIGHT * (worker_s - stream.cost_s)
+        self._s_per_pixel += FRAME_WEIGHT * (worker_s / stream.pixels - self._s_per_pixel)
 
-    def review(self, now: float) -> dict[str, float]:
-        """Return the sessions whose rate changes, with it; looks once a second."""
+    def reallocate_rates(self, now: float) -> dict[str, float]:
+        """Return the new rates of the sessions whose rate changes; looks once a second."""
         if now < self._reviewed_s + REVIEW_S:
             return {}
         self._reviewed_s = now
         free, changed = self._capacity, {}
-        for session_id, guest in self._guests.items():
-            rate_hz = max(self._rate(guest, free), self._lowest_hz(guest))
-            if abs(rate_hz - guest.granted_hz) > NOTICEABLE * guest.granted_hz:
-                guest.granted_hz = rate_hz
-                changed[session_id] = self._said(guest)
-            free -= guest.promised
+        for session_id, stream in self._streams.items():
+            rate_hz = max(self._affordable_hz(stream, free), self._lowest_hz(stream))
+            if abs(rate_hz - stream.granted_hz) > MIN_RELATIVE_CHANGE * stream.granted_hz:
+                stream.granted_hz = rate_hz
+                changed[session_id] = self._offered_rate(stream)
+            free -= stream.promised
         return changed
 
-    def _newcomer(self, hello: Hello) -> AdmittedStream:
+    def _new_stream(self, hello: Hello) -> AdmittedStream:
         pixels = max(k.intrinsics.width_px * k.intrinsics.height_px for k in hello.cameras)
-        asked_hz = max(camera.rate_hz for camera in hello.cameras)
-        cost_s = pixels * self._s_per_pixel
-        says_rate = asked_hz > 0
-        asked_hz = asked_hz or ASSUMED_HZ
-        return AdmittedStream(pixels, len(hello.cameras), asked_hz, cost_s, asked_hz, says_rate)
+        stated_hz = max(camera.rate_hz for camera in hello.cameras)
+        requested_hz = stated_hz or ASSUMED_HZ
+        return AdmittedStream(
+            pixels=pixels,
+            cameras=len(hello.cameras),
+            requested_hz=requested_hz,
+            cost_s=pixels * self._s_per_pixel,
+            granted_hz=requested_hz,
+            states_rate=stated_hz > 0,
+        )
 
-    def _full(self, guest: AdmittedStream, free: float) -> LimitExceeded:
+    def _full(self, stream: AdmittedStream, free: float) -> LimitExceeded:
         limits = self._limits
         return LimitExceeded(
             Limit.CAPACITY,
-            f"{len(self._guests)} vehicles leave {max(0.0, free):.2f} of {self._capacity:g} "
-            f"workers; {guest.cameras} x {guest.pixels} pixels at {guest.asked_hz:g} Hz take "
-            f"{guest.promised:.2f}; come again in {limits.retry_s:g} s",
+            f"{len(self._streams)} vehicles leave {max(0.0, free):.2f} of {self._capacity:g} "
+            f"workers; {stream.cameras} x {stream.pixels} pixels at {stream.requested_hz:g} Hz "
+            f"take {stream.promised:.2f}; come again in {limits.retry_s:g} s",
             limits.retry_s,
         )
 
-    def _rate(self, guest: AdmittedStream, free: float) -> float:
+    def _affordable_hz(self, stream: AdmittedStream, free: float) -> float:
         """Return the rate that ``free`` workers allow, up to the one that was asked for."""
-        return min(guest.asked_hz, max(0.0, free) / (guest.cameras * guest.cost_s))
+        return min(stream.requested_hz, max(0.0, free) / (stream.cameras * stream.cost_s))
 
-    def _lowest_hz(self, guest: AdmittedStream) -> float:
-        return min(self._limits.lowest_hz, guest.asked_hz)
+    def _lowest_hz(self, stream: AdmittedStream) -> float:
+        return min(self._limits.lowest_hz, stream.requested_hz)
 
     @staticmethod
-    def _said(guest: AdmittedStream) -> float:
-        """A vehicle that never said its rate is not held to one, unless it must be lower."""
-        full = guest.granted_hz >= guest.asked_hz
-        return 0.0 if full and not guest.says_rate else guest.granted_hz
+    def _offered_rate(stream: AdmittedStream) -> float:
+        """Return the rate to tell the vehicle: 0, "no limit", if it stated none and gets all."""
+        full = stream.granted_hz >= stream.requested_hz
+        return 0.0 if full and not stream.states_rate else stream.granted_hz
+
+
+@dataclass(frozen=True)
+class StreamPermit:
+    """A stream that was let in: what its vehicle may use, and the rate of each of its cameras."""
+
+    rate_hz: float
+    allowance: Allowance
+    worked: Callable[[float], None]
+    """Called with the seconds for which a frame kept a worker busy."""
+    leave: Callable[[], None]
+    """Gives back everything the stream was granted; to be called once."""
+
+
+class EntryControl:
+    """Judges a Hello by everything that limits who may stream: quotas, cameras, workers' time."""
+
+    def __init__(self, quotas: Quotas, admission: Admission) -> None:
+        self._quotas = quotas
+        self._cameras = ActiveCameras()
+        self._admission = admission
+
+    def enter(
+        self, hello: Hello, account: str, session_id: str, sender: CameraSender, now: float
+    ) -> StreamPermit:
+        """Let a stream in that ``account`` is to be charged for.
+
+        Raises ``LimitExceeded``, after which nothing is held for the stream.
+        """
+        allowance = self._quotas.enter(account, now)
+
+        def leave() -> None:
+            allowance.leave()
+            self._cameras.leave(sender)
+            self._admission.leave(session_id)
+
+        try:
+            rate_hz = self._admission.enter(session_id, hello)
+            self._cameras.enter(hello, sender, now)
+        except LimitExceeded:
+            leave()
+            raise
+        worked = partial(self._admission.worked, session_id)
+        return StreamPermit(rate_hz, allowance, worked, leave)
+
+    def reallocate_rates(self, now: float) -> dict[str, float]:
+        """Return the new rates of the sessions whose rate changes."""
+        return self._admission.reallocate_rates(now)

@@ -1,29 +1,42 @@
-"""One camera of one session: frames in order, one being decoded, and who was promised what.
+"""The cameras of one session: frames in order, one being decoded per camera, and credits.
 
 Sans-IO bookkeeping. Frames enter with ``admit``, leave to the decoder with ``start`` and end in
-``succeed`` or ``fail``; each ends in exactly one answer. The epoch and the next expected sequence
-move only when a frame was reconstructed, so that a damaged frame cannot move them.
+``succeed``, ``fail`` or ``refuse``; each gets exactly one answer. The epoch and the next expected
+sequence move only when a frame was reconstructed, so that a damaged frame cannot move them.
+
+This is the one place where the server judges the order of frames, before any work is spent on
+them. ``DeltaDecoder`` checks the order, too: it guards callers that have no queue, such as the
+offline decoder, and within the server its check never fires.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from rfcore.errors import PacketRejected, RejectReason
-from rfcore.wire.messages import CameraDescription, Frame
+from rfcore.errors import InvalidInput, PacketRejected, RejectReason
+from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, shown
+from rfcore.wire.messages import Credit, Frame, FrameAddress, Hello
 
-__all__ = ["MAX_EPOCH_STEP", "MAX_GAP", "CameraQueue", "Gap", "Waiting"]
+__all__ = [
+    "MAX_EPOCH_STEP",
+    "MAX_GAP",
+    "CameraQueue",
+    "SequenceGap",
+    "SessionCameras",
+    "WaitingFrame",
+]
 
 MAX_GAP = 64
 """Sequences that may be missing at once; credits keep an honest sender far below it."""
 
 MAX_EPOCH_STEP = 1 << 16
-"""How far an epoch may lead the last one; a flipped high bit shall not carry the lane off."""
+"""How far an epoch may lead the last one: a flipped high bit must not make all that follow stale"""
 
 
 @dataclass(frozen=True)
-class Waiting:
+class WaitingFrame:
     """A frame and when it arrived."""
 
     frame: Frame
@@ -31,7 +44,7 @@ class Waiting:
 
 
 @dataclass(frozen=True)
-class Gap:
+class SequenceGap:
     """``count`` consecutive sequences, from ``first`` on, that never arrived."""
 
     first: int
@@ -39,16 +52,15 @@ class Gap:
 
 
 class CameraQueue:
-    """The state of one camera. ``window`` frames may be unanswered at a time."""
+    """The frames of one camera. ``window`` frames may be unanswered at a time."""
 
-    def __init__(self, camera: CameraDescription, window: int) -> None:
-        self.camera = camera
+    def __init__(self, window: int) -> None:
         self.epoch: int | None = None
         self.last_good: int | None = None
         self.answered = 0
         self._window = window
-        self._queue: deque[Waiting] = deque()
-        self._running: Waiting | None = None
+        self._queue: deque[WaitingFrame] = deque()
+        self._running: WaitingFrame | None = None
         self._refused: set[tuple[int, int]] = set()
 
     @property
@@ -68,9 +80,9 @@ class CameraQueue:
                 RejectReason.OVERLOADED,
                 f"{self.outstanding} frames are waiting, {self._window} may; wait for Credit",
             )
-        self._queue.append(Waiting(frame, now))
+        self._queue.append(WaitingFrame(frame, now))
 
-    def start(self) -> Waiting | None:
+    def start(self) -> WaitingFrame | None:
         """Return the next frame to decode, or None while one is running or none waits."""
         if self._running is not None or not self._queue:
             return None
@@ -90,17 +102,26 @@ class CameraQueue:
                 RejectReason.INVALID_ARGUMENT,
                 f"frame.epoch: {epoch} leads {current} by more than {MAX_EPOCH_STEP}",
             )
-        missing = sequence - self._expected(epoch)
-        if missing > MAX_GAP:
+        expected = self._expected(epoch)
+        if sequence < expected:
+            raise PacketRejected(
+                RejectReason.STALE_SEQUENCE,
+                f"sequence {sequence} where {expected} or later is expected",
+            )
+        if sequence > expected + MAX_GAP:
             raise PacketRejected(
                 RejectReason.INVALID_ARGUMENT,
-                f"frame.sequence: {sequence} skips {missing} frames, at most {MAX_GAP} can be lost",
+                f"frame.sequence: {sequence} skips {sequence - expected} frames, "
+                f"at most {MAX_GAP} can be lost",
             )
 
-    def succeed(self, lost: int) -> list[Gap]:
-        """The running frame was reconstructed; return the gaps nobody was told of yet."""
+    def succeed(self) -> list[SequenceGap]:
+        """Note that the running frame was reconstructed.
+
+        Returns the sequences before it that never arrived and were not answered yet.
+        """
         packet = self._finish().packet
-        before = range(packet.sequence - lost, packet.sequence)
+        before = range(self._expected(packet.epoch), packet.sequence)
         missing = [n for n in before if (packet.epoch, n) not in self._refused]
         self.epoch, self.last_good = packet.epoch, packet.sequence
         self._refused.clear()
@@ -108,12 +129,12 @@ class CameraQueue:
         return _runs(missing)
 
     def fail(self) -> None:
-        """The running frame did not become a picture."""
+        """Note that the running frame did not become a picture."""
         packet = self._finish().packet
         self.refuse(packet.epoch, packet.sequence)
 
     def refuse(self, epoch: int, sequence: int) -> None:
-        """A frame is answered with a Nack: it no longer counts as missing."""
+        """Note that a frame is answered with a Nack: it no longer counts as missing."""
         self.answered += 1
         if len(self._refused) < MAX_GAP:
             self._refused.add((epoch, sequence))
@@ -130,12 +151,98 @@ class CameraQueue:
         return frame
 
 
-def _runs(sequences: list[int]) -> list[Gap]:
+class SessionCameras:
+    """The queues of a session's cameras by id, and the fields that their frames may name.
+
+    Empty until ``open``; every method may be called before.
+    """
+
+    def __init__(self, window: int) -> None:
+        self._window = window
+        self._queues: dict[str, CameraQueue] = {}
+        self._fields: dict[bytes, str] = {}
+
+    def open(self, hello: Hello) -> None:
+        """Make a queue for each camera of ``hello``, and know its fields by their prefixes."""
+        for camera in hello.cameras:
+            self._queues[camera.camera_id] = CameraQueue(self._window)
+        for field_id in hello.field_ids:
+            self._fields[bytes.fromhex(field_id)[:FIELD_ID_PREFIX_BYTES]] = field_id
+        self._fields[b""] = hello.field_ids[0]
+
+    @property
+    def are_busy(self) -> bool:
+        """Whether a frame of any camera was taken and is not answered yet."""
+        return any(queue.outstanding for queue in self._queues.values())
+
+    def queue_of(self, frame: Frame) -> CameraQueue:
+        """Return the queue of a frame's camera.
+
+        Raises ``InvalidInput`` for a camera or a field that Hello did not name.
+        """
+        if frame.camera_id not in self._queues:
+            raise InvalidInput(
+                "frame.camera_id", f"{shown(frame.camera_id)} is not a camera of this Hello"
+            )
+        if frame.field_id_prefix not in self._fields:
+            raise InvalidInput(
+                "frame.field_id_prefix",
+                f"{frame.field_id_prefix.hex()} is not a field of this Hello "
+                f"({', '.join(dict.fromkeys(self._fields.values()))})",
+            )
+        return self._queues[frame.camera_id]
+
+    def field_of(self, frame: Frame) -> str:
+        """Return the id of the field that the frame of a queue is predicted from."""
+        return self._fields[frame.field_id_prefix]
+
+    def refuse(self, address: FrameAddress) -> None:
+        """Note that a message is answered with a Nack.
+
+        If it cannot be told which camera it was of, each camera's credit grows by one: the vehicle
+        spent a credit on the message, and no camera may run out of them.
+        """
+        queue = self._queues.get(address.camera_id)
+        if queue is not None:
+            queue.refuse(address.epoch, address.sequence)
+            return
+        for other in self._queues.values():
+            other.answered += 1
+
+    def started(self) -> Iterator[tuple[CameraQueue, WaitingFrame]]:
+        """Take out, camera by camera, every frame that may be decoded now.
+
+        A camera whose frame the caller answers at once, with ``fail``, yields its next one.
+        """
+        for queue in self._queues.values():
+            while (waiting := queue.start()) is not None:
+                yield queue, waiting
+
+    def position(self, address: FrameAddress) -> tuple[int, int | None]:
+        """Return the current epoch of a camera, and the last good sequence if it is of that of
+        ``address``."""
+        queue = self._queues.get(address.camera_id)
+        if queue is None:
+            return 0, None
+        return queue.epoch or 0, queue.last_good if queue.epoch == address.epoch else None
+
+    def credits(self, camera_ids: Iterable[str] | None = None) -> list[Credit]:
+        """Return the credits of these cameras; of all without ``camera_ids``, or if one is ""."""
+        wanted = None if camera_ids is None else set(camera_ids)
+        everything = wanted is None or "" in wanted
+        return [
+            Credit(camera_id, queue.granted)
+            for camera_id, queue in self._queues.items()
+            if everything or (wanted is not None and camera_id in wanted)
+        ]
+
+
+def _runs(sequences: list[int]) -> list[SequenceGap]:
     """Return ascending numbers as runs of consecutive ones."""
-    runs: list[Gap] = []
+    runs: list[SequenceGap] = []
     for sequence in sequences:
         if runs and sequence == runs[-1].first + runs[-1].count:
-            runs[-1] = Gap(runs[-1].first, runs[-1].count + 1)
+            runs[-1] = SequenceGap(runs[-1].first, runs[-1].count + 1)
         else:
-            runs.append(Gap(sequence, 1))
+            runs.append(SequenceGap(sequence, 1))
     return runs

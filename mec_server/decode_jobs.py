@@ -1,4 +1,4 @@
-"""Numerical work that a session hands out, and what comes back."""
+"""What a session and the code around it exchange: decoding work, its outcome, the stream's end."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from rfcore.errors import RfedgeError
 from rfcore.wire.messages import Frame, Hello, StageTimes
 
-__all__ = ["DecodeJob", "DecodeOutcome", "End", "OpenJob"]
+__all__ = ["DecodeJob", "DecodeOutcome", "OpenJob", "StreamEnd"]
 
 
 @dataclass(frozen=True)
 class OpenJob:
-    """Prepare fields and decoders for ``hello``; ``exact`` says how strictly to compare."""
+    """Open fields and decoders for ``hello``; ``exact``: both renderers give the same bits."""
 
     hello: Hello
     exact: bool
@@ -30,19 +30,18 @@ class DecodeJob:
 
 @dataclass(frozen=True)
 class DecodeOutcome:
-    """A reconstructed frame: how many before it are missing, its digest, the time it took.
+    """A reconstructed frame: its digest and the time it took.
 
     ``exact`` is false when the renders differed by rounding, and with them the pictures.
     """
 
-    lost: int
     reconstruction_digest: bytes
     times: StageTimes
     exact: bool = True
 
 
 @dataclass(frozen=True)
-class End:
+class StreamEnd:
     """The stream is over; ``error`` is None when it ended as it should."""
 
     error: RfedgeError | None = None

@@ -1,7 +1,7 @@
-"""EdgeService over grpc.aio: accepts streams, ends them with a status, and lets them go.
+"""EdgeService over grpc.aio: accepts vehicles' streams, and ends each with a gRPC status.
 
-Messages travel as bytes here and are parsed by ``rfcore.wire.convert``: a message that cannot be
-parsed is then a Nack like any other, instead of the end of the stream.
+gRPC hands messages over as bytes and ``rfcore.wire.convert`` parses them, so that a message that
+cannot be parsed is answered with a Nack like any other, instead of ending the stream.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ log = structlog.get_logger()
 
 
 class EdgeService:
-    """Accepts streams and lets them go when the server drains."""
+    """Accepts streams, and ends them when the server drains."""
 
-    def __init__(self, around: ServerContext) -> None:
-        self._around = around
+    def __init__(self, server: ServerContext) -> None:
+        self._server = server
         self._streams: set[Stream] = set()
 
     def register(self, server: grpc.aio.Server) -> None:
@@ -52,35 +52,35 @@ class EdgeService:
             stream.fields_changed(current_field_ids)
 
     async def _handle(self, requests: AsyncIterator[bytes], context: Context) -> None:
-        if len(self._streams) >= self._around.max_streams:
-            await self._turn_away(context)
-        stream = Stream(self._around, context, self._deal_out)
+        if len(self._streams) >= self._server.max_streams:
+            await self._refuse(context)
+        stream = Stream(self._server, context, self._reallocate_rates)
         self._streams.add(stream)
-        self._around.metrics.sessions.inc()
+        self._server.metrics.sessions.inc()
         try:
             end = await stream.run(requests)
         finally:
             self._streams.discard(stream)
-            self._around.metrics.sessions.dec()
-            stream.leave()
+            self._server.metrics.sessions.dec()
+            stream.close()
         if end.error is not None:
             if isinstance(end.error, LimitExceeded):
-                self._around.metrics.limited.labels(end.error.limit).inc()
+                self._server.metrics.limited.labels(end.error.limit).inc()
             await context.abort(status_of(end.error), str(end.error), _retry_after(end.error))
 
-    def _deal_out(self) -> None:
+    def _reallocate_rates(self) -> None:
         """Tell vehicles whose rate changes."""
-        changed = self._around.admission.review(time.monotonic())
+        changed = self._server.entry.reallocate_rates(time.monotonic())
         if changed:
             for stream in self._streams:
                 stream.regrant(changed)
 
-    async def _turn_away(self, context: Context) -> None:
+    async def _refuse(self, context: Context) -> None:
         error = LimitExceeded(
             Limit.SERVER_STREAMS,
             f"{len(self._streams)} streams are open, as many as may be; try again later",
         )
-        self._around.metrics.limited.labels(error.limit).inc()
+        self._server.metrics.limited.labels(error.limit).inc()
         log.warning("stream refused", peer=context.peer(), problem=str(error))
         await context.abort(status_of(error), str(error))
 

@@ -11,14 +11,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import fields
 from functools import cached_property
 
-from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client import CollectorRegistry, Counter
 
 from mec_server.decoding.process import LossCause
 from mec_server.quotas import Limit
 from rfcore.codec.references import References, references_name
 from rfcore.errors import RejectReason
 from rfcore.field import RadianceField
-from rfcore.wire.instruments import Instruments
+from rfcore.wire.instruments import DurationSeries, Instruments
 from rfcore.wire.messages import Ack, Frame, Nack, ServerMessage, StageTimes
 
 __all__ = ["ServerMetrics", "VehicleMetrics"]
@@ -196,9 +196,8 @@ class VehicleMetrics:
         return received.labels(*self._label) if self._label else received
 
     @cached_property
-    def _latency(self) -> Histogram:
-        latency = self._metrics.latency
-        return latency.labels(*self._label) if self._label else latency
+    def _latency(self) -> DurationSeries:
+        return self._metrics.latency.labels(*self._label)
 
     def _by(self, references: References) -> tuple[Counter, Counter]:
         labels = (*self._label, references_name(references))

@@ -1,7 +1,7 @@
-"""How much one vehicle may ask of the server, whatever number of streams it opens.
+"""How much one vehicle may ask of the server over all its streams, and who may send a camera.
 
-Sans-IO: ``now`` is an argument. Who a vehicle is comes from its certificate; without one it is who
-it says, and the quotas then guard against mistakes, not against lies.
+Sans-IO: ``now`` is an argument. A vehicle's name comes from its certificate; without one it is the
+name in its Hello, and the quotas then guard against mistakes, not against lies.
 """
 
 from __future__ import annotations
@@ -9,23 +9,42 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Protocol
 
 from mec_server.config import VehicleQuota
 from rfcore.errors import LimitExceeded
+from rfcore.wire.messages import Hello
 
-__all__ = ["BARRED_S", "MAX_LOST_DECODERS", "Allowance", "Limit", "Quotas", "TokenBucket"]
+__all__ = [
+    "BARRED_S",
+    "CAMERA_SILENT_S",
+    "MAX_LOST_DECODERS",
+    "ActiveCameras",
+    "Allowance",
+    "CameraSender",
+    "Limit",
+    "Quotas",
+    "TokenBucket",
+]
 
 MAX_LOST_DECODERS = 3
 BARRED_S = 60.0
-"""Whose packets cost so many decoder processes within this time is not let in for as long."""
+"""A vehicle whose packets cost so many decoder processes within this time is kept out for as long.
+"""
+
+CAMERA_SILENT_S = 3.0
+"""A stream that sent nothing for so long may be taken over by another agent: its own keepalive
+(2 s and 1 s) has noticed by then that the connection is dead. Cameras slower than 1 Hz get two of
+their periods more."""
 
 
 class Limit(StrEnum):
-    """What somebody had too much of; label of ``rfedge_server_limited_total``."""
+    """Which limit was exceeded; label of ``rfedge_server_limited_total``."""
 
     SERVER_STREAMS = "server_streams"
     CAPACITY = "capacity"
     VEHICLE_STREAMS = "vehicle_streams"
+    CAMERA_TAKEN = "camera_taken"
     FRAME_RATE = "frame_rate"
     BYTE_RATE = "byte_rate"
     LOST_DECODERS = "lost_decoders"
@@ -33,7 +52,7 @@ class Limit(StrEnum):
 
 
 class TokenBucket:
-    """Lets ``rate`` a second through, and one second's worth at once."""
+    """Lets ``rate`` per second through, in bursts of up to one second's worth."""
 
     def __init__(self, rate: float, now: float) -> None:
         self._rate = rate
@@ -41,7 +60,7 @@ class TokenBucket:
         self._filled_s = now
 
     def take(self, amount: float, now: float) -> bool:
-        """Tell whether anything is left, and if so take ``amount``, be it more than that."""
+        """Return whether anything is left; if so take ``amount``, even if that is more."""
         elapsed_s = max(0.0, now - self._filled_s)
         self._left = min(self._rate, self._left + elapsed_s * self._rate)
         self._filled_s = now
@@ -61,13 +80,13 @@ class Account:
     lost_decoders_s: deque[float] = field(default_factory=lambda: deque(maxlen=MAX_LOST_DECODERS))
 
     def is_barred(self, now: float) -> bool:
-        """Whether its packets have cost too many decoders of late."""
+        """Return whether its packets cost too many decoders lately."""
         lost = self.lost_decoders_s
         return len(lost) == MAX_LOST_DECODERS and now - lost[0] < BARRED_S
 
 
 class Quotas:
-    """The accounts of the vehicles that are here, or were barred a moment ago."""
+    """The accounts of the vehicles that have streams, or are barred."""
 
     def __init__(self, quota: VehicleQuota) -> None:
         self._quota = quota
@@ -94,7 +113,7 @@ class Quotas:
         return Allowance(quota, account)
 
     def _forget(self, now: float) -> None:
-        """Drop who is gone, so that names cost no memory."""
+        """Drop the accounts of vehicles without streams, so that names cost no memory."""
         gone = [
             name
             for name, account in self._accounts.items()
@@ -112,7 +131,7 @@ class Allowance:
         self._account = account
 
     def spend(self, message_bytes: int, now: float) -> None:
-        """Take note of a message; raise ``LimitExceeded`` if it is one too many."""
+        """Count a message; raise ``LimitExceeded`` if it is one too many."""
         if not self._account.frames.take(1, now):
             raise LimitExceeded(
                 Limit.FRAME_RATE, f"more than {self._quota.frames_per_s:g} frames a second"
@@ -123,14 +142,84 @@ class Allowance:
             )
 
     def lost_decoder(self, now: float) -> None:
-        """Take note that a packet cost a decoder; raise ``LimitExceeded`` if it was the last."""
+        """Count a decoder that a packet cost; raise ``LimitExceeded`` if that bars the vehicle."""
         self._account.lost_decoders_s.append(now)
         if self._account.is_barred(now):
             raise _barred()
 
     def leave(self) -> None:
-        """The stream is over."""
+        """Give the stream back to the account."""
         self._account.streams -= 1
+
+
+class CameraSender(Protocol):
+    """A stream, as far as the question of who sends a camera goes."""
+
+    @property
+    def agent(self) -> str:
+        """Return which agent process opened the stream; an agent may open several."""
+
+    def silent_s(self, now: float) -> float:
+        """Return for how long it has sent nothing; 0 while it waits for an answer."""
+
+    def displace(self, error: LimitExceeded) -> None:
+        """End it: another agent sends its cameras from now on."""
+
+
+class ActiveCameras:
+    """Which streams send which cameras, so that two agents never send the same one.
+
+    Streams of one agent may share a camera: during a handover between tiles, or when its stream
+    broke and is opened again. Another agent is refused while a stream of the first one is alive;
+    one that has fallen silent is ended, and the other agent takes its cameras over.
+    """
+
+    def __init__(self) -> None:
+        self._senders: dict[tuple[str, str], dict[CameraSender, float]] = {}
+
+    def enter(self, hello: Hello, sender: CameraSender, now: float) -> None:
+        """Note that ``sender`` sends the cameras of ``hello``; raise ``LimitExceeded``."""
+        cameras = {(hello.vehicle_id, c.camera_id): c.rate_hz for c in hello.cameras}
+        displaced: dict[CameraSender, str] = {}
+        for key in cameras:
+            for other, silent_after_s in self._senders.get(key, {}).items():
+                if other.agent == sender.agent:
+                    continue
+                if other.silent_s(now) < silent_after_s:
+                    raise _taken(key, silent_after_s)
+                displaced[other] = "/".join(key)
+        for other, camera in displaced.items():
+            self.leave(other)
+            other.displace(_displaced(camera, other.silent_s(now)))
+        for key, rate_hz in cameras.items():
+            slower_s = 2.0 / rate_hz if 0 < rate_hz < 1 else 0.0
+            self._senders.setdefault(key, {})[sender] = CAMERA_SILENT_S + slower_s
+
+    def leave(self, sender: CameraSender) -> None:
+        """Forget a stream; does nothing for one that was refused or displaced."""
+        for key in [key for key, senders in self._senders.items() if sender in senders]:
+            del self._senders[key][sender]
+            if not self._senders[key]:
+                del self._senders[key]
+
+
+def _taken(key: tuple[str, str], silent_after_s: float) -> LimitExceeded:
+    vehicle_id, camera_id = key
+    return LimitExceeded(
+        Limit.CAMERA_TAKEN,
+        f"another agent sends camera {camera_id} of vehicle {vehicle_id}; stop it, or give this "
+        f"one another --vehicle or --camera (an agent that sends nothing for {silent_after_s:g} s "
+        "may be replaced)",
+        CAMERA_SILENT_S,
+    )
+
+
+def _displaced(camera: str, silent_s: float) -> LimitExceeded:
+    return LimitExceeded(
+        Limit.CAMERA_TAKEN,
+        f"nothing came for {silent_s:.1f} s, and another agent sends {camera} now",
+        CAMERA_SILENT_S,
+    )
 
 
 def _barred() -> LimitExceeded:

@@ -112,7 +112,7 @@ class CameraDecoder:
             decode_ns=decoded.stage_ns.get("decode", 0),
         )
         digest = decoded.state.kept[0].digest
-        outcome = DecodeOutcome(decoded.lost, digest, times, decoded.exact)
+        outcome = DecodeOutcome(digest, times, decoded.exact)
         return Reconstruction(decoded.frame, outcome)
 
     def _render(self, job: DecodeJob) -> FieldView:

@@ -6,35 +6,32 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-from mec_server.admission import Admission
+from mec_server.admission import EntryControl
 from mec_server.config import SessionLimits
+from mec_server.event_loop import Workers
 from mec_server.metrics import ServerMetrics
-from mec_server.quotas import Quotas
 from mec_server.reconstruction import FieldSource, OpenCameras, Tools
 from mec_server.recorder import Recorder
 from mec_server.twin.state import Twin
-from mec_server.workers import Workers
 
 __all__ = ["ServerContext"]
 
 
 @dataclass(frozen=True)
 class ServerContext:
-    """What the sessions of one server share.
-
-    ``workers`` decode, ``opener`` makes ready for new vehicles: a crowd of them, or a decoder
-    process that takes its time, shall not hold up frames.
-    """
+    """The parts of one server that its streams use."""
 
     fields: FieldSource
     held_field_ids: Callable[[], tuple[str, ...]]
     workers: Workers
+    """Threads that decode frames."""
     opener: Executor
+    """Opens fields and decoders for new vehicles: a crowd of them, or a decoder process that is
+    slow to start, must not delay the frames of others."""
     tools: Tools
     metrics: ServerMetrics
     limits: SessionLimits
-    quotas: Quotas
-    admission: Admission
+    entry: EntryControl
     max_streams: int
     twin: Twin
     open_cameras: OpenCameras

@@ -1,12 +1,12 @@
 """The server's side of one stream, without socket, clock or decoder.
 
-``receive`` takes what the vehicle said, ``jobs_to_start`` hands out numerical work, ``opened`` /
-``decoded`` / ``rejected`` bring its outcome back, ``messages_to_send`` has the answers, and
-``get_timer`` says when ``handle_timer`` wants to be called. ``closed`` becomes an error (or a clean
-end) when the stream is over.
+``receive`` takes a message of the vehicle, ``jobs_to_start`` hands out decoding work, ``opened`` /
+``decoded`` / ``rejected`` take its outcome, ``messages_to_send`` has the answers, and ``get_timer``
+says when ``handle_timer`` is to be called. ``closed`` is set when the stream is over: to an error,
+or to a clean end.
 
 States: awaiting hello -> opening -> open -> draining -> closed. A Hello or Frame with a bad value
-is answered with a Nack and the session lives on; a broken rule of the conversation ends it.
+is answered with a Nack and the session lives on; a broken rule of the protocol ends it.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 
-from mec_server.camera_queue import CameraQueue, Waiting
+from mec_server.camera_queue import SessionCameras
 from mec_server.config import SessionLimits
-from mec_server.decode_jobs import DecodeJob, DecodeOutcome, End, OpenJob
+from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob, StreamEnd
 from mec_server.quotas import Limit
 from rfcore.errors import (
     AccessDenied,
@@ -30,14 +30,13 @@ from rfcore.errors import (
     RfedgeError,
     UnknownField,
 )
-from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, MAX_FIELDS, shown
+from rfcore.wire.checks import MAX_FIELDS
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import FrameRefused
 from rfcore.wire.identity import PeerIdentity
 from rfcore.wire.messages import (
     Ack,
     ClientMessage,
-    Credit,
     FieldNotice,
     Frame,
     FrameAddress,
@@ -82,27 +81,24 @@ class ServerSession:
         self.session_id = session_id
         self.hello: Hello | None = None
         self.state = SessionState.AWAITING_HELLO
-        self.closed: End | None = None
+        self.closed: StreamEnd | None = None
         self._limits = limits or SessionLimits()
         self._held = tuple(held_field_ids)
         self._identity = identity
-        self._lanes: dict[str, CameraQueue] = {}
-        self._fields: dict[bytes, str] = {}
+        self._cameras = SessionCameras(self._limits.window_frames)
         self._opening: OpenJob | None = None
         self._outbox: deque[ServerMessage] = deque()
         self._deadline_s = now + self._limits.hello_s
+        self._heard_s = now
         self._unusable = 0
         self._exact = False
         self._rate_hz = 0.0
 
-    # --- what the vehicle said
-
-    def end(self, error: RfedgeError) -> None:
-        """End the stream for a reason that lies outside of the conversation."""
-        self._close(error)
+    # --- messages of the vehicle
 
     def receive(self, message: ClientMessage, now: float) -> None:
         """Take one checked message."""
+        self._heard_s = now
         if isinstance(message, Hello):
             self._receive_hello(message)
         else:
@@ -111,23 +107,23 @@ class ServerSession:
     def refuse(self, error: InvalidInput, now: float) -> None:
         """Answer for a message that failed its checks; the session lives on."""
         address = error.address if isinstance(error, FrameRefused) else FrameAddress("", 0, 0)
-        lane = self._lanes.get(address.camera_id)
-        if lane is None:
-            for other in self._lanes.values():  # whose it was cannot be told; nobody shall starve
-                other.answered += 1
-        else:
-            lane.refuse(address.epoch, address.sequence)
-        self._nack(address, RejectReason.INVALID_ARGUMENT, str(error))
-        self._alive(now)
-        self._unusable_frame()
+        self._refuse(address, RejectReason.INVALID_ARGUMENT, str(error), now)
 
     def overrun(self, frame: Frame, error: LimitExceeded, now: float) -> None:
         """Answer for a frame beyond the vehicle's quota; the session lives on."""
-        lane = self._lanes.get(frame.camera_id)
-        if lane is not None:
-            lane.refuse(frame.packet.epoch, frame.packet.sequence)
-        self._nack(frame.address, RejectReason.OVERLOADED, str(error))
-        self._alive(now)
+        self._refuse(frame.address, RejectReason.OVERLOADED, str(error), now)
+
+    def silent_s(self, now: float) -> float:
+        """Return for how long the vehicle has sent nothing; 0 while it waits for an answer."""
+        return 0.0 if self._cameras.are_busy else max(0.0, now - self._heard_s)
+
+    def _refuse(
+        self, address: FrameAddress, reason: RejectReason, problem: str, now: float
+    ) -> None:
+        self._heard_s = now
+        self._cameras.refuse(address)
+        self._nack(address, reason, problem)
+        self._restart_deadline(now)
         self._unusable_frame()
 
     def _unusable_frame(self) -> None:
@@ -163,31 +159,16 @@ class ServerSession:
         if self.state is SessionState.AWAITING_HELLO:
             self._close(ProtocolError("a frame came before Hello"))
             return
-        self._alive(now)
+        self._restart_deadline(now)
         try:
-            lane = self._lane_of(frame)
+            queue = self._cameras.queue_of(frame)
             if self.state is SessionState.DRAINING:
                 raise PacketRejected(RejectReason.OVERLOADED, "this server is shutting down")
-            lane.admit(frame, now)
+            queue.admit(frame, now)
         except InvalidInput as error:
             self.refuse(FrameRefused(error, frame.address), now)
         except PacketRejected as error:
-            self._lanes[frame.camera_id].refuse(frame.packet.epoch, frame.packet.sequence)
-            self._nack(frame.address, error.reason, error.problem)
-            self._unusable_frame()
-
-    def _lane_of(self, frame: Frame) -> CameraQueue:
-        if frame.camera_id not in self._lanes:
-            raise InvalidInput(
-                "frame.camera_id", f"{shown(frame.camera_id)} is not a camera of this Hello"
-            )
-        if frame.field_id_prefix not in self._fields:
-            raise InvalidInput(
-                "frame.field_id_prefix",
-                f"{frame.field_id_prefix.hex()} is not a field of this Hello "
-                f"({', '.join(dict.fromkeys(self._fields.values()))})",
-            )
-        return self._lanes[frame.camera_id]
+            self._refuse(frame.address, error.reason, error.problem, now)
 
     # --- numerical work
 
@@ -197,24 +178,18 @@ class ServerSession:
         if self._opening is not None and self.state is SessionState.OPENING:
             jobs.append(self._opening)
             self._opening = None
-        for lane in self._lanes.values():
-            while (waiting := lane.start()) is not None:
-                job = self._job(lane, waiting, now)
-                if job is not None:
-                    jobs.append(job)
-                    break
+        for queue, waiting in self._cameras.started():
+            frame = waiting.frame
+            try:
+                queue.check_order(frame)
+            except PacketRejected as error:
+                queue.fail()
+                self._nack(frame.address, error.reason, error.problem)
+            else:
+                field_id = self._cameras.field_of(frame)
+                jobs.append(DecodeJob(frame, field_id, waiting.received_s, now))
         self._finish_draining()
         return jobs
-
-    def _job(self, lane: CameraQueue, waiting: Waiting, now: float) -> DecodeJob | None:
-        frame = waiting.frame
-        try:
-            lane.check_order(frame)
-        except PacketRejected as error:
-            lane.fail()
-            self._nack(frame.address, error.reason, error.problem)
-            return None
-        return DecodeJob(frame, self._fields[frame.field_id_prefix], waiting.received_s, now)
 
     def opened(self, job: OpenJob, now: float) -> None:
         """Fields and decoders of ``job`` are ready."""
@@ -222,16 +197,11 @@ class ServerSession:
             return
         self.state = SessionState.OPEN
         self.hello = job.hello
-        for camera in job.hello.cameras:
-            self._lanes[camera.camera_id] = CameraQueue(camera, self._limits.window_frames)
-        for field_id in job.hello.field_ids:
-            self._fields[bytes.fromhex(field_id)[:FIELD_ID_PREFIX_BYTES]] = field_id
-        self._fields[b""] = job.hello.field_ids[0]
+        self._cameras.open(job.hello)
         self._exact = job.exact
         self._outbox.append(Welcome(self.session_id, job.exact, self._rate_hz))
-        for camera_id, lane in self._lanes.items():
-            self._outbox.append(Credit(camera_id, lane.granted))
-        self._alive(now)
+        self._outbox += self._cameras.credits()
+        self._restart_deadline(now)
 
     def grant(self, rate_hz: float) -> None:
         """Let each camera send so many pictures per second; 0: as many as credits allow."""
@@ -253,9 +223,8 @@ class ServerSession:
     def decoded(self, job: DecodeJob, outcome: DecodeOutcome, now: float) -> None:
         """The frame of ``job`` was reconstructed."""
         self._unusable = 0
-        lane = self._lanes[job.frame.camera_id]
         address, times = job.frame.address, outcome.times
-        for gap in lane.succeed(outcome.lost):
+        for gap in self._cameras.queue_of(job.frame).succeed():
             first = replace(address, sequence=gap.first)
             self._nack(first, RejectReason.SEQUENCE_GAP, "never arrived", gap.count)
         times = StageTimes(
@@ -270,16 +239,19 @@ class ServerSession:
 
     def rejected(self, job: DecodeJob, error: PacketRejected, now: float) -> None:
         """The frame of ``job`` did not become a picture."""
-        lane = self._lanes[job.frame.camera_id]
-        lane.fail()
+        self._cameras.queue_of(job.frame).fail()
         self._nack(job.frame.address, error.reason, error.problem)
         self._answered(now)
 
     def _answered(self, now: float) -> None:
-        self._alive(now)
+        self._restart_deadline(now)
         self._finish_draining()
 
-    # --- answers and time
+    # --- answers, time and the end
+
+    def end(self, error: RfedgeError) -> None:
+        """End the stream for a reason that lies outside of the protocol."""
+        self._close(error)
 
     @property
     def has_news(self) -> bool:
@@ -291,10 +263,7 @@ class ServerSession:
         messages = list(self._outbox)
         self._outbox.clear()
         answered = {m.address.camera_id for m in messages if isinstance(m, (Ack, Nack))}
-        for camera_id, lane in self._lanes.items():
-            if camera_id in answered or "" in answered:
-                messages.append(Credit(camera_id, lane.granted))
-        return messages
+        return [*messages, *self._cameras.credits(answered)]
 
     def drain(self) -> None:
         """Take no more frames, finish those taken, then close."""
@@ -309,10 +278,6 @@ class ServerSession:
         if self.state is SessionState.OPEN:
             self._outbox.append(FieldNotice(tuple(current_field_ids)))
 
-    def disconnected(self) -> None:
-        """The vehicle ended the stream, or vanished."""
-        self._close(None)
-
     def get_timer(self) -> float | None:
         """Return when ``handle_timer`` has something to do, or None."""
         timed = (SessionState.AWAITING_HELLO, SessionState.OPEN)
@@ -323,34 +288,32 @@ class ServerSession:
         timer = self.get_timer()
         if timer is None or now < timer:
             return
-        if any(lane.outstanding for lane in self._lanes.values()):
-            self._alive(now)
+        if self._cameras.are_busy:
+            self._restart_deadline(now)
         elif self.state is SessionState.AWAITING_HELLO:
             self._close(ProtocolError(f"no Hello within {self._limits.hello_s:g} s"))
         else:
             self._close(None)
 
-    def _alive(self, now: float) -> None:
+    def _restart_deadline(self, now: float) -> None:
         if self.state is SessionState.OPEN:
             self._deadline_s = now + self._limits.idle_s
 
     def _finish_draining(self) -> None:
         if self.state is not SessionState.DRAINING:
             return
-        if not any(lane.outstanding for lane in self._lanes.values()):
+        if not self._cameras.are_busy:
             self._close(None)
 
     def _close(self, error: RfedgeError | None) -> None:
         if self.closed is None:
             self.state = SessionState.CLOSED
-            self.closed = End(error)
+            self.closed = StreamEnd(error)
 
     def _nack(
         self, address: FrameAddress, reason: RejectReason, problem: str, count: int = 1
     ) -> None:
-        lane = self._lanes.get(address.camera_id)
-        epoch = (lane.epoch if lane else None) or 0
-        last_good = lane.last_good if lane and lane.epoch == address.epoch else None
+        epoch, last_good = self._cameras.position(address)
         self._outbox.append(Nack(address, reason, problem, count, last_good, epoch))
 
 

@@ -1,8 +1,9 @@
-"""One vehicle's stream: pumps its session between gRPC and the workers.
+"""One vehicle's stream: moves messages between gRPC and the session, and frames to the workers.
 
-A reader takes messages in and starts the work they allow; workers' outcomes come back as calls on
-the loop; a writer sends what there is to say. A frame wakes the reader once and the writer once,
-and makes no task: at thousands of frames a second, each wake-up more is a tenth of a core.
+A reader takes messages in and starts the work they allow; outcomes come back from the workers as
+calls on the event loop; a writer sends the answers. A frame wakes the reader once and the writer
+once, and makes no task: at thousands of frames per second each further wake-up costs a tenth of a
+core.
 """
 
 from __future__ import annotations
@@ -11,22 +12,21 @@ import asyncio
 import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Mapping
-from functools import partial
 
 import grpc
 import structlog
 
-from mec_server.decode_jobs import DecodeJob, End, OpenJob
+from mec_server.admission import StreamPermit
+from mec_server.decode_jobs import DecodeJob, OpenJob, StreamEnd
 from mec_server.decoding.process import DecoderLost
-from mec_server.lazy_timer import LazyTimer
-from mec_server.quotas import Allowance
-from mec_server.reconstruction import Decoder, Reconstruction
-from mec_server.recorder import Recording
+from mec_server.event_loop import LazyTimer
 from mec_server.server_context import ServerContext
 from mec_server.session import ServerSession, SessionState
+from mec_server.stream_decoders import FrameResult, StreamDecoders
 from mec_server.twin.state import TwinView
 from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeError
+from rfcore.wire.conventions import AGENT_PROCESS
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
 from rfcore.wire.identity import peer_identity
@@ -36,41 +36,42 @@ __all__ = ["Context", "Stream"]
 
 log = structlog.get_logger()
 Context = grpc.aio.ServicerContext[bytes, bytes]
-Worked = tuple[Reconstruction, float]
-"""A picture, and the seconds it took a worker."""
 
 UNKNOWN_VEHICLE = ""
-"""Whom a stream counts for until its Hello was accepted."""
+"""The vehicle id under which a stream is counted until its Hello is accepted."""
 
 
 class Stream:
-    """Pumps one session; ``deal_out`` is called when frames' costs may have changed."""
+    """Serves one session. ``reallocate_rates`` is called after each frame, when the time that
+    frames take has changed.
+
+    It is a ``mec_server.quotas.CameraSender``.
+    """
 
     def __init__(
-        self, around: ServerContext, context: Context, deal_out: Callable[[], None]
+        self, server: ServerContext, context: Context, reallocate_rates: Callable[[], None]
     ) -> None:
-        self._around = around
-        self._deal_out = deal_out
+        session_id = uuid.uuid4().hex[:12]
+        self.agent = _agent_process(context)
+        self._server = server
+        self._reallocate_rates = reallocate_rates
         self._context = context
         self._wake = asyncio.Event()
-        self._alarm = LazyTimer(self._wake)
+        self._timer = LazyTimer(self._wake)
         self._tasks = asyncio.TaskGroup()
         self._identity = peer_identity(context.auth_context())
-        self._allowance: Allowance | None = None
-        self._overrunning = False
-        self._opening: asyncio.Future[dict[str, Decoder]] | None = None
-        self._decoders: dict[str, Decoder] = {}
+        self._permit: StreamPermit | None = None
+        self._over_quota = False
+        self._decoders = StreamDecoders(server)
         self._intrinsics: dict[str, Intrinsics] = {}
         self._fault: Exception | None = None
-        self._left = False
-        self._metrics = around.metrics.of(UNKNOWN_VEHICLE)
-        session_id = uuid.uuid4().hex[:12]
+        self._metrics = server.metrics.of(UNKNOWN_VEHICLE)
         self._log = log.bind(session=session_id, peer=context.peer())
         self._session = ServerSession(
             session_id,
-            around.held_field_ids(),
+            server.held_field_ids(),
             time.monotonic(),
-            around.limits,
+            server.limits,
             self._identity,
         )
 
@@ -92,19 +93,30 @@ class Stream:
             self._session.grant(rate_hz)
             self._wake.set()
 
-    def leave(self) -> None:
-        """Let nothing remain of this stream, in the twin or in the metrics."""
-        self._left = True
-        self._alarm.cancel()
-        self._around.twin.leave(self._session.session_id)
-        self._metrics.forget()
-        self._around.admission.leave(self._session.session_id)
-        if self._allowance is not None:
-            self._allowance.leave()
-        if self._opening is not None:
-            self._opening.add_done_callback(_close_decoders)
+    def silent_s(self, now: float) -> float:
+        """Return for how long the vehicle has sent nothing; 0 while it waits for an answer."""
+        return self._session.silent_s(now)
 
-    async def run(self, requests: AsyncIterator[bytes]) -> End:
+    def displace(self, error: LimitExceeded) -> None:
+        """End the stream: another agent sends its cameras from now on."""
+        self._log.warning("stream displaced", reason=error.limit, problem=str(error))
+        self._session.end(error)
+        self._wake.set()
+
+    def close(self) -> None:
+        """Remove every trace of the stream: twin, metrics, quotas, decoders."""
+        self._timer.cancel()
+        self._decoders.close()
+        self._server.twin.leave(self._session.session_id)
+        self._metrics.forget()
+        self._leave()
+
+    def _leave(self) -> None:
+        if self._permit is not None:
+            self._permit.leave()
+            self._permit = None
+
+    async def run(self, requests: AsyncIterator[bytes]) -> StreamEnd:
         """Serve until the session is closed; return how it ended."""
         self._log.info("stream opened")
         try:
@@ -127,12 +139,10 @@ class Stream:
             reader.cancel()
 
     def _advance(self) -> None:
-        """Start the work that can be started, and wake the writer if there is something to say."""
+        """Start the work that can be started, and wake the writer if there is something to send."""
         for job in self._session.jobs_to_start(time.monotonic()):
             if isinstance(job, DecodeJob):
-                self._around.workers.submit(
-                    partial(self._reconstruct, job), partial(self._finished, job)
-                )
+                self._decoders.submit(job, self._finished)
             else:
                 self._tasks.create_task(self._open(job))
         if self._session.has_news:
@@ -146,17 +156,17 @@ class Stream:
                 await self._context.write(data)
 
     async def _rest(self) -> None:
-        """Wait until there is something to say or the session's timer runs out."""
+        """Wait until there is something to send or the session's timer runs out."""
         if self._session.closed is not None:
             return
-        self._alarm.by(self._session.get_timer())
+        self._timer.restart(self._session.get_timer())
         await self._wake.wait()
         self._wake.clear()
         if self._fault is not None:
             raise self._fault
         self._session.handle_timer(time.monotonic())
 
-    # --- what the vehicle says
+    # --- messages of the vehicle
 
     async def _read(self, requests: AsyncIterator[bytes]) -> None:
         async for data in requests:
@@ -177,12 +187,12 @@ class Stream:
     def _receive_hello(self, hello: Hello, now: float) -> None:
         session = self._session
         session.receive(hello, now)
-        if session.state is not SessionState.OPENING or self._allowance is not None:
+        if session.state is not SessionState.OPENING:
             return
-        named = self._identity.uris[0] if self._identity is not None else hello.vehicle_id
+        account = self._identity.uris[0] if self._identity is not None else hello.vehicle_id
+        self._leave()  # what an earlier Hello that could not be opened was granted
         try:
-            self._allowance = self._around.quotas.enter(named, now)
-            rate_hz = self._around.admission.enter(session.session_id, hello)
+            self._permit = self._server.entry.enter(hello, account, session.session_id, self, now)
         except LimitExceeded as error:
             self._log.warning(
                 "vehicle refused",
@@ -192,82 +202,65 @@ class Stream:
             )
             session.end(error)
         else:
-            session.grant(rate_hz)
+            session.grant(self._permit.rate_hz)
 
     def _receive_frame(self, frame: Frame, message_bytes: int, now: float) -> None:
         self._metrics.received(frame, message_bytes)
         try:
-            if self._allowance is not None:
-                self._allowance.spend(message_bytes, now)
+            if self._permit is not None:
+                self._permit.allowance.spend(message_bytes, now)
         except LimitExceeded as error:
-            self._around.metrics.limited.labels(error.limit).inc()
-            if not self._overrunning:  # once until it is over: the log has quotas, too
+            self._server.metrics.limited.labels(error.limit).inc()
+            if not self._over_quota:  # logged once per excess: the log must not overflow, too
                 self._log.warning("frames refused", reason=error.limit, problem=str(error))
-            self._overrunning = True
+            self._over_quota = True
             self._session.overrun(frame, error, now)
         else:
-            self._overrunning = False
+            self._over_quota = False
             self._session.receive(frame, now)
 
     async def _open(self, job: OpenJob) -> None:
-        around = self._around
-        self._opening = asyncio.get_running_loop().run_in_executor(
-            around.opener, around.open_cameras, job, around.fields, around.tools
-        )
         try:
-            self._decoders = await asyncio.shield(self._opening)
+            await self._decoders.open(job)
         except RfedgeError as error:
             self._session.open_failed(error, time.monotonic())
         else:
             self._intrinsics = {c.camera_id: c.intrinsics for c in job.hello.cameras}
             self._log = self._log.bind(vehicle=job.hello.vehicle_id)
             self._metrics.forget()
-            self._metrics = around.metrics.of(job.hello.vehicle_id)
+            self._metrics = self._server.metrics.of(job.hello.vehicle_id)
             self._log.info("vehicle welcomed", fields=job.hello.field_ids, exact=job.exact)
             self._session.opened(job, time.monotonic())
         self._wake.set()
 
-    # --- numerical work
+    # --- outcomes of frames, on the event loop
 
-    def _reconstruct(self, job: DecodeJob) -> Worked | None:
-        """Runs on a worker; nobody waits for the frames of a stream that was left."""
-        hello = self._session.hello
-        if self._left or hello is None:
-            return None
-        started_s = time.perf_counter()
-        done = self._decoders[job.frame.camera_id].reconstruct(job)
-        seconds = time.perf_counter() - started_s
-        if self._around.recorder is not None:
-            self._around.recorder.save(Recording(hello.vehicle_id, job.frame, done.picture))
-        return done, seconds
-
-    def _finished(self, job: DecodeJob, outcome: Worked | Exception | None) -> None:
-        """Runs on the loop: what became of a frame."""
-        if self._left or outcome is None:
-            return
+    def _finished(self, job: DecodeJob, outcome: FrameResult | Exception) -> None:
         try:
-            if isinstance(outcome, tuple):
-                self._reconstructed(job, *outcome)
+            if isinstance(outcome, FrameResult):
+                self._reconstructed(job, outcome)
             elif isinstance(outcome, PacketRejected):
                 self._rejected(job, outcome)
             else:
                 raise outcome
-        except Exception as error:  # a fault of ours ends the stream it met, loudly
+        except Exception as error:  # a programming error ends the stream that met it, loudly
             self._fault = error
             self._wake.set()
         else:
             self._advance()
 
-    def _reconstructed(self, job: DecodeJob, done: Reconstruction, seconds: float) -> None:
+    def _reconstructed(self, job: DecodeJob, result: FrameResult) -> None:
         now = time.monotonic()
-        self._around.admission.worked(self._session.session_id, seconds)
-        self._deal_out()
-        self._session.decoded(job, done.outcome, now)
+        outcome = result.reconstruction.outcome
+        if self._permit is not None:
+            self._permit.worked(result.worker_s)
+        self._reallocate_rates()
+        self._session.decoded(job, outcome, now)
         latency_s = max(0.0, (time.time_ns() - job.frame.capture_time_ns) / 1e9)
         self._metrics.reconstructed(latency_s)
-        if not done.outcome.exact:
-            self._around.metrics.inexact.inc()
-        self._show(job, done, now, latency_s)
+        if not outcome.exact:
+            self._server.metrics.inexact.inc()
+        self._show(job, result, now, latency_s)
 
     def _rejected(self, job: DecodeJob, error: PacketRejected) -> None:
         self._log.warning(
@@ -280,35 +273,34 @@ class Stream:
         )
         now = time.monotonic()
         self._session.rejected(job, error, now)
-        if self._allowance is not None and isinstance(error.__cause__, DecoderLost):
+        if self._permit is not None and isinstance(error.__cause__, DecoderLost):
             try:
-                self._allowance.lost_decoder(now)
+                self._permit.allowance.lost_decoder(now)
             except LimitExceeded as barred:
                 self._session.end(barred)
 
-    def _show(self, job: DecodeJob, done: Reconstruction, now: float, latency_s: float) -> None:
+    def _show(self, job: DecodeJob, result: FrameResult, now: float, latency_s: float) -> None:
         hello, session = self._session.hello, self._session
         if hello is None or session.closed is not None:
             return
-        self._around.twin.show(
+        self._server.twin.show(
             TwinView(
                 vehicle_id=hello.vehicle_id,
                 session_id=session.session_id,
                 frame=job.frame,
                 intrinsics=self._intrinsics[job.frame.camera_id],
                 field_id=job.field_id,
-                picture=done.picture,
-                digest=done.outcome.reconstruction_digest,
+                picture=result.reconstruction.picture,
+                digest=result.reconstruction.outcome.reconstruction_digest,
                 reconstructed_s=now,
                 latency_s=latency_s,
             )
         )
 
 
-def _close_decoders(opening: asyncio.Future[dict[str, Decoder]]) -> None:
-    """Close, on threads, what was opened for a stream that is over."""
-    if opening.cancelled() or opening.exception() is not None:
-        return
-    loop = asyncio.get_running_loop()
-    for decoder in opening.result().values():
-        loop.run_in_executor(None, decoder.close)
+def _agent_process(context: Context) -> str:
+    """Return the name of the agent process at the other end, or else of its connection."""
+    for key, value in context.invocation_metadata() or ():
+        if key == AGENT_PROCESS:
+            return str(value)
+    return context.peer()

@@ -1,21 +1,23 @@
-"""Network addresses, and the rule that plaintext stays on this machine unless allowed out.
+"""Network addresses: what may be spoken there, and why one cannot be listened on or reached.
 
-Why a server cannot be reached: one handshake with the standard library, which says so.
-
-gRPC keeps trying in silence. In TLS 1.3 a server judges a client's certificate after the client has
-finished, so what counts is the first byte that comes back (RFC 8446, section 4.4.2.4): HTTP/2's
-settings, or the end of the connection.
+Plaintext stays on this machine unless it is allowed to leave. gRPC says neither why it cannot bind
+a port nor why it cannot connect: it gives no cause, or keeps trying silently. So the standard
+library binds the port once beforehand (``Address.check_free``), and makes one handshake with a
+server that cannot be reached (``check_handshake``). In TLS 1.3 a server judges a client's
+certificate after the client has finished, so what counts in a handshake is the first byte that
+comes back (RFC 8446, section 4.4.2.4): HTTP/2's settings, or the end of the connection.
 """
 
 from __future__ import annotations
 
 import ipaddress
+import os
 import socket
 import ssl
 from contextlib import suppress
 from dataclasses import dataclass
 
-from rfcore.errors import AccessDenied, InvalidInput
+from rfcore.errors import AccessDenied, InvalidInput, RfedgeError
 from rfcore.wire.checks import shown
 from rfcore.wire.tls import TlsFiles
 
@@ -53,6 +55,21 @@ class Address:
         except ValueError:
             return False
 
+    def check_free(self, option: str) -> None:
+        """Raise ``RfedgeError`` naming ``option`` if nobody can listen on this address now."""
+        if self.port == 0:
+            return
+        try:
+            family = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)[0][0]
+            socket.create_server((self.host, self.port), family=family).close()
+        except OSError as error:
+            # create_server repeats the address in its message; a failed look-up has no errno of C
+            number = error.errno or 0
+            problem = os.strerror(number) if number > 0 else error.strerror
+            raise RfedgeError(
+                f"cannot listen on {self}: {problem}; give another {option}"
+            ) from error
+
     def require_private(self, field: str, allow_insecure: bool) -> None:
         """Raise ``InvalidInput`` for plaintext that would leave the machine without permission."""
         if not (self.is_loopback or allow_insecure):
@@ -63,21 +80,21 @@ class Address:
             )
 
 
-PATIENCE_S = 2.0
+HANDSHAKE_TIMEOUT_S = 2.0
 NOT_TLS = frozenset({"WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "PACKET_LENGTH_TOO_LONG"})
 """How OpenSSL calls an answer that is not a TLS record."""
 
 
 def check_handshake(address: Address, tls: TlsFiles | None) -> None:
-    """Raise ``AccessDenied`` if the two ends refuse each other; nobody there is no refusal."""
+    """Raise ``AccessDenied`` if the two ends refuse each other; nobody listening is no refusal."""
     try:
-        with socket.create_connection((address.host, address.port), PATIENCE_S) as plain:
+        with socket.create_connection((address.host, address.port), HANDSHAKE_TIMEOUT_S) as plain:
             if tls is None:
                 _check_plaintext(address, plain)
             else:
                 _check_tls(address, plain, tls)
     except OSError:
-        return  # not there, not yet, or not answering: whoever waits goes on waiting
+        return  # no server there, not yet, or one that does not answer: the caller goes on waiting
 
 
 def _check_tls(address: Address, plain: socket.socket, tls: TlsFiles) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 __all__ = [
+    "AGENT_PROCESS",
     "CHANNEL_OPTIONS",
     "FRAME_BUDGET_BUCKETS_S",
     "MAX_MESSAGE_BYTES",
@@ -22,6 +23,10 @@ MAX_MESSAGE_BYTES: Final = 1 << 20
 
 RETRY_AFTER: Final = "retry-after-ms"
 """Trailing metadata of a refused stream: after how many milliseconds it may be opened again."""
+
+AGENT_PROCESS: Final = "agent-process"
+"""Metadata of a stream: a name of the agent process that opened it, different for each process. A
+server lets two processes never send the same camera; without it the connection stands for it."""
 
 STREAM_METHOD: Final = "/rfcore.wire.v1.EdgeService/Stream"
 

@@ -24,13 +24,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client import CollectorRegistry
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.files import write_whole
 from rfcore.link import DirectionPlan, LinkPlan, LinkProfile
 from rfcore.link.profile_file import read_link
 from rfcore.wire.address import Address
+from rfcore.wire.instruments import MetricsEndpoint
 from rfedge.link.direction import SPIN_S, Direction
 from rfedge.link.metrics import LinkMetrics
 from rfedge.link.side import Side
@@ -174,8 +175,8 @@ class LinkProxy:
     def _serve_metrics(self) -> None:
         port = self._settings.metrics_port
         if port is not None:
-            server, _ = start_http_server(port, self._settings.metrics_host, self.registry)
-            print(f"rfedge link: metrics on port {server.server_port}", file=sys.stderr)
+            endpoint = MetricsEndpoint(self.registry, self._settings.metrics_host, port)
+            print(f"rfedge link: metrics on port {endpoint.port}", file=sys.stderr)
 
     def _accept(self, to: Address) -> Side:
         side = Side(self._up, self._ended)

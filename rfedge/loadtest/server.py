@@ -56,7 +56,7 @@ class PassingDecoder:
         packet = job.frame.packet
         if packet.crc32 != packet.expected_crc32():
             raise PacketRejected(RejectReason.CRC_MISMATCH, f"packet {packet.sequence}")
-        outcome = DecodeOutcome(0, packet.reconstruction_digest, StageTimes())
+        outcome = DecodeOutcome(packet.reconstruction_digest, StageTimes())
         return Reconstruction(self._grey, outcome)
 
     def close(self) -> None:

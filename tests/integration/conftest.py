@@ -244,9 +244,11 @@ def raw_vehicle() -> Callable[..., Any]:
     """Return a context manager that opens a raw stream to an address."""
 
     @asynccontextmanager
-    async def run(address: object) -> AsyncIterator[RawVehicle]:
+    async def run(
+        address: object, metadata: tuple[tuple[str, str], ...] = ()
+    ) -> AsyncIterator[RawVehicle]:
         async with grpc.aio.insecure_channel(str(address), options=CHANNEL_OPTIONS) as channel:
-            yield RawVehicle(channel.stream_stream(STREAM_METHOD)())
+            yield RawVehicle(channel.stream_stream(STREAM_METHOD)(metadata=metadata))
 
     return run
 

@@ -5,9 +5,11 @@ from dataclasses import replace
 from typing import Any
 
 import grpc
+import pytest
 
 from mec_server.config import VehicleQuota
-from rfcore.wire.messages import Nack
+from rfcore.wire.conventions import AGENT_PROCESS, RETRY_AFTER
+from rfcore.wire.messages import Hello, Nack
 
 
 def limited(server: Any, limit: str) -> float:
@@ -16,15 +18,19 @@ def limited(server: Any, limit: str) -> float:
     return float(value)
 
 
+def with_camera(hello: Hello, camera_id: str) -> Hello:
+    return replace(hello, cameras=(replace(hello.cameras[0], camera_id=camera_id),))
+
+
 async def test_a_stream_beyond_the_vehicles_own_is_refused_and_another_vehicles_is_not(
     coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
     async with AsyncExitStack() as stack, serve(quota=VehicleQuota(streams=2)) as server:
-        for _ in range(2):
+        for name in ("front", "rear"):
             vehicle = await stack.enter_async_context(raw_vehicle(server.address))
-            await vehicle.greet(coded.hello)
+            await vehicle.greet(with_camera(coded.hello, name))
         third = await stack.enter_async_context(raw_vehicle(server.address))
-        await third.say(coded.hello)
+        await third.say(with_camera(coded.hello, "left"))
         assert await third.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
         assert "2 streams open, 2 may be" in await third.stream.details()
         assert limited(server, "vehicle_streams") == 1
@@ -32,7 +38,7 @@ async def test_a_stream_beyond_the_vehicles_own_is_refused_and_another_vehicles_
         await other.greet(replace(coded.hello, vehicle_id="cav-other"))
         assert await vehicle.farewell() is grpc.StatusCode.OK
         again = await stack.enter_async_context(raw_vehicle(server.address))
-        await again.greet(coded.hello)
+        await again.greet(with_camera(coded.hello, "rear"))
 
 
 async def test_a_stream_beyond_the_servers_is_refused_before_it_said_anything(
@@ -72,3 +78,91 @@ async def test_a_stream_of_nothing_but_rubbish_is_ended(
         assert await vehicle.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
         assert "64 messages in a row" in await vehicle.stream.details()
         assert limited(server, "unusable_frames") == 1
+
+
+async def test_a_second_agent_for_a_camera_is_refused_with_the_reason_and_when_to_try_again(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    async with (
+        serve() as server,
+        raw_vehicle(server.address) as first,
+        raw_vehicle(server.address) as second,
+    ):
+        await first.greet(coded.hello)
+        await second.say(coded.hello)
+        assert await second.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        details = await second.stream.details()
+        assert details.startswith(
+            "camera_taken: another agent sends camera front of vehicle cav-raw; stop it, or give "
+            "this one another --vehicle or --camera"
+        )
+        assert (RETRY_AFTER, "3000") in tuple(await second.stream.trailing_metadata())
+        assert limited(server, "camera_taken") == 1
+        assert await first.told(coded.frames[0]) == ("ack", 0), "the first one notices nothing"
+
+
+async def test_streams_of_one_agent_process_may_share_a_camera(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    """It opens the next tile's stream before it closes the last, and reconnects at any time."""
+    agent = ((AGENT_PROCESS, "the same"),)
+    async with (
+        serve() as server,
+        raw_vehicle(server.address, metadata=agent) as first,
+        raw_vehicle(server.address, metadata=agent) as second,
+    ):
+        await first.greet(coded.hello)
+        await second.greet(coded.hello)
+        assert await first.told(coded.frames[0]) == ("ack", 0)
+        assert await second.told(coded.frames[0]) == ("ack", 0)
+
+
+async def test_an_agent_that_fell_silent_is_replaced_by_another_and_told_why(
+    coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mec_server.quotas.CAMERA_SILENT_S", 0.0)
+    async with (
+        serve() as server,
+        raw_vehicle(server.address) as silent,
+        raw_vehicle(server.address) as second,
+    ):
+        await silent.greet(coded.hello)
+        await second.greet(coded.hello)
+        assert await second.told(coded.frames[0]) == ("ack", 0)
+        assert await silent.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert "another agent sends cav-raw/front now" in await silent.stream.details()
+        assert limited(server, "camera_taken") == 1
+
+
+async def test_a_hello_refused_for_its_camera_holds_nothing(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    """Two streams are allowed: one that was refused must not use up the second."""
+    async with serve(quota=VehicleQuota(streams=2)) as server, raw_vehicle(server.address) as first:
+        await first.greet(coded.hello)
+        for _ in range(3):
+            async with raw_vehicle(server.address) as refused:
+                await refused.say(coded.hello)
+                assert await refused.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        async with raw_vehicle(server.address) as other:
+            await other.greet(with_camera(coded.hello, "rear"))
+
+
+async def test_a_second_hello_counts_with_its_own_cameras(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    """A Hello that could not be opened does not let the next one in under its name."""
+    broken = replace(coded.hello.cameras[0], camera_id="rear")
+    header = replace(broken.codec, sps=broken.codec.sps[:-2])
+    bad = replace(coded.hello, cameras=(replace(broken, codec=header),))
+    async with (
+        serve() as server,
+        raw_vehicle(server.address) as first,
+        raw_vehicle(server.address) as second,
+    ):
+        await first.greet(coded.hello)
+        answer = await second.ask(bad)
+        assert isinstance(answer, Nack), answer
+        await second.say(coded.hello)
+        assert await second.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert "camera_taken" in await second.stream.details()

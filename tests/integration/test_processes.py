@@ -5,7 +5,9 @@ The only tests here that look at the clock: how fast a vehicle comes back is the
 
 import asyncio
 import json
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -17,11 +19,14 @@ from typing import Any
 import grpc
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
+from structlog.testing import capture_logs
 
 from cav_agent.config import AgentConfig, AgentLimits, PaceKind
 from cav_agent.vehicle import Vehicle
+from mec_server.config import ServerConfig
+from mec_server.server import EdgeServer
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.wire.settings import TransportSettings
+from rfcore.wire.settings import MetricsSettings, TransportSettings
 
 Process = asyncio.subprocess.Process
 
@@ -251,6 +256,77 @@ async def test_plaintext_is_served_to_this_machine_only_unless_allowed(serve: An
 
 async def test_a_taken_port_is_one_clear_error(serve: Any) -> None:
     async with serve() as server:
-        with pytest.raises(RfedgeError, match=r"cannot listen on 127\.0\.0\.1:"):
+        named = rf"cannot listen on {server.address}: Address already in use"
+        with pytest.raises(RfedgeError, match=named):
             async with serve(listen=str(server.address)):
                 pass
+
+
+@pytest.mark.parametrize("option", ["--listen", "--metrics-port"])
+async def test_a_port_in_use_is_named_without_a_traceback_and_ends_with_status_2(
+    street: Any, option: str
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as holder:
+        port = holder.getsockname()[1]
+        listening = ["--listen", f"127.0.0.1:{port}"]
+        if option == "--metrics-port":
+            listening = ["--listen", "127.0.0.1:0", "--metrics-port", str(port)]
+        server = await start("mec_server", "--fields", str(street.store), *listening)
+        _, told = await server.communicate()
+    assert server.returncode == 2
+    assert "Traceback" not in told.decode()
+    lines = [line for line in told.decode().splitlines() if not line.startswith("{")]
+    assert len(lines) == 1, "nothing of gRPC's or asyncio's own"
+    what = "listen" if option == "--listen" else "serve metrics"
+    assert lines[0] == (
+        f"mec-server: cannot {what} on 127.0.0.1:{port}: Address already in use; "
+        f"give another {option}"
+    )
+
+
+def is_served(server: EdgeServer) -> bool:
+    """Whether somebody listens on the port of the server's metrics."""
+    endpoint = server._metrics_endpoint
+    assert endpoint is not None
+    try:
+        socket.create_connection(("127.0.0.1", endpoint.port)).close()
+    except ConnectionRefusedError:
+        return False
+    return True
+
+
+async def test_a_server_gives_its_ports_back_when_it_stops_or_cannot_start(
+    serve: Any, street: Any
+) -> None:
+    metrics = MetricsSettings(port=0)
+    async with serve(metrics=metrics) as first:
+        assert is_served(first)
+        config = ServerConfig(street.store, str(first.address), metrics=metrics)
+        second = EdgeServer(config)
+        with pytest.raises(RfedgeError, match="cannot listen"):
+            await second.start()
+        assert not is_served(second)
+        assert is_served(first)
+    assert not is_served(first)
+
+
+async def test_a_server_without_fields_warns_and_takes_up_those_that_come(
+    serve: Any, street: Any, travel: Any, tmp_path: Path
+) -> None:
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    with capture_logs() as logs:
+        async with serve(fields=folder) as server:
+            (warning,) = [line for line in logs if line["log_level"] == "warning"]
+            assert warning["event"] == "no fields to serve: every vehicle will be refused"
+            assert warning["folder"] == str(folder)
+            assert "put field archives (.rff) into this folder" in warning["remedy"]
+            shutil.copy(street.store / "street.rff", folder)
+            assert (await travel(server.address)).counts == {"acked": 6}
+
+
+async def test_a_server_with_fields_does_not_warn(serve: Any) -> None:
+    with capture_logs() as logs:
+        async with serve():
+            pass
+    assert [line for line in logs if line["log_level"] == "warning"] == []

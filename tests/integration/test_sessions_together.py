@@ -52,7 +52,7 @@ class World:
 
     def connect(self) -> None:
         self.server = ServerSession("s", [FIELD], self.now)
-        self.decoder = (0, 0)
+        self.decoded = (0, -1)
         self.delayed.clear()
         self.agent.connected(self.now)
         self.exchange()
@@ -122,19 +122,13 @@ class World:
             self.server.opened(job, self.now)
             return
         packet = job.frame.packet
-        expected = self.decoder[1] if self.decoder[0] == packet.epoch else 0
-        reason = None
-        if packet.sequence < expected:
-            reason = RejectReason.STALE_SEQUENCE
-        elif packet.crc32 != packet.expected_crc32():
-            reason = RejectReason.CRC_MISMATCH
-        if reason is not None:
-            self.server.rejected(job, PacketRejected(reason, "as the codec would"), self.now)
+        assert (packet.epoch, packet.sequence) > self.decoded, "handed out in order"
+        if packet.crc32 != packet.expected_crc32():
+            rejected = PacketRejected(RejectReason.CRC_MISMATCH, "as the codec would")
+            self.server.rejected(job, rejected, self.now)
             return
-        self.decoder = (packet.epoch, packet.sequence + 1)
-        outcome = DecodeOutcome(
-            packet.sequence - expected, packet.reconstruction_digest, StageTimes()
-        )
+        self.decoded = (packet.epoch, packet.sequence)
+        outcome = DecodeOutcome(packet.reconstruction_digest, StageTimes())
         self.server.decoded(job, outcome, self.now)
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mec_server.admission import ASSUMED_HZ, NOTICEABLE, REVIEW_S, Admission
+from mec_server.admission import ASSUMED_HZ, MIN_RELATIVE_CHANGE, REVIEW_S, Admission
 from mec_server.config import AdmissionLimits
 from mec_server.session import ServerSession
 from rfcore.camera import Intrinsics
@@ -92,7 +92,7 @@ def test_without_a_load_limit_whoever_comes_is_let_in() -> None:
     admission = Admission(AdmissionLimits(load=0.0), 1)
     assert [admission.enter(f"cav-{i}", hello_of(30.0)) for i in range(100)] == [0.0] * 100
     assert admission.promised_share == 0.0
-    assert admission.review(100.0) == {}
+    assert admission.reallocate_rates(100.0) == {}
 
 
 def test_a_vehicle_that_says_no_rate_counts_with_the_usual_one_and_is_not_held_to_it() -> None:
@@ -105,10 +105,10 @@ def test_what_a_leaving_vehicle_had_goes_to_those_who_have_less_than_they_asked_
     admission = server_where_frames_take(0.04)
     admission.enter("second", hello_of(20.0))
     admission.enter("third", hello_of(30.0))
-    assert admission.review(0.0) == {}
+    assert admission.reallocate_rates(0.0) == {}
     admission.leave("second")
-    assert admission.review(REVIEW_S / 2) == {}, "rates are dealt out once a second"
-    assert admission.review(REVIEW_S) == {"third": 30.0}
+    assert admission.reallocate_rates(REVIEW_S / 2) == {}, "rates are reallocated once a second"
+    assert admission.reallocate_rates(REVIEW_S) == {"third": 30.0}
 
 
 def test_when_frames_become_dearer_the_last_ones_give_way() -> None:
@@ -119,7 +119,7 @@ def test_when_frames_become_dearer_the_last_ones_give_way() -> None:
         for name in ("first", "second", "third"):
             admission.worked(name, 0.04)
     assert admission.promised_share > 1.0
-    assert admission.review(0.0) == {"third": pytest.approx(9.0, rel=1e-3)}
+    assert admission.reallocate_rates(0.0) == {"third": pytest.approx(9.0, rel=1e-3)}
     assert admission.promised_share == pytest.approx(1.0, rel=1e-3)
 
 
@@ -148,8 +148,8 @@ def test_never_more_is_promised_than_may_be_beyond_the_lowest_rates(
         assert min(hz, 2.0) * (1 - 1e-9) <= rate_hz <= hz
         least += min(hz, 2.0) * cameras * seconds
     bound = max(1.0, least / (0.8 * 4) + 1.0)
-    admission.review(0.0)
-    assert admission.promised_share <= bound * (1 + NOTICEABLE)
+    admission.reallocate_rates(0.0)
+    assert admission.promised_share <= bound * (1 + MIN_RELATIVE_CHANGE)
 
 
 @pytest.mark.parametrize(

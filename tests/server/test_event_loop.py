@@ -3,7 +3,9 @@
 import asyncio
 import threading
 
-from mec_server.workers import Workers
+import pytest
+
+from mec_server.event_loop import LazyTimer, Workers
 
 
 def test_what_was_returned_or_raised_reaches_the_loop_that_asked() -> None:
@@ -75,3 +77,41 @@ def test_close_waits_for_what_was_asked_for() -> None:
         return done
 
     assert sorted(asyncio.run(run())) == list(range(20))
+
+
+@pytest.fixture
+def event() -> asyncio.Event:
+    return asyncio.Event()
+
+
+async def test_a_deadline_that_has_come_sets_the_event(event: asyncio.Event) -> None:
+    timer = LazyTimer(event)
+    timer.restart(asyncio.get_running_loop().time() + 3600.0)
+    timer.restart(asyncio.get_running_loop().time() - 1.0)
+    async with asyncio.timeout(10.0):
+        await event.wait()
+
+
+async def test_a_later_deadline_keeps_the_timer_and_an_earlier_one_replaces_it(
+    event: asyncio.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = asyncio.get_running_loop()
+    armed: list[float] = []
+    call_at = loop.call_at
+
+    def counting(when: float, ring: object, *args: object) -> asyncio.TimerHandle:
+        armed.append(when)
+        return call_at(when, ring, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(loop, "call_at", counting)
+    now = loop.time()
+    timer = LazyTimer(event)
+    for later in range(100):
+        timer.restart(now + 60.0 + later)
+    timer.restart(now + 30.0)
+    assert armed == [now + 60.0, now + 30.0]
+    timer.restart(None)
+    timer.restart(now + 50.0)
+    assert armed[-1] == now + 50.0
+    timer.cancel()
+    assert not event.is_set()
