@@ -43,7 +43,13 @@ from rfcore.wire.messages import (
 )
 from rfcore.wire.v1 import edge_pb2 as pb
 
-__all__ = ["FrameRefused", "client_message_from_bytes", "client_message_to_bytes"]
+__all__ = [
+    "FrameRefused",
+    "client_message_from_bytes",
+    "client_message_from_wire",
+    "client_message_to_bytes",
+    "client_message_to_wire",
+]
 
 
 class FrameRefused(InvalidInput):
@@ -64,6 +70,11 @@ def client_message_from_bytes(data: bytes) -> ClientMessage:
         request.ParseFromString(data)
     except DecodeError as error:
         raise InvalidInput("message", f"{len(data)} bytes are not a StreamRequest") from error
+    return client_message_from_wire(request)
+
+
+def client_message_from_wire(request: pb.StreamRequest) -> ClientMessage:
+    """Check what a vehicle sent; raises as ``client_message_from_bytes``."""
     match request.WhichOneof("message"):
         case "hello":
             return _hello_from_wire(request.hello)
@@ -74,9 +85,14 @@ def client_message_from_bytes(data: bytes) -> ClientMessage:
 
 def client_message_to_bytes(message: ClientMessage) -> bytes:
     """Serialise a vehicle's message; its length is the packet size."""
+    return client_message_to_wire(message).SerializeToString()
+
+
+def client_message_to_wire(message: ClientMessage) -> pb.StreamRequest:
+    """Return a vehicle's message as protobuf."""
     if isinstance(message, Hello):
-        return pb.StreamRequest(hello=_hello_to_wire(message)).SerializeToString()
-    return pb.StreamRequest(frame=_frame_to_wire(message)).SerializeToString()
+        return pb.StreamRequest(hello=_hello_to_wire(message))
+    return pb.StreamRequest(frame=_frame_to_wire(message))
 
 
 def _hello_from_wire(hello: pb.Hello) -> Hello:

@@ -1,28 +1,31 @@
-"""A coded drive in a file, ``.rfv``: what the vehicle said, without the conversation.
+"""A coded drive in a file, ``.rfv``: the messages a vehicle sends, without the server's answers.
 
-Layout: 8 bytes of magic, then messages, each preceded by its length as a protobuf varint: one
-``StreamRequest`` with Hello, then one for every Frame. The magic holds a carriage return, a
-control-Z and a line feed, so that a transfer that mangles text is noticed at once (as PNG does).
+Layout: 8 bytes of magic, then messages in protobuf's length-prefixed form: one ``StreamRequest``
+with Hello, then one for every Frame. The magic holds a carriage return, a control-Z and a line
+feed, so that a transfer that converts line ends is noticed at once (as in PNG).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
-from rfcore.errors import InvalidData, InvalidInput
+from google.protobuf.message import DecodeError
+from google.protobuf.proto import parse_length_prefixed, serialize_length_prefixed
+
+from rfcore.errors import InvalidData
 from rfcore.files import whole_file
 from rfcore.wire.conventions import MAX_MESSAGE_BYTES
-from rfcore.wire.convert import client_message_from_bytes, client_message_to_bytes
+from rfcore.wire.convert import client_message_from_wire, client_message_to_wire
 from rfcore.wire.messages import ClientMessage, Frame, Hello
+from rfcore.wire.v1 import edge_pb2 as pb
 
 __all__ = ["MAGIC", "CodedDrive", "read_drive", "write_drive"]
 
 MAGIC = b"RFV1\r\n\x1a\n"
-MAX_LENGTH_BYTES = 4
-"""A varint of four bytes reaches 256 MiB, well past any message we accept."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,9 @@ def write_drive(path: Path, drive: CodedDrive) -> None:
     """Write ``drive``; the file appears whole or not at all. Raises ``OSError``."""
     with whole_file(path) as file:
         file.write(MAGIC)
-        file.writelines(_records((drive.hello, *drive.frames)))
+        messages: tuple[ClientMessage, ...] = (drive.hello, *drive.frames)
+        for message in messages:
+            serialize_length_prefixed(client_message_to_wire(message), cast("BytesIO", file))
 
 
 def read_drive(path: Path) -> CodedDrive:
@@ -63,51 +68,36 @@ def read_drive(path: Path) -> CodedDrive:
     return CodedDrive(messages[0], tuple(frames))
 
 
-def _records(messages: Iterable[ClientMessage]) -> Iterator[bytes]:
-    for message in messages:
-        data = client_message_to_bytes(message)
-        yield _varint(len(data)) + data
+class _BoundedReader:
+    """What protobuf reads a message from: refuses a claimed length before memory is taken for it.
+
+    ``ValueError`` for a length above ``MAX_MESSAGE_BYTES``, and where the file ends within a
+    message.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def read(self, size: int) -> bytes:
+        """Return ``size`` bytes; a single one, of a length, may be missing at the file's end."""
+        if size > MAX_MESSAGE_BYTES:
+            raise ValueError(f"claims {size} bytes, the limit is {MAX_MESSAGE_BYTES}")
+        data = self._file.read(size)
+        if len(data) != size and size > 1:
+            raise ValueError(f"truncated: it has {len(data)} of its {size} bytes")
+        return data
 
 
 def _messages(file: BinaryIO, path: Path) -> Iterator[ClientMessage]:
-    number = 0
-    while (length := _read_varint(file, path, number)) is not None:
-        if length > MAX_MESSAGE_BYTES:
-            raise InvalidData(
-                f"{path}: message {number} claims {length} bytes, the limit is {MAX_MESSAGE_BYTES}"
-            )
-        data = file.read(length)
-        if len(data) != length:
-            raise InvalidData(
-                f"{path}: truncated, message {number} has {len(data)} of its {length} bytes"
-            )
+    reader, number = _BoundedReader(file), 0
+    while True:
         try:
-            yield client_message_from_bytes(data)
-        except InvalidInput as error:
+            request: pb.StreamRequest | None
+            request = parse_length_prefixed(pb.StreamRequest, cast("BytesIO", reader))
+            if request is None:
+                return
+            message = client_message_from_wire(request)
+        except (ValueError, DecodeError) as error:  # InvalidInput is a ValueError
             raise InvalidData(f"{path}: message {number}: {error}") from error
+        yield message
         number += 1
-
-
-def _varint(value: int) -> bytes:
-    """Return the base-128 form, least significant group first, high bit = more to come."""
-    groups = bytearray()
-    while value > 0x7F:
-        groups.append(value & 0x7F | 0x80)
-        value >>= 7
-    groups.append(value)
-    return bytes(groups)
-
-
-def _read_varint(file: BinaryIO, path: Path, number: int) -> int | None:
-    """Return the next length, or None where the file ends between two messages."""
-    value = 0
-    for index in range(MAX_LENGTH_BYTES):
-        byte = file.read(1)
-        if not byte:
-            if index == 0:
-                return None
-            raise InvalidData(f"{path}: truncated in the length of message {number}")
-        value |= (byte[0] & 0x7F) << (7 * index)
-        if byte[0] < 0x80:
-            return value
-    raise InvalidData(f"{path}: the length of message {number} is not a length")

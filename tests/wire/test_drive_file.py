@@ -45,11 +45,17 @@ def test_every_truncation_is_noticed_except_between_messages(
         (b"", "first bytes are wrong"),
         (b"RFV1\n\n\x1a\n", "first bytes are wrong"),
         (MAGIC, "message 0 is not a Hello"),
-        (MAGIC + b"\xff\xff\xff\x7f" + b"x", "message 0 claims 268435455 bytes"),
-        (MAGIC + b"\xff" * 10, "length of message 0 is not a length"),
-        (MAGIC + b"\x80", "truncated in the length of message 0"),
-        (MAGIC + b"\x05abc", "message 0 has 3 of its 5 bytes"),
-        (MAGIC + b"\x03abc", "message 0: message: 3 bytes are not a StreamRequest"),
+        (
+            MAGIC + b"\xff\xff\xff\x7f" + b"x",
+            "message 0: claims 268435455 bytes, the limit is 1048576",
+        ),
+        (MAGIC + b"\xff" * 10, "message 0: Too many bytes when decoding varint"),
+        (MAGIC + b"\x80", "message 0: Fail to read varint"),
+        (MAGIC + b"\x00", "message 0: message: is neither hello nor frame"),
+        (MAGIC + b"\x01", "message 0: Truncated message"),
+        (MAGIC + b"\xff" * 9 + b"\x01x", "message 0: claims 18446744073709551615 bytes"),
+        (MAGIC + b"\x05abc", "message 0: truncated: it has 3 of its 5 bytes"),
+        (MAGIC + b"\x03abc", "message 0: Error parsing message"),
     ],
 )
 def test_what_is_no_drive_is_refused(tmp_path: Path, content: bytes, named: str) -> None:
