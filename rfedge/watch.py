@@ -1,14 +1,21 @@
-"""A consumer of the twin: reads the stream, prints a line a picture, and keeps what it is told to.
+"""A consumer of the twin: prints a line per picture, and keeps pictures in folders or as a video.
 
-One thread that blocks: if the disk is slow, this consumer misses pictures and says how many.
-
-What a consumer of the twin keeps on disk: pictures in folders, or one camera as a video.
+One thread receives and keeps pictures, one after the other: when the disk is slow this consumer
+misses pictures, and says how many. The main thread only waits for signals: ``watch_until_stopped``.
+A signal must not raise an exception wherever the receiving thread happens to be: in gRPC's Python
+code that may leave a lock taken for ever, and the process then hangs in ``channel.close``.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import signal
+import sys
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import Future, wait
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
@@ -37,7 +44,14 @@ from rfcore.wire.twin import (
 )
 from rfcore.wire.v1 import twin_pb2_grpc
 
-__all__ = ["PictureFolder", "PictureVideo", "WatchSettings", "watch"]
+__all__ = [
+    "PictureFolder",
+    "PictureVideo",
+    "TwinWatcher",
+    "WatchSettings",
+    "watch",
+    "watch_until_stopped",
+]
 
 
 TICKS_PER_S = 90_000
@@ -149,6 +163,13 @@ def _even(picture: I420) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 LONGEST_MESSAGE_BYTES = 64 << 20
 """A raw picture of 8192x4320 px and its header."""
 CONNECT_S = 10.0
+LOOK_EVERY_S = 0.05
+"""How often the main thread looks whether a signal came or the watcher ended."""
+
+FINISH_S = 5.0
+"""How long a watcher that was told to stop may take to complete its files."""
+
+UNFINISHED = "rfedge watch: ended before its files were complete\n"
 
 
 @dataclass(frozen=True)
@@ -190,65 +211,138 @@ class WatchSettings:
         return Wish(self.vehicle_ids, encoding)
 
 
-def watch(settings: WatchSettings) -> None:
-    """Watch to the end; raise ``RfedgeError`` when the server cannot be reached or refuses."""
-    with ExitStack() as stack:
-        folder = PictureFolder(settings.folder) if settings.folder else None
-        video = stack.enter_context(PictureVideo(settings.video)) if settings.video else None
-        messages = stack.enter_context(_Stream(settings))
-        pictures = 0
-        for message in messages:
-            print(_line(message), flush=True)
-            if isinstance(message, Departure):
-                continue
-            if folder is not None:
-                folder.keep(message)
-            if video is not None:
-                video.keep(message)
-            pictures += 1
-            if pictures == settings.pictures:
-                return
-
-
-class _Stream:
-    """The server's messages, as an iterator that is closed by leaving the context."""
+class TwinWatcher:
+    """Receives what ``settings`` ask for; ``run`` on one thread, ``stop`` from any other."""
 
     def __init__(self, settings: WatchSettings) -> None:
         self._settings = settings
-        options = (
-            *(o for o in CHANNEL_OPTIONS if o[0] != "grpc.max_receive_message_length"),
-            ("grpc.max_receive_message_length", LONGEST_MESSAGE_BYTES),
-        )
-        if settings.tls is None:
-            self._channel = grpc.insecure_channel(settings.address, options=options)
-        else:
-            credentials = settings.tls.channel_credentials()
-            self._channel = grpc.secure_channel(settings.address, credentials, options=options)
+        self._lock = threading.Lock()
+        self._stopped = False
+        self._call: grpc.Call | None = None
 
-    def __enter__(self) -> Iterator[TwinPicture | Departure]:
+    def run(self) -> None:
+        """Watch until the server ends the stream, enough was seen, or ``stop``.
+
+        Files are whole when it returns or raises. Raises ``RfedgeError`` when the server cannot be
+        reached or refuses.
+        """
+        settings, pictures = self._settings, 0
+        with ExitStack() as stack:
+            folder = PictureFolder(settings.folder) if settings.folder else None
+            video = stack.enter_context(PictureVideo(settings.video)) if settings.video else None
+            channel = stack.enter_context(_open_channel(settings))
+            for message in self._messages(channel):
+                print(_line(message), flush=True)
+                if isinstance(message, Departure):
+                    continue
+                if folder is not None:
+                    folder.keep(message)
+                if video is not None:
+                    video.keep(message)
+                pictures += 1
+                if pictures == settings.pictures:
+                    return
+
+    def stop(self) -> None:
+        """Have ``run`` return after the picture it is keeping; may be called before ``run``."""
+        with self._lock:
+            self._stopped = True
+            if self._call is not None:
+                self._call.cancel()
+
+    def _messages(self, channel: grpc.Channel) -> Iterator[TwinPicture | Departure]:
+        request = watch_request(self._settings.wish)
+        with self._lock:
+            if self._stopped:
+                return
+            stub = twin_pb2_grpc.TwinServiceStub(channel)
+            self._call = call = stub.Watch(request, wait_for_ready=True)
         try:
-            grpc.channel_ready_future(self._channel).result(timeout=CONNECT_S)
-        except grpc.FutureTimeoutError as error:
-            self._channel.close()
-            check_handshake(Address.parse("address", self._settings.address), self._settings.tls)
-            raise RfedgeError(
-                f"no server at {self._settings.address} within {CONNECT_S:g} s"
-            ) from error
-        return self._messages()
-
-    def __exit__(self, *exception: object) -> None:
-        self._channel.close()
-
-    def _messages(self) -> Iterator[TwinPicture | Departure]:
-        stub = twin_pb2_grpc.TwinServiceStub(self._channel)
-        try:
-            for response in stub.Watch(watch_request(self._settings.wish)):
+            self._wait_for_server(call)
+            for response in call:
+                if self._stopped:
+                    return
                 yield watched(response)
         except grpc.RpcError as error:
-            raise RfedgeError(_said(error)) from error
+            if not self._stopped:
+                raise RfedgeError(_problem(error)) from error
+
+    def _wait_for_server(self, call: grpc.Call) -> None:
+        """Wait until the server answers, or the call is cancelled; raise ``RfedgeError``."""
+        expired = threading.Event()
+
+        def expire() -> None:
+            expired.set()
+            call.cancel()
+
+        timer = threading.Timer(CONNECT_S, expire)
+        timer.start()
+        try:
+            call.initial_metadata()
+        finally:
+            timer.cancel()
+        if expired.is_set() and not self._stopped:
+            settings = self._settings
+            check_handshake(Address.parse("address", settings.address), settings.tls)
+            raise RfedgeError(f"no server at {settings.address} within {CONNECT_S:g} s")
 
 
-def _said(error: grpc.RpcError) -> str:
+def watch(settings: WatchSettings) -> None:
+    """Watch to the end; raises what ``TwinWatcher.run`` raises."""
+    TwinWatcher(settings).run()
+
+
+def watch_until_stopped(settings: WatchSettings) -> None:
+    """Watch to the end, or until SIGINT or SIGTERM; to be called from the main thread.
+
+    After the first signal files are completed. If that takes longer than ``FINISH_S``, because
+    nobody reads standard output or the disk does not answer, or at a second signal, the process
+    ends at once, with status 1. Raises what ``TwinWatcher.run`` raises.
+    """
+    signals: list[int] = []
+    watcher, ended = TwinWatcher(settings), Future[None]()
+
+    def run() -> None:
+        try:
+            watcher.run()
+        except BaseException as error:
+            ended.set_exception(error)
+        else:
+            ended.set_result(None)
+
+    def note(number: int, _: object) -> None:
+        signals.append(number)  # and nothing else: a handler runs between any two instructions
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        threading.Thread(target=run, name="watch", daemon=True).start()
+        while not ended.done() and not signals:
+            wait([ended], timeout=LOOK_EVERY_S)
+        watcher.stop()
+        finish_until_s = time.monotonic() + FINISH_S
+        while not ended.done():
+            if len(signals) > 1 or time.monotonic() > finish_until_s:
+                os.write(sys.stderr.fileno(), UNFINISHED.encode())
+                os._exit(1)  # the thread may hold the lock of standard output for ever
+            wait([ended], timeout=LOOK_EVERY_S)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    ended.result()
+
+
+def _open_channel(settings: WatchSettings) -> grpc.Channel:
+    options = (
+        *(o for o in CHANNEL_OPTIONS if o[0] != "grpc.max_receive_message_length"),
+        ("grpc.max_receive_message_length", LONGEST_MESSAGE_BYTES),
+    )
+    if settings.tls is None:
+        return grpc.insecure_channel(settings.address, options=options)
+    credentials = settings.tls.channel_credentials()
+    return grpc.secure_channel(settings.address, credentials, options=options)
+
+
+def _problem(error: grpc.RpcError) -> str:
     if not isinstance(error, grpc.Call):
         return str(error)
     return f"{error.code().name.lower()}: {error.details()}"

@@ -93,11 +93,8 @@ class Watch:
 
     def run(self) -> None:
         """Watch until the server ends the stream, enough was seen, SIGINT or SIGTERM."""
-        import signal
-        from contextlib import suppress
-
         from rfcore.wire.tls import TlsFiles
-        from rfedge.watch import WatchSettings, watch
+        from rfedge.watch import WatchSettings, watch_until_stopped
 
         settings = WatchSettings(
             address=self.address,
@@ -109,9 +106,7 @@ class Watch:
             tls=TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca),
             allow_insecure=self.allow_insecure,
         )
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        with suppress(KeyboardInterrupt):  # the usual end; files are closed on the way
-            watch(settings)
+        watch_until_stopped(settings)
 
 
 @dataclass(frozen=True)

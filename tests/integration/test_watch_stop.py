@@ -1,0 +1,236 @@
+"""``rfedge watch`` ends when it is told to, at whatever moment that is."""
+
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import grpc
+import pytest
+
+from rfcore.camera import Intrinsics, Pose
+from rfcore.errors import RfedgeError
+from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, watch_response
+from rfcore.wire.v1 import twin_pb2_grpc
+from rfedge import watch as module
+from rfedge.demo.processes import command_of
+from rfedge.watch import TwinWatcher, WatchSettings, watch_until_stopped
+
+DEPARTURE = watch_response(Departure("cav-1", "front"))
+STARTED_S = 60.0
+
+
+def grey(sequence: int) -> TwinPicture:
+    """A grey picture of 16x16 px, captured 0.1 s after the one before."""
+    return TwinPicture(
+        vehicle_id="cav-1",
+        camera_id="front",
+        session_id="s",
+        epoch=0,
+        sequence=sequence,
+        capture_time_ns=sequence * 10**8,
+        age_ns=0,
+        pose=Pose.identity(),
+        intrinsics=Intrinsics(16, 16, 8.0, 8.0, 8.0, 8.0),
+        field_id="ab" * 32,
+        reconstruction_digest=b"d" * 16,
+        encoding=PictureEncoding.I420,
+        picture=b"\x80" * (16 * 16 * 3 // 2),
+    )
+
+
+class EndlessTwin(twin_pb2_grpc.TwinServiceServicer):
+    """Sends without end, and counts; with ``idle`` it sends nothing."""
+
+    def __init__(self) -> None:
+        self.sent = 0
+        self.idle = False
+        self.pictures = False
+        self.watched = threading.Event()
+        self.enough = threading.Event()
+        self.enough_at = 0
+
+    def Watch(self, request: Any, context: Any) -> Iterator[Any]:  # noqa: N802, ARG002
+        over = threading.Event()
+        context.add_callback(over.set)
+        context.send_initial_metadata(())
+        self.watched.set()
+        if self.idle:
+            over.wait()
+        while not over.is_set():
+            self.sent += 1
+            yield watch_response(grey(self.sent)) if self.pictures else DEPARTURE
+            if self.sent >= self.enough_at:
+                self.enough.set()
+
+
+@pytest.fixture
+def twin() -> EndlessTwin:
+    return EndlessTwin()
+
+
+@pytest.fixture
+def address(twin: EndlessTwin) -> Iterator[str]:
+    server = grpc.server(ThreadPoolExecutor(4))
+    twin_pb2_grpc.add_TwinServiceServicer_to_server(twin, server)
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    yield f"127.0.0.1:{port}"
+    server.stop(0).wait()
+
+
+def in_thread(run: Callable[[], None]) -> threading.Thread:
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+@pytest.mark.parametrize("repetition", range(3))
+@pytest.mark.parametrize("after", [0, 1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144])
+def test_a_watcher_ends_after_any_number_of_messages(
+    twin: EndlessTwin, address: str, after: int, repetition: int
+) -> None:
+    """Stopped from another thread while messages stream in."""
+    del repetition
+    twin.enough_at = after
+    watcher = TwinWatcher(WatchSettings(address))
+    thread = in_thread(watcher.run)
+    assert (twin.watched if after == 0 else twin.enough).wait(STARTED_S)
+    watcher.stop()
+    thread.join(STARTED_S)
+    assert not thread.is_alive()
+
+
+@pytest.mark.parametrize("switches", [0, 1, 2, 4, 8, 16, 32, 64, 128, 256])
+def test_a_watcher_ends_at_any_point_of_its_start(address: str, switches: int) -> None:
+    """Other threads run between the start and the stop: connecting, asking, the first messages."""
+    watcher = TwinWatcher(WatchSettings(address))
+    thread = in_thread(watcher.run)
+    for _ in range(64 * switches):
+        os.sched_yield()
+    watcher.stop()
+    thread.join(STARTED_S)
+    assert not thread.is_alive()
+
+
+def test_a_watcher_that_was_stopped_before_it_ran_ends_at_once(address: str) -> None:
+    watcher = TwinWatcher(WatchSettings(address))
+    watcher.stop()
+    watcher.run()
+
+
+def test_a_watcher_ends_while_it_waits_for_a_server_or_for_pictures(
+    twin: EndlessTwin, address: str
+) -> None:
+    twin.idle = True
+    watching, waiting = TwinWatcher(WatchSettings(address)), TwinWatcher(NOBODY)
+    threads = [in_thread(watching.run), in_thread(waiting.run)]
+    assert twin.watched.wait(STARTED_S)
+    for watcher in (watching, waiting):
+        watcher.stop()
+    for thread in threads:
+        thread.join(STARTED_S)
+    assert not any(thread.is_alive() for thread in threads)
+
+
+NOBODY = WatchSettings("127.0.0.1:1")
+
+
+def test_without_a_server_the_error_names_the_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CONNECT_S", 0.05)
+    with pytest.raises(RfedgeError, match=r"no server at 127\.0\.0\.1:1 within 0\.05 s"):
+        module.watch(NOBODY)
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """The handlers of the test's own process are in place again afterwards."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    assert [signal.getsignal(number) for number in numbers] == before
+
+
+@pytest.mark.usefixtures("handlers")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_watch_at_any_moment_with_a_whole_video(
+    twin: EndlessTwin, address: str, number: signal.Signals, tmp_path: Path
+) -> None:
+    """Forty times, each after more messages than before."""
+    twin.pictures = True
+    for repetition in range(20):
+        twin.enough.clear()
+        twin.enough_at = twin.sent + 1 + 2 * repetition
+
+        def tell() -> None:
+            assert twin.enough.wait(STARTED_S)
+            os.kill(os.getpid(), number)
+
+        teller = in_thread(tell)
+        video = tmp_path / f"{repetition}.mp4"
+        watch_until_stopped(WatchSettings(address, video=video))
+        teller.join()
+        assert b"moov" in video.read_bytes(), "the index, which is written last"
+
+
+@pytest.mark.usefixtures("handlers")
+def test_an_error_of_the_watch_is_raised_where_it_was_called(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "CONNECT_S", 0.05)
+    with pytest.raises(RfedgeError, match="no server at"):
+        watch_until_stopped(NOBODY)
+
+
+@contextmanager
+def command(address: str) -> Iterator[subprocess.Popen[bytes]]:
+    """``rfedge watch`` as a process, whose output nobody reads."""
+    arguments = [*command_of("rfedge"), "watch", address]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def ended(process: subprocess.Popen[bytes]) -> tuple[int, str]:
+    """Send SIGTERM; return the exit status and the errors."""
+    assert process.stderr is not None
+    process.send_signal(signal.SIGTERM)
+    return process.wait(STARTED_S), process.stderr.read().decode()
+
+
+def test_the_command_ends_while_it_watches(twin: EndlessTwin, address: str) -> None:
+    twin.idle = True
+    with command(address) as process:
+        assert twin.watched.wait(STARTED_S)
+        assert ended(process) == (0, "")
+
+
+def test_the_command_ends_although_nobody_reads_what_it_prints(
+    twin: EndlessTwin, address: str
+) -> None:
+    """The pipe is full, printing blocks: after a time it ends all the same, and says so."""
+    with command(address) as process:
+        assert twin.watched.wait(STARTED_S)
+        assert process.stdout is not None
+        while unread_bytes(process.stdout) < PIPE_BYTES:
+            os.sched_yield()
+        assert ended(process) == (1, module.UNFINISHED)
+
+
+PIPE_BYTES = (1 << 16) - 4096
+"""A pipe of Linux holds 64 KiB; the last page is not always filled."""
+
+
+def unread_bytes(pipe: IO[bytes]) -> int:
+    """Return how much was written to a pipe and not read."""
+    return int.from_bytes(fcntl.ioctl(pipe.fileno(), termios.FIONREAD, b"\0" * 4), sys.byteorder)
