@@ -132,6 +132,10 @@ class ServerMetrics:
         """Tell which field was opened."""
         self._fields.labels(field.field_id[:16], field.metadata.kind).set(1)
 
+    def count_lost_decoder(self, cause: LossCause) -> None:
+        """Count a decoder process that died in use."""
+        self.decoders_lost.labels(cause).inc()
+
     def of(self, vehicle_id: str) -> VehicleMetrics:
         """Return what a stream of ``vehicle_id`` counts on; ``forget`` it when the stream ends."""
         self._streams[vehicle_id] += 1

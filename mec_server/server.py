@@ -64,7 +64,9 @@ class EdgeServer:
         self._metrics_endpoint: MetricsEndpoint | None = None
         self._opener = ThreadPoolExecutor(1, "opener")
         self._workers = Workers(config.workers)
-        self._decoders = Decoders(config.decoder, not self.address.is_loopback, self._metrics)
+        self._decoders = Decoders(
+            config.decoder, not self.address.is_loopback, self._metrics.count_lost_decoder
+        )
         self._recorder = self._open_recorder(config.save)
         self._health = health_aio.HealthServicer()
         self._store = FieldStore(config.fields)

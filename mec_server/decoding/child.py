@@ -1,9 +1,9 @@
-"""The decoder process: FFmpeg's H.264 decoder alone, with little to win for whoever takes it over.
+"""The decoder process: runs FFmpeg's H.264 decoder alone, with as few rights as possible.
 
 Started by ``mec_server.decoding.process`` as ``python -m mec_server.decoding.child SOCKET MEMORY``,
-two inherited descriptors; it ends when the socket does. Before the first byte from outside it gives
-up what it will not need: address space, descriptors, files, processes, core dumps. The time limit
-moves along: so many seconds of CPU for one request, however long the process lives.
+two inherited descriptors; it ends when the socket is closed. Before it reads the first byte that
+comes from a vehicle it gives up what it will not need: address space, descriptors, files,
+processes, core dumps. The limit of CPU time is for one request and is moved on before each.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class DecoderChild:
         self._decoder: H264Decoder | None = None
 
     def answer(self, request: bytes) -> bytes:
-        """Do what ``request`` asks for; return what to say."""
+        """Do what ``request`` asks for; return the answer."""
         command, numbers = request_from_bytes(request)
         try:
             self._obey(command, numbers)
@@ -70,12 +70,13 @@ class DecoderChild:
         for unit in units:
             self._decoder.feed(unit)
         if wanted is not None:
-            self._put(self._decoder.decode(wanted))
+            self._put(self._decoder.decode(bytes(wanted)))
 
-    def _units(self, lengths: Sequence[int]) -> Iterator[bytes]:
-        start = 0
+    def _units(self, lengths: Sequence[int]) -> Iterator[memoryview]:
+        """Yield the access units in place: FFmpeg copies each once, to pad it."""
+        memory, start = memoryview(self._memory), 0
         for length in lengths:
-            yield self._memory[start : start + length]
+            yield memory[start : start + length]
             start += length
 
     def _put(self, picture: I420) -> None:

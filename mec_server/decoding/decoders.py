@@ -2,12 +2,11 @@
 
 FFmpeg has been broken by crafted streams before, and will be again. Packets from other machines
 are therefore decoded where a crash costs one frame: AUTO takes bubblewrap where it works, else
-plain processes, and decodes in the server only when nobody but this machine can reach it.
+plain processes, and decodes in the server only when no other machine can reach it.
 
-The command line that puts a decoder process into a sandbox of bubblewrap.
-
-In it there is no network, no other process, and no file but Python's and this project's code, all
-read-only: no key, no field, no recording. <https://github.com/containers/bubblewrap>
+In a sandbox of bubblewrap there is no network, no other process, and no file but Python's and this
+project's code, all read-only: no key, no field, no recording.
+<https://github.com/containers/bubblewrap>
 """
 
 from __future__ import annotations
@@ -24,20 +23,24 @@ import mec_server
 import rfcore
 from mec_server.config import DecoderKind
 from mec_server.decoding.pool import DecoderPool
-from mec_server.decoding.process import DecoderLost, child_environment
-from mec_server.metrics import ServerMetrics
+from mec_server.decoding.process import DecoderLost, LossCause, child_environment
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.codec.h264.splice import PictureDecoder
 from rfcore.errors import BackendUnavailable, RfedgeError
 
-__all__ = ["Decoders", "Lost", "OpenDecoder", "bubblewrap_command"]
+__all__ = ["Decoders", "OpenDecoder", "bubblewrap_command"]
 
+log = structlog.get_logger()
 
 SYSTEM = ("/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache")
+"""What programs need of the system; read-only in a sandbox."""
 
 
 def bubblewrap_command(environment: Mapping[str, str]) -> list[str]:
-    """Return what to put before a command; raise ``BackendUnavailable`` without bubblewrap."""
+    """Return the command line that runs a command in a sandbox, to be put before it.
+
+    Raises ``BackendUnavailable`` without bubblewrap.
+    """
     program = shutil.which("bwrap")
     if program is None:
         raise BackendUnavailable(
@@ -52,39 +55,38 @@ def bubblewrap_command(environment: Mapping[str, str]) -> list[str]:
 
 
 def _readable() -> Iterable[str]:
-    """Return the folders that running our code takes, each before what lies in it."""
+    """Return the folders that our code is run from, each before those inside it."""
     installed = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
     own = [path for package in (rfcore, mec_server) for path in package.__path__]
     found = {*SYSTEM, sys.prefix, sys.base_prefix, *installed, *own}
     return sorted(path for path in found if Path(path).exists())
 
 
-log = structlog.get_logger()
-Lost = Callable[[DecoderLost], None]
-
-
 class OpenDecoder(Protocol):
-    """How a decoder for pictures of one size is had."""
+    """Opens decoders."""
 
     def __call__(self, size_px: tuple[int, int]) -> PictureDecoder:
-        """Return it; raise ``CodecError`` if there is none to be had."""
+        """Return a decoder for pictures of ``size_px``; raise ``CodecError`` if there is none."""
 
 
 class Decoders:
     """Opens decoders of one kind; ``start``, then ``open``, then ``close``.
 
     ``reachable``: whether packets may come from other machines; it decides what AUTO means.
+    ``count_loss`` is called for each decoder process that dies in use, on any thread.
     """
 
-    def __init__(self, kind: DecoderKind, reachable: bool, metrics: ServerMetrics) -> None:
+    def __init__(
+        self, kind: DecoderKind, reachable: bool, count_loss: Callable[[LossCause], None]
+    ) -> None:
         if kind is DecoderKind.AUTO and not reachable:
             kind = DecoderKind.IN_PROCESS
         self.kind = kind
-        self._metrics = metrics
+        self._count_loss = count_loss
         self._pool: DecoderPool | None = None
 
     def start(self) -> None:
-        """Have the first process stand ready; raise ``RfedgeError`` if that cannot be."""
+        """Start a first spare process; raise ``RfedgeError`` if that fails."""
         if self.kind is DecoderKind.AUTO:
             self._start_best()
         elif self.kind is not DecoderKind.IN_PROCESS:
@@ -110,9 +112,7 @@ class Decoders:
 
     def _pool_of(self, kind: DecoderKind) -> DecoderPool:
         sandboxed = kind is DecoderKind.BUBBLEWRAP
-        pool = DecoderPool(
-            bubblewrap_command(child_environment()) if sandboxed else (), self._count
-        )
+        pool = DecoderPool(bubblewrap_command(child_environment()) if sandboxed else (), self._lost)
         try:
             pool.wait_until_ready()
         except RfedgeError as error:
@@ -120,6 +120,6 @@ class Decoders:
             raise BackendUnavailable(f"decoder {kind}: {error}") from error
         return pool
 
-    def _count(self, lost: DecoderLost) -> None:
-        self._metrics.decoders_lost.labels(lost.cause).inc()
+    def _lost(self, lost: DecoderLost) -> None:
+        self._count_loss(lost.cause)
         log.error("decoder lost", reason=str(lost.cause), pid=lost.pid, problem=str(lost))

@@ -15,13 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter_ns
 
-from prometheus_client import CollectorRegistry
-
 from mec_server.config import DecoderKind
 from mec_server.decoding.decoders import Decoders
-from mec_server.metrics import ServerMetrics
+from mec_server.decoding.process import LossCause
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.state import DecoderState
+from rfcore.errors import RfedgeError
 from rfcore.field import RadianceField, load_field, render_field_view
 from rfcore.views import FieldView
 from rfcore.wire.messages import Frame
@@ -66,13 +65,17 @@ def decoder_rows() -> list[DecoderRow]:
 
 
 def _decoder(kind: DecoderKind, drive: PrerecordedDrive, opened: ExitStack) -> DeltaDecoder:
-    decoders = Decoders(kind, True, ServerMetrics(CollectorRegistry()))
+    decoders = Decoders(kind, True, _fail)
     decoders.start()
     opened.callback(decoders.close)
     header = drive.hello.cameras[0].codec
     decoder = DeltaDecoder(header, True, perf_counter_ns, decoders.open)
     opened.callback(decoder.close)
     return decoder
+
+
+def _fail(cause: LossCause) -> None:
+    raise RfedgeError(f"a decoder process was lost ({cause}) on a sample that decodes")
 
 
 def _times(

@@ -158,7 +158,7 @@ async def test_an_oversize_message_ends_its_stream_and_no_other(
     coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
     async with serve() as server, raw_vehicle(server.address) as other:
-        await other.greet(coded.hello)
+        await other.greet(replace(coded.hello, vehicle_id="cav-other"))
         async with raw_vehicle(server.address) as vehicle:
             await vehicle.greet(coded.hello)
             await vehicle.say(bytes(2 << 20))
@@ -170,7 +170,7 @@ async def test_a_vehicle_that_vanishes_leaves_the_others_alone(
     coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
     async with serve() as server, raw_vehicle(server.address) as other:
-        await other.greet(coded.hello)
+        await other.greet(replace(coded.hello, vehicle_id="cav-other"))
         async with raw_vehicle(server.address) as vehicle:
             await vehicle.greet(coded.hello)
             await vehicle.say(coded.frames[0])

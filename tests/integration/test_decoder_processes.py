@@ -3,6 +3,7 @@
 import asyncio
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ async def test_a_decoder_killed_between_frames_costs_the_next_one_and_no_other_v
 ) -> None:
     async with serve(decoder=DecoderKind.CHILD) as server, raw_vehicle(server.address) as other:
         (of_other,) = processes_of_decoders()
-        await other.greet(coded.hello)
+        await other.greet(replace(coded.hello, vehicle_id="cav-other"))
         async with raw_vehicle(server.address) as vehicle:
             await vehicle.greet(coded.hello)
             assert await vehicle.told(coded.frames[0]) == ("ack", 0)

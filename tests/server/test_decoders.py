@@ -207,7 +207,7 @@ def test_bubblewrap_shows_no_network_no_process_and_no_file_of_ours(
 
 @pytest.fixture
 def decoders() -> Callable[[DecoderKind, bool], Decoders]:
-    return lambda kind, reachable: Decoders(kind, reachable, ServerMetrics(CollectorRegistry()))
+    return lambda kind, reachable: Decoders(kind, reachable, lambda _: None)
 
 
 @pytest.mark.slow
@@ -246,7 +246,7 @@ def test_a_process_that_cannot_start_says_why() -> None:
 
 def test_a_lost_decoder_is_counted_by_cause(units: Sequence[bytes]) -> None:
     registry = CollectorRegistry()
-    made = Decoders(DecoderKind.CHILD, True, ServerMetrics(registry))
+    made = Decoders(DecoderKind.CHILD, True, ServerMetrics(registry).count_lost_decoder)
     made.start()
     decoder: Any = made.open(SIZE_PX)
     os.kill(python_of(decoder), signal.SIGSEGV)
