@@ -1,4 +1,4 @@
-"""What the edge server can be told; parsed once, in ``__main__``."""
+"""The edge server's configuration; parsed once, in ``__main__``."""
 
 from __future__ import annotations
 
@@ -96,17 +96,18 @@ class AdmissionLimits:
 
 @dataclass(frozen=True)
 class ConsumerLimits:
-    """Those who watch the twin (`rfedge watch`); one that takes nothing for long is let go."""
+    """Consumers of the twin (`rfedge watch`); the stream of one that stops reading is ended."""
 
     consumers: Annotated[int, arg(name="max-consumers")] = 8
     """How many may watch at once."""
-    patience_s: Annotated[float, Suppress] = 10.0
+    stalled_s: Annotated[float, Suppress] = 10.0
+    """A consumer that took nothing for so long is too slow."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.consumers <= 1000:
             raise InvalidInput("consumers", f"{self.consumers} is outside 0..1000")
-        if not self.patience_s > 0:
-            raise InvalidInput("patience_s", f"{self.patience_s} must be above 0 s")
+        if not self.stalled_s > 0:
+            raise InvalidInput("stalled_s", f"{self.stalled_s} must be above 0 s")
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
-"""What Prometheus sees of the server. Names begin with ``rfedge_server_`` or ``rfedge_twin_``.
+"""Metrics of the server. Names begin with ``rfedge_server_``; those of the twin are in ``twin``.
 
-No metric tells vehicles apart unless ``per_vehicle`` is set: ids are unbounded, and every label
-value is a time series for ever. With it, a vehicle's series leave when its last stream ends.
+The values of every label are a closed set that no peer can add to, since each value is a time
+series for ever. So no metric tells vehicles apart unless ``per_vehicle`` is set; then a vehicle's
+series are removed when its last stream ends.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ class ServerMetrics:
             self._begin_at_zero()
 
     def _begin_at_zero(self) -> None:
-        """Let each reason exist before its first frame: a rate needs two samples."""
+        """Make each reason's series before its first frame: a rate needs two samples."""
         self.frames.labels("acked", "")
         for reason in RejectReason:
             self.frames.labels("nacked", reason)
@@ -115,8 +116,8 @@ class ServerMetrics:
         for cause in LossCause:
             self.decoders_lost.labels(cause)
 
-    def took(self, times: StageTimes) -> None:
-        """Note where the time of a frame went."""
+    def observe_stages(self, times: StageTimes) -> None:
+        """Observe the time of a frame, stage by stage."""
         for name, stage in self._stages:
             stage.observe(getattr(times, name) / 1e9)
         self.answer.observe(times.total_ns / 1e9)
@@ -124,12 +125,12 @@ class ServerMetrics:
     def observe_admission(
         self, promised: Callable[[], float], reduced: Callable[[], float]
     ) -> None:
-        """Read what was promised to vehicles when a scrape asks for it."""
+        """Have each scrape read how much of the workers' time is promised to vehicles."""
         self._promised.set_function(promised)
         self._reduced.set_function(reduced)
 
     def field_opened(self, field: RadianceField) -> None:
-        """Tell which field was opened."""
+        """Publish which field was opened."""
         self._fields.labels(field.field_id[:16], field.metadata.kind).set(1)
 
     def count_lost_decoder(self, cause: LossCause) -> None:
@@ -137,7 +138,7 @@ class ServerMetrics:
         self.decoders_lost.labels(cause).inc()
 
     def of(self, vehicle_id: str) -> VehicleMetrics:
-        """Return what a stream of ``vehicle_id`` counts on; ``forget`` it when the stream ends."""
+        """Return the metrics for a stream of ``vehicle_id``; ``forget`` them when it ends."""
         self._streams[vehicle_id] += 1
         return VehicleMetrics(self, vehicle_id)
 
@@ -153,10 +154,10 @@ class ServerMetrics:
 
 
 class VehicleMetrics:
-    """The server's metrics as one stream counts on them.
+    """The server's metrics with the labels of one stream filled in.
 
-    What a label's value leads to is looked up once: a frame counts on a dozen of them, and looking
-    up takes as long as counting.
+    The series of each label value is looked up once: a frame is counted in a dozen of them, and
+    looking one up takes as long as counting.
     """
 
     def __init__(self, metrics: ServerMetrics, vehicle_id: str) -> None:
@@ -171,7 +172,9 @@ class VehicleMetrics:
         packet = frame.packet
         counters = self._references.get(packet.references)
         if counters is None:
-            counters = self._references[packet.references] = self._by(packet.references)
+            counters = self._references[packet.references] = self._references_counters(
+                packet.references
+            )
         payload, coded = counters
         self._received.inc(packet_bytes)
         payload.inc(len(packet.payload))
@@ -181,17 +184,17 @@ class VehicleMetrics:
         """Count the frames that ``messages`` answer."""
         for message in messages:
             if isinstance(message, Ack):
-                self._ended("acked", "").inc()
-                self._metrics.took(message.times)
+                self._frames_counter("acked", "").inc()
+                self._metrics.observe_stages(message.times)
             elif isinstance(message, Nack):
-                self._ended("nacked", str(message.reason)).inc(message.count)
+                self._frames_counter("nacked", str(message.reason)).inc(message.count)
 
     def reconstructed(self, latency_s: float) -> None:
-        """Note how old a picture was when it became one."""
+        """Observe the age of a picture when it was reconstructed."""
         self._latency.observe(latency_s)
 
     def forget(self) -> None:
-        """The stream is over."""
+        """Note that the stream is over."""
         self._metrics.forget(self._vehicle_id)
 
     @cached_property
@@ -203,11 +206,11 @@ class VehicleMetrics:
     def _latency(self) -> DurationSeries:
         return self._metrics.latency.labels(*self._label)
 
-    def _by(self, references: References) -> tuple[Counter, Counter]:
+    def _references_counters(self, references: References) -> tuple[Counter, Counter]:
         labels = (*self._label, references_name(references))
         return self._metrics.payload.labels(*labels), self._metrics.coded.labels(*labels)
 
-    def _ended(self, result: str, reason: str) -> Counter:
+    def _frames_counter(self, result: str, reason: str) -> Counter:
         counter = self._frames.get((result, reason))
         if counter is None:
             counter = self._metrics.frames.labels(*self._label, result, reason)

@@ -37,10 +37,10 @@ from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
+    Subscription,
     TwinPicture,
-    Wish,
-    watch_request,
-    watched,
+    subscription_to_wire,
+    twin_message_from_wire,
 )
 from rfcore.wire.v1 import twin_pb2_grpc
 
@@ -193,13 +193,13 @@ class WatchSettings:
             check_name("vehicle", name)
         if self.pictures is not None and self.pictures < 1:
             raise InvalidInput("pictures", f"{self.pictures} must be at least 1")
-        if self.video is not None and self.wish.encoding is not PictureEncoding.I420:
+        if self.video is not None and self.subscription.encoding is not PictureEncoding.I420:
             raise InvalidInput("encoding", f"{self.encoding} makes no video; leave it out")
-        if self.folder is not None and self.wish.encoding is PictureEncoding.NONE:
+        if self.folder is not None and self.subscription.encoding is PictureEncoding.NONE:
             raise InvalidInput("encoding", "none leaves nothing to keep; leave it out")
 
     @property
-    def wish(self) -> Wish:
+    def subscription(self) -> Subscription:
         """What to ask the server for."""
         encoding = PictureEncoding.NONE
         if self.encoding is not None:
@@ -208,7 +208,7 @@ class WatchSettings:
             encoding = PictureEncoding.I420
         elif self.folder is not None:
             encoding = PictureEncoding.JPEG
-        return Wish(self.vehicle_ids, encoding)
+        return Subscription(self.vehicle_ids, encoding)
 
 
 class TwinWatcher:
@@ -251,7 +251,7 @@ class TwinWatcher:
                 self._call.cancel()
 
     def _messages(self, channel: grpc.Channel) -> Iterator[TwinPicture | Departure]:
-        request = watch_request(self._settings.wish)
+        request = subscription_to_wire(self._settings.subscription)
         with self._lock:
             if self._stopped:
                 return
@@ -262,7 +262,7 @@ class TwinWatcher:
             for response in call:
                 if self._stopped:
                     return
-                yield watched(response)
+                yield twin_message_from_wire(response)
         except grpc.RpcError as error:
             if not self._stopped:
                 raise RfedgeError(_problem(error)) from error

@@ -1,15 +1,17 @@
-"""What Prometheus sees of the twin and those who watch it. Names begin with ``rfedge_twin_``."""
+"""Metrics of the twin and its consumers. Names begin with ``rfedge_twin_``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from enum import StrEnum
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from rfcore.wire.instruments import Family, Instruments
+from rfcore.wire.twin import PictureEncoding
 
-__all__ = ["TwinMetrics"]
+__all__ = ["ConsumerEnd", "TwinMetrics"]
 
 AGE = Family(
     "rfedge_twin_age_seconds",
@@ -21,6 +23,15 @@ MISSED = Family(
     "counter",
     "Pictures that a consumer was too slow for.",
 )
+
+
+class ConsumerEnd(StrEnum):
+    """Why a consumer's stream ended."""
+
+    LEFT = "left"
+    SLOW = "slow"
+    REFUSED = "refused"
+    DRAINED = "drained"
 
 
 class TwinMetrics:
@@ -51,8 +62,10 @@ class TwinMetrics:
         self.sent_age = make.seconds(
             "rfedge_twin_sent_age_seconds", "Seconds from capture to handing over to a consumer."
         )
-        for reason in ("left", "slow", "refused", "drained"):
+        for reason in ConsumerEnd:
             self.ended.labels(reason)
+        for encoding in PictureEncoding:
+            self.sent.labels(encoding)
 
 
 class _Ages(Collector):

@@ -1,8 +1,7 @@
-"""TwinService over grpc.aio: one coroutine a consumer, between its mailbox and its stream.
+"""TwinService over grpc.aio: one coroutine per consumer, between its mailbox and its stream.
 
-Pictures of the twin as consumers want them: each is encoded once, for however many.
-
-Runs on one thread of its own, so that consumers cost vehicles no worker.
+Pictures are encoded on one thread of their own, each once for however many consumers, so that
+consumers take no time from the workers that decode.
 """
 
 from __future__ import annotations
@@ -10,27 +9,35 @@ from __future__ import annotations
 import asyncio
 import time
 from concurrent.futures import ThreadPoolExecutor
-from enum import StrEnum
 from weakref import WeakKeyDictionary
 
 import grpc
 import structlog
 
 from mec_server.config import ConsumerLimits
-from mec_server.twin.metrics import TwinMetrics
+from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
 from mec_server.twin.state import Mailbox, Twin, TwinView
 from rfcore.errors import InvalidInput
 from rfcore.image import I420, jpeg_bytes, png_bytes
 from rfcore.native.yuv import rgb_from_i420
-from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, Wish, watch_response, wish_of
+from rfcore.wire.twin import (
+    Departure,
+    PictureEncoding,
+    Subscription,
+    TwinPicture,
+    subscription_from_wire,
+    twin_message_to_wire,
+)
 from rfcore.wire.v1 import twin_pb2 as pb
 from rfcore.wire.v1 import twin_pb2_grpc
 
 __all__ = ["TwinPictures", "TwinService", "encoded"]
 
+log = structlog.get_logger()
+
 
 class TwinPictures:
-    """Encodes views; what was encoded is kept as long as its view."""
+    """Encodes views; an encoded picture is kept as long as its view."""
 
     def __init__(self) -> None:
         self._executor = ThreadPoolExecutor(1, "twin")
@@ -64,21 +71,11 @@ def encoded(picture: I420, encoding: PictureEncoding) -> bytes:
             return png_bytes(rgb_from_i420(picture))
 
 
-log = structlog.get_logger()
 Context = grpc.aio.ServicerContext[pb.WatchRequest, pb.WatchResponse]
 
 
-class End(StrEnum):
-    """How a consumer ended."""
-
-    LEFT = "left"
-    SLOW = "slow"
-    REFUSED = "refused"
-    DRAINED = "drained"
-
-
 class TwinService(twin_pb2_grpc.TwinServiceServicer):
-    """Shows ``twin`` to consumers."""
+    """Streams the pictures of ``twin`` to consumers."""
 
     def __init__(self, twin: Twin, metrics: TwinMetrics, limits: ConsumerLimits) -> None:
         self._twin = twin
@@ -93,7 +90,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         twin_pb2_grpc.add_TwinServiceServicer_to_server(self, server)
 
     def drain(self) -> None:
-        """Let every consumer go."""
+        """End the stream of every consumer."""
         self._draining.set()
 
     def close(self) -> None:
@@ -103,33 +100,33 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
     async def Watch(  # type: ignore[override]  # noqa: N802 (a coroutine that writes will do)
         self, request: pb.WatchRequest, context: Context
     ) -> None:
-        """Send what is to be seen, until the consumer leaves."""
+        """Send pictures until the consumer leaves, reads too slowly, or the server drains."""
         try:
-            wish = wish_of(request)
+            subscription = subscription_from_wire(request)
         except InvalidInput as error:
             await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
         if self._watching >= self._limits.consumers:
-            self._metrics.ended.labels(End.REFUSED).inc()
+            self._metrics.ended.labels(ConsumerEnd.REFUSED).inc()
             await context.abort(
                 grpc.StatusCode.RESOURCE_EXHAUSTED,
                 f"{self._watching} consumers watch, {self._limits.consumers} may; try again later",
             )
         self._watching += 1
         self._metrics.consumers.inc()
-        end = End.LEFT
+        end = ConsumerEnd.LEFT
         try:
             end = await _Consumer(self._twin, self._pictures, self._metrics, context).serve(
-                wish, self._limits.patience_s, self._draining
+                subscription, self._limits.stalled_s, self._draining
             )
         finally:
             self._watching -= 1
             self._metrics.consumers.dec()
             self._metrics.ended.labels(end).inc()
             log.info("consumer ended", peer=context.peer(), reason=str(end))
-        if end is End.SLOW:
+        if end is ConsumerEnd.SLOW:
             await context.abort(
                 grpc.StatusCode.RESOURCE_EXHAUSTED,
-                f"nothing was taken for {self._limits.patience_s:g} s; read faster",
+                f"nothing was taken for {self._limits.stalled_s:g} s; read faster",
             )
 
 
@@ -145,12 +142,16 @@ class _Consumer:
         self._context = context
         self._arrived = asyncio.Event()
 
-    async def serve(self, wish: Wish, patience_s: float, draining: asyncio.Event) -> End:
-        """Serve to the end, and say how it ended."""
-        mailbox = self._twin.watch(wish, self._arrived.set)
+    async def serve(
+        self, subscription: Subscription, stalled_s: float, draining: asyncio.Event
+    ) -> ConsumerEnd:
+        """Write what arrives, to the end; return how it ended."""
+        mailbox = self._twin.watch(subscription, self._arrived.set)
         drained = asyncio.create_task(draining.wait())
         try:
-            await self._context.send_initial_metadata(())  # from here on nothing is missed unseen
+            await self._context.send_initial_metadata(
+                ()
+            )  # from here on every missed picture is counted
             while not draining.is_set():
                 entry = mailbox.take()
                 if entry is None:
@@ -159,14 +160,14 @@ class _Consumer:
                 writing = asyncio.create_task(self._write(mailbox, entry))
                 await asyncio.wait(
                     {writing, drained},
-                    timeout=patience_s,
+                    timeout=stalled_s,
                     return_when=asyncio.FIRST_COMPLETED,
                 )
                 if not writing.done():
                     writing.cancel()
-                    return End.DRAINED if draining.is_set() else End.SLOW
+                    return ConsumerEnd.DRAINED if draining.is_set() else ConsumerEnd.SLOW
                 writing.result()
-            return End.DRAINED
+            return ConsumerEnd.DRAINED
         finally:
             drained.cancel()
             self._twin.unwatch(mailbox)
@@ -179,12 +180,12 @@ class _Consumer:
 
     async def _write(self, mailbox: Mailbox, entry: TwinView | Departure) -> None:
         if isinstance(entry, Departure):
-            await self._context.write(watch_response(entry))
+            await self._context.write(twin_message_to_wire(entry))
             return
-        encoding = mailbox.wish.encoding
+        encoding = mailbox.subscription.encoding
         data = await self._pictures.bytes_of(entry, encoding)
         age_s = entry.age_s(time.monotonic())
-        message = watch_response(_message(entry, age_s, mailbox, data))
+        message = twin_message_to_wire(_message(entry, age_s, mailbox, data))
         await self._context.write(message)
         self._metrics.sent.labels(encoding).inc()
         self._metrics.bytes.inc(message.ByteSize())
@@ -205,7 +206,7 @@ def _message(view: TwinView, age_s: float, mailbox: Mailbox, data: bytes) -> Twi
         intrinsics=view.intrinsics,
         field_id=view.field_id,
         reconstruction_digest=view.digest,
-        encoding=mailbox.wish.encoding,
+        encoding=mailbox.subscription.encoding,
         picture=data,
         skipped=mailbox.skipped[view.key],
     )

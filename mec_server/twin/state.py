@@ -1,9 +1,9 @@
-"""The twin: the newest picture of every camera, and a mailbox for each who watches.
+"""The twin: the newest picture of every camera, and a mailbox for each consumer.
 
 Without asyncio or clock. ``show`` costs the same whether anybody reads or not: a mailbox holds at
-most the newest picture of a camera, and its departure, so whoever reads slowly misses pictures, but
-never the last, and delays nobody. One vehicle is one entry whatever number of streams it has: the
-newest capture wins.
+most the newest picture of a camera and its departure, so a consumer that reads slowly misses
+pictures, but never the last one, and delays nobody. A vehicle is one entry however many streams it
+has: the newest capture wins.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from rfcore.camera import Intrinsics
 from rfcore.image import I420
 from rfcore.wire.messages import Frame
-from rfcore.wire.twin import Departure, Wish
+from rfcore.wire.twin import Departure, Subscription
 
 __all__ = ["CameraKey", "Mailbox", "Twin", "TwinView"]
 
@@ -48,10 +48,10 @@ class TwinView:
 
 
 class Mailbox:
-    """What one consumer has not taken yet; ``arrived`` is called when there is something."""
+    """What one consumer has not taken yet; ``arrived`` is called for each new entry."""
 
-    def __init__(self, wish: Wish, arrived: Callable[[], None]) -> None:
-        self.wish = wish
+    def __init__(self, subscription: Subscription, arrived: Callable[[], None]) -> None:
+        self.subscription = subscription
         self.skipped: Counter[CameraKey] = Counter()
         self._arrived = arrived
         self._entries: OrderedDict[tuple[CameraKey, type], TwinView | Departure] = OrderedDict()
@@ -62,7 +62,7 @@ class Mailbox:
     def put(self, key: CameraKey, entry: TwinView | Departure) -> bool:
         """Keep ``entry``: a picture in place of an older one of its camera, or of its departure; a
         departure behind its last picture. Return whether a picture was missed."""
-        if not self.wish.includes(key[0]):
+        if not self.subscription.includes(key[0]):
             return False
         missed = isinstance(entry, TwinView) and (key, TwinView) in self._entries
         if isinstance(entry, TwinView):
@@ -84,7 +84,7 @@ class Mailbox:
 
 
 class Twin:
-    """The state of the street, as pictures."""
+    """The newest picture of every camera of every vehicle."""
 
     def __init__(self) -> None:
         self._views: dict[CameraKey, TwinView] = {}
@@ -92,27 +92,27 @@ class Twin:
         self.missed = 0
 
     def show(self, view: TwinView) -> None:
-        """Take in a picture, unless another stream of its vehicle has brought a newer one."""
-        seen = self._views.get(view.key)
+        """Take in a picture, unless another stream of its vehicle has sent a newer one."""
+        newest = self._views.get(view.key)
         if (
-            seen is not None
-            and seen.session_id != view.session_id
-            and seen.frame.capture_time_ns > view.frame.capture_time_ns
+            newest is not None
+            and newest.session_id != view.session_id
+            and newest.frame.capture_time_ns > view.frame.capture_time_ns
         ):
             return
         self._views[view.key] = view
         self._tell(view.key, view)
 
     def leave(self, session_id: str) -> None:
-        """A stream ended: cameras that no other stream took over are no longer seen."""
+        """Remove the cameras of a stream that ended, unless another stream took them over."""
         for key, view in tuple(self._views.items()):
             if view.session_id == session_id:
                 del self._views[key]
                 self._tell(key, Departure(*key))
 
-    def watch(self, wish: Wish, arrived: Callable[[], None]) -> Mailbox:
-        """Return a new consumer's mailbox, with what is to be seen now in it."""
-        mailbox = Mailbox(wish, arrived)
+    def watch(self, subscription: Subscription, arrived: Callable[[], None]) -> Mailbox:
+        """Return a new consumer's mailbox, filled with the newest picture of each camera."""
+        mailbox = Mailbox(subscription, arrived)
         for key, view in self._views.items():
             mailbox.put(key, view)
         self._mailboxes.append(mailbox)

@@ -32,6 +32,7 @@ from rfcore.field.splats import SplatField
 from rfcore.files import write_whole
 
 __all__ = [
+    "FIELD_ID",
     "READERS",
     "FieldFile",
     "FieldStore",
@@ -122,6 +123,7 @@ def save_field(field: RadianceField, path: Path) -> str:
 
 SUFFIX = ".rff"
 FIELD_ID = re.compile(r"[0-9a-f]{64}")
+"""What a field id looks like: the hexadecimal digits of a SHA-256."""
 Stamp = tuple[Path, int, int]
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 
 from rfcore.errors import InvalidInput
+from rfcore.field.store import FIELD_ID
 
 __all__ = [
     "FIELD_ID_PREFIX_BYTES",
@@ -44,7 +45,6 @@ FIELD_ID_PREFIX_BYTES = 8
 """Of the 32 bytes of a field's sha256, how many each frame repeats."""
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-FIELD_ID = re.compile(r"[0-9a-f]{64}")
 
 
 def shown(text: str) -> str:

@@ -1,4 +1,4 @@
-"""What a server tells those who watch its twin: plain values, and between them and protobuf.
+"""Messages between a server's twin and its consumers: plain values, to and from protobuf.
 
 What comes from a peer is checked here: a request that is wrong raises ``InvalidInput``, a response
 that is wrong ``ProtocolError``.
@@ -19,12 +19,12 @@ __all__ = [
     "MAX_WATCHED_VEHICLES",
     "Departure",
     "PictureEncoding",
+    "Subscription",
     "TwinPicture",
-    "Wish",
-    "watch_request",
-    "watch_response",
-    "watched",
-    "wish_of",
+    "subscription_from_wire",
+    "subscription_to_wire",
+    "twin_message_from_wire",
+    "twin_message_to_wire",
 ]
 
 MAX_WATCHED_VEHICLES: Final = 256
@@ -41,14 +41,14 @@ class PictureEncoding(StrEnum):
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What a consumer wants to see; no vehicle named means all of them."""
+class Subscription:
+    """What a consumer asks for: pictures of these vehicles (none named: all), in one encoding."""
 
     vehicle_ids: frozenset[str] = frozenset()
     encoding: PictureEncoding = PictureEncoding.JPEG
 
     def includes(self, vehicle_id: str) -> bool:
-        """Return whether the consumer wants to see this vehicle."""
+        """Return whether pictures of this vehicle are asked for."""
         return not self.vehicle_ids or vehicle_id in self.vehicle_ids
 
 
@@ -74,38 +74,39 @@ class TwinPicture:
 
 @dataclass(frozen=True)
 class Departure:
-    """A vehicle's camera is no longer seen."""
+    """A vehicle's camera sends no more pictures."""
 
     vehicle_id: str
     camera_id: str
 
 
-def watch_request(wish: Wish) -> twin_pb2.WatchRequest:
-    """Return a consumer's request."""
+def subscription_to_wire(subscription: Subscription) -> twin_pb2.WatchRequest:
+    """Return a consumer's request as protobuf."""
     return twin_pb2.WatchRequest(
-        vehicle_ids=sorted(wish.vehicle_ids), encoding=_encoding_to_wire(wish.encoding)
+        vehicle_ids=sorted(subscription.vehicle_ids),
+        encoding=_encoding_to_wire(subscription.encoding),
     )
 
 
-def wish_of(request: twin_pb2.WatchRequest) -> Wish:
-    """Return what a consumer wants; raise ``InvalidInput`` for what nobody can have."""
+def subscription_from_wire(request: twin_pb2.WatchRequest) -> Subscription:
+    """Return what a consumer asks for; raise ``InvalidInput`` for a value outside its limits."""
     check_range("vehicle_ids", len(request.vehicle_ids), 0, MAX_WATCHED_VEHICLES)
     names = (check_name(f"vehicle_ids[{i}]", name) for i, name in enumerate(request.vehicle_ids))
     if request.encoding == twin_pb2.PICTURE_ENCODING_UNSPECIFIED:
-        return Wish(frozenset(names))
-    return Wish(frozenset(names), _encoding_from_wire(request.encoding))
+        return Subscription(frozenset(names))
+    return Subscription(frozenset(names), _encoding_from_wire(request.encoding))
 
 
-def watch_response(message: TwinPicture | Departure) -> twin_pb2.WatchResponse:
-    """Return a server's message."""
+def twin_message_to_wire(message: TwinPicture | Departure) -> twin_pb2.WatchResponse:
+    """Return a server's message as protobuf."""
     if isinstance(message, Departure):
         departure = twin_pb2.Departure(vehicle_id=message.vehicle_id, camera_id=message.camera_id)
         return twin_pb2.WatchResponse(departure=departure)
     return twin_pb2.WatchResponse(picture=_picture_to_wire(message))
 
 
-def watched(response: twin_pb2.WatchResponse) -> TwinPicture | Departure:
-    """Return what a server said; raise ``ProtocolError`` if it cannot be."""
+def twin_message_from_wire(response: twin_pb2.WatchResponse) -> TwinPicture | Departure:
+    """Return a server's message; raise ``ProtocolError`` for one no server of ours would send."""
     try:
         match response.WhichOneof("message"):
             case "picture":

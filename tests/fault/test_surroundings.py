@@ -16,7 +16,7 @@ import pytest
 
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.twin import PictureEncoding, Wish, watch_request
+from rfcore.wire.twin import PictureEncoding, Subscription, subscription_to_wire
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.certs.authority import Members, certify, write_certificates
 
@@ -101,7 +101,7 @@ async def test_a_viewer_that_does_not_read(streaming: Any, case: Any) -> None:
                 grpc.aio.insecure_channel(server.address, options=CHANNEL_OPTIONS)
             )
             call = twin_pb2_grpc.TwinServiceStub(channel).Watch(
-                watch_request(Wish(encoding=PictureEncoding.I420))
+                subscription_to_wire(Subscription(encoding=PictureEncoding.I420))
             )
             await call.initial_metadata()
         before_bytes = server.rss_bytes()

@@ -24,7 +24,14 @@ from rfcore.camera import TileOrigin
 from rfcore.field import FieldMetadata, SplatField, save_field
 from rfcore.wire.conventions import CHANNEL_OPTIONS
 from rfcore.wire.tiles import Area
-from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, Wish, watch_request, watched
+from rfcore.wire.twin import (
+    Departure,
+    PictureEncoding,
+    Subscription,
+    TwinPicture,
+    subscription_to_wire,
+    twin_message_from_wire,
+)
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.demo.processes import command_of
 from rfedge.fields.publish import Ground, publish
@@ -98,9 +105,9 @@ async def seen_at(address: str, seen: list[TwinPicture | Departure]) -> None:
     """Collect what a consumer of one server's twin sees."""
     async with grpc.aio.insecure_channel(address, options=CHANNEL_OPTIONS) as channel:
         stub = twin_pb2_grpc.TwinServiceStub(channel)
-        responses = stub.Watch(watch_request(Wish(encoding=PictureEncoding.NONE)))
+        responses = stub.Watch(subscription_to_wire(Subscription(encoding=PictureEncoding.NONE)))
         while (response := await responses.read()) is not grpc.aio.EOF:
-            seen.append(watched(response))
+            seen.append(twin_message_from_wire(response))
 
 
 def stays_ns(seen: list[TwinPicture | Departure]) -> list[tuple[int, int]]:

@@ -17,7 +17,13 @@ from rfcore.wire.address import own_problem
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.tls import TlsFiles
-from rfcore.wire.twin import PictureEncoding, TwinPicture, Wish, watch_request, watched
+from rfcore.wire.twin import (
+    PictureEncoding,
+    Subscription,
+    TwinPicture,
+    subscription_to_wire,
+    twin_message_from_wire,
+)
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.certs.authority import Members, certify, write_certificates
 from rfedge.watch import WatchSettings, watch
@@ -192,7 +198,9 @@ async def test_no_service_answers_without_a_certificate(
                 stub = health_pb2_grpc.HealthStub(channel)
                 call: Any = stub.Check(health_pb2.HealthCheckRequest())
             elif service == "watch":
-                call = twin_pb2_grpc.TwinServiceStub(channel).Watch(watch_request(Wish()))
+                call = twin_pb2_grpc.TwinServiceStub(channel).Watch(
+                    subscription_to_wire(Subscription())
+                )
             else:
                 call = channel.stream_stream(STREAM_METHOD)()
             assert await call.code() is grpc.StatusCode.UNAVAILABLE
@@ -238,11 +246,11 @@ async def test_a_consumer_asks_for_health_and_sees_the_drive(
     ):
         health = await health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest())
         assert health.status == health_pb2.HealthCheckResponse.SERVING
-        wish = Wish(encoding=PictureEncoding.NONE)
-        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(watch_request(wish))
+        subscription = Subscription(encoding=PictureEncoding.NONE)
+        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(subscription_to_wire(subscription))
         await call.initial_metadata()
         await travel(server.address, tls=certs("vehicle-cav-1"))
-        seen = watched(await call.read())
+        seen = twin_message_from_wire(await call.read())
         assert isinstance(seen, TwinPicture)
         assert seen.vehicle_id == "cav-1"
 

@@ -23,10 +23,10 @@ from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
+    Subscription,
     TwinPicture,
-    Wish,
-    watch_request,
-    watched,
+    subscription_to_wire,
+    twin_message_from_wire,
 )
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.demo.processes import command_of
@@ -34,9 +34,9 @@ from rfedge.watch import WatchSettings, watch
 
 
 @asynccontextmanager
-async def consumer(address: object, wish: Wish) -> AsyncIterator[Any]:
+async def consumer(address: object, subscription: Subscription) -> AsyncIterator[Any]:
     async with grpc.aio.insecure_channel(str(address), options=CHANNEL_OPTIONS) as channel:
-        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(watch_request(wish))
+        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(subscription_to_wire(subscription))
         await call.initial_metadata()
         yield call
 
@@ -44,7 +44,7 @@ async def consumer(address: object, wish: Wish) -> AsyncIterator[Any]:
 async def next_of(call: Any) -> TwinPicture | Departure:
     response = await call.read()
     assert response is not grpc.aio.EOF
-    return watched(response)
+    return twin_message_from_wire(response)
 
 
 async def seen_until_departure(call: Any) -> list[TwinPicture]:
@@ -62,7 +62,7 @@ def planes(picture: TwinPicture) -> I420:
 async def test_a_consumer_sees_to_the_bit_what_the_vehicle_holds(serve: Any, travel: Any) -> None:
     async with (
         serve() as server,
-        consumer(server.address, Wish(encoding=PictureEncoding.I420)) as call,
+        consumer(server.address, Subscription(encoding=PictureEncoding.I420)) as call,
     ):
         record = await travel(server.address)
         pictures = await seen_until_departure(call)
@@ -83,10 +83,12 @@ async def test_a_picture_comes_in_the_encoding_that_was_asked_for(
 ) -> None:
     """JPEG at quality 90 with half the chroma stays within a few levels on average."""
     async with serve() as server:
-        async with consumer(server.address, Wish(encoding=PictureEncoding.I420)) as call:
+        async with consumer(server.address, Subscription(encoding=PictureEncoding.I420)) as call:
             await travel(server.address)
             exact = (await seen_until_departure(call))[-1]
-        async with consumer(server.address, Wish(encoding=PictureEncoding(encoding))) as call:
+        async with consumer(
+            server.address, Subscription(encoding=PictureEncoding(encoding))
+        ) as call:
             await travel(server.address)
             picture = (await seen_until_departure(call))[-1]
     assert picture.encoding == encoding
@@ -101,11 +103,11 @@ async def test_a_picture_comes_in_the_encoding_that_was_asked_for(
 async def test_a_consumer_that_never_reads_slows_no_vehicle_and_is_let_go(
     serve: Any, travel: Any
 ) -> None:
-    """Its window is full after a few pictures; what it misses is counted, and patience ends."""
-    limits = ConsumerLimits(patience_s=3.0)
+    """Its window is full after a few pictures; misses are counted; after 3 s it is let go."""
+    limits = ConsumerLimits(stalled_s=3.0)
     async with serve(consumers=limits) as server:
         value = server.registry.get_sample_value
-        async with consumer(server.address, Wish(encoding=PictureEncoding.I420)):
+        async with consumer(server.address, Subscription(encoding=PictureEncoding.I420)):
             while not value("rfedge_twin_pictures_missed_total"):
                 record = await travel(server.address)
                 assert record.counts == {"acked": 6}
@@ -121,30 +123,32 @@ async def test_consumers_are_limited_and_one_that_leaves_makes_room(
 ) -> None:
     async with serve(consumers=ConsumerLimits(consumers=1)) as server:
         value = server.registry.get_sample_value
-        async with consumer(server.address, Wish()) as first:
+        async with consumer(server.address, Subscription()) as first:
             await travel(server.address)
             assert isinstance(await next_of(first), TwinPicture)
-            async with consumer(server.address, Wish()) as second:
+            async with consumer(server.address, Subscription()) as second:
                 assert await second.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
                 assert "1 consumers watch, 1 may" in await second.details()
         while value("rfedge_twin_consumers"):
             await asyncio.sleep(0.01)
         assert value("rfedge_twin_consumers_ended_total", {"reason": "left"}) == 1
         assert value("rfedge_twin_consumers_ended_total", {"reason": "refused"}) == 1
-        async with consumer(server.address, Wish()) as third:
+        async with consumer(server.address, Subscription()) as third:
             await travel(server.address)
             assert isinstance(await next_of(third), TwinPicture)
 
 
 @pytest.mark.parametrize(
-    ("wish", "problem"),
+    ("subscription", "problem"),
     [
-        (Wish(frozenset({"../etc"})), "vehicle_ids"),
-        (Wish(frozenset(str(i) for i in range(257))), "vehicle_ids: 257 is outside 0..256"),
+        (Subscription(frozenset({"../etc"})), "vehicle_ids"),
+        (Subscription(frozenset(str(i) for i in range(257))), "vehicle_ids: 257 is outside 0..256"),
     ],
 )
-async def test_a_wish_nobody_can_have_is_refused(serve: Any, wish: Wish, problem: str) -> None:
-    async with serve() as server, consumer(server.address, wish) as call:
+async def test_a_subscription_nobody_can_have_is_refused(
+    serve: Any, subscription: Subscription, problem: str
+) -> None:
+    async with serve() as server, consumer(server.address, subscription) as call:
         assert await call.code() is grpc.StatusCode.INVALID_ARGUMENT
         assert problem in await call.details()
 
@@ -154,7 +158,7 @@ async def consumer_of_stopping(serve: Any) -> AsyncIterator[Any]:
     """A consumer whose server stops while it watches."""
     async with AsyncExitStack() as stack:
         server = await stack.enter_async_context(serve())
-        call = await stack.enter_async_context(consumer(server.address, Wish()))
+        call = await stack.enter_async_context(consumer(server.address, Subscription()))
         assert server.registry.get_sample_value("rfedge_twin_consumers") == 1
         await server.stop()
         yield call
@@ -170,7 +174,7 @@ async def test_the_age_of_the_twin_is_there_while_a_vehicle_streams(
 ) -> None:
     async with serve(metrics=MetricsSettings(per_vehicle=True)) as server:
         value = server.registry.get_sample_value
-        async with consumer(server.address, Wish(encoding=PictureEncoding.NONE)) as call:
+        async with consumer(server.address, Subscription(encoding=PictureEncoding.NONE)) as call:
             driving = asyncio.create_task(travel(server.address))
             while (age_s := value("rfedge_twin_age_seconds", {"vehicle": "cav-1"})) is None:
                 await asyncio.sleep(0)

@@ -18,13 +18,13 @@ import pytest
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.errors import RfedgeError
-from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, watch_response
+from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, twin_message_to_wire
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge import watch as module
 from rfedge.demo.processes import command_of
 from rfedge.watch import TwinWatcher, WatchSettings, watch_until_stopped
 
-DEPARTURE = watch_response(Departure("cav-1", "front"))
+DEPARTURE = twin_message_to_wire(Departure("cav-1", "front"))
 STARTED_S = 60.0
 
 
@@ -67,7 +67,7 @@ class EndlessTwin(twin_pb2_grpc.TwinServiceServicer):
             over.wait()
         while not over.is_set():
             self.sent += 1
-            yield watch_response(grey(self.sent)) if self.pictures else DEPARTURE
+            yield twin_message_to_wire(grey(self.sent)) if self.pictures else DEPARTURE
             if self.sent >= self.enough_at:
                 self.enough.set()
 

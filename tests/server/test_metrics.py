@@ -1,11 +1,25 @@
-"""Vehicles are told apart in the metrics only when asked, and leave nothing behind."""
+"""Vehicles are told apart in the metrics only when asked, and no peer can add label values."""
+
+import ast
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import permutations
+from pathlib import Path
 
 import pytest
 from prometheus_client import CollectorRegistry
 
-from mec_server.metrics import ServerMetrics
+import mec_server
+from mec_server.decoding.process import LossCause
+from mec_server.metrics import STAGES, ServerMetrics
+from mec_server.quotas import Limit
+from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
+from rfcore.codec.h264.config import REFERENCE_FRAMES
+from rfcore.codec.references import Reference, references_name
 from rfcore.errors import RejectReason
+from rfcore.field.interface import KINDS
 from rfcore.wire.messages import Ack, Frame, FrameAddress, Nack, StageTimes
+from rfcore.wire.twin import PictureEncoding
 
 ADDRESS = FrameAddress("front", 0, 0)
 
@@ -53,3 +67,76 @@ def test_with_the_flag_a_vehicles_series_leave_with_its_last_stream(
     assert vehicles(registry) == {"cav-1", "cav-2"}, "its other stream lives"
     metrics.forget("cav-1")
     assert vehicles(registry) == {"cav-2"}
+
+
+REFERENCES = [
+    order for count in range(REFERENCE_FRAMES + 1) for order in permutations(Reference, count)
+]
+CLOSED = {
+    "result": {"acked", "nacked"},
+    "reason": {"", *RejectReason, *ConsumerEnd},
+    "references": set(map(references_name, REFERENCES)),
+    "stage": set(STAGES),
+    "limit": set(Limit),
+    "cause": set(LossCause),
+    "encoding": set(PictureEncoding),
+    "kind": set(KINDS),
+}
+"""The values that each label can have."""
+
+OWN = {"field", "version", "renderer_contract", "python"}
+"""Labels whose values the operator decides on, with what is installed and served."""
+
+
+def both(registry: CollectorRegistry) -> ServerMetrics:
+    """Return the server's metrics, with the twin's on the same registry."""
+    metrics = ServerMetrics(registry)
+    TwinMetrics(metrics.instruments, dict, int)
+    return metrics
+
+
+def test_every_label_of_the_server_is_a_closed_set_or_the_operators_own(
+    registry: CollectorRegistry,
+) -> None:
+    families = both(registry).instruments.families
+    assert {label for family in families for label in family.labels} <= set(CLOSED) | OWN
+
+
+def test_whatever_frames_and_answers_hold_label_values_stay_within_their_sets(
+    registry: CollectorRegistry, make_frame: Callable[..., Frame]
+) -> None:
+    metrics = both(registry)
+    stream = metrics.of("cav-1")
+    for number, references in enumerate(REFERENCES):
+        frame = make_frame(number)
+        stream.received(replace(frame, packet=_predicted(frame, references)), 500)
+    for reason in RejectReason:
+        problem = f"no answer to frame {reason} within 1.4 s"
+        stream.answered([Nack(ADDRESS, reason, problem)])
+    stream.answered([Ack(ADDRESS, StageTimes(), b"d" * 16)])
+    seen = {
+        (name, value)
+        for family in registry.collect()
+        for sample in family.samples
+        for name, value in sample.labels.items()
+        if name not in {"le", *OWN}
+    }
+    assert seen <= {(name, str(value)) for name, values in CLOSED.items() for value in values}
+    assert {value for name, value in seen if name == "references"} == CLOSED["references"]
+
+
+def _predicted(frame: Frame, references: tuple[Reference, ...]) -> object:
+    base = b"" if set(references) <= {Reference.RENDER} else b"b" * 16
+    return replace(frame.packet, references=references, base_digest=base)
+
+
+def test_every_limit_the_server_raises_is_one_of_the_enumeration() -> None:
+    """``limit`` is counted as a label; a text made on the spot would be a new series each time."""
+    raised = [
+        ast.unparse(call.args[0])
+        for path in Path(mec_server.__path__[0]).rglob("*.py")
+        for call in ast.walk(ast.parse(path.read_text()))
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == "LimitExceeded"
+    ]
+    assert len(raised) >= len(Limit)
+    assert {name.removeprefix("Limit.") for name in raised} == {limit.name for limit in Limit}

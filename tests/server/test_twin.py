@@ -12,7 +12,7 @@ from mec_server.twin.state import Mailbox, Twin, TwinView
 from rfcore.camera import Intrinsics
 from rfcore.image import I420
 from rfcore.wire.messages import Frame
-from rfcore.wire.twin import Wish
+from rfcore.wire.twin import Subscription
 
 PICTURE = I420(*(np.zeros(size, np.uint8) for size in ((2, 2), (1, 1), (1, 1))))
 INTRINSICS = Intrinsics(2, 2, 1.0, 1.0, 1.0, 1.0)
@@ -45,7 +45,7 @@ def test_a_mailbox_keeps_the_newest_of_each_camera_and_counts_what_was_missed(
     view: MakeView,
 ) -> None:
     twin, calls = Twin(), []
-    mailbox = twin.watch(Wish(), lambda: calls.append(1))
+    mailbox = twin.watch(Subscription(), lambda: calls.append(1))
     for sequence in range(5):
         twin.show(view("cav-1", sequence=sequence))
     twin.show(view("cav-2", sequence=0))
@@ -57,7 +57,7 @@ def test_a_mailbox_keeps_the_newest_of_each_camera_and_counts_what_was_missed(
 
 def test_a_camera_that_is_shown_often_does_not_push_the_others_back(view: MakeView) -> None:
     twin = Twin()
-    mailbox = twin.watch(Wish(), lambda: None)
+    mailbox = twin.watch(Subscription(), lambda: None)
     for sequence in range(3):
         for vehicle in ("fast", "slow"):
             if vehicle == "fast" or sequence == 0:
@@ -68,12 +68,12 @@ def test_a_camera_that_is_shown_often_does_not_push_the_others_back(view: MakeVi
 def test_a_new_consumer_sees_at_once_what_is_there(view: MakeView) -> None:
     twin = Twin()
     twin.show(view("cav-1", sequence=7))
-    assert taken(twin.watch(Wish(), lambda: None)) == [("cav-1", 7)]
+    assert taken(twin.watch(Subscription(), lambda: None)) == [("cav-1", 7)]
 
 
 def test_a_consumer_gets_only_the_vehicles_it_named(view: MakeView) -> None:
     twin = Twin()
-    mailbox = twin.watch(Wish(frozenset({"cav-2"})), lambda: None)
+    mailbox = twin.watch(Subscription(frozenset({"cav-2"})), lambda: None)
     for vehicle in ("cav-1", "cav-2"):
         twin.show(view(vehicle))
     twin.leave("s-1")
@@ -88,7 +88,7 @@ def test_a_vehicle_with_two_streams_is_one_vehicle_and_the_newest_capture_wins(
     twin.show(view(session="old", sequence=5, captured_ns=500))
     twin.show(view(session="new", sequence=0, captured_ns=600))
     twin.show(view(session="old", sequence=6, captured_ns=550))
-    mailbox = twin.watch(Wish(), lambda: None)
+    mailbox = twin.watch(Subscription(), lambda: None)
     twin.leave("old")
     assert taken(mailbox) == [("cav-1", 0)], "the old stream takes nobody with it"
     twin.leave("new")
@@ -98,7 +98,7 @@ def test_a_vehicle_with_two_streams_is_one_vehicle_and_the_newest_capture_wins(
 
 def test_within_a_stream_a_clock_that_is_set_back_does_not_freeze_the_twin(view: MakeView) -> None:
     twin = Twin()
-    mailbox = twin.watch(Wish(), lambda: None)
+    mailbox = twin.watch(Subscription(), lambda: None)
     twin.show(view(sequence=0, captured_ns=10**18))
     twin.show(view(sequence=1, captured_ns=5))
     assert taken(mailbox) == [("cav-1", 1)]
@@ -114,7 +114,7 @@ def test_the_age_is_that_of_the_oldest_newest_picture_and_grows(view: MakeView) 
 
 def test_a_consumer_that_left_costs_nothing(view: MakeView) -> None:
     twin = Twin()
-    mailbox = twin.watch(Wish(), lambda: None)
+    mailbox = twin.watch(Subscription(), lambda: None)
     twin.unwatch(mailbox)
     twin.show(view())
     assert len(mailbox) == 0
@@ -122,7 +122,7 @@ def test_a_consumer_that_left_costs_nothing(view: MakeView) -> None:
 
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.booleans()), max_size=40))
 def test_what_was_shown_is_taken_or_missed_and_never_both(steps: list[tuple[str, bool]]) -> None:
-    mailbox, shown, got = Mailbox(Wish(), lambda: None), 0, 0
+    mailbox, shown, got = Mailbox(Subscription(), lambda: None), 0, 0
     for name, is_take in steps:
         if is_take:
             got += mailbox.take() is not None
@@ -137,7 +137,7 @@ def test_what_was_shown_is_taken_or_missed_and_never_both(steps: list[tuple[str,
 
 def test_the_last_picture_is_seen_before_the_departure(view: MakeView) -> None:
     twin = Twin()
-    mailbox = twin.watch(Wish(), lambda: None)
+    mailbox = twin.watch(Subscription(), lambda: None)
     for sequence in (0, 1):
         twin.show(view(sequence=sequence))
     twin.leave("s-1")
@@ -147,7 +147,7 @@ def test_the_last_picture_is_seen_before_the_departure(view: MakeView) -> None:
 
 def test_who_is_back_has_not_departed(view: MakeView) -> None:
     twin = Twin()
-    mailbox = twin.watch(Wish(), lambda: None)
+    mailbox = twin.watch(Subscription(), lambda: None)
     twin.show(view(sequence=0))
     twin.leave("s-1")
     twin.show(view(session="s-2", sequence=7))

@@ -9,12 +9,12 @@ from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
+    Subscription,
     TwinPicture,
-    Wish,
-    watch_request,
-    watch_response,
-    watched,
-    wish_of,
+    subscription_from_wire,
+    subscription_to_wire,
+    twin_message_from_wire,
+    twin_message_to_wire,
 )
 from rfcore.wire.v1 import twin_pb2
 
@@ -28,30 +28,34 @@ PICTURE = TwinPicture(
     st.frozensets(st.from_regex(r"[a-z][a-z0-9._-]{0,20}", fullmatch=True), max_size=5),
     st.sampled_from(PictureEncoding),
 )
-def test_a_wish_survives_the_wire(vehicles: frozenset[str], encoding: PictureEncoding) -> None:
-    wish = Wish(vehicles, encoding)
-    assert wish_of(watch_request(wish)) == wish
+def test_a_subscription_survives_the_wire(
+    vehicles: frozenset[str], encoding: PictureEncoding
+) -> None:
+    subscription = Subscription(vehicles, encoding)
+    assert subscription_from_wire(subscription_to_wire(subscription)) == subscription
 
 
 @pytest.mark.parametrize("message", [PICTURE, Departure("cav-1", "front")])
 def test_a_message_survives_the_wire(message: TwinPicture | Departure) -> None:
-    sent = watch_response(message).SerializeToString()
-    assert watched(twin_pb2.WatchResponse.FromString(sent)) == message
+    sent = twin_message_to_wire(message).SerializeToString()
+    assert twin_message_from_wire(twin_pb2.WatchResponse.FromString(sent)) == message
 
 
-def test_a_wish_without_an_encoding_gets_jpeg() -> None:
-    assert wish_of(twin_pb2.WatchRequest()) == Wish(frozenset(), PictureEncoding.JPEG)
+def test_a_subscription_without_an_encoding_gets_jpeg() -> None:
+    assert subscription_from_wire(twin_pb2.WatchRequest()) == Subscription(
+        frozenset(), PictureEncoding.JPEG
+    )
 
 
 def test_an_unknown_encoding_is_refused() -> None:
     with pytest.raises(InvalidInput, match="encoding: 99"):
-        wish_of(twin_pb2.WatchRequest(encoding=99))  # type: ignore[arg-type]
+        subscription_from_wire(twin_pb2.WatchRequest(encoding=99))  # type: ignore[arg-type]
 
 
 def test_an_impossible_picture_is_the_servers_fault() -> None:
-    bad = watch_response(PICTURE)
+    bad = twin_message_to_wire(PICTURE)
     bad.picture.pose.x_m = float("nan")
     with pytest.raises(ProtocolError, match="impossible picture"):
-        watched(bad)
+        twin_message_from_wire(bad)
     with pytest.raises(ProtocolError, match="update it"):
-        watched(twin_pb2.WatchResponse())
+        twin_message_from_wire(twin_pb2.WatchResponse())
