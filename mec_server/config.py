@@ -24,8 +24,8 @@ __all__ = [
 
 
 class DecoderKind(StrEnum):
-    """Where packets are decoded; AUTO: in the server if only this machine can reach it, else under
-    bubblewrap where that works, else in processes with limits."""
+    """Where packets are decoded; AUTO: in the server if only this machine can reach it, otherwise
+    under bubblewrap where that works, otherwise in processes with limits."""
 
     AUTO = "auto"
     IN_PROCESS = "in-process"
@@ -37,8 +37,8 @@ class DecoderKind(StrEnum):
 class SessionLimits:
     """Deadlines in seconds and the window of one session.
 
-    ``window_frames``: frames of one camera on their way or being decoded; two keep the link busy
-    while one is decoded, more would only be older.
+    ``window_frames``: frames of one camera in flight or being decoded; two keep the link busy
+    while one is decoded, more would only add delay.
     """
 
     hello_s: float = 5.0
@@ -55,7 +55,7 @@ class SessionLimits:
 
 @dataclass(frozen=True)
 class VehicleQuota:
-    """What one vehicle may use at most, over all its streams: far above what an honest one does,
+    """What one vehicle may use at most, over all its streams: far above what a correct one uses,
     far below what would starve the others."""
 
     streams: Annotated[int, arg(name="vehicle-streams")] = 8
@@ -80,9 +80,9 @@ class AdmissionLimits:
 
     load: Annotated[float, arg(name="max-load")] = 0.8
     """Share of the workers' time that vehicles are promised; beyond it they get a lower rate, or
-    are asked to come again. 0: whoever comes is let in."""
+    are asked to come again. 0: every vehicle is let in."""
     lowest_hz: Annotated[float, arg(name="lowest-rate")] = 2.0
-    """Pictures per second below which a vehicle is rather refused."""
+    """Lowest rate in pictures per second; a vehicle that can be given less is refused."""
     retry_s: Annotated[float, Suppress] = 5.0
 
     def __post_init__(self) -> None:

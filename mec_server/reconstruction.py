@@ -1,7 +1,7 @@
-"""The numerical work of one session: render, convert, splice, decode. Runs on worker threads.
+"""Reconstruction of one session's frames: render, convert, splice, decode; on worker threads.
 
-Plain functions of values; nothing here knows asyncio or gRPC. One ``CameraDecoder`` is used by one
-thread at a time (the session has one frame of a camera in work).
+Nothing here knows asyncio or gRPC. One ``CameraDecoder`` is used by one thread at a time, since a
+session decodes one frame of a camera at a time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ClockNs = Callable[[], int]
 
 
 class FieldSource(Protocol):
-    """Where fields come from."""
+    """Opens fields."""
 
     def open(self, field_id: str) -> Renderer:
         """Return the field; raise ``UnknownField`` or ``InvalidData``."""
@@ -42,7 +42,7 @@ class FieldSource(Protocol):
 
 @dataclass(frozen=True)
 class Tools:
-    """A clock for the stages, and where decoders come from."""
+    """A clock for the times of stages, and what opens H.264 decoders."""
 
     clock_ns: ClockNs
     open_decoder: OpenDecoder
@@ -50,20 +50,20 @@ class Tools:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A frame as the vehicle's closed loop holds it, with what the session answers."""
+    """A frame, identical to the one in the vehicle's closed loop, and its ``outcome``."""
 
     picture: I420
     outcome: DecodeOutcome
 
 
 class Decoder(Protocol):
-    """Who reconstructs the frames of one camera."""
+    """Reconstructs the frames of one camera."""
 
     def reconstruct(self, job: DecodeJob) -> Reconstruction:
         """Return the frame of ``job``; raise ``PacketRejected`` and stay good for the next."""
 
     def close(self) -> None:
-        """Let go of what it holds."""
+        """Give back what it holds."""
 
 
 OpenCameras = Callable[[OpenJob, FieldSource, Tools], dict[str, Decoder]]
@@ -86,7 +86,7 @@ class CameraDecoder:
         self._state: DecoderState | None = None
 
     def close(self) -> None:
-        """Let go of the decoder; waits for a frame that is being decoded."""
+        """Close the decoder; waits for a frame that is being decoded."""
         self._decoder.close()
 
     def reconstruct(self, job: DecodeJob) -> Reconstruction:

@@ -1,8 +1,8 @@
-"""Reconstructed pictures on disk: DIR/<vehicle>/<camera>/<sequence>.png beside an index.jsonl.
+"""Writes reconstructed pictures to disk: DIR/<vehicle>/<camera>/<sequence>.png and index.jsonl.
 
 The first epoch's pictures are named by their sequence alone (000007.png); later ones have the
-epoch in front (e0003-000007.png), since sequences begin again. The index has one line a picture.
-A disk that refuses stops the recording, once and for all, and never the streaming.
+epoch in front (e0003-000007.png), since sequences begin again. The index has one line per picture.
+A disk that fails ends the recording for good, and never the streaming.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rfcore.wire.messages import Frame
 __all__ = ["Recorder", "Recording", "picture_name"]
 
 MAX_WAITING = 32
-"""Pictures that may wait for the disk; then decoding waits, and with it the vehicle."""
+"""Pictures that may wait for the disk; beyond it decoding waits, and with it the vehicle."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Recording:
 
 
 class Recorder:
-    """Writes pictures on a thread of its own; ``on_failure`` is told of the first error."""
+    """Writes pictures on a thread of its own; ``on_failure`` is called with the first error."""
 
     def __init__(self, directory: Path, on_failure: Callable[[OSError], None]) -> None:
         self._directory = directory
@@ -45,12 +45,12 @@ class Recorder:
         self._thread.start()
 
     def save(self, recording: Recording) -> None:
-        """Keep a picture; returns at once unless the disk is far behind."""
+        """Queue a picture; returns at once unless ``MAX_WAITING`` pictures wait for the disk."""
         if not self._failed:
             self._queue.put(recording)
 
     def close(self) -> None:
-        """Write what waits, then stop."""
+        """Write what is queued, then stop."""
         self._queue.put(None)
         self._thread.join()
 

@@ -1,7 +1,8 @@
-"""Decoders in processes of their own, one a camera, and one that stands ready.
+"""Decoders in processes of their own, one per camera, and a spare one.
 
-Starting Python and FFmpeg takes 0.3 s, so the next process is started before it is needed: whoever
-loses one has another at once. All are started by one thread, which lives as long as the pool.
+Starting Python and FFmpeg takes 0.3 s, so the next process is started before it is needed: a
+decoder that loses its process has another one at once. All are started by one thread, which lives
+as long as the pool.
 """
 
 from __future__ import annotations
@@ -18,13 +19,12 @@ from rfcore.image import I420
 
 __all__ = ["ChildDecoder", "DecoderPool"]
 
-
-MAX_WAITING = 15
-"""Access units that are fed with the one that is decoded; a frame has at most three references."""
+MAX_STAGED = 15
+"""Access units that can be sent with the one to decode; a frame has at most three references."""
 
 
 class DecoderPool:
-    """Starts decoder processes behind ``wrapper``; ``lost`` is told of each that dies in use."""
+    """Starts decoder processes by ``wrapper``; ``lost`` is called for each that dies in use."""
 
     def __init__(self, wrapper: Sequence[str], lost: Callable[[DecoderLost], None]) -> None:
         self.lost = lost
@@ -34,19 +34,19 @@ class DecoderPool:
         self._spare = self._starter.submit(self._start)
 
     def wait_until_ready(self) -> None:
-        """Return when a process stands ready; raise ``RfedgeError`` if none can be started."""
+        """Return when the spare process is ready; raise ``RfedgeError`` if none can be started."""
         self._spare.result()
 
     def take(self) -> DecoderProcess:
-        """Return the process that stands ready, and have another started.
+        """Return the spare process, and have another one started.
 
-        One that died while it waited is passed over. Raises ``RfedgeError`` if none can be started.
+        A spare that has died is replaced. Raises ``RfedgeError`` if none can be started.
         """
         with suppress(RfedgeError):
-            ready = self._next()
-            if ready.is_alive:
-                return ready
-            ready.close()
+            spare = self._next()
+            if spare.is_alive:
+                return spare
+            spare.close()
         return self._next()
 
     def _next(self) -> DecoderProcess:
@@ -62,7 +62,7 @@ class DecoderPool:
         return ChildDecoder(self, size_px)
 
     def close(self) -> None:
-        """End the process that stands ready; those in use are their users' to close."""
+        """End the spare process; those in use are closed by their decoders."""
         self._starter.shutdown(cancel_futures=True)
         self._spare.add_done_callback(_close_started)
 
@@ -75,9 +75,9 @@ class DecoderPool:
 class ChildDecoder:
     """``H264Decoder`` in another process: the same pictures and the same errors.
 
-    What is fed waits in the shared memory for what comes next, so that a frame is one request. A
-    process that dies costs the picture it was asked for; the next request has the next process. One
-    caller at a time, but ``close`` may come from any thread.
+    Access units that are fed are staged in the shared memory until the next request, so that a
+    frame is one request. A process that dies costs the picture it was asked for; the next request
+    goes to the next process. One caller at a time, but ``close`` may come from any thread.
     """
 
     def __init__(self, pool: DecoderPool, size_px: tuple[int, int]) -> None:
@@ -85,26 +85,26 @@ class ChildDecoder:
         self._size_px = size_px
         self._lock = threading.Lock()
         self._closed = False
-        self._waiting: list[int] = []
+        self._staged_bytes: list[int] = []
         self._process: DecoderProcess | None = self._open()
 
     def decode(self, access_unit: bytes) -> I420:
         """Decode one access unit of one whole picture, or raise ``CodecError``."""
         with self._lock:
-            process = self._lay_down(access_unit)
-            self._request(process, Command.DECODE, *self._laid_down())
+            process = self._stage_unit(access_unit)
+            self._request(process, Command.DECODE, *self._take_staged())
             width, height = self._size_px
             return I420.unpacked(self._size_px, process.take(width * height * 3 // 2))
 
     def feed(self, access_unit: bytes | memoryview) -> None:
-        """Decode for the sake of what comes after, and with it: errors may wait until then."""
+        """Decode as a reference for the next picture, and with it: errors may come then."""
         with self._lock:
-            self._lay_down(access_unit)
+            self._stage_unit(access_unit)
 
     def reset(self) -> None:
         """Forget everything; a process that died has nothing to forget."""
         with self._lock:
-            self._waiting.clear()
+            self._staged_bytes.clear()
             if self._process is not None:
                 self._request(self._process, Command.RESET)
 
@@ -116,28 +116,28 @@ class ChildDecoder:
                 self._process.close()
                 self._process = None
 
-    def _lay_down(self, access_unit: bytes | memoryview) -> DecoderProcess:
-        """Put an access unit behind those that wait, or after them where there is no room."""
+    def _stage_unit(self, access_unit: bytes | memoryview) -> DecoderProcess:
+        """Put an access unit behind those staged; where there is no room, have them decoded."""
         if self._process is None:
             self._process = self._open()
         process, size = self._process, len(access_unit)
         if size > INPUT_BYTES:
             raise CodecError(f"access unit of {size} bytes exceeds {INPUT_BYTES}")
-        if len(self._waiting) == MAX_WAITING or sum(self._waiting) + size > INPUT_BYTES:
-            self._request(process, Command.FEED, *self._laid_down())
-        process.put(access_unit, sum(self._waiting))
-        self._waiting.append(size)
+        if len(self._staged_bytes) == MAX_STAGED or sum(self._staged_bytes) + size > INPUT_BYTES:
+            self._request(process, Command.FEED, *self._take_staged())
+        process.put(access_unit, sum(self._staged_bytes))
+        self._staged_bytes.append(size)
         return process
 
-    def _laid_down(self) -> list[int]:
-        """Return the lengths of what waits, which the next request is about."""
-        lengths, self._waiting = self._waiting, []
+    def _take_staged(self) -> list[int]:
+        """Return the lengths of the staged access units, for the request that decodes them."""
+        lengths, self._staged_bytes = self._staged_bytes, []
         return lengths
 
     def _open(self) -> DecoderProcess:
         if self._closed:
             raise CodecError("decoder is closed: its stream is over")
-        self._waiting.clear()
+        self._staged_bytes.clear()
         try:
             process = self._pool.take()
         except RfedgeError as error:

@@ -1,7 +1,7 @@
-"""One decoder process as the server sees it: started, asked, and found dead or killed.
+"""One decoder process as the server sees it: started, sent requests, and found dead or killed.
 
-Whatever goes wrong in it is a ``DecoderLost``; the server reads nothing from it but one-byte
-answers, short texts, and as many samples as it asked for.
+A process that dies or does not answer is a ``DecoderLost``. The server reads nothing from it but
+one-byte answers, short texts, and as many samples as it asked for.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from rfcore.errors import CodecError, RfedgeError
 __all__ = ["DecoderLost", "DecoderProcess", "LossCause", "child_environment"]
 
 START_S = 20.0
-"""0.3 s on an idle machine; one that swaps or is stormed takes longer."""
+"""Time limit of its start: 0.3 s on an idle machine, more on one that swaps or is overloaded."""
 
 ANSWER_S = 2.0
-"""A thousand times what a 640x360 picture takes."""
+"""Time limit of an answer: a thousand times what a 640x360 picture takes."""
 
 SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
 
 class LossCause(StrEnum):
-    """How a decoder process came to its end."""
+    """How a decoder process ended."""
 
     SIGNAL = "signal"
     EXIT = "exit"
@@ -57,16 +57,16 @@ class DecoderLost(CodecError):
 
 
 def child_environment() -> Mapping[str, str]:
-    """Return the variables a decoder process is started with."""
+    """Return the environment variables of a decoder process."""
     inherited = ("PYTHONPATH", "LD_LIBRARY_PATH")
     own = {"OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     return own | {name: os.environ[name] for name in inherited if name in os.environ}
 
 
 class DecoderProcess:
-    """A decoder process behind ``wrapper`` (a command line that runs its own arguments).
+    """A decoder process, started by ``wrapper``: a command line that runs its own arguments.
 
-    Call it from a thread that outlives the process: bubblewrap ends with the thread that began it.
+    Make it on a thread that outlives the process: bubblewrap ends with the thread that started it.
     """
 
     def __init__(self, wrapper: Sequence[str] = ()) -> None:
@@ -95,15 +95,15 @@ class DecoderProcess:
         )
 
     def wait_until_ready(self) -> None:
-        """Return when it serves; raise ``RfedgeError`` with its last words if it never will."""
+        """Return when it answers; raise ``RfedgeError`` with its last line of errors otherwise."""
         try:
-            self._hear(START_S)
+            self._receive(START_S)
         except DecoderLost as lost:
             self._errors.seek(0)
-            said = self._errors.read()[-4000:].decode(errors="replace").strip().splitlines()
+            errors = self._errors.read()[-4000:].decode(errors="replace").strip().splitlines()
             self.close()
             raise RfedgeError(
-                f"{lost} at its start: {said[-1] if said else 'no message'}"
+                f"{lost} at its start: {errors[-1] if errors else 'no message'}"
             ) from lost
 
     @property
@@ -112,30 +112,33 @@ class DecoderProcess:
         return self._process.poll() is None
 
     def ask(self, command: Command, *numbers: int) -> None:
-        """Have one thing done; raise ``DecoderLost``, or ``CodecError`` if FFmpeg refuses."""
-        with suppress(OSError):  # how it ended is for the answer to say
+        """Send a request and wait for its answer.
+
+        Raises ``DecoderLost``, or ``CodecError`` if FFmpeg refuses.
+        """
+        with suppress(OSError):  # a process that ended is noticed when its answer is received
             self._control.send(request_to_bytes(command, *numbers))
-        answer = self._hear(ANSWER_S)
+        answer = self._receive(ANSWER_S)
         if answer != DONE:
             raise CodecError(answer[1:].decode(errors="replace"))
 
     def put(self, access_unit: bytes | memoryview, start: int) -> None:
-        """Lay down what the next request is about; the caller knows that there is room."""
+        """Write an access unit into the shared memory; the caller checks that there is room."""
         self._memory[start : start + len(access_unit)] = access_unit
 
     def take(self, size_bytes: int) -> bytes:
-        """Return a copy of the picture decoded last; the process may change its own at any time."""
+        """Return a copy of the picture decoded last; the process may overwrite its own any time."""
         return self._memory[OUTPUT_AT : OUTPUT_AT + size_bytes]
 
     def close(self) -> None:
-        """Kill it, whatever it does, and reap it."""
+        """Kill and reap it."""
         self._process.kill()
         self._process.wait()
         self._control.close()
         self._memory.close()
         self._errors.close()
 
-    def _hear(self, within_s: float) -> bytes:
+    def _receive(self, within_s: float) -> bytes:
         self._control.settimeout(within_s)
         try:
             answer = self._control.recv(MAX_ANSWER_BYTES)

@@ -1,10 +1,10 @@
-"""What a server and its decoder processes agree on: commands, and a piece of memory they share.
+"""Protocol between a server and its decoder processes: requests on a socket, data in shared memory.
 
-A request is a command and its numbers, on a socket that keeps messages apart; the answer is
-``DONE``, or ``FAILED`` and what is wrong. Access units lie one after the other at the start of the
-memory, a decoded picture (I420, plane after plane, of the size given by OPEN) at ``OUTPUT_AT``. The
-memory is a sealed memfd: it cannot shrink under its reader, is on no disk, and only the pages in
-use exist.
+A request is a command and its numbers, one message of a SOCK_SEQPACKET socket; the answer is
+``DONE``, or ``FAILED`` and an error text. Access units stand one after the other at the start of
+the memory, a decoded picture (I420, plane after plane, of the size given by OPEN) at ``OUTPUT_AT``.
+The memory is a sealed memfd: it cannot shrink under its reader, is on no disk, and only pages in
+use take memory.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Which tiles a folder publishes, followed while the server runs.
+"""Which tiles a folder publishes, kept up to date while the server runs.
 
-A manifest that cannot be read, or that names a field which cannot be opened, changes nothing: what
-was good stays, and the problem is said once for each manifest.
+A manifest that cannot be read, or that names a field which cannot be opened, changes nothing: the
+tiles that were current stay, and the problem is logged once for each manifest.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""FieldService over grpc.aio: which fields are here, and their bytes from any offset on."""
+"""FieldService over grpc.aio: lists the fields of this server and sends them, from any offset."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["FieldService"]
 
 
 class FieldService(field_pb2_grpc.FieldServiceServicer):
-    """Hands out the archives of ``store``, and says which ``tiles`` they are for now."""
+    """Sends the archives of ``store``, and lists the ``tiles`` that are current."""
 
     def __init__(self, store: Store, tiles: Callable[[], tuple[Tile, ...]]) -> None:
         self._store = store
@@ -46,7 +46,7 @@ class FieldService(field_pb2_grpc.FieldServiceServicer):
         request: pb.GetManifestRequest,
         context: grpc.aio.ServicerContext[pb.GetManifestRequest, pb.GetManifestResponse],
     ) -> pb.GetManifestResponse:
-        """Tell size and digest of an archive."""
+        """Return size and digest of an archive."""
         try:
             path = self._store.path(check_field_id("field_id", request.field_id))
         except RfedgeError as error:

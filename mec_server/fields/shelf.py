@@ -38,7 +38,7 @@ class Store(Protocol):
 
 
 class FieldShelf:
-    """Fields of ``store``, opened by ``load``; the least recently asked for leaves first."""
+    """A cache of opened fields of ``store``: ``load`` opens one, the least recently used leaves."""
 
     def __init__(self, store: Store, load: Callable[[str], Renderer]) -> None:
         self._store = store
@@ -57,9 +57,9 @@ class FieldShelf:
             return self._open[field_id]
 
     def warm_up(self) -> int:
-        """Open as many fields as stay open, so that the first vehicle waits for none.
+        """Open fields in advance, so that the first vehicle waits for none; return how many.
 
-        Where fields are open already they are what is asked for, and others wait for their vehicle.
+        Fields that are open already (the published ones) are taken to be all that is needed.
         """
         ids = list(self._open or self._store.ids())[:MAX_OPEN_FIELDS]
         for field_id in ids:
@@ -70,11 +70,10 @@ class FieldShelf:
 def field_loader(
     store: FieldStore, render: RenderSettings, *, opened: Callable[[RadianceField], None]
 ) -> Callable[[str], RadianceField]:
-    """Return how a shelf opens fields of ``store``: whole, checked, and with a renderer built.
+    """Return a function that opens a field of ``store``: checked, and with its renderer built.
 
-    ``opened`` is told of each.
-
-    What it returns raises ``UnknownField``, ``FieldFormatError`` or ``BackendUnavailable``.
+    ``opened`` is called with each field. The function raises ``UnknownField``,
+    ``FieldFormatError`` or ``BackendUnavailable``.
     """
 
     def load(field_id: str) -> RadianceField:

@@ -1,4 +1,4 @@
-"""What both ends of the wire agree on besides the proto: gRPC options, names, buckets, limits.
+"""Conventions of both ends besides the proto: gRPC options, names, histogram buckets, limits.
 
 Every option that departs from gRPC's default says why; the figures were measured on loopback.
 """
@@ -66,7 +66,7 @@ CHANNEL_OPTIONS: Final[Options] = (
     # Despite its name, how long one attempt may take (20 s by default). Two seconds let links of
     # half a second of round trip in; 100 ms would shut them out for ever.
     ("grpc.min_reconnect_backoff_ms", 2_000),
-    # A process that reconnects shall not inherit another channel's backoff or connection.
+    # A process that reconnects must not inherit another channel's backoff or connection.
     ("grpc.use_local_subchannel_pool", 1),
 )
 

@@ -1,4 +1,4 @@
-"""Whom a certificate names: one URI as its subject alternative name, in the form of a SPIFFE ID.
+"""Identities in certificates: one URI as the subject alternative name, in the form of a SPIFFE ID.
 
 ``spiffe://rfedge/vehicle/cav-1`` may send frames as ``cav-1`` and as nobody else; every other role
 (``server``, ``consumer``) may send none. <https://spiffe.io/docs/latest/spiffe-specs/spiffe-id/>

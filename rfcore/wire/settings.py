@@ -1,12 +1,11 @@
-"""Settings that both services take on their command lines, in groups.
+"""Settings that both services take on their command lines, and the form of their logs.
 
-Each group is one box of ``--help``. Option names are flat (``--metrics-port``, ``--tls-cert``), as
-operators write them in unit files; the group is only how the program holds them.
+Each group of settings is one box of ``--help``. Option names are flat (``--metrics-port``,
+``--tls-cert``), as operators write them in unit files.
 
-Logs of the services: readable on a terminal, one JSON object a line anywhere else.
-
-Keys are the same in both: ``vehicle``, ``session``, ``camera``, ``epoch`` and ``seq`` say what a
-line is about, ``event`` what happened, and ``reason`` is a word that can be counted.
+Logs are readable lines on a terminal and one JSON object per line elsewhere, with the same keys:
+``vehicle``, ``session``, ``camera``, ``epoch`` and ``seq`` say what a line is about, ``event`` what
+happened, and ``reason`` is a word that can be counted.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ class RenderSettings:
 
 @dataclass(frozen=True)
 class TransportSettings:
-    """Who this process is, and whom it speaks to; plaintext without certificates."""
+    """Certificates of this process and of the authority; plaintext without them."""
 
     certificate: Annotated[Path | None, arg(name="tls-cert")] = None
     """Certificate of this process (PEM); a vehicle's names --vehicle."""

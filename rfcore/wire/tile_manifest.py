@@ -68,7 +68,7 @@ class Publication:
         return tuple(versions.tile(name) for name, versions in sorted(self.tiles.items()))
 
     def having(self, name: str, versions: TileVersions) -> Publication:
-        """Return this with tile ``name`` put in or replaced."""
+        """Return a publication with tile ``name`` added or replaced."""
         return replace(self, tiles={**self.tiles, name: versions})
 
 

@@ -1,8 +1,8 @@
-"""Tiles of a street: which field is good for which ground, as servers tell vehicles.
+"""Tiles of a street: which field covers which area, as servers announce it to vehicles.
 
 An area is a rectangle on the ground in the drives' own global frame (east, north, metres, float64);
-its field serves for ``margin_m`` beyond it, so that a neighbour can step in. A server that
-publishes no tiles serves its fields everywhere.
+its field may be used for ``margin_m`` beyond it, so that a neighbouring server can take over. A
+server that publishes no tiles serves its fields everywhere.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Tile:
 
 
 def tile_message(tile: Tile) -> pb.Tile:
-    """Return a tile as it travels."""
+    """Return a tile as protobuf."""
     message = pb.Tile(
         name=tile.name, field_id=tile.field_id, version=tile.version, margin_m=tile.margin_m
     )
@@ -88,7 +88,7 @@ def tile_message(tile: Tile) -> pb.Tile:
 
 
 def tile_of(message: pb.Tile) -> Tile:
-    """Return a tile that arrived; raise ``InvalidInput`` naming what is wrong with it."""
+    """Return a received tile; raise ``InvalidInput`` naming what is wrong with it."""
     area = None
     if message.HasField("area"):
         sides = message.area

@@ -1,7 +1,7 @@
-"""Mutual TLS: three PEM files a process, checked once, and the gRPC credentials made of them.
+"""Mutual TLS: three PEM files per process, checked once, and the gRPC credentials made of them.
 
-Both ends prove who they are to the same certificate authority. A server looks at its files at every
-handshake and takes up new ones; streams that are open go on. A client reads its own at the start.
+Both ends have certificates of the same authority. A server checks its files at every handshake and
+uses new ones from then on; open streams are not affected. A client reads its own at the start.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class TlsFiles:
         return context
 
     def channel_credentials(self) -> grpc.ChannelCredentials:
-        """Return what a client shows, and what it wants to see."""
+        """Return a client's credentials for gRPC."""
         return grpc.ssl_channel_credentials(
             root_certificates=self.authority.read_bytes(),
             private_key=self.key.read_bytes(),
@@ -76,10 +76,10 @@ class TlsFiles:
         )
 
     def server_credentials(self) -> grpc.ServerCredentials:
-        """Return what a server shows; a client without a certificate is not let in.
+        """Return a server's credentials for gRPC; a client without a certificate is refused.
 
-        Files that were replaced count from the next handshake on. As long as they cannot be read,
-        or the key is not the certificate's (one is there and the other to come), the old ones do.
+        Files that were replaced are used from the next handshake on. As long as they cannot be
+        read, or the key does not fit the certificate (only one was replaced yet), the old ones are.
         """
         return grpc.dynamic_ssl_server_credentials(
             self.shown_by_server(),
@@ -107,7 +107,7 @@ class TlsFiles:
 
 
 class Renewal:
-    """Looks whether a server's files were replaced; gRPC asks at every handshake."""
+    """Checks whether a server's files were replaced; gRPC asks at every handshake."""
 
     def __init__(self, files: TlsFiles) -> None:
         self._files = files
