@@ -1,14 +1,18 @@
 """Metrics follow the conventions, and the document lists exactly what exists."""
 
 import re
+import socket
+import urllib.request
 from pathlib import Path
 
 import pytest
-from prometheus_client import CollectorRegistry, generate_latest
+from hypothesis import given
+from hypothesis import strategies as st
+from prometheus_client import CollectorRegistry, Histogram, generate_latest
 
-from rfcore.errors import InvalidInput
+from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.conventions import FRAME_BUDGET_BUCKETS_S
-from rfcore.wire.instruments import Instruments
+from rfcore.wire.instruments import Instruments, MetricsEndpoint
 from rfedge.pages.metrics import families, metrics_page
 
 ROOT = Path(__file__).parents[2]
@@ -67,3 +71,79 @@ def test_buckets_hold_the_frame_budgets() -> None:
 def test_a_name_against_the_conventions_is_refused(name: str, text: str, problem: str) -> None:
     with pytest.raises(InvalidInput, match=problem):
         Instruments(CollectorRegistry()).seconds(name, text)
+
+
+@given(st.lists(st.tuples(st.sampled_from("abc"), st.floats(0, 10)), max_size=30))
+def test_a_histogram_is_served_as_that_of_the_client_library(
+    observed: list[tuple[str, float]],
+) -> None:
+    name, text, bounds = "rfedge_x_seconds", "Time.", FRAME_BUDGET_BUCKETS_S
+    ours, theirs = CollectorRegistry(), CollectorRegistry()
+    histogram = Instruments(ours).seconds(name, text, ("stage",))
+    oracle = Histogram(name, text, ("stage",), buckets=bounds, registry=theirs)
+    for stage, seconds in observed:
+        histogram.labels(stage).observe(seconds)
+        oracle.labels(stage).observe(seconds)
+    assert served(ours) == served(theirs)
+
+
+def served(registry: CollectorRegistry) -> list[str]:
+    """Return what a scrape sees, without the times of creation."""
+    return [x for x in generate_latest(registry).decode().splitlines() if "_created" not in x]
+
+
+def test_an_observation_at_a_bound_is_in_its_bucket_and_one_beyond_all_in_the_last() -> None:
+    registry = CollectorRegistry()
+    histogram = Instruments(registry).seconds("rfedge_x_seconds", "Time.")
+    for seconds in (FRAME_BUDGET_BUCKETS_S[0], 1e6):
+        histogram.observe(seconds)
+    lines = served(registry)
+    assert f'rfedge_x_seconds_bucket{{le="{FRAME_BUDGET_BUCKETS_S[0]}"}} 1.0' in lines
+    assert f'rfedge_x_seconds_bucket{{le="{FRAME_BUDGET_BUCKETS_S[-1]}"}} 1.0' in lines
+    assert 'rfedge_x_seconds_bucket{le="+Inf"} 2.0' in lines
+    assert "rfedge_x_seconds_count 2.0" in lines
+
+
+def test_removed_series_are_served_no_more_and_others_stay() -> None:
+    registry = CollectorRegistry()
+    histogram = Instruments(registry).seconds("rfedge_x_seconds", "Time.", ("vehicle", "stage"))
+    for vehicle in ("cav-1", "cav-2"):
+        for stage in ("render", "decode"):
+            histogram.labels(vehicle, stage).observe(0.1)
+    histogram.remove_by_labels({"vehicle": "cav-1"})
+    text = "\n".join(served(registry))
+    assert "cav-1" not in text
+    assert text.count("rfedge_x_seconds_count") == 2
+
+
+def test_labels_of_another_number_and_a_name_twice_are_refused() -> None:
+    make = Instruments(CollectorRegistry())
+    histogram = make.seconds("rfedge_x_seconds", "Time.", ("stage",))
+    with pytest.raises(InvalidInput, match=r"metric\.labels"):
+        histogram.labels("render", "decode")
+    with pytest.raises(KeyError):
+        histogram.observe(0.1)
+    with pytest.raises(ValueError, match="Duplicated timeseries"):
+        make.seconds("rfedge_x_seconds", "Time.")
+
+
+def test_an_endpoint_serves_until_it_is_closed_and_names_a_port_in_use() -> None:
+    registry = CollectorRegistry()
+    Instruments(registry).gauge("rfedge_y", "Things.").set(2)
+    endpoint = MetricsEndpoint(registry, "127.0.0.1", 0)
+    with urllib.request.urlopen(f"http://127.0.0.1:{endpoint.port}/metrics") as response:
+        assert b"rfedge_y 2.0" in response.read()
+    problem = (
+        f"cannot serve metrics on 127.0.0.1:{endpoint.port}: Address already in use; "
+        "give another --metrics-port"
+    )
+    with pytest.raises(RfedgeError, match=f"^{re.escape(problem)}$"):
+        MetricsEndpoint(registry, "127.0.0.1", endpoint.port)
+    endpoint.close()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", endpoint.port))
+
+
+def test_a_host_that_is_not_ours_is_named_too() -> None:
+    with pytest.raises(RfedgeError, match=r"cannot serve metrics on 192\.0\.2\.1:0: Cannot assign"):
+        MetricsEndpoint(CollectorRegistry(), "192.0.2.1", 0)
