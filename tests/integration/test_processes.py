@@ -254,6 +254,24 @@ async def test_plaintext_is_served_to_this_machine_only_unless_allowed(serve: An
         assert server.address.port > 0
 
 
+async def test_a_second_agent_of_a_vehicle_is_refused_says_why_and_harms_nobody(
+    serve: Any, vehicle: Any, street: Any, tmp_path: Path
+) -> None:
+    async with serve() as server, vehicle(server.address, loop=True) as driving:
+        await driving.until(lambda: driving.acked() >= 1)
+        arguments = agent_arguments(street, str(server.address), tmp_path / "second.jsonl")
+        second = await start("cav_agent", *arguments)
+        refused = b"camera_taken: another agent sends camera front of vehicle cav-1; stop it"
+        async with asyncio.timeout(60):
+            while refused not in (line := await second.stderr.readline()):
+                assert line, "it ended without saying why"
+        second.terminate()
+        await second.communicate()
+        seen = driving.acked()
+        await driving.until(lambda: driving.acked() >= seen + 3)
+    assert {line["result"] for line in driving.lines()} == {"acked"}
+
+
 async def test_a_taken_port_is_one_clear_error(serve: Any) -> None:
     async with serve() as server:
         named = rf"cannot listen on {server.address}: Address already in use"
