@@ -300,22 +300,14 @@ def watch_until_stopped(settings: WatchSettings) -> None:
     ends at once, with status 1. Raises what ``TwinWatcher.run`` raises.
     """
     signals: list[int] = []
-    watcher, ended = TwinWatcher(settings), Future[None]()
-
-    def run() -> None:
-        try:
-            watcher.run()
-        except BaseException as error:
-            ended.set_exception(error)
-        else:
-            ended.set_result(None)
 
     def note(number: int, _: object) -> None:
         signals.append(number)  # and nothing else: a handler runs between any two instructions
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        threading.Thread(target=run, name="watch", daemon=True).start()
+        watcher = TwinWatcher(settings)
+        ended = _started(watcher)
         while not ended.done() and not signals:
             wait([ended], timeout=LOOK_EVERY_S)
         watcher.stop()
@@ -329,6 +321,22 @@ def watch_until_stopped(settings: WatchSettings) -> None:
         for number, handler in before.items():
             signal.signal(number, handler)
     ended.result()
+
+
+def _started(watcher: TwinWatcher) -> Future[None]:
+    """Run ``watcher`` on a thread of its own; return what becomes of it."""
+    ended = Future[None]()
+
+    def run() -> None:
+        try:
+            watcher.run()
+        except BaseException as error:
+            ended.set_exception(error)
+        else:
+            ended.set_result(None)
+
+    threading.Thread(target=run, name="watch", daemon=True).start()
+    return ended
 
 
 def _open_channel(settings: WatchSettings) -> grpc.Channel:
