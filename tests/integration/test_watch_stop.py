@@ -1,18 +1,17 @@
 """``rfedge watch`` ends when it is told to, at whatever moment that is."""
 
-import fcntl
 import os
 import signal
 import subprocess
 import sys
-import termios
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
+import av
 import grpc
 import pytest
 
@@ -162,23 +161,36 @@ def handlers() -> Iterator[None]:
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_watch_at_any_moment_with_a_whole_video(
-    twin: EndlessTwin, address: str, number: signal.Signals, tmp_path: Path
+    twin: EndlessTwin,
+    address: str,
+    number: signal.Signals,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Forty times, each after more messages than before."""
+    """Twenty times, each after more pictures than before."""
     twin.pictures = True
     for repetition in range(20):
-        twin.enough.clear()
-        twin.enough_at = twin.sent + 1 + 2 * repetition
+        lines: list[str] = []
+        enough = threading.Event()
 
-        def tell() -> None:
-            assert twin.enough.wait(STARTED_S)
+        def count(line: str, flush: bool, lines: Any = lines, enough: Any = enough) -> None:
+            assert flush
+            lines.append(line)
+            if len(lines) == 2 + 2 * repetition:  # noqa: B023 - called in this repetition only
+                enough.set()
+
+        def tell(enough: Any = enough) -> None:
+            assert enough.wait(STARTED_S)
             os.kill(os.getpid(), number)
 
+        monkeypatch.setattr(module, "print", count, raising=False)
         teller = in_thread(tell)
         video = tmp_path / f"{repetition}.mp4"
         watch_until_stopped(WatchSettings(address, video=video))
         teller.join()
-        assert b"moov" in video.read_bytes(), "the index, which is written last"
+        with av.open(str(video)) as container:
+            kept = len(list(container.decode(video=0)))
+        assert kept == len(lines), "every picture that was reported is in it"
 
 
 @pytest.mark.usefixtures("handlers")
@@ -191,46 +203,54 @@ def test_an_error_of_the_watch_is_raised_where_it_was_called(
 
 
 @contextmanager
-def command(address: str) -> Iterator[subprocess.Popen[bytes]]:
-    """``rfedge watch`` as a process, whose output nobody reads."""
-    arguments = [*command_of("rfedge"), "watch", address]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+def process(*command: str) -> Iterator[subprocess.Popen[bytes]]:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
         try:
-            yield process
+            yield running
         finally:
-            process.kill()
-
-
-def ended(process: subprocess.Popen[bytes]) -> tuple[int, str]:
-    """Send SIGTERM; return the exit status and the errors."""
-    assert process.stderr is not None
-    process.send_signal(signal.SIGTERM)
-    return process.wait(STARTED_S), process.stderr.read().decode()
+            running.kill()
 
 
 def test_the_command_ends_while_it_watches(twin: EndlessTwin, address: str) -> None:
     twin.idle = True
-    with command(address) as process:
+    with process(*command_of("rfedge"), "watch", address) as watching:
         assert twin.watched.wait(STARTED_S)
-        assert ended(process) == (0, "")
+        watching.send_signal(signal.SIGTERM)
+        assert watching.wait(STARTED_S) == 0
+        assert watching.stderr is not None
+        assert watching.stderr.read() == b""
 
 
-def test_the_command_ends_although_nobody_reads_what_it_prints(
-    twin: EndlessTwin, address: str
+BLOCKED = """
+import sys, threading
+from rfedge import watch
+
+def never(*values, **options):
+    sys.stderr.write("printing\\n")
+    sys.stderr.flush()
+    threading.Event().wait()
+
+watch.print, watch.FINISH_S = never, float(sys.argv[2])
+watch.watch_until_stopped(watch.WatchSettings(sys.argv[1]))
+"""
+"""A watcher that never gets a line printed, as when nobody reads its pipe."""
+
+
+@pytest.mark.usefixtures("twin")
+@pytest.mark.parametrize(
+    ("finish_s", "signals"),
+    [
+        pytest.param(0.1, [signal.SIGTERM], id="it was given time"),
+        pytest.param(3600.0, [signal.SIGTERM, signal.SIGINT], id="a second signal came"),
+    ],
+)
+def test_a_watcher_that_cannot_finish_ends_all_the_same_and_says_so(
+    address: str, finish_s: float, signals: list[signal.Signals]
 ) -> None:
-    """The pipe is full, printing blocks: after a time it ends all the same, and says so."""
-    with command(address) as process:
-        assert twin.watched.wait(STARTED_S)
-        assert process.stdout is not None
-        while unread_bytes(process.stdout) < PIPE_BYTES:
-            os.sched_yield()
-        assert ended(process) == (1, module.UNFINISHED)
-
-
-PIPE_BYTES = (1 << 16) - 4096
-"""A pipe of Linux holds 64 KiB; the last page is not always filled."""
-
-
-def unread_bytes(pipe: IO[bytes]) -> int:
-    """Return how much was written to a pipe and not read."""
-    return int.from_bytes(fcntl.ioctl(pipe.fileno(), termios.FIONREAD, b"\0" * 4), sys.byteorder)
+    with process(sys.executable, "-c", BLOCKED, address, str(finish_s)) as watching:
+        assert watching.stderr is not None
+        assert watching.stderr.readline() == b"printing\n"
+        for number in signals:
+            watching.send_signal(number)
+        assert watching.wait(STARTED_S) == 1
+        assert watching.stderr.read().decode() == module.UNFINISHED
