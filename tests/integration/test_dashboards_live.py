@@ -68,16 +68,16 @@ class Command:
     def __init__(self, name: str, process: asyncio.subprocess.Process) -> None:
         self._name = name
         self._process = process
-        self._said: list[str] = []
+        self._lines: list[str] = []
 
     async def says(self, find: Callable[[str], Any]) -> Any:
         """Return the first true value of ``find`` of a line."""
         assert self._process.stderr is not None
         while line := (await self._process.stderr.readline()).decode():
-            self._said.append(line)
+            self._lines.append(line)
             if found := find(line):
                 return found
-        pytest.fail(f"{self._name} ended:\n{''.join(self._said)}")
+        pytest.fail(f"{self._name} ended:\n{''.join(self._lines)}")
 
     async def drain(self) -> None:
         """Read on, so that the command never waits for us."""

@@ -1,4 +1,4 @@
-"""What is around the server gone wrong: disks, files, certificates, viewers, a crowd."""
+"""Trouble from outside the server: disks, files, certificates, consumers, a crowd of vehicles."""
 
 import asyncio
 import signal
