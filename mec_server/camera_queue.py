@@ -124,7 +124,8 @@ class CameraQueue:
         before = range(self._expected(packet.epoch), packet.sequence)
         missing = [n for n in before if (packet.epoch, n) not in self._refused]
         self.epoch, self.last_good = packet.epoch, packet.sequence
-        self._refused.clear()
+        done = (packet.epoch, packet.sequence)
+        self._refused = {refused for refused in self._refused if refused > done}
         self.answered += 1 + len(missing)
         return _runs(missing)
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from mec_server.camera_queue import (
@@ -35,6 +35,7 @@ def reconstruct(queue: CameraQueue, frame: Frame) -> list[SequenceGap]:
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(arrivals)
+@example([(0, 1, False), (0, 0, True), (0, 2, True)])
 def test_each_frame_is_answered_once_and_credit_counts_the_answers(
     make_frame: MakeFrame, arrived: list[tuple[int, int, bool]]
 ) -> None:
