@@ -210,7 +210,7 @@ def _taken(key: tuple[str, str], silent_after_s: float) -> LimitExceeded:
         f"another agent sends camera {camera_id} of vehicle {vehicle_id}; stop it, or give this "
         f"one another --vehicle or --camera (an agent that sends nothing for {silent_after_s:g} s "
         "may be replaced)",
-        CAMERA_SILENT_S,
+        silent_after_s,
     )
 
 

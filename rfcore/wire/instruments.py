@@ -189,7 +189,7 @@ class MetricsEndpoint:
         except OSError as error:
             raise RfedgeError(
                 f"cannot serve metrics on {host}:{port}: {error.strerror or error}; "
-                "give another --metrics-port"
+                "give another --metrics-port, or 0 for a free one"
             ) from error
         self.port = self._server.server_port
 

@@ -145,8 +145,9 @@ def test_another_agent_takes_over_from_one_that_fell_silent(hello: Hello) -> Non
 def test_a_slow_camera_is_given_two_of_its_periods(hello: Hello) -> None:
     cameras, first = ActiveCameras(), Sender("a")
     cameras.enter(slow(hello, 0.2), first, 0.0)
-    with pytest.raises(LimitExceeded):
+    with pytest.raises(LimitExceeded) as caught:
         cameras.enter(hello, Sender("b"), CAMERA_SILENT_S + 9.9)
+    assert caught.value.retry_after_s == CAMERA_SILENT_S + 10.0, "by then a dead one is replaced"
     cameras.enter(hello, Sender("b"), CAMERA_SILENT_S + 10.0)
     assert first.displaced is not None
 

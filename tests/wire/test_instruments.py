@@ -135,7 +135,7 @@ def test_an_endpoint_serves_until_it_is_closed_and_names_a_port_in_use() -> None
         assert b"rfedge_y 2.0" in response.read()
     problem = (
         f"cannot serve metrics on 127.0.0.1:{endpoint.port}: Address already in use; "
-        "give another --metrics-port"
+        "give another --metrics-port, or 0 for a free one"
     )
     with pytest.raises(RfedgeError, match=f"^{re.escape(problem)}$"):
         MetricsEndpoint(registry, "127.0.0.1", endpoint.port)
