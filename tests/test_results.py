@@ -222,10 +222,10 @@ def test_no_verb_of_eval_writes_over_a_tracked_file_unless_told_to() -> None:
     from dataclasses import fields
     from typing import get_args, get_type_hints
 
-    from rfedge.cli.eval import Eval
+    from rfedge.cli.measure import Eval
 
     choices = get_args(get_type_hints(Eval, include_extras=True)["verb"])
-    verbs = [get_args(choice)[0] for choice in choices]
+    verbs = [get_args(choice)[0] for choice in get_args(choices[0])]
     assert len(verbs) >= 6
     for verb in verbs:
         outputs = {f.name: f.default for f in fields(verb) if f.name in ("out", "figures", "cells")}

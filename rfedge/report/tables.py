@@ -7,6 +7,7 @@ continued in a further table below, which repeats the columns that tell its rows
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,7 +72,7 @@ def print_table(console: Console, title: str, columns: Sequence[str], rows: Cell
     if title:
         console.print(title, markup=False, highlight=False, style="italic")
     for part in parts:
-        _print_part(console, [columns[k] for k in part], part, rows)
+        _print_part(console, columns, part, rows)
     if same:
         console.print(f"In every row: {', '.join(same)}.", markup=False, highlight=False)
 
@@ -85,19 +86,40 @@ def _check(columns: Sequence[str], rows: Cells) -> None:
 
 
 def _widths(columns: Sequence[str], rows: Cells) -> list[int]:
-    return [
-        max([len(name), *(len(row[k]) for row in rows)]) + BORDER for k, name in enumerate(columns)
-    ]
+    """Return the characters that each column needs, its header broken where it can be."""
+    parts = [[*_header_parts(name), *(row[k] for row in rows)] for k, name in enumerate(columns)]
+    return [max(map(len, texts)) + BORDER for texts in parts]
+
+
+def _header_parts(name: str) -> list[str]:
+    """Return a column's name broken after every space and dot: ``sender_ms.``, ``render``."""
+    return re.findall(r"[^ .]*(?:\.| |$)", name)[:-1] or [name]
+
+
+def _header(name: str, width: int) -> str:
+    """Return a column's name in as many lines as it takes within ``width``."""
+    lines = [""]
+    for part in _header_parts(name):
+        if lines[-1] and len(lines[-1]) + len(part.rstrip()) > width:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def _keys(shown: Sequence[int], rows: Cells) -> list[int]:
-    """Return the first columns, as many as it takes to tell the rows apart; else the first."""
-    distinct = len({tuple(row) for row in rows})
-    for count in range(1, len(shown)):
-        keys = list(shown[:count])
-        if len({tuple(row[k] for k in keys) for row in rows}) == distinct:
-            return keys
-    return list(shown[:1])
+    """Return columns, the first ones there are, that tell the rows apart; none is needless."""
+
+    def told_apart(columns: Sequence[int]) -> int:
+        return len({tuple(row[k] for k in columns) for row in rows})
+
+    distinct = told_apart(shown)
+    counts = range(1, len(shown) + 1)
+    keys = list(shown[: next(n for n in counts if told_apart(shown[:n]) == distinct)])
+    for column in reversed(keys.copy()):
+        without = [k for k in keys if k != column]
+        if without and told_apart(without) == distinct:
+            keys = without
+    return keys
 
 
 def _parts(
@@ -115,14 +137,16 @@ def _parts(
     return parts
 
 
-def _print_part(console: Console, names: Sequence[str], part: Sequence[int], rows: Cells) -> None:
+def _print_part(console: Console, columns: Sequence[str], part: Sequence[int], rows: Cells) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    widths = _widths(columns, rows)
     printed = Table()
-    for name, column in zip(names, part, strict=True):
+    for column in part:
+        header = Text(_header(columns[column], widths[column] - BORDER))
         is_number = all(row[column][:1] in "0123456789+-±." for row in rows)
-        printed.add_column(Text(name), justify="right" if is_number else "left", overflow="fold")
+        printed.add_column(header, justify="right" if is_number else "left", overflow="fold")
     for row in rows:
         printed.add_row(*(Text(row[column]) for column in part))
     console.print(printed)
