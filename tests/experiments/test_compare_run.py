@@ -197,7 +197,8 @@ def test_a_window_nobody_reaches_ends_the_comparison_before_its_long_part(thumbn
     ("options", "window"), [((), None), (("--window", "30", "34.5"), (30.0, 34.5))]
 )
 def test_the_command_takes_a_window(tmp_path, monkeypatch, options, window):
-    monkeypatch.chdir(tmp_path)  # where the cells go
+    monkeypatch.chdir(tmp_path)
+    Path("wall.rff").touch()
     jobs = []
     monkeypatch.setattr(compare_run, "run_compare", lambda job, _console: jobs.append(job))
     command = tyro.cli(EvalCompare, args=["wall.rff", "wall@10=drive.json", *options])
