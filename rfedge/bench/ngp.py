@@ -18,17 +18,19 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.extras import needs
 from rfcore.field import NgpField, load_field
 from rfcore.metrics import psnr
 from rfcore.ngp.native import NgpRenderer
 from rfcore.ngp.shape import NgpParameters
 from rfcore.train import NgpTrainer, NgpTrainingConfig
 from rfcore.views import PosedPicture
+from rfedge.samples import sample_path
 from rfedge.timing import median_ms
 
 __all__ = ["NgpRow", "check_against_reference", "ngp_rows"]
 
-STREET = Path("samples/street")
+STREET = sample_path("street")
 ITERATIONS = 600
 BUDGETS = (None, 16, 12, 8)
 CASES = (
@@ -170,9 +172,11 @@ def _torch_ms(numbers: NgpParameters, camera: Camera, size: tuple[int, int]) -> 
 
 
 def _reference_colour(numbers: NgpParameters, camera: Camera) -> NDArray[np.float64]:
-    import torch
 
     from rfcore.ngp import reference
+
+    with needs("reference"):
+        import torch
 
     with torch.no_grad():
         colour, _, _ = reference.render(reference.parameters(numbers), numbers, camera)

@@ -16,13 +16,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
+from rfcore.extras import needs
 from rfcore.image import Rgb
 from rfcore.metrics import psnr
+
+with needs("eval"):
+    import cv2
+    import flip_evaluator
 
 __all__ = [
     "BANDS",
@@ -88,8 +92,6 @@ def render_quality(render: Rgb, camera: Rgb) -> RenderQuality:
 def flip(render: Rgb, camera: Rgb) -> float:
     """Return the mean FLIP (Andersson et al. 2020) of two pictures of one size, at its default
     viewing distance; it takes longer than everything else here together."""
-    import flip_evaluator
-
     pictures = (picture.astype(np.float32) / 255 for picture in (camera, render))
     _, mean, _ = flip_evaluator.evaluate(*pictures, "LDR")
     return float(mean)

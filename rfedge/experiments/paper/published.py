@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
 from rfcore.codec.h264.bitstream import split_nals
@@ -27,10 +26,14 @@ from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.ffmpeg import EncoderOptions, PictureKind, decode_clip, encode_pictures
 from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, nal_type, parse_slice_start
 from rfcore.errors import CodecError, InvalidInput
+from rfcore.extras import needs
 from rfcore.image import I420, Rgb
 from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfedge.experiments.picture_quality import RenderQuality, colour_ssim, render_quality
+
+with needs("eval"):
+    import cv2
 
 __all__ = [
     "PUBLISHED_CRFS",
