@@ -152,13 +152,17 @@ install = $(BIN)/python deploy/requirements.py $(1) | grep -v ^torch= > $(VENV)/
 	$(BIN)/python -m pip install -q -r $(VENV)/$(1).txt
 endif
 
+# After the locked packages, which are all it needs; before those that are not, which would choose for it.
+torch = $(BIN)/python -m pip install -q $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) -r requirements/torch.txt
+
 $(DEMO): pyproject.toml requirements/demo.txt | $(BIN)/python
 	$(call install,demo)
 	touch $@
 
 $(FULL): pyproject.toml requirements/test.txt requirements/torch.txt | $(DEMO)
+	$(if $(filter 1,$(LOCKED)),,$(torch))
 	$(call install,test)
-	$(BIN)/python -m pip install -q $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) -r requirements/torch.txt
+	$(torch)
 	touch $@
 
 # An editable install does not rebuild C++ by itself; this does, incrementally, under build/.
