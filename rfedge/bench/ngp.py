@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput, RfedgeError
-from rfcore.extras import needs
+from rfcore.extras import needs, require
 from rfcore.field import NgpField, load_field
 from rfcore.metrics import psnr
 from rfcore.ngp.native import NgpRenderer
@@ -75,6 +75,7 @@ def ngp_rows(field: Path | None = None) -> list[NgpRow]:
     ``FieldFormatError`` for a file that holds no field, ``InvalidInput`` for one of another kind,
     ``RfedgeError`` when the renderer is wrong.
     """
+    require("reference", "torch")
     numbers = _trained() if field is None else _loaded(field)
     held_out = read_dataset(STREET / "transforms_drive_empty.json").pictures[::HELD_OUT_EVERY]
     camera = held_out[0].camera

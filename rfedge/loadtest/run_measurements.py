@@ -13,7 +13,7 @@ from rfedge.loadtest.plan import Load, Vehicles
 from rfedge.loadtest.usage import Usage
 from rfedge.loadtest.verdict import Measured, Resources, VehicleCount
 
-with needs("ops"):
+with needs("loadtest"):
     import psutil
 
 __all__ = ["RunMeasurements", "VehicleReport", "links_busy", "measured"]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from rfcore.extras import needs
 
-with needs("ops"):
+with needs("loadtest"):
     import psutil
 
 __all__ = ["Sample", "Usage", "Watcher", "slope_per_minute"]
