@@ -27,6 +27,7 @@ from rfcore.errors import DatasetError, RfedgeError
 from rfcore.extras import needs
 from rfcore.files import write_whole
 from rfcore.image import Rgb
+from rfedge.samples import sample_path
 
 with needs("scene"):
     import cv2
@@ -169,7 +170,7 @@ class MakeSample:
 
     built: Annotated[Path, Positional] = Path("out/sample")
     """Folder with the built scenes `empty` and `vehicles`."""
-    sample: Annotated[Path, Positional] = Path("samples/street")
+    sample: Annotated[Path, Positional] = sample_path("street")
     """The sample's folder."""
 
     def run(self) -> None:
