@@ -1,6 +1,7 @@
-# Two images. runtime: agent, server, link, and the verbs about fields and certificates; without
-# PyTorch and OpenCV. full: all of rfedge. `make images` builds both, from wheels that it collects on
-# the host in build/wheels; where these are missing the build collects and compiles them itself.
+# Two images. runtime: agent, server, link, and the verbs about fields and certificates. full: training
+# and evaluation too. Versions and hashes are those of requirements/. `make images` builds both, from
+# wheels that it collects on the host in build/wheels; where these are missing the build collects and
+# compiles them itself.
 ARG BASE=debian:bookworm-slim
 FROM ${BASE} AS python
 RUN apt-get update \
@@ -32,7 +33,6 @@ CMD ["rfedge", "--help"]
 FROM source AS full-packages
 ARG PIP_INDEX_URL
 ARG PIP_EXTRA_INDEX_URL
-ARG TORCH_INDEX
 RUN test -d build/wheels/full || deploy/wheelhouse-in-image.sh full
 RUN python3 -m venv --without-pip /opt/rfedge \
 	&& PYTHONPATH=$(echo build/wheels/full/pip/pip-*.whl) /opt/rfedge/bin/python -m pip install -q \

@@ -2,27 +2,35 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
-STAMP  := $(VENV)/.installed
+# What is installed: enough for the demo (85 MB of wheels and a compiler's tools), or every extra and
+# the tools of test and check (0.6 GB, torch's CPU build among them). And what is compiled.
+DEMO   := $(VENV)/.installed-demo
+FULL   := $(VENV)/.installed-test
 BUILT  := $(VENV)/.built
+# The versions and hashes of requirements/; LOCKED=0 takes what pyproject.toml permits instead.
+LOCKED ?= 1
 # A package index with CPU builds of PyTorch, for those whose default index brings CUDA packages.
 TORCH_INDEX ?=
+# Pythons that `make wheels` builds for: all that are found, unless named.
+PYTHONS ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo sample sample-field test test-slow test-prometheus test-netns test-fault test-compose \
-	test-system-packages stability check build bench proto figures images up down operations-figures \
-	load load-transport load-receiver load-full soak soak-short
+.PHONY: help demo sample sample-field test test-slow test-prometheus test-netns test-fault \
+	test-compose test-system-packages stability check build bench proto figures images up \
+	down operations-figures load load-transport load-receiver load-full soak soak-short \
+	test-wheels build-full lock wheels nightly
 
 help:  ## show the targets
-	@awk -F':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-18s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: build  ## run the main job: two processes, one field, two drives; writes out/demo
 	$(BIN)/rfedge demo
 
-test: build  ## run the test suite
+test: build-full  ## run the fast tests (four minutes of two cores)
 	$(BIN)/python -m pytest -m "not slow"
 
-test-slow: build test-system-packages  ## run the tests that take more than ten seconds each
+test-slow: build-full test-system-packages  ## run the tests that take more than ten seconds each
 	$(BIN)/python -m pytest -m "slow and not compose and not fault" --timeout 600
 
 # Debian packages that slow tests use beside Python: cross compiler and emulator for
@@ -40,18 +48,18 @@ test-system-packages:  ## install the programs that test-slow uses (root, Debian
 		DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends $(SYSTEM_PACKAGES); \
 	else echo "slow tests need $(SYSTEM_PACKAGES), which root can install: some will fail"; fi
 
-test-prometheus: build test-system-packages  ## test rules with promtool, and dashboards on a live run
+test-prometheus: build-full test-system-packages  ## test rules with promtool, and dashboards on a live run
 	$(BIN)/python -m pytest -m prometheus --timeout 600
 
-test-netns: build test-system-packages  ## compare the link with the kernel's own shaper (root)
+test-netns: build-full test-system-packages  ## compare the link with the kernel's own shaper (root)
 	$(BIN)/python -m pytest -m netns --timeout 600
 
-test-fault: build test-system-packages  ## break servers, vehicles and links; writes results/faults.json (root)
+test-fault: build-full test-system-packages  ## break servers, vehicles and links; writes results/faults.json (root)
 	$(BIN)/python -m pytest tests/fault -m fault --timeout 120 --faults-json results/faults.json
 	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
 	mv docs/reliability.md.part docs/reliability.md
 
-stability: build  ## run the hard cases; writes results/stability.json and docs/stability.md
+stability: build-full  ## run the hard cases; writes results/stability.json and docs/stability.md
 	$(BIN)/python -m pytest tests/hard/test_stability.py::test_the_case_holds \
 		--stability-json results/stability.json --stability-page docs/stability.md
 
@@ -63,8 +71,8 @@ WHEELS_HERE = $(shell $(BIN)/python -c 'import sys; print(sys.version_info[:2] =
 images: build  ## build the images rfedge-runtime and rfedge-full
 	@for image in runtime full; do \
 		if [ "$(WHEELS_HERE)" = True ]; then \
-			PYTHON=$(BIN)/python TORCH_INDEX="$(TORCH_INDEX)" deploy/wheelhouse.sh $$image build/wheels/$$image; fi && \
-		docker build -q --target $$image --build-arg TORCH_INDEX="$(TORCH_INDEX)" -t rfedge-$$image:local . || exit 1; done
+			PYTHON=$(BIN)/python deploy/wheelhouse.sh $$image build/wheels/$$image; fi && \
+		docker build -q --target $$image -t rfedge-$$image:local . || exit 1; done
 	@docker image ls --format '{{.Repository}}:{{.Tag}} {{.Size}}' 'rfedge-*'
 
 # STAND_IN=1: Debian's Prometheus and no Grafana, where no image registry can be reached.
@@ -78,26 +86,26 @@ up:  ## start two roadside servers, four vehicles, Prometheus and Grafana in con
 down:  ## stop them and remove their volumes
 	$(COMPOSE) $(COMPOSE_FILES) down -v
 
-operations-figures: build  ## plot every panel of what `make up` started, into docs/operations.md
+operations-figures: build-full  ## plot every panel of what `make up` started, into docs/operations.md
 	$(BIN)/python deploy/compose/show.py
 
 LOADTEST = $(BIN)/rfedge loadtest --record results/loadtest.json
 load: load-transport load-receiver load-full  ## what two cores carry (`make -k load`, 3 min); writes results/loadtest.json
-load-transport: build  ## 100 streams at 30 Hz, pictures not decoded; writes results/loadtest.json
+load-transport: build-full  ## 100 streams at 30 Hz, pictures not decoded; writes results/loadtest.json
 	$(LOADTEST) --mode transport --vehicles 100 --hz 30 --out out/loadtest/transport
-load-receiver: build  ## 8 vehicles at 10 Hz, decoded against cached renders; writes results/loadtest.json
+load-receiver: build-full  ## 8 vehicles at 10 Hz, decoded against cached renders; writes results/loadtest.json
 	$(LOADTEST) --mode receiver --vehicles 8 --hz 10 --out out/loadtest/receiver
-load-full: build  ## 4 vehicles at 5 Hz, rendered and decoded; writes results/loadtest.json
+load-full: build-full  ## 4 vehicles at 5 Hz, rendered and decoded; writes results/loadtest.json
 	$(LOADTEST) --mode full --vehicles 4 --hz 5 --out out/loadtest/full
 
 MINUTES ?= 30
-soak: build  ## half load for MINUTES (30): memory, descriptors and threads must not grow
+soak: build-full  ## half load for MINUTES (30): memory, descriptors and threads must not grow
 	$(BIN)/python -m rfedge.loadtest.soak --minutes $(MINUTES) $(ARGS)
 
-soak-short: build  ## five minutes of it
+soak-short: build-full  ## five minutes of it
 	$(BIN)/python -m rfedge.loadtest.soak --minutes 5
 
-check: build  ## lint, types, layers, generated files
+check: build-full  ## lint, types, layers, generated files
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -105,23 +113,23 @@ check: build  ## lint, types, layers, generated files
 	@if npx --yes @bufbuild/buf --version >/dev/null 2>&1; then npx --yes @bufbuild/buf lint proto; \
 		else echo "buf lint was not run: it needs node and its registry"; fi
 
-sample: build  ## render the street in samples/street anew (half an hour; pip install 'rfedge[scene]')
+sample: build-full  ## render the street in samples/street anew (half an hour)
 	$(BIN)/rfedge scene build samples/street/empty.toml --split drive,train --out out/sample/empty
 	$(BIN)/rfedge scene build samples/street/vehicles.toml --split drive --out out/sample/vehicles
 	$(BIN)/python -m rfedge.demo.make_sample out/sample samples/street
 
-sample-field: build  ## train the field that ships in samples/fields (some minutes)
+sample-field: build-full  ## train the field that ships in samples/fields (some minutes)
 	$(BIN)/python -m rfedge.demo.field samples/street $(ARGS)
 
-bench: build  ## measure kernels and codec: correctness first, then time
+bench: build-full  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench raster
 	$(BIN)/rfedge bench train
 	$(BIN)/rfedge bench codec
 
-results-%: build  ## record `rfedge eval NAME` in results/NAME.json; options in ARGS (docs/evaluation.md)
+results-%: build-full  ## record `rfedge eval NAME` in results/NAME.json; options in ARGS (docs/evaluation.md)
 	$(BIN)/rfedge eval $* $(ARGS) --out results/$*.json
 
-figures: build  ## redraw docs/ from results/: figures, results.md, ladder.md, metrics.md, dashboards
+figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.md, metrics.md, dashboards
 	$(BIN)/python -m rfedge.pages.results results docs
 	$(BIN)/python -m rfedge.experiments.ladder.page results docs
 	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
@@ -130,25 +138,55 @@ figures: build  ## redraw docs/ from results/: figures, results.md, ladder.md, m
 	mv docs/metrics.md.part docs/metrics.md
 	$(BIN)/python -m rfedge.dashboards deploy/grafana/dashboards
 
+nightly:  ## what .ci/run leaves out: faults, wheels of every Python, half an hour of load, containers
+	.ci/run nightly
+
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-$(STAMP): pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install -q --upgrade "pip>=25.1"
-	$(BIN)/python -m pip install -q $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch==2.13.0
-	$(BIN)/python -m pip install -q --group dev
+# The packages of a set, and nothing that they bring beside it when it is locked.
+ifeq ($(LOCKED),1)
+install = $(BIN)/python -m pip install -q --no-deps --require-hashes -r requirements/$(1).txt
+else
+install = $(BIN)/python deploy/requirements.py $(1) | grep -v ^torch= > $(VENV)/$(1).txt && \
+	$(BIN)/python -m pip install -q -r $(VENV)/$(1).txt
+endif
+
+# After the locked packages, which are all it needs; before those that are not, which would choose for it.
+torch = $(BIN)/python -m pip install -q $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) -r requirements/torch.txt
+
+$(DEMO): pyproject.toml requirements/demo.txt | $(BIN)/python
+	$(call install,demo)
+	touch $@
+
+$(FULL): pyproject.toml requirements/test.txt requirements/torch.txt | $(DEMO)
+	$(if $(filter 1,$(LOCKED)),,$(torch))
+	$(call install,test)
+	$(torch)
 	touch $@
 
 # An editable install does not rebuild C++ by itself; this does, incrementally, under build/.
-$(BUILT): $(STAMP) $(NATIVE)
-	$(BIN)/python -m pip install -q --no-build-isolation -e .
+$(BUILT): $(DEMO) $(NATIVE)
+	$(BIN)/python -m pip install -q --no-build-isolation --no-deps -e .
 	touch $@
 
-build: $(BUILT)  ## set up .venv and compile the kernels
+build: $(BUILT)  ## set up .venv for the demo and compile the kernels
+
+build-full: $(FULL) $(BUILT)  ## the same with every extra, for tests, checks and experiments
+
+lock: $(DEMO)  ## pin versions and hashes anew in requirements/ (Python 3.11)
+	$(BIN)/python -m pip install -q "pip-tools>=7.5"
+	PYTHON=$(BIN)/python deploy/lock.sh
+
+wheels:  ## build a manylinux wheel for each CPython from 3.11 to 3.13 that is found, into dist/
+	$(PYTHON) deploy/wheels.py build $(PYTHONS)
+
+test-wheels: wheels  ## install each into an empty venv, run the demo, compare what it encodes
+	$(PYTHON) deploy/wheels.py test $(PYTHONS)
 
 # The stubs are committed, so that installing needs no protoc; tests/wire/test_stubs.py sees drift.
 STUBS ?= .
-proto: $(STAMP)  ## regenerate the gRPC stubs in rfcore/wire/v1
+proto: $(FULL)  ## regenerate the gRPC stubs in rfcore/wire/v1
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m grpc_tools.protoc -I proto \
 		--python_out=$(STUBS) --grpc_python_out=$(STUBS) --mypy_out=$(STUBS) \
 		--mypy_grpc_out=$(STUBS) proto/rfcore/wire/v1/*.proto

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 from tyro.conf import arg
 
 from rfcore.errors import InvalidInput
+from rfedge.samples import sample_path
 
 if TYPE_CHECKING:
     from rfcore.field import RadianceField, SplatField
@@ -59,7 +60,7 @@ JSON = arg(metavar="FILE.json")
 
 IMPORTED = Path("out/fields")
 """Where ``rfedge field import`` puts what it reads."""
-SAMPLES = Path("samples/fields")
+SAMPLES = sample_path("fields")
 SUFFIX = ".rff"
 PICTURES = (".gif", ".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")

@@ -14,12 +14,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from rfcore.camera import Camera
+from rfcore.extras import needs
 from rfcore.harmonics import CONSTANT, higher_harmonics
 from rfcore.ngp.shape import HashGrid, NgpParameters, NgpShape, Space
+
+with needs("reference"):
+    import torch
+    from torch import Tensor
 
 __all__ = [
     "Rays",

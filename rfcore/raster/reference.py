@@ -15,13 +15,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
-import torch
-from torch import Tensor
-from torch.nn import functional
 
 from rfcore.camera import Camera
+from rfcore.extras import needs
 from rfcore.harmonics import CONSTANT, higher_harmonics
 from rfcore.raster.gaussians import Gaussians
+
+with needs("reference"):
+    import torch
+    from torch import Tensor
+    from torch.nn import functional
 
 __all__ = ["loss_l1_dssim", "parameters", "render", "spherical_harmonics"]
 

@@ -25,11 +25,12 @@ from rfcore.field import RadianceField, load_field, render_field_view
 from rfcore.views import FieldView
 from rfcore.wire.messages import Frame
 from rfedge.loadtest.prerecorded import PrerecordedDrive, prerecorded_drive
+from rfedge.samples import sample_path
 
 __all__ = ["DecoderRow", "decoder_rows"]
 
-FIELD = Path("samples/fields/street.rff")
-DRIVE = Path("samples/street/transforms_drive_vehicles.json")
+FIELD = sample_path("fields/street.rff")
+DRIVE = sample_path("street/transforms_drive_vehicles.json")
 KINDS = (DecoderKind.IN_PROCESS, DecoderKind.CHILD, DecoderKind.BUBBLEWRAP)
 LAPS = 5
 """How many times the drive is decoded, after one pass to warm up."""

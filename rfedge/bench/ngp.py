@@ -18,17 +18,19 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.extras import needs, require
 from rfcore.field import NgpField, load_field
 from rfcore.metrics import psnr
 from rfcore.ngp.native import NgpRenderer
 from rfcore.ngp.shape import NgpParameters
 from rfcore.train import NgpTrainer, NgpTrainingConfig
 from rfcore.views import PosedPicture
+from rfedge.samples import sample_path
 from rfedge.timing import median_ms
 
 __all__ = ["NgpRow", "check_against_reference", "ngp_rows"]
 
-STREET = Path("samples/street")
+STREET = sample_path("street")
 ITERATIONS = 600
 BUDGETS = (None, 16, 12, 8)
 CASES = (
@@ -73,6 +75,7 @@ def ngp_rows(field: Path | None = None) -> list[NgpRow]:
     ``FieldFormatError`` for a file that holds no field, ``InvalidInput`` for one of another kind,
     ``RfedgeError`` when the renderer is wrong.
     """
+    require("reference", "torch")
     numbers = _trained() if field is None else _loaded(field)
     held_out = read_dataset(STREET / "transforms_drive_empty.json").pictures[::HELD_OUT_EVERY]
     camera = held_out[0].camera
@@ -170,9 +173,11 @@ def _torch_ms(numbers: NgpParameters, camera: Camera, size: tuple[int, int]) -> 
 
 
 def _reference_colour(numbers: NgpParameters, camera: Camera) -> NDArray[np.float64]:
-    import torch
 
     from rfcore.ngp import reference
+
+    with needs("reference"):
+        import torch
 
     with torch.no_grad():
         colour, _, _ = reference.render(reference.parameters(numbers), numbers, camera)

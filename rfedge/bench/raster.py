@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.errors import RfedgeError
+from rfcore.extras import needs
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfedge.bench import Rows
@@ -162,9 +163,11 @@ def check_against_reference(gaussians: Gaussians, camera: Camera) -> None:
 
 
 def _reference_colour(gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
-    import torch
 
     from rfcore.raster import reference
+
+    with needs("reference"):
+        import torch
 
     with torch.no_grad():
         colour, _, _ = reference.render(reference.parameters(gaussians), camera)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rfcore.errors import RfedgeError
+from rfcore.extras import needs
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 from rfedge.bench.street import street_camera, street_gaussians
@@ -46,9 +47,11 @@ def train_rows() -> list[TrainRow]:
 
 def check_gradients() -> None:
     """Raise ``RfedgeError`` unless the gradients of a small street follow the reference."""
-    import torch
 
     from rfcore.raster import reference
+
+    with needs("reference"):
+        import torch
 
     gaussians, camera = street_gaussians(CHECK_COUNT), street_camera(*CHECK_SIZE_PX)
     target = _target(CHECK_SIZE_PX)

@@ -9,6 +9,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from rfedge.arguments import FOLDER
+from rfedge.samples import sample_path
 
 __all__ = ["Demo"]
 
@@ -17,7 +18,7 @@ __all__ = ["Demo"]
 class Demo:
     """Take or train a field, run server, link and vehicle on two drives, and report."""
 
-    sample: Annotated[Path, FOLDER] = Path("samples/street")
+    sample: Annotated[Path, FOLDER] = sample_path("street")
     """Dataset folder: training views, points, and the drives `empty` and `vehicles`."""
     out: Annotated[Path, FOLDER] = Path("out/demo")
     """Folder for report.html, reconstructed.mp4 and result.json; replaced on every run."""

@@ -15,6 +15,7 @@ from rfedge.experiments.latency import EvalLatency
 from rfedge.experiments.never_worse import EvalNeverWorse
 from rfedge.experiments.paper import EvalPaper
 from rfedge.experiments.robust import EvalRobust
+from rfedge.samples import sample_path
 
 __all__ = ["Bench", "Eval", "LoadTest"]
 
@@ -77,9 +78,9 @@ class LoadTest:
     """Let the server refuse vehicles or lower their rate; the verdict is about those let in."""
     find_limit: bool = False
     """Look for the largest number that holds."""
-    field: Annotated[Path, FIELD] = Path("samples/fields/street.rff")
+    field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
     """Field archive, the only one in its folder."""
-    drive: Annotated[Path, DATASET] = Path("samples/street/transforms_drive_vehicles.json")
+    drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")
     """Drive whose pictures the vehicles send."""
     workers: int = 2
     """Frames the server reconstructs at once, and threads of a render."""

@@ -77,12 +77,6 @@ class ScenePoses:
 
         from rich.console import Console
 
-        from rfcore.errors import BackendUnavailable
-
-        try:
-            import pycolmap  # noqa: F401
-        except ImportError as error:
-            raise BackendUnavailable("pycolmap is missing: pip install 'rfedge[colmap]'") from error
         from rfedge.datasets.colmap_features import Matching, PoseSettings, SharedCamera
         from rfedge.datasets.poses import pose_dataset
 
@@ -146,7 +140,8 @@ class SceneRecordCarla:
 
     def run(self) -> None:
         """Connect, record, and write the dataset."""
-        from rfcore.errors import BackendUnavailable, RfedgeError
+        from rfcore.errors import RfedgeError
+        from rfcore.extras import needs
         from rfcore.files import whole_folder
         from rfedge.datasets.carla import Recorder, RecordSettings
         from rfedge.datasets.rig import mounts_named
@@ -162,10 +157,8 @@ class SceneRecordCarla:
             fov_deg=self.fov_deg,
             timeout_s=self.timeout_s,
         )
-        try:
+        with needs("carla"):
             import carla
-        except ImportError as error:
-            raise BackendUnavailable("carla is missing: pip install 'rfedge[carla]'") from error
         with whole_folder(self.out) as folder:
             try:
                 client = carla.Client(self.host, self.port)

@@ -131,9 +131,6 @@ class CertsInit:
         """Make them and say what is where."""
         from datetime import UTC, datetime
 
-        from rfedge.certs import require_cryptography
-
-        require_cryptography()
         from rfedge.certs.authority import Members, certify, write_certificates
 
         members = Members(self.vehicles, self.consumers, self.hosts)
@@ -158,9 +155,6 @@ class CertsShow:
         from datetime import UTC, datetime, timedelta
 
         from rfcore.errors import InvalidData
-        from rfedge.certs import require_cryptography
-
-        require_cryptography()
         from rfedge.certs.authority import read_certificates
 
         soon = datetime.now(UTC) + timedelta(days=self.within_days)

@@ -15,15 +15,18 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import pycolmap
 
 from rfcore.camera import Pose
 from rfcore.dataset.colmap import camera_of, parameter_count
 from rfcore.dataset.picture_file import picture_size_px
 from rfcore.dataset.source import SourceCamera, SourcePicture
 from rfcore.errors import DatasetError, InvalidInput
+from rfcore.extras import needs
 from rfcore.image import write_png
 from rfcore.lens import BrownLens, FisheyeLens
+
+with needs("colmap"):
+    import pycolmap
 
 __all__ = [
     "Matching",

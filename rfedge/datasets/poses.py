@@ -14,7 +14,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import pycolmap
 
 from rfcore.camera import Pose, TileOrigin
 from rfcore.dataset.assemble import chosen_origin
@@ -23,6 +22,7 @@ from rfcore.dataset.read import read_source, refuse_video
 from rfcore.dataset.source import SourceCamera, SourcePicture, SourcePoints
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import DatasetError
+from rfcore.extras import needs
 from rfcore.files import whole_folder
 from rfedge.datasets.colmap_features import (
     PoseSettings,
@@ -36,6 +36,9 @@ from rfedge.datasets.colmap_features import (
     rigid_of,
     source_camera,
 )
+
+with needs("colmap"):
+    import pycolmap
 
 __all__ = ["Solution", "Tell", "pose_dataset", "solve_poses"]
 

@@ -26,8 +26,8 @@ from rfcore.field.store import encode_field
 from rfcore.files import write_whole
 from rfcore.train import DensityControl, SplatTrainingConfig
 from rfcore.train.levels import LevelFitConfig
-from rfedge.demo.make_sample import run_maker
 from rfedge.results import Provenance, make_result, provenance, write_result
+from rfedge.samples import sample_path
 from rfedge.training.finish import finish_field
 from rfedge.training.run import TrainingJob, train_field, training_config
 
@@ -106,7 +106,7 @@ def _manifest_digest(sample: Path) -> str:
 class MakeSampleField:
     """Train a sample's field, fit its levels, compress it, and write it with its record."""
 
-    sample: Annotated[Path, Positional] = Path("samples/street")
+    sample: Annotated[Path, Positional] = sample_path("street")
     """Dataset folder with a manifest: training views, points and the drive `empty`."""
     gaussians: int | None = None
     """At most how many Gaussians to start with; default: the trainer's own."""
@@ -145,6 +145,8 @@ class MakeSampleField:
 
 def main() -> int:
     """Parse the command line and make the field; return the exit status."""
+    from rfedge.demo.make_sample import run_maker  # needs an extra, which the demo does without
+
     return run_maker(MakeSampleField, "sample-field")
 
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
-import cv2
 import tyro
 from tyro.conf import Positional
 
@@ -25,8 +24,13 @@ from rfcore.dataset.read import read_source
 from rfcore.dataset.source import Source
 from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, write_points
 from rfcore.errors import DatasetError, RfedgeError
+from rfcore.extras import needs
 from rfcore.files import write_whole
 from rfcore.image import Rgb
+from rfedge.samples import sample_path
+
+with needs("scene"):
+    import cv2
 
 __all__ = ["MakeSample", "Maker", "main", "pack_sample", "run_maker"]
 
@@ -166,7 +170,7 @@ class MakeSample:
 
     built: Annotated[Path, Positional] = Path("out/sample")
     """Folder with the built scenes `empty` and `vehicles`."""
-    sample: Annotated[Path, Positional] = Path("samples/street")
+    sample: Annotated[Path, Positional] = sample_path("street")
     """The sample's folder."""
 
     def run(self) -> None:

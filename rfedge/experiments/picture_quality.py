@@ -6,7 +6,7 @@ frequency, over the camera's own in the same band; 0 is a perfect render, 1 one 
 be flat there, above 1 one that does harm. Bands are in cycles a pixel, so that they mean the same
 at every size. LPIPS is not computed: its weights are not ours to ship.
 
-``luma_ssim`` is ``rfcore.metrics.ssim`` in float32, in a fifth of the time: the same window,
+``luma_ssim`` is ``rfcore.metrics.ssim`` in float32, in half the time: the same window,
 constants and mirrored border. 128 is subtracted from all samples before variances are taken, which
 do not depend on it, so that the error stays below 1e-4.
 """
@@ -16,11 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
+from rfcore.extras import needs
 from rfcore.image import Rgb
 from rfcore.metrics import psnr
 
@@ -38,7 +38,9 @@ __all__ = [
 RADIUS_PX, SIGMA_PX = 5, 1.5
 C1, C2 = np.float32((0.01 * 255) ** 2), np.float32((0.03 * 255) ** 2)
 MIDDLE = np.float32(128)
-WEIGHTS = cv2.getGaussianKernel(2 * RADIUS_PX + 1, SIGMA_PX, cv2.CV_32F)
+GAUSSIAN = np.exp(-0.5 * (np.arange(RADIUS_PX + 1) / SIGMA_PX) ** 2)
+WEIGHTS = (GAUSSIAN / (2 * GAUSSIAN.sum() - 1)).astype(np.float32)
+"""Of the middle sample and of those at each distance from it."""
 F32 = NDArray[np.floating[Any]]
 
 
@@ -57,10 +59,21 @@ def luma_ssim(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
 
 
 def _windowed(plane: F32) -> F32:
-    border = cv2.BORDER_REFLECT_101
-    return np.asarray(
-        cv2.sepFilter2D(plane, cv2.CV_32F, WEIGHTS, WEIGHTS, borderType=border), np.float32
-    )
+    """Return the mean under the window around each sample, over a border that mirrors the plane."""
+    padded = np.pad(plane, RADIUS_PX, mode="reflect")
+    return _along_rows(_along_rows(padded).T).T
+
+
+def _along_rows(padded: F32) -> F32:
+    """Filter [H + 2 RADIUS_PX, W] to [H, W], the two samples at one distance together."""
+    height = len(padded) - 2 * RADIUS_PX
+    filtered = WEIGHTS[0] * padded[RADIUS_PX : RADIUS_PX + height]
+    for distance in range(1, RADIUS_PX + 1):
+        above, below = RADIUS_PX - distance, RADIUS_PX + distance
+        pair = padded[above : above + height] + padded[below : below + height]
+        pair *= WEIGHTS[distance]
+        filtered += pair
+    return np.ascontiguousarray(filtered)
 
 
 BANDS = ((0.0, 1 / 16), (1 / 16, 1 / 8), (1 / 8, 1 / 4), (1 / 4, 0.75))
@@ -88,7 +101,8 @@ def render_quality(render: Rgb, camera: Rgb) -> RenderQuality:
 def flip(render: Rgb, camera: Rgb) -> float:
     """Return the mean FLIP (Andersson et al. 2020) of two pictures of one size, at its default
     viewing distance; it takes longer than everything else here together."""
-    import flip_evaluator
+    with needs("eval"):
+        import flip_evaluator
 
     pictures = (picture.astype(np.float32) / 255 for picture in (camera, render))
     _, mean, _ = flip_evaluator.evaluate(*pictures, "LDR")

@@ -14,10 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from rfcore.errors import InvalidInput
+from rfcore.extras import needs
 from rfedge.experiments.clips import CodedClip
+
+with needs("eval"):
+    from scipy.interpolate import PchipInterpolator
 
 __all__ = ["RateCurve", "Window", "bd_rate_interval", "bd_rate_percent", "rate_curve"]
 

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import psutil
-
+from rfcore.extras import needs
 from rfedge.loadtest.plan import Load, Vehicles
 from rfedge.loadtest.usage import Usage
 from rfedge.loadtest.verdict import Measured, Resources, VehicleCount
+
+with needs("loadtest"):
+    import psutil
 
 __all__ = ["RunMeasurements", "VehicleReport", "links_busy", "measured"]
 

@@ -23,6 +23,7 @@ from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.run import Run, TestBed, run_load
 from rfedge.loadtest.usage import Sample, slope_per_minute
 from rfedge.results import make_result, provenance, write_result
+from rfedge.samples import sample_path
 
 __all__ = ["MAX_SLOPE_MB", "SoakRow", "SoakSettings", "soak", "what_grew"]
 
@@ -48,9 +49,9 @@ class SoakSettings:
     """Pictures per second of each."""
     warm_up: float = 60.0
     """Seconds before it counts: caches fill, allocators find their size."""
-    field: Path = Path("samples/fields/street.rff")
+    field: Path = sample_path("fields/street.rff")
     """Field archive, the only one in its folder."""
-    drive: Path = Path("samples/street/transforms_drive_vehicles.json")
+    drive: Path = sample_path("street/transforms_drive_vehicles.json")
     """Drive whose pictures the vehicles send."""
     out: Path = Path("out/soak/soak.json")
     """File for the result; beside it, the processes' logs."""

@@ -13,7 +13,10 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-import psutil
+from rfcore.extras import needs
+
+with needs("loadtest"):
+    import psutil
 
 __all__ = ["Sample", "Usage", "Watcher", "slope_per_minute"]
 

@@ -16,7 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rfcore.extras import needs
 from rfedge.loadtest.plan import Bounds
+
+with needs("loadtest"):
+    from scipy.stats import binomtest
 
 __all__ = [
     "Measured",
@@ -210,8 +214,6 @@ def share_at_least(successes: int, trials: int) -> float:
 
     Frames of one vehicle are late together, so the true interval is wider.
     """
-    from scipy.stats import binomtest
-
     if not trials:
         return 0.0
     interval = binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")

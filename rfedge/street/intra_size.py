@@ -18,7 +18,7 @@ from rfcore.codec.h264.ffmpeg import EncoderOptions, PictureKind, encode_picture
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import Rgb, read_rgb
 from rfcore.native.yuv import i420_from_rgb
-from rfedge.experiments.paper.published import slice_nals
+from rfedge.experiments.paper.savings import slice_nals
 from rfedge.results import make_result, provenance, write_result
 
 __all__ = ["IntraCoding", "SceneSizes", "intra_bytes", "sizes_of", "write_sizes"]

@@ -20,6 +20,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from rfcore.errors import InvalidInput
 from rfcore.tables import Range, Table
+from rfedge.samples import sample_path
 from rfedge.street.effects import EFFECTS, EffectKind, load_effect
 from rfedge.street.geometry.layout import Geometry
 
@@ -123,7 +124,7 @@ def _lines_of_keys(text: str) -> dict[str, int]:
     return found
 
 
-SCENES = Path("samples/scenes")
+SCENES = sample_path("scenes")
 Size = Annotated[tuple[int, int], Range(16, 8192)]
 
 

@@ -50,7 +50,7 @@ __all__ = [
 ]
 
 BASE_BYTES = 350 << 20
-"""The interpreter, numpy, OpenCV and the report's libraries."""
+"""The interpreter, numpy, PyAV, the report's libraries and what finding neighbours takes."""
 FLOATS_OF_GEOMETRY = 11
 SETS = 3
 """Parameters and two moments."""

@@ -11,9 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isqrt
 from pathlib import Path
+from typing import Any
 
-import cv2
+import av
 import numpy as np
+from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from rfcore.dataset import Dataset, Distortion, read_dataset
@@ -56,19 +58,22 @@ def points_from_depth_maps(pictures: Sequence[PosedPicture], folder: Path) -> Po
 def read_depth_m(path: Path) -> NDArray[np.float32]:
     """Read a depth map in metres; raise ``DatasetError`` naming the file."""
     try:
-        if path.suffix == ".npy":
-            depth = np.load(path, allow_pickle=False)
-        else:
-            depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except (OSError, ValueError) as error:
+        depth = np.load(path, allow_pickle=False) if path.suffix == ".npy" else _stored(path)
+    except (FFmpegError, OSError, StopIteration, IndexError, ValueError) as error:
         raise DatasetError(f"{path}: not a readable depth map ({error})") from error
-    if depth is None or depth.ndim != 2:
+    if depth.ndim != 2:
         raise DatasetError(f"{path}: not a readable depth map of one channel")
     if path.suffix == ".npy":
         return np.asarray(depth, np.float32)
     if depth.dtype != np.uint16:
         raise DatasetError(f"{path}: {depth.dtype} pixels, a depth map has 16 bits of millimetres")
     return np.asarray(depth / MILLIMETRES, np.float32)
+
+
+def _stored(path: Path) -> NDArray[Any]:
+    """Return the pixels as the file has them: [H, W], or [H, W, C] for more than one channel."""
+    with av.open(str(path)) as container:
+        return next(container.decode(video=0)).to_ndarray()
 
 
 def _map_of(picture: PosedPicture, folder: Path) -> Path | None:

@@ -255,18 +255,3 @@ def test_foreign_images_are_pinned() -> None:
 def test_the_stand_in_changes_nothing_but_images() -> None:
     assert set(STAND_IN["services"]["prometheus"]) == {"image", "build"}
     assert set(STAND_IN["services"]["grafana"]) == {"profiles"}
-
-
-def test_the_runtime_image_lacks_what_the_services_may_not_import() -> None:
-    path = ROOT / "deploy/requirements.py"
-    spec = importlib.util.spec_from_file_location("requirements", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    runtime = module.requirements("runtime", ROOT / "pyproject.toml")
-    full = module.requirements("full", ROOT / "pyproject.toml")
-    left_out = {re.split(r"[<>=]", line)[0] for line in set(full) - set(runtime)}
-    assert left_out == module.ONLY_FULL
-    with pytest.raises(ValueError, match="neither runtime nor full"):
-        module.requirements("both", ROOT / "pyproject.toml")

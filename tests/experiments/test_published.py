@@ -8,10 +8,10 @@ from rfcore.native.yuv import i420_from_rgb
 from rfedge.experiments.paper.published import (
     PublishedFrame,
     Setting,
-    paper_savings_percent,
     published_rows,
     reduced,
 )
+from rfedge.experiments.paper.savings import paper_savings_percent
 
 SMALL = Setting((64, 48), "downscaled", "medium", 23.0)
 

@@ -52,7 +52,7 @@ def test_a_library_that_aborts_the_process_is_passed_over(
 
 @pytest.mark.parametrize("missing", ["mitsuba", "pyoidn", "scipy"])
 def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
-    monkeypatch.setattr(backend, "find_spec", lambda name: None if name == missing else name)
+    monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(
         BackendUnavailable, match=rf"^{missing} is missing: pip install 'rfedge\[scene\]'$"
     ):

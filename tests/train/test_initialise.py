@@ -1,10 +1,11 @@
 """The Gaussians a run starts from: as wide as their neighbourhood, coloured like their points."""
 
+import cv2
 import numpy as np
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfcore.train.start import gaussians_from_points, spacing_m
+from rfcore.train.start import LEAF_POINTS, QUERIES, gaussians_from_points, spacing_m
 from rfcore.views import PointCloud
 
 
@@ -27,6 +28,31 @@ def test_a_search_through_all_pairs_agrees() -> None:
     distances = np.linalg.norm(xyz_m[:, None].astype(float) - xyz_m[None], axis=-1)
     want = np.sort(distances, axis=1)[:, 1:4].mean(axis=1)
     np.testing.assert_allclose(spacing_m(xyz_m), want, rtol=1e-5)
+
+
+def points_of_many_kinds() -> dict[str, np.ndarray]:
+    """Clouds around which a search tree goes wrong: long tails, copies, outliers, few points."""
+    rng = generator()
+    return {
+        "two": rng.normal(size=(2, 3)),
+        "as many as a leaf": rng.normal(size=(LEAF_POINTS, 3)),
+        "one more than a leaf": rng.normal(size=(LEAF_POINTS + 1, 3)),
+        "one more than a batch": rng.normal(size=(QUERIES + 1, 3)),
+        "long tails": np.exp(3 * rng.normal(size=(3000, 3))),
+        "outliers": np.vstack([rng.normal(size=(2000, 3)), 1e6 * rng.normal(size=(50, 3))]),
+        "copies": np.repeat(rng.normal(size=(100, 3)), 30, axis=0),
+        "a plane": rng.normal(size=(2000, 3)) * [1, 1, 0],
+        "one place": np.zeros((500, 3)),
+    }
+
+
+@pytest.mark.parametrize("kind", points_of_many_kinds())
+def test_spacing_is_that_of_opencvs_exact_tree_to_the_bit(kind: str) -> None:
+    xyz_m = points_of_many_kinds()[kind].astype(np.float32)
+    exact_tree = cv2.flann.Index(xyz_m, {"algorithm": 4})
+    _, squared = exact_tree.knnSearch(xyz_m, min(4, len(xyz_m)), params={})
+    want = np.sqrt(squared.astype(np.float64))[:, 1:].mean(axis=1)
+    np.testing.assert_array_equal(spacing_m(xyz_m), want)
 
 
 def test_deviation_is_spacing_times_scale() -> None:

@@ -17,7 +17,13 @@ from rfedge.cli.train import Train
 from rfedge.training.finish import training_result
 from rfedge.training.loop import LoopLimits
 from rfedge.training.run import TrainingJob, train
-from rfedge.training.views import ViewChoice, read_views, share_of_views, split_every
+from rfedge.training.views import (
+    ViewChoice,
+    read_depth_m,
+    read_views,
+    share_of_views,
+    split_every,
+)
 
 VIEWS = 8
 
@@ -161,6 +167,31 @@ def test_bad_depth_maps_are_refused_by_name(wall: Path, tmp_path: Path) -> None:
     (tmp_path / "0.npy").write_bytes(b"nonsense")
     with pytest.raises(DatasetError, match=r"0\.npy"):
         read_views(ViewChoice(wall, depths=tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("pixels", "problem"),
+    [
+        (np.full((32, 48), 40, np.uint8), r"0\.png: uint8 pixels, a depth map has 16 bits"),
+        (np.full((32, 48, 3), 4000, np.uint16), r"0\.png: not a readable depth map of one"),
+        (None, r"0\.png: not a readable depth map"),
+    ],
+)
+def test_a_picture_that_holds_no_depths_is_refused(
+    wall: Path, tmp_path: Path, pixels: np.ndarray | None, problem: str
+) -> None:
+    data = b"nonsense" if pixels is None else cv2.imencode(".png", pixels)[1].tobytes()
+    (tmp_path / "0.png").write_bytes(data)
+    with pytest.raises(DatasetError, match=problem):
+        read_views(ViewChoice(wall, depths=tmp_path))
+
+
+def test_a_depth_map_is_read_in_millimetres(tmp_path: Path) -> None:
+    stored = np.random.default_rng(3).integers(0, 65536, (7, 9), dtype=np.uint16)
+    cv2.imwrite(str(tmp_path / "0.png"), stored)
+    np.testing.assert_array_equal(
+        read_depth_m(tmp_path / "0.png"), (stored / 1000).astype(np.float32)
+    )
 
 
 def test_declared_exposure_is_learned_and_nothing_else_is(wall: Path, tmp_path: Path) -> None:

@@ -8,6 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
+from rfedge.samples import sample_path
+
 __all__ = ["EvalLadder"]
 
 
@@ -19,9 +21,9 @@ class EvalLadder:
     cost before it starts; stopped and started again, it goes on where it was.
     """
 
-    fields: Annotated[tuple[Path, ...], Positional] = (Path("samples/fields/street.rff"),)
+    fields: Annotated[tuple[Path, ...], Positional] = (sample_path("fields/street.rff"),)
     """Field archives (.rff), of any kind; the first one's full rung is what rates are against."""
-    drive: Path = Path("samples/street/transforms_drive_vehicles.json")
+    drive: Path = sample_path("street/transforms_drive_vehicles.json")
     """The drive to code."""
     frames: int = 24
     """How many of its pictures."""

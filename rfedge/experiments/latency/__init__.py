@@ -8,11 +8,13 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
+from rfedge.samples import sample_path
+
 __all__ = ["EvalLatency"]
 
 SAMPLES = (
-    "empty@10=samples/street/transforms_drive_empty.json",
-    "vehicles@10=samples/street/transforms_drive_vehicles.json",
+    f"empty@10={sample_path('street/transforms_drive_empty.json')}",
+    f"vehicles@10={sample_path('street/transforms_drive_vehicles.json')}",
 )
 
 
@@ -24,11 +26,11 @@ class EvalLatency:
     and 10 ms, and the uplink at which 99 % of them are. Coded clips are kept and not coded again.
     """
 
-    field: Annotated[Path, Positional] = Path("samples/fields/street.rff")
+    field: Annotated[Path, Positional] = sample_path("fields/street.rff")
     """The field archive (.rff) both ends hold."""
     drives: Annotated[tuple[str, ...], Positional] = SAMPLES
     """NAME@HZ=DATASET for each drive."""
-    traces: tuple[Path, ...] = (Path("samples/links/drive.up"),)
+    traces: tuple[Path, ...] = (sample_path("links/drive.up"),)
     """Recorded uplinks in Mahimahi's format."""
     preset: str = "veryfast"
     """x264 preset of both."""

@@ -1,16 +1,10 @@
-"""The experiment as published: savings of a two-frame clip, and rows as its tables need them.
+"""The experiment as published, frame by frame: rows as its tables need them.
 
-A clip of two frames, the render and then the camera's, goes through x264 with the preset's own
-defaults: one frame a second, the same CRF for both, picture types left to the encoder. The figure
-is ``100 I / (I + P)`` in bytes of the slices, parameter sets and SEI left out. It says little about
-bytes saved: it divides by a picture nobody sends, so P = I reads 50 %, and spending more on the
-unsent picture raises it. ``rfedge.demo.measure`` has the figure at equal quality.
-
-``published_rows`` codes one frame so at every size, preset and CRF; the camera frame alone, coded
-the same way, says what an I picture of it costs. Nothing here is our own coding. PSNR and SSIM are
-of RGB, without the encoder's padding. ``downscaled`` renders and frames are made at the drive's
-size and reduced together, as published; ``native`` renders are made at the small size, which is
-what a vehicle would do.
+``published_rows`` codes the two-frame clip of ``rfedge.experiments.paper.savings`` at every size,
+preset and CRF; the camera frame alone, coded the same way, says what an I picture of it costs.
+Nothing here is our own coding. PSNR and SSIM are of RGB, without the encoder's padding.
+``downscaled`` renders and frames are made at the drive's size and reduced together, as published;
+``native`` renders are made at the small size, which is what a vehicle would do.
 """
 
 from __future__ import annotations
@@ -19,114 +13,34 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
-from rfcore.codec.h264.bitstream import split_nals
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.h264.ffmpeg import EncoderOptions, PictureKind, decode_clip, encode_pictures
-from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, nal_type, parse_slice_start
-from rfcore.errors import CodecError, InvalidInput
+from rfcore.codec.h264.ffmpeg import decode_clip
+from rfcore.errors import InvalidInput
+from rfcore.extras import needs
 from rfcore.image import I420, Rgb
 from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
+from rfedge.experiments.paper.savings import (
+    intra_alone,
+    published_clip,
+    savings_of_clip,
+    slice_nals,
+)
 from rfedge.experiments.picture_quality import RenderQuality, colour_ssim, render_quality
+
+with needs("eval"):
+    import cv2
 
 __all__ = [
     "PUBLISHED_CRFS",
     "PUBLISHED_PRESETS",
-    "PaperSavings",
     "PublishedFrame",
     "Setting",
-    "intra_alone",
-    "paper_savings",
-    "paper_savings_percent",
-    "published_clip",
     "published_rows",
     "reduced",
-    "savings_of_clip",
-    "slice_nals",
 ]
-
-
-_TYPES = ("P", "B", "I")
-
-
-@dataclass(frozen=True)
-class PaperSavings:
-    """Slice bytes of both pictures, start codes left out, and the type x264 chose for the second.
-
-    ``second_type`` is "P", "B", "I" or "IDR"; x264 codes the second picture as "I" when the render
-    helps too little.
-    """
-
-    i_bytes: int
-    p_bytes: int
-    second_type: str
-
-    @property
-    def percent(self) -> float:
-        """100 I / (I + P), whatever the type of the second picture."""
-        return 100.0 * self.i_bytes / (self.i_bytes + self.p_bytes)
-
-
-def published_clip(camera: I420, render: I420, preset: str, crf: float) -> tuple[bytes, bytes]:
-    """Code the published two-frame clip; return the access units of render and camera.
-
-    Raises ``InvalidInput`` for pictures of different sizes, a size, preset or CRF outside
-    ``CodecConfig``, ``CodecError`` if x264 fails.
-    """
-    if camera.size_px != render.size_px:
-        raise InvalidInput("camera", f"{camera.size_px} px where the render has {render.size_px}")
-    options = _published_options(camera.size_px, preset, crf)
-    clip = [(render, PictureKind.CHOSEN), (camera, PictureKind.CHOSEN)]
-    first, second = encode_pictures(options, clip)
-    return first, second
-
-
-def intra_alone(camera: I420, preset: str, crf: float) -> bytes:
-    """Code the camera frame alone with the published options; return its access unit."""
-    options = _published_options(camera.size_px, preset, crf)
-    (unit,) = encode_pictures(options, [(camera, PictureKind.CHOSEN)])
-    return unit
-
-
-def savings_of_clip(clip: tuple[bytes, bytes]) -> PaperSavings:
-    """Return the sizes of a published clip's slices."""
-    first, second = map(slice_nals, clip)
-    return PaperSavings(sum(map(len, first)), sum(map(len, second)), _type_of(second[0]))
-
-
-def paper_savings(camera: I420, render: I420, preset: str, crf: float) -> PaperSavings:
-    """Code the published two-frame clip and return its sizes; raises as ``published_clip``."""
-    return savings_of_clip(published_clip(camera, render, preset, crf))
-
-
-def paper_savings_percent(camera: I420, render: I420, preset: str, crf: float) -> float:
-    """Return ``paper_savings(...).percent``."""
-    return paper_savings(camera, render, preset, crf).percent
-
-
-def slice_nals(access_unit: bytes) -> list[bytes]:
-    """Return the slices of an access unit; raise ``CodecError`` if it has none."""
-    nals = [nal for nal in split_nals(access_unit) if nal_type(nal) in (NAL_P, NAL_IDR)]
-    if not nals:
-        raise CodecError(f"access unit of {len(access_unit)} bytes holds no slice")
-    return nals
-
-
-def _published_options(size_px: tuple[int, int], preset: str, crf: float) -> EncoderOptions:
-    config = CodecConfig(*size_px, preset=preset, crf=crf)
-    return EncoderOptions(
-        config.coded_size_px, preset, crf, params={"threads": "1"}, tune=None, rate_hz=1
-    )
-
-
-def _type_of(nal: bytes) -> str:
-    if nal_type(nal) == NAL_IDR:
-        return "IDR"
-    # Only the slice type is of interest here; it precedes frame_num.
-    return _TYPES[parse_slice_start(nal, log2_max_frame_num=4).slice_type]
 
 
 PUBLISHED_PRESETS = ("veryslow", "medium", "veryfast")

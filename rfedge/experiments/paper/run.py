@@ -20,6 +20,7 @@ from rich.console import Console
 from rfcore.camera import Camera, Pose
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
+from rfcore.extras import require
 from rfcore.field import RadianceField
 from rfcore.image import Rgb
 from rfcore.views import PosedPicture
@@ -93,6 +94,7 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
     Raises ``InvalidInput``, ``DatasetError`` or ``FieldFormatError`` before anything is coded if an
     input is wrong.
     """
+    require("eval", "flip_evaluator")
     fields = [(name, open_field(path)) for name, path in map(named_path, job.fields)]
     pieces = list(_pieces(job, fields))
     store = CellStore(job.cells)

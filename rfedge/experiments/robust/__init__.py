@@ -8,6 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
+from rfedge.samples import sample_path
+
 __all__ = ["EvalRobust"]
 
 
@@ -19,9 +21,11 @@ class EvalRobust:
     total rate, by the SSIM of what a viewer sees. Stopped and started again, it goes on.
     """
 
-    field: Annotated[Path, Positional] = Path("samples/fields/street.rff")
+    field: Annotated[Path, Positional] = sample_path("fields/street.rff")
     """The field archive (.rff) both ends hold."""
-    drive: Annotated[str, Positional] = "vehicles@10=samples/street/transforms_drive_vehicles.json"
+    drive: Annotated[str, Positional] = (
+        f"vehicles@10={sample_path('street/transforms_drive_vehicles.json')}"
+    )
     """NAME@HZ=DATASET of the drive."""
     dusk: str | None = None
     """NAME@HZ=DATASET of a drive in another light than the field's."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +18,7 @@ from rfcore.camera import Camera
 from rfcore.dataset.source import SourcePoints
 from rfcore.dataset.write import write_points
 from rfcore.errors import DatasetError
+from rfcore.extras import needs
 from rfcore.files import write_whole
 from rfcore.image import Rgb, write_png
 from rfcore.lens import LensCamera
@@ -29,6 +29,9 @@ from rfedge.street.render.backend import Backend
 from rfedge.street.render.renderer import Renderer, Sampling
 from rfedge.street.scene_file import Scene
 from rfedge.street.shots import Shot, Split
+
+with needs("scene"):
+    import cv2
 
 __all__ = [
     "POINTS_PER_VIEW",

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
+from rfcore.extras import needs
 from rfedge.street.geometry.facade import BuildingStyle, facade, rooms
 from rfedge.street.geometry.grain import enlarged, fractal, texture, tinted
 from rfedge.street.geometry.layout import BEYOND_M, Layout, Plot
 from rfedge.street.geometry.mesh import F32, F64, Colour, Label, Material, Mesh, Texture, placed
 from rfedge.street.geometry.solids import Stuff, boxes, quads
 from rfedge.street.geometry.world import Part
+
+with needs("scene"):
+    import cv2
 
 __all__ = ["WALL_TILE_M", "bricks", "buildings", "plaster", "roof_tiles", "stone"]
 

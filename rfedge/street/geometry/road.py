@@ -5,9 +5,9 @@ Asphalt has cracks and patches, pavements are slabs, and paint is worn.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
+from rfcore.extras import needs
 from rfedge.street.geometry.grain import fractal, speckle, texture, tinted
 from rfedge.street.geometry.layout import (
     BAY_LENGTH_M,
@@ -22,6 +22,9 @@ from rfedge.street.geometry.layout import (
 from rfedge.street.geometry.mesh import F32, F64, Label, Material, Mesh, Texture
 from rfedge.street.geometry.solids import Stuff, boxes, disc, quads
 from rfedge.street.geometry.world import Part
+
+with needs("scene"):
+    import cv2
 
 __all__ = ["ASPHALT_TILE_M", "SLAB_TILE_M", "asphalt", "paint", "road", "slabs"]
 

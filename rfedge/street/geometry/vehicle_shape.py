@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rfcore.errors import InvalidInput
+from rfcore.extras import needs
 from rfedge.street.geometry.mesh import F64
 
 __all__ = ["BODIES", "BodyShape", "Knots", "curve"]
@@ -74,7 +75,8 @@ def _spline(knots: Knots) -> Callable[[F64], F64]:
 
     ``PchipInterpolator`` itself ends with three-point slopes, which would bend noses and tails.
     """
-    from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
+    with needs("scene"):
+        from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
     x, y = np.array(knots, np.float64).T
     slopes = PchipInterpolator(x, y).derivative()(x)

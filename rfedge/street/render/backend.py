@@ -14,11 +14,10 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from rfcore.errors import BackendUnavailable
+from rfcore.extras import needs, require
 
 __all__ = ["Backend", "chosen_backend", "load_mitsuba", "require_renderer"]
 
@@ -55,9 +54,7 @@ class Backend:
 
 def require_renderer() -> None:
     """Raise ``BackendUnavailable`` where the extra is not installed."""
-    for name in ("mitsuba", "pyoidn", "scipy"):
-        if find_spec(name) is None:
-            raise BackendUnavailable(f"{name} is missing: pip install 'rfedge[scene]'")
+    require("scene", "mitsuba", "pyoidn", "scipy")
 
 
 def chosen_backend() -> Backend:
@@ -98,9 +95,12 @@ def load_mitsuba(backend: Backend, threads: int) -> Any:
     """Import Mitsuba in this process, which can have one backend only; return the module."""
     if backend.llvm:
         os.environ["DRJIT_LIBLLVM_PATH"] = backend.llvm
-    mitsuba = import_module("mitsuba")
+    with needs("scene"):
+        mitsuba = import_module("mitsuba")
     mitsuba.set_variant(backend.variant)
     if backend.vectorised:
-        import_module("drjit").set_thread_count(threads)
+        with needs("scene"):
+            drjit = import_module("drjit")
+        drjit.set_thread_count(threads)
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     return mitsuba

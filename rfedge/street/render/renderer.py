@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics
 from rfcore.errors import InvalidInput
+from rfcore.extras import needs
 from rfedge.street.geometry.mesh import F32, F64, Label
 from rfedge.street.geometry.world import World
 from rfedge.street.render.backend import Backend, load_mitsuba
@@ -49,7 +50,8 @@ def _directions(k: Intrinsics) -> tuple[F64, F64]:
 def _cast_together(
     mi: Any, loaded: MitsubaScene, origin: F64, towards: F64
 ) -> tuple[F64, NDArray[np.intp]]:
-    import drjit
+    with needs("scene"):
+        import drjit
 
     rays = mi.Ray3f(
         mi.Point3f(*(mi.Float(np.full(len(towards), value, np.float32)) for value in origin)),
@@ -183,7 +185,8 @@ def _fov_deg(k: Intrinsics) -> float:
 
 
 def _denoised(colour: F32, albedo: F32, normal: F32) -> F32:
-    import pyoidn
+    with needs("scene"):
+        import pyoidn
 
     guides = (np.ascontiguousarray(values) for values in (albedo, normal))
     return np.asarray(pyoidn.denoise(np.ascontiguousarray(colour), *guides, hdr=True), np.float32)

@@ -1,0 +1,23 @@
+#!/bin/sh
+# Pins what each set of deploy/requirements.py installs, with hashes, in requirements/*.txt.
+# PYTHON must be a 3.11 with pip-tools. `test` has every package and is compiled first; the other
+# sets are compiled under its pins and take their hashes from it. No file names an index. torch is
+# pinned without a hash, in requirements/torch.txt: each index has its own build of one version.
+set -eu
+: "${PYTHON:=python3}"
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+mkdir -p requirements
+: > "$work/pins"
+for name in test demo runtime full; do
+	"$PYTHON" deploy/requirements.py $name > "$work/$name.in"
+	[ $name = test ] || cp "$work/all.txt" "$work/locked.txt"
+	"$PYTHON" -m piptools compile -q --generate-hashes --unsafe-package torch --strip-extras \
+		--no-header --no-annotate --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
+		--no-emit-options -c "$work/pins" -o "$work/locked.txt" "$work/$name.in"
+	grep -v '^#' "$work/locked.txt" | grep . > "requirements/$name.txt"
+	[ $name = test ] || continue
+	sed 's/ *\\$//; /^ *--hash/d' requirements/test.txt > "$work/pins"
+	cp "$work/locked.txt" "$work/all.txt"
+done
+grep '^torch==' "$work/test.in" > requirements/torch.txt

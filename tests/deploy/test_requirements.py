@@ -1,0 +1,138 @@
+"""What is installed where: every set of packages is pinned with hashes, and names no index."""
+
+import importlib.util
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[2]
+PYPROJECT = ROOT / "pyproject.toml"
+
+
+def script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / f"deploy/{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+SCRIPT = script("requirements")
+SETS: tuple[str, ...] = tuple(SCRIPT.SETS)
+
+
+def wanted(name: str) -> dict[str, Requirement]:
+    """What pyproject.toml asks for, by normalised name."""
+    lines = [Requirement(line) for line in SCRIPT.requirements(name, PYPROJECT)]
+    return {canonicalize_name(requirement.name): requirement for requirement in lines}
+
+
+def pins(name: str) -> dict[str, str]:
+    """Version of each package in requirements/NAME.txt."""
+    text = (ROOT / f"requirements/{name}.txt").read_text(encoding="utf-8")
+    found = re.findall(r"^([A-Za-z0-9._-]+)==([^ ;\\\n]+)", text, flags=re.MULTILINE)
+    return {canonicalize_name(package): version for package, version in found}
+
+
+def test_the_runtime_image_lacks_reports_and_evaluation() -> None:
+    left_out = set(wanted("full")) - set(wanted("runtime"))
+    assert left_out >= SCRIPT.ONLY_FULL
+    assert {"scipy", "opencv-contrib-python-headless"} <= left_out
+    assert "torch" not in wanted("full")
+
+
+def test_the_demo_needs_no_extra() -> None:
+    base = {canonicalize_name(name) for name in wanted("demo")}
+    assert {"numpy", "matplotlib", "nanobind"} <= base
+    assert not {"torch", "scipy", "opencv-contrib-python-headless", "pytest"} & base
+
+
+def test_an_unknown_set_is_refused() -> None:
+    with pytest.raises(ValueError, match="'both' is none of runtime, full, demo, test"):
+        SCRIPT.requirements("both", PYPROJECT)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_pins_satisfy_pyproject(name: str) -> None:
+    pinned = pins(name) | pins("torch")
+    for package, requirement in wanted(name).items():
+        assert package in pinned, f"{package} is not pinned: run `make lock`"
+        assert requirement.specifier.contains(pinned[package]), f"run `make lock`: {requirement}"
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_every_pin_has_a_hash(name: str) -> None:
+    text = (ROOT / f"requirements/{name}.txt").read_text(encoding="utf-8")
+    blocks = re.split(r"\n(?=\S)", text.strip())
+    assert len(blocks) == len(pins(name)) >= len(wanted(name)) - 1
+    for block in blocks:
+        assert re.search(r"--hash=sha256:[0-9a-f]{64}", block), block
+
+
+def test_sets_agree_on_versions() -> None:
+    everything = pins("test")
+    for name in SETS:
+        assert pins(name).items() <= everything.items()
+
+
+def test_only_torch_is_without_a_hash_and_it_is_the_pinned_one() -> None:
+    assert pins("torch") == {"torch": "2.13.0"}
+    assert str(wanted("test")["torch"].specifier) == "==2.13.0"
+    assert not any("torch" in pins(name) for name in SETS)
+
+
+def test_no_committed_file_names_a_package_index() -> None:
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True)
+    names = [name for name in listed.stdout.decode().split("\0") if name]
+    assert len(names) > 100
+    index = re.compile(r"(index-url|find-links|TORCH_INDEX)[ =]+['\"]?\w+:/|/simple/?['\"\s]")
+    texts = (".py", ".txt", ".toml", ".md", ".sh", ".yml", "Makefile", "Dockerfile", "run", ".cfg")
+    for name in names:
+        path = ROOT / name
+        if path.name.endswith(texts) and path.is_file():
+            found = index.search(path.read_text(encoding="utf-8"))
+            assert found is None, f"{name}: {found}"
+
+
+def ledger(tmp_path: Path, makefile: str) -> subprocess.CompletedProcess[str]:
+    """Run ``.ci/run`` above a Makefile of the test's own."""
+    (tmp_path / ".ci").mkdir()
+    shutil.copy(ROOT / ".ci/run", tmp_path / ".ci/run")
+    (tmp_path / "Makefile").write_text(makefile)
+    return subprocess.run(
+        [tmp_path / ".ci/run"], capture_output=True, text=True, check=False, timeout=60
+    )
+
+
+def test_ci_prints_minutes_of_every_step(tmp_path: Path) -> None:
+    done = ledger(tmp_path, "build-full check test test-slow soak-short:\n\t@true\n")
+    lines = done.stdout.splitlines()[-6:]
+    for line, step in zip(lines, ("build-full", "check", "test", "test-slow"), strict=False):
+        assert re.fullmatch(rf"{step} +\d+\.\d min  passed", line)
+    assert re.fullmatch(r"total +\d+\.\d min  of 45", lines[-1])
+    assert done.returncode == 0
+
+
+def test_ci_goes_on_after_a_step_that_failed_and_fails(tmp_path: Path) -> None:
+    done = ledger(tmp_path, "build-full test test-slow soak-short:\n\t@true\ncheck:\n\t@false\n")
+    assert re.search(r"^check +\d+\.\d min  FAILED\ntest +\d+\.\d min  passed$", done.stdout, re.M)
+    assert done.returncode == 1
+
+
+def test_wheels_are_built_for_an_interpreter_that_is_named(tmp_path: Path) -> None:
+    wheels = script("wheels")
+    version = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    assert wheels.found_pythons([sys.executable]) == {version: sys.executable}
+    fake = tmp_path / "python3.12"
+    fake.write_text("#!/bin/sh\necho '2.7 cpython'\n")
+    fake.chmod(0o755)
+    with pytest.raises(SystemExit, match=r"no CPython of 3\.11, 3\.12, 3\.13"):
+        wheels.found_pythons([str(fake)])
