@@ -208,7 +208,7 @@ def _tau_figure(played: Sequence[PlayedRow], stem: Path) -> list[Path]:
             style: dict[str, Any] = {"color": LINES[number % 6], "marker": MARKERS[number % 6]}
             axes.plot(x, y, label=name, linewidth=1.5, markersize=4, **style)
             lines += [[name, f"{a:g}", f"{b:.3f}"] for a, b in zip(x, y, strict=True)]
-        axes.axhspan(5, 10, color="#dfe4ea", zorder=0)
+        axes.axhspan(5, 10, color="#dfe4ea", zorder=0, label="budgets: 5 to 10 ms")
         axes.set(xscale="log", yscale="log", xlabel="throughput, Mbit/s", ylabel="tau, ms a frame")
         axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
     return write_figure(stem, figure, lines)
@@ -229,7 +229,7 @@ def _cdf_figure(played: Sequence[PlayedRow], stem: Path) -> list[Path]:
             x, y = zip(*arrived, strict=True)
             axes.step(x, y, where="post", color=LINES[number % 6], label=row.sender)
             lines += [[row.sender, f"{b:.2f}", f"{a:.3f}"] for a, b in arrived]
-        axes.axvspan(5, 10, color="#dfe4ea", zorder=0)
+        axes.axvspan(5, 10, color="#dfe4ea", zorder=0, label="budgets: 5 to 10 ms")
         axes.set(xlabel=f"network latency at {CDF_RATE_BPS / 1e6:g} Mbit/s, ms", ylabel="share")
         axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
     return write_figure(stem, figure, lines)
