@@ -54,7 +54,7 @@ class AgentMetrics:
         )
         self._rate = make.gauge(
             "rfedge_agent_proven_bytes_per_second",
-            "Throughput that the last answers prove, base delay counted as transmission; "
+            "Throughput that the last answers prove, minimum round-trip time counted as sending; "
             "0 without --max-delay-ms.",
         )
         self._rung = make.gauge(
