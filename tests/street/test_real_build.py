@@ -87,10 +87,10 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     command += ["--split", "drive", "--workers", "2"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
-        said = [parent.stdout.readline() for _ in range(2)]
+        begun = any("1 of 4 frames" in line for line in parent.stdout)
         parent.kill()
         parent.stdout.read()  # ends when no worker holds it any more
-    assert "1 of 4 frames" in said[1]
+    assert begun
     assert list((tmp_path / "s" / "drive" / "images").glob("*.png"))
     scene = load_scene(str(file))
     build(scene, tmp_path / "s", (64, 36), 1, "0:4")
