@@ -170,6 +170,22 @@ def warp_i420(
     threads: int,
 ) -> int: ...
 
+# --- h264 -------------------------------------------------------------------
+
+class SliceCoder:
+    def __init__(self, width: int, height: int, isa: str) -> None: ...
+    def encode(
+        self,
+        frame: tuple[_U8, _U8, _U8],
+        references: Sequence[tuple[_U8, _U8, _U8]],
+        slice_qp: int,
+        qp: NDArray[np.int8],
+        lambda_q8: NDArray[np.uint32],
+        motion_q8: NDArray[np.uint32],
+        effort: tuple[int, int, int, int],
+        out: tuple[_U8, _U8, _U8],
+    ) -> bytes: ...
+
 # --- pcm --------------------------------------------------------------------
 
 def pcm_macroblocks(y: _U8, u: _U8, v: _U8, out: _U8) -> None: ...

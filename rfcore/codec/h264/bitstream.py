@@ -88,9 +88,10 @@ class BitWriter:
         """Append a signed Exp-Golomb code (9.1.1)."""
         return self.ue(2 * value - 1 if value > 0 else -2 * value)
 
-    def align(self) -> BitWriter:
-        """Append zero bits up to the next byte."""
-        return self.u(-sum(map(len, self._bits)) % 8, 0)
+    def align(self, bit: int = 0) -> BitWriter:
+        """Append zero bits, or one bits, up to the next byte."""
+        width = -sum(map(len, self._bits)) % 8
+        return self.u(width, bit * ((1 << width) - 1))
 
     def stop(self) -> BitWriter:
         """Append the RBSP's stop bit and align (7.3.2.11)."""

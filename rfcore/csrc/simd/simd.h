@@ -11,12 +11,7 @@
 #include <cstdint>
 #include <cstring>
 
-#if defined(RF_ISA_SCALAR)
-// Sixteen lanes unrolled into every caller take the compiler minutes.
-#define RF_INLINE static inline __attribute__((unused))
-#else
-#define RF_INLINE static inline __attribute__((always_inline))
-#endif
+#include "simd/inline.h"
 
 #if defined(RF_ISA_AVX512)
 #include "simd/avx512.h"

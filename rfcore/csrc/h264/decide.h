@@ -1,0 +1,541 @@
+// How a macroblock is coded: candidates by prediction, the least J = D + lambda R of them.
+#pragma once
+
+#include "h264/motion.h"
+
+namespace {
+
+// The picture's own samples around the macroblock, and room for its blocks while they are coded
+// one after the other: row 0 above, column 7 left, from column 8 on the macroblock and 8 more.
+struct Canvas {
+    static constexpr ptrdiff_t kStride = 40;
+    alignas(32) uint8_t sample[17 * 40];
+    uint8_t* at(int x, int y) { return sample + kStride * (y + 1) + 8 + x; }
+};
+
+// Partitions are not tried where 16x16 is predicted this well, in bits: they would cost as much.
+constexpr uint32_t kWholeBits = 100;
+
+class MacroblockCoder {
+public:
+    MacroblockCoder(const SliceJob& job, const Contexts& contexts)
+        : job_(job), contexts_(contexts) {}
+
+    // Decides on macroblock (mx, my); the result is valid until the next call.
+    const Candidate& decide(int mx, int my, const Around& around) {
+        begin(mx, my, around);
+        best_ = nullptr;
+        if (job_.reference_count > 0) try_inter();
+        if (best_ == nullptr || wants_intra()) try_intra();
+        return *best_;
+    }
+
+private:
+    void begin(int mx, int my, const Around& around) {
+        around_ = &around;
+        x_ = 16 * mx;
+        y_ = 16 * my;
+        for (int p = 0; p < 3; ++p) {
+            const Plane& plane = job_.frame[p];
+            const int shift = p > 0;
+            source_[p] = {plane.at + (y_ >> shift) * plane.stride + (x_ >> shift), plane.stride};
+            picture_[p] = job_.reconstruction[p] +
+                          (y_ >> shift) * job_.reconstruction_stride[p] + (x_ >> shift);
+        }
+        rates_.begin(contexts_);
+        quality_.rates = &rates_;
+        quality_.around = around_;
+        quality_.qp = job_.qp[my * job_.width_mb + mx];
+        quality_.lambda_q8 = job_.lambda_q8[quality_.qp];
+        motion_q8_ = job_.motion_q8[quality_.qp];
+        const int right = 16 * job_.width_mb - x_, below = 16 * job_.height_mb - y_;
+        const auto limit = [](int v, int most) {
+            return static_cast<int16_t>(v < -most ? -most : v > most ? most : v);
+        };
+        // Vectors stay within 24 samples of the picture, and within level 1's vertical range.
+        range_ = {limit(-4 * (x_ + 24), 2000), limit(4 * (right + 8), 2000),
+                  limit(-4 * (y_ + 24), 252), limit(4 * (below + 8), 252)};
+    }
+
+    Candidate& spare() { return &candidates_[0] == best_ ? candidates_[1] : candidates_[0]; }
+
+    void start(Candidate& c, Kind kind) {
+        c.mb.kind = kind;
+        c.mb.transform8 = false;
+        c.mb.shape = 0;
+        c.mb.cbp_luma = c.mb.cbp_chroma = c.mb.chroma_mode = 0;
+        c.mb.coded = 0;
+        c.luma_bits = c.chroma_bits = 0;
+        c.mb.qp = static_cast<int8_t>(quality_.qp);
+    }
+
+    uint32_t bits(const Candidate& c) const {
+        CabacCounter counter(contexts_);
+        write_macroblock(counter, c.mb, *around_, job_.reference_count);
+        return counter.cost() + c.luma_bits + c.chroma_bits;
+    }
+
+    // Weighs a finished candidate against the best one.
+    void weigh(Candidate& c) {
+        c.cost = quality_.cost(c.luma_error + c.chroma_error, bits(c));
+        if (best_ == nullptr || c.cost < best_->cost) best_ = &c;
+    }
+
+    // --- inter ---
+
+    void predict(const Coded& mb, uint8_t* luma, uint8_t (*chroma)[64]) {
+        alignas(32) uint8_t scratch[256];
+        for (int p = 0; p < kPartitionCount[mb.shape]; ++p) {
+            const Partition& part = kPartitions[mb.shape][p];
+            const int x = 8 * (part.block & 1), y = 8 * (part.block >> 1);
+            const int width = 4 * part.width, height = 4 * part.height;
+            const Reference& reference = job_.references[mb.reference[part.block]];
+            const Mv mv = mb.mv[part.block];
+            const Block block =
+                luma_prediction(reference, x_ + x, y_ + y, mv, width, height, scratch);
+            uint8_t* out = luma + 16 * y + x;
+            if (width == 16) {
+                copy_block(block.at, block.stride, out, 16, 16, height);
+            } else {
+                copy_block(block.at, block.stride, out, 16, 8, height);
+            }
+            for (int c = 0; c < 2; ++c) {
+                const Plane& plane = reference.chroma[c];
+                uint8_t* to = chroma[c] + 4 * y + x / 2;
+                if (width == 16) {
+                    predict_chroma<8>(plane, (x_ + x) / 2, (y_ + y) / 2, mv, height / 2, to);
+                } else {
+                    predict_chroma<4>(plane, (x_ + x) / 2, (y_ + y) / 2, mv, height / 2, to);
+                }
+            }
+        }
+    }
+
+    // Completes an inter candidate whose shape, references, vectors and differences are set.
+    void finish_inter(Candidate& c) {
+        alignas(32) uint8_t luma[256], chroma[2][64];
+        predict(c.mb, luma, chroma);
+        code_chroma(quality_, &source_[1], chroma, c);
+        const LumaCosts costs = code_luma8(quality_, source_[0], luma, c);
+        weigh(c);
+        if (c.mb.cbp_luma == 0) return;
+        Candidate& other = scratch_;
+        other = c;
+        if (!code_luma4(quality_, source_[0], luma, costs, other)) return;
+        weigh(other);
+        if (best_ == &other) {
+            c = other;
+            best_ = &c;
+        }
+    }
+
+    void set_partition(Coded& mb, const Partition& part, int index, Mv mv, Mv predicted) {
+        for (int b = 0; b < 4; ++b) {
+            if (!part.covers(b)) continue;
+            mb.reference[b] = static_cast<int8_t>(index);
+            mb.mv[b] = mv;
+        }
+        mb.mvd[part.block] = {static_cast<int16_t>(mv.x - predicted.x),
+                              static_cast<int16_t>(mv.y - predicted.y)};
+    }
+
+    // Skips where the skipped macroblock's prediction leaves nothing to code; true if so.
+    bool try_skip() {
+        const Mv mv = skip_vector(field_);
+        skip_vector_ = mv;
+        if (!range_.holds(mv)) return false;
+        Candidate& c = spare();
+        start(c, Kind::kSkip);
+        set_partition(c.mb, kPartitions[0][0], 0, mv, mv);
+        alignas(32) uint8_t luma[256], chroma[2][64];
+        predict(c.mb, luma, chroma);
+        const bool nothing = leaves_nothing(luma, chroma);
+        __builtin_memcpy(c.luma, luma, sizeof luma);
+        __builtin_memcpy(c.chroma, chroma, sizeof chroma);
+        c.luma_error = squared_error<16>(source_[0].at, source_[0].stride, luma, 16);
+        c.chroma_error = squared_error<8>(source_[1].at, source_[1].stride, chroma[0], 8) +
+                         squared_error<8>(source_[2].at, source_[2].stride, chroma[1], 8);
+        weigh(c);
+        return nothing;
+    }
+
+    // Whether nothing beside this prediction would be worth its bits.
+    bool leaves_nothing(const uint8_t* luma, const uint8_t (*chroma)[64]) {
+        Candidate& c = scratch_;
+        start(c, Kind::kInter);
+        for (int b = 0; b < 4; ++b) {
+            const int x = 8 * (b & 1), y = 8 * (b >> 1), at = 16 * y + x;
+            if (code_block8(quality_, source_[0].at + y * source_[0].stride + x, source_[0].stride,
+                            luma + at, 16, c.mb.luma, c.luma + at, 16)) {
+                return false;
+            }
+        }
+        code_chroma(quality_, &source_[1], chroma, c);
+        return c.mb.cbp_chroma == 0;
+    }
+
+    Search search_of(int index, int shape, const Partition& part) const {
+        const int x = 8 * (part.block & 1), y = 8 * (part.block >> 1);
+        return {job_.references[index], source_[0].at + y * source_[0].stride + x,
+                source_[0].stride, x_ + x, y_ + y, 4 * part.width, 4 * part.height,
+                predicted_vector(field_, shape, part, index), motion_q8_, range_};
+    }
+
+    Found started(const Search& search, int index, const Mv* starts, int count) const {
+        Mv all[6] = {search.predicted, {0, 0}};
+        int used = 2;
+        for (int i = 0; i < count; ++i) all[used++] = starts[i];
+        Found found = search.first_of(all, used);
+        found.cost += reference_cost(index);
+        return found;
+    }
+
+    Found refined(const Search& search, int index, Found found) const {
+        found.cost -= reference_cost(index);
+        found = search.refined(found, job_.effort);
+        found.cost += reference_cost(index);
+        return found;
+    }
+
+    uint32_t reference_cost(int index) const {
+        return job_.reference_count < 2 ? 0 : motion_q8_ * static_cast<uint32_t>(index + 1);
+    }
+
+    void try_inter() {
+        field_.begin(*around_);
+        if (try_skip()) return;
+        Found whole[kMaxReferences];
+        const Mv starts[3] = {field_.mv[1][0], field_.mv[0][1], skip_vector_};
+        for (int r = 0; r < job_.reference_count; ++r) {
+            const Search search = search_of(r, 0, kPartitions[0][0]);
+            whole[r] = started(search, r, starts, 3);
+        }
+        const auto order = [&](int& best, int& second) {
+            best = second = 0;
+            for (int r = 1; r < job_.reference_count; ++r) {
+                if (whole[r].cost < whole[best].cost) {
+                    second = best;
+                    best = r;
+                } else if (second == best || whole[r].cost < whole[second].cost) {
+                    second = r;
+                }
+            }
+        };
+        int best, second;
+        order(best, second);
+        for (int r = 0; r < job_.reference_count; ++r) {
+            if (r != best && r != second && !job_.effort.every_reference) continue;
+            if (whole[r].cost > whole[best].cost + whole[best].cost / 2) continue;
+            whole[r] = refined(search_of(r, 0, kPartitions[0][0]), r, whole[r]);
+        }
+        order(best, second);
+        const Mv predicted = predicted_vector(field_, 0, kPartitions[0][0], best);
+        inter_cost_ = whole[best].cost;
+        Candidate& c = spare();
+        start(c, Kind::kInter);
+        set_partition(c.mb, kPartitions[0][0], best, whole[best].mv, predicted);
+        finish_inter(c);
+        if (best_->mb.kind == Kind::kInter && best_->mb.cbp_luma == 0) return;
+        if (inter_cost_ < kWholeBits * motion_q8_) return;
+        try_parts(whole);
+    }
+
+    // Four 8x8 blocks, then the halves that agree with them; the cheapest of these is coded.
+    void try_parts(const Found* whole) {
+        Coded parts[3];
+        uint32_t costs[3];
+        costs[2] = search_shape(3, whole, nullptr, parts[2]);
+        costs[0] = search_shape(1, whole, &parts[2], parts[0]);
+        costs[1] = search_shape(2, whole, &parts[2], parts[1]);
+        int least = 0;
+        for (int i = 1; i < 3; ++i) {
+            if (costs[i] < costs[least]) least = i;
+        }
+        if (costs[least] >= inter_cost_) return;
+        inter_cost_ = costs[least];
+        Candidate& c = spare();
+        start(c, Kind::kInter);
+        const Coded& chosen = parts[least];
+        c.mb.shape = chosen.shape;
+        for (int b = 0; b < 4; ++b) {
+            c.mb.reference[b] = chosen.reference[b];
+            c.mb.mv[b] = chosen.mv[b];
+            c.mb.mvd[b] = chosen.mvd[b];
+        }
+        finish_inter(c);
+    }
+
+    // Vectors for every partition of `shape`; `from`, if there, has those of 8x8 blocks to start
+    // from. Returns the cost of all.
+    uint32_t search_shape(int shape, const Found* whole, const Coded* from, Coded& out) {
+        out.shape = static_cast<uint8_t>(shape);
+        field_.forget();
+        uint32_t total = motion_q8_ * (shape == 3 ? 6u : 2u);
+        for (int p = 0; p < kPartitionCount[shape]; ++p) {
+            const Partition& part = kPartitions[shape][p];
+            const int last = part.block + (part.width == 4) + 2 * (part.height == 4);
+            Found least = {{0, 0}, UINT32_MAX};
+            int index = 0;
+            for (int r = 0; r < job_.reference_count; ++r) {
+                if (from && r != from->reference[part.block] && r != from->reference[last]) {
+                    continue;
+                }
+                Mv starts[3] = {whole[r].mv, whole[r].mv, whole[r].mv};
+                if (from) {
+                    starts[1] = from->mv[part.block];
+                    starts[2] = from->mv[last];
+                }
+                const Search search = search_of(r, shape, part);
+                Found found = search.first_of(starts, from ? 3 : 1);
+                found.cost += reference_cost(r);
+                if (found.cost < least.cost) {
+                    least = found;
+                    index = r;
+                }
+            }
+            const Search search = search_of(index, shape, part);
+            if (!from) least = refined(search, index, least);
+            const Mv least_predicted = search.predicted;
+            set_partition(out, part, index, least.mv, least_predicted);
+            field_.fill(part, static_cast<int8_t>(index), least.mv);
+            total += least.cost;
+        }
+        return total;
+    }
+
+    // --- intra ---
+
+    bool wants_intra() {
+        return job_.effort.intra_reach == 0 || best_->mb.cbp_luma != 0;
+    }
+
+    bool beyond_reach(uint32_t difference) const {
+        const int reach = job_.effort.intra_reach;
+        return reach > 0 && 1024 * uint64_t{difference} > uint64_t{inter_cost_} * unsigned(reach);
+    }
+
+    void try_intra() {
+        alignas(32) uint8_t luma[256], least[256];
+        uint32_t lowest = UINT32_MAX;
+        int mode16 = 2;
+        for (int mode = 0; mode < 4; ++mode) {
+            if (!predict_luma16(mode, picture_[0], job_.reconstruction_stride[0], *around_, luma)) {
+                continue;
+            }
+            const uint32_t cost =
+                transformed_difference<16>(source_[0].at, source_[0].stride, luma, 16, 16);
+            if (cost < lowest) {
+                lowest = cost;
+                mode16 = mode;
+                __builtin_memcpy(least, luma, sizeof luma);
+            }
+        }
+        if (best_ != nullptr && beyond_reach(lowest)) return;
+        Candidate& c = spare();
+        start(c, Kind::kIntra16);
+        c.mb.intra16_mode = static_cast<uint8_t>(mode16);
+        intra_chroma(c);
+        if (best_ == nullptr || worth_16(lowest)) {
+            code_luma16(quality_, source_[0], least, c);
+            weigh(c);
+        }
+        // c may have become the best; the chroma of all three kinds is the same.
+        Candidate& next = &c == best_ ? spare() : c;
+        if (&next != &c) copy_chroma(c, next);
+        if (!try_blocks<8>(next)) return;
+        Candidate& last = best_ == &next ? spare() : next;
+        if (&last != &next) copy_chroma(next, last);
+        try_blocks<4>(last);
+    }
+
+    // One mode for all of the macroblock beats inter prediction only where it comes near to it.
+    bool worth_16(uint32_t difference) const {
+        return job_.effort.intra_reach == 0 || 256 * uint64_t{difference} <= inter_cost_;
+    }
+
+    static void copy_chroma(const Candidate& from, Candidate& to) {
+        to.mb = from.mb;
+        to.chroma_bits = from.chroma_bits;
+        to.chroma_error = from.chroma_error;
+        __builtin_memcpy(to.chroma, from.chroma, sizeof to.chroma);
+    }
+
+    void intra_chroma(Candidate& c) {
+        alignas(32) uint8_t prediction[2][64], least[2][64] = {};
+        uint32_t lowest = UINT32_MAX;
+        for (int mode = 0; mode < 4; ++mode) {
+            uint32_t cost = 0;
+            bool possible = true;
+            for (int p = 0; p < 2; ++p) {
+                possible = possible && predict_chroma8(mode, picture_[1 + p],
+                                                       job_.reconstruction_stride[1 + p], *around_,
+                                                       prediction[p]);
+                if (possible) {
+                    cost += transformed_difference<8>(source_[1 + p].at, source_[1 + p].stride,
+                                                      prediction[p], 8, 8);
+                }
+            }
+            if (!possible || cost >= lowest) continue;
+            lowest = cost;
+            c.mb.chroma_mode = static_cast<uint8_t>(mode);
+            __builtin_memcpy(least, prediction, sizeof least);
+        }
+        code_chroma(quality_, &source_[1], least, c);
+    }
+
+    void begin_canvas() {
+        const ptrdiff_t stride = job_.reconstruction_stride[0];
+        const uint8_t* at = picture_[0];
+        if (around_->above) copy_block(at - stride, 0, canvas_.at(0, -1), 0, 16, 1);
+        if (around_->above_right) copy_block(at - stride + 16, 0, canvas_.at(16, -1), 0, 8, 1);
+        if (around_->above_left) *canvas_.at(-1, -1) = at[-stride - 1];
+        for (int y = 0; around_->left && y < 16; ++y) *canvas_.at(-1, y) = at[y * stride - 1];
+    }
+
+    // Intra_4x4 (8.3.1.1) and Intra_8x8 (8.3.2.1): the smaller of the modes to the left and above.
+    int predicted_mode(const Coded& mb, int raster) const {
+        const int x = raster & 3, y = raster >> 2;
+        if ((x == 0 && !around_->left) || (y == 0 && !around_->above)) return kDc;
+        const int left = x ? mb.intra_mode[raster - 1] : around_->left->intra_mode[raster + 3];
+        const int above = y ? mb.intra_mode[raster - 4] : around_->above->intra_mode[raster + 12];
+        return left < above ? left : above;
+    }
+
+    template <int side>
+    bool above_right_known(int x, int y) const {  // in blocks of `side`
+        constexpr int kAcross = 16 / side;
+        if (y == 0) return (x < kAcross - 1 ? around_->above : around_->above_right) != nullptr;
+        if (side == 8) return x == 0;
+        return !(x == 3 || (x == 1 && y != 2));
+    }
+
+    // Gives up where the luma alone costs more than the best candidate; false if that was in the
+    // upper half, so that smaller blocks would not pay either.
+    template <int side>
+    bool try_blocks(Candidate& c) {
+        constexpr int kAcross = 16 / side, kSteps = side / 4;
+        c.mb.kind = side == 8 ? Kind::kIntra8 : Kind::kIntra4;
+        c.mb.transform8 = side == 8;
+        c.mb.cbp_luma = 0;
+        c.mb.coded &= ~0x1FFFFu;
+        c.luma_bits = c.luma_error = 0;
+        const Cost most = best_->cost - quality_.cost(c.chroma_error, c.chroma_bits);
+        begin_canvas();
+        for (int i = 0; i < kAcross * kAcross; ++i) {
+            const int raster = kRasterOfBlk[i * (side == 8 ? 4 : 1)];
+            const int x = raster & 3, y = raster >> 2;
+            const int predicted = predicted_mode(c.mb, raster);
+            const int mode = choose_mode<side>(4 * x, 4 * y, predicted);
+            for (int j = 0; j < kSteps; ++j) {
+                for (int k = 0; k < kSteps; ++k) {
+                    c.mb.intra_mode[raster + 4 * j + k] = static_cast<int8_t>(mode);
+                }
+            }
+            c.mb.predicted_mode[raster] = static_cast<int8_t>(predicted);
+            code_intra_block<side>(c, i, raster, strip<side>().of(mode));
+            if (quality_.cost(c.luma_error, c.luma_bits) > most) return 2 * i >= kAcross * kAcross;
+        }
+        copy_block(canvas_.at(0, 0), Canvas::kStride, c.luma, 16, 16, 16);
+        weigh(c);
+        return true;
+    }
+
+    template <int side>
+    void code_intra_block(Candidate& c, int i, int raster, const uint8_t* prediction) {
+        const int x = 4 * (raster & 3), y = 4 * (raster >> 2);
+        const uint8_t* source = source_[0].at + y * source_[0].stride + x;
+        constexpr ptrdiff_t kStride = ModeStrip<side>::kStride;
+        uint8_t* out = canvas_.at(x, y);
+        if (side == 8) {
+            const uint32_t bits =
+                code_block8(quality_, source, source_[0].stride, prediction, kStride,
+                            c.mb.luma + 64 * i, out, Canvas::kStride);
+            c.luma_bits += bits;
+            c.luma_error += squared_error<8>(source, source_[0].stride, out, Canvas::kStride);
+            if (bits) {
+                c.mb.cbp_luma |= static_cast<uint8_t>(1 << i);
+                c.mb.coded |= 0x33u << raster;
+            }
+            return;
+        }
+        const int context =
+            kFlagContext[kLuma4] + luma_flag_context(c.mb, *around_, raster, c.mb.coded);
+        const uint32_t bits = code_block4(quality_, context, source, source_[0].stride, prediction,
+                                          kStride, c.mb.luma + 16 * i, out, Canvas::kStride);
+        c.luma_bits += bits;
+        c.luma_error += squared_error<4>(source, source_[0].stride, out, Canvas::kStride);
+        if (bits) {
+            c.mb.cbp_luma |= static_cast<uint8_t>(1 << (i >> 2));
+            c.mb.coded |= 1u << raster;
+        }
+    }
+
+    template <int side>
+    int choose_mode(int x, int y, int predicted) {
+        const bool left = x > 0 || around_->left, above = y > 0 || around_->above;
+        const Neighbour* beyond_corner = x > 0 ? around_->above
+                                         : y > 0 ? around_->left
+                                                 : around_->above_left;
+        const bool corner = (x > 0 && y > 0) || beyond_corner != nullptr;
+        Edge<side> edge;
+        read_edge<side>(canvas_.at(x, y), Canvas::kStride, left, above, corner,
+                        above_right_known<side>(x / side, y / side), edge);
+        if constexpr (side == 8) {
+            Edge<8> filtered;
+            filter_edge(edge, filtered);
+            edge = filtered;
+        }
+        const uint8_t* source = source_[0].at + y * source_[0].stride + x;
+        ModeStrip<side>& modes = strip<side>();
+        for (int mode = 0; mode < kBlockModes; ++mode) {
+            if (mode_available(mode, edge)) {
+                predict_block<side>(mode, edge, modes.of(mode), ModeStrip<side>::kStride);
+            }
+        }
+        uint32_t differences[ModeStrip<side>::kVectors * ModeStrip<side>::kPerVector];
+        strip_differences(source, source_[0].stride, modes, differences);
+        uint32_t lowest = UINT32_MAX;
+        int chosen = kDc;
+        for (int mode = 0; mode < kBlockModes; ++mode) {
+            if (!mode_available(mode, edge)) continue;
+            const uint32_t cost =
+                256 * differences[mode] + motion_q8_ * (mode == predicted ? 1u : 4u);
+            if (cost < lowest) {
+                lowest = cost;
+                chosen = mode;
+            }
+        }
+        return chosen;
+    }
+
+    template <int side>
+    ModeStrip<side>& strip() {
+        if constexpr (side == 8) {
+            return strip8_;
+        } else {
+            return strip4_;
+        }
+    }
+
+    const SliceJob& job_;
+    const Contexts& contexts_;
+    const Around* around_ = nullptr;
+    int x_ = 0, y_ = 0;
+    Plane source_[3];
+    uint8_t* picture_[3];
+    Rates rates_;
+    Quality quality_;
+    uint32_t motion_q8_ = 0;
+    Range range_;
+    MotionField field_;
+    Mv skip_vector_ = {0, 0};
+    uint32_t inter_cost_ = 0;
+    Candidate candidates_[2];
+    Candidate scratch_;
+    Candidate* best_ = nullptr;
+    Canvas canvas_;
+    ModeStrip<4> strip4_ = {};
+    ModeStrip<8> strip8_ = {};
+};
+
+}  // namespace

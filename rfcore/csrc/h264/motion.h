@@ -1,0 +1,212 @@
+// Motion vectors: their prediction (8.4.1) and their search.
+#pragma once
+
+#include "h264/residual.h"
+
+namespace {
+
+// References and vectors of the 4x4 blocks around and inside a macroblock: row 0 above, column 0
+// left, rows and columns 1..4 its own, row 0 column 5 above to the right.
+struct MotionField {
+    int8_t reference[5][6];
+    Mv mv[5][6];
+
+    void clear() {
+        for (int y = 0; y < 5; ++y) {
+            for (int x = 0; x < 6; ++x) put(x, y, kUnavailable, {0, 0});
+        }
+    }
+
+    void put(int x, int y, int8_t index, Mv vector) {
+        reference[y][x] = index;
+        mv[y][x] = vector;
+    }
+
+    void take(int x, int y, const Neighbour* from, int raster) {
+        if (from != nullptr) {
+            put(x, y, from->reference[2 * (raster >> 3) + ((raster >> 1) & 1)], from->mv[raster]);
+        }
+    }
+
+    void begin(const Around& around) {
+        clear();
+        take(0, 0, around.above_left, 15);
+        take(5, 0, around.above_right, 12);
+        for (int i = 0; i < 4; ++i) {
+            take(1 + i, 0, around.above, 12 + i);
+            take(0, 1 + i, around.left, 4 * i + 3);
+        }
+    }
+
+    // Forgets the macroblock's own blocks.
+    void forget() {
+        for (int y = 1; y < 5; ++y) {
+            for (int x = 1; x < 5; ++x) put(x, y, kUnavailable, {0, 0});
+        }
+    }
+
+    void fill(const Partition& part, int8_t index, Mv vector) {
+        for (int i = 0; i < 16; ++i) {
+            if (!part.covers(2 * (i >> 3) + ((i >> 1) & 1))) continue;
+            put(1 + (i & 3), 1 + (i >> 2), index, vector);
+        }
+    }
+};
+
+inline int16_t median(int16_t a, int16_t b, int16_t c) {
+    const int16_t low = a < b ? a : b, high = a < b ? b : a;
+    return c < low ? low : c > high ? high : c;
+}
+
+// 8.4.1.3 without the rules for halves.
+inline Mv median_prediction(const MotionField& f, int index, int x, int y, int width) {
+    const int row = y + 1, column = x + 1;
+    int cx = column + width, cy = row - 1;
+    if (f.reference[cy][cx] == kUnavailable) cx = column - 1;
+    const int8_t a = f.reference[row][column - 1], b = f.reference[row - 1][column];
+    const int8_t c = f.reference[cy][cx];
+    const Mv mva = f.mv[row][column - 1], mvb = f.mv[row - 1][column], mvc = f.mv[cy][cx];
+    if (b == kUnavailable && c == kUnavailable && a != kUnavailable) return mva;
+    const int same = (a == index) + (b == index) + (c == index);
+    if (same == 1) return a == index ? mva : b == index ? mvb : mvc;
+    return {median(mva.x, mvb.x, mvc.x), median(mva.y, mvb.y, mvc.y)};
+}
+
+inline Mv predicted_vector(const MotionField& f, int shape, const Partition& part, int index) {
+    const int x = 2 * (part.block & 1), y = 2 * (part.block >> 1);
+    if (shape == 1 && y == 0 && f.reference[0][1] == index) return f.mv[0][1];
+    if (shape == 1 && y == 2 && f.reference[3][0] == index) return f.mv[3][0];
+    if (shape == 2 && x == 0 && f.reference[1][0] == index) return f.mv[1][0];
+    if (shape == 2 && x == 2) {
+        const int cx = f.reference[0][5] == kUnavailable ? 2 : 5;
+        if (f.reference[0][cx] == index) return f.mv[0][cx];
+    }
+    return median_prediction(f, index, x, y, part.width);
+}
+
+// 8.4.1.1.
+inline Mv skip_vector(const MotionField& f) {
+    const int8_t a = f.reference[1][0], b = f.reference[0][1];
+    if (a == kUnavailable || b == kUnavailable) return {0, 0};
+    if (a == 0 && f.mv[1][0] == Mv{0, 0}) return {0, 0};
+    if (b == 0 && f.mv[0][1] == Mv{0, 0}) return {0, 0};
+    return median_prediction(f, 0, 0, 0, 4);
+}
+
+// About the bits of one component of mvd_l0, in 1/256.
+inline uint32_t vector_bits(int difference) {
+    const uint32_t size = static_cast<uint32_t>(difference < 0 ? -difference : difference);
+    if (size == 0) return 180;
+    return 700 + 512u * static_cast<uint32_t>(31 - __builtin_clz(size));
+}
+
+struct Range {
+    int16_t low_x, high_x, low_y, high_y;  // of vectors, in quarter samples
+    bool holds(Mv v) const {
+        return v.x >= low_x && v.x <= high_x && v.y >= low_y && v.y <= high_y;
+    }
+    Mv clamped(Mv v) const {
+        return {v.x < low_x ? low_x : v.x > high_x ? high_x : v.x,
+                v.y < low_y ? low_y : v.y > high_y ? high_y : v.y};
+    }
+};
+
+struct Found {
+    Mv mv;
+    uint32_t cost;  // 256 times the difference, plus bits
+};
+
+// Searches one block in one reference.
+struct Search {
+    const Reference& reference;
+    const uint8_t* source;
+    ptrdiff_t source_stride;
+    int x, y, width, height;  // of the block in the picture
+    Mv predicted;
+    uint32_t motion_q8;
+    Range range;
+
+    uint32_t vector_cost(Mv v) const {
+        const uint32_t bits = vector_bits(v.x - predicted.x) + vector_bits(v.y - predicted.y);
+        return static_cast<uint32_t>((static_cast<uint64_t>(motion_q8) * bits) >> 8);
+    }
+
+    uint32_t whole(Mv v) const {
+        const Plane& plane = reference.luma[0];
+        const uint8_t* at = plane.at + (y + (v.y >> 2)) * plane.stride + x + (v.x >> 2);
+        const uint32_t sum =
+            width == 16 ? absolute_difference<16>(source, source_stride, at, plane.stride, height)
+                        : absolute_difference<8>(source, source_stride, at, plane.stride, height);
+        return 256 * sum + vector_cost(v);
+    }
+
+    uint32_t exact(Mv v) const {
+        alignas(32) uint8_t scratch[256];
+        const Block block = luma_prediction(reference, x, y, v, width, height, scratch);
+        const uint32_t sum =
+            width == 16
+                ? transformed_difference<16>(source, source_stride, block.at, block.stride, height)
+                : transformed_difference<8>(source, source_stride, block.at, block.stride, height);
+        return 256 * sum + vector_cost(v);
+    }
+
+    // One step to the best of the four neighbours at `distance`; false where none is better.
+    template <class Measure>
+    bool step(Found& best, int distance, Measure measure) const {
+        static constexpr int8_t kDirections[4][2] = {{1, 0}, {-1, 0}, {0, 1}, {0, -1}};
+        const Mv centre = best.mv;
+        for (const auto& d : kDirections) {
+            const Mv v = {static_cast<int16_t>(centre.x + distance * d[0]),
+                          static_cast<int16_t>(centre.y + distance * d[1])};
+            if (!range.holds(v)) continue;
+            const uint32_t cost = measure(v);
+            if (cost < best.cost) best = {v, cost};
+        }
+        return !(best.mv == centre);
+    }
+
+    // The best of `starts`: those between samples as they are, and the nearest whole one.
+    Found first_of(const Mv* starts, int count) const {
+        Found best = {{0, 0}, UINT32_MAX};
+        for (int i = 0; i < count; ++i) {
+            Mv v = range.clamped(starts[i]);
+            v = {static_cast<int16_t>((v.x + 2) & ~3), static_cast<int16_t>((v.y + 2) & ~3)};
+            if (!range.holds(v) || (i > 0 && v == best.mv)) continue;
+            const uint32_t cost = whole(v);
+            if (cost < best.cost) best = {v, cost};
+        }
+        best.cost = exact(best.mv);
+        for (int i = 0; i < count; ++i) {
+            const Mv v = starts[i];
+            if (((v.x | v.y) & 3) == 0 || !range.holds(v)) continue;
+            const uint32_t cost = exact(v);
+            if (cost < best.cost) best = {v, cost};
+        }
+        return best;
+    }
+
+    // Walks from `start` by whole samples, then by halves and quarters.
+    Found refined(const Found& start, const Effort& effort) const {
+        const auto by_whole = [this](Mv v) { return whole(v); };
+        const auto by_exact = [this](Mv v) { return exact(v); };
+        const Mv rounded = {static_cast<int16_t>((start.mv.x + 2) & ~3),
+                            static_cast<int16_t>((start.mv.y + 2) & ~3)};
+        Found best = start;
+        if (range.holds(rounded)) {
+            Found walk = {rounded, whole(rounded)};
+            for (int i = 0; i < effort.search_steps && step(walk, 4, by_whole); ++i) {
+            }
+            if (!(walk.mv == rounded)) {
+                walk.cost = exact(walk.mv);
+                if (walk.cost < best.cost) best = walk;
+            }
+        }
+        for (int i = 0; i < effort.subsample_steps && step(best, 2, by_exact); ++i) {
+        }
+        for (int i = 0; i < effort.subsample_steps && step(best, 1, by_exact); ++i) {
+        }
+        return best;
+    }
+};
+
+}  // namespace

@@ -1,0 +1,62 @@
+// Codes pictures of one size as slices against given pictures.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+#include "h264/kernels.h"
+
+namespace rfcore::h264 {
+
+// Planes Y, Cb, Cr of 4:2:0; chroma has (width + 1) / 2 by (height + 1) / 2 samples.
+struct Picture {
+    const uint8_t* plane[3];
+    ptrdiff_t stride[3];
+};
+
+struct SliceSettings {
+    int slice_qp;
+    const int8_t* qp;  // of each macroblock
+    uint32_t lambda_q8[52];
+    uint32_t motion_q8[52];
+    Effort effort;
+};
+
+class SliceCoder {
+public:
+    SliceCoder(int width, int height, const Kernels& kernels);
+
+    int width_mb() const { return width_mb_; }
+    int height_mb() const { return height_mb_; }
+
+    // The bytes of slice_data; `references[0]` is reference index 0, none makes an I slice.
+    // Reference samples are raised to at least 1, as I_PCM pictures hold them.
+    const std::vector<uint8_t>& encode(const Picture& frame, const Picture* references,
+                                       int reference_count, const SliceSettings& settings);
+    // Of the last slice, before deblocking; width and height in samples of the plane.
+    void reconstruction(int plane, uint8_t* out, ptrdiff_t stride, int width, int height) const;
+
+private:
+    struct Padded {
+        std::vector<uint8_t> samples;
+        ptrdiff_t stride = 0;
+        int border = 0;
+        void resize(int width, int height, int border_samples);
+        uint8_t* at() { return samples.data() + border * stride + border; }
+    };
+
+    void take(const Picture& from, int plane, uint8_t least, Padded& to) const;
+    Reference reference(const Picture& from, int index);
+
+    int width_, height_, width_mb_, height_mb_;
+    const Kernels& kernels_;
+    Padded frame_[3];
+    Padded luma_[kMaxReferences][4];
+    Padded chroma_[kMaxReferences][2];
+    Padded reconstruction_[3];
+    std::vector<Neighbour> macroblocks_;
+    std::vector<uint8_t> out_;
+};
+
+}  // namespace rfcore::h264

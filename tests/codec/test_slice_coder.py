@@ -1,0 +1,319 @@
+"""The slice coder: decoders agree with it, and it writes the same bytes everywhere.
+
+FFmpeg is the oracle: with the deblocking filter off, what it decodes is the coder's own
+reconstruction, sample for sample.
+"""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import StreamHeader
+from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, nal_type
+from rfcore.codec.h264.slice_coder import Effort, OwnSlice, SliceCoder
+from rfcore.codec.h264.slices import encode_slice
+from rfcore.codec.h264.splice import SpliceDecoder, grey
+from rfcore.errors import BackendUnavailable, InvalidInput
+from rfcore.image import I420
+from rfcore.native.backend import available_isas
+
+Size = tuple[int, int]
+
+ODD, NARROW, WIDE = (35, 33), (16, 48), (100, 52)
+SIZES: Sequence[Size] = (ODD, NARROW, WIDE)
+QUANTISERS = (0, 10, 20, 26, 33, 40, 51)
+KINDS = ("near", "noise", "unrelated")
+
+
+@cache
+def header_of(size: Size) -> StreamHeader:
+    """The parameter sets of a stream of the product: x264 writes them."""
+    config = CodecConfig(*size)
+    return encode_slice(config, [grey(config)], grey(config)).header
+
+
+@cache
+def coder_of(size: Size, isa: str | None = None) -> SliceCoder:
+    return SliceCoder(header_of(size), isa=isa)
+
+
+def macroblocks(size: Size) -> int:
+    return -(-size[0] // 16) * -(-size[1] // 16)
+
+
+def from_planes(size: Size, plane: Callable[[int, int], NDArray[np.float64]]) -> I420:
+    width, height = size
+    shapes = ((height, width), *[((height + 1) // 2, (width + 1) // 2)] * 2)
+    return I420(*(np.clip(plane(*shape), 0, 255).astype(np.uint8) for shape in shapes))
+
+
+def noise(rng: np.random.Generator, size: Size) -> I420:
+    return from_planes(size, lambda height, width: rng.uniform(0, 256, (height, width)))
+
+
+def waves(rng: np.random.Generator, size: Size) -> I420:
+    def wave(height: int, width: int) -> NDArray[np.float64]:
+        y, x = np.mgrid[:height, :width]
+        across = 60 * np.sin(x / rng.uniform(2, 20) + rng.uniform(0, 6))
+        down = 50 * np.cos(y / rng.uniform(2, 20))
+        plane: NDArray[np.float64] = 128 + across + down + rng.normal(0, 4, (height, width))
+        return plane
+
+    return from_planes(size, wave)
+
+
+def moved(rng: np.random.Generator, picture: I420, shift: int, sigma: float) -> I420:
+    planes = []
+    for plane in picture.planes:
+        rolled = np.roll(plane, (shift, shift // 2), (0, 1))
+        noisy = rolled + rng.normal(0, sigma, plane.shape)
+        planes.append(np.clip(noisy, 0, 255).astype(np.uint8))
+    return I420(*planes)
+
+
+def scene(kind: str, size: Size, references: int, seed: int) -> tuple[I420, list[I420]]:
+    """A frame and its references: shifted copies, noise throughout, or other structures."""
+    rng = np.random.default_rng(seed)
+    if kind == "noise":
+        return noise(rng, size), [noise(rng, size) for _ in range(references)]
+    frame = waves(rng, size)
+    if kind == "near":
+        return frame, [moved(rng, frame, k, 2.0 + k) for k in range(references)]
+    return frame, [waves(rng, size) for _ in range(references)]
+
+
+def decoded(size: Size, coded: OwnSlice, references: Sequence[I420]) -> I420:
+    """What the product's receiver makes of the slice, its check of payloads included."""
+    decoder = SpliceDecoder(header_of(size))
+    decoder.check_payload(coded.payload, len(references))
+    decoder.predict_from(*references)
+    return decoder.decode(coded.payload)
+
+
+def largest_difference(a: I420, b: I420) -> int:
+    pairs = zip(a.planes, b.planes, strict=True)
+    return max(int(np.abs(p.astype(int) - q).max()) for p, q in pairs)
+
+
+def check_decoders_agree(
+    size: Size, frame: I420, references: Sequence[I420], qp: int, effort: Effort, seed: int
+) -> None:
+    offsets = None
+    if seed % 2:
+        rng = np.random.default_rng(seed)
+        offsets = rng.integers(-4, 5, macroblocks(size)).astype(np.int8)
+    coded = coder_of(size).encode(
+        frame, references, qp, effort=effort, deblocked=False, offsets=offsets
+    )
+    assert largest_difference(decoded(size, coded, references), coded.reconstruction) == 0
+
+
+@pytest.mark.parametrize("references", range(4))
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("size", SIZES)
+def test_ffmpeg_decodes_the_coders_own_reconstruction(
+    size: Size, kind: str, references: int
+) -> None:
+    for seed, qp in enumerate(QUANTISERS):
+        frame, pictures = scene(kind, size, references, seed)
+        check_decoders_agree(size, frame, pictures, qp, list(Effort)[seed % 3], seed)
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@given(
+    size=st.sampled_from(SIZES),
+    kind=st.sampled_from(KINDS),
+    references=st.integers(0, 3),
+    qp=st.integers(0, 51),
+    effort=st.sampled_from(Effort),
+    seed=st.integers(0, 1 << 32),
+)
+def test_ffmpeg_decodes_the_reconstruction_of_any_scene(
+    size: Size, kind: str, references: int, qp: int, effort: Effort, seed: int
+) -> None:
+    frame, pictures = scene(kind, size, references, seed)
+    check_decoders_agree(size, frame, pictures, qp, effort, seed)
+
+
+def test_the_largest_steps_of_the_quantiser_between_macroblocks_decode() -> None:
+    frame, references = scene("near", WIDE, 2, 5)
+    offsets = np.resize(np.array([-128, 127, 0, 127], np.int8), macroblocks(WIDE))
+    coded = coder_of(WIDE).encode(frame, references, 26, deblocked=False, offsets=offsets)
+    assert largest_difference(decoded(WIDE, coded, references), coded.reconstruction) == 0
+
+
+def test_a_widest_picture_decodes() -> None:
+    """The rows of half samples have room for 8192 samples and their border."""
+    size = (8192, 16)
+    frame, references = scene("near", size, 1, 6)
+    coded = coder_of(size).encode(frame, references, 30, effort=Effort.FAST, deblocked=False)
+    assert largest_difference(decoded(size, coded, references), coded.reconstruction) == 0
+
+
+def test_with_the_filter_on_decoders_show_another_picture_of_the_same_quality() -> None:
+    frame, references = scene("unrelated", WIDE, 1, 7)
+    coded = coder_of(WIDE).encode(frame, references, 40)
+    shown = decoded(WIDE, coded, references)
+    assert 0 < largest_difference(shown, coded.reconstruction) < 60
+
+
+def test_a_frame_equal_to_its_reference_is_skipped_throughout() -> None:
+    frame = moved(np.random.default_rng(0), scene("near", WIDE, 0, 8)[0], 0, 0.0)
+    coded = coder_of(WIDE).encode(frame, [frame], 26, deblocked=False)
+    assert len(coded.payload) < 16
+    assert largest_difference(coded.reconstruction, frame) == 0
+
+
+def test_a_slice_predicts_from_whichever_reference_is_right() -> None:
+    frame, _ = scene("near", WIDE, 0, 9)
+    others = [noise(np.random.default_rng(seed), WIDE) for seed in range(2)]
+    sizes = [
+        len(coder_of(WIDE).encode(frame, pictures, 26).payload)
+        for pictures in ([*others, frame], [others[0], frame, others[1]], [frame, *others])
+    ]
+    assert max(sizes) < 80
+
+
+def test_a_lower_quantiser_is_nearer_to_the_frame_and_takes_more_bytes() -> None:
+    frame, references = scene("unrelated", WIDE, 1, 10)
+    coded = [coder_of(WIDE).encode(frame, references, qp) for qp in (14, 24, 34, 44)]
+    errors = [float(np.square(c.reconstruction.y.astype(float) - frame.y).mean()) for c in coded]
+    assert errors == sorted(errors)
+    lengths = [len(c.payload) for c in coded]
+    assert lengths == sorted(lengths, reverse=True)
+
+
+def test_macroblocks_with_a_lower_offset_are_nearer_to_the_frame() -> None:
+    frame, references = scene("unrelated", (96, 48), 1, 11)
+    offsets = np.zeros((3, 6), np.int8)
+    offsets[:, 3:] = -12
+    coded = coder_of((96, 48)).encode(frame, references, 36, offsets=offsets.ravel())
+    squared = np.square(coded.reconstruction.y.astype(float) - frame.y)
+    assert squared[:, 48:].mean() < squared[:, :48].mean() / 2
+
+
+def test_a_slice_without_references_is_an_idr_pictures() -> None:
+    frame, references = scene("near", WIDE, 1, 12)
+    coder = coder_of(WIDE)
+    assert nal_type(coder.encode(frame, [], 30).payload) == NAL_IDR
+    assert nal_type(coder.encode(frame, references, 30).payload) == NAL_P
+
+
+def test_a_frame_codes_to_the_same_bytes_whatever_was_coded_before() -> None:
+    frame, references = scene("near", WIDE, 2, 13)
+    coder = SliceCoder(header_of(WIDE))
+    first = coder.encode(frame, references, 24).payload
+    coder.encode(*scene("noise", WIDE, 3, 14), 4)
+    assert coder.encode(frame, references, 24).payload == first
+
+
+def test_the_frame_and_references_may_be_parts_of_larger_pictures() -> None:
+    frame, (reference,) = scene("near", WIDE, 1, 15)
+
+    def inside(picture: I420) -> I420:
+        return I420(*(np.pad(plane, 7)[7:-7, 7:-7] for plane in picture.planes))
+
+    expected = coder_of(WIDE).encode(frame, [reference], 24).payload
+    assert coder_of(WIDE).encode(inside(frame), [inside(reference)], 24).payload == expected
+
+
+@pytest.mark.parametrize("isa", available_isas())
+@pytest.mark.parametrize("effort", Effort)
+def test_every_instruction_set_writes_the_same_bytes(effort: Effort, isa: str) -> None:
+    for seed, (kind, qp) in enumerate(zip(KINDS, (22, 2, 34), strict=True)):
+        frame, references = scene(kind, WIDE, 3 - seed, seed)
+        expected = coder_of(WIDE).encode(frame, references, qp, effort=effort)
+        got = coder_of(WIDE, isa).encode(frame, references, qp, effort=effort)
+        assert got.payload == expected.payload
+        assert largest_difference(got.reconstruction, expected.reconstruction) == 0
+
+
+GOLDEN = {
+    (Effort.FAST, 3, 22): "830de2b8f460b19c",
+    (Effort.DEFAULT, 3, 22): "dc6de680ec05bda2",
+    (Effort.THOROUGH, 3, 22): "0f506c3e5043f32e",
+    (Effort.DEFAULT, 1, 34): "a9d1b6d34648652a",
+    (Effort.DEFAULT, 0, 30): "84b2ef1d07ce7f5a",
+}
+"""First digits of the SHA-256 of slices, by effort, references and quantiser. They
+change with every decision of the coder; print them with this file's ``digest``."""
+
+
+def blocks(rng: np.random.Generator, size: Size, shift: int, seed: int) -> I420:
+    """Grey blocks with noise, made of integers alone: the same picture on every machine."""
+    width, height = size
+    grey_levels = np.random.default_rng(seed).integers(40, 200, (24, 40))
+    grid = np.kron(grey_levels, np.ones((7, 7), np.int64))
+    planes = []
+    for step in (1, 2, 2):
+        across = (4 + shift) * 2 // step
+        part = grid[: height // step, across : across + width // step]
+        soft = (part + np.roll(part, 1, 0) + np.roll(part, 1, 1)) // 3
+        planes.append((soft + rng.integers(-3, 4, soft.shape)).astype(np.uint8))
+    return I420(*planes)
+
+
+def halves(a: I420, b: I420) -> I420:
+    """The mean of two pictures: what neither explains alone."""
+    pairs = zip(a.planes, b.planes, strict=True)
+    return I420(*(((p.astype(np.uint16) + q) // 2).astype(np.uint8) for p, q in pairs))
+
+
+def digest(effort: Effort, references: int, qp: int) -> str:
+    size = (160, 96)
+    rng = np.random.default_rng(4)
+    frame = halves(blocks(rng, size, 3, 3), blocks(rng, size, 0, 4))
+    pictures = [
+        halves(blocks(rng, size, 2 * k, 3), blocks(rng, size, 1 - k, 4 + k))
+        for k in range(references)
+    ]
+    payload = coder_of(size).encode(frame, pictures, qp, effort=effort).payload
+    return hashlib.sha256(payload).hexdigest()[:16]
+
+
+@pytest.mark.parametrize(("effort", "references", "qp"), GOLDEN)
+def test_slices_keep_their_bytes(effort: Effort, references: int, qp: int) -> None:
+    assert digest(effort, references, qp) == GOLDEN[effort, references, qp]
+
+
+@pytest.mark.parametrize("qp", [-1, 52])
+def test_a_quantiser_outside_the_standard_is_refused(qp: int) -> None:
+    frame, references = scene("near", ODD, 1, 0)
+    with pytest.raises(InvalidInput, match=f"{qp} is outside 0..51"):
+        coder_of(ODD).encode(frame, references, qp)
+
+
+def test_more_references_than_the_stream_allows_are_refused() -> None:
+    frame, references = scene("near", ODD, 4, 0)
+    with pytest.raises(InvalidInput, match="4 are more than the stream's 3"):
+        coder_of(ODD).encode(frame, references, 26)
+
+
+@pytest.mark.parametrize("wrong", ["frame", "reference"])
+def test_pictures_of_another_size_are_refused(wrong: str) -> None:
+    frame, references = scene("near", ODD, 1, 0)
+    other, _ = scene("near", WIDE, 0, 0)
+    pictures = (other, references) if wrong == "frame" else (frame, [other])
+    with pytest.raises(InvalidInput, match=rf"{wrong}.*\(100, 52\) px"):
+        coder_of(ODD).encode(*pictures, 26)
+
+
+@pytest.mark.parametrize(
+    "offsets", [np.zeros(5, np.int8), np.zeros(6, np.int16), np.zeros((2, 3), np.int8)]
+)
+def test_offsets_that_do_not_fit_the_macroblocks_are_refused(offsets: NDArray[np.int8]) -> None:
+    frame, references = scene("near", (48, 32), 1, 0)
+    with pytest.raises(InvalidInput, match=r"where int8 \(6,\) is expected"):
+        coder_of((48, 32)).encode(frame, references, 26, offsets=offsets)
+
+
+def test_an_instruction_set_that_is_not_there_is_refused() -> None:
+    with pytest.raises(BackendUnavailable, match="'abacus'"):
+        SliceCoder(header_of(ODD), isa="abacus")
