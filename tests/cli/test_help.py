@@ -1,13 +1,19 @@
 """The commands say what they take, fast, and turn mistakes into one line."""
 
+import contextlib
+import io
 import re
 import subprocess
 import sys
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
+
+from rfedge.cli import main
 
 VERBS = ("demo", "train", "render", "encode", "decode", "link", "loadtest", "watch", "bench")
 EVAL_VERBS = ("eval compare", "eval never-worse", "eval paper", "eval robust")
@@ -25,10 +31,32 @@ TRAIN_VIEWS = str(SAMPLES / "street/transforms_train.json")
 HEAVY = ("numpy", "torch", "cv2", "matplotlib", "av", "grpc", "cryptography")
 
 
-def rfedge(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "rfedge", *arguments], capture_output=True, text=True, check=False
-    )
+@dataclass(frozen=True)
+class Ended:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def rfedge(*arguments: str) -> Ended:
+    """Run the command in this process: a start costs more than most of what is tested here."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        patch.object(sys, "argv", ["rfedge", *arguments]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            code = main()
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    return Ended(code, out.getvalue(), err.getvalue())
+
+
+def in_a_process(*arguments: str) -> Ended:
+    command = [sys.executable, "-m", "rfedge", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return Ended(done.returncode, done.stdout, done.stderr)
 
 
 @cache
@@ -73,7 +101,7 @@ def test_placeholders_say_what_they_want(verb: str, shown: str) -> None:
 
 
 def test_the_version_is_that_of_the_distribution() -> None:
-    done = rfedge("--version")
+    done = in_a_process("--version")
     assert (done.returncode, done.stdout) == (0, f"rfedge {version('rfedge')}\n")
 
 
@@ -134,6 +162,12 @@ def test_a_users_mistake_is_one_line_and_exit_status_2(
     assert said in done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
     assert list(tmp_path.iterdir()) == [], "a refused command leaves nothing behind"
+
+
+def test_a_process_ends_with_that_line_and_status() -> None:
+    done = in_a_process("train", "nowhere", "--out", "field.txt")
+    assert done == rfedge("train", "nowhere", "--out", "field.txt")
+    assert done.returncode == 2
 
 
 def test_a_log_file_gets_each_line_as_it_comes(tmp_path: Path) -> None:
