@@ -5,8 +5,8 @@ Sans-IO bookkeeping. Frames enter with ``admit``, leave to the decoder with ``st
 sequence move only when a frame was reconstructed, so that a damaged frame cannot move them.
 
 This is the one place where the server judges the order of frames, before any work is spent on
-them. ``DeltaDecoder`` checks the order, too: it guards callers that have no queue, such as the
-offline decoder, and within the server its check never fires.
+them; the session checks their CRC at the same time. ``DeltaDecoder`` checks both, too: it guards
+callers that have no queue, such as the offline decoder; within the server its checks never fire.
 """
 
 from __future__ import annotations

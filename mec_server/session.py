@@ -91,6 +91,7 @@ class ServerSession:
         self._deadline_s = now + self._limits.hello_s
         self._heard_s = now
         self._unusable = 0
+        self._damaged: deque[tuple[Frame, PacketRejected]] = deque(maxlen=MAX_UNUSABLE)
         self._exact = False
         self._rate_hz = 0.0
 
@@ -173,7 +174,10 @@ class ServerSession:
     # --- numerical work
 
     def jobs_to_start(self, now: float) -> list[OpenJob | DecodeJob]:
-        """Return the work that can begin now: one frame a camera, in order."""
+        """Return the work that can begin now: one frame a camera, in order.
+
+        Frames that are stale or damaged (a wrong CRC) are answered here: they cost no rendering.
+        """
         jobs: list[OpenJob | DecodeJob] = []
         if self._opening is not None and self.state is SessionState.OPENING:
             jobs.append(self._opening)
@@ -182,14 +186,27 @@ class ServerSession:
             frame = waiting.frame
             try:
                 queue.check_order(frame)
+                frame.packet.check_crc32()
             except PacketRejected as error:
                 queue.fail()
-                self._nack(frame.address, error.reason, error.problem)
+                self._refuse_unstarted(frame, error)
             else:
                 field_id = self._cameras.field_of(frame)
                 jobs.append(DecodeJob(frame, field_id, waiting.received_s, now))
         self._finish_draining()
         return jobs
+
+    def _refuse_unstarted(self, frame: Frame, error: PacketRejected) -> None:
+        self._nack(frame.address, error.reason, error.problem)
+        if error.reason is RejectReason.CRC_MISMATCH:
+            self._damaged.append((frame, error))
+        self._unusable_frame()
+
+    def take_damaged(self) -> list[tuple[Frame, PacketRejected]]:
+        """Return, once, the frames that were refused for their CRC, and why: for the log."""
+        damaged = list(self._damaged)
+        self._damaged.clear()
+        return damaged
 
     def opened(self, job: OpenJob, now: float) -> None:
         """Fields and decoders of ``job`` are ready."""

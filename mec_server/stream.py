@@ -145,6 +145,8 @@ class Stream:
                 self._decoders.submit(job, self._finished)
             else:
                 self._tasks.create_task(self._open(job))
+        for frame, error in self._session.take_damaged():
+            self._log_rejected(frame, error)
         if self._session.has_news:
             self._wake.set()
 
@@ -263,14 +265,7 @@ class Stream:
         self._show(job, result, now, latency_s)
 
     def _rejected(self, job: DecodeJob, error: PacketRejected) -> None:
-        self._log.warning(
-            "frame rejected",
-            camera=job.frame.camera_id,
-            epoch=job.frame.packet.epoch,
-            seq=job.frame.packet.sequence,
-            reason=str(error.reason),
-            problem=error.problem,
-        )
+        self._log_rejected(job.frame, error)
         now = time.monotonic()
         self._session.rejected(job, error, now)
         if self._permit is not None and isinstance(error.__cause__, DecoderLost):
@@ -278,6 +273,16 @@ class Stream:
                 self._permit.allowance.lost_decoder(now)
             except LimitExceeded as barred:
                 self._session.end(barred)
+
+    def _log_rejected(self, frame: Frame, error: PacketRejected) -> None:
+        self._log.warning(
+            "frame rejected",
+            camera=frame.camera_id,
+            epoch=frame.packet.epoch,
+            seq=frame.packet.sequence,
+            reason=str(error.reason),
+            problem=error.problem,
+        )
 
     def _show(self, job: DecodeJob, result: FrameResult, now: float, latency_s: float) -> None:
         hello, session = self._session.hello, self._session

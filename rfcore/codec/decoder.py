@@ -100,7 +100,7 @@ class DeltaDecoder:
             )
         started_ns = self._clock_ns()
         _check_order(state, packet)
-        _check_crc(packet)
+        packet.check_crc32()
         same_render = self._check_render(packet, render)
         past = self._past(state, packet)
         self._check_payload(packet)
@@ -203,12 +203,4 @@ def _check_order(state: DecoderState, packet: DeltaPacket) -> None:
         raise PacketRejected(
             RejectReason.STALE_SEQUENCE,
             f"sequence {packet.sequence} where {state.next_sequence} or later is expected",
-        )
-
-
-def _check_crc(packet: DeltaPacket) -> None:
-    expected = packet.expected_crc32()
-    if packet.crc32 != expected:
-        raise PacketRejected(
-            RejectReason.CRC_MISMATCH, f"CRC {packet.crc32:08x} of contents with {expected:08x}"
         )

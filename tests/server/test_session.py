@@ -7,11 +7,12 @@ import pytest
 
 from mec_server.config import SessionLimits
 from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
-from mec_server.session import ServerSession, SessionState
+from mec_server.session import MAX_UNUSABLE, ServerSession, SessionState
 from rfcore.errors import (
     AccessDenied,
     CodecError,
     InvalidInput,
+    LimitExceeded,
     PacketRejected,
     ProtocolError,
     RejectReason,
@@ -39,7 +40,7 @@ MakeFrame = Callable[..., Frame]
 
 
 class ReferenceDecoder:
-    """Accepts what the codec would: frames in order; a CRC of 0 stands for a damaged one."""
+    """Accepts what the codec would: frames in order, undamaged, and nothing else reaches it."""
 
     def __init__(self) -> None:
         self.position: dict[str, tuple[int, int]] = {}
@@ -58,10 +59,14 @@ class ReferenceDecoder:
         packet = frame.packet
         position = self.position.get(frame.camera_id, (0, -1))
         assert (packet.epoch, packet.sequence) > position, "the session hands them out in order"
-        if packet.crc32 == 0:
-            raise PacketRejected(RejectReason.CRC_MISMATCH, "crc32 is 0")
+        assert packet.crc32 == packet.expected_crc32(), "a damaged packet is rendered for"
         self.position[frame.camera_id] = (packet.epoch, packet.sequence)
         return DecodeOutcome(b"d" * 16, StageTimes(render_ns=5))
+
+
+def with_wrong_crc(frame: Frame) -> Frame:
+    """Return ``frame`` as if bits of it were flipped on the way."""
+    return replace(frame, packet=replace(frame.packet, crc32=0))
 
 
 def answers(messages: list[ServerMessage]) -> list[tuple[str, int]]:
@@ -216,7 +221,7 @@ def test_the_next_packet_is_right_again(
     frames = []
     for number in arrived:
         frame = make_frame(abs(number))
-        broken = replace(frame, packet=replace(frame.packet, crc32=0))
+        broken = with_wrong_crc(frame)
         frames.append(broken if number < 0 else frame)
     names = {
         "ack": "ack",
@@ -242,8 +247,7 @@ def test_a_new_epoch_starts_afresh_and_the_old_one_is_over(
 def test_a_frame_that_failed_in_a_new_epoch_is_answered_once(
     session: ServerSession, make_frame: MakeFrame
 ) -> None:
-    first = make_frame(0, epoch=4)
-    broken = replace(first, packet=replace(first.packet, crc32=0))
+    broken = with_wrong_crc(make_frame(0, epoch=4))
     frames = [make_frame(0), broken, make_frame(1, epoch=4)]
     assert deliver(session, frames) == [("ack", 0), ("crc_mismatch", 0), ("ack", 1)]
 
@@ -255,6 +259,34 @@ def test_a_flipped_epoch_does_not_carry_the_session_away(
     assert deliver(session, frames) == [
         ("ack", 0), ("invalid_argument", 1), ("sequence_gap", 1), ("ack", 2),
     ]  # fmt: skip
+
+
+def test_a_damaged_frame_is_refused_before_a_worker_renders_and_can_be_logged(
+    session: ServerSession, make_frame: MakeFrame
+) -> None:
+    damaged = with_wrong_crc(make_frame(0))
+    session.receive(damaged, 1.0)
+    assert session.jobs_to_start(1.0) == []
+    assert answers(session.messages_to_send(1.0)) == [("crc_mismatch", 0)]
+    ((logged, error),) = session.take_damaged()
+    assert logged == damaged
+    assert error.problem.startswith("CRC 00000000 of contents with")
+    assert session.take_damaged() == []
+
+
+@pytest.mark.parametrize("kind", ["damaged", "stale"])
+def test_a_stream_of_nothing_but_frames_refused_unrendered_is_ended(
+    session: ServerSession, make_frame: MakeFrame, kind: str
+) -> None:
+    deliver(session, [make_frame(0)])
+    bad = make_frame(0) if kind == "stale" else with_wrong_crc(make_frame(1))
+    deliver(session, [bad] * (MAX_UNUSABLE - 1))
+    deliver(session, [make_frame(1)])
+    assert session.closed is None, "a frame that could be used begins the count again"
+    bad = make_frame(0) if kind == "stale" else with_wrong_crc(make_frame(2))
+    deliver(session, [bad] * MAX_UNUSABLE)
+    assert session.closed is not None
+    assert isinstance(session.closed.error, LimitExceeded)
 
 
 def test_a_nack_tells_the_last_good_sequence_and_the_present_epoch(
