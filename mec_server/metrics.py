@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections import Counter as Tally
 from collections.abc import Callable, Iterable
 from dataclasses import fields
+from enum import StrEnum
 from functools import cached_property
 
+import structlog
 from prometheus_client import CollectorRegistry, Counter
 
 from mec_server.decoding.process import LossCause
@@ -22,7 +24,36 @@ from rfcore.field import RadianceField
 from rfcore.wire.instruments import DurationSeries, Instruments
 from rfcore.wire.messages import Ack, Frame, Nack, ServerMessage, StageTimes
 
-__all__ = ["ServerMetrics", "VehicleMetrics"]
+__all__ = ["BackgroundTask", "OpeningResult", "ServerMetrics", "VehicleMetrics"]
+
+log = structlog.get_logger()
+
+
+class BackgroundTask(StrEnum):
+    """What runs beside the streams; an exception in one ends no stream by itself."""
+
+    PUBLICATIONS = "publications"
+    """Looks for newly published fields; goes on with its next look."""
+    OPENING = "opening"
+    """Opens a stream's fields and decoders; a failure ends that stream."""
+    OUTCOME = "outcome"
+    """Hands the outcome of a worker to its stream; the others are still handed over."""
+    CLOSING = "closing"
+    """Closes a decoder of a stream that is over."""
+    DECODER_START = "decoder_start"
+    """Starts the spare decoder process; another one is started when one is needed."""
+    RECORDING = "recording"
+    """Writes pictures to disk; recording ends for good, streaming goes on."""
+
+
+class OpeningResult(StrEnum):
+    """How the opening of a stream's decoders ended."""
+
+    OPENED = "opened"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+    """The stream was over before its decoders were open."""
+
 
 STAGES = tuple(f.name.removesuffix("_ns") for f in fields(StageTimes) if f.name != "total_ns")
 
@@ -93,6 +124,16 @@ class ServerMetrics:
             "Decoder processes that died in use: by a signal, by themselves, or for being slow.",
             ("cause",),
         )
+        self._task_failures = make.counter(
+            "rfedge_server_task_failures",
+            "Unexpected exceptions in what runs beside the streams, by background task.",
+            ("task",),
+        )
+        self._openings = make.counter(
+            "rfedge_server_openings",
+            "Streams whose fields and decoders were to be opened, by result.",
+            ("result",),
+        )
         self.recording = make.gauge(
             "rfedge_server_recording",
             "1 while pictures are recorded, 0 when none are asked for or the disk refused.",
@@ -115,6 +156,10 @@ class ServerMetrics:
             self.limited.labels(limit)
         for cause in LossCause:
             self.decoders_lost.labels(cause)
+        for task in BackgroundTask:
+            self._task_failures.labels(task)
+        for result in OpeningResult:
+            self._openings.labels(result)
 
     def observe_stages(self, times: StageTimes) -> None:
         """Observe the time of a frame, stage by stage."""
@@ -136,6 +181,15 @@ class ServerMetrics:
     def count_lost_decoder(self, cause: LossCause) -> None:
         """Count a decoder process that died in use."""
         self.decoders_lost.labels(cause).inc()
+
+    def task_failed(self, task: BackgroundTask, error: Exception) -> None:
+        """Log and count an exception that a background task did not expect; from any thread."""
+        self._task_failures.labels(task).inc()
+        log.error("background task failed", task=str(task), problem=repr(error), exc_info=error)
+
+    def count_opening(self, result: OpeningResult) -> None:
+        """Count an opening that ended."""
+        self._openings.labels(result).inc()
 
     def of(self, vehicle_id: str) -> VehicleMetrics:
         """Return the metrics for a stream of ``vehicle_id``; ``forget`` them when it ends."""

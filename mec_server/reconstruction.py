@@ -14,7 +14,7 @@ from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
 from mec_server.decoding.decoders import OpenDecoder
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.state import DecoderState
-from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason, RfedgeError
+from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.field import Renderer, render_field_view
 from rfcore.image import I420
 from rfcore.views import FieldView
@@ -134,7 +134,7 @@ def open_cameras(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, D
     for index, camera in enumerate(job.hello.cameras):
         try:
             decoders[camera.camera_id] = CameraDecoder(camera, renderers, job.exact, tools)
-        except RfedgeError as error:
+        except Exception as error:
             for opened in decoders.values():
                 opened.close()
             if not isinstance(error, InvalidInput):

@@ -34,9 +34,12 @@ class Recording:
 
 
 class Recorder:
-    """Writes pictures on a thread of its own; ``on_failure`` is called with the first error."""
+    """Writes pictures on a thread of its own; ``on_failure`` is called with the first error.
 
-    def __init__(self, directory: Path, on_failure: Callable[[OSError], None]) -> None:
+    After any error the thread goes on emptying its queue, so that no worker waits for it for ever.
+    """
+
+    def __init__(self, directory: Path, on_failure: Callable[[Exception], None]) -> None:
         self._directory = directory
         self._on_failure = on_failure
         self._failed = False
@@ -60,7 +63,7 @@ class Recorder:
                 continue
             try:
                 self._write(recording)
-            except OSError as error:
+            except Exception as error:
                 self._failed = True
                 self._on_failure(error)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import grpc
@@ -17,11 +18,11 @@ from mec_server.admission import Admission, EntryControl
 from mec_server.config import ServerConfig
 from mec_server.decoding.decoders import Decoders
 from mec_server.edge_service import EdgeService
-from mec_server.event_loop import Workers
+from mec_server.event_loop import Workers, repeat_forever
 from mec_server.fields.published import PublishedFields
 from mec_server.fields.service import FieldService
 from mec_server.fields.shelf import FieldShelf, field_loader
-from mec_server.metrics import ServerMetrics
+from mec_server.metrics import BackgroundTask, ServerMetrics
 from mec_server.quotas import Quotas
 from mec_server.reconstruction import OpenCameras, Tools, open_cameras
 from mec_server.recorder import Recorder
@@ -62,10 +63,14 @@ class EdgeServer:
         self._metrics = ServerMetrics(self.registry, per_vehicle=config.metrics.per_vehicle)
         self._metrics.workers.set(config.workers)
         self._metrics_endpoint: MetricsEndpoint | None = None
-        self._opener = ThreadPoolExecutor(1, "opener")
-        self._workers = Workers(config.workers)
+        outcome_failed = self._failed(BackgroundTask.OUTCOME)
+        self._opener = Workers(1, outcome_failed, "opener")
+        self._workers = Workers(config.workers, outcome_failed)
         self._decoders = Decoders(
-            config.decoder, not self.address.is_loopback, self._metrics.count_lost_decoder
+            config.decoder,
+            not self.address.is_loopback,
+            self._metrics.count_lost_decoder,
+            self._failed(BackgroundTask.DECODER_START),
         )
         self._recorder = self._open_recorder(config.save)
         self._health = health_aio.HealthServicer()
@@ -82,6 +87,9 @@ class EdgeServer:
         self._twin_service.register(self._server)
         FieldService(self._store, lambda: self._published.tiles).register(self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+
+    def _failed(self, task: BackgroundTask) -> Callable[[Exception], None]:
+        return partial(self._metrics.task_failed, task)
 
     def _context(self, twin: Twin, open_decoders: OpenCameras) -> ServerContext:
         config = self._config
@@ -129,7 +137,13 @@ class EdgeServer:
         await asyncio.to_thread(self._decoders.start)
         self.address = Address(self.address.host, self._open_port())
         await self._server.start()
-        self._following = asyncio.create_task(self._follow_publications())
+        self._following = asyncio.create_task(
+            repeat_forever(
+                self.take_up_fields,
+                PUBLICATIONS_EVERY_S,
+                self._failed(BackgroundTask.PUBLICATIONS),
+            )
+        )
         await self._set_health(health_pb2.HealthCheckResponse.SERVING)
         if self._config.ready_file is not None:
             write_whole(self._config.ready_file, f"{self.address}\n")
@@ -163,7 +177,7 @@ class EdgeServer:
         self._edge.drain()
         self._twin_service.drain()
         await self._server.stop(drain_s)
-        await asyncio.to_thread(self._opener.shutdown)
+        await asyncio.to_thread(self._opener.close)
         await asyncio.to_thread(self._workers.close)
         await asyncio.to_thread(self._decoders.close)
         self._twin_service.close()
@@ -176,11 +190,6 @@ class EdgeServer:
         """Serve what is published now, and tell the vehicles if it is something else."""
         if await asyncio.to_thread(self._published.refresh):
             self._edge.fields_changed(tuple(tile.field_id for tile in self._published.tiles))
-
-    async def _follow_publications(self) -> None:
-        while True:
-            await asyncio.sleep(PUBLICATIONS_EVERY_S)
-            await self.take_up_fields()
 
     def _open_port(self) -> int:
         self.address.check_free("--listen")
@@ -197,8 +206,10 @@ class EdgeServer:
         self._metrics.recording.set(1)
         return Recorder(directory, self._recording_failed)
 
-    def _recording_failed(self, error: OSError) -> None:
+    def _recording_failed(self, error: Exception) -> None:
         self._metrics.recording.set(0)
+        if not isinstance(error, OSError):
+            self._metrics.task_failed(BackgroundTask.RECORDING, error)
         log.error("recording stopped, streaming goes on", problem=str(error))
 
     def _serve_metrics(self) -> None:

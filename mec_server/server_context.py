@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Executor
 from dataclasses import dataclass
 
 from mec_server.admission import EntryControl
@@ -25,9 +24,9 @@ class ServerContext:
     held_field_ids: Callable[[], tuple[str, ...]]
     workers: Workers
     """Threads that decode frames."""
-    opener: Executor
-    """Opens fields and decoders for new vehicles: a crowd of them, or a decoder process that is
-    slow to start, must not delay the frames of others."""
+    opener: Workers
+    """One thread that opens fields and decoders for new vehicles: a crowd of them, or a decoder
+    process that is slow to start, must not delay the frames of others."""
     tools: Tools
     metrics: ServerMetrics
     limits: SessionLimits

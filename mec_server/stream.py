@@ -59,6 +59,7 @@ class Stream:
         self._wake = asyncio.Event()
         self._timer = LazyTimer(self._wake)
         self._tasks = asyncio.TaskGroup()
+        self._opening: asyncio.Task[None] | None = None
         self._identity = peer_identity(context.auth_context())
         self._permit: StreamPermit | None = None
         self._over_quota = False
@@ -137,6 +138,8 @@ class Stream:
                 await self._rest()
             await self._write()
             reader.cancel()
+            if self._opening is not None:
+                self._opening.cancel()
 
     def _advance(self) -> None:
         """Start the work that can be started, and wake the writer if there is something to send."""
@@ -144,7 +147,7 @@ class Stream:
             if isinstance(job, DecodeJob):
                 self._decoders.submit(job, self._finished)
             else:
-                self._tasks.create_task(self._open(job))
+                self._opening = self._tasks.create_task(self._open(job))
         for frame, error in self._session.take_damaged():
             self._log_rejected(frame, error)
         if self._session.has_news:
@@ -191,7 +194,7 @@ class Stream:
         session.receive(hello, now)
         if session.state is not SessionState.OPENING:
             return
-        account = self._identity.uris[0] if self._identity is not None else hello.vehicle_id
+        account = self._account(hello)
         self._leave()  # what an earlier Hello that could not be opened was granted
         try:
             self._permit = self._server.entry.enter(hello, account, session.session_id, self, now)
@@ -205,6 +208,10 @@ class Stream:
             session.end(error)
         else:
             session.grant(self._permit.rate_hz)
+
+    def _account(self, hello: Hello) -> str:
+        """Return whom the stream's work is charged to: the certificate's name, if there is one."""
+        return self._identity.uris[0] if self._identity is not None else hello.vehicle_id
 
     def _receive_frame(self, frame: Frame, message_bytes: int, now: float) -> None:
         self._metrics.received(frame, message_bytes)
@@ -223,7 +230,7 @@ class Stream:
 
     async def _open(self, job: OpenJob) -> None:
         try:
-            await self._decoders.open(job)
+            await self._decoders.open(self._account(job.hello), job)
         except RfedgeError as error:
             self._session.open_failed(error, time.monotonic())
         else:

@@ -5,15 +5,22 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from mec_server.decode_jobs import DecodeJob, OpenJob
+from mec_server.metrics import BackgroundTask, OpeningResult
 from mec_server.reconstruction import Decoder, Reconstruction
 from mec_server.recorder import Recording
 from mec_server.server_context import ServerContext
+from rfcore.codec.h264.splice import PictureDecoder
+from rfcore.errors import RfedgeError
 
 __all__ = ["FrameResult", "StreamDecoders"]
+
+
+class OpeningCancelled(RfedgeError):
+    """The stream is over; its decoders are not wanted any more."""
 
 
 @dataclass(frozen=True)
@@ -25,26 +32,46 @@ class FrameResult:
 
 
 class StreamDecoders:
-    """Decodes the frames of one stream; used from the event loop only."""
+    """Decodes the frames of one stream; used from the event loop only.
+
+    Streams of the same ``owner`` share one turn at the workers and at the opener.
+    """
 
     def __init__(self, server: ServerContext) -> None:
         self._server = server
+        self._owner = ""
         self._vehicle_id = ""
-        self._opening: asyncio.Future[dict[str, Decoder]] | None = None
         self._decoders: dict[str, Decoder] = {}
         self._closed = False
 
-    async def open(self, job: OpenJob) -> None:
+    async def open(self, owner: str, job: OpenJob) -> None:
         """Open fields and decoders for ``job``, on a thread that delays no frames.
 
-        Raises what ``OpenCameras`` raises.
+        Cancelled, it opens no more decoders and closes those that are open. Raises what
+        ``OpenCameras`` raises.
         """
-        server = self._server
-        self._opening = asyncio.get_running_loop().run_in_executor(
-            server.opener, server.open_cameras, job, server.fields, server.tools
-        )
-        self._decoders = await asyncio.shield(self._opening)
-        self._vehicle_id = job.hello.vehicle_id
+        opened: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+        def done(outcome: dict[str, Decoder] | Exception) -> None:
+            self._count_opening(outcome)
+            if isinstance(outcome, dict):
+                self._decoders = outcome
+                if self._closed:
+                    self._close_decoders()
+            if opened.done():
+                return
+            if isinstance(outcome, Exception):
+                opened.set_exception(outcome)
+            else:
+                opened.set_result(None)
+
+        self._server.opener.submit(owner, partial(self._open_cameras, job), done)
+        try:
+            await opened
+        except asyncio.CancelledError:
+            self._closed = True
+            raise
+        self._owner, self._vehicle_id = owner, job.hello.vehicle_id
 
     def submit(
         self, job: DecodeJob, finished: Callable[[DecodeJob, FrameResult | Exception], None]
@@ -55,13 +82,51 @@ class StreamDecoders:
             if outcome is not None and not self._closed:
                 finished(job, outcome)
 
-        self._server.workers.submit(partial(self._reconstruct, job), done)
+        self._server.workers.submit(self._owner, partial(self._reconstruct, job), done)
 
     def close(self) -> None:
         """Close the decoders on threads, those that are still being opened included."""
         self._closed = True
-        if self._opening is not None:
-            self._opening.add_done_callback(_close_decoders)
+        self._close_decoders()
+
+    def _open_cameras(self, job: OpenJob) -> dict[str, Decoder]:
+        """Runs on the opener; the decoders of a stream that is over are not opened any more."""
+        server = self._server
+
+        def open_decoder(size_px: tuple[int, int]) -> PictureDecoder:
+            self._check_wanted()
+            return server.tools.open_decoder(size_px)
+
+        self._check_wanted()
+        tools = replace(server.tools, open_decoder=open_decoder)
+        return server.open_cameras(job, server.fields, tools)
+
+    def _check_wanted(self) -> None:
+        if self._closed:
+            raise OpeningCancelled("the stream ended before its decoders were open")
+
+    def _count_opening(self, outcome: dict[str, Decoder] | Exception) -> None:
+        metrics = self._server.metrics
+        if isinstance(outcome, OpeningCancelled) or self._closed:
+            metrics.count_opening(OpeningResult.CANCELLED)
+        elif isinstance(outcome, Exception):
+            metrics.count_opening(OpeningResult.FAILED)
+        else:
+            metrics.count_opening(OpeningResult.OPENED)
+        if isinstance(outcome, Exception) and not isinstance(outcome, RfedgeError):
+            metrics.task_failed(BackgroundTask.OPENING, outcome)
+
+    def _close_decoders(self) -> None:
+        decoders, self._decoders = self._decoders, {}
+        loop = asyncio.get_running_loop()
+        for decoder in decoders.values():
+            loop.run_in_executor(None, self._close_decoder, decoder)
+
+    def _close_decoder(self, decoder: Decoder) -> None:
+        try:
+            decoder.close()
+        except Exception as error:
+            self._server.metrics.task_failed(BackgroundTask.CLOSING, error)
 
     def _reconstruct(self, job: DecodeJob) -> FrameResult | None:
         """Runs on a worker; frames of a stream that is over are not decoded any more."""
@@ -74,11 +139,3 @@ class StreamDecoders:
         if recorder is not None:
             recorder.save(Recording(self._vehicle_id, job.frame, reconstruction.picture))
         return FrameResult(reconstruction, worker_s)
-
-
-def _close_decoders(opening: asyncio.Future[dict[str, Decoder]]) -> None:
-    if opening.cancelled() or opening.exception() is not None:
-        return
-    loop = asyncio.get_running_loop()
-    for decoder in opening.result().values():
-        loop.run_in_executor(None, decoder.close)

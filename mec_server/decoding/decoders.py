@@ -77,12 +77,17 @@ class Decoders:
     """
 
     def __init__(
-        self, kind: DecoderKind, reachable: bool, count_loss: Callable[[LossCause], None]
+        self,
+        kind: DecoderKind,
+        reachable: bool,
+        count_loss: Callable[[LossCause], None],
+        start_failed: Callable[[Exception], None],
     ) -> None:
         if kind is DecoderKind.AUTO and not reachable:
             kind = DecoderKind.IN_PROCESS
         self.kind = kind
         self._count_loss = count_loss
+        self._start_failed = start_failed
         self._pool: DecoderPool | None = None
 
     def start(self) -> None:
@@ -112,7 +117,8 @@ class Decoders:
 
     def _pool_of(self, kind: DecoderKind) -> DecoderPool:
         sandboxed = kind is DecoderKind.BUBBLEWRAP
-        pool = DecoderPool(bubblewrap_command(child_environment()) if sandboxed else (), self._lost)
+        wrapper = bubblewrap_command(child_environment()) if sandboxed else ()
+        pool = DecoderPool(wrapper, self._lost, self._start_failed)
         try:
             pool.wait_until_ready()
         except RfedgeError as error:

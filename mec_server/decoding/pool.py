@@ -24,10 +24,20 @@ MAX_STAGED = 15
 
 
 class DecoderPool:
-    """Starts decoder processes by ``wrapper``; ``lost`` is called for each that dies in use."""
+    """Starts decoder processes by ``wrapper``.
 
-    def __init__(self, wrapper: Sequence[str], lost: Callable[[DecoderLost], None]) -> None:
+    ``lost`` is called for each that dies in use, ``start_failed`` with what a spare could not be
+    started for, on the starter's thread; whoever takes that spare has another one started.
+    """
+
+    def __init__(
+        self,
+        wrapper: Sequence[str],
+        lost: Callable[[DecoderLost], None],
+        start_failed: Callable[[Exception], None],
+    ) -> None:
         self.lost = lost
+        self._start_failed = start_failed
         self._wrapper = tuple(wrapper)
         self._lock = threading.Lock()
         self._starter = ThreadPoolExecutor(1, "decoder-starter")
@@ -52,7 +62,7 @@ class DecoderPool:
     def _next(self) -> DecoderProcess:
         with self._lock:
             try:
-                spare, self._spare = self._spare, self._starter.submit(self._start)
+                spare, self._spare = self._spare, self._starter.submit(self._start_spare)
             except RuntimeError as error:
                 raise RfedgeError("no decoder process is started any more") from error
         return spare.result()
@@ -65,6 +75,13 @@ class DecoderPool:
         """End the spare process; those in use are closed by their decoders."""
         self._starter.shutdown(cancel_futures=True)
         self._spare.add_done_callback(_close_started)
+
+    def _start_spare(self) -> DecoderProcess:
+        try:
+            return self._start()
+        except Exception as error:
+            self._start_failed(error)
+            raise
 
     def _start(self) -> DecoderProcess:
         process = DecoderProcess(self._wrapper)

@@ -66,7 +66,7 @@ def decoder_rows() -> list[DecoderRow]:
 
 
 def _decoder(kind: DecoderKind, drive: PrerecordedDrive, opened: ExitStack) -> DeltaDecoder:
-    decoders = Decoders(kind, True, _fail)
+    decoders = Decoders(kind, True, _fail, lambda _: None)  # taking the spare raises
     decoders.start()
     opened.callback(decoders.close)
     header = drive.hello.cameras[0].codec

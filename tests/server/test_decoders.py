@@ -48,6 +48,11 @@ def units() -> list[bytes]:
     return clip(SIZE_PX, 4)
 
 
+def unexpected(error: Exception) -> None:
+    """Take the failure of a spare, where none may fail."""
+    raise AssertionError(f"a spare process could not be started: {error}")
+
+
 KINDS = ["child", pytest.param("bubblewrap", marks=pytest.mark.slow)]
 """The sandbox takes a program that ``make test-slow`` installs."""
 
@@ -55,7 +60,7 @@ KINDS = ["child", pytest.param("bubblewrap", marks=pytest.mark.slow)]
 @pytest.fixture(scope="module", params=KINDS)
 def pool(request: pytest.FixtureRequest) -> Iterator[DecoderPool]:
     """Processes with limits, and the same in a sandbox."""
-    made = DecoderPool(WRAPPERS[request.param](), lambda lost: LOST.append(lost))
+    made = DecoderPool(WRAPPERS[request.param](), lambda lost: LOST.append(lost), unexpected)
     made.wait_until_ready()
     yield made
     made.close()
@@ -185,7 +190,7 @@ def test_bubblewrap_shows_no_network_no_process_and_no_file_of_ours(
 ) -> None:
     ours = tmp_path / "ours"
     ours.write_text("seen")
-    pool = DecoderPool(WRAPPERS["bubblewrap"](), lambda _: None)
+    pool = DecoderPool(WRAPPERS["bubblewrap"](), lambda _: None, unexpected)
     decoder = pool.open(SIZE_PX)
     try:
         decoder.decode(units[0])
@@ -207,7 +212,7 @@ def test_bubblewrap_shows_no_network_no_process_and_no_file_of_ours(
 
 @pytest.fixture
 def decoders() -> Callable[[DecoderKind, bool], Decoders]:
-    return lambda kind, reachable: Decoders(kind, reachable, lambda _: None)
+    return lambda kind, reachable: Decoders(kind, reachable, lambda _: None, unexpected)
 
 
 @pytest.mark.slow
@@ -237,16 +242,31 @@ def test_a_sandbox_that_was_asked_for_and_cannot_be_had_is_an_error(
         decoders(DecoderKind.BUBBLEWRAP, True).start()
 
 
+NO_ROOM = (sys.executable, "-c", "raise SystemExit('no room')")
+"""What a process is started by in place of a sandbox; ends at once."""
+
+
 def test_a_process_that_cannot_start_says_why() -> None:
-    pool = DecoderPool((sys.executable, "-c", "raise SystemExit('no room')"), lambda _: None)
+    pool = DecoderPool(NO_ROOM, lambda _: None, unexpected)
     with pytest.raises(RfedgeError, match="ended with status 1 at its start: no room"):
         pool.wait_until_ready()
     pool.close()
 
 
+def test_a_spare_that_cannot_be_started_is_reported_though_nobody_waits_for_it() -> None:
+    failures: list[Exception] = []
+    pool = DecoderPool(NO_ROOM, lambda _: None, failures.append)
+    with pytest.raises(RfedgeError, match="no room"):
+        pool.take()
+    pool.close()
+    assert failures
+    assert all("no room" in str(error) for error in failures)
+
+
 def test_a_lost_decoder_is_counted_by_cause(units: Sequence[bytes]) -> None:
     registry = CollectorRegistry()
-    made = Decoders(DecoderKind.CHILD, True, ServerMetrics(registry).count_lost_decoder)
+    count_loss = ServerMetrics(registry).count_lost_decoder
+    made = Decoders(DecoderKind.CHILD, True, count_loss, unexpected)
     made.start()
     decoder: Any = made.open(SIZE_PX)
     os.kill(python_of(decoder), signal.SIGSEGV)

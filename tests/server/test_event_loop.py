@@ -1,16 +1,100 @@
-"""Workers bring every outcome back to the loop, in the order of finishing, and wake it once."""
+"""Workers take turns among owners, bring every outcome back to the loop, and wake it once."""
 
 import asyncio
 import threading
+from collections import Counter, defaultdict
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from mec_server.event_loop import LazyTimer, Workers
+from mec_server.event_loop import FairQueue, LazyTimer, Workers, repeat_forever
+
+
+def unexpected(error: Exception) -> None:
+    """Take what a callback raised, where none may."""
+    raise AssertionError(f"a callback raised {error!r}")
+
+
+# --- turns
+
+OWNERS = ("cav-1", "cav-2", "cav-3")
+steps = st.lists(st.sampled_from([*OWNERS, "take"]), max_size=60)
+"""What happens to a queue: an owner puts an item, or the next one is taken."""
+
+
+@given(steps)
+def test_every_item_is_taken_once_and_in_the_order_of_its_owner(plan: list[str]) -> None:
+    queue: FairQueue[tuple[str, int]] = FairQueue()
+    put: Counter[str] = Counter()
+    taken: dict[str, list[int]] = defaultdict(list)
+
+    def take() -> None:
+        owner, number = queue.take()
+        taken[owner].append(number)
+
+    for step in plan:
+        waiting = sum(put.values()) - sum(map(len, taken.values()))
+        if step != "take":
+            queue.put(step, (step, put[step]))
+            put[step] += 1
+        elif waiting:
+            take()
+        else:
+            with pytest.raises(IndexError):
+                queue.take()
+    while sum(map(len, taken.values())) < sum(put.values()):
+        take()
+    assert {owner: list(range(count)) for owner, count in put.items()} == dict(taken)
+    with pytest.raises(IndexError):
+        queue.take()
+
+
+@given(steps)
+def test_an_item_waits_for_at_most_one_item_of_each_other_owner_per_own_item(
+    plan: list[str],
+) -> None:
+    queue: FairQueue[tuple[str, Counter[str]]] = FairQueue()
+    taken: Counter[str] = Counter()
+    waiting: Counter[str] = Counter()
+
+    def take() -> None:
+        owner, before = queue.take()
+        own = 1 + taken[owner] - before[owner]  # how many items of its own it waited for, with it
+        for other in OWNERS:
+            if other != owner:
+                assert taken[other] - before[other] <= own
+        taken[owner] += 1
+        waiting[owner] -= 1
+
+    for step in plan:
+        if step != "take":
+            queue.put(step, (step, Counter(taken)))
+            waiting[step] += 1
+        elif waiting.total():
+            take()
+    while waiting.total():
+        take()
+
+
+def test_one_frame_behind_a_hundred_of_another_owner_is_the_second_to_begin() -> None:
+    queue: FairQueue[str] = FairQueue()
+    for _ in range(100):
+        queue.put("greedy", "greedy")
+    queue.put("modest", "modest")
+    assert [queue.take() for _ in range(3)] == ["greedy", "modest", "greedy"]
+
+
+# --- workers
 
 
 def test_what_was_returned_or_raised_reaches_the_loop_that_asked() -> None:
     async def run() -> list[int | Exception]:
-        workers, outcomes, all_here = Workers(2), list[int | Exception](), asyncio.Event()
+        workers, outcomes, all_here = (
+            Workers(2, unexpected),
+            list[int | Exception](),
+            asyncio.Event(),
+        )
         here = threading.get_ident()
 
         def done(outcome: int | Exception) -> None:
@@ -20,7 +104,7 @@ def test_what_was_returned_or_raised_reaches_the_loop_that_asked() -> None:
                 all_here.set()
 
         for divisor in (1, 0, 2):
-            workers.submit(lambda divisor=divisor: 10 // divisor, done)
+            workers.submit("cav-1", lambda divisor=divisor: 10 // divisor, done)
         await all_here.wait()
         await asyncio.to_thread(workers.close)
         return outcomes
@@ -32,10 +116,10 @@ def test_what_was_returned_or_raised_reaches_the_loop_that_asked() -> None:
 
 def test_one_worker_does_work_in_the_order_of_asking() -> None:
     async def run() -> list[int]:
-        workers, order, last = Workers(1), list[int](), asyncio.Event()
+        workers, order, last = Workers(1, unexpected), list[int](), asyncio.Event()
         for number in range(100):
-            workers.submit(lambda number=number: order.append(number), lambda _: None)
-        workers.submit(lambda: None, lambda _: last.set())
+            workers.submit("cav-1", lambda number=number: order.append(number), lambda _: None)
+        workers.submit("cav-1", lambda: None, lambda _: last.set())
         await last.wait()
         await asyncio.to_thread(workers.close)
         return order
@@ -45,7 +129,7 @@ def test_one_worker_does_work_in_the_order_of_asking() -> None:
 
 def test_outcomes_that_wait_together_wake_the_loop_once() -> None:
     async def run() -> int:
-        workers, loop = Workers(1), asyncio.get_running_loop()
+        workers, loop = Workers(1, unexpected), asyncio.get_running_loop()
         woken, finished, last = 0, threading.Event(), asyncio.Event()
         wake = loop.call_soon_threadsafe
 
@@ -56,9 +140,9 @@ def test_outcomes_that_wait_together_wake_the_loop_once() -> None:
 
         loop.call_soon_threadsafe = count
         for _ in range(10):
-            workers.submit(lambda: None, lambda _: None)
-        workers.submit(finished.set, lambda _: None)
-        workers.submit(lambda: None, lambda _: last.set())
+            workers.submit("cav-1", lambda: None, lambda _: None)
+        workers.submit("cav-1", finished.set, lambda _: None)
+        workers.submit("cav-1", lambda: None, lambda _: last.set())
         assert finished.wait(10), "the loop is held up, and the worker is not"
         await last.wait()
         loop.call_soon_threadsafe = wake
@@ -70,13 +154,73 @@ def test_outcomes_that_wait_together_wake_the_loop_once() -> None:
 
 def test_close_waits_for_what_was_asked_for() -> None:
     async def run() -> list[int]:
-        workers, done = Workers(2), list[int]()
+        workers, done = Workers(2, unexpected), list[int]()
         for number in range(20):
-            workers.submit(lambda number=number: done.append(number), lambda _: None)
+            workers.submit("cav-1", lambda number=number: done.append(number), lambda _: None)
         await asyncio.to_thread(workers.close)
         return done
 
     assert sorted(asyncio.run(run())) == list(range(20))
+
+
+async def test_workers_let_owners_take_turns() -> None:
+    workers, order = Workers(1, unexpected), list[str]()
+    begun, gate, last = threading.Event(), threading.Event(), asyncio.Event()
+
+    def hold() -> None:
+        begun.set()
+        assert gate.wait(10)
+
+    workers.submit("greedy", hold, lambda _: None)
+    assert await asyncio.to_thread(begun.wait, 10)
+    for _ in range(5):
+        workers.submit("greedy", lambda: order.append("greedy"), lambda _: None)
+    workers.submit("modest", lambda: order.append("modest"), lambda _: None)
+    workers.submit("last", lambda: None, lambda _: last.set())
+    gate.set()
+    await last.wait()
+    await asyncio.to_thread(workers.close)
+    assert order == ["greedy", "modest", "greedy", "greedy", "greedy", "greedy"]
+
+
+async def test_a_callback_that_raises_is_reported_and_the_next_ones_run() -> None:
+    failures: list[Exception] = []
+    workers, last, begun = Workers(1, failures.append), asyncio.Event(), threading.Event()
+    error = ValueError("of the callback")
+
+    def fail(_: object) -> None:
+        raise error
+
+    workers.submit("cav-1", lambda: None, fail)
+    workers.submit("cav-1", begun.set, lambda _: last.set())
+    assert begun.wait(10), "the loop is held up: both outcomes are delivered together"
+    async with asyncio.timeout(10.0):
+        await last.wait()
+    await asyncio.to_thread(workers.close)
+    assert failures == [error]
+
+
+async def test_what_is_repeated_goes_on_after_an_error_that_is_reported() -> None:
+    failures: list[Exception] = []
+    error, again, calls = ValueError("the first time"), asyncio.Event(), 0
+
+    async def work() -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 1:
+            raise error
+        again.set()
+
+    task = asyncio.create_task(repeat_forever(work, 0.0, failures.append))
+    async with asyncio.timeout(10.0):
+        await again.wait()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert failures == [error]
+
+
+# --- deadlines
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from prometheus_client import CollectorRegistry
 
 import mec_server
 from mec_server.decoding.process import LossCause
-from mec_server.metrics import STAGES, ServerMetrics
+from mec_server.metrics import STAGES, BackgroundTask, OpeningResult, ServerMetrics
 from mec_server.quotas import Limit
 from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
 from rfcore.codec.h264.config import REFERENCE_FRAMES
@@ -73,7 +73,7 @@ REFERENCES = [
     order for count in range(REFERENCE_FRAMES + 1) for order in permutations(Reference, count)
 ]
 CLOSED = {
-    "result": {"acked", "nacked"},
+    "result": {"acked", "nacked", *OpeningResult},
     "reason": {"", *RejectReason, *ConsumerEnd},
     "references": set(map(references_name, REFERENCES)),
     "stage": set(STAGES),
@@ -81,6 +81,7 @@ CLOSED = {
     "cause": set(LossCause),
     "encoding": set(PictureEncoding),
     "kind": set(KINDS),
+    "task": set(BackgroundTask),
 }
 """The values that each label can have."""
 

@@ -50,12 +50,31 @@ def test_a_full_disk_stops_the_recording_once(
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
     monkeypatch.setattr(module, "write_png", full)
-    failures: list[OSError] = []
+    failures: list[Exception] = []
     recorder = Recorder(tmp_path, failures.append)
     for sequence in range(100):
         recorder.save(Recording("cav-1", make_frame(sequence), grey(128)))
     recorder.close()
-    assert [error.errno for error in failures] == [errno.ENOSPC]
+    (error,) = failures
+    assert isinstance(error, OSError)
+    assert error.errno == errno.ENOSPC
+
+
+def test_an_error_that_is_not_the_disks_ends_the_recording_and_blocks_no_worker(
+    make_frame: MakeFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error = ValueError("of the writer")
+
+    def broken(_: Path, __: object) -> None:
+        raise error
+
+    monkeypatch.setattr(module, "write_png", broken)
+    failures: list[Exception] = []
+    recorder = Recorder(tmp_path, failures.append)
+    for sequence in range(2 * module.MAX_WAITING + 1):
+        recorder.save(Recording("cav-1", make_frame(sequence), grey(128)))
+    recorder.close()
+    assert failures == [error]
 
 
 def test_two_cameras_have_folders_of_their_own(make_frame: MakeFrame, tmp_path: Path) -> None:
