@@ -12,6 +12,7 @@ from collections.abc import AsyncIterator
 import grpc
 import structlog
 
+from mec_server.metrics import BackgroundTask
 from mec_server.quotas import Limit
 from mec_server.server_context import ServerContext
 from mec_server.stream import Context, Stream
@@ -59,6 +60,9 @@ class EdgeService:
         self._server.metrics.sessions.inc()
         try:
             end = await stream.run(requests)
+        except Exception as error:
+            self._server.metrics.task_failed(BackgroundTask.STREAM, error)
+            raise
         finally:
             self._streams.discard(stream)
             self._server.metrics.sessions.dec()

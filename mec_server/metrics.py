@@ -30,18 +30,22 @@ log = structlog.get_logger()
 
 
 class BackgroundTask(StrEnum):
-    """What runs beside the streams; an exception in one ends no stream by itself."""
+    """What runs in the server beside its event loop's callbacks, and what an exception ends."""
 
     PUBLICATIONS = "publications"
     """Looks for newly published fields; goes on with its next look."""
     OPENING = "opening"
-    """Opens a stream's fields and decoders; a failure ends that stream."""
+    """Opens a stream's fields and decoders; a failure ends that stream, if it still lives."""
     OUTCOME = "outcome"
     """Hands the outcome of a worker to its stream; the others are still handed over."""
     CLOSING = "closing"
     """Closes a decoder of a stream that is over."""
     DECODER_START = "decoder_start"
     """Starts the spare decoder process; another one is started when one is needed."""
+    STREAM = "stream"
+    """Serves one stream of a vehicle, which ends; the vehicle may open another."""
+    CONSUMER = "consumer"
+    """Serves one consumer of the twin, whose stream ends."""
     RECORDING = "recording"
     """Writes pictures to disk; recording ends for good, streaming goes on."""
 
@@ -126,7 +130,7 @@ class ServerMetrics:
         )
         self._task_failures = make.counter(
             "rfedge_server_task_failures",
-            "Unexpected exceptions in what runs beside the streams, by background task.",
+            "Unexpected exceptions by background task; each is logged, and the server goes on.",
             ("task",),
         )
         self._openings = make.counter(

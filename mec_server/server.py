@@ -81,7 +81,10 @@ class EdgeServer:
         self._following: asyncio.Task[None] | None = None
         twin = Twin()
         self._edge = EdgeService(self._context(twin, open_decoders))
-        self._twin_service = TwinService(twin, self._twin_metrics(twin), config.consumers)
+        consumer_failed = self._failed(BackgroundTask.CONSUMER)
+        self._twin_service = TwinService(
+            twin, self._twin_metrics(twin), config.consumers, consumer_failed
+        )
         self._server = grpc.aio.server(options=SERVER_OPTIONS)
         self._edge.register(self._server)
         self._twin_service.register(self._server)

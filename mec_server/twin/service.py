@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from weakref import WeakKeyDictionary
 
@@ -75,12 +76,22 @@ Context = grpc.aio.ServicerContext[pb.WatchRequest, pb.WatchResponse]
 
 
 class TwinService(twin_pb2_grpc.TwinServiceServicer):
-    """Streams the pictures of ``twin`` to consumers."""
+    """Streams the pictures of ``twin`` to consumers.
 
-    def __init__(self, twin: Twin, metrics: TwinMetrics, limits: ConsumerLimits) -> None:
+    ``failed`` is called with an unexpected exception, which ends the stream that met it.
+    """
+
+    def __init__(
+        self,
+        twin: Twin,
+        metrics: TwinMetrics,
+        limits: ConsumerLimits,
+        failed: Callable[[Exception], None],
+    ) -> None:
         self._twin = twin
         self._metrics = metrics
         self._limits = limits
+        self._failed = failed
         self._pictures = TwinPictures()
         self._watching = 0
         self._draining = asyncio.Event()
@@ -118,6 +129,9 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
             end = await _Consumer(self._twin, self._pictures, self._metrics, context).serve(
                 subscription, self._limits.stalled_s, self._draining
             )
+        except Exception as error:
+            self._failed(error)
+            raise
         finally:
             self._watching -= 1
             self._metrics.consumers.dec()

@@ -19,6 +19,8 @@ from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tool
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.wire.conventions import AGENT_PROCESS
 from rfcore.wire.messages import Ack, Frame, Hello
+from rfcore.wire.twin import Subscription, subscription_to_wire
+from rfcore.wire.v1 import twin_pb2_grpc
 
 EVERYBODY = AdmissionLimits(load=0.0)
 SAME_AGENT = ((AGENT_PROCESS, "the same"),)
@@ -308,6 +310,32 @@ async def opening_fails(scene: Scene) -> Any:
     return server
 
 
+async def stream_fails(scene: Scene) -> Any:
+    def broken(_: str, __: DecodeJob) -> None:
+        surprise()
+
+    async with scene.serve(watched(broken)) as server, scene.raw_vehicle(server.address) as vehicle:
+        await vehicle.greet(scene.coded.hello)
+        await vehicle.say(scene.coded.frames[0])
+        assert await vehicle.end() is grpc.StatusCode.UNKNOWN
+    return server
+
+
+async def consumer_fails(scene: Scene) -> Any:
+    scene.patch.setattr("mec_server.twin.service.encoded", surprise)
+    async with scene.serve() as server, AsyncExitStack() as stack:
+        channel = grpc.aio.insecure_channel(str(server.address))
+        stub = twin_pb2_grpc.TwinServiceStub(await stack.enter_async_context(channel))
+        watching = stub.Watch(subscription_to_wire(Subscription()))
+        await until(lambda: counted(server, "rfedge_twin_consumers") == 1)
+        await drive_on(scene, server)
+        with pytest.raises(grpc.aio.AioRpcError) as raised:
+            await watching.read()
+        assert raised.value.code() is grpc.StatusCode.UNKNOWN
+        await drive_on(scene, server)
+    return server
+
+
 async def outcome_fails(scene: Scene) -> Any:
     async with scene.serve() as server:
         with pytest.MonkeyPatch.context() as patch:
@@ -363,8 +391,12 @@ SABOTAGE: dict[BackgroundTask, Callable[[Scene], Awaitable[Any]]] = {
     BackgroundTask.OUTCOME: outcome_fails,
     BackgroundTask.CLOSING: closing_fails,
     BackgroundTask.DECODER_START: decoder_start_fails,
+    BackgroundTask.STREAM: stream_fails,
+    BackgroundTask.CONSUMER: consumer_fails,
     BackgroundTask.RECORDING: recording_fails,
 }
+ENDS_WITH_IT = {BackgroundTask.OPENING: BackgroundTask.STREAM}
+"""A task that ends through the failure of another is counted, too."""
 
 
 @pytest.mark.parametrize("task", BackgroundTask)
@@ -379,9 +411,9 @@ async def test_an_unexpected_exception_in_a_background_task_is_logged_and_counte
     scene = Scene(coded, serve, raw_vehicle, monkeypatch, tmp_path)
     with capture_logs() as lines:
         server = await SABOTAGE[task](scene)
-    assert failed(server, task)
-    for other in set(BackgroundTask) - {task}:
-        assert not failed(server, other)
+    expected = {task, ENDS_WITH_IT.get(task, task)}
+    assert {each for each in BackgroundTask if failed(server, each)} == expected
     logged = [line for line in lines if line["event"] == "background task failed"]
-    assert {(line["task"], line["problem"]) for line in logged} == {(str(task), "SurpriseError()")}
-    assert len(logged) == counted(server, FAILURES, task=task)
+    assert {line["task"] for line in logged} == expected
+    assert all("SurpriseError()" in line["problem"] for line in logged)
+    assert len(logged) == sum(counted(server, FAILURES, task=each) for each in expected)
