@@ -417,3 +417,24 @@ async def test_an_unexpected_exception_in_a_background_task_is_logged_and_counte
     assert {line["task"] for line in logged} == expected
     assert all("SurpriseError()" in line["problem"] for line in logged)
     assert len(logged) == sum(counted(server, FAILURES, task=each) for each in expected)
+
+
+async def test_vehicles_and_consumers_that_vanish_are_no_failures(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    async with serve(admission=EVERYBODY) as server, AsyncExitStack() as stack:
+        channel = grpc.aio.insecure_channel(str(server.address))
+        stub = twin_pb2_grpc.TwinServiceStub(await stack.enter_async_context(channel))
+        for number in range(8):
+            watching = stub.Watch(subscription_to_wire(Subscription()))
+            await until(lambda: counted(server, "rfedge_twin_consumers") == 1)
+            async with raw_vehicle(server.address) as vehicle:
+                await vehicle.greet(replace(coded.hello, vehicle_id=f"cav-{number}"))
+                await vehicle.say(coded.frames[0])
+                if number % 2:
+                    await watching.read()
+                await vehicle.say(coded.frames[1])
+            watching.cancel()
+            await until(lambda: counted(server, "rfedge_server_sessions") == 0)
+            await until(lambda: counted(server, "rfedge_twin_consumers") == 0)
+    assert [task for task in BackgroundTask if failed(server, task)] == []
