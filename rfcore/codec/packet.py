@@ -87,7 +87,7 @@ class DeltaPacket:
     def check_crc32(self) -> None:
         """Raise ``PacketRejected`` (CRC_MISMATCH) if the contents are not those that were sealed.
 
-        Costs about a microsecond a kilobyte: callers check before any rendering or decoding.
+        It takes microseconds: callers check before any rendering or decoding.
         """
         expected = self.expected_crc32()
         if self.crc32 != expected:
