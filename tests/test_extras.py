@@ -244,6 +244,7 @@ DRIVE = f"empty@10={ROOT / 'samples/street/transforms_drive_empty.json'}"
             f"eval paper --fields a={FIELD} --drives a={DRIVE.partition('=')[2]}",
         ),
         ("cv2", "eval", f"eval paper --fields a={FIELD} --drives a={DRIVE.partition('=')[2]}"),
+        ("cv2", "localise", f"localise {DRIVE.partition('=')[2]} --field {FIELD}"),
         ("psutil", "loadtest", "loadtest"),
         ("scipy", "loadtest", "loadtest"),
         ("cryptography", "ops", "certs init --vehicles car-1"),

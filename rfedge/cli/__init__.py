@@ -25,6 +25,7 @@ from rfcore.errors import RfedgeError
 from rfedge.cli.codec import Decode, Encode
 from rfedge.cli.demo import Demo
 from rfedge.cli.field import Field
+from rfedge.cli.localise import Localise
 from rfedge.cli.measure import Bench, Eval, LoadTest
 from rfedge.cli.render import Render
 from rfedge.cli.scene import Scene
@@ -40,6 +41,7 @@ Verb = (
     | Annotated[Field, subcommand("field")]
     | Annotated[Encode, subcommand("encode")]
     | Annotated[Decode, subcommand("decode")]
+    | Annotated[Localise, subcommand("localise")]
     | Annotated[Link, subcommand("link")]
     | Annotated[LoadTest, subcommand("loadtest")]
     | Annotated[Scene, subcommand("scene")]

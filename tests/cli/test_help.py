@@ -15,7 +15,10 @@ import pytest
 
 from rfedge.cli import main
 
-VERBS = ("demo", "train", "render", "encode", "decode", "link", "loadtest", "watch", "bench")
+VERBS = (
+    *("demo", "train", "render", "encode", "decode", "localise"),
+    *("link", "loadtest", "watch", "bench"),
+)
 EVAL_VERBS = ("eval compare", "eval never-worse", "eval paper", "eval robust")
 CERTS_VERBS = ("certs init", "certs show")
 SCENE_VERBS = ("scene build", "scene convert", "scene poses", "scene record-carla")
@@ -131,6 +134,9 @@ def test_the_help_loads_nothing_heavy() -> None:
         (("demo", "--sample", "nowhere"), "nowhere"),
         (("demo", "--link-bps", "0"), "above 0 bit/s"),
         (("decode", "missing.rfv", "--field", "f.rff", "--out", "o"), "missing.rfv"),
+        (("localise", "nowhere", "--field", FIELD), "nowhere"),
+        (("localise", TRAIN_VIEWS, "--field", FIELD, "--start-error", "2m"), "METRESm:DEGREESdeg"),
+        (("localise", TRAIN_VIEWS, "--field", FIELD, "--tries", "0"), "0 tries"),
         (("link", "--to", "nonsense"), "nonsense"),
         (("link", "--to", "127.0.0.1:1", "--profile", "missing.toml"), "missing.toml"),
         (("loadtest", "--hz", "0"), "0.1..1000 Hz"),

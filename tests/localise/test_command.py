@@ -1,0 +1,122 @@
+"""What ``rfedge localise`` measures and writes."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.dataset.trajectory import read_trajectory
+from rfcore.errors import InvalidInput
+from rfcore.localise.localiser import Localised, Lost, Obstacle
+from rfcore.localise.matching import Solution
+from rfcore.motion import rotation_vector
+from rfcore.views import PosedPicture
+from rfedge.cli.localise import Localise
+from rfedge.experiments.localisation import (
+    Attempt,
+    StartError,
+    displaced,
+    parse_start_error,
+    row_text,
+    summary,
+    write_poses,
+)
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+POSE = Pose((1.0, 2.0, 3.0), (0.5, -0.5, 0.5, -0.5))
+CAMERA = Camera(Intrinsics(4, 4, 2, 2, 2, 2), POSE)
+LOST = Lost(Obstacle.FEW_INLIERS, 7)
+ERROR = StartError(2.0, 3.0)
+
+
+def picture(number: int, time_ns: int = 0) -> PosedPicture:
+    return PosedPicture(
+        f"{number}.png", CAMERA, lambda: np.zeros((4, 4, 3), np.uint8), time_ns=time_ns
+    )
+
+
+def attempt(
+    number: int, error_m: float | None, *, false_start: bool = False, time_ns: int = 0
+) -> Attempt:
+    """A search that was lost, or found a pose; right where it is within 0.01 m."""
+    if error_m is None:
+        return Attempt(picture(number, time_ns), false_start, LOST, None, None, False, 100.0)
+    found = Localised(Solution(POSE, 90, 0.5), 80.0, 1)
+    right = error_m < 0.01 and not false_start
+    return Attempt(picture(number, time_ns), false_start, found, error_m, 0.02, right, 300.0)
+
+
+def test_a_start_is_exactly_as_far_off_as_asked_and_mostly_level() -> None:
+    rng = np.random.default_rng(1)
+    starts = [POSE.inverse().compose(displaced(POSE, ERROR, rng)) for _ in range(50)]
+    for start in starts:
+        assert math.hypot(*start.translation_m) == pytest.approx(2.0)
+        assert math.hypot(*rotation_vector(start.rotation)) == pytest.approx(math.radians(3.0))
+    assert np.std([start.translation_m[1] for start in starts]) < 0.4
+    yaws = [rotation_vector(start.rotation)[1] for start in starts]
+    assert min(map(abs, yaws)) > math.radians(2.5)
+    assert {yaw > 0 for yaw in yaws} == {True, False}
+
+
+def test_a_summary_counts_right_poses_of_tries_and_wrong_ones_of_all() -> None:
+    done = [attempt(n, error_m) for n, error_m in enumerate((0.002, 0.004, 1.0, None))]
+    done += [attempt(9, None, false_start=True) for _ in range(3)]
+    done += [attempt(9, 0.001, false_start=True)]
+    row = summary("drive", ERROR, done)
+    assert (row.tries, row.false_starts) == (4, 4)
+    assert row.localised_percent == 50.0
+    assert row.false_percent == 25.0
+    assert row.median_m == 0.004
+    assert row.p95_m == pytest.approx(0.004 + 0.9 * 0.996)
+    assert row.localise_ms == 300.0
+    assert "50.0 % of 4 localised" in row_text(row)
+
+
+def test_a_summary_without_a_pose_has_no_errors() -> None:
+    row = summary("drive", ERROR, [attempt(0, None)])
+    assert (row.median_m, row.median_deg, row.p95_m) == (None, None, None)
+    assert "no pose" in row_text(row)
+
+
+def test_poses_are_written_once_a_picture_and_gaps_are_told(tmp_path: Path) -> None:
+    out = tmp_path / "poses.tum"
+    done = [attempt(n, 0.001 if n != 1 else None, time_ns=n * 100_000_000) for n in range(3)]
+    assert write_poses(out, [*done, attempt(2, 0.001), attempt(4, 0.1, false_start=True)]) == 2
+    read = read_trajectory(out)
+    assert read.times_ns == (0, 200_000_000)
+    assert read.poses == (POSE, POSE)
+    assert "# 0.100000000 lost: few inliers" in out.read_text()
+
+
+def test_poses_of_pictures_without_times_are_numbered(tmp_path: Path) -> None:
+    out = tmp_path / "poses.tum"
+    assert write_poses(out, [attempt(n, 0.001) for n in range(3)]) == 3
+    assert out.read_text().startswith("# number of the picture tx ty tz qx qy qz qw\n0 1 2 3 ")
+
+
+@pytest.mark.parametrize("text", ["2m", "3deg:2m", "0m:1deg", "2m:0deg", "-1m:1deg", "nanm:1deg"])
+def test_a_start_error_of_another_form_is_refused(text: str) -> None:
+    with pytest.raises(InvalidInput, match="is not METRESm:DEGREESdeg, such as 2m:3deg"):
+        parse_start_error(text)
+
+
+def test_a_start_error_may_have_fractions() -> None:
+    assert parse_start_error("0.5m:1.25deg") == StartError(0.5, 1.25)
+
+
+@pytest.mark.sample
+def test_the_command_localises_the_samples_drive(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, result = tmp_path / "poses.tum", tmp_path / "localise.json"
+    drive = SAMPLES / "street/transforms_drive_empty.json"
+    field = SAMPLES / "fields/street.rff"
+    Localise(drive, field, tries=3, false_starts=1, out=out, json=str(result)).run()
+    (row,) = json.loads(result.read_text())["rows"]
+    assert (row["tries"], row["localised_percent"], row["false_percent"]) == (3, 100.0, 0.0)
+    assert row["median_m"] < 0.03
+    assert len(read_trajectory(out).poses) == 3
+    assert "100.0 % of 3 localised" in capsys.readouterr().out

@@ -1,0 +1,160 @@
+"""A camera finds itself in the sample's street, and says it is lost wherever it cannot."""
+
+import math
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.dataset import read_dataset
+from rfcore.errors import InvalidInput
+from rfcore.field import FULL, Quality, RadianceField, load_field
+from rfcore.localise.localiser import (
+    Localised,
+    Localiser,
+    LocaliserSettings,
+    Lost,
+    Obstacle,
+    agreement,
+    median_depth,
+)
+from rfcore.localise.matching import grey
+from rfcore.localise.prior import PosePrior, moved
+from rfcore.motion import rotation_vector
+from rfcore.views import PosedPicture, View
+
+pytestmark = pytest.mark.sample
+SAMPLES = Path(__file__).parents[2] / "samples"
+FEW = LocaliserSettings(most_hypotheses=3)
+"""Of a search that is to end lost."""
+START = ((1.4, 0.2, 1.4), (0.0, math.radians(3.0), 0.0))
+"""2 m and 3 degrees off."""
+U8 = NDArray[np.uint8]
+
+
+@cache
+def field() -> RadianceField:
+    return load_field(SAMPLES / "fields/street.rff", threads=2)
+
+
+@cache
+def picture(number: int, drive: str = "empty") -> PosedPicture:
+    return read_dataset(SAMPLES / f"street/transforms_drive_{drive}.json").pictures[number]
+
+
+def search(
+    number: int, rgb: U8 | None = None, *, around: Pose | None = None, drive: str = "empty"
+) -> Localised | Lost:
+    """Localise a picture of a drive, or another one in its place, from 2 m and 3 degrees off."""
+    taken = picture(number, drive)
+    pose = moved(taken.camera.world_from_cam if around is None else around, *START)
+    lost = rgb is not None or around is not None
+    localiser = Localiser(field(), taken.camera.intrinsics, FEW if lost else None)
+    return localiser.localise(taken.read() if rgb is None else rgb, PosePrior(pose, 2.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("number", "drive"), [(0, "empty"), (9, "empty"), (20, "empty"), (12, "vehicles")]
+)
+def test_a_start_2_m_and_3_degrees_off_finds_the_pose(number: int, drive: str) -> None:
+    """Within 0.3 % of the median depth, which is 10.7 m, and 0.1 degrees."""
+    answer = search(number, drive=drive)
+    assert isinstance(answer, Localised)
+    truth = picture(number, drive).camera
+    error = truth.world_from_cam.inverse().compose(answer.world_from_cam)
+    depth_m = median_depth(field().render(truth, FULL))
+    assert math.hypot(*error.translation_m) < 0.003 * depth_m
+    assert math.degrees(math.hypot(*rotation_vector(error.rotation))) < 0.1
+    assert answer.solution.inliers > 100
+
+
+def test_the_same_search_gives_the_same_bits() -> None:
+    assert search(5) == search(5)
+
+
+def test_a_black_picture_is_lost_before_anything_is_rendered() -> None:
+    answer = search(3, np.zeros((360, 640, 3), np.uint8))
+    assert answer == Lost(Obstacle.FEW_FEATURES, 0)
+
+
+def test_noise_is_lost() -> None:
+    noise = np.random.default_rng(2).integers(0, 256, (360, 640, 3), np.uint8)
+    assert search(3, noise) == Lost(Obstacle.FEW_INLIERS, 3)
+
+
+def test_a_street_that_is_nowhere_is_lost() -> None:
+    """Mirrored: everything a street has, in no place of this one."""
+    assert isinstance(search(3, np.ascontiguousarray(picture(3).read()[:, ::-1])), Lost)
+
+
+def test_a_search_that_looks_the_other_way_is_lost() -> None:
+    turned = moved(picture(3).camera.world_from_cam, (0.0, 0.0, 0.0), (0.0, math.pi, 0.0))
+    assert isinstance(search(3, around=turned), Lost)
+
+
+def test_a_pose_too_far_from_a_sure_prior_is_not_claimed() -> None:
+    """Features find the pose 2 m away; a prior of 0.1 m refutes it."""
+    taken = picture(9)
+    prior = PosePrior(moved(taken.camera.world_from_cam, *START), 0.1, 3.0)
+    answer = Localiser(field(), taken.camera.intrinsics, FEW).localise(taken.read(), prior)
+    assert answer == Lost(Obstacle.IMPLAUSIBLE, 3)
+
+
+def test_a_pose_that_looks_unlike_is_not_claimed() -> None:
+    taken = picture(9)
+    strict = LocaliserSettings(least_agreement=1e6, most_hypotheses=2)
+    prior = PosePrior(taken.camera.world_from_cam, 2.0, 3.0)
+    answer = Localiser(field(), taken.camera.intrinsics, strict).localise(taken.read(), prior)
+    assert answer == Lost(Obstacle.UNLIKE, 2)
+
+
+class Emptiness:
+    """A field with nothing in it."""
+
+    def render(self, camera: Camera, _: Quality) -> View:
+        size = (camera.intrinsics.height_px, camera.intrinsics.width_px)
+        nothing = np.zeros(size, np.float32)
+        return View(np.zeros((*size, 3), np.float32), nothing, nothing)
+
+
+def test_nothing_is_found_in_an_empty_field() -> None:
+    taken = picture(3)
+    prior = PosePrior(taken.camera.world_from_cam, 1.0, 1.0)
+    answer = Localiser(Emptiness(), taken.camera.intrinsics, FEW).localise(taken.read(), prior)
+    assert answer == Lost(Obstacle.FEW_INLIERS, 3)
+
+
+def test_agreement_tells_the_place_from_one_beside_it_and_ignores_exposure() -> None:
+    taken = picture(9)
+    pose, rgb = taken.camera.world_from_cam, taken.read()
+    intrinsics = taken.camera.intrinsics
+    here = field().render(taken.camera, FULL)
+    beside = field().render(Camera(intrinsics, moved(pose, (0.5, 0.0, 0.0))), FULL)
+    darker = (0.4 * rgb).astype(np.uint8)
+    limit = LocaliserSettings().least_agreement
+    assert agreement(grey(rgb), here) > 5 * limit
+    assert agreement(grey(darker), here) > 5 * limit
+    assert agreement(grey(rgb), beside) < limit
+
+
+def test_noise_agrees_with_nothing() -> None:
+    """Gaussian chance of a thousand draws stays below five standard deviations."""
+    view = field().render(picture(9).camera, FULL)
+    rng = np.random.default_rng(4)
+    noises = [rng.integers(0, 256, (360, 640), np.uint8) for _ in range(5)]
+    assert max(agreement(noise, view) for noise in noises) < 5.0
+
+
+def test_a_picture_of_another_size_is_refused() -> None:
+    localiser = Localiser(field(), Intrinsics(64, 36, 32, 32, 32, 18))
+    prior = PosePrior(Pose.identity(), 1.0, 1.0)
+    with pytest.raises(InvalidInput, match=r"uint8 \(360, 640, 3\) must be uint8 \(36, 64, 3\)"):
+        localiser.localise(picture(3).read(), prior)
+
+
+def test_a_setting_of_zero_is_refused() -> None:
+    with pytest.raises(InvalidInput, match=r"localiser.inlier_px: 0 must be above 0"):
+        LocaliserSettings(inlier_px=0)
