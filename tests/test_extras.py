@@ -265,6 +265,7 @@ def test_a_verb_says_in_one_line_which_extra_it_needs(
     assert list(tmp_path.iterdir()) == [], "nothing was begun"
 
 
+@pytest.mark.slow
 def test_services_demo_and_training_import_no_package_of_an_extra(tmp_path: Path) -> None:
     modules = [
         *("cav_agent.__main__", "mec_server.__main__", "mec_server.decoding.process"),
