@@ -4,16 +4,7 @@
 namespace rfcore::raster {
 
 const Kernels& kernels_for(const char* isa) {
-    static const Kernels* const all[] = {
-#if defined(RF_HAVE_X86)
-        &kAvx512Kernels,
-        &kAvx2Kernels,
-#endif
-#if defined(RF_HAVE_NEON)
-        &kNeonKernels,
-#endif
-        &kScalarKernels,
-    };
+    static const Kernels* const all[] = {RF_KERNEL_TABLES};
     return kernel_table(all, isa);
 }
 

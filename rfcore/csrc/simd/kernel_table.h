@@ -7,6 +7,15 @@
 
 #include "simd/isa.h"
 
+// The tables of a kernel family, as its namespace names them, best first.
+#if defined(RF_HAVE_X86)
+#define RF_KERNEL_TABLES &kAvx512Kernels, &kAvx2Kernels, &kScalarKernels
+#elif defined(RF_HAVE_NEON)
+#define RF_KERNEL_TABLES &kNeonKernels, &kScalarKernels
+#else
+#define RF_KERNEL_TABLES &kScalarKernels
+#endif
+
 namespace rfcore {
 
 // The table of `tables` whose `isa` this machine runs under that name; "" asks for the best.
