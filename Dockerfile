@@ -24,7 +24,8 @@ FROM python AS runtime
 COPY deploy/healthy.sh /usr/local/bin/healthy
 # Volumes mounted here for the first time belong to the user that the services run as.
 RUN useradd --uid 10001 --no-create-home --home-dir /nonexistent rfedge \
-	&& install -d -o rfedge -g rfedge /fields /certs /cache /pictures
+	&& install -d -o rfedge -g rfedge /fields /certs /cache /pictures /keys \
+		/keys/rsu /keys/watch /keys/twin /keys/cav-1 /keys/cav-2 /keys/cav-3 /keys/cav-4
 COPY --from=runtime-packages /opt/rfedge /opt/rfedge
 ENV PATH=/opt/rfedge/bin:$PATH PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1
 USER rfedge

@@ -16,10 +16,10 @@ PYTHONS ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo sample sample-field test test-slow test-prometheus test-netns test-fault \
-	test-compose test-system-packages stability check build bench proto figures images up \
-	down operations-figures load load-transport load-receiver load-full soak soak-short \
-	test-wheels build-full lock wheels nightly
+.PHONY: help demo sample sample-field test test-slow test-slices test-prometheus test-netns test-fault test-attack \
+	test-compose test-system-packages drive-long stability check build bench proto figures images up \
+	down operations-figures load load-transport load-receiver load-full load-links load-overload load-ratio soak soak-short \
+	test-wheels build-full lock wheels nightly test-asan fuzz fuzz-nightly test-fault-core sizing
 
 help:  ## show the targets
 	@awk -F':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-18s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -31,18 +31,26 @@ test: build-full  ## run the fast tests (four minutes of two cores)
 	$(BIN)/python -m pytest -m "not slow"
 
 test-slow: build-full test-system-packages  ## run the tests that take more than ten seconds each
-	$(BIN)/python -m pytest -m "slow and not compose and not fault" --timeout 600
+	$(BIN)/python -m pytest -m "slow and not compose and not fault and not attack and not nightly" --timeout 600
+
+test-slices: build-full  ## compare a million macroblocks of the slice coder with FFmpeg; fuzz it
+	$(BIN)/python -m pytest tests/codec/test_slice_conformance.py -m nightly
 
 # Debian packages that slow tests use beside Python: cross compiler and emulator for
 # tests/native/test_aarch64.py, promtool and prometheus for tests/deploy, ip and tc for tests/link,
-# OpenH264 for tests/codec/test_second_decoder.py, bwrap for tests/server, nft for tests/fault.
+# OpenH264 for tests/codec/test_second_decoder.py, GStreamer's RTSP server for tests/agent/live,
+# Chromium for tests/twin, bwrap for tests/server and tests/confinement, libseccomp for
+# tests/confinement, nft for tests/fault, PoCL (OpenCL on the CPU) for tests/raster.
 # A test fails without its program, and says so.
 SYSTEM_PACKAGES := g++-aarch64-linux-gnu qemu-user prometheus iproute2 \
-	gstreamer1.0-tools gstreamer1.0-plugins-bad bubblewrap nftables
+	gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good gstreamer1.0-plugins-bad \
+	gstreamer1.0-plugins-ugly gir1.2-gst-rtsp-server-1.0 python3-gi bubblewrap libseccomp2 nftables \
+	chromium chromium-driver pocl-opencl-icd
 SYSTEM_PROGRAMS := aarch64-linux-gnu-g++ qemu-aarch64 promtool prometheus ip tc gst-inspect-1.0 \
-	bwrap nft
+	bwrap nft chromium chromedriver
 test-system-packages:  ## install the programs that test-slow uses (root, Debian)
-	@if (for name in $(SYSTEM_PROGRAMS); do command -v $$name >/dev/null || exit 1; done); then :; \
+	@if (for name in $(SYSTEM_PROGRAMS); do command -v $$name >/dev/null || exit 1; done) && \
+		[ -e /etc/OpenCL/vendors/pocl.icd ]; then :; \
 	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 		apt-get -qq update && \
 		DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends $(SYSTEM_PACKAGES); \
@@ -54,10 +62,46 @@ test-prometheus: build-full test-system-packages  ## test rules with promtool, a
 test-netns: build-full test-system-packages  ## compare the link with the kernel's own shaper (root)
 	$(BIN)/python -m pytest -m netns --timeout 600
 
+# RESUME=1: keep the rows that are there of this revision, and run what is missing.
 test-fault: build-full test-system-packages  ## break servers, vehicles and links; writes results/faults.json (root)
-	$(BIN)/python -m pytest tests/fault -m fault --timeout 120 --faults-json results/faults.json
+	$(BIN)/python -m pytest tests/fault -m fault --timeout 120 --faults-json results/faults.json \
+		$(if $(RESUME),--resume)
 	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
 	mv docs/reliability.md.part docs/reliability.md
+
+test-attack: build-full test-system-packages  ## attack a server under compose's limits; writes results/attacks.json (root)
+	$(BIN)/python -m pytest tests/attack -m attack --timeout 180 --attacks-json results/attacks.json \
+		$(if $(RESUME),--resume)
+	$(BIN)/python -m rfedge.pages.attacks results/attacks.json > docs/attacks.md.part
+	mv docs/attacks.md.part docs/attacks.md
+
+# The most telling ones: a server and a decoder that die, packets that are damaged.
+FAULT_CORE := test_processes.py::test_kill_9_of_the_server test_processes.py::test_kill_9_of_a_decoder \
+	test_packets.py::test_damaged_packets
+test-fault-core: build-full test-system-packages  ## the faults that CI injects on each push
+	$(BIN)/python -m pytest -m fault --timeout 120 $(addprefix tests/fault/,$(FAULT_CORE))
+
+# Scalar kernels under AddressSanitizer and UndefinedBehaviorSanitizer; one source serves them all.
+ASAN := build/asan
+ASAN_TESTS := tests/raster/test_native.py tests/raster/test_native_poison.py tests/ngp/test_native.py \
+	tests/native/test_digest.py tests/native/test_warp.py tests/native/test_yuv.py tests/codec/test_pcm_picture.py tests/fuzz
+ASAN_PRELOAD = $(shell $(CXX) -print-file-name=libasan.so) $(shell $(CXX) -print-file-name=libstdc++.so)
+test-asan: build-full  ## kernels and readers under sanitizers, a build of their own in build/asan
+	$(BIN)/cmake -S . -B $(ASAN) -G Ninja -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
+		-DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja -DCMAKE_CXX_FLAGS_RELEASE=-O1 \
+		-DRFEDGE_SANITIZE=ON -DRFEDGE_SAMPLES=OFF > /dev/null
+	$(BIN)/ninja -C $(ASAN) _native
+	LD_PRELOAD="$(ASAN_PRELOAD)" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+		$(BIN)/python tests/native/sanitized.py $(ASAN) -q -m "not slow" --timeout 250 \
+		$(ASAN_TESTS)
+
+SECONDS ?= 30
+fuzz: build-full  ## SECONDS (30) of coverage-guided fuzzing of each reader (tests/fuzz)
+	$(BIN)/python -m pip install -q --no-deps --require-hashes -r requirements/fuzz.txt
+	PYTHONPATH=. $(BIN)/python tests/fuzz/fuzz.py $(SECONDS) $(TARGETS)
+
+fuzz-nightly:  ## ten minutes of it for each reader
+	$(MAKE) fuzz SECONDS=600
 
 stability: build-full  ## run the hard cases; writes results/stability.json and docs/stability.md
 	$(BIN)/python -m pytest tests/hard/test_stability.py::test_the_case_holds \
@@ -81,7 +125,8 @@ COMPOSE = $(shell docker compose version >/dev/null 2>&1 && echo docker compose 
 up:  ## start two roadside servers, four vehicles, Prometheus and Grafana in containers
 	$(COMPOSE) $(COMPOSE_FILES) up -d
 	@. ./.env && echo "dashboards  http://localhost:$$GRAFANA_PORT/dashboards" && \
-		echo "Prometheus  http://localhost:$$PROMETHEUS_PORT/targets"
+		echo "Prometheus  http://localhost:$$PROMETHEUS_PORT/targets" && \
+		echo "the street  http://localhost:$$TWIN_PORT/?token=$$TWIN_TOKEN"
 
 down:  ## stop them and remove their volumes
 	$(COMPOSE) $(COMPOSE_FILES) down -v
@@ -89,14 +134,25 @@ down:  ## stop them and remove their volumes
 operations-figures: build-full  ## plot every panel of what `make up` started, into docs/operations.md
 	$(BIN)/python deploy/compose/show.py
 
-LOADTEST = $(BIN)/rfedge loadtest --record results/loadtest.json
-load: load-transport load-receiver load-full  ## what two cores carry (`make -k load`, 3 min); writes results/loadtest.json
+RUNS ?= 3
+LOADTEST = $(BIN)/rfedge loadtest --record results/loadtest.json --runs $(RUNS)
+load: load-transport load-receiver load-full load-links load-overload  ## what two cores carry (`make -k load`, 8 min); writes results/loadtest.json
 load-transport: build-full  ## 100 streams at 30 Hz, pictures not decoded; writes results/loadtest.json
 	$(LOADTEST) --mode transport --vehicles 100 --hz 30 --out out/loadtest/transport
 load-receiver: build-full  ## 8 vehicles at 10 Hz, decoded against cached renders; writes results/loadtest.json
 	$(LOADTEST) --mode receiver --vehicles 8 --hz 10 --out out/loadtest/receiver
-load-full: build-full  ## 4 vehicles at 5 Hz, rendered and decoded; writes results/loadtest.json
-	$(LOADTEST) --mode full --vehicles 4 --hz 5 --out out/loadtest/full
+load-full: build-full  ## 8 vehicles at 10 Hz, rendered and decoded; writes results/loadtest.json
+	$(LOADTEST) --mode full --vehicles 8 --hz 10 --out out/loadtest/full
+load-links: build-full  ## 8 vehicles, each on a recorded link of its own; writes results/loadtest.json
+	$(LOADTEST) --mode receiver --vehicles 8 --hz 5 --link samples/links/drive.toml \
+		--out out/loadtest/links
+load-overload: build-full  ## twice of that load-full, admission on; writes results/loadtest.json
+	$(LOADTEST) --mode full --vehicles 16 --hz 10 --admission --out out/loadtest/overload
+
+# The revision whose figures results/loadtest.json had when the server was reworked for isolation.
+BASE ?= 83ce11fb3ba2
+load-ratio: build-full  ## vehicles that the full loop carries now and at BASE, in turn, 3 runs each (10 min)
+	$(BIN)/python tests/loadtest/limit_ratio.py $(BASE) out/loadtest/ratio.json
 
 MINUTES ?= 30
 soak: build-full  ## half load for MINUTES (30): memory, descriptors and threads must not grow
@@ -104,6 +160,11 @@ soak: build-full  ## half load for MINUTES (30): memory, descriptors and threads
 
 soak-short: build-full  ## five minutes of it
 	$(BIN)/python -m rfedge.loadtest.soak --minutes 5
+
+sizing: build-full  ## measure the tables of `rfedge size` (half an hour of one core); then `make figures`
+	$(BIN)/rfedge scene build samples/sizing/drive_1080p.toml --split drive --out out/drive-1080p
+	$(BIN)/rfedge eval sizing vehicles@10=samples/street/transforms_drive_vehicles.json \
+		vehicles@30=out/drive-1080p/transforms_drive.json --out rfedge/sizing/tables.json
 
 check: build-full  ## lint, types, layers, generated files
 	$(BIN)/ruff format --check .
@@ -117,6 +178,9 @@ sample: build-full  ## render the street in samples/street anew (half an hour)
 	$(BIN)/rfedge scene build samples/street/empty.toml --split drive,train --out out/sample/empty
 	$(BIN)/rfedge scene build samples/street/vehicles.toml --split drive --out out/sample/vehicles
 	$(BIN)/python -m rfedge.demo.make_sample out/sample samples/street
+
+drive-long: build-full  ## render 30 s of the sample's street at 10 Hz into out/drive-long (16 minutes of two cores)
+	$(BIN)/rfedge scene build samples/localise/drive_30s.toml --split drive --out out/drive-long
 
 sample-field: build-full  ## train the field that ships in samples/fields (some minutes)
 	$(BIN)/python -m rfedge.demo.field samples/street $(ARGS)
@@ -134,6 +198,11 @@ figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.
 	$(BIN)/python -m rfedge.experiments.ladder.page results docs
 	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
 	mv docs/reliability.md.part docs/reliability.md
+	if test -f results/attacks.json; then \
+		$(BIN)/python -m rfedge.pages.attacks results/attacks.json > docs/attacks.md.part && \
+		mv docs/attacks.md.part docs/attacks.md; fi
+	$(BIN)/python -m rfedge.pages.sizing > docs/sizing.md.part
+	mv docs/sizing.md.part docs/sizing.md
 	$(BIN)/python -m rfedge.pages.metrics > docs/metrics.md.part
 	mv docs/metrics.md.part docs/metrics.md
 	$(BIN)/python -m rfedge.dashboards deploy/grafana/dashboards

@@ -22,6 +22,7 @@ def main() -> None:
     try:
         config = tyro.cli(AgentConfig, config=OPTIONS, prog="cav-agent")
         configure_logs(sys.stderr, config.log)
+        config.render.check()
         asyncio.run(drive(config))
     except (RfedgeError, OSError) as error:
         print(f"cav-agent: {error}", file=sys.stderr)

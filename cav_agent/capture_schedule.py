@@ -2,8 +2,9 @@
 
 ``Realtime`` captures picture i at its time, whatever became of the ones before. ``Lockstep``
 captures the next when the previous was answered, and one that was lost again; an experiment then
-covers every picture, at the speed of the link. State machines without a clock: ``now`` is an
-argument. ``cav_agent.handover_controller`` asks them and decides which server takes the picture.
+covers every picture, at the speed of the link or the rate that a full server grants. State machines
+without a clock: ``now`` is an argument. ``cav_agent.handover_controller`` asks them and decides
+which server takes the picture.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Protocol
 from cav_agent.frames import EndReason, FrameResult, Outcome
 from rfcore.errors import InvalidInput, RfedgeError
 
-__all__ = ["MAX_TRIES", "CaptureSchedule", "Lockstep", "Realtime"]
+__all__ = ["MAX_TRIES", "ROUNDING_S", "CaptureSchedule", "Lockstep", "Realtime"]
 
 ROUNDING_S = 1e-6
 """Tolerance for the rounding error of summed periods."""
@@ -94,42 +95,60 @@ class Realtime:
 
 
 class Lockstep:
-    """The next picture when the previous was answered; a lost one again."""
+    """The next picture when the previous was answered, no sooner than the server's limit allows; a
+    lost one again.
 
-    def __init__(self, pictures: int, *, loop: bool = False) -> None:
+    Of a rig of several ``cameras`` the next instant when all its pictures have ended, all of them
+    again when one was lost. A camera whose picture cannot be coded does not hold up the others.
+    """
+
+    def __init__(self, pictures: int, *, cameras: int = 1, loop: bool = False) -> None:
         _check(pictures, 1.0)
-        self._pictures, self._loop = pictures, loop
+        self._pictures, self._cameras, self._loop = pictures, cameras, loop
+        self._ended: list[FrameResult] = []
         self._index = 0
         self._tries = 0
         self._waiting = False
+        self._period_s = 0.0
+        self._captured_s = float("-inf")
 
-    def next_capture(self, now: float) -> int | None:  # noqa: ARG002
-        """Return the index to capture, unless one is on its way."""
-        if self._waiting or self.finished:
+    def next_capture(self, now: float) -> int | None:
+        """Return the index to capture, unless one is on its way or the limit is reached."""
+        if self._waiting or self.finished or now < self._captured_s + self._period_s - ROUNDING_S:
             return None
         self._waiting = True
+        self._captured_s = now
         self._tries += 1
         return self._index % self._pictures
 
     def ended(self, result: FrameResult) -> None:
         """Go on after an answer; raise ``RfedgeError`` for a picture that cannot be delivered."""
-        self._waiting = False
-        if result.outcome in (Outcome.ACKED, Outcome.NACKED):
+        self._ended.append(result)
+        if len(self._ended) < self._cameras:
+            return
+        ended, self._ended, self._waiting = self._ended, [], False
+        left = [r for r in ended if r.outcome not in (Outcome.ACKED, Outcome.NACKED)]
+        retried = [r for r in left if r.reason not in HOPELESS]
+        if not retried and len(left) < len(ended):
             self._index += 1
             self._tries = 0
             return
+        result = (retried or left)[0]
         name = result.capture.picture.name
-        if result.reason in HOPELESS:
+        if not retried:
             raise RfedgeError(f"picture {name} could not be coded: {result.problem}")
         if self._tries >= MAX_TRIES and result.reason is not EndReason.STOPPING:
             raise RfedgeError(f"picture {name} was lost {self._tries} times: {result.explanation}")
 
     def limit(self, rate_hz: float) -> None:
-        """Do nothing: the server's answers are the limit."""
+        """Capture no more than ``rate_hz`` pictures per second."""
+        self._period_s = 1.0 / rate_hz if rate_hz else 0.0
 
     def get_timer(self) -> float | None:
-        """Return None: time alone changes nothing."""
-        return None
+        """Return when the limit allows the next picture, if nothing else is waited for."""
+        if self._waiting or self.finished or not self._period_s:
+            return None
+        return self._captured_s + self._period_s
 
     @property
     def finished(self) -> bool:

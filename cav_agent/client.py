@@ -1,4 +1,4 @@
-"""One camera's stream to one server on grpc.aio: keeps it open and moves pictures through it.
+"""A vehicle's stream to one server on grpc.aio: keeps it open and moves pictures through it.
 
 Three coroutines: ``_encode_pictures`` gets captured pictures encoded (on the encoder's thread) and
 reports how they ended; ``_stay_connected`` opens stream after stream; inside it a reader and a
@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,17 +19,25 @@ from typing import Protocol
 import grpc
 import structlog
 
+from cav_agent.backoff import Backoff
 from cav_agent.config import AgentLimits
-from cav_agent.frames import Capture, EncodedFrame, EncodeJob, EndReason, FrameResult, StreamEnd
-from cav_agent.server_connection import ServerConnection
+from cav_agent.frames import (
+    Capture,
+    EncodedFrame,
+    EncodeJob,
+    EndReason,
+    FrameResult,
+    RetryReason,
+    StreamEnd,
+)
+from cav_agent.server_connection import ServerConnection, retry_after_s
 from cav_agent.session import AgentSession, LinkState
 from rfcore.errors import ProtocolError, RfedgeError
-from rfcore.views import PosedPicture
-from rfcore.wire.conventions import AGENT_PROCESS, RETRY_AFTER, STREAM_METHOD
+from rfcore.wire.conventions import AGENT_PROCESS, STREAM_METHOD
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import FieldNotice, Welcome
 
-__all__ = ["CameraSource", "CameraTaken", "StreamClient", "StreamObserver"]
+__all__ = ["CameraSource", "CameraTaken", "FieldNotServed", "StreamClient", "StreamObserver"]
 
 log = structlog.get_logger()
 Stream = grpc.aio.StreamStreamCall[bytes, bytes]
@@ -40,22 +48,17 @@ IDENTIFICATION = ((AGENT_PROCESS, uuid.uuid4().hex),)
 FINAL = frozenset(
     {
         grpc.StatusCode.INVALID_ARGUMENT,
-        grpc.StatusCode.NOT_FOUND,
-        grpc.StatusCode.FAILED_PRECONDITION,
         grpc.StatusCode.UNIMPLEMENTED,
         grpc.StatusCode.PERMISSION_DENIED,
         grpc.StatusCode.UNAUTHENTICATED,
         grpc.StatusCode.DATA_LOSS,
     }
 )
-"""Statuses that another try would only repeat."""
+"""Statuses that another try on the same terms would only repeat: they end the client. Whether the
+drive ends with it is for ``cav_agent.handover_controller`` to say."""
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.02, 1.0
 """Between streams: short after one that was welcomed, doubling while none is."""
-
-LONGEST_RETRY_AFTER_S = 30.0
-"""A server that is full says when to try again; no longer than this is waited."""
-
 
 CAMERA_TAKEN = "camera_taken"
 """First word of the details with which a server refuses a camera that another agent sends."""
@@ -68,6 +71,10 @@ class CameraTaken(ProtocolError):
     """Another agent sends a camera with the names of this vehicle and camera."""
 
 
+class FieldNotServed(ProtocolError):
+    """The server does not hold the stream's field (any more); its tiles are to be relearned."""
+
+
 class StreamObserver(Protocol):
     """Hears of everything that happens to the pictures of a stream and to its connection."""
 
@@ -77,12 +84,19 @@ class StreamObserver(Protocol):
     def connected(self, is_connected: bool) -> None:
         """The server welcomed the vehicle, or its stream was lost."""
 
+    def retrying(self, reason: RetryReason) -> None:
+        """Something failed and will be tried again."""
+
+    def message_unknown(self) -> None:
+        """The server sent a message that this agent does not know, and ignores."""
+
 
 @dataclass(frozen=True)
 class CameraSource:
-    """The pictures of a drive, posed for the stream's tile, and what encodes them."""
+    """What takes the pictures of an instant by its number, posed for the stream's tile, and what
+    encodes them."""
 
-    pictures: tuple[PosedPicture, ...]
+    take: Callable[[int], Sequence[Capture]]
     encode: Callable[[EncodeJob], EncodedFrame]
     executor: Executor
 
@@ -124,9 +138,8 @@ class StreamClient:
         return self._session.rate_limit_hz
 
     def capture(self, index: int) -> None:
-        """Take picture ``index`` of the drive now."""
-        picture = self._source.pictures[index]
-        self._session.offer(Capture(index, picture, time.monotonic(), time.time_ns()))
+        """Take the pictures at place ``index`` of the drive now."""
+        self._session.offer(*self._source.take(index))
         self._changed.set()
 
     def withdraw(self) -> None:
@@ -231,7 +244,7 @@ class StreamClient:
     # --- the stream
 
     async def _stay_connected(self) -> None:
-        pause_s = FIRST_PAUSE_S
+        backoff = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
         while not self._finished:
             await self._wait_for_server()
             end = await self._one_stream()
@@ -244,8 +257,10 @@ class StreamClient:
             self._session.connection_lost(end, time.monotonic())
             self._changed.set()
             log.warning("stream lost", reason=str(end.reason), problem=end.problem)
-            pause_s = FIRST_PAUSE_S if welcomed else min(2 * pause_s, LONGEST_PAUSE_S)
-            await asyncio.sleep(max(pause_s, self._retry_after_s))
+            self._observer.retrying(RetryReason.STREAM)
+            if welcomed:
+                backoff.reset()
+            await asyncio.sleep(max(backoff.next_s(), self._retry_after_s))
 
     async def _wait_for_server(self) -> None:
         limit_s = self._limits.give_up_s
@@ -267,6 +282,8 @@ class StreamClient:
             await self._read(stream)
         except grpc.aio.AioRpcError as error:
             return self._ended_by(error)
+        except ProtocolError as error:
+            return StreamEnd(EndReason.STREAM_LOST, str(error))
         except asyncio.CancelledError:
             if self._session.broken is None:
                 raise
@@ -284,18 +301,24 @@ class StreamClient:
         A camera that another agent sends is final at the second refusal in a row.
         """
         details = error.details() or ""
+        if error.code() is grpc.StatusCode.NOT_FOUND:
+            self._server.fields_changed.set()
+            raise FieldNotServed(details) from error
         if error.code() in FINAL:
             raise ProtocolError(details) from error
         is_taken = details.partition(":")[0] == CAMERA_TAKEN
         self._times_taken = self._times_taken + 1 if is_taken else 0
         if self._times_taken >= CAMERA_TAKEN_TRIES:
             raise CameraTaken(details) from error
-        self._retry_after_s = _retry_after_s(error)
+        self._retry_after_s = retry_after_s(error)
         return StreamEnd(EndReason.STREAM_LOST, f"{error.code().name}: {details}")
 
     async def _read(self, stream: Stream) -> None:
         async for data in stream:
-            for message in server_messages_from_bytes(data):
+            messages = server_messages_from_bytes(data)
+            if not messages:
+                self._observer.message_unknown()
+            for message in messages:
                 self._session.receive(message, time.monotonic())
                 if isinstance(message, Welcome):
                     self._times_taken = 0
@@ -321,11 +344,3 @@ class StreamClient:
             async with asyncio.timeout(self._limits.drain_s):
                 await self._stream.done_writing()
                 await asyncio.wait({connecting})
-
-
-def _retry_after_s(error: grpc.aio.AioRpcError) -> float:
-    """Return how long a server that refused the stream asks to be left alone."""
-    for key, value in error.trailing_metadata():
-        if key == RETRY_AFTER and isinstance(value, str) and value.isdecimal():
-            return min(int(value) / 1e3, LONGEST_RETRY_AFTER_S)
-    return 0.0

@@ -7,9 +7,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Suppress
+from tyro.conf import Suppress, arg
 
-from rfcore.codec.h264.config import CRF_RANGE, PRESETS
+from cav_agent.live.settings import LiveSettings
+from cav_agent.pose_feed.settings import PoseFeedSettings
+from rfcore.codec.h264.config import CRF_RANGE, CoderSettings
 from rfcore.codec.sender.steering import SteeringSettings
 from rfcore.errors import InvalidInput
 from rfcore.wire.checks import check_field_id, check_name
@@ -20,19 +22,18 @@ __all__ = ["AgentConfig", "AgentLimits", "PaceKind"]
 
 @dataclass(frozen=True)
 class AgentLimits:
-    """Time limits in seconds, and how many pictures may wait for the encoder.
+    """Time limits in seconds, and how many pictures may wait for the encoder."""
 
-    ``greeting_s``: from Hello to Welcome. ``answer_s``: from encoding to Ack or Nack, before the
-    stream is given up; less once the server's usual time is known (``AnswerTimeout``).
-    ``give_up_s``: without any connection, before the drive ends with an error; 0 means never.
-    ``drain_s``: for the last frames, after ``stop`` and at the end of the drive.
-    """
-
-    greeting_s: float = 10.0
-    answer_s: float = 5.0
-    give_up_s: float = 30.0
-    drain_s: float = 5.0
-    slot_frames: int = 1
+    greeting_s: Annotated[float, Suppress] = 10.0
+    """From Hello to Welcome."""
+    answer_s: Annotated[float, Suppress] = 5.0
+    """From encoding to Ack or Nack, before the stream is given up; less once the server's usual
+    time is known (``AnswerTimeout``)."""
+    give_up_s: Annotated[float, arg(name="give-up-s")] = 0.0
+    """How many seconds without any server before the drive ends with an error; 0: never."""
+    drain_s: Annotated[float, Suppress] = 5.0
+    """For the last frames, after ``stop`` and at the end of the drive."""
+    slot_frames: Annotated[int, Suppress] = 1
 
     def __post_init__(self) -> None:
         for name in ("greeting_s", "answer_s"):
@@ -58,10 +59,13 @@ class AgentConfig:
 
     server: str
     """HOST:PORT of mec-server (or of `rfedge link` in front of it)."""
-    drive: Path
+    drive: Path | None = None
     """Dataset in time order: a transforms.json, or the folder of the only one."""
     fields: Path = Path("~/.cache/rfedge/fields")
     """Directory of field archives; a field the server has is fetched into it."""
+    rig: Path | None = None
+    """Instead of --drive: a rig file, several cameras in one session, each with its drive or source
+    (docs/live.md)."""
     neighbours: tuple[str, ...] = ()
     """HOST:PORT of further servers along the drive: the vehicle is handed over from tile to tile,
     and to a neighbour whose tile covers it when a server is lost."""
@@ -78,19 +82,25 @@ class AgentConfig:
     """Field id (sha256); without it, what servers publish or the only field they have."""
     vehicle: str = "cav-1"
     """Name of the vehicle on the wire."""
+    allow_recording: bool = False
+    """Let servers keep the pictures on disk, if they record (`mec-server --record`)."""
     crf: float = 23.0
-    """H.264 quality, 1 (best) to 51; 23 is x264's default."""
-    preset: str = "medium"
-    """x264 preset, ultrafast to veryslow."""
+    """H.264 quality, 1 (best) to 51; 6 more double the quantiser's step."""
+    coding: CoderSettings = CoderSettings()
     max_delay_ms: float | None = None
     """Longest time from capture to Ack; quality falls below --crf to keep it, and pictures are
     dropped when the lowest quality cannot. Without it every frame has --crf."""
     deadline_ms: float | None = None
     """Milliseconds a frame may take on this machine, from the picture to the packet: the best rung
-    of the ladder that keeps it is used, a lower one under load, in place of the preset."""
+    of the ladder that keeps it is used, a lower one under load, in place of the effort."""
     ladder: Path = Path("results/ladder.json")
     """Times and rates of the rungs, as `rfedge eval ladder` measured them."""
     steering: SteeringSettings = SteeringSettings()
+    localise: bool = False
+    """Find the camera's pose in the field, from what the feed or the dataset says of it, and code
+    frames without the field while it is lost; needs the extra localise (docs/localise.md)."""
+    feed: PoseFeedSettings = PoseFeedSettings()
+    live: LiveSettings = LiveSettings()
     log: LogForm = LogForm.AUTO
     """console lines, json lines, or auto: console on a terminal."""
     report: Path | None = None
@@ -98,9 +108,16 @@ class AgentConfig:
     render: RenderSettings = RenderSettings()
     metrics: MetricsSettings = MetricsSettings()
     transport: TransportSettings = TransportSettings()
-    limits: Annotated[AgentLimits, Suppress] = AgentLimits()
+    limits: AgentLimits = AgentLimits()
 
     def __post_init__(self) -> None:
+        given = [self.drive, self.live.source, self.rig]
+        if given.count(None) != 2:
+            raise InvalidInput("drive", "give exactly one of --drive, --source and --rig")
+        if self.live.source is not None and self.pace is not PaceKind.REALTIME:
+            raise InvalidInput("pace", f"{self.pace}: a live camera does not wait, use realtime")
+        if self.rig is not None and self.steering.mask is not None:
+            raise InvalidInput("mask", "the masks of a rig stand in its file")
         check_name("camera", self.camera)
         check_name("vehicle", self.vehicle)
         if self.field is not None:
@@ -109,8 +126,6 @@ class AgentConfig:
             raise InvalidInput("rate", f"{self.rate} Hz is outside 0.01..1000 Hz")
         if not CRF_RANGE[0] <= self.crf <= CRF_RANGE[1]:
             raise InvalidInput("crf", f"{self.crf} is outside {CRF_RANGE[0]:g}..{CRF_RANGE[1]:g}")
-        if self.preset not in PRESETS:
-            raise InvalidInput("preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
         if self.max_delay_ms is not None and not 10 <= self.max_delay_ms <= 60_000:
             raise InvalidInput("max_delay_ms", f"{self.max_delay_ms} ms is outside 10..60000 ms")
         if self.deadline_ms is not None and not 1 <= self.deadline_ms <= 60_000:

@@ -115,6 +115,16 @@ class DeadlineController:
             return self._fall(now)
         return self._climb(now)
 
+    def measured_in_part(self, rung: MeasuredRung, sender_ms: float, now: float) -> Step | None:
+        """Take the time of a frame that left out some of what ``rung`` does, like rendering.
+
+        That it was quick says nothing of this machine; that it was late does.
+        """
+        if sender_ms > self._deadline_ms:
+            return self.measured(rung, sender_ms, now)
+        self.late = False
+        return None
+
     def _fall(self, now: float) -> Step | None:
         if now - self._climbed_s < 2 * self._climb_delay_s:
             self._climb_delay_s = min(2 * self._climb_delay_s, self._limits.max_climb_delay_s)
@@ -157,8 +167,14 @@ class Rungs(Protocol):
     def current(self) -> Rung:
         """The rung for the next frame."""
 
-    def coded(self, sender_s: float, now: float) -> None:
-        """A frame on ``current`` took ``sender_s`` from picture to packet, until ``now``."""
+    def coded(
+        self, sender_s: float, now: float, instant: int = 0, *, in_field: bool = True
+    ) -> None:
+        """A frame on ``current`` took ``sender_s`` from picture to packet, until ``now``.
+
+        ``instant``: of a rig, which its frame belongs to; 0: it stands alone. ``in_field``: its
+        camera was found, so that all was done that the rung has a time for.
+        """
 
 
 class FixedRung:
@@ -167,12 +183,18 @@ class FixedRung:
     def __init__(self, rung: Rung) -> None:
         self.current = rung
 
-    def coded(self, sender_s: float, now: float) -> None:
+    def coded(
+        self, sender_s: float, now: float, instant: int = 0, *, in_field: bool = True
+    ) -> None:
         """Do nothing: the rung does not depend on it."""
 
 
 class DeadlineRungs:
-    """The rungs ``controller`` chooses; ``on_coded`` gets the controller and its step per frame."""
+    """The rungs ``controller`` chooses; ``on_coded`` gets the controller and its step per frame.
+
+    The deadline of a rig is that of all cameras together: the frames of an instant count as one,
+    which took as long as they did in sum.
+    """
 
     def __init__(
         self,
@@ -181,14 +203,31 @@ class DeadlineRungs:
     ) -> None:
         self._controller = controller
         self._on_coded = on_coded
+        self._instant, self._instant_s, self._instant_in_field = 0, 0.0, True
 
     @property
     def current(self) -> Rung:
         """The rung for the next frame."""
         return self._controller.current.rung
 
-    def coded(self, sender_s: float, now: float) -> None:
-        """Let the controller choose anew, and report what it did."""
+    def coded(
+        self, sender_s: float, now: float, instant: int = 0, *, in_field: bool = True
+    ) -> None:
+        """Let the controller choose anew, and report what it did; of an instant's frames with the
+        first of the next."""
+        if instant and instant == self._instant:
+            self._instant_s += sender_s
+            self._instant_in_field &= in_field
+            return
+        measured_s, whole = sender_s, in_field
+        if instant:
+            measured_s, whole = self._instant_s, self._instant_in_field
+        self._instant, self._instant_s, self._instant_in_field = instant, sender_s, in_field
+        if measured_s:
+            self._measured(measured_s, now, whole)
+
+    def _measured(self, sender_s: float, now: float, whole: bool) -> None:
         controller = self._controller
-        step = controller.measured(controller.current, 1e3 * sender_s, now)
+        take = controller.measured if whole else controller.measured_in_part
+        step = take(controller.current, 1e3 * sender_s, now)
         self._on_coded(controller, step)

@@ -9,28 +9,39 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import itertools
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import grpc
 import structlog
 
 from cav_agent.config import AgentConfig
 from cav_agent.deadline import DeadlineController, DeadlineRungs, FixedRung, Rungs
+from cav_agent.drive_pictures import (
+    OneCamera,
+    RecordedPictures,
+    RecordedRig,
+    VehicleCamera,
+    VehiclePictures,
+)
 from cav_agent.frame_log import DriveObserver
 from cav_agent.handover import ServedTile
-from cav_agent.server_connection import ServerConnection
+from cav_agent.lights import TileLights
+from cav_agent.server_connection import ServerConnection, retry_after_s
 from rfcore.camera import TileOrigin
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.sender.ladder import Rung, read_ladder
 from rfcore.codec.sender.steering import Steering
 from rfcore.dataset import read_dataset
+from rfcore.dataset.rig import read_rig, read_rig_drive
 from rfcore.errors import FieldFormatError, InvalidInput, RfedgeError, UnknownField
 from rfcore.field import FieldStore, RadianceField
 from rfcore.views import PosedPicture
+from rfcore.wire.tiles import Tile
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 
@@ -40,6 +51,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MAX_FIELD_BYTES",
     "FieldCache",
+    "PreparedCamera",
     "PreparedField",
     "Store",
     "fetch_field",
@@ -52,6 +64,9 @@ MAX_FIELD_BYTES = 4 << 30
 """Longest archive the agent takes; more than any vehicle renders in time."""
 
 MAX_RESUMES = 5
+MAX_REFUSALS = 60
+"""Tries of a transfer that broke, and of one that a server has no room for: about a minute."""
+
 RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL, grpc.StatusCode.CANCELLED)
 
 
@@ -70,15 +85,26 @@ class Store(Protocol):
 
 
 @dataclass(frozen=True)
+class PreparedCamera:
+    """How one camera's pictures are coded."""
+
+    camera: VehicleCamera
+    codec: CodecConfig
+    steering: Steering
+
+
+@dataclass(frozen=True)
 class PreparedField:
     """A field that is ready to code against, and the drive as seen in its tile."""
 
     field: RadianceField
-    pictures: tuple[PosedPicture, ...]
-    """Posed relative to the field's tile origin."""
-    codec: CodecConfig
+    pictures: VehiclePictures
+    """Posed relative to the field's tile origin, or not posed: a live camera's."""
+    cameras: tuple[PreparedCamera, ...]
     rungs: Rungs
-    steering: Steering
+    lights: TileLights
+    field_ids: tuple[str, ...]
+    """Those that frames may be coded against, the field's own first."""
 
 
 class FieldCache:
@@ -88,65 +114,124 @@ class FieldCache:
     """
 
     def __init__(
-        self, config: AgentConfig, servers: Sequence[ServerConnection], observer: DriveObserver
+        self,
+        config: AgentConfig,
+        servers: Sequence[ServerConnection],
+        observer: DriveObserver,
+        live: VehiclePictures | None = None,
     ) -> None:
         self._config = config
+        self._live = live
+        self._instants = itertools.count(1)
         self._servers = tuple(servers)
         self._observer = observer
-        self._prepared: OrderedDict[str, asyncio.Task[PreparedField]] = OrderedDict()
+        self._prepared: OrderedDict[Tile, asyncio.Task[PreparedField]] = OrderedDict()
+        self._fetching: dict[Tile, asyncio.Task[None]] = {}
 
     async def prepared(self, served: ServedTile) -> PreparedField:
         """Return the tile's field, ready to code against; raise ``RfedgeError`` if it cannot be.
 
         A failure is not kept: the next call tries again.
         """
-        tasks, field_id = self._prepared, served.tile.field_id
-        task = tasks.get(field_id)
+        tasks, tile = self._prepared, _without_ground(served.tile)
+        task = tasks.get(tile)
         if task is None or (task.done() and (task.cancelled() or task.exception())):
-            task = tasks[field_id] = asyncio.create_task(self._load(served))
-        tasks.move_to_end(field_id)
+            task = tasks[tile] = asyncio.create_task(self._load(served))
+        tasks.move_to_end(tile)
         while len(tasks) > MAX_PREPARED and next(iter(tasks.values())).done():
             tasks.popitem(last=False)
         return await asyncio.shield(task)
 
     async def close(self) -> None:
         """Stop what is being fetched or prepared."""
-        for task in self._prepared.values():
+        tasks: list[asyncio.Task[Any]] = [*self._prepared.values(), *self._fetching.values()]
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*self._prepared.values(), return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _load(self, served: ServedTile) -> PreparedField:
-        config, field_id = self._config, served.tile.field_id
+        tile, loop = served.tile, asyncio.get_running_loop()
+        field = await self._opened(served, (tile.field_id,))
+
+        def want() -> None:
+            loop.call_soon_threadsafe(self._fetch_lights, served, lights)
+
+        lights = TileLights(field, want if tile.lights else lambda: None)
+        return await asyncio.to_thread(self._prepare, field, lights, tile.renderable_ids)
+
+    async def _opened(self, served: ServedTile, archive_ids: Sequence[str]) -> RadianceField:
+        """Return the last of ``archive_ids``, fetching those that are not in the store."""
+        config = self._config
         folder, render = config.fields.expanduser(), config.render
         store = FieldStore(folder)
-        if field_id not in store.ids():
-            server = self._servers[served.server]
-            channel = await server.require(config.limits.give_up_s or None)
-            await fetch_field(channel, store, field_id, folder)
-        field = await asyncio.to_thread(
-            store.load, field_id, threads=render.threads, isa=render.isa
+        for field_id in archive_ids:
+            if field_id not in await asyncio.to_thread(store.ids):
+                server = self._servers[served.server]
+                channel = await server.require(config.limits.give_up_s or None)
+                try:
+                    await fetch_field(channel, store, field_id, folder)
+                    size_bytes = (await asyncio.to_thread(store.path, field_id)).stat().st_size
+                    self._observer.field_fetched(size_bytes)
+                except UnknownField:
+                    server.fields_changed.set()  # it publishes another one by now
+                    raise
+        return await asyncio.to_thread(
+            store.load,
+            archive_ids[-1],
+            threads=render.threads,
+            isa=render.field_isa,
+            max_bytes=render.max_field_bytes,
         )
-        return await asyncio.to_thread(self._prepare, field)
 
-    def _prepare(self, field: RadianceField) -> PreparedField:
+    def _fetch_lights(self, served: ServedTile, lights: TileLights) -> None:
+        """Begin to fetch the tile's other lights, unless that is going on."""
+        running = self._fetching.get(served.tile)
+        if running is None or running.done():
+            self._fetching[served.tile] = asyncio.create_task(self._add_lights(served, lights))
+
+    async def _add_lights(self, served: ServedTile, lights: TileLights) -> None:
+        """Fetch and open what is missing, one after the other; the drive goes on without it."""
+        for light in served.tile.lights:
+            if light.field_id in lights.held_ids():
+                continue
+            try:
+                field = await self._opened(served, light.field_ids)
+                _check_origin(field, lights.own)
+                await asyncio.to_thread(field.prepare)
+            except RfedgeError as error:
+                log.warning("light not fetched", light=light.name, problem=str(error))
+                continue
+            lights.add(field)
+            log.info("light ready", light=light.name, field=light.field_id)
+
+    def _prepare(
+        self, field: RadianceField, lights: TileLights, field_ids: tuple[str, ...]
+    ) -> PreparedField:
         config = self._config
-        pictures = read_drive(config, field.metadata.tile_origin)
-        k = pictures[0].camera.intrinsics
-        codec = CodecConfig(k.width_px, k.height_px, config.preset, config.crf)
+        pictures = self._live or self._recorded(field.metadata.tile_origin)
+        cameras = tuple(_prepared_camera(config, camera) for camera in pictures.cameras)
         rungs = self._rungs(field)
         field.prepare()
         self._observer.field_ready(field, len(pictures))
-        steering = config.steering.steering(codec.size_px)
-        return PreparedField(field, pictures, codec, rungs, steering)
+        return PreparedField(field, pictures, cameras, rungs, lights, field_ids)
+
+    def _recorded(self, origin: TileOrigin) -> VehiclePictures:
+        config = self._config
+        if config.rig is None:
+            pictures = RecordedPictures(read_drive(config, origin))
+            return OneCamera(config.camera, pictures, config.steering)
+        rig = read_rig(config.rig)
+        return RecordedRig(rig, read_rig_drive(rig, origin), self._instants)
 
     def _rungs(self, field: RadianceField) -> Rungs:
         """Return how frames are coded; under a deadline prepare every renderer it may ask for."""
         config = self._config
         if config.deadline_ms is None:
-            return FixedRung(Rung(preset=config.preset))
-        ladder = read_ladder(config.ladder, field.metadata.kind, config.crf)
-        for measured in ladder:
-            field.prepare(measured.rung.quality)
+            return FixedRung(Rung(effort=config.coding.name))
+        kind, coder = field.metadata.kind, config.coding.coder
+        ladder = read_ladder(config.ladder, kind, config.crf, coder, tracking=config.localise)
+        for quality in {measured.rung.quality for measured in ladder}:
+            field.prepare(quality)
         controller = DeadlineController(ladder, config.deadline_ms)
         log.info(
             "deadline",
@@ -157,12 +242,35 @@ class FieldCache:
         return DeadlineRungs(controller, self._observer.coded_under_deadline)
 
 
+def _without_ground(tile: Tile) -> Tile:
+    """Return what of a tile says which fields there are: tiles of the same ones share them."""
+    return replace(tile, name="any", area=None, margin_m=0.0, version=1)
+
+
+def _check_origin(light: RadianceField, own: RadianceField) -> None:
+    """Raise ``FieldFormatError`` for a light in other coordinates: poses are sent in the tile's."""
+    if light.metadata.tile_origin != own.metadata.tile_origin:
+        raise FieldFormatError(
+            f"light {light.field_id} has its origin at {light.metadata.tile_origin}, its tile at "
+            f"{own.metadata.tile_origin}"
+        )
+
+
+def _prepared_camera(config: AgentConfig, camera: VehicleCamera) -> PreparedCamera:
+    k = camera.intrinsics
+    codec = CodecConfig(k.width_px, k.height_px, config.coding.name, config.crf)
+    settings = replace(camera.steering, mask_qp=config.steering.mask_qp)
+    return PreparedCamera(camera, codec, settings.steering(codec.size_px))
+
+
 def read_drive(config: AgentConfig, origin: TileOrigin) -> tuple[PosedPicture, ...]:
     """Return the drive's pictures posed relative to ``origin``.
 
     Poses are rounded as on the wire before anything is rendered at them, so that both ends render
     at the same one. Raises ``InvalidInput`` unless all pictures are of one camera.
     """
+    if config.drive is None:
+        raise InvalidInput("drive", "is missing")
     pictures = read_dataset(config.drive, tile_origin=origin).pictures
     intrinsics = pictures[0].camera.intrinsics
     for picture in pictures:
@@ -214,15 +322,21 @@ async def _size(stub: FieldServiceAsyncStub, field_id: str) -> int:
 async def _receive_all(
     stub: FieldServiceAsyncStub, field_id: str, partial: Path, size_bytes: int
 ) -> None:
-    for resume in range(MAX_RESUMES + 1):
+    """Receive what is missing; resume where it broke, and come again to a server that is busy."""
+    resumes = refusals = 0
+    while True:
         try:
             await _receive(stub, field_id, partial, size_bytes)
             return
         except grpc.aio.AioRpcError as error:
-            if error.code() not in RETRIED or resume == MAX_RESUMES:
+            is_refused = error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+            resumes, refusals = resumes + (not is_refused), refusals + is_refused
+            final = not is_refused and error.code() not in RETRIED
+            if final or resumes > MAX_RESUMES or refusals > MAX_REFUSALS:
                 problem = f"{error.code().name}: {error.details()}"
                 raise RfedgeError(f"field {field_id} does not arrive ({problem})") from error
             log.warning("field transfer interrupted", problem=error.details())
+            await asyncio.sleep(retry_after_s(error))
 
 
 async def _receive(

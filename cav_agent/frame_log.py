@@ -14,16 +14,23 @@ from typing import Any, TextIO
 import structlog
 
 from cav_agent.deadline import DeadlineController, Step
-from cav_agent.frames import FrameResult, Outcome
+from cav_agent.frames import FrameResult, Outcome, RetryReason
 from cav_agent.handover import HandoverCause, ServedTile
+from cav_agent.live.source import SourceProblem
 from cav_agent.metrics import AgentMetrics
+from cav_agent.pose_feed.fix import FeedProblem
 from cav_agent.rate_control import QualitySteps
 from rfcore.field import RadianceField
+from rfcore.localise.fix import Fix, State
 from rfcore.wire.address import Address
+from rfcore.wire.sensing import ClockKind
 
 __all__ = ["DriveObserver", "FrameLog", "log_line"]
 
 log = structlog.get_logger()
+
+TOLD_OFFSET_S = 0.1
+"""A change of the pose feed's time offset by less is not logged."""
 
 
 class FrameLog:
@@ -51,10 +58,20 @@ class DriveObserver:
         self._servers = tuple(servers)
         self._frame_log = frame_log
         self._quality_steps = QualitySteps()
+        self._pose_state: State | None = None
+        self._feed_offset_s: float | None = None
+        self._log = log
+
+    def of_camera(self, camera_id: str) -> DriveObserver:
+        """Return an observer of one source of a rig, which names its camera in the log."""
+        named = DriveObserver(self._metrics, self._servers, self._frame_log)
+        named._log = log.bind(camera=camera_id)
+        return named
 
     def ended(self, result: FrameResult) -> None:
         """A captured picture came to its end."""
         self._metrics.ended(result)
+        self._log_pose(result)
         if self._frame_log is not None:
             self._frame_log.ended(result)
         _log_failure(result)
@@ -64,11 +81,23 @@ class DriveObserver:
         """A server welcomed the vehicle, or its stream was lost."""
         self._metrics.connected(is_connected)
 
+    def retrying(self, reason: RetryReason) -> None:
+        """Something failed and will be tried again."""
+        self._metrics.retrying(reason)
+
+    def message_unknown(self) -> None:
+        """A server sent a message that this agent does not know."""
+        self._metrics.message_unknown()
+
     def handed_over(self, served: ServedTile, cause: HandoverCause) -> None:
         """``served`` takes the vehicle's pictures now."""
         self._metrics.handed_over(cause)
         server = str(self._servers[served.server])
         log.info("handed over", server=server, tile=served.tile.name, cause=str(cause))
+
+    def field_fetched(self, size_bytes: int) -> None:
+        """An archive was fetched."""
+        self._metrics.field_fetched(size_bytes)
 
     def field_ready(self, field: RadianceField, pictures: int) -> None:
         """A field was opened and can be coded against."""
@@ -85,6 +114,45 @@ class DriveObserver:
                 rung=step.after.rung.name,
                 slowness=round(step.slowness, 2),
             )
+
+    def feed_problem(self, problem: FeedProblem, text: str, begins: bool) -> None:
+        """Something is wrong with the pose feed: counted, and said where it begins."""
+        self._metrics.feed_problem(problem)
+        if begins:
+            log.warning("pose feed", reason=str(problem), problem=text)
+
+    def source_open(self, clock: ClockKind) -> None:
+        """Frames of the live source come, their times from ``clock``."""
+        self._metrics.source_open(clock)
+        self._log.info("source open", capture_clock=str(clock))
+
+    def source_lost(self, problem: SourceProblem, text: str, begins: bool) -> None:
+        """The live source was lost, or could not be opened again: said once, counted each time."""
+        self._metrics.source_lost(problem)
+        if begins:
+            self._log.warning("source lost", reason=str(problem), problem=text)
+
+    def source_frames(self, taken: int, dropped: int) -> None:
+        """So many more frames of the live source were taken over, or dropped before coding."""
+        self._metrics.source_frames(taken, dropped)
+
+    def feed_heard(self, fixes: int) -> None:
+        """So many more fixes of the pose feed are used."""
+        self._metrics.feed_heard(fixes)
+
+    def _log_pose(self, result: FrameResult) -> None:
+        """Log when the camera was found, or lost, and how late the feed is if that changed."""
+        fix = None if result.encoded is None else result.encoded.fix
+        if fix is None:
+            return
+        if fix.state is not self._pose_state:
+            self._pose_state = fix.state
+            log.info("pose", state=str(fix.state), picture=result.capture.picture.name)
+        offset_s, told_s = fix.feed_offset_s, self._feed_offset_s
+        if offset_s is None or (told_s is not None and abs(offset_s - told_s) < TOLD_OFFSET_S):
+            return
+        self._feed_offset_s = offset_s
+        log.info("pose feed's time offset", seconds=round(offset_s, 3))
 
     def _log_quality(self, result: FrameResult) -> None:
         """Log when rate control lowered or raised the quality by much."""
@@ -128,7 +196,10 @@ def log_line(result: FrameResult) -> dict[str, Any]:
     return {
         "name": result.capture.picture.name,
         "index": result.capture.index,
+        "camera": result.capture.camera_id or None,
+        "instant": result.capture.instant or None,
         "capture_time_ns": result.capture.capture_time_ns,
+        "capture_clock": result.capture.clock and str(result.capture.clock),
         "result": str(result.outcome),
         "reason": str(result.reason),
         "problem": result.problem,
@@ -149,10 +220,25 @@ def _coding_of(result: FrameResult) -> dict[str, Any]:
         "tries": encoded.tries if encoded else None,
         "rung": encoded.rung.name if encoded else None,
         "crf": encoded.crf if encoded else None,
+        "light_field": encoded.field_id or None if encoded else None,
+        "pose": _pose_of(encoded.fix) if encoded and encoded.fix else None,
         "target_bytes": result.budget.target_bytes if result.budget else None,
         "packet_bytes": result.packet_bytes if packet else None,
         "render_digest": packet.render_digest.hex() if packet else None,
         "reconstruction_digest": packet.reconstruction_digest.hex() if packet else None,
+    }
+
+
+def _pose_of(fix: Fix) -> dict[str, Any]:
+    correction = fix.correction
+    return {
+        "state": str(fix.state),
+        "agreement": fix.agreement,
+        "inliers": fix.inliers,
+        "renders": fix.renders,
+        "correction_m": correction.metres if correction else None,
+        "correction_deg": correction.degrees if correction else None,
+        "feed_offset_s": fix.feed_offset_s,
     }
 
 

@@ -15,8 +15,10 @@ from rfcore.camera import Pose
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.sender.ladder import FULL_RUNG, Rung
 from rfcore.errors import RejectReason
+from rfcore.localise.fix import Fix, State
 from rfcore.views import PosedPicture
 from rfcore.wire.messages import FrameAddress, StageTimes
+from rfcore.wire.sensing import ClockKind
 
 __all__ = [
     "Capture",
@@ -25,18 +27,32 @@ __all__ = [
     "EndReason",
     "FrameResult",
     "Outcome",
+    "RetryReason",
+    "RigPose",
     "StreamEnd",
 ]
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A picture the camera has taken; pixels are read when it is encoded."""
+    """A picture a camera has taken; pixels are read when it is encoded.
+
+    Of a live camera ``clock`` says what ``captured_s`` rests on, and ``received_s`` when the agent
+    had the picture.
+    """
 
     index: int
     picture: PosedPicture
     captured_s: float
     capture_time_ns: int
+    clock: ClockKind | None = None
+    received_s: float | None = None
+    camera_id: str = ""
+    """Of a rig; empty: the vehicle's only camera."""
+    instant: int = 0
+    """Pictures of a rig with the same number were taken together; 0: it stands alone."""
+    world_from_rig: Pose | None = None
+    """Of a rig's drive, rounded as it is sent."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +62,7 @@ class EncodeJob:
     ``base`` is the frame it may be predicted from; ``None``: nothing but the render. ``exact``:
     whether the server's renders are ours to the bit. ``budget``: the bytes it may take;
     ``None``: the configured CRF. ``connection`` counts the streams the session has opened.
+    ``started_s``: when it was taken to be coded.
     """
 
     capture: Capture
@@ -54,17 +71,32 @@ class EncodeJob:
     base: FrameAddress | None = None
     exact: bool = True
     budget: ByteBudget | None = None
+    started_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class RigPose:
+    """Where a rig was when a picture was taken, rounded as it is sent; ``None``: it is lost.
+
+    ``state``: how it was found in the field, if it is looked for there.
+    """
+
+    world_from_rig: Pose | None
+    state: State | None = None
 
 
 @dataclass(frozen=True)
 class EncodedFrame:
     """A coded picture and what coding it took.
 
-    ``stage_s``: seconds by stage (convert, render, refine if poses are refined, references, encode,
+    ``stage_s``: seconds by stage (convert, render, or track if poses are found, references, encode,
     closed_loop). ``tries``: how often it was coded to fit the payload's limit. ``rung``, ``crf``:
     the setting it was coded with. ``pose``: the one it was coded at; ``None``: the measured one.
     ``read_s``: seconds it took to load the picture from the dataset. A vehicle's camera hands its
-    pictures over, so this is no stage of the sender and part of no delay.
+    pictures over, so this is no stage of the sender and part of no delay. ``fix``: how its pose was
+    found in the field, where that is done. ``waited_s``: of a live camera, from its arrival until
+    it was taken to be coded. ``field_id``: the field it was coded against; empty: Hello's first.
+    ``world_from_rig``: of a rig's camera, the pose to send.
     """
 
     packet: DeltaPacket
@@ -74,6 +106,10 @@ class EncodedFrame:
     crf: float | None = None
     pose: Pose | None = None
     read_s: float = 0.0
+    fix: Fix | None = None
+    waited_s: float = 0.0
+    field_id: str = ""
+    world_from_rig: RigPose | None = None
 
     @property
     def sender_s(self) -> float:
@@ -123,6 +159,21 @@ class EndReason(StrEnum):
     """The stream's task ended before the picture did."""
 
 
+class RetryReason(StrEnum):
+    """What failed and is tried again: a closed set, fit for a metric's label."""
+
+    STREAM = "stream"
+    """A stream was lost, or refused for the moment; another is opened."""
+    REFUSED = "refused"
+    """The server refused a vehicle that it, or another server, had welcomed before."""
+    FIELD_GONE = "field_gone"
+    """The server does not hold the field any more; its tiles are asked for again."""
+    FIELD = "field"
+    """A field could not be fetched."""
+    TILES = "tiles"
+    """A server did not list its tiles."""
+
+
 @dataclass(frozen=True)
 class StreamEnd:
     """Why a stream to a server ended; ``problem`` is for the log."""
@@ -160,10 +211,18 @@ class FrameResult:
 
     @property
     def stage_s(self) -> dict[str, float]:
-        """Seconds by stage, with ``read`` for loading the picture; empty if it was not encoded."""
+        """Seconds by stage, with ``read`` for loading the picture; empty if it was not encoded.
+
+        Of a live camera, with ``receive`` from capture to arrival, ``wait`` from there to coding.
+        """
         if self.encoded is None:
             return {}
-        return {"read": self.encoded.read_s, **self.encoded.stage_s}
+        stage_s = {"read": self.encoded.read_s, **self.encoded.stage_s}
+        capture = self.capture
+        if capture.received_s is None:
+            return stage_s
+        before = {"receive": capture.received_s - capture.captured_s}
+        return before | {"wait": self.encoded.waited_s} | stage_s
 
     @property
     def explanation(self) -> str:

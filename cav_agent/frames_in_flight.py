@@ -105,6 +105,10 @@ class FramesInFlight:
         """Note that a frame was sent ``now``."""
         self._frames[address] = replace(self._frames[address], sent_s=now)
 
+    def instant_of(self, address: FrameAddress) -> int:
+        """Return which instant of a rig a frame belongs to; 0: it stands alone."""
+        return self._frames[address].result.capture.instant
+
     def pop(self, address: FrameAddress) -> FrameInFlight:
         """Remove a frame."""
         return self._frames.pop(address)

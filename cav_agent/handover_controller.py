@@ -18,13 +18,13 @@ from contextlib import suppress
 import structlog
 
 from cav_agent.capture_schedule import CaptureSchedule, Lockstep, Realtime
-from cav_agent.client import CameraTaken
+from cav_agent.client import CameraTaken, FieldNotServed
 from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.frame_log import DriveObserver
-from cav_agent.frames import FrameResult
+from cav_agent.frames import FrameResult, RetryReason
 from cav_agent.handover import LOST_AFTER_S, Handover, Position, ServedTile, TileRoute
 from cav_agent.tile_stream import PrepareStream, TileStream
-from rfcore.errors import RfedgeError
+from rfcore.errors import ProtocolError, RfedgeError
 
 __all__ = ["HandoverController"]
 
@@ -35,9 +35,6 @@ NEAR_S, NEAR_PICTURES = 2.0, 3
 
 AHEAD_S, AHEAD_PICTURES = 30.0, 30
 """How long before a border the next field is fetched; in lockstep, how many pictures."""
-
-RETRY_S = 2.0
-"""Until a stream that failed is opened again."""
 
 SHORTEST_REST_S = 0.001
 POLL_S = 0.25
@@ -57,19 +54,22 @@ class HandoverController:
         positions: Sequence[Position],
         prepare: PrepareStream,
         observer: DriveObserver,
+        schedule: CaptureSchedule | None = None,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._config = config
         self._positions = tuple(positions)
         self._prepare = prepare
         self._observer = observer
-        self._schedule = _schedule(config, len(positions))
+        self._schedule = schedule or _schedule(config, len(positions))
         self._tiles: dict[int, tuple[ServedTile, ...]] = {}
         self._streams: dict[ServedTile, TileStream] = {}
         self._handover: Handover | None = None
         self._next = 0
         self._changed = asyncio.Event()
         self._stopping = False
+        self._was_welcomed = False
+        self._failed: RfedgeError | None = None
         self._began_s = self._streaming_at_s = time.monotonic()
 
     def tiles_published(self, server: int, tiles: Sequence[ServedTile]) -> None:
@@ -85,6 +85,10 @@ class HandoverController:
             self._handover.follow(route)
         self._changed.set()
 
+    def picture_arrived(self) -> None:
+        """Look at the schedule: a live camera has a new picture, or has ended."""
+        self._changed.set()
+
     def stop(self) -> None:
         """Capture no more; ``run`` ends when what is in flight was answered."""
         self._stopping = True
@@ -97,6 +101,8 @@ class HandoverController:
         try:
             while not self._is_done():
                 now = time.monotonic()
+                if self._failed is not None:
+                    raise self._failed
                 self._collect(now)
                 knows_first = 0 in self._tiles or now - self._began_s >= LOST_AFTER_S
                 if self._handover is not None and knows_first:
@@ -115,15 +121,27 @@ class HandoverController:
     # --- what streams report
 
     def ended(self, result: FrameResult) -> None:
-        """Count a picture that came to its end; the schedule may raise ``RfedgeError``."""
+        """Count a picture that came to its end; the schedule may end the drive with an error."""
         self.counts[str(result.outcome)] += 1
         self._observer.ended(result)
-        self._schedule.ended(result)
+        try:
+            self._schedule.ended(result)
+        except RfedgeError as error:
+            self._failed = error
         self._changed.set()
 
     def connected(self, is_connected: bool) -> None:
         """Pass on that a server welcomed the vehicle, or that its stream was lost."""
+        self._was_welcomed = self._was_welcomed or is_connected
         self._observer.connected(is_connected)
+
+    def retrying(self, reason: RetryReason) -> None:
+        """Pass on that something is tried again."""
+        self._observer.retrying(reason)
+
+    def message_unknown(self) -> None:
+        """Pass on that a server sent something unknown."""
+        self._observer.message_unknown()
 
     # --- pictures
 
@@ -179,24 +197,38 @@ class HandoverController:
         return frozenset(served for served, stream in streams if stream.is_streaming)
 
     def _collect(self, now: float) -> None:
-        """Note streams that ended.
-
-        An error ends the drive if it is of the only stream, if no server has taken the vehicle for
-        as long as it may, or if another agent sends its camera; else the stream is tried again.
-        """
+        """Note streams that ended: tried again, unless the error ends the drive."""
         if self._streaming():
             self._streaming_at_s = now
-        limit_s = self._config.limits.give_up_s or math.inf
-        is_over = now - self._streaming_at_s >= limit_s or len(self._streams) == 1
         for stream in self._streams.values():
             error = stream.collect()
             if error is None:
                 continue
-            if is_over or isinstance(error, CameraTaken) or not isinstance(error, RfedgeError):
+            if self._is_final(error, now):
                 raise error
-            stream.retry_at_s = now + RETRY_S
-            tile = stream.served.tile.name
-            log.warning("stream given up for now", tile=tile, problem=str(error))
+            pause_s = stream.hold_back(now)
+            self._observer.retrying(_retry_reason(error))
+            log.warning(
+                "stream given up for now",
+                tile=stream.served.tile.name,
+                problem=str(error),
+                again_in_s=round(pause_s, 2),
+            )
+
+    def _is_final(self, error: BaseException, now: float) -> bool:
+        """Return whether ``error`` ends the drive.
+
+        It does if another agent sends the camera, or no server has taken the vehicle for as long as
+        it may. What says that the vehicle was set up wrongly ends it only at the start: once a
+        server has welcomed it, the same words are about the server, which can change again.
+        """
+        if isinstance(error, CameraTaken) or not isinstance(error, RfedgeError):
+            return True
+        limit_s = self._config.limits.give_up_s or math.inf
+        if now - self._streaming_at_s >= limit_s:
+            return True
+        is_transport = type(error) is RfedgeError
+        return not (self._was_welcomed or is_transport or len(self._streams) > 1)
 
     async def _rest(self, now: float) -> None:
         due = [now + POLL_S]
@@ -221,6 +253,12 @@ class HandoverController:
         if self._config.pace is PaceKind.LOCKSTEP:
             return in_lockstep
         return max(in_lockstep, math.ceil(seconds * self._config.rate))
+
+
+def _retry_reason(error: BaseException) -> RetryReason:
+    if isinstance(error, FieldNotServed):
+        return RetryReason.FIELD_GONE
+    return RetryReason.REFUSED if isinstance(error, ProtocolError) else RetryReason.FIELD
 
 
 def _schedule(config: AgentConfig, pictures: int) -> CaptureSchedule:

@@ -10,10 +10,14 @@ from __future__ import annotations
 from prometheus_client import CollectorRegistry
 
 from cav_agent.deadline import Step
-from cav_agent.frames import EncodedFrame, FrameResult
+from cav_agent.frames import EncodedFrame, FrameResult, RetryReason
 from cav_agent.handover import HandoverCause
+from cav_agent.live.source import SourceProblem
+from cav_agent.pose_feed.fix import FeedProblem
 from rfcore.codec.references import references_name
+from rfcore.localise.fix import Fix, State
 from rfcore.wire.instruments import Instruments
+from rfcore.wire.sensing import ClockKind
 
 __all__ = ["AgentMetrics"]
 
@@ -24,11 +28,23 @@ class AgentMetrics:
     def __init__(self, registry: CollectorRegistry) -> None:
         self.instruments = make = Instruments(registry)
         make.process()
+        make.devices()
         self._connected = make.gauge(
             "rfedge_agent_connected", "1 while the server has welcomed this vehicle."
         )
         self._lost = make.counter(
             "rfedge_agent_connections_lost", "Streams that ended before the drive did."
+        )
+        self._retries = make.counter(
+            "rfedge_agent_retries",
+            "What failed and is tried again: stream, refused, field_gone, field, tiles.",
+            ("reason",),
+        )
+        for reason in RetryReason:
+            self._retries.labels(reason)
+        self._unknown = make.counter(
+            "rfedge_agent_unknown_messages",
+            "Messages of a newer server that this agent does not know, and ignores.",
         )
         self._frames = make.counter(
             "rfedge_agent_frames",
@@ -46,6 +62,32 @@ class AgentMetrics:
         self._recoded = make.counter(
             "rfedge_agent_recoded_frames",
             "Frames coded again at a higher CRF because their P slice was above the limit.",
+        )
+        self._pose_state = make.gauge(
+            "rfedge_agent_pose_state",
+            "1 for the present state of the camera's pose (lost, localising, tracking), else 0; "
+            "only with --localise.",
+            ("state",),
+        )
+        self._poses = make.counter(
+            "rfedge_agent_pose_frames", "Coded frames by what was known of their pose.", ("state",)
+        )
+        for state in State:
+            self._poses.labels(state)
+        self._inliers = make.gauge(
+            "rfedge_agent_pose_inliers", "Feature matches that agreed with the last pose searched."
+        )
+        self._agreement = make.gauge(
+            "rfedge_agent_pose_agreement",
+            "Standard deviations of chance by which the last tracked frame resembles its render.",
+        )
+        self._correction = make.gauge(
+            "rfedge_agent_pose_correction_metres",
+            "How far the last tracked pose is from the sensor's measurement of its time.",
+        )
+        self._feed_offset = make.gauge(
+            "rfedge_agent_pose_feed_offset_seconds",
+            "What to add to the pose feed's times to get the camera's, as tracking tells it.",
         )
         self._crf = make.gauge("rfedge_agent_crf", "CRF of the last coded frame, 1 (best) to 51.")
         self._target = make.gauge(
@@ -91,6 +133,52 @@ class AgentMetrics:
             ("cause",),
         )
 
+        self._source = make.gauge(
+            "rfedge_agent_source_open",
+            "1 while frames of the live source come; only with --source.",
+        )
+        self._capture_clock = make.gauge(
+            "rfedge_agent_capture_clock",
+            "1 for what the live source's times of capture rest on: sender_report, arrival.",
+            ("clock",),
+        )
+        self._source_frames = make.counter(
+            "rfedge_agent_source_frames",
+            "Frames of the live source by what became of them: taken over, or dropped because a "
+            "newer one came first, the rate is lower, or their time went back.",
+            ("result",),
+        )
+        self._source_losses = make.counter(
+            "rfedge_agent_source_losses",
+            "Times that the live source was lost or did not open: ended, silent, wrong_size.",
+            ("reason",),
+        )
+        self._field_bytes = make.counter(
+            "rfedge_agent_field_bytes", "Bytes of field archives and layers that were fetched."
+        )
+        self._fixes = make.counter(
+            "rfedge_agent_pose_feed_fixes", "Poses of the vehicle's own sensors that are used."
+        )
+        self._feed_problems = make.counter(
+            "rfedge_agent_pose_feed_problems",
+            "What was wrong with the pose feed, by reason; the log tells each once.",
+            ("reason",),
+        )
+        for problem in FeedProblem:
+            self._feed_problems.labels(problem)
+
+    def field_fetched(self, size_bytes: int) -> None:
+        """Count the bytes of an archive that was fetched."""
+        self._field_bytes.inc(size_bytes)
+
+    def feed_heard(self, fixes: int) -> None:
+        """Count poses of the vehicle's own sensors."""
+        self._fixes.inc(fixes)
+
+    def feed_problem(self, problem: FeedProblem) -> None:
+        """Count something wrong with the pose feed."""
+        self._feed_problems.labels(str(problem)).inc()
+
     def identify(self, vehicle_id: str, camera_id: str) -> None:
         """Export the names of vehicle and camera, for operators who want them."""
         self.instruments.info(
@@ -121,6 +209,30 @@ class AgentMetrics:
         if not is_connected:
             self._lost.inc()
 
+    def source_open(self, clock: ClockKind) -> None:
+        """Note that frames of the live source come, and what their times rest on."""
+        self._source.set(1)
+        for kind in ClockKind:
+            self._capture_clock.labels(kind).set(kind is clock)
+
+    def source_lost(self, problem: SourceProblem) -> None:
+        """Count a loss of the live source."""
+        self._source.set(0)
+        self._source_losses.labels(problem).inc()
+
+    def source_frames(self, taken: int, dropped: int) -> None:
+        """Count frames of the live source."""
+        self._source_frames.labels("taken").inc(taken)
+        self._source_frames.labels("dropped").inc(dropped)
+
+    def retrying(self, reason: RetryReason) -> None:
+        """Count something that failed and is tried again."""
+        self._retries.labels(reason).inc()
+
+    def message_unknown(self) -> None:
+        """Count a message that is ignored."""
+        self._unknown.inc()
+
     def ended(self, result: FrameResult) -> None:
         """Count a picture that came to its end."""
         self._frames.labels(str(result.outcome), str(result.reason)).inc()
@@ -143,3 +255,18 @@ class AgentMetrics:
             self._recoded.inc()
         if encoded.crf is not None:
             self._crf.set(encoded.crf)
+        if encoded.fix is not None:
+            self._fixed(encoded.fix)
+
+    def _fixed(self, fix: Fix) -> None:
+        for state in State:
+            self._pose_state.labels(state).set(state is fix.state)
+        self._poses.labels(fix.state).inc()
+        if fix.inliers is not None:
+            self._inliers.set(fix.inliers)
+        if fix.state is State.TRACKING:
+            self._agreement.set(fix.agreement)
+        if fix.correction is not None:
+            self._correction.set(fix.correction.metres)
+        if fix.feed_offset_s is not None:
+            self._feed_offset.set(fix.feed_offset_s)

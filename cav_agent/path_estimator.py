@@ -97,6 +97,13 @@ class PathEstimator:
             raise InvalidInput("packet.size_bytes", f"{size_bytes} must be at least 1")
         self._in_flight[key] = _InFlight(size_bytes, now_ns)
 
+    def grew(self, key: Hashable, size_bytes: int, idle_ns: int) -> None:
+        """``size_bytes`` more went out that count as one packet with ``key``, after the path had
+        nothing of it to carry for ``idle_ns``."""
+        packet = self._in_flight[key]
+        whole = _InFlight(packet.size_bytes + size_bytes, packet.sent_ns + idle_ns)
+        self._in_flight[key] = whole
+
     def lost(self, key: Hashable) -> None:
         """No answer will come, or one that says nothing of the path; unknown keys are ignored."""
         self._in_flight.pop(key, None)

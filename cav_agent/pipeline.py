@@ -10,30 +10,67 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 from cav_agent.deadline import FixedRung, Rungs
-from cav_agent.frames import EncodedFrame, EncodeJob
-from rfcore.camera import Camera, Intrinsics
+from cav_agent.frames import Capture, EncodedFrame, EncodeJob, RigPose
+from cav_agent.lights import TileLights
+from cav_agent.rig_poses import RigPoses, TrackedRig
+from rfcore.camera import Camera, Intrinsics, Pose, camera_on_rig
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.references import RENDER_ONLY
-from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
-from rfcore.codec.sender.frame_costs import FrameCosts
+from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice, without_field
 from rfcore.codec.sender.ladder import Rung
-from rfcore.codec.sender.pose_search import PoseSearch, Refined
 from rfcore.codec.sender.rate import RateModel, RateTarget
 from rfcore.codec.sender.steering import NO_STEERING, Steering
 from rfcore.codec.state import KEPT_FRAMES, EncoderState, Past
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, Renderer, render_field_view
 from rfcore.image import I420, Rgb
+from rfcore.localise.fix import Fix
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, PosedPicture
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 
-__all__ = ["Pipeline", "PipelineOptions"]
+__all__ = ["CameraPoses", "OnRig", "Pipeline", "PipelineOptions", "Tracking"]
 
 ClockNs = Callable[[], int]
+
+
+class CameraPoses(Protocol):
+    """Says where the camera is (``cav_agent.pose_feed``, ``cav_agent.live``)."""
+
+    def camera(self, capture: Capture) -> Camera:
+        """Return a picture's camera, its pose rounded as it is sent; raise ``RfedgeError``."""
+
+
+class Tracking(Protocol):
+    """Finds the camera in the field (``cav_agent.tracking``)."""
+
+    def locate(self, capture: Capture, frame: I420, rung: Rung) -> Fix:
+        """Return what is known of a picture's pose."""
+
+
+@dataclass(frozen=True)
+class OnRig:
+    """A camera's place on a rig, and what says where that is.
+
+    ``reference``: of the camera by whose pictures the rig is found in the field, who finds it.
+    """
+
+    camera_from_rig: Pose
+    poses: RigPoses
+    reference: TrackedRig | None = None
+
+
+@dataclass(frozen=True)
+class Placed:
+    """What the field shows where a picture was taken; ``view`` ``None``: its camera is lost."""
+
+    view: FieldView | None
+    fix: Fix | None = None
+    world_from_rig: RigPose | None = None
 
 
 @dataclass(frozen=True)
@@ -43,11 +80,21 @@ class PipelineOptions:
     limit_bytes: int = MAX_PAYLOAD_BYTES
     """A larger slice is coded again at a higher CRF, as long as there is one."""
     rungs: Rungs | None = None
-    """Says on which rung each frame is coded; ``None``: the preset, with every reference."""
+    """Says on which rung each frame is coded; ``None``: the effort, with every reference."""
     steering: Steering = NO_STEERING
     """Applies to every frame."""
+    feed: CameraPoses | None = None
+    """Says where the camera is; ``None``: the drive's own poses."""
+    tracking: Tracking | None = None
+    """Finds each frame's pose in the field; ``None``: it is coded at the measured one."""
+    on_rig: OnRig | None = None
+    """Of a rig's camera; then the two above are not used."""
     threads: int = 1
     """The encoder's; the renderer has its own."""
+    lights: TileLights | None = None
+    """Fields of other lights, of which the nearest is coded against; without ``tracking``."""
+    check_decode: bool = False
+    """Decode every slice on the vehicle, too, to see that it is what its coder promised."""
 
 
 class Stopwatch:
@@ -75,14 +122,15 @@ class Pipeline:
     ) -> None:
         self._renderer = renderer
         self._config = config
+        self._lights = None if options is None or options.tracking else options.lights
         self._clock_ns = clock_ns
         self._options = options = options or PipelineOptions()
-        self._rungs = options.rungs or FixedRung(Rung(preset=config.preset))
-        self._encoder = DeltaEncoder(config, clock_ns, options.threads)
+        self._rungs = options.rungs or FixedRung(Rung(effort=config.effort))
+        self._encoder = DeltaEncoder(
+            config, clock_ns, options.threads, check_decode=options.check_decode
+        )
         self._state: EncoderState | None = None
         self._rate = RateModel()
-        refine_ms = options.steering.refine_pose_ms
-        self._search = None if refine_ms is None else PoseSearch(refine_ms, clock_ns)
         self._pasts: dict[tuple[int, int] | None, Past] = {}
 
     @property
@@ -94,7 +142,7 @@ class Pipeline:
         """Return the packet of ``job``'s picture.
 
         Raises ``DatasetError`` for a picture that cannot be read, ``InvalidInput`` for one of
-        another size, ``CodecError`` when x264 fails.
+        another size, ``CodecError`` when coding fails, ``RfedgeError`` before a feed's first pose.
         """
         watch = Stopwatch(self._clock_ns)
         picture = job.capture.picture
@@ -103,32 +151,71 @@ class Pipeline:
         rung = self._rungs.current
         frame = i420_from_rgb(rgb)
         stage_s = {"convert": watch.lap_s()}
-        view = render_field_view(self._renderer, picture.camera, rung.quality)
-        stage_s["render"] = watch.lap_s()
-        refined = Refined(view, FrameCosts(frame))
-        if self._search is not None:
-            refined = self._refined(self._search, frame, view, rung.quality)
-            stage_s["refine"] = watch.lap_s()
-        choice = self._choice(job, rung)
+        waited_s, received_s = 0.0, job.capture.received_s
+        if received_s is not None:  # a live camera's picture is undistorted here: part of the delay
+            stage_s, read_s = {"read": read_s} | stage_s, 0.0
+            waited_s = job.started_s - received_s
+        placed = self._placed(job, frame, rung)
+        field_id = "" if self._lights is None else self._lights.named_id
+        stage_s["render" if placed.fix is None else "track"] = watch.lap_s()
         state = self._state_for(job)
-        encoded = self._encoder.encode(state, frame, refined.view, choice, refined.costs)
+        choice = self._choice(job, rung)
+        if placed.view is None:
+            choice = without_field(choice, state)
+        view = placed.view or FieldView.nothing(picture.camera.intrinsics)
+        encoded = self._encoder.encode(state, frame, view, choice)
         self._remember(encoded)
         stage_s |= {stage: ns / 1e9 for stage, ns in encoded.stage_ns.items()}
-        pose = refined.view.camera.world_from_cam
-        made = EncodedFrame(encoded.packet, stage_s, encoded.tries, rung, encoded.crf, pose, read_s)
-        self._rungs.coded(made.sender_s, self._clock_ns() / 1e9)
+        pose = view.camera.world_from_cam
+        made = EncodedFrame(
+            packet=encoded.packet,
+            stage_s=stage_s,
+            tries=encoded.tries,
+            rung=rung,
+            crf=encoded.crf,
+            pose=pose,
+            read_s=read_s,
+            fix=placed.fix,
+            waited_s=waited_s,
+            field_id=field_id,
+            world_from_rig=placed.world_from_rig,
+        )
+        self._rungs.coded(
+            made.sender_s,
+            self._clock_ns() / 1e9,
+            job.capture.instant,
+            in_field=placed.view is not None,
+        )
         return made
 
-    def _refined(
-        self, search: PoseSearch, frame: I420, measured: FieldView, quality: Quality
-    ) -> Refined:
-        """Return what the field shows at the pose to send."""
-        crf = self._config.crf if self._rate.crf is None else self._rate.crf
+    def _placed(self, job: EncodeJob, frame: I420, rung: Rung) -> Placed:
+        """Return what the field shows at the pose to send, and how that was found, if it was."""
+        options, picture = self._options, job.capture.picture
+        if options.on_rig is not None:
+            return self._placed_on_rig(job.capture, frame, rung, options.on_rig)
+        if options.tracking is not None:
+            fix = options.tracking.locate(job.capture, frame, rung)
+            return Placed(fix.view, fix)
+        camera = picture.camera if options.feed is None else options.feed.camera(job.capture)
+        return Placed(self._view(frame, camera, rung.quality))
 
-        def render_at(camera: Camera) -> FieldView:
-            return render_field_view(self._renderer, camera, quality)
+    def _placed_on_rig(self, capture: Capture, frame: I420, rung: Rung, on_rig: OnRig) -> Placed:
+        """Render at the pose that the rig's gives the camera: the very one its receiver finds."""
+        fix = None
+        if on_rig.reference is not None:
+            fix = on_rig.reference.locate(capture, frame, rung)
+        sent = on_rig.poses.at(capture)
+        if sent.world_from_rig is None:
+            return Placed(None, fix, sent)
+        pose = camera_on_rig(sent.world_from_rig, on_rig.camera_from_rig)
+        camera = Camera(capture.picture.camera.intrinsics, pose)
+        return Placed(self._view(frame, camera, rung.quality), fix, sent)
 
-        return search.refine(frame, measured, render_at, crf)
+    def _view(self, frame: I420, camera: Camera, quality: Quality) -> FieldView:
+        """Return what the field shows, of its lights the one that the frame was taken in."""
+        if self._lights is not None:
+            return self._lights.view(frame, camera, quality)
+        return render_field_view(self._renderer, camera, quality)
 
     def _choice(self, job: EncodeJob, rung: Rung) -> FrameChoice:
         budget, limit_bytes = job.budget, self._options.limit_bytes
@@ -140,8 +227,7 @@ class Pipeline:
             max_references=max(1, rung.references),
             block_means=not job.exact,
             limit_bytes=limit_bytes,
-            preset=rung.preset,
-            fast_unsent=rung.fast_unsent,
+            effort=rung.effort,
             qp_map=self._options.steering.qp_map,
             target=None if budget is None else RateTarget(budget.target_bytes, self._rate),
         )

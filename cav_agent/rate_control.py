@@ -6,11 +6,16 @@ the bytes that the path's recent behaviour leaves room for (``cav_agent.path_est
 more than it can carry at the rate of capture. When not even the smallest frame has room, the next
 picture waits for an answer; a newer one may take its place, so pictures are dropped before they are
 coded.
+
+The frames of a rig's instant count as one packet on the path: sent when the first of them was,
+answered with the last, less the time for which none was on its way because the next was being
+coded. One frame of a camera among several is too short to tell the path's rate from its jitter.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Hashable
+from dataclasses import dataclass, field, replace
 
 from cav_agent.path_estimator import PathEstimator
 from rfcore.errors import InvalidInput
@@ -60,9 +65,29 @@ class ByteBudget:
     limit_bytes: int
     rate_bps: float | None = None
 
+    def with_target(self, target_bytes: float) -> ByteBudget:
+        """Return the budget of a camera that gets so much of this one."""
+        return replace(self, target_bytes=target_bytes, limit_bytes=int(LIMIT * target_bytes))
+
+
+@dataclass
+class InstantOnPath:
+    """The frames of an instant that are ``unsent`` or ``unanswered``; times in seconds."""
+
+    unsent: int
+    unanswered: set[FrameAddress] = field(default_factory=set)
+    answered_s: float | None = None
+    longest_latency_s: float = 0.0
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more will be sent or answered."""
+        return not (self.unsent > 0 or self.unanswered)
+
 
 class RateControl:
-    """Keeps one camera's frames within ``max_delay_s`` from capture to Ack."""
+    """Keeps frames within ``max_delay_s`` from capture to Ack: of a camera, or of a rig's instants
+    together."""
 
     def __init__(self, max_delay_s: float) -> None:
         if not 0.01 <= max_delay_s <= 60:
@@ -75,6 +100,8 @@ class RateControl:
         self._overhead_bytes = float(OVERHEAD_BYTES)
         self._interval_s: float | None = None
         self._captured_s: float | None = None
+        self._instants: dict[Hashable, InstantOnPath] = {}
+        self._instant_of: dict[FrameAddress, Hashable] = {}
 
     @property
     def rate_bps(self) -> float | None:
@@ -82,7 +109,7 @@ class RateControl:
         return self._path.rate_bps
 
     def captured(self, now: float) -> None:
-        """A picture was captured."""
+        """A picture was captured, or those of an instant."""
         if self._captured_s is not None:
             interval_s = now - self._captured_s
             self._interval_s = _mean(self._interval_s, interval_s)
@@ -94,47 +121,103 @@ class RateControl:
         left_s = self._max_delay_s - least_s
         return now - captured_s > (left_s if left_s > 0 else self._max_delay_s)
 
-    def budget(self, captured_s: float, now: float) -> ByteBudget | None:
-        """Return the bytes for the picture of ``captured_s`` if coding begins ``now``.
+    def budget(self, captured_s: float, now: float, pictures: int = 1) -> ByteBudget | None:
+        """Return the bytes for the pictures of ``captured_s`` together if coding begins ``now``.
 
-        None while it should wait for an answer.
+        ``pictures``: how many there are, of one instant. None while they should wait for an answer.
         """
-        if self._path.bytes_in_flight and self._room_bytes(captured_s, now, 1.0) < LEAST_BYTES:
+        room = self._room_bytes(captured_s, now, 1.0, pictures)
+        if self._path.bytes_in_flight and room < LEAST_BYTES * pictures:
             return None
-        room = self._share * self._room_bytes(captured_s, now, SHARE)
+        room = self._share * self._room_bytes(captured_s, now, SHARE, pictures)
         if self._interval_s:
             carried = self._path.sustained_bytes(1e9 * self._interval_s, _ns(now))
-            room = min(room, SUSTAINED * carried - self._overhead_bytes)
-        target = min(max(room, LEAST_BYTES), MOST_BYTES)
+            room = min(room, SUSTAINED * carried - pictures * self._overhead_bytes)
+        target = min(max(room, LEAST_BYTES * pictures), MOST_BYTES)
         return ByteBudget(target, int(LIMIT * target), self._path.rate_bps)
 
-    def _room_bytes(self, captured_s: float, now: float, share: float) -> float:
-        """Return how large a slice may be to be answered within ``share`` of the delay."""
-        due_s = captured_s + share * self._max_delay_s
-        room = self._path.room_bytes(_ns(now + self._work_s), _ns(due_s), _ns(now))
-        return room - self._overhead_bytes
+    def _room_bytes(self, captured_s: float, now: float, share: float, pictures: int) -> float:
+        """Return how long the slices of an instant may be to be answered within ``share`` of the
+        delay: sending begins when the first is coded, and the last has its part of the room."""
+        due_ns, now_ns = _ns(captured_s + share * self._max_delay_s), _ns(now)
+        first, last = (
+            self._path.room_bytes(_ns(now + coded * self._work_s), due_ns, now_ns)
+            for coded in (1, pictures)
+        )
+        return min(first, pictures * last) - pictures * self._overhead_bytes
 
     def coded(self, sender_s: float, payload_bytes: int, packet_bytes: int) -> None:
         """A frame took the sender ``sender_s`` from the picture to the packet."""
         self._work_s = _mean(self._work_s or None, sender_s)
         self._overhead_bytes = _mean(self._overhead_bytes, packet_bytes - payload_bytes)
 
-    def sent(self, address: FrameAddress, packet_bytes: int, now: float) -> None:
-        """A frame was sent."""
-        self._path.sent(address, packet_bytes, _ns(now))
+    def begun(self, instant: int, pictures: int) -> None:
+        """So many pictures of a rig's instant will be coded; 0: of a camera that stands alone."""
+        for key in [key for key, other in self._instants.items() if not other.unanswered]:
+            self._path.lost(key)
+            del self._instants[key]
+        if instant:
+            self._instants[instant] = InstantOnPath(pictures)
+
+    def sent(self, address: FrameAddress, packet_bytes: int, now: float, instant: int = 0) -> None:
+        """A frame was sent, of a rig's ``instant`` or of a camera that stands alone."""
+        key: Hashable = instant or address
+        frames = self._instants.setdefault(key, InstantOnPath(1))
+        if frames.unanswered:
+            self._path.grew(key, packet_bytes, 0)
+        elif frames.answered_s is not None:
+            self._path.grew(key, packet_bytes, max(0, _ns(now - frames.answered_s)))
+        else:
+            self._path.sent(key, packet_bytes, _ns(now))
+        frames.unsent -= 1
+        frames.unanswered.add(address)
+        self._instant_of[address] = key
+
+    def not_sent(self, instant: int) -> None:
+        """A frame of an instant was not sent after all."""
+        frames = self._instants.get(instant)
+        if frames is not None:
+            frames.unsent -= 1
+            self._close(instant, frames)
 
     def answered(self, address: FrameAddress, latency_s: float, now: float) -> None:
         """A frame was answered ``latency_s`` after its capture, by Ack or Nack."""
-        self._path.answered(address, _ns(now))
+        key = self._instant_of.pop(address, None)
+        if key is None:
+            self._adapt(latency_s, now)
+            return
+        frames = self._instants[key]
+        frames.unanswered.discard(address)
+        frames.answered_s = now
+        frames.longest_latency_s = max(frames.longest_latency_s, latency_s)
+        self._close(key, frames)
+
+    def lost(self, address: FrameAddress) -> None:
+        """No answer to a frame will come: of its instant no time can be told."""
+        key = self._instant_of.pop(address, None)
+        if key is None:
+            return
+        frames = self._instants[key]
+        frames.unanswered.discard(address)
+        self._path.lost(key)
+        self._close(key, frames)
+
+    def _close(self, key: Hashable, frames: InstantOnPath) -> None:
+        """Learn of the path from an instant that is over."""
+        if not frames.is_over:
+            return
+        del self._instants[key]
+        if frames.answered_s is not None:
+            self._path.answered(key, _ns(frames.answered_s))
+            self._adapt(frames.longest_latency_s, frames.answered_s)
+
+    def _adapt(self, latency_s: float, now: float) -> None:
+        """Use less of the room when a frame, or the last of an instant, was late; else more."""
         if latency_s <= self._max_delay_s:
             self._share = min(1.0, self._share + GROW)
         elif now - latency_s >= self._cut_s:
             self._share = max(LEAST_SHARE, SHRINK * self._share)
             self._cut_s = now
-
-    def lost(self, address: FrameAddress) -> None:
-        """No answer to a frame will come."""
-        self._path.lost(address)
 
 
 class QualitySteps:

@@ -13,19 +13,27 @@ from typing import Self
 import grpc
 
 from cav_agent.config import AgentConfig
-from rfcore.errors import InvalidInput, RfedgeError, UnknownField
+from rfcore.errors import AccessDenied, InvalidInput, RfedgeError, UnknownField
 from rfcore.wire.address import Address, check_handshake
 from rfcore.wire.checks import check_field_id
-from rfcore.wire.conventions import CHANNEL_OPTIONS
+from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER
 from rfcore.wire.tiles import MAX_TILES, Tile, tile_of
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 
-__all__ = ["WHOLE_STREET", "ServerConnection", "server_connections"]
+__all__ = ["WHOLE_STREET", "ServerConnection", "retry_after_s", "server_connections"]
 
 ASK_AFTER_S = 1.0
 """A server that does not connect within this time is asked whether it refuses the handshake."""
+
+REFUSED = (grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.UNAUTHENTICATED)
+
+LIST_S = 10.0
+"""How long a connected server may take to list its tiles."""
+
+LONGEST_RETRY_AFTER_S = 30.0
+"""A server that is full says when to try again; no longer than this is waited."""
 
 WHOLE_STREET = "street"
 """Name of the only tile of a server that publishes none."""
@@ -86,26 +94,29 @@ class ServerConnection:
         try:
             await self.wait_until_ready(within_s)
         except TimeoutError as error:
-            raise self._no_server(within_s) from error
+            raise self._no_server(within_s or 0.0) from error
         return self.channel
 
     async def published_tiles(self, within_s: float | None) -> tuple[Tile, ...]:
         """Return the tiles the server publishes; without tiles, its only field, everywhere.
 
         Raises ``UnknownField`` for several fields without tiles, ``InvalidInput`` for a wrong tile,
+        ``AccessDenied`` when the certificate does not permit it,
         ``RfedgeError`` when no answer comes within ``within_s``.
         """
         stub = FieldServiceStub(await self.require(within_s))
         try:
-            async with asyncio.timeout(within_s):
+            async with asyncio.timeout(LIST_S if within_s is None else within_s):
                 listed = await stub.ListFields(pb.ListFieldsRequest(), wait_for_ready=True)
         except TimeoutError as error:
-            raise self._no_server(within_s) from error
+            raise self._no_server(within_s or LIST_S) from error
         except grpc.aio.AioRpcError as error:
+            if error.code() in REFUSED:
+                raise AccessDenied(f"{self.address}: {error.details()}") from error
             raise RfedgeError(f"the server does not list its fields: {error.details()}") from error
         return _tiles_of(listed)
 
-    def _no_server(self, within_s: float | None) -> RfedgeError:
+    def _no_server(self, within_s: float) -> RfedgeError:
         return RfedgeError(f"no server at {self.address} within {within_s:g} s")
 
     async def _ready_by_tls(self) -> None:
@@ -146,3 +157,11 @@ def _tiles_of(listed: pb.ListFieldsResponse) -> tuple[Tile, ...]:
         here = ", ".join(listed.field_ids) or "none"
         raise UnknownField(f"the server holds several fields or none ({here}); choose with --field")
     return (Tile(WHOLE_STREET, check_field_id("field", listed.field_ids[0])),)
+
+
+def retry_after_s(error: grpc.aio.AioRpcError) -> float:
+    """Return how long a server that refused a call asks to be left alone; 0: it did not say."""
+    for key, value in error.trailing_metadata():
+        if key == RETRY_AFTER and isinstance(value, str) and value.isdecimal():
+            return min(int(value) / 1e3, LONGEST_RETRY_AFTER_S)
+    return 0.0

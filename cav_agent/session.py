@@ -1,11 +1,12 @@
-"""The vehicle's side of one camera's stream: a state machine without socket, clock or encoder.
+"""The vehicle's side of one stream: a state machine without socket, clock or encoder.
 
-``cav_agent.client`` moves bytes and time in and out of it. ``offer`` takes a captured picture into
-a slot where the newest wins; ``job_to_start`` hands one out for encoding when the server's credit
-allows; ``encoded`` brings the packet back; ``messages_to_send`` has what goes up, ``receive`` takes
-what came down; ``get_timer`` says when ``handle_timer`` wants to be called; ``take_results`` tells
-how each picture ended.
+``cav_agent.client`` moves bytes and time in and out of it. ``offer`` takes a captured picture, or
+those of one instant of a rig, into a slot where the newest wins; ``job_to_start`` hands one out for
+encoding when the server's credit allows; ``encoded`` brings the packet back; ``messages_to_send``
+has what goes up, ``receive`` takes what came down; ``get_timer`` says when ``handle_timer`` wants
+to be called; ``take_results`` tells how each picture ended.
 
+Each camera has its own epochs and credits, so what is wrong with one leaves the others alone.
 Pictures are dropped only before they are encoded. A frame is predicted from the one sent before it,
 as if that had arrived. After a Nack a new epoch begins, and its first frame goes back to the last
 one that the server is known to have decoded; after a lost connection, or when the server does not
@@ -16,9 +17,11 @@ frame is ever predicted from another.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from cav_agent.bit_division import BitDivision
 from cav_agent.config import AgentLimits
 from cav_agent.frames import (
     Capture,
@@ -31,8 +34,11 @@ from cav_agent.frames import (
 )
 from cav_agent.frames_in_flight import FramesInFlight, PredictionChain
 from cav_agent.rate_control import ByteBudget, RateControl
+from cav_agent.waiting_instants import WaitingInstants
+from rfcore.camera import Pose
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
-from rfcore.wire.checks import MAX_PAYLOAD_BYTES
+from rfcore.localise.fix import State
+from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, MAX_PAYLOAD_BYTES
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import (
     Ack,
@@ -71,12 +77,27 @@ class OutgoingMessage:
         return cls(message, client_message_to_bytes(message))
 
 
-class AgentSession:
-    """One camera's stream to one server; ``hello`` names that camera first.
+@dataclass
+class SendingCamera:
+    """What is known of one camera: which frames it predicts from, and how many it may send."""
 
-    ``rate_control`` says how many bytes each frame may take; without it all have the configured
-    CRF. ``failed`` is set when the server refused the vehicle's Hello, ``broken`` when it did not
-    answer in time; either ends the stream.
+    chain: PredictionChain
+    granted: int = 0
+    used: int = 0
+
+    @property
+    def may_send(self) -> bool:
+        """Whether the server's credit allows another frame."""
+        return self.used < self.granted
+
+
+class AgentSession:
+    """The stream of the cameras of ``hello`` to one server.
+
+    ``rate_control`` says how many bytes each instant may take, and ``bit_division`` how its
+    cameras share them; without the former all have the configured CRF. ``failed`` is set when the
+    server refused the vehicle's Hello, ``broken`` when it did not answer in time; either ends the
+    stream.
     """
 
     def __init__(
@@ -84,6 +105,7 @@ class AgentSession:
         hello: Hello,
         limits: AgentLimits | None = None,
         rate_control: RateControl | None = None,
+        bit_division: BitDivision | None = None,
         *,
         first_epoch: int = 0,
     ) -> None:
@@ -94,15 +116,18 @@ class AgentSession:
         self.failed: RfedgeError | None = None
         self.broken: StreamEnd | None = None
         self._hello = hello
-        self._camera_id = hello.cameras[0].camera_id
+        self._first_camera_id = hello.cameras[0].camera_id
         self._limits = limits or AgentLimits()
         self._rate_control = rate_control
-        self._chain = PredictionChain(first_epoch)
+        self._bit_division = bit_division or BitDivision({})
+        self._budgets: dict[str, ByteBudget] = {}
+        self._cameras = {
+            camera.camera_id: SendingCamera(PredictionChain(first_epoch))
+            for camera in hello.cameras
+        }
         self._in_flight = FramesInFlight(self._limits.answer_s)
         self._connection = 0
-        self._granted = 0
-        self._used = 0
-        self._slot: deque[Capture] = deque()
+        self._slot = WaitingInstants(self._limits.slot_frames, lambda c: self._of(c).may_send)
         self._job: EncodeJob | None = None
         self._outbox: deque[OutgoingMessage] = deque()
         self._results: deque[FrameResult] = deque()
@@ -110,13 +135,16 @@ class AgentSession:
 
     @property
     def epoch(self) -> int:
-        """The epoch of the next packet."""
-        return self._chain.epoch
+        """The highest epoch of the cameras' next packets."""
+        return max(camera.chain.epoch for camera in self._cameras.values())
 
     @property
     def is_idle(self) -> bool:
         """Whether no picture waits, is being encoded or is unanswered."""
         return not (self._slot or self._job or self._in_flight)
+
+    def _of(self, camera_id: str) -> SendingCamera:
+        return self._cameras[camera_id or self._first_camera_id]
 
     # --- connection
 
@@ -125,7 +153,8 @@ class AgentSession:
         self.state = LinkState.GREETING
         self.broken = None
         self._connection += 1
-        self._granted = self._used = 0
+        for camera in self._cameras.values():
+            camera.granted = camera.used = 0
         self._greeting_until_s = now + self._limits.greeting_s
         self._in_flight.stream_opened()
         self._outbox.append(OutgoingMessage.of(self._hello))
@@ -136,14 +165,14 @@ class AgentSession:
         self._outbox.clear()
         for address in self._in_flight.addresses:
             self._finish(address, Outcome.LOST, end.reason, end.problem, now)
-        self._chain.forget()
-        self._chain.restart()
+        for camera in self._cameras.values():
+            camera.chain.forget()
+            camera.chain.restart()
 
     def abandon(self, end: StreamEnd, now: float) -> None:
         """End every picture that was taken: nobody will encode or send any more of them."""
-        for capture in self._slot:
+        for capture in self._slot.clear():
             self._results.append(FrameResult(capture, Outcome.LOST, end.reason, end.problem))
-        self._slot.clear()
         if self._job is not None:
             capture = self._take_job().capture
             self._results.append(FrameResult(capture, Outcome.LOST, end.reason, end.problem))
@@ -158,8 +187,9 @@ class AgentSession:
                 self.state = LinkState.STREAMING
                 self.session_id, self.exact = session_id, exact
                 self.rate_limit_hz = message.rate_hz
-            case Credit(camera_id, frames) if camera_id == self._camera_id:
-                self._granted = max(self._granted, frames)
+            case Credit(camera_id, frames) if camera_id in self._cameras:
+                camera = self._cameras[camera_id]
+                camera.granted = max(camera.granted, frames)
             case Ack():
                 self._acked(message, now)
             case Nack():
@@ -173,7 +203,7 @@ class AgentSession:
             return
         packet = frame.result.packet
         if packet is not None and packet.reconstruction_digest == ack.reconstruction_digest:
-            self._chain.decoded(ack.address)
+            self._of(ack.address.camera_id).chain.decoded(ack.address)
         self._finish(ack.address, Outcome.ACKED, EndReason.NONE, "", now)
 
     def _nacked(self, nack: Nack, now: float) -> None:
@@ -181,10 +211,12 @@ class AgentSession:
             self.failed = ProtocolError(f"the server refused this vehicle's Hello: {nack.problem}")
             return
         self._end_refused(nack, now)
-        is_over = nack.address.camera_id != "" and nack.address.epoch < self.epoch
-        if is_over and nack.current_epoch <= self.epoch:
-            return  # it follows from a loss that a new epoch has answered already
-        self._chain.restart(nack.current_epoch)
+        camera_id = nack.address.camera_id
+        if camera_id == "":
+            for camera in self._cameras.values():
+                camera.chain.restart(nack.current_epoch)
+        elif camera_id in self._cameras:
+            _restart_after(nack, self._cameras[camera_id].chain)
 
     def _end_refused(self, nack: Nack, now: float) -> None:
         """End the frames that ``nack`` is about; an overloaded server has not looked at them."""
@@ -192,55 +224,69 @@ class AgentSession:
         outcome = Outcome.LOST if overloaded else Outcome.NACKED
         for address, frame in self._in_flight.refused_by(nack):
             if nack.reason is RejectReason.UNKNOWN_STATE:
-                self._chain.unknown_to_server(frame.base)
+                self._of(address.camera_id).chain.unknown_to_server(frame.base)
             self._finish(address, outcome, nack.reason, nack.problem, now)
 
     # --- pictures
 
-    def offer(self, capture: Capture) -> None:
-        """Take a picture; the oldest that waits is dropped when there is no room for it."""
-        if len(self._slot) >= self._limits.slot_frames:
-            self._drop(EndReason.SUPERSEDED)
-        self._slot.append(capture)
+    def offer(self, *captures: Capture) -> None:
+        """Take the pictures of an instant; what waits longest is dropped when there is no room."""
+        self._drop(self._slot.offer(captures), EndReason.SUPERSEDED)
         if self._rate_control is not None:
-            self._rate_control.captured(capture.captured_s)
+            self._rate_control.captured(captures[0].captured_s)
 
     def withdraw(self) -> None:
         """Let go what waits for the encoder, to be captured again for another server."""
-        while self._slot:
-            capture = self._slot.popleft()
+        for capture in self._slot.clear():
             self._results.append(FrameResult(capture, Outcome.LOST, EndReason.HANDED_OVER))
 
     def stop(self) -> None:
         """Drop what waits for the encoder; what is being encoded or unanswered goes on."""
-        while self._slot:
-            self._drop(EndReason.STOPPING)
+        self._drop(self._slot.clear(), EndReason.STOPPING)
 
-    def _drop(self, reason: EndReason) -> None:
-        self._results.append(FrameResult(self._slot.popleft(), Outcome.DROPPED, reason))
+    def _drop(self, captures: Iterable[Capture], reason: EndReason) -> None:
+        self._results.extend(FrameResult(c, Outcome.DROPPED, reason) for c in captures)
 
     def job_to_start(self, now: float) -> EncodeJob | None:
         """Return the picture to encode now; None without picture, credit, free encoder or room."""
         ready = self.state is LinkState.STREAMING and self._job is None
         self._drop_late(now)
-        if not ready or not self._slot or self._used >= self._granted:
+        if not ready or not (self._slot.is_begun or self._begin_instant(now)):
             return None
-        budget: ByteBudget | None = None
-        if self._rate_control is not None:
-            budget = self._rate_control.budget(self._slot[0].captured_s, now)
-            if budget is None:
-                return None
-        exact = bool(self.exact)
-        base = self._chain.base if exact else None
-        capture = self._slot.popleft()
-        self._job = EncodeJob(capture, self.epoch, self._connection, base, exact, budget)
-        self._chain.started()
+        capture = self._slot.next()
+        if capture is None:
+            return None
+        exact, chain = bool(self.exact), self._of(capture.camera_id).chain
+        base = chain.base if exact else None
+        budget = self._budgets.get(capture.camera_id)
+        self._job = EncodeJob(capture, chain.epoch, self._connection, base, exact, budget, now)
+        chain.started()
         return self._job
+
+    def _begin_instant(self, now: float) -> bool:
+        """Begin the instant that waits and divide its bytes; return whether that could be done."""
+        captures = self._slot.startable()
+        if not captures:
+            return False
+        control = self._rate_control
+        if control is not None:
+            first_s = min(capture.captured_s for capture in captures)
+            budget = control.budget(first_s, now, len(captures))
+            if budget is None:
+                return False
+            camera_ids = [capture.camera_id for capture in captures]
+            shares = self._bit_division.divide(budget.target_bytes, camera_ids)
+            self._budgets = {c: budget.with_target(size) for c, size in shares.items()}
+            control.begun(captures[0].instant, len(captures))
+        self._drop(self._slot.begin(), EndReason.SUPERSEDED)
+        return True
 
     def _drop_late(self, now: float) -> None:
         control = self._rate_control
-        while control is not None and self._slot and control.is_late(self._slot[0].captured_s, now):
-            self._drop(EndReason.TOO_LATE)
+        while control is not None and (waiting_s := self._slot.waiting_since_s) is not None:
+            if not control.is_late(waiting_s, now):
+                return
+            self._drop(self._slot.drop_oldest(), EndReason.TOO_LATE)
 
     def encoded(self, encoded: EncodedFrame, now: float) -> None:
         """The picture of the running job became ``encoded``: send it, if its stream still is."""
@@ -250,6 +296,8 @@ class AgentSession:
         payload_bytes, packet_bytes = len(encoded.packet.payload), len(outgoing.data)
         if self._rate_control is not None:
             self._rate_control.coded(encoded.sender_s, payload_bytes, packet_bytes)
+        if encoded.crf is not None:
+            self._bit_division.coded(job.capture.camera_id, payload_bytes, encoded.crf)
         result = FrameResult(
             job.capture,
             Outcome.LOST,
@@ -262,10 +310,12 @@ class AgentSession:
         if payload_bytes > MAX_PAYLOAD_BYTES:
             self._drop_oversize(frame, now)
         elif (obstacle := self._obstacle(job)) is not None:
+            self._not_sent(frame.instant)
             self._finish(frame.address, Outcome.LOST, *obstacle, now)
         else:
-            self._used += 1
-            self._chain.sent(frame.address)
+            camera = self._cameras[frame.camera_id]
+            camera.used += 1
+            camera.chain.sent(frame.address)
             self._outbox.append(outgoing)
 
     def _drop_oversize(self, frame: Frame, now: float) -> None:
@@ -273,14 +323,15 @@ class AgentSession:
         problem = (
             f"{size_bytes} bytes of payload exceed {MAX_PAYLOAD_BYTES} even at the highest CRF"
         )
+        self._not_sent(frame.instant)
         self._finish(frame.address, Outcome.DROPPED, EndReason.OVERSIZE, problem, now)
-        self._chain.restart()
+        self._cameras[frame.camera_id].chain.restart()
 
     def _obstacle(self, job: EncodeJob) -> tuple[EndReason, str] | None:
         """Return why the frame of ``job`` is not worth sending, or None."""
         if job.connection != self._connection or self.state is not LinkState.STREAMING:
             return EndReason.NOT_SENT, "the stream ended before it was sent"
-        if job.epoch != self.epoch and job.base is not None:
+        if job.epoch != self._of(job.capture.camera_id).chain.epoch and job.base is not None:
             return EndReason.BASE_LOST, "the frame it needs was not decoded"
         return None
 
@@ -289,7 +340,12 @@ class AgentSession:
         capture = self._take_job().capture
         result = FrameResult(capture, Outcome.DROPPED, EndReason.NOT_CODED, str(error))
         self._results.append(result)
-        self._chain.restart()
+        self._not_sent(capture.instant)
+        self._of(capture.camera_id).chain.restart()
+
+    def _not_sent(self, instant: int) -> None:
+        if self._rate_control is not None:
+            self._rate_control.not_sent(instant)
 
     def _take_job(self) -> EncodeJob:
         if self._job is None:
@@ -299,12 +355,15 @@ class AgentSession:
 
     def _frame(self, capture: Capture, encoded: EncodedFrame) -> Frame:
         return Frame(
-            self._camera_id,
+            capture.camera_id or self._first_camera_id,
             capture.capture_time_ns,
-            encoded.pose or capture.picture.camera.world_from_cam,
-            b"",  # the field of Hello; an agent has one
+            _pose_to_send(capture, encoded),
+            bytes.fromhex(encoded.field_id)[:FIELD_ID_PREFIX_BYTES],
             encoded.packet,
             encoded.rung.quality,
+            capture.clock,
+            _localisation(encoded),
+            capture.instant,
         )
 
     def _finish(
@@ -345,7 +404,8 @@ class AgentSession:
             return  # a Nack that names no frame ended it; it is sent since it has used its credit
         self._in_flight.sent(address, now)
         if self._rate_control is not None:
-            self._rate_control.sent(address, packet_bytes, now)
+            instant = self._in_flight.instant_of(address)
+            self._rate_control.sent(address, packet_bytes, now, instant)
 
     def take_results(self) -> list[FrameResult]:
         """Return, once, the pictures that came to an end."""
@@ -373,3 +433,25 @@ class AgentSession:
             waited_s = self._in_flight.longest_wait_s(now)
             problem = f"no answer to a frame within {waited_s:.2g} s"
             self.broken = StreamEnd(EndReason.NO_ANSWER, problem)
+
+
+def _restart_after(nack: Nack, chain: PredictionChain) -> None:
+    """Begin an epoch, unless it follows from a loss that a new one has answered already."""
+    if nack.address.epoch < chain.epoch and nack.current_epoch <= chain.epoch:
+        return
+    chain.restart(nack.current_epoch)
+
+
+def _localisation(encoded: EncodedFrame) -> State | None:
+    """Return how the frame's pose was found in the field, in its own picture or the reference's."""
+    found = encoded.fix or encoded.world_from_rig
+    return None if found is None else found.state
+
+
+def _pose_to_send(capture: Capture, encoded: EncodedFrame) -> Pose | None:
+    """Return the pose that a frame was coded at; ``None`` if the camera is lost."""
+    if encoded.world_from_rig is not None:
+        return encoded.world_from_rig.world_from_rig
+    if encoded.fix is not None:
+        return encoded.fix.world_from_cam
+    return encoded.pose or capture.picture.camera.world_from_cam

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
+from cav_agent.backoff import Backoff
 from cav_agent.client import StreamClient, StreamObserver
 from cav_agent.handover import ServedTile
 
@@ -19,6 +20,9 @@ OpenStream = Callable[[StreamObserver], StreamClient]
 
 PrepareStream = Callable[[ServedTile], Awaitable[OpenStream]]
 """Fetches and opens a tile's field; returns how to open streams with it."""
+
+FIRST_RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
+"""Until a stream that failed is opened again: longer with every failure in a row."""
 
 
 class TileStream:
@@ -35,6 +39,7 @@ class TileStream:
         self._open: OpenStream | None = None
         self._preparing: asyncio.Task[OpenStream] | None = None
         self._running: asyncio.Task[None] | None = None
+        self._backoff = Backoff(FIRST_RETRY_S, LONGEST_RETRY_S)
 
     @property
     def is_streaming(self) -> bool:
@@ -84,9 +89,17 @@ class TileStream:
         if self._running is not None:
             await self._running
 
+    def hold_back(self, now: float) -> float:
+        """Try nothing for a while, since something failed; return for how many seconds."""
+        pause_s = self._backoff.next_s()
+        self.retry_at_s = now + pause_s
+        return pause_s
+
     def collect(self) -> BaseException | None:
         """Take note of tasks that ended; return the error with which one did."""
         error = None
+        if self.is_streaming:
+            self._backoff.reset()
         if self._preparing is not None and self._preparing.done():
             error = self._preparing.exception()
             self._preparing = None

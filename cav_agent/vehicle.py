@@ -8,43 +8,74 @@ and brings the answer back to the session, and the controller hears how it ended
 from __future__ import annotations
 
 import asyncio
+import os
+import sys
+import threading
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import AsyncExitStack
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import structlog
 from prometheus_client import CollectorRegistry
 
+from cav_agent.backoff import Backoff
+from cav_agent.bit_division import BitDivision
+from cav_agent.capture_schedule import CaptureSchedule, Lockstep
 from cav_agent.client import CameraSource, StreamClient, StreamObserver
 from cav_agent.config import AgentConfig, PaceKind
-from cav_agent.field_cache import FieldCache, PreparedField, read_drive
+from cav_agent.drive_pictures import OneCamera, VehiclePictures
+from cav_agent.field_cache import FieldCache, PreparedCamera, PreparedField, read_drive
 from cav_agent.frame_log import DriveObserver, FrameLog
+from cav_agent.frames import EncodedFrame, EncodeJob, RetryReason
 from cav_agent.handover import ServedTile
 from cav_agent.handover_controller import HandoverController
+from cav_agent.live.camera import LiveCamera, TrajectoryPoses, open_camera
+from cav_agent.live.rig import LiveRig, open_rig
 from cav_agent.metrics import AgentMetrics
-from cav_agent.pipeline import Pipeline, PipelineOptions
+from cav_agent.pipeline import OnRig, Pipeline, PipelineOptions, Tracking
+from cav_agent.pose_feed.feed import FieldFeed, PoseFeed
+from cav_agent.pose_feed.following import FollowedFeed
+from cav_agent.pose_feed.placing import Place
+from cav_agent.pose_feed.settings import SourceKind
+from cav_agent.pose_feed.sources import FeedTask
 from cav_agent.rate_control import RateControl
+from cav_agent.rig_poses import DrivenRig, MeasuredRig, RigPoses, TrackedRig
 from cav_agent.server_connection import WHOLE_STREET, ServerConnection, server_connections
 from cav_agent.session import AgentSession
 from cav_agent.tile_stream import OpenStream
 from rfcore.camera import TileOrigin
-from rfcore.errors import RfedgeError
+from rfcore.dataset.rig import read_rig, read_rig_drive
+from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.field import RadianceField
+from rfcore.wire.checks import check_name
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.instruments import MetricsEndpoint
 from rfcore.wire.messages import CameraDescription, Hello, RendererContract
 from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.tiles import Tile
 
-__all__ = ["Vehicle"]
+__all__ = ["SEARCH_NICENESS", "Vehicle", "yield_to_frames"]
+
+SEARCH_NICENESS = 5
+"""By how much the thread that searches poses yields: beside it frames take as long as alone (25 ms
+on two cores with other work; beside one of their own priority 45). At 10 they take no less, and
+other work keeps the search from ending."""
+_NO_ROUTE = (
+    "the street has several tiles, and a live camera without a trajectory does not say which of "
+    "them it passes: name the one field with --field, or give [trajectory] in camera.toml"
+)
 
 log = structlog.get_logger()
 
-RETRY_S = 2.0
-"""Until a server that did not list its tiles is asked again."""
+FIRST_RETRY_S, LONGEST_RETRY_S = 0.5, 5.0
+"""Until a server that did not list its tiles is asked again. Vehicles learn from the list that a
+field was replaced, so it is asked for more often than a stream that was refused is opened."""
 
 
 class Vehicle:
@@ -56,6 +87,8 @@ class Vehicle:
         self._config = config
         self._metrics = AgentMetrics(self.registry)
         self._stopped = asyncio.Event()
+        self._live: LiveCamera | LiveRig | None = None
+        self._picture_arrived: Callable[[], None] = lambda: None
 
     def stop(self) -> None:
         """Finish the frame in flight, then end."""
@@ -68,15 +101,12 @@ class Vehicle:
             self._metrics.identify(config.vehicle, config.camera)
         _serve_metrics(config.metrics, self.registry)
         with structlog.contextvars.bound_contextvars(vehicle=config.vehicle):
-            pictures = await asyncio.to_thread(read_drive, config, TileOrigin())
-            positions = [picture.camera.world_from_cam.translation_m[:2] for picture in pictures]
+            way = await asyncio.to_thread(_way, config)
             async with AsyncExitStack() as stack:
-                return await self._drive(await self._controller(stack, positions))
+                return await self._drive(await self._controller(stack, way))
 
-    async def _controller(
-        self, stack: AsyncExitStack, positions: Sequence[tuple[float, float]]
-    ) -> HandoverController:
-        """Open what the drive needs; ``stack`` closes it."""
+    async def _controller(self, stack: AsyncExitStack, way: Way) -> HandoverController:
+        """Open what the drive along ``way`` needs; ``stack`` closes it."""
         config = self._config
         encoder = stack.enter_context(ThreadPoolExecutor(1, "encoder"))
         for server in self._servers:
@@ -87,10 +117,72 @@ class Vehicle:
             stack.callback(frame_log.close)
         addresses = [server.address for server in self._servers]
         observer = DriveObserver(self._metrics, addresses, frame_log)
-        fields = FieldCache(config, self._servers, observer)
+        live = self._live = await self._open_source(stack, observer)
+        pictures: VehiclePictures | None = live if isinstance(live, LiveRig) else None
+        if isinstance(live, LiveCamera):
+            pictures = OneCamera(config.camera, live.pictures, config.steering)
+        fields = FieldCache(config, self._servers, observer, pictures)
         stack.push_async_callback(fields.close)
-        streams = StreamFactory(config, self._servers, fields, encoder)
-        return HandoverController(config, positions, streams.prepare, observer)
+        feed = await self._open_feed(stack, observer)
+        searcher = stack.enter_context(
+            ThreadPoolExecutor(1, "localiser", initializer=yield_to_frames)
+        )
+        streams = StreamFactory(config, self._servers, fields, encoder, searcher, feed, live)
+        if live is None:
+            return HandoverController(
+                config, way.positions, streams.prepare, observer, way.schedule
+            )
+        controller = HandoverController(
+            config, live.positions, streams.prepare, observer, live.schedule
+        )
+        self._picture_arrived = controller.picture_arrived
+        return controller
+
+    async def _open_source(
+        self, stack: AsyncExitStack, observer: DriveObserver
+    ) -> LiveCamera | LiveRig | None:
+        """Begin to read the live cameras, if there are any; ``stack`` ends it."""
+        config, loop = self._config, asyncio.get_running_loop()
+        rig = None if config.rig is None else read_rig(config.rig)
+        if config.live.source is None and (rig is None or not rig.is_live):
+            return None
+
+        def arrived() -> None:
+            loop.call_soon_threadsafe(lambda: self._picture_arrived())
+
+        open_live = open_camera if rig is None else partial(open_rig, rig)
+        live: LiveCamera | LiveRig = await asyncio.to_thread(
+            open_live,
+            config.live,
+            config.rate,
+            observer,
+            has_feed=config.feed.source is not None,
+            repeats=config.loop,
+            arrived=arrived,
+        )
+        stack.push_async_callback(asyncio.to_thread, live.close)
+        if config.neighbours and not live.knows_route:
+            raise RfedgeError(_NO_ROUTE)
+        return live
+
+    async def _open_feed(self, stack: AsyncExitStack, observer: DriveObserver) -> PoseFeed | None:
+        """Begin to read the vehicle's own poses, if it has any; ``stack`` ends it.
+
+        A file is read before the drive begins.
+        """
+        settings = self._config.feed
+        source = settings.source
+        if source is None:
+            return None
+        recorded = source.kind is SourceKind.FILE
+        offset_s = settings.feed_offset_s
+        feed = PoseFeed(observer.feed_problem, offset_s=offset_s, recorded=recorded)
+        task = FeedTask(source, feed, time.time_ns, observer.feed_heard)
+        if recorded:
+            await task.run()
+            return feed
+        stack.push_async_callback(_cancelled, asyncio.create_task(task.run()))
+        return feed
 
     async def _drive(self, controller: HandoverController) -> Counter[str]:
         """Drive while learning what servers publish, until the end or ``stop``."""
@@ -117,19 +209,24 @@ class Vehicle:
         """Tell the controller what a server publishes, and again whenever that changes."""
         server = self._servers[number]
         is_known = False
+        backoff = Backoff(FIRST_RETRY_S, LONGEST_RETRY_S)
         while True:
+            server.fields_changed.clear()
             try:
                 tiles = await self._tiles(server)
             except RfedgeError as error:
-                if len(self._servers) == 1 and not is_known:
+                if len(self._servers) == 1 and not is_known and not _may_pass(error, self._config):
                     raise
+                controller.retrying(RetryReason.TILES)
                 log.warning("tiles not listed", server=str(server.address), problem=str(error))
-                await asyncio.sleep(RETRY_S)
+                await asyncio.sleep(backoff.next_s())
                 continue
+            backoff.reset()
+            if self._live is not None and len(tiles) > 1 and not self._live.knows_route:
+                raise RfedgeError(_NO_ROUTE)
             controller.tiles_published(number, [ServedTile(number, tile) for tile in tiles])
             is_known = True
             await server.fields_changed.wait()
-            server.fields_changed.clear()
 
     async def _tiles(self, server: ServerConnection) -> tuple[Tile, ...]:
         config = self._config
@@ -139,7 +236,8 @@ class Vehicle:
 
 
 class StreamFactory:
-    """Makes the clients of new streams, whose frames are encoded one at a time on ``encoder``."""
+    """Makes the clients of new streams, whose frames are encoded one at a time on ``encoder``,
+    and whose poses are searched on ``searcher``."""
 
     def __init__(
         self,
@@ -147,11 +245,17 @@ class StreamFactory:
         servers: Sequence[ServerConnection],
         fields: FieldCache,
         encoder: Executor,
+        searcher: Executor,
+        feed: PoseFeed | None = None,
+        live: LiveCamera | LiveRig | None = None,
     ) -> None:
         self._config = config
         self._servers = tuple(servers)
         self._fields = fields
         self._encoder = encoder
+        self._searcher = searcher
+        self._feed = feed
+        self._live = live
         self._sessions: deque[AgentSession] = deque(maxlen=4)
 
     async def prepare(self, served: ServedTile) -> OpenStream:
@@ -162,38 +266,172 @@ class StreamFactory:
     def _client(
         self, server: ServerConnection, prepared: PreparedField, observer: StreamObserver
     ) -> StreamClient:
-        config = self._config
-        pipeline = Pipeline(
-            prepared.field,
-            prepared.codec,
-            time.perf_counter_ns,
-            PipelineOptions(
-                rungs=prepared.rungs,
-                steering=prepared.steering,
-                threads=config.render.threads,
-            ),
+        places = self._places_on_rig(prepared)
+        pipelines = {
+            camera.camera.camera_id: self._pipeline(prepared, camera, on_rig)
+            for camera, on_rig in zip(prepared.cameras, places, strict=True)
+        }
+
+        def encode(job: EncodeJob) -> EncodedFrame:
+            return pipelines[job.capture.camera_id].encode(job)
+
+        session = self._session(self._hello(prepared, pipelines), prepared)
+        source = CameraSource(prepared.pictures.take, encode, self._encoder)
+        return StreamClient(server, session, source, observer, self._config.limits)
+
+    def _pipeline(
+        self, prepared: PreparedField, camera: PreparedCamera, on_rig: OnRig | None
+    ) -> Pipeline:
+        config, field = self._config, prepared.field
+        is_alone = on_rig is None
+        options = PipelineOptions(
+            check_decode=config.coding.check_decode,
+            rungs=prepared.rungs,
+            steering=camera.steering,
+            threads=config.render.threads,
+            lights=None if config.localise else prepared.lights,
+            feed=self._poses(field) if is_alone and not config.localise else None,
+            tracking=self._tracking(prepared) if is_alone and config.localise else None,
+            on_rig=on_rig,
         )
-        session = self._session(self._hello(prepared, pipeline))
-        source = CameraSource(prepared.pictures, pipeline.encode, self._encoder)
-        return StreamClient(server, session, source, observer, config.limits)
+        return Pipeline(field, camera.codec, time.perf_counter_ns, options)
 
-    def _hello(self, prepared: PreparedField, pipeline: Pipeline) -> Hello:
+    def _places_on_rig(self, prepared: PreparedField) -> list[OnRig | None]:
+        """Return what says where each camera is, from the first, the rig's reference camera."""
+        extrinsics = [camera.camera.camera_from_rig for camera in prepared.cameras]
+        reference = extrinsics[0]
+        if reference is None:
+            return [None]
+        measured = self._poses(prepared.field)
+        poses: RigPoses = DrivenRig() if measured is None else MeasuredRig(measured, reference)
+        tracked = None
+        if self._config.localise:
+            poses = tracked = TrackedRig(self._tracking(prepared), reference, poses)
+        return [
+            OnRig(camera_from_rig, poses, None if i else tracked)
+            for i, camera_from_rig in enumerate(extrinsics)
+            if camera_from_rig is not None
+        ]
+
+    def _tracking(self, prepared: PreparedField) -> Tracking:
+        """Return what finds the camera in a field; imports OpenCV, which nothing else here needs.
+
+        Raises ``RfedgeError`` where the extra is not installed.
+        """
+        from cav_agent.tracking import CameraTracking, DatasetPoses
+
+        field, config = prepared.field, self._config
+        poses = self._poses(field)
+        return CameraTracking(
+            field,
+            prepared.cameras[0].camera.intrinsics,
+            poses or DatasetPoses(),
+            self._searcher,
+            bounds=field.bounds,
+            patient=config.pace is PaceKind.LOCKSTEP,
+        )
+
+    def _poses(self, field: RadianceField) -> FollowedFeed | TrajectoryPoses | None:
+        """Return what says where the camera is in a field's axes, if not the pictures do."""
+        trajectory = self._live and self._live.poses(field.metadata.tile_origin)
+        return trajectory or self._followed(field)
+
+    def _followed(self, field: RadianceField) -> FollowedFeed | None:
+        """Return the feed's poses in a field's axes."""
+        feed, config = self._feed, self._config
+        if feed is None:
+            return None
+        metadata = field.metadata
+        place = Place(metadata.anchor, metadata.tile_origin, config.feed.mount)
+        in_field = FieldFeed(feed, place, field.bounds)
+        return FollowedFeed(in_field, recorded=feed.recorded, rate_hz=config.rate)
+
+    def _hello(self, prepared: PreparedField, pipelines: Mapping[str, Pipeline]) -> Hello:
         config = self._config
-        intrinsics = prepared.pictures[0].camera.intrinsics
         rate_hz = config.rate if config.pace is PaceKind.REALTIME else 0.0
-        camera = CameraDescription(config.camera, intrinsics, pipeline.header, rate_hz)
+        cameras = tuple(
+            CameraDescription(
+                camera.camera_id,
+                camera.intrinsics,
+                pipelines[camera.camera_id].header,
+                rate_hz,
+                camera.camera_from_rig,
+            )
+            for camera in prepared.pictures.cameras
+        )
         contract = RendererContract(RENDERER_CONTRACT, exact=True)
-        return Hello(config.vehicle, (camera,), (prepared.field.field_id,), contract)
+        fields = prepared.field_ids
+        return Hello(config.vehicle, cameras, fields, contract, config.allow_recording)
 
-    def _session(self, hello: Hello) -> AgentSession:
+    def _session(self, hello: Hello, prepared: PreparedField) -> AgentSession:
         """Return a session whose epochs none of the last sessions has used: packets of one camera
         that overlap at a handover have different addresses."""
         first_epoch = max((session.epoch for session in self._sessions), default=-1) + 1
         delay_ms = self._config.max_delay_ms
         rate_control = None if delay_ms is None else RateControl(delay_ms / 1e3)
-        session = AgentSession(hello, self._config.limits, rate_control, first_epoch=first_epoch)
+        cameras = prepared.pictures.cameras
+        division = BitDivision({camera.camera_id: camera.priority for camera in cameras})
+        session = AgentSession(
+            hello, self._config.limits, rate_control, division, first_epoch=first_epoch
+        )
         self._sessions.append(session)
         return session
+
+
+@dataclass(frozen=True)
+class Way:
+    """Where a recorded drive goes, (east, north) in metres, and when its pictures are captured if
+    not as ``HandoverController`` decides."""
+
+    positions: Sequence[tuple[float, float]] = ()
+    schedule: CaptureSchedule | None = None
+
+
+def _way(config: AgentConfig) -> Way:
+    """Read the drive that ``config`` names; empty for cameras that send now."""
+    if config.rig is not None:
+        return _way_of_rig(config, config.rig)
+    if config.drive is None:
+        return Way()
+    pictures = read_drive(config, TileOrigin())
+    return Way([picture.camera.world_from_cam.translation_m[:2] for picture in pictures])
+
+
+def _way_of_rig(config: AgentConfig, file: Path) -> Way:
+    rig = read_rig(file)
+    for camera in rig.cameras:
+        check_name("rig.camera.name", camera.name)
+    if rig.is_live:
+        if config.pace is not PaceKind.REALTIME:
+            raise InvalidInput("pace", f"{config.pace}: a live camera does not wait, use realtime")
+        return Way()
+    instants = read_rig_drive(rig)
+    schedule = None
+    if config.pace is PaceKind.LOCKSTEP:
+        schedule = Lockstep(len(instants), cameras=len(rig.cameras), loop=config.loop)
+    return Way([instant.world_from_rig.translation_m[:2] for instant in instants], schedule)
+
+
+def yield_to_frames() -> None:
+    """Let every other thread go before the calling one; Linux alone has a niceness of threads."""
+    if sys.platform == "linux":
+        thread = threading.get_native_id()
+        niceness = os.getpriority(os.PRIO_PROCESS, thread) + SEARCH_NICENESS
+        os.setpriority(os.PRIO_PROCESS, thread, min(niceness, 19))
+
+
+def _may_pass(error: RfedgeError, config: AgentConfig) -> bool:
+    """Whether a server that did not list its tiles at the start may do so later, and is waited for.
+
+    A refused certificate, or a choice of field that is missing, is the vehicle's own mistake.
+    """
+    return type(error) is RfedgeError and not config.limits.give_up_s
+
+
+async def _cancelled(task: asyncio.Task[None]) -> None:
+    """Cancel a task and wait until it has ended."""
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
 
 
 def _serve_metrics(settings: MetricsSettings, registry: CollectorRegistry) -> None:

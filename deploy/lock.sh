@@ -21,3 +21,10 @@ for name in test demo runtime full; do
 	cp "$work/locked.txt" "$work/all.txt"
 done
 grep '^torch==' "$work/test.in" > requirements/torch.txt
+# The fuzzer, which only `make fuzz` installs, beside what is there.
+"$PYTHON" -c 'import tomllib; g = tomllib.load(open("pyproject.toml", "rb"))["dependency-groups"]
+print(*g["fuzz"], sep="\n")' > "$work/fuzz.in"
+"$PYTHON" -m piptools compile -q --generate-hashes --strip-extras --no-header --no-annotate \
+	--no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-emit-options \
+	-o "$work/fuzz.txt" "$work/fuzz.in"
+grep -v '^#' "$work/fuzz.txt" | grep . > requirements/fuzz.txt

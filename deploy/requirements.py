@@ -19,9 +19,9 @@ __all__ = ["ONLY_FULL", "SETS", "requirements"]
 ONLY_FULL = frozenset({"matplotlib", "jinja2"})
 """Base dependencies that only reports need: the services and `rfedge link` start without them."""
 SETS = {
-    "runtime": (("ops",), ()),
-    "full": (("ops", "eval"), ()),
-    "demo": ((), ("build",)),
+    "runtime": (("ops", "twin"), ()),
+    "full": (("ops", "eval", "twin"), ()),
+    "demo": (("twin",), ("build",)),
     "test": (None, ("build", "test", "check")),
 }
 """Extras (None: all) and dependency groups of each set, beside the base dependencies."""

@@ -22,6 +22,7 @@ def main() -> None:
     try:
         config = tyro.cli(ServerConfig, config=OPTIONS, prog="mec-server")
         configure_logs(sys.stderr, config.log)
+        config.render.check()
         asyncio.run(serve(config))
     except (RfedgeError, OSError) as error:
         print(f"mec-server: {error}", file=sys.stderr)

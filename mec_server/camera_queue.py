@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, shown
-from rfcore.wire.messages import Credit, Frame, FrameAddress, Hello
+from rfcore.wire.messages import CameraDescription, Credit, Frame, FrameAddress, Hello
 
 __all__ = [
     "MAX_EPOCH_STEP",
@@ -161,12 +161,14 @@ class SessionCameras:
     def __init__(self, window: int) -> None:
         self._window = window
         self._queues: dict[str, CameraQueue] = {}
+        self._descriptions: dict[str, CameraDescription] = {}
         self._fields: dict[bytes, str] = {}
 
     def open(self, hello: Hello) -> None:
         """Make a queue for each camera of ``hello``, and know its fields by their prefixes."""
         for camera in hello.cameras:
             self._queues[camera.camera_id] = CameraQueue(self._window)
+            self._descriptions[camera.camera_id] = camera
         for field_id in hello.field_ids:
             self._fields[bytes.fromhex(field_id)[:FIELD_ID_PREFIX_BYTES]] = field_id
         self._fields[b""] = hello.field_ids[0]
@@ -192,6 +194,10 @@ class SessionCameras:
                 f"({', '.join(dict.fromkeys(self._fields.values()))})",
             )
         return self._queues[frame.camera_id]
+
+    def posed(self, frame: Frame) -> Frame:
+        """Return the frame of a queue at the pose of its camera, which came as that of its rig."""
+        return self._descriptions[frame.camera_id].posed(frame)
 
     def field_of(self, frame: Frame) -> str:
         """Return the id of the field that the frame of a queue is predicted from."""

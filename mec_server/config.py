@@ -15,21 +15,23 @@ from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, Trans
 
 __all__ = [
     "AdmissionLimits",
-    "ConsumerLimits",
     "DecoderKind",
+    "IdentityBudget",
+    "RecordSettings",
+    "ServerBudget",
     "ServerConfig",
     "SessionLimits",
-    "VehicleQuota",
 ]
 
 
 class DecoderKind(StrEnum):
-    """Where packets are decoded; AUTO: in the server if only this machine can reach it, otherwise
-    under bubblewrap where that works, otherwise in processes with limits."""
+    """Where packets are decoded (``rfcore.confinement``); AUTO: in the server if only this machine
+    can reach it, otherwise under bubblewrap where that works, otherwise under Landlock."""
 
     AUTO = "auto"
     IN_PROCESS = "in-process"
     CHILD = "child"
+    LANDLOCK = "landlock"
     BUBBLEWRAP = "bubblewrap"
 
 
@@ -38,15 +40,17 @@ class SessionLimits:
     """Deadlines in seconds and the window of one session.
 
     ``window_frames``: frames of one camera in flight or being decoded; two keep the link busy
-    while one is decoded, more would only add delay.
+    while one is decoded, more would only add delay. ``stalled_s``: a peer that took nothing of what
+    is sent to it for so long is let go.
     """
 
     hello_s: float = 5.0
     idle_s: float = 60.0
+    stalled_s: float = 10.0
     window_frames: int = 2
 
     def __post_init__(self) -> None:
-        for name in ("hello_s", "idle_s"):
+        for name in ("hello_s", "idle_s", "stalled_s"):
             if not getattr(self, name) > 0:
                 raise InvalidInput(f"limits.{name}", f"{getattr(self, name)} must be above 0 s")
         if not 1 <= self.window_frames <= 64:
@@ -54,35 +58,88 @@ class SessionLimits:
 
 
 @dataclass(frozen=True)
-class VehicleQuota:
-    """What one vehicle may use at most, over all its streams: far above what a correct one uses,
-    far below what would starve the others."""
+class IdentityBudget:
+    """What one identity (certificate) may use at most, over all its connections: far above what a
+    correct one uses, far below what would starve the others."""
 
-    streams: Annotated[int, arg(name="vehicle-streams")] = 8
-    """How many streams one vehicle may have."""
-    frames_per_s: Annotated[float, arg(name="vehicle-frames-per-s")] = 500.0
-    """How many frames it may send, over all its streams."""
-    bytes_per_s: Annotated[float, arg(name="vehicle-bytes-per-s")] = 32e6
+    share: Annotated[float, arg(name="identity-share")] = 0.5
+    """Share of the server's budgets, and of the workers' time when others want it, that one
+    identity may have, whatever the numbers below say."""
+    streams: Annotated[int, arg(name="identity-streams")] = 8
+    """Streams of frames."""
+    decoders: Annotated[int, arg(name="identity-decoders")] = 40
+    """Decoders (processes) of all its cameras: a rig of 18 on two streams, as during a handover;
+    a camera above 1920x1088 counts as several."""
+    fetches: Annotated[int, arg(name="identity-fetches")] = 2
+    """Fields it may be fetching."""
+    watches: Annotated[int, arg(name="identity-consumers")] = 4
+    """Consumers of the twin."""
+    rpcs: Annotated[int, arg(name="identity-rpcs")] = 32
+    """Calls in progress, of any kind."""
+    calls_per_s: Annotated[float, arg(name="identity-calls-per-s")] = 50.0
+    """Calls it may begin."""
+    messages_per_s: Annotated[float, arg(name="identity-messages-per-s")] = 1200.0
+    """Messages it may send on its streams: frames, and what was to be one."""
+    bytes_per_s: Annotated[float, arg(name="identity-bytes-per-s")] = 32e6
+    """Bytes these may have."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.share <= 1:
+            raise InvalidInput("identity-share", f"{self.share:g} is outside 0..1")
+        for name in ("streams", "decoders", "fetches", "watches", "rpcs"):
+            _check_budget(f"identity.{name}", getattr(self, name), 100_000)
+        for name in ("calls_per_s", "messages_per_s", "bytes_per_s"):
+            _check_budget(f"identity.{name}", getattr(self, name), 1e12)
+
+
+@dataclass(frozen=True)
+class ServerBudget:
+    """What all identities together may use."""
+
+    streams: Annotated[int, arg(name="max-streams")] = 256
+    """How many streams of vehicles may be open at once."""
+    decoders: Annotated[int, arg(name="max-decoders")] = 0
+    """How many decoders there may be. 0: as many as fit into memory, 48 MiB each."""
+    fetches: Annotated[int, arg(name="max-fetches")] = 16
+    """How many fields may be sent at once."""
+    watches: Annotated[int, arg(name="max-consumers")] = 8
+    """How many consumers may watch at once."""
+    rpcs: Annotated[int, arg(name="max-rpcs")] = 512
+    """How many calls may be in progress, of any kind."""
+    calls_per_s: Annotated[float, arg(name="max-calls-per-s")] = 1000.0
+    """How many calls may begin."""
+    messages_per_s: Annotated[float, arg(name="max-messages-per-s")] = 20_000.0
+    """How many messages may come on streams of vehicles."""
+    bytes_per_s: Annotated[float, arg(name="max-bytes-per-s")] = 1e9
     """How many bytes these may have."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.streams <= 1000:
-            raise InvalidInput("quota.streams", f"{self.streams} is outside 1..1000")
-        for name in ("frames_per_s", "bytes_per_s"):
-            value = getattr(self, name)
-            if not 1 <= value <= 1e12:
-                raise InvalidInput(f"quota.{name}", f"{value} is outside 1..1e12")
+        for name in ("streams", "fetches", "rpcs"):
+            _check_budget(f"max-{name}", getattr(self, name), 100_000)
+        for name in ("decoders", "watches"):
+            if not 0 <= getattr(self, name) <= 100_000:
+                raise InvalidInput(f"max-{name}", f"{getattr(self, name)} is outside 0..100000")
+        for name in ("calls_per_s", "messages_per_s", "bytes_per_s"):
+            _check_budget(f"max-{name}", getattr(self, name), 1e12)
+
+
+def _check_budget(name: str, value: float, highest: float) -> None:
+    if not 1 <= value <= highest:
+        raise InvalidInput(name, f"{value:g} is outside 1..{highest:g}")
 
 
 @dataclass(frozen=True)
 class AdmissionLimits:
-    """How much of the workers' time is promised to vehicles (see ``mec_server.admission``)."""
+    """How much of the workers' time is promised to vehicles (``mec_server.ledger.promises``)."""
 
     load: Annotated[float, arg(name="max-load")] = 0.8
     """Share of the workers' time that vehicles are promised; beyond it they get a lower rate, or
     are asked to come again. 0: every vehicle is let in."""
     lowest_hz: Annotated[float, arg(name="lowest-rate")] = 2.0
     """Lowest rate in pictures per second; a vehicle that can be given less is refused."""
+    render_deadline_s: Annotated[float, arg(name="render-deadline")] = 5.0
+    """Seconds from a frame's arrival to the expected end of its decoding; one that would take
+    longer is refused unrendered. After 5 s its vehicle has given it up."""
     retry_s: Annotated[float, Suppress] = 5.0
 
     def __post_init__(self) -> None:
@@ -90,24 +147,29 @@ class AdmissionLimits:
             raise InvalidInput("max-load", f"{self.load:g} is outside 0..1")
         if not 0 < self.lowest_hz <= MAX_RATE_HZ:
             raise InvalidInput("lowest-rate", f"{self.lowest_hz:g} is outside 0..{MAX_RATE_HZ:g}")
+        if not self.render_deadline_s > 0:
+            raise InvalidInput("render-deadline", f"{self.render_deadline_s:g} must be above 0 s")
         if not self.retry_s > 0:
             raise InvalidInput("retry_s", f"{self.retry_s:g} must be above 0 s")
 
 
 @dataclass(frozen=True)
-class ConsumerLimits:
-    """Consumers of the twin (`rfedge watch`); the stream of one that stops reading is ended."""
+class RecordSettings:
+    """What is kept on disk of what vehicles send that allow it (`cav-agent --allow-recording`)."""
 
-    consumers: Annotated[int, arg(name="max-consumers")] = 8
-    """How many may watch at once."""
-    stalled_s: Annotated[float, Suppress] = 10.0
-    """A consumer that took nothing for so long is too slow."""
+    folder: Annotated[Path | None, arg(name="record", metavar="FOLDER")] = None
+    """Keep pictures, poses and times as datasets: FOLDER/VEHICLE/CAMERA/PART (docs/data.md);
+    nothing without it."""
+    max_gb: Annotated[float, arg(name="record-max-gb")] = 10.0
+    """What all recordings in the folder may take, in 10^9 bytes; the oldest parts are deleted."""
+    max_age_h: Annotated[float, arg(name="record-max-age-h")] = 72.0
+    """After how many hours a part is deleted."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.consumers <= 1000:
-            raise InvalidInput("consumers", f"{self.consumers} is outside 0..1000")
-        if not self.stalled_s > 0:
-            raise InvalidInput("stalled_s", f"{self.stalled_s} must be above 0 s")
+        if not 0.01 <= self.max_gb <= 1e6:
+            raise InvalidInput("record-max-gb", f"{self.max_gb:g} is outside 0.01..1e6")
+        if not 0.01 <= self.max_age_h <= 1e6:
+            raise InvalidInput("record-max-age-h", f"{self.max_age_h:g} is outside 0.01..1e6")
 
 
 @dataclass(frozen=True)
@@ -118,14 +180,16 @@ class ServerConfig:
     """Directory of field archives (.rff)."""
     listen: str = "127.0.0.1:50051"
     """HOST:PORT to accept vehicles on; port 0 takes a free one."""
-    save: Path | None = None
-    """Directory for reconstructed pictures (PNG) and their index; none without it."""
+    record: RecordSettings = RecordSettings()
     workers: int = 2
     """Frames reconstructed at once."""
     decoder: DecoderKind = DecoderKind.AUTO
-    """Where packets are decoded. in-process: in the server. child: in processes with limits, one a
-    camera. bubblewrap: in sandboxes. auto: in-process if only this machine can reach the server,
-    else bubblewrap where it works, else child."""
+    """Where packets are decoded. bubblewrap: in sandboxes, one a camera. landlock: in processes
+    that give up files, network and most system calls. child: in processes with limits alone.
+    in-process: in the server. auto: in-process if only this machine can reach the server, else
+    bubblewrap where it works, else landlock; never less."""
+    sandbox_as_root: bool = False
+    """Decode in a sandbox though the server runs as root; refused otherwise."""
     log: LogForm = LogForm.AUTO
     """console lines, json lines, or auto: console on a terminal."""
     ready_file: Path | None = None
@@ -133,19 +197,32 @@ class ServerConfig:
     render: RenderSettings = RenderSettings()
     metrics: MetricsSettings = MetricsSettings()
     transport: TransportSettings = TransportSettings()
-    consumers: ConsumerLimits = ConsumerLimits()
-    max_streams: int = 256
-    """How many streams of vehicles may be open at once."""
-    quota: VehicleQuota = VehicleQuota()
+    access: Path | None = None
+    """File that says what consumers may see and which certificates are revoked (TOML, see
+    docs/operations.md); read again when it changes. Without it consumers see everything."""
+    address_connections: int = 256
+    """Connections that one address (of IPv6, one /64) may hold, whoever is behind them; newer ones
+    are closed within a quarter of a second. 0: any number."""
+    max_connection_age_s: float = 86_400.0
+    """After how many seconds a connection is renewed, open streams in it after half a minute more;
+    0: never."""
+    server_budget: ServerBudget = ServerBudget()
+    identity_budget: IdentityBudget = IdentityBudget()
     admission: AdmissionLimits = AdmissionLimits()
     drain_s: Annotated[float, Suppress] = 5.0
     limits: Annotated[SessionLimits, Suppress] = SessionLimits()
 
     def __post_init__(self) -> None:
-        for name, highest in (("workers", 256), ("max_streams", 100_000)):
-            value = getattr(self, name)
-            if not 1 <= value <= highest:
-                raise InvalidInput(name, f"{value} is outside 1..{highest}")
+        if not 1 <= self.workers <= 256:
+            raise InvalidInput("workers", f"{self.workers} is outside 1..256")
+        if not 0 <= self.address_connections <= 65_536:
+            raise InvalidInput(
+                "address-connections", f"{self.address_connections} is outside 0..65536"
+            )
+        if not (self.max_connection_age_s == 0 or 1 <= self.max_connection_age_s <= 1e6):
+            raise InvalidInput(
+                "max_connection_age_s", f"{self.max_connection_age_s:g} is neither 0 nor 1..1e6"
+            )
         if not self.fields.is_dir():
             raise InvalidInput("fields", f"{self.fields} is not a directory")
         if not self.drain_s >= 0:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rfcore.errors import RfedgeError
+from rfcore.errors import PacketRejected, RejectReason, RfedgeError
 from rfcore.wire.messages import Frame, Hello, StageTimes
 
-__all__ = ["DecodeJob", "DecodeOutcome", "OpenJob", "StreamEnd"]
+__all__ = ["DecodeJob", "DecodeOutcome", "OpenJob", "RenderTooLate", "StreamEnd"]
 
 
 @dataclass(frozen=True)
@@ -45,3 +45,14 @@ class StreamEnd:
     """The stream is over; ``error`` is None when it ended as it should."""
 
     error: RfedgeError | None = None
+
+
+class RenderTooLate(PacketRejected):
+    """A frame that was not rendered, since it would have been decoded after its deadline."""
+
+    def __init__(self, waited_s: float, expected_s: float, deadline_s: float) -> None:
+        super().__init__(
+            RejectReason.OVERLOADED,
+            f"it waited {waited_s:.3g} s and would take {expected_s:.3g} s to render and decode; "
+            f"the deadline is {deadline_s:g} s after its arrival",
+        )

@@ -7,22 +7,20 @@ cannot be parsed is answered with a Nack like any other, instead of ending the s
 from __future__ import annotations
 
 import time
+import uuid
 from collections.abc import AsyncIterator
 
 import grpc
-import structlog
 
+from mec_server.ledger.entry import StreamAccount
 from mec_server.metrics import BackgroundTask
-from mec_server.quotas import Limit
+from mec_server.peers import abort, peer_account
 from mec_server.server_context import ServerContext
 from mec_server.stream import Context, Stream
-from rfcore.errors import LimitExceeded, RfedgeError
-from rfcore.wire.conventions import RETRY_AFTER, STREAM_METHOD
-from rfcore.wire.status import status_of
+from rfcore.errors import LimitExceeded
+from rfcore.wire.conventions import STREAM_METHOD
 
 __all__ = ["EdgeService"]
-
-log = structlog.get_logger()
 
 
 class EdgeService:
@@ -52,10 +50,36 @@ class EdgeService:
         for stream in self._streams:
             stream.fields_changed(current_field_ids)
 
+    def end_stalled(self, now: float) -> None:
+        """End the streams whose peers take no answers; counted."""
+        for stream in tuple(self._streams):
+            error = stream.end_if_stalled(now)
+            if error is not None:
+                self._server.metrics.count_limited(error.limit)
+
     async def _handle(self, requests: AsyncIterator[bytes], context: Context) -> None:
-        if len(self._streams) >= self._server.max_streams:
-            await self._refuse(context)
-        stream = Stream(self._server, context, self._reallocate_rates)
+        """Serve one stream; it is charged for until its status was sent, or its peer is gone."""
+        session_id = uuid.uuid4().hex[:12]
+        identity, named = peer_account(context)
+        entry = self._server.entry
+        try:
+            account = entry.open(session_id, identity, named, time.monotonic())
+        except LimitExceeded as error:
+            self._server.metrics.count_limited(error.limit)
+            await abort(context, error)
+        try:
+            await self._serve(requests, context, session_id, account)
+        finally:
+            account.close()
+
+    async def _serve(
+        self,
+        requests: AsyncIterator[bytes],
+        context: Context,
+        session_id: str,
+        account: StreamAccount,
+    ) -> None:
+        stream = Stream(self._server, context, session_id, account, self._reallocate_rates)
         self._streams.add(stream)
         self._server.metrics.sessions.inc()
         try:
@@ -68,9 +92,9 @@ class EdgeService:
             self._server.metrics.sessions.dec()
             stream.close()
         if end.error is not None:
-            if isinstance(end.error, LimitExceeded):
-                self._server.metrics.limited.labels(end.error.limit).inc()
-            await context.abort(status_of(end.error), str(end.error), _retry_after(end.error))
+            if isinstance(end.error, LimitExceeded) and not stream.is_stalled:
+                self._server.metrics.count_limited(end.error.limit)
+            await abort(context, end.error)
 
     def _reallocate_rates(self) -> None:
         """Tell vehicles whose rate changes."""
@@ -78,17 +102,3 @@ class EdgeService:
         if changed:
             for stream in self._streams:
                 stream.regrant(changed)
-
-    async def _refuse(self, context: Context) -> None:
-        error = LimitExceeded(
-            Limit.SERVER_STREAMS,
-            f"{len(self._streams)} streams are open, as many as may be; try again later",
-        )
-        self._server.metrics.limited.labels(error.limit).inc()
-        log.warning("stream refused", peer=context.peer(), problem=str(error))
-        await context.abort(status_of(error), str(error))
-
-
-def _retry_after(error: RfedgeError) -> tuple[tuple[str, str], ...]:
-    after_s = error.retry_after_s if isinstance(error, LimitExceeded) else None
-    return () if after_s is None else ((RETRY_AFTER, str(round(1e3 * after_s))),)

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections import OrderedDict, deque
-from collections.abc import Awaitable, Callable
+from collections import Counter, OrderedDict, deque
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
+from itertools import count as count_up
 from queue import SimpleQueue
 from typing import Any, Generic, TypeVar
 
@@ -22,6 +24,9 @@ R = TypeVar("R")
 T = TypeVar("T")
 Work = Callable[[], Any]
 Done = Callable[[Any], None]
+
+MAX_SUBSTITUTES = 16
+"""Threads that work in place of waiting ones, at most."""
 
 
 class FairQueue(Generic[T]):
@@ -38,11 +43,15 @@ class FairQueue(Generic[T]):
         """Add ``item`` behind the other items of ``owner``."""
         self._waiting.setdefault(owner, deque()).append(item)
 
-    def take(self) -> T:
-        """Remove and return the item whose turn it is; raise ``IndexError`` if there is none."""
-        if not self._waiting:
-            raise IndexError("take from an empty queue")
-        owner, items = self._waiting.popitem(last=False)
+    def take(self, may: Callable[[str], bool] = lambda _: True) -> T:
+        """Remove and return the item whose turn it is, of the owners that ``may`` have one.
+
+        Raises ``IndexError`` if there is none.
+        """
+        owner = next((owner for owner in self._waiting if may(owner)), None)
+        if owner is None:
+            raise IndexError("take from a queue without an item that may be taken")
+        items = self._waiting.pop(owner)
         item = items.popleft()
         if items:
             self._waiting[owner] = items
@@ -53,16 +62,28 @@ class Workers:
     """``count`` threads that work for one event loop: the one from which work is submitted.
 
     ``callback_failed`` is called on the loop with what a ``done`` raised; the others still run.
+    While ``crowded``, no owner keeps more than all threads but one busy: work cannot be
+    interrupted, and a thread is to be there for the others when one's pieces take long.
     """
 
     def __init__(
-        self, count: int, callback_failed: Callable[[Exception], None], name: str = "worker"
+        self,
+        count: int,
+        callback_failed: Callable[[Exception], None],
+        name: str = "worker",
+        crowded: Callable[[], bool] = lambda: False,
     ) -> None:
         self._count = count
         self._callback_failed = callback_failed
         self._name = name
         self._threads: list[threading.Thread] = []
-        self._waiting: FairQueue[tuple[Work, Done]] = FairQueue()
+        self._numbers = count_up()
+        self._substitutes = 0
+        self._crowded = crowded
+        self._closing = False
+        self._waiting: FairQueue[tuple[str, Work, Done]] = FairQueue()
+        self._in_work: Counter[str] = Counter()
+        self._deferred = 0
         self._lock = threading.Lock()
         self._permits: SimpleQueue[bool] = SimpleQueue()
         """True for each piece of work that waits, then False for each thread that is to end."""
@@ -81,33 +102,90 @@ class Workers:
         if self._loop is None:
             self._start(asyncio.get_running_loop())
         with self._lock:
-            self._waiting.put(owner, (work, done))
+            self._waiting.put(owner, (owner, work, done))
         self._permits.put(True)
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Let another thread work while the block waits for something outside of this process.
+
+        Without effect on a thread that is none of these, and where ``MAX_SUBSTITUTES`` work
+        already: then the block holds its worker.
+        """
+        if threading.current_thread() not in self._threads or not self._substitute():
+            yield
+            return
+        try:
+            yield
+        finally:
+            self._permits.put(False)  # ends whichever thread gets to it first
+            with self._lock:
+                self._substitutes -= 1
 
     def close(self) -> None:
         """Finish the work that was submitted, then end the threads; waits for them."""
-        for _ in self._threads:
+        with self._lock:
+            self._closing = True
+        self._resume_deferred()
+        for _ in range(self._count):
             self._permits.put(False)
         for thread in self._threads:
             thread.join()
 
+    def _substitute(self) -> bool:
+        with self._lock:
+            if self._substitutes >= MAX_SUBSTITUTES or self._loop is None:
+                return False
+            self._substitutes += 1
+            self._threads = [thread for thread in self._threads if thread.is_alive()]
+            self._start_thread(self._loop)
+        return True
+
     def _start(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        for number in range(self._count):
-            thread = threading.Thread(
-                target=self._run, args=(loop,), name=f"{self._name}_{number}", daemon=True
-            )
-            thread.start()
-            self._threads.append(thread)
+        for _ in range(self._count):
+            self._start_thread(loop)
+
+    def _start_thread(self, loop: asyncio.AbstractEventLoop) -> None:
+        thread = threading.Thread(
+            target=self._run, args=(loop,), name=f"{self._name}_{next(self._numbers)}", daemon=True
+        )
+        thread.start()
+        self._threads.append(thread)
 
     def _run(self, loop: asyncio.AbstractEventLoop) -> None:
         while self._permits.get():
-            with self._lock:
-                work, done = self._waiting.take()
-            self._finished.append(partial(done, _outcome(work)))
-            if not self._woken:  # after appending: ``_deliver`` clears it before it looks
-                self._woken = True
-                loop.call_soon_threadsafe(self._deliver)
+            self._work_next(loop)
+
+    def _may_begin(self, owner: str) -> bool:
+        most = max(1, self._count - 1)
+        return self._in_work[owner] < most or self._closing or not self._crowded()
+
+    def _work_next(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Do the next piece of work of an owner that may begin one.
+
+        What may not begin yet gets another permit when a piece of work ends.
+        """
+        with self._lock:
+            try:
+                owner, work, done = self._waiting.take(self._may_begin)
+            except IndexError:
+                self._deferred += 1
+                return
+            self._in_work[owner] += 1
+        self._finished.append(partial(done, _outcome(work)))
+        with self._lock:
+            self._in_work -= Counter((owner,))  # drops those that reach zero
+        self._resume_deferred()
+        if not self._woken:  # after appending: ``_deliver`` clears it before it looks
+            self._woken = True
+            loop.call_soon_threadsafe(self._deliver)
+
+    def _resume_deferred(self) -> None:
+        with self._lock:
+            deferred, self._deferred = self._deferred, 0
+        for _ in range(deferred):
+            self._permits.put(True)
 
     def _deliver(self) -> None:
         self._woken = False

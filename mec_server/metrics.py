@@ -8,20 +8,25 @@ series are removed when its last stream ends.
 from __future__ import annotations
 
 from collections import Counter as Tally
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from enum import StrEnum
-from functools import cached_property
+from functools import cached_property, partial
 
 import structlog
 from prometheus_client import CollectorRegistry, Counter
+from prometheus_client.core import CounterMetricFamily, Metric
+from prometheus_client.registry import Collector
 
+from mec_server.config import DecoderKind
 from mec_server.decoding.process import LossCause
-from mec_server.quotas import Limit
+from mec_server.ledger.budgets import HELD, SPENT, Limit
+from mec_server.ledger.entry import EntryControl
+from mec_server.ledger.peer_log import LogLimiter
 from rfcore.codec.references import References, references_name
 from rfcore.errors import RejectReason
 from rfcore.field import RadianceField
-from rfcore.wire.instruments import DurationSeries, Instruments
+from rfcore.wire.instruments import DurationSeries, Family, Instruments
 from rfcore.wire.messages import Ack, Frame, Nack, ServerMessage, StageTimes
 
 __all__ = ["BackgroundTask", "OpeningResult", "ServerMetrics", "VehicleMetrics"]
@@ -34,6 +39,8 @@ class BackgroundTask(StrEnum):
 
     PUBLICATIONS = "publications"
     """Looks for newly published fields; goes on with its next look."""
+    FIELDS = "fields"
+    """Looks for archives in the folder of fields; goes on with its next look."""
     OPENING = "opening"
     """Opens a stream's fields and decoders; a failure ends that stream, if it still lives."""
     OUTCOME = "outcome"
@@ -44,6 +51,10 @@ class BackgroundTask(StrEnum):
     """Starts the spare decoder process; another one is started when one is needed."""
     STREAM = "stream"
     """Serves one stream of a vehicle, which ends; the vehicle may open another."""
+    ACCESS = "access"
+    """Follows the access file and ends calls that are not permitted any more; goes on."""
+    CONNECTIONS = "connections"
+    """Closes connections of addresses that hold too many; goes on with its next look."""
     CONSUMER = "consumer"
     """Serves one consumer of the twin, whose stream ends."""
     RECORDING = "recording"
@@ -59,6 +70,18 @@ class OpeningResult(StrEnum):
     """The stream was over before its decoders were open."""
 
 
+SPENT_FAMILY = Family(
+    "rfedge_server_spent_total",
+    "counter",
+    "What identities spent: calls, messages, bytes, worker_seconds.",
+    ("resource",),
+)
+SUPPRESSED = Family(
+    "rfedge_server_log_lines_suppressed_total",
+    "counter",
+    "Log lines about peers that were not written, since their identity caused too many.",
+)
+
 STAGES = tuple(f.name.removesuffix("_ns") for f in fields(StageTimes) if f.name != "total_ns")
 
 
@@ -69,6 +92,7 @@ class ServerMetrics:
         self.per_vehicle = per_vehicle
         self.instruments = make = Instruments(registry)
         make.process()
+        make.devices()
         vehicle = ("vehicle",) if per_vehicle else ()
         self.sessions = make.gauge("rfedge_server_sessions", "Streams that are open.")
         self.workers = make.gauge("rfedge_server_workers", "Frames that may be in work at once.")
@@ -112,8 +136,16 @@ class ServerMetrics:
         )
         self.limited = make.counter(
             "rfedge_server_limited",
-            "Streams refused or ended, and frames refused, because of a limit or quota.",
+            "Calls and streams refused or ended, and frames refused, because of a limit.",
             ("limit",),
+        )
+        self.refused_certificates = make.counter(
+            "rfedge_server_refused_certificates",
+            "Calls refused or ended for their certificate: revoked, expired, or other grants.",
+        )
+        self.implausible_captures = make.counter(
+            "rfedge_server_implausible_captures",
+            "Frames captured far from the server's clock; no age or latency is made of them.",
         )
         self._promised = make.gauge(
             "rfedge_server_promised_ratio",
@@ -123,10 +155,34 @@ class ServerMetrics:
             "rfedge_server_reduced_vehicles",
             "Vehicles that were granted a lower rate than they asked for.",
         )
+        self._identities = make.gauge(
+            "rfedge_server_identities", "Identities that hold something, or did lately."
+        )
+        self._held = make.gauge(
+            "rfedge_server_held", "What all identities together hold, by resource.", ("resource",)
+        )
+        self._most_held = make.gauge(
+            "rfedge_server_most_held", "What the identity holds that holds most.", ("resource",)
+        )
+        self._budget = make.gauge(
+            "rfedge_server_budget", "What all identities together may hold.", ("resource",)
+        )
+        self._identity_budget = make.gauge(
+            "rfedge_server_identity_budget", "What one identity may hold.", ("resource",)
+        )
+        self._spent: dict[str, Callable[[], float]] = {}
+        make.collector(SPENT_FAMILY, _Counts(SPENT_FAMILY, self._spent))
+        self._suppressed: dict[str, Callable[[], float]] = {}
+        make.collector(SUPPRESSED, _Counts(SUPPRESSED, self._suppressed))
         self.decoders_lost = make.counter(
             "rfedge_server_decoders_lost",
             "Decoder processes that died in use: by a signal, by themselves, or for being slow.",
             ("cause",),
+        )
+        self._decoder = make.gauge(
+            "rfedge_server_decoder",
+            "Where packets are decoded: 1 for the kind in force, 0 for the others.",
+            ("kind",),
         )
         self._task_failures = make.counter(
             "rfedge_server_task_failures",
@@ -171,20 +227,37 @@ class ServerMetrics:
             stage.observe(getattr(times, name) / 1e9)
         self.answer.observe(times.total_ns / 1e9)
 
-    def observe_admission(
-        self, promised: Callable[[], float], reduced: Callable[[], float]
-    ) -> None:
-        """Have each scrape read how much of the workers' time is promised to vehicles."""
-        self._promised.set_function(promised)
-        self._reduced.set_function(reduced)
+    def observe_ledger(self, entry: EntryControl, limiter: LogLimiter) -> None:
+        """Have each scrape read what is promised, held and spent."""
+        ledger, promises = entry.ledger, entry.promises
+        self._promised.set_function(lambda: promises.promised_share)
+        self._reduced.set_function(lambda: promises.reduced)
+        self._identities.set_function(lambda: ledger.identities)
+        for resource in HELD:
+            self._held.labels(resource).set_function(partial(ledger.held, resource))
+            self._most_held.labels(resource).set_function(partial(ledger.most_held, resource))
+            self._budget.labels(resource).set(ledger.budget(resource).total)
+            self._identity_budget.labels(resource).set(ledger.budget(resource).identity)
+        self._spent |= {name: partial(ledger.spent, name) for name in SPENT}
+        self._suppressed[""] = lambda: limiter.suppressed
 
     def field_opened(self, field: RadianceField) -> None:
         """Publish which field was opened."""
         self._fields.labels(field.field_id[:16], field.metadata.kind).set(1)
 
+    def count_limited(self, limit: str, count: int = 1) -> None:
+        """Count what was refused or ended because of ``limit``."""
+        self.limited.labels(limit).inc(count)
+
     def count_lost_decoder(self, cause: LossCause) -> None:
         """Count a decoder process that died in use."""
         self.decoders_lost.labels(cause).inc()
+
+    def decoder_started(self, kind: DecoderKind) -> None:
+        """Say where packets are decoded."""
+        for known in DecoderKind:
+            if known is not DecoderKind.AUTO:
+                self._decoder.labels(known).set(known is kind)
 
     def task_failed(self, task: BackgroundTask, error: Exception) -> None:
         """Log and count an exception that a background task did not expect; from any thread."""
@@ -274,3 +347,24 @@ class VehicleMetrics:
             counter = self._metrics.frames.labels(*self._label, result, reason)
             self._frames[result, reason] = counter
         return counter
+
+
+class _Counts(Collector):
+    """Counters that are read from elsewhere at each scrape, by the value of their one label."""
+
+    def __init__(self, family: Family, counts: Mapping[str, Callable[[], float]]) -> None:
+        self._family = family
+        self._counts = counts
+
+    def describe(self) -> Iterable[Metric]:
+        return [self._empty()]
+
+    def collect(self) -> Iterable[Metric]:
+        metric = self._empty()
+        for value, count in self._counts.items():
+            metric.add_metric([value] if self._family.labels else [], count())
+        return [metric]
+
+    def _empty(self) -> CounterMetricFamily:
+        family = self._family
+        return CounterMetricFamily(family.name, family.text, labels=list(family.labels))

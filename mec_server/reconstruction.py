@@ -15,7 +15,7 @@ from mec_server.decoding.decoders import OpenDecoder
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.state import DecoderState
 from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason
-from rfcore.field import Renderer, render_field_view
+from rfcore.field import Renderer
 from rfcore.image import I420
 from rfcore.views import FieldView
 from rfcore.wire.messages import CameraDescription, StageTimes
@@ -116,9 +116,8 @@ class CameraDecoder:
         return Reconstruction(decoded.frame, outcome)
 
     def _render(self, job: DecodeJob) -> FieldView:
-        camera = job.frame.camera(self._camera.intrinsics)
         try:
-            return render_field_view(self._renderers[job.field_id], camera, job.frame.quality)
+            return job.frame.view(self._renderers[job.field_id], self._camera.intrinsics)
         except InvalidInput as error:
             raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
 

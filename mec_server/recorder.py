@@ -1,92 +1,194 @@
-"""Writes reconstructed pictures to disk: DIR/<vehicle>/<camera>/<sequence>.png and index.jsonl.
+"""Records what vehicles agreed to as datasets: FOLDER/<vehicle>/<camera>/<start>-<session>/.
 
-The first epoch's pictures are named by their sequence alone (000007.png); later ones have the
-epoch in front (e0003-000007.png), since sequences begin again. The index has one line per picture.
-A disk that fails ends the recording for good, and never the streaming.
+Each such part is a ``recording.jsonl`` and its pictures (``rfcore.dataset.recorded_session``). The
+first epoch's pictures are named by their sequence alone (000007.png); later ones have the epoch in
+front (e0003-000007.png), since sequences begin again. A disk that fails ends the recording for
+good, and never the streaming.
 """
 
 from __future__ import annotations
 
-import json
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rfcore.image import I420, write_png
+from mec_server.recording_room import KeepLimits, RecordingRoom
+from rfcore.camera import Pose, TileOrigin
+from rfcore.dataset.recorded_session import RECORDING_NAME, RecordedCamera, RecordedPicture
+from rfcore.files import write_whole
+from rfcore.image import I420, png_bytes
 from rfcore.native.yuv import rgb_from_i420
-from rfcore.wire.messages import Frame
+from rfcore.wire.messages import Frame, Hello
 
-__all__ = ["Recorder", "Recording", "picture_name"]
+__all__ = ["Recorder", "SessionRecording", "picture_name"]
 
 MAX_WAITING = 32
 """Pictures that may wait for the disk; beyond it decoding waits, and with it the vehicle."""
+TIDY_EVERY_S = 60.0
+"""How often old parts are looked for while nothing is written."""
 
 
 @dataclass(frozen=True)
-class Recording:
-    """One picture to keep."""
+class Waiting:
+    """One picture to keep; ``world_from_cam`` is None where the camera was lost."""
 
-    vehicle_id: str
+    camera: RecordedCamera
     frame: Frame
+    field_id: str
+    world_from_cam: Pose | None
     picture: I420
+
+
+@dataclass(frozen=True)
+class OpenPart:
+    """A part that is written, and the capture time of its last picture."""
+
+    folder: Path
+    last_ns: int
 
 
 class Recorder:
     """Writes pictures on a thread of its own; ``on_failure`` is called with the first error.
 
     After any error the thread goes on emptying its queue, so that no worker waits for it for ever.
+    ``origin_of`` tells where the tile of a field is; ``now_ms`` the time of the Unix epoch.
     """
 
-    def __init__(self, directory: Path, on_failure: Callable[[Exception], None]) -> None:
-        self._directory = directory
+    def __init__(
+        self,
+        root: Path,
+        limits: KeepLimits,
+        origin_of: Callable[[str], TileOrigin],
+        now_ms: Callable[[], int],
+        on_failure: Callable[[Exception], None],
+    ) -> None:
+        self._root = root
+        self._limits = limits
+        self._origin_of = origin_of
+        self._now_ms = now_ms
         self._on_failure = on_failure
         self._failed = False
-        self._queue: queue.Queue[Recording | None] = queue.Queue(MAX_WAITING)
+        self._room: RecordingRoom | None = None
+        self._open: dict[RecordedCamera, OpenPart] = {}
+        self._queue: queue.Queue[Waiting | None] = queue.Queue(MAX_WAITING)
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
-    def save(self, recording: Recording) -> None:
-        """Queue a picture; returns at once unless ``MAX_WAITING`` pictures wait for the disk."""
-        if not self._failed:
-            self._queue.put(recording)
+    def session(self, session_id: str, hello: Hello) -> SessionRecording | None:
+        """Return what records a vehicle's session; None for a vehicle that did not agree to it.
+
+        Raises what ``origin_of`` raises for a field.
+        """
+        if not hello.allow_recording:
+            return None
+        origins = {field_id: self._origin_of(field_id) for field_id in hello.field_ids}
+        return SessionRecording(session_id, hello, origins, self._put)
 
     def close(self) -> None:
         """Write what is queued, then stop."""
         self._queue.put(None)
         self._thread.join()
 
-    def _run(self) -> None:
-        while (recording := self._queue.get()) is not None:
-            if self._failed:
-                continue
-            try:
-                self._write(recording)
-            except Exception as error:
-                self._failed = True
-                self._on_failure(error)
+    def _put(self, waiting: Waiting) -> None:
+        if not self._failed:
+            self._queue.put(waiting)
 
-    def _write(self, recording: Recording) -> None:
-        frame = recording.frame
-        folder = self._directory / recording.vehicle_id / frame.camera_id
-        folder.mkdir(parents=True, exist_ok=True)
-        name = picture_name(frame)
-        write_png(folder / name, rgb_from_i420(recording.picture))
-        line = {
-            "file": name,
-            "epoch": frame.packet.epoch,
-            "sequence": frame.packet.sequence,
-            "capture_time_ns": frame.capture_time_ns,
-            "translation_m": frame.pose.translation_m,
-            "rotation_wxyz": frame.pose.rotation,
-            "digest": recording.picture.digest().hex(),
+    def _run(self) -> None:
+        while True:
+            try:
+                waiting = self._queue.get(timeout=TIDY_EVERY_S)
+            except queue.Empty:
+                self._attempt(lambda room: room.make(0, self._now_ms()))
+                continue
+            if waiting is None:
+                return
+            self._attempt(lambda room, one=waiting: self._write(room, one))  # type: ignore[misc]
+
+    def _attempt(self, work: Callable[[RecordingRoom], object]) -> None:
+        if self._failed:
+            return
+        try:
+            if self._room is None:
+                self._room = RecordingRoom(self._root, self._limits)
+            work(self._room)
+        except Exception as error:
+            self._failed = True
+            self._on_failure(error)
+
+    def _write(self, room: RecordingRoom, waiting: Waiting) -> None:
+        png = png_bytes(rgb_from_i420(waiting.picture))
+        line = _line(waiting)
+        room.make(len(png) + len(line), self._now_ms())
+        part = self._part(room, waiting)
+        write_whole(part / picture_name(waiting.frame), png)
+        with (part / RECORDING_NAME).open("a") as file:
+            file.write(line)
+        room.add(part, len(png) + len(line))
+        self._open[waiting.camera] = OpenPart(part, waiting.frame.capture_time_ns)
+
+    def _part(self, room: RecordingRoom, waiting: Waiting) -> Path:
+        """Return the folder to write to: a new one where the last is full or time went back."""
+        camera, now_ms = waiting.camera, self._now_ms()
+        part = self._open.get(camera)
+        if (
+            part is not None
+            and part.last_ns <= waiting.frame.capture_time_ns
+            and not room.is_full(part.folder, now_ms)
+        ):
+            return part.folder
+        self._open = {
+            other: part
+            for other, part in self._open.items()
+            if not room.is_full(part.folder, now_ms)
         }
-        with (folder / "index.jsonl").open("a") as index:
-            index.write(json.dumps(line) + "\n")
+        folder = room.begin(camera.vehicle_id, camera.camera_id, camera.session_id, now_ms)
+        write_whole(folder / RECORDING_NAME, camera.line())
+        room.add(folder, len(camera.line()))
+        return folder
+
+
+class SessionRecording:
+    """Records the pictures of one session; used by the server's workers."""
+
+    def __init__(
+        self,
+        session_id: str,
+        hello: Hello,
+        origins: Mapping[str, TileOrigin],
+        put: Callable[[Waiting], None],
+    ) -> None:
+        self._cameras = {
+            camera.camera_id: RecordedCamera(
+                hello.vehicle_id, camera.camera_id, session_id, camera.intrinsics
+            )
+            for camera in hello.cameras
+        }
+        self._origins = origins
+        self._put = put
+
+    def save(self, frame: Frame, field_id: str, picture: I420) -> None:
+        """Queue a picture; returns at once unless ``MAX_WAITING`` pictures wait for the disk."""
+        pose = frame.pose
+        world_from_cam = None if pose is None else self._origins[field_id].globalise(pose)
+        self._put(Waiting(self._cameras[frame.camera_id], frame, field_id, world_from_cam, picture))
 
 
 def picture_name(frame: Frame) -> str:
     """Return the file name of a reconstructed frame."""
     epoch, sequence = frame.packet.epoch, frame.packet.sequence
     return f"{sequence:06}.png" if epoch == 0 else f"e{epoch:04}-{sequence:06}.png"
+
+
+def _line(waiting: Waiting) -> str:
+    frame = waiting.frame
+    return RecordedPicture(
+        file=picture_name(frame),
+        capture_time_ns=frame.capture_time_ns,
+        epoch=frame.packet.epoch,
+        sequence=frame.packet.sequence,
+        field_id=waiting.field_id,
+        world_from_cam=waiting.world_from_cam,
+        digest=waiting.picture.digest().hex(),
+    ).line()

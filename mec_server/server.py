@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
+from typing import Any
 
 import grpc
 import structlog
@@ -14,26 +15,33 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_health.v1.health import aio as health_aio
 from prometheus_client import CollectorRegistry
 
-from mec_server.admission import Admission, EntryControl
-from mec_server.config import ServerConfig
-from mec_server.decoding.decoders import Decoders
+from mec_server.access import AccessFile
+from mec_server.config import RecordSettings, ServerConfig
+from mec_server.connection_cap import ConnectionCap
+from mec_server.decoding.decoders import Decoders, DecoderSettings
 from mec_server.edge_service import EdgeService
 from mec_server.event_loop import Workers, repeat_forever
+from mec_server.fields.index import FieldIndex, field_loader
 from mec_server.fields.published import PublishedFields
 from mec_server.fields.service import FieldService
-from mec_server.fields.shelf import FieldShelf, field_loader
+from mec_server.fields.shelf import FieldShelf
+from mec_server.guard import Guard
+from mec_server.ledger.budgets import Limit, Resource, budgets_of, memory_limit_bytes
+from mec_server.ledger.entry import EntryControl
+from mec_server.ledger.peer_log import LogLimiter, PeerLog
 from mec_server.metrics import BackgroundTask, ServerMetrics
-from mec_server.quotas import Quotas
+from mec_server.peers import ChargeRpcs, Slots
 from mec_server.reconstruction import OpenCameras, Tools, open_cameras
 from mec_server.recorder import Recorder
+from mec_server.recording_room import KeepLimits
 from mec_server.server_context import ServerContext
 from mec_server.twin.metrics import TwinMetrics
-from mec_server.twin.service import TwinService
+from mec_server.twin.service import Sight, TwinService
 from mec_server.twin.state import Twin
 from rfcore.errors import RfedgeError
-from rfcore.field import FieldStore
 from rfcore.files import write_whole
 from rfcore.wire.address import Address
+from rfcore.wire.checks import MAX_FIELDS
 from rfcore.wire.conventions import SERVER_OPTIONS
 from rfcore.wire.instruments import MetricsEndpoint
 
@@ -43,6 +51,22 @@ log = structlog.get_logger()
 
 PUBLICATIONS_EVERY_S = 1.0
 """How often the manifest in the folder of fields is checked for a change: one stat()."""
+
+FIELDS_EVERY_S = 1.0
+"""How often the folder of fields is listed: one stat() an archive, and its digest if it is new."""
+
+SPARE_RPCS = 64
+"""gRPC itself refuses calls beyond the ledger's budget and so many more: those that the ledger is
+about to refuse, by name."""
+SWEEP_EVERY_S = 1.0
+"""How often the access file is checked for a change, and open calls for certificates that are no
+longer good."""
+
+CONNECTIONS_EVERY_S = 0.25
+"""How often connections are counted by address."""
+
+CONNECTION_GRACE_MS = 30_000
+"""How long streams of a connection that is renewed may go on before they are ended."""
 
 SERVICES = ("", *(f"rfcore.wire.v1.{name}Service" for name in ("Edge", "Field", "Twin")))
 
@@ -64,31 +88,55 @@ class EdgeServer:
         self._metrics.workers.set(config.workers)
         self._metrics_endpoint: MetricsEndpoint | None = None
         outcome_failed = self._failed(BackgroundTask.OUTCOME)
+        self._log_limiter = LogLimiter()
+        self._entry = self._entry_control()
+        promises = self._entry.promises
         self._opener = Workers(1, outcome_failed, "opener")
-        self._workers = Workers(config.workers, outcome_failed)
+        self._workers = Workers(config.workers, outcome_failed, crowded=lambda: promises.is_crowded)
         self._decoders = Decoders(
-            config.decoder,
-            not self.address.is_loopback,
+            DecoderSettings(config.decoder, not self.address.is_loopback, config.sandbox_as_root),
             self._metrics.count_lost_decoder,
             self._failed(BackgroundTask.DECODER_START),
+            self._workers.waiting,
         )
-        self._recorder = self._open_recorder(config.save)
         self._health = health_aio.HealthServicer()
-        self._store = FieldStore(config.fields)
-        load = field_loader(self._store, config.render, opened=self._metrics.field_opened)
-        self._shelf = FieldShelf(self._store, load)
+        self._index = FieldIndex(config.fields)
+        load = field_loader(self._index, config.render, opened=self._metrics.field_opened)
+        self._shelf = FieldShelf(self._index, load)
+        self._recorder = self._open_recorder(config.record)
         self._published = PublishedFields(config.fields, self._shelf.open)
-        self._following: asyncio.Task[None] | None = None
+        self._following: list[asyncio.Task[None]] = []
+        self._access = AccessFile(config.access)
+        self._access.start()
+        self._guard = Guard(
+            self._access, lambda: datetime.now(UTC), self._metrics.refused_certificates.inc
+        )
         twin = Twin()
         self._edge = EdgeService(self._context(twin, open_decoders))
         consumer_failed = self._failed(BackgroundTask.CONSUMER)
+        ledger, limited = self._entry.ledger, self._metrics.count_limited
         self._twin_service = TwinService(
-            twin, self._twin_metrics(twin), config.consumers, consumer_failed
+            twin,
+            self._twin_metrics(twin),
+            Slots(ledger, Resource.WATCHES, limited),
+            config.limits.stalled_s,
+            consumer_failed,
+            self._sight,
         )
-        self._server = grpc.aio.server(options=SERVER_OPTIONS)
+        self._server = grpc.aio.server(
+            interceptors=(self._guard, ChargeRpcs(ledger, limited)),
+            options=_options(config),
+            maximum_concurrent_rpcs=config.server_budget.rpcs + SPARE_RPCS,
+        )
         self._edge.register(self._server)
         self._twin_service.register(self._server)
-        FieldService(self._store, lambda: self._published.tiles).register(self._server)
+        FieldService(
+            self._index,
+            lambda: self._published.tiles,
+            Slots(ledger, Resource.FETCHES, limited),
+            config.limits.stalled_s,
+            self._guard.may_fetch,
+        ).register(self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
 
     def _failed(self, task: BackgroundTask) -> Callable[[Exception], None]:
@@ -96,22 +144,30 @@ class EdgeServer:
 
     def _context(self, twin: Twin, open_decoders: OpenCameras) -> ServerContext:
         config = self._config
-        admission = Admission(config.admission, config.workers)
-        self._metrics.observe_admission(lambda: admission.promised_share, lambda: admission.reduced)
         return ServerContext(
             fields=self._shelf,
-            held_field_ids=self._store.ids,
+            held_field_ids=self._index.ids,
             workers=self._workers,
             opener=self._opener,
             tools=Tools(time.perf_counter_ns, self._decoders.open),
             metrics=self._metrics,
             limits=config.limits,
-            entry=EntryControl(Quotas(config.quota), admission),
-            max_streams=config.max_streams,
+            entry=self._entry,
+            log_limiter=self._log_limiter,
             twin=twin,
             open_cameras=open_decoders,
             recorder=self._recorder,
         )
+
+    def _entry_control(self) -> EntryControl:
+        config = self._config
+        budgets = budgets_of(
+            config.identity_budget, config.server_budget, config.workers, memory_limit_bytes()
+        )
+        share = config.identity_budget.share
+        entry = EntryControl(budgets, config.admission, config.workers, share, time.monotonic())
+        self._metrics.observe_ledger(entry, self._log_limiter)
+        return entry
 
     def _twin_metrics(self, twin: Twin) -> TwinMetrics:
         return TwinMetrics(
@@ -135,18 +191,17 @@ class EdgeServer:
 
     async def _start(self) -> Address:
         self._serve_metrics()
+        await asyncio.to_thread(self._index.start)
         await asyncio.to_thread(self._published.start)
         opened = await asyncio.to_thread(self._shelf.warm_up)
         await asyncio.to_thread(self._decoders.start)
+        self._metrics.decoder_started(self._decoders.kind)
         self.address = Address(self.address.host, self._open_port())
         await self._server.start()
-        self._following = asyncio.create_task(
-            repeat_forever(
-                self.take_up_fields,
-                PUBLICATIONS_EVERY_S,
-                self._failed(BackgroundTask.PUBLICATIONS),
-            )
-        )
+        self._follow(self.take_up_fields, PUBLICATIONS_EVERY_S, BackgroundTask.PUBLICATIONS)
+        self._follow(self._sweep_calls, SWEEP_EVERY_S, BackgroundTask.ACCESS)
+        self._follow(self.index_fields, FIELDS_EVERY_S, BackgroundTask.FIELDS)
+        self._cap_connections()
         await self._set_health(health_pb2.HealthCheckResponse.SERVING)
         if self._config.ready_file is not None:
             write_whole(self._config.ready_file, f"{self.address}\n")
@@ -175,8 +230,8 @@ class EdgeServer:
 
     async def _release(self, drain_s: float) -> None:
         """Give back everything that ``__init__`` and ``start`` took, as far as they came."""
-        if self._following is not None:
-            self._following.cancel()
+        for task in self._following:
+            task.cancel()
         self._edge.drain()
         self._twin_service.drain()
         await self._server.stop(drain_s)
@@ -192,7 +247,48 @@ class EdgeServer:
     async def take_up_fields(self) -> None:
         """Serve what is published now, and tell the vehicles if it is something else."""
         if await asyncio.to_thread(self._published.refresh):
-            self._edge.fields_changed(tuple(tile.field_id for tile in self._published.tiles))
+            tiles = self._published.tiles
+            every = dict.fromkeys(name for tile in tiles for name in tile.renderable_ids)
+            self._edge.fields_changed(tuple(every)[:MAX_FIELDS])
+
+    async def index_fields(self) -> None:
+        """Look for archives that were put into the folder, or taken out of it."""
+        await asyncio.to_thread(self._index.refresh)
+
+    async def _sweep_calls(self) -> None:
+        self._guard.sweep()
+        self._edge.end_stalled(time.monotonic())
+
+    def _cap_connections(self) -> None:
+        most = self._config.address_connections
+        if not most:
+            return
+        cap = ConnectionCap(self.address.port, most)
+
+        async def sweep() -> None:
+            for source, cut in (await asyncio.to_thread(cap.sweep)).items():
+                self._metrics.count_limited(Limit.ADDRESS_CONNECTIONS, cut)
+                lines = PeerLog(log, self._log_limiter, source, time.monotonic)
+                lines.warning("connections closed", address=source, connections=cut, limit=most)
+
+        self._follow(sweep, CONNECTIONS_EVERY_S, BackgroundTask.CONNECTIONS)
+
+    def _sight(self, context: grpc.aio.ServicerContext[Any, Any]) -> Sight:
+        """Return what the peer of a call may see of the twin."""
+        grant = self._guard.grant(context)
+
+        def covers(vehicle_id: str, field_id: str) -> bool:
+            here = (tile.name for tile in self._published.tiles if field_id in tile.archive_ids)
+            return grant.covers(vehicle_id, frozenset(here))
+
+        return Sight(covers, grant.check_vehicles)
+
+    def _follow(
+        self, work: Callable[[], Awaitable[object]], every_s: float, task: BackgroundTask
+    ) -> None:
+        self._following.append(
+            asyncio.create_task(repeat_forever(work, every_s, self._failed(task)))
+        )
 
     def _open_port(self) -> int:
         self.address.check_free("--listen")
@@ -203,11 +299,18 @@ class EdgeServer:
         except RuntimeError as error:
             raise RfedgeError(f"cannot listen on {self.address}: {error}") from error
 
-    def _open_recorder(self, directory: Path | None) -> Recorder | None:
-        if directory is None:
+    def _open_recorder(self, settings: RecordSettings) -> Recorder | None:
+        if settings.folder is None:
             return None
         self._metrics.recording.set(1)
-        return Recorder(directory, self._recording_failed)
+        limits = KeepLimits(round(settings.max_gb * 1e9), settings.max_age_h * 3600)
+        return Recorder(
+            settings.folder,
+            limits,
+            lambda field_id: self._shelf.open(field_id).metadata.tile_origin,
+            lambda: time.time_ns() // 1_000_000,
+            self._recording_failed,
+        )
 
     def _recording_failed(self, error: Exception) -> None:
         self._metrics.recording.set(0)
@@ -224,3 +327,13 @@ class EdgeServer:
     async def _set_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
         for service in SERVICES:
             await self._health.set(service, status)
+
+
+def _options(config: ServerConfig) -> tuple[tuple[str, int], ...]:
+    if not config.max_connection_age_s:
+        return SERVER_OPTIONS
+    return (
+        *SERVER_OPTIONS,
+        ("grpc.max_connection_age_ms", round(1e3 * config.max_connection_age_s)),
+        ("grpc.max_connection_age_grace_ms", CONNECTION_GRACE_MS),
+    )

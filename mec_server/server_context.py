@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from mec_server.admission import EntryControl
 from mec_server.config import SessionLimits
 from mec_server.event_loop import Workers
+from mec_server.ledger.entry import EntryControl
+from mec_server.ledger.peer_log import LogLimiter
 from mec_server.metrics import ServerMetrics
 from mec_server.reconstruction import FieldSource, OpenCameras, Tools
 from mec_server.recorder import Recorder
@@ -31,7 +32,7 @@ class ServerContext:
     metrics: ServerMetrics
     limits: SessionLimits
     entry: EntryControl
-    max_streams: int
+    log_limiter: LogLimiter
     twin: Twin
     open_cameras: OpenCameras
     recorder: Recorder | None = None

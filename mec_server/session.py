@@ -19,7 +19,7 @@ from enum import StrEnum
 from mec_server.camera_queue import SessionCameras
 from mec_server.config import SessionLimits
 from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob, StreamEnd
-from mec_server.quotas import Limit
+from mec_server.ledger.budgets import Limit
 from rfcore.errors import (
     AccessDenied,
     InvalidInput,
@@ -52,6 +52,10 @@ __all__ = ["ServerSession", "SessionState"]
 
 MAX_UNUSABLE = 64
 """Messages in a row that are refused before any work is spent on them; then the stream ends."""
+
+MAX_UNREAD = 256
+"""Answers that wait for a peer to read them; a correct one has a few frames in flight. Then the
+stream ends: a peer that sends and does not read must cost no memory."""
 
 
 class SessionState(StrEnum):
@@ -111,7 +115,7 @@ class ServerSession:
         self._refuse(address, RejectReason.INVALID_ARGUMENT, str(error), now)
 
     def overrun(self, frame: Frame, error: LimitExceeded, now: float) -> None:
-        """Answer for a frame beyond the vehicle's quota; the session lives on."""
+        """Answer for a frame beyond a budget; the session lives on."""
         self._refuse(frame.address, RejectReason.OVERLOADED, str(error), now)
 
     def silent_s(self, now: float) -> float:
@@ -149,7 +153,7 @@ class ServerSession:
                 return
         unknown = [field_id for field_id in hello.field_ids if field_id not in self._held]
         if unknown:
-            self._outbox.append(FieldNotice(self._held[:MAX_FIELDS]))
+            self._say(FieldNotice(self._held[:MAX_FIELDS]))
             self._close(_unknown_field(unknown[0], self._held))
             return
         exact = hello.renderer.exact and hello.renderer.name == RENDERER_CONTRACT
@@ -165,7 +169,7 @@ class ServerSession:
             queue = self._cameras.queue_of(frame)
             if self.state is SessionState.DRAINING:
                 raise PacketRejected(RejectReason.OVERLOADED, "this server is shutting down")
-            queue.admit(frame, now)
+            queue.admit(self._cameras.posed(frame), now)
         except InvalidInput as error:
             self.refuse(FrameRefused(error, frame.address), now)
         except PacketRejected as error:
@@ -216,15 +220,16 @@ class ServerSession:
         self.hello = job.hello
         self._cameras.open(job.hello)
         self._exact = job.exact
-        self._outbox.append(Welcome(self.session_id, job.exact, self._rate_hz))
-        self._outbox += self._cameras.credits()
+        self._say(Welcome(self.session_id, job.exact, self._rate_hz))
+        for credit in self._cameras.credits():
+            self._say(credit)
         self._restart_deadline(now)
 
     def grant(self, rate_hz: float) -> None:
         """Let each camera send so many pictures per second; 0: as many as credits allow."""
         self._rate_hz = rate_hz
         if self.state is SessionState.OPEN:
-            self._outbox.append(Welcome(self.session_id, self._exact, rate_hz))
+            self._say(Welcome(self.session_id, self._exact, rate_hz))
 
     def open_failed(self, error: RfedgeError, now: float) -> None:
         """Hello named something that cannot be opened; a bad value leaves room for another."""
@@ -251,7 +256,7 @@ class ServerSession:
             decode_ns=times.decode_ns,
             total_ns=_ns(now - job.received_s),
         )
-        self._outbox.append(Ack(address, times, outcome.reconstruction_digest))
+        self._say(Ack(address, times, outcome.reconstruction_digest))
         self._answered(now)
 
     def rejected(self, job: DecodeJob, error: PacketRejected, now: float) -> None:
@@ -293,7 +298,7 @@ class ServerSession:
     def fields_changed(self, current_field_ids: Sequence[str]) -> None:
         """Tell a vehicle that streams which fields are current now; its own goes on being good."""
         if self.state is SessionState.OPEN:
-            self._outbox.append(FieldNotice(tuple(current_field_ids)))
+            self._say(FieldNotice(tuple(current_field_ids)))
 
     def get_timer(self) -> float | None:
         """Return when ``handle_timer`` has something to do, or None."""
@@ -327,11 +332,22 @@ class ServerSession:
             self.state = SessionState.CLOSED
             self.closed = StreamEnd(error)
 
+    def _say(self, message: ServerMessage) -> None:
+        if len(self._outbox) < MAX_UNREAD:
+            self._outbox.append(message)
+            return
+        self._outbox.clear()
+        self._close(
+            LimitExceeded(
+                Limit.UNREAD_ANSWERS, f"{MAX_UNREAD} answers wait to be read, as many as may be"
+            )
+        )
+
     def _nack(
         self, address: FrameAddress, reason: RejectReason, problem: str, count: int = 1
     ) -> None:
         epoch, last_good = self._cameras.position(address)
-        self._outbox.append(Nack(address, reason, problem, count, last_good, epoch))
+        self._say(Nack(address, reason, problem, count, last_good, epoch))
 
 
 def _ns(seconds: float) -> int:

@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import asyncio
 import time
-import uuid
 from collections.abc import AsyncIterator, Callable, Mapping
 
 import grpc
 import structlog
 
-from mec_server.admission import StreamPermit
-from mec_server.decode_jobs import DecodeJob, OpenJob, StreamEnd
+from mec_server.decode_jobs import DecodeJob, OpenJob, RenderTooLate, StreamEnd
 from mec_server.decoding.process import DecoderLost
 from mec_server.event_loop import LazyTimer
+from mec_server.ledger.budgets import Limit
+from mec_server.ledger.entry import StreamAccount
+from mec_server.ledger.peer_log import PeerLog
+from mec_server.reconstruction import Reconstruction
 from mec_server.server_context import ServerContext
 from mec_server.session import ServerSession, SessionState
 from mec_server.stream_decoders import FrameResult, StreamDecoders
@@ -37,21 +39,29 @@ __all__ = ["Context", "Stream"]
 log = structlog.get_logger()
 Context = grpc.aio.ServicerContext[bytes, bytes]
 
+MAX_AHEAD_S, MAX_BEHIND_S = 1.0, 60.0
+"""A capture time further ahead of the server's clock, or further behind it, is no time of capture:
+clocks kept by NTP differ by milliseconds, and no frame is delivered after a minute."""
+
 UNKNOWN_VEHICLE = ""
 """The vehicle id under which a stream is counted until its Hello is accepted."""
 
 
 class Stream:
     """Serves one session. ``reallocate_rates`` is called after each frame, when the time that
-    frames take has changed.
+    frames take has changed. ``account`` is charged; who made it closes it.
 
-    It is a ``mec_server.quotas.CameraSender``.
+    It is a ``mec_server.ledger.active_cameras.CameraSender``.
     """
 
     def __init__(
-        self, server: ServerContext, context: Context, reallocate_rates: Callable[[], None]
+        self,
+        server: ServerContext,
+        context: Context,
+        session_id: str,
+        account: StreamAccount,
+        reallocate_rates: Callable[[], None],
     ) -> None:
-        session_id = uuid.uuid4().hex[:12]
         self.agent = _agent_process(context)
         self._server = server
         self._reallocate_rates = reallocate_rates
@@ -61,13 +71,17 @@ class Stream:
         self._tasks = asyncio.TaskGroup()
         self._opening: asyncio.Task[None] | None = None
         self._identity = peer_identity(context.auth_context())
-        self._permit: StreamPermit | None = None
-        self._over_quota = False
-        self._decoders = StreamDecoders(server)
+        self._account = account
+        self._over_budget = False
+        self.is_stalled = False
+        self._writing_since_s: float | None = None
+        self._is_closed = False
+        self._decoders = StreamDecoders(server, session_id)
         self._intrinsics: dict[str, Intrinsics] = {}
         self._fault: Exception | None = None
         self._metrics = server.metrics.of(UNKNOWN_VEHICLE)
-        self._log = log.bind(session=session_id, peer=context.peer())
+        lines = log.bind(session=session_id, peer=context.peer())
+        self._log = PeerLog(lines, server.log_limiter, account.identity, time.monotonic)
         self._session = ServerSession(
             session_id,
             server.held_field_ids(),
@@ -91,6 +105,7 @@ class Stream:
         rate_hz = changed.get(self._session.session_id)
         if rate_hz is not None:
             self._log.info("rate granted", rate_hz=rate_hz)
+            self._account.grant(rate_hz, time.monotonic())
             self._session.grant(rate_hz)
             self._wake.set()
 
@@ -105,17 +120,15 @@ class Stream:
         self._wake.set()
 
     def close(self) -> None:
-        """Remove every trace of the stream: twin, metrics, quotas, decoders."""
+        """Remove every trace of the stream: twin, metrics, decoders, and what Hello was granted."""
+        if self._is_closed:
+            return
+        self._is_closed = True
         self._timer.cancel()
         self._decoders.close()
         self._server.twin.leave(self._session.session_id)
         self._metrics.forget()
-        self._leave()
-
-    def _leave(self) -> None:
-        if self._permit is not None:
-            self._permit.leave()
-            self._permit = None
+        self._account.leave()
 
     async def run(self, requests: AsyncIterator[bytes]) -> StreamEnd:
         """Serve until the session is closed; return how it ended."""
@@ -145,7 +158,7 @@ class Stream:
         """Start the work that can be started, and wake the writer if there is something to send."""
         for job in self._session.jobs_to_start(time.monotonic()):
             if isinstance(job, DecodeJob):
-                self._decoders.submit(job, self._finished)
+                self._decoders.submit(job, self._account.expected_s(), self._finished)
             else:
                 self._opening = self._tasks.create_task(self._open(job))
         for frame, error in self._session.take_damaged():
@@ -155,10 +168,29 @@ class Stream:
 
     async def _write(self) -> None:
         messages = self._session.messages_to_send(time.monotonic())
-        if messages:
-            self._metrics.answered(messages)
-            for data in server_messages_to_bytes(messages):
-                await self._context.write(data)
+        if not messages or self.is_stalled:
+            return
+        self._metrics.answered(messages)
+        for data in server_messages_to_bytes(messages):
+            self._writing_since_s = time.monotonic()
+            await self._context.write(data)
+        self._writing_since_s = None
+
+    def end_if_stalled(self, now: float) -> LimitExceeded | None:
+        """End the stream and give back what it holds if its peer took no answer for long.
+
+        gRPC sends no status before what is being written, so the call itself lasts until the peer
+        reads again or is gone, and is charged for as long. Returns why it ended, once.
+        """
+        since_s, stalled_s = self._writing_since_s, self._server.limits.stalled_s
+        if self.is_stalled or since_s is None or now < since_s + stalled_s:
+            return None
+        self.is_stalled = True
+        error = LimitExceeded(Limit.UNREAD_ANSWERS, f"no answer was taken for {stalled_s:g} s")
+        self._log.warning("stream stalled", reason=error.limit, problem=str(error))
+        self._session.end(error)
+        self.close()
+        return error
 
     async def _rest(self) -> None:
         """Wait until there is something to send or the session's timer runs out."""
@@ -175,29 +207,47 @@ class Stream:
 
     async def _read(self, requests: AsyncIterator[bytes]) -> None:
         async for data in requests:
-            now = time.monotonic()
-            try:
-                message = client_message_from_bytes(data)
-            except InvalidInput as error:
-                self._log.warning("message refused", problem=str(error))
-                self._session.refuse(error, now)
-            else:
-                if isinstance(message, Frame):
-                    self._receive_frame(message, len(data), now)
-                else:
-                    self._receive_hello(message, now)
+            self._receive(data, time.monotonic())
             self._advance()
+            if self._session.closed is not None:
+                return
         self.drain()
+
+    def _receive(self, data: bytes, now: float) -> None:
+        """Take one message; whatever it is, it is charged."""
+        excess = self._excess(lambda: self._account.spend_message(len(data), now))
+        try:
+            message = client_message_from_bytes(data)
+        except InvalidInput as error:
+            self._log.warning("message refused", problem=str(error))
+            self._session.refuse(error, now)
+            return
+        if isinstance(message, Frame):
+            self._receive_frame(message, len(data), excess, now)
+        elif excess is not None:
+            self._session.end(excess)
+        else:
+            self._receive_hello(message, now)
+
+    def _excess(self, spend: Callable[[], None]) -> LimitExceeded | None:
+        """Return the limit that ``spend`` exceeds, if it does: counted, and logged once."""
+        try:
+            spend()
+        except LimitExceeded as error:
+            self._server.metrics.count_limited(error.limit)
+            if not self._over_budget:
+                self._log.warning("frames refused", reason=error.limit, problem=str(error))
+            self._over_budget = True
+            return error
+        return None
 
     def _receive_hello(self, hello: Hello, now: float) -> None:
         session = self._session
         session.receive(hello, now)
         if session.state is not SessionState.OPENING:
             return
-        account = self._account(hello)
-        self._leave()  # what an earlier Hello that could not be opened was granted
         try:
-            self._permit = self._server.entry.enter(hello, account, session.session_id, self, now)
+            rate_hz = self._account.enter(hello, self, now)
         except LimitExceeded as error:
             self._log.warning(
                 "vehicle refused",
@@ -207,33 +257,28 @@ class Stream:
             )
             session.end(error)
         else:
-            session.grant(self._permit.rate_hz)
+            session.grant(rate_hz)
 
-    def _account(self, hello: Hello) -> str:
-        """Return whom the stream's work is charged to: the certificate's name, if there is one."""
-        return self._identity.uris[0] if self._identity is not None else hello.vehicle_id
-
-    def _receive_frame(self, frame: Frame, message_bytes: int, now: float) -> None:
+    def _receive_frame(
+        self, frame: Frame, message_bytes: int, excess: LimitExceeded | None, now: float
+    ) -> None:
         self._metrics.received(frame, message_bytes)
-        try:
-            if self._permit is not None:
-                self._permit.allowance.spend(message_bytes, now)
-        except LimitExceeded as error:
-            self._server.metrics.limited.labels(error.limit).inc()
-            if not self._over_quota:  # logged once per excess: the log must not overflow, too
-                self._log.warning("frames refused", reason=error.limit, problem=str(error))
-            self._over_quota = True
-            self._session.overrun(frame, error, now)
-        else:
-            self._over_quota = False
-            self._session.receive(frame, now)
+        if excess is None:
+            excess = self._excess(lambda: self._account.spend_frame(frame, message_bytes, now))
+        if excess is not None:
+            self._session.overrun(frame, excess, now)
+            return
+        self._over_budget = False
+        self._session.receive(frame, now)
 
     async def _open(self, job: OpenJob) -> None:
         try:
-            await self._decoders.open(self._account(job.hello), job)
+            await self._decoders.open(self._account.identity, job, self._account.take_decoders())
         except RfedgeError as error:
+            self._account.opening_ended(opened=False, now=time.monotonic())
             self._session.open_failed(error, time.monotonic())
         else:
+            self._account.opening_ended(opened=True, now=time.monotonic())
             self._intrinsics = {c.camera_id: c.intrinsics for c in job.hello.cameras}
             self._log = self._log.bind(vehicle=job.hello.vehicle_id)
             self._metrics.forget()
@@ -246,38 +291,49 @@ class Stream:
 
     def _finished(self, job: DecodeJob, outcome: FrameResult | Exception) -> None:
         try:
-            if isinstance(outcome, FrameResult):
-                self._reconstructed(job, outcome)
-            elif isinstance(outcome, PacketRejected):
-                self._rejected(job, outcome)
-            else:
+            if isinstance(outcome, Exception):
                 raise outcome
+            now = time.monotonic()
+            complete = isinstance(outcome.reconstruction, Reconstruction)
+            self._account.worked(job.field_id, outcome.worker_s, now, complete=complete)
+            self._reallocate_rates()
+            if isinstance(outcome.reconstruction, Reconstruction):
+                self._reconstructed(job, outcome.reconstruction, now)
+            else:
+                self._rejected(job, outcome.reconstruction, now)
         except Exception as error:  # a programming error ends the stream that met it, loudly
             self._fault = error
             self._wake.set()
         else:
             self._advance()
 
-    def _reconstructed(self, job: DecodeJob, result: FrameResult) -> None:
-        now = time.monotonic()
-        outcome = result.reconstruction.outcome
-        if self._permit is not None:
-            self._permit.worked(result.worker_s)
-        self._reallocate_rates()
+    def _reconstructed(self, job: DecodeJob, reconstruction: Reconstruction, now: float) -> None:
+        outcome = reconstruction.outcome
         self._session.decoded(job, outcome, now)
-        latency_s = max(0.0, (time.time_ns() - job.frame.capture_time_ns) / 1e9)
-        self._metrics.reconstructed(latency_s)
+        latency_s = self._latency_s(job)
         if not outcome.exact:
             self._server.metrics.inexact.inc()
-        self._show(job, result, now, latency_s)
+        self._show(job, reconstruction, now, latency_s)
 
-    def _rejected(self, job: DecodeJob, error: PacketRejected) -> None:
+    def _latency_s(self, job: DecodeJob) -> float:
+        """Return the seconds since a frame's capture, by its own word if that can be; else since
+        its arrival: a clock that is wrong makes no age, and no sum, wrong."""
+        claimed_s = (time.time_ns() - job.frame.capture_time_ns) / 1e9
+        if not -MAX_AHEAD_S <= claimed_s <= MAX_BEHIND_S:
+            self._server.metrics.implausible_captures.inc()
+            return max(0.0, time.monotonic() - job.received_s)
+        latency_s = max(0.0, claimed_s)
+        self._metrics.reconstructed(latency_s)
+        return latency_s
+
+    def _rejected(self, job: DecodeJob, error: PacketRejected, now: float) -> None:
         self._log_rejected(job.frame, error)
-        now = time.monotonic()
         self._session.rejected(job, error, now)
-        if self._permit is not None and isinstance(error.__cause__, DecoderLost):
+        if isinstance(error, RenderTooLate):
+            self._server.metrics.count_limited(Limit.RENDER_DEADLINE)
+        if isinstance(error.__cause__, DecoderLost):
             try:
-                self._permit.allowance.lost_decoder(now)
+                self._account.lost_decoder(now)
             except LimitExceeded as barred:
                 self._session.end(barred)
 
@@ -291,7 +347,9 @@ class Stream:
             problem=error.problem,
         )
 
-    def _show(self, job: DecodeJob, result: FrameResult, now: float, latency_s: float) -> None:
+    def _show(
+        self, job: DecodeJob, reconstruction: Reconstruction, now: float, latency_s: float
+    ) -> None:
         hello, session = self._session.hello, self._session
         if hello is None or session.closed is not None:
             return
@@ -302,8 +360,8 @@ class Stream:
                 frame=job.frame,
                 intrinsics=self._intrinsics[job.frame.camera_id],
                 field_id=job.field_id,
-                picture=result.reconstruction.picture,
-                digest=result.reconstruction.outcome.reconstruction_digest,
+                picture=reconstruction.picture,
+                digest=reconstruction.outcome.reconstruction_digest,
                 reconstructed_s=now,
                 latency_s=latency_s,
             )

@@ -8,13 +8,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
-from mec_server.decode_jobs import DecodeJob, OpenJob
+from mec_server.decode_jobs import DecodeJob, OpenJob, RenderTooLate
+from mec_server.ledger.ledger import Hold
 from mec_server.metrics import BackgroundTask, OpeningResult
 from mec_server.reconstruction import Decoder, Reconstruction
-from mec_server.recorder import Recording
+from mec_server.recorder import SessionRecording
 from mec_server.server_context import ServerContext
 from rfcore.codec.h264.splice import PictureDecoder
-from rfcore.errors import RfedgeError
+from rfcore.errors import PacketRejected, RfedgeError
 
 __all__ = ["FrameResult", "StreamDecoders"]
 
@@ -25,9 +26,9 @@ class OpeningCancelled(RfedgeError):
 
 @dataclass(frozen=True)
 class FrameResult:
-    """A reconstructed frame, and the seconds for which it kept a worker busy."""
+    """A reconstructed frame, or why there is none; and for how long it kept a worker busy."""
 
-    reconstruction: Reconstruction
+    reconstruction: Reconstruction | PacketRejected
     worker_s: float
 
 
@@ -37,16 +38,19 @@ class StreamDecoders:
     Streams of the same ``owner`` share one turn at the workers and at the opener.
     """
 
-    def __init__(self, server: ServerContext) -> None:
+    def __init__(self, server: ServerContext, session_id: str) -> None:
         self._server = server
+        self._session_id = session_id
         self._owner = ""
-        self._vehicle_id = ""
+        self._recording: SessionRecording | None = None
         self._decoders: dict[str, Decoder] = {}
+        self._held: Hold | None = None
         self._closed = False
 
-    async def open(self, owner: str, job: OpenJob) -> None:
+    async def open(self, owner: str, job: OpenJob, held: Hold) -> None:
         """Open fields and decoders for ``job``, on a thread that delays no frames.
 
+        ``held``, what they are charged as, is released when the last of them is closed.
         Cancelled, it opens no more decoders and closes those that are open. Raises what
         ``OpenCameras`` raises.
         """
@@ -54,10 +58,12 @@ class StreamDecoders:
 
         def done(outcome: dict[str, Decoder] | Exception) -> None:
             self._count_opening(outcome)
-            if isinstance(outcome, dict):
-                self._decoders = outcome
+            if isinstance(outcome, dict) and outcome:
+                self._decoders, self._held = outcome, held
                 if self._closed:
                     self._close_decoders()
+            else:
+                held.release()
             if opened.done():
                 return
             if isinstance(outcome, Exception):
@@ -71,18 +77,25 @@ class StreamDecoders:
         except asyncio.CancelledError:
             self._closed = True
             raise
-        self._owner, self._vehicle_id = owner, job.hello.vehicle_id
+        self._owner = owner
 
     def submit(
-        self, job: DecodeJob, finished: Callable[[DecodeJob, FrameResult | Exception], None]
+        self,
+        job: DecodeJob,
+        expected_s: float,
+        finished: Callable[[DecodeJob, FrameResult | Exception], None],
     ) -> None:
-        """Decode a frame on a worker, then call ``finished`` on the loop; never after ``close``."""
+        """Decode a frame on a worker, then call ``finished`` on the loop; never after ``close``.
+
+        ``expected_s``: for how long it will keep the worker busy. One that would end after its
+        deadline is rejected (``RenderTooLate``) when its turn comes, before anything is rendered.
+        """
 
         def done(outcome: FrameResult | Exception | None) -> None:
             if outcome is not None and not self._closed:
                 finished(job, outcome)
 
-        self._server.workers.submit(self._owner, partial(self._reconstruct, job), done)
+        self._server.workers.submit(self._owner, partial(self._reconstruct, job, expected_s), done)
 
     def close(self) -> None:
         """Close the decoders on threads, those that are still being opened included."""
@@ -98,6 +111,8 @@ class StreamDecoders:
             return server.tools.open_decoder(size_px)
 
         self._check_wanted()
+        if server.recorder is not None:
+            self._recording = server.recorder.session(self._session_id, job.hello)
         tools = replace(server.tools, open_decoder=open_decoder)
         return server.open_cameras(job, server.fields, tools)
 
@@ -118,9 +133,15 @@ class StreamDecoders:
 
     def _close_decoders(self) -> None:
         decoders, self._decoders = self._decoders, {}
+        held, self._held = self._held, None
+        if held is None:
+            return
         loop = asyncio.get_running_loop()
-        for decoder in decoders.values():
+        closing = [
             loop.run_in_executor(None, self._close_decoder, decoder)
+            for decoder in decoders.values()
+        ]
+        asyncio.gather(*closing).add_done_callback(lambda _: held.release())
 
     def _close_decoder(self, decoder: Decoder) -> None:
         try:
@@ -128,14 +149,23 @@ class StreamDecoders:
         except Exception as error:
             self._server.metrics.task_failed(BackgroundTask.CLOSING, error)
 
-    def _reconstruct(self, job: DecodeJob) -> FrameResult | None:
+    def _reconstruct(self, job: DecodeJob, expected_s: float) -> FrameResult | None:
         """Runs on a worker; frames of a stream that is over are not decoded any more."""
         if self._closed:
             return None
         started_s = time.perf_counter()
-        reconstruction = self._decoders[job.frame.camera_id].reconstruct(job)
+        try:
+            self._check_deadline(job, expected_s)
+            reconstruction = self._decoders[job.frame.camera_id].reconstruct(job)
+        except PacketRejected as error:
+            return FrameResult(error, time.perf_counter() - started_s)
         worker_s = time.perf_counter() - started_s
-        recorder = self._server.recorder
-        if recorder is not None:
-            recorder.save(Recording(self._vehicle_id, job.frame, reconstruction.picture))
+        if self._recording is not None:
+            self._recording.save(job.frame, job.field_id, reconstruction.picture)
         return FrameResult(reconstruction, worker_s)
+
+    def _check_deadline(self, job: DecodeJob, expected_s: float) -> None:
+        waited_s = time.monotonic() - job.received_s
+        deadline_s = self._server.entry.render_deadline_s
+        if waited_s + expected_s > deadline_s:
+            raise RenderTooLate(waited_s, expected_s, deadline_s)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["MAX_SIDE_PX", "Camera", "Intrinsics", "Pose", "TileOrigin"]
+__all__ = ["MAX_SIDE_PX", "Camera", "Intrinsics", "Pose", "TileOrigin", "camera_on_rig"]
 
 MAX_SIDE_PX = 8192
 """Longest picture side accepted anywhere."""
@@ -225,6 +225,11 @@ class Camera:
         if z == 0.0:
             return (math.nan, math.nan, 0.0)
         return (k.fx_px * x / z + k.cx_px, k.fy_px * y / z + k.cy_px, z)
+
+
+def camera_on_rig(world_from_rig: Pose, camera_from_rig: Pose) -> Pose:
+    """Return world_from_cam of a camera of a rig, with the same bits on every machine."""
+    return world_from_rig.compose(camera_from_rig.inverse())
 
 
 def _normalised(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:

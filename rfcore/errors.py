@@ -92,6 +92,8 @@ class RejectReason(StrEnum):
     INVALID_ARGUMENT = "invalid_argument"
     OVERLOADED = "overloaded"
     UNKNOWN_STATE = "unknown_state"
+    UNSPECIFIED = "unspecified"
+    """Of a newer server, whose reason this vehicle does not know."""
 
 
 class PacketRejected(RfedgeError):

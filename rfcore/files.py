@@ -1,12 +1,14 @@
 """Files and folders that appear whole or not at all.
 
 The content goes to ``NAME.part`` beside the file, which is renamed over it at the end; when writing
-fails the part is removed and what stood there before is untouched. A folder is not replaced: it
-must not exist before.
+fails the part is removed and what stood there before is untouched. A file is on the disk before it
+gets its name, and the name before the function returns, so that a power cut leaves the old file or
+the new one. A folder is not replaced: it must not exist before.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +17,11 @@ from typing import BinaryIO
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["whole_file", "whole_folder", "write_whole"]
+__all__ = ["DECODED_BYTES", "whole_file", "whole_folder", "write_whole"]
+
+
+DECODED_BYTES = 2 << 30
+"""Memory that what a file holds may take, decoded, unless told: 9 million splats of SH degree 3."""
 
 
 @contextmanager
@@ -25,9 +31,32 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     try:
         with partial.open("wb") as file:
             yield file
+            file.flush()
+            os.fsync(file.fileno())
         partial.replace(path)
+        _sync_folder(path.parent)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the names in ``folder`` written to the disk."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _sync_contents(folder: Path) -> None:
+    """Have everything in ``folder`` written to the disk: files, and the names of what it holds."""
+    for path in folder.rglob("*"):
+        if path.is_dir():
+            _sync_folder(path)
+        elif path.is_file():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+    _sync_folder(folder)
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
@@ -49,6 +78,8 @@ def whole_folder(path: Path) -> Iterator[Path]:
     partial.mkdir(parents=True)
     try:
         yield partial
+        _sync_contents(partial)
         partial.replace(path)
+        _sync_folder(path.parent)
     finally:
         shutil.rmtree(partial, ignore_errors=True)

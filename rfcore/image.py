@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from fractions import Fraction
+from io import BytesIO
 from pathlib import Path
 
 import av
@@ -22,7 +23,16 @@ from numpy.typing import NDArray
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.files import write_whole
 
-__all__ = ["I420", "Rgb", "jpeg_bytes", "png_bytes", "read_rgb", "write_png"]
+__all__ = [
+    "I420",
+    "Rgb",
+    "jpeg_bytes",
+    "png_bytes",
+    "read_rgb",
+    "rgb_from_bytes",
+    "rgb_from_video_frame",
+    "write_png",
+]
 
 Rgb = NDArray[np.uint8]
 Plane = NDArray[np.uint8]
@@ -32,6 +42,10 @@ EXACT_CONVERSION = (
 )
 """swscale's short cuts darken a JPEG's green by 0.9 levels on average; so converted it is 0.02."""
 
+
+UNSPECIFIED_MATRIX = 2
+"""ITU-T H.273, MatrixCoefficients."""
+HD_LINES = 720
 
 JPEG_QUANTISER = "3"
 """FFmpeg's scale for MJPEG: 2 is best, 31 worst."""
@@ -90,22 +104,57 @@ class I420:
 
     def digest(self) -> bytes:
         """Return BLAKE2b-128 of the size and the three planes: equal pictures, equal 16 bytes."""
-        state = hashlib.blake2b(digest_size=16)
-        state.update(f"{self.size_px}".encode())
+        state = hashlib.blake2b(self.digest_head(), digest_size=16)
         for plane in self.planes:
             state.update(np.ascontiguousarray(plane).data)
         return state.digest()
 
+    def digest_head(self) -> bytes:
+        """Return what goes before the planes in the digest: the size."""
+        return f"{self.size_px}".encode()
+
+
+MAX_PICTURE_PX = 1 << 26
+"""What a picture file may hold: 8192x8192, 200 MB decoded."""
+
 
 def read_rgb(path: Path) -> Rgb:
     """Read a picture file as uint8 [H, W, 3]; raise ``DatasetError`` if it cannot be decoded."""
+    return _decode(str(path), str(path))
+
+
+def rgb_from_bytes(data: bytes, source: str) -> Rgb:
+    """Return a picture file's content as uint8 [H, W, 3]; raise ``DatasetError`` naming ``source``
+    if it cannot be decoded."""
+    return _decode(BytesIO(data), source)
+
+
+def _decode(file: str | BytesIO, source: str) -> Rgb:
     try:
-        with av.open(str(path)) as container:
+        with av.open(file, "r") as container:
+            _check_pixels(source, container.streams.video[0])
             frame = next(container.decode(video=0))
             rgb = frame.reformat(format="rgb24", interpolation=EXACT_CONVERSION)
             return np.ascontiguousarray(rgb.to_ndarray())
     except (FFmpegError, OSError, StopIteration, IndexError) as error:
-        raise DatasetError(f"{path}: not a readable picture ({error})") from error
+        raise DatasetError(f"{source}: not a readable picture ({error})") from error
+
+
+def _check_pixels(source: str, stream: av.VideoStream) -> None:
+    """Raise ``DatasetError`` for a picture above ``MAX_PICTURE_PX``, before it is decoded."""
+    pixels = stream.width * stream.height
+    if pixels > MAX_PICTURE_PX:
+        size = f"{stream.width}x{stream.height} px"
+        raise DatasetError(f"{source}: {size} is above {MAX_PICTURE_PX} pixels; scale it down")
+
+
+def rgb_from_video_frame(frame: av.VideoFrame) -> Rgb:
+    """Return uint8 [H, W, 3]; a matrix that is not stated is taken as players take it."""
+    matrix = frame.colorspace
+    if matrix == UNSPECIFIED_MATRIX:
+        matrix = Colorspace.ITU709 if frame.height >= HD_LINES else Colorspace.ITU601
+    rgb = frame.reformat(format="rgb24", src_colorspace=matrix, interpolation=EXACT_CONVERSION)
+    return np.ascontiguousarray(rgb.to_ndarray())
 
 
 def write_png(path: Path, rgb: Rgb) -> None:

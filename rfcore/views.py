@@ -27,7 +27,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 
@@ -42,6 +42,7 @@ below 0.001 / 0.25 / 0.5 / 0.75 / 0.9 / above is 0.082 / 0.065 / 0.062 / 0.061 /
 """
 NOTHING_M = np.float32(1e-6)
 """A depth of nothing hit, or one whose inverse would overflow; no renderer draws so near."""
+GREY = 128
 F32 = NDArray[np.float32]
 
 
@@ -116,16 +117,27 @@ class FieldView:
             bad = int((~np.isfinite(self.depth)).sum())
             raise InvalidInput("depth", f"{bad} of {self.depth.size} values are NaN or infinite")
 
+    @staticmethod
+    def nothing(intrinsics: Intrinsics) -> FieldView:
+        """Return what a camera that is lost is given: grey, no depth, opaque nowhere."""
+        shape = (intrinsics.height_px, intrinsics.width_px)
+        half = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
+        grey = (np.full(side, GREY, np.uint8) for side in (shape, half, half))
+        nowhere = np.zeros(shape, np.float32)
+        return FieldView(Camera(intrinsics, Pose.identity()), I420(*grey), nowhere, nowhere)
+
     @property
     def confidence(self) -> F32:
         """Opacity, less where depth breaks; raises ``InvalidInput`` where opacity was dropped."""
-        return confidence(self.depth, self._kept_opacity())
+        return confidence(self.depth, self.kept_opacity)
 
     def covers(self, least_opacity: float) -> NDArray[np.bool_]:
         """Return where opacity is above ``least_opacity``; raises as ``confidence`` does."""
-        return self._kept_opacity() > least_opacity
+        return self.kept_opacity > least_opacity
 
-    def _kept_opacity(self) -> F32:
+    @property
+    def kept_opacity(self) -> F32:
+        """Opacity; raises ``InvalidInput`` where it was dropped."""
         if self.opacity is None:
             raise InvalidInput("opacity", "was dropped from this view; render it again")
         return self.opacity

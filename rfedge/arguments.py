@@ -13,6 +13,7 @@ This module is imported for every ``--help`` and therefore imports nothing heavy
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING
 from tyro.conf import arg
 
 from rfcore.errors import InvalidInput
+from rfcore.files import DECODED_BYTES
 from rfedge.samples import sample_path
 
 if TYPE_CHECKING:
@@ -34,12 +36,16 @@ __all__ = [
     "IMPORTED",
     "JSON",
     "PLY",
+    "RENDERER",
     "RFF",
     "SAMPLES",
     "SCENE",
     "SIZE",
+    "SPLATS",
     "check_folder",
     "field_path",
+    "is_field_file",
+    "max_field_bytes",
     "open_field",
     "open_splats",
     "parse_size",
@@ -54,8 +60,10 @@ SCENE = arg(metavar="SCENE")
 ADDRESS = arg(metavar="HOST:PORT")
 SIZE = arg(metavar="WIDTHxHEIGHT")
 FOLDER = arg(metavar="FOLDER")
+RENDERER = arg(metavar="cpu|opencl[:DEVICE]")
 RFF = arg(metavar="FILE.rff")
 PLY = arg(metavar="FILE.ply")
+SPLATS = arg(metavar="FILE.ply|.spz")
 JSON = arg(metavar="FILE.json")
 
 IMPORTED = Path("out/fields")
@@ -80,6 +88,16 @@ def field_path(name: Path | str) -> Path:
     )
 
 
+def is_field_file(path: Path) -> bool:
+    """Return whether a file is a field's archive, by how it begins."""
+    from rfcore.field.archive import MAGIC
+
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
 def open_field(name: Path | str, *, threads: int = 1, isa: str | None = None) -> RadianceField:
     """Load a field by path or name.
 
@@ -87,7 +105,24 @@ def open_field(name: Path | str, *, threads: int = 1, isa: str | None = None) ->
     """
     from rfcore.field import load_field
 
-    return load_field(field_path(name), threads=threads, isa=isa)
+    return load_field(field_path(name), threads=threads, isa=isa, max_bytes=max_field_bytes())
+
+
+def max_field_bytes() -> int:
+    """Return the memory that a field's splats may take, which RFEDGE_MAX_FIELD_GB states.
+
+    Raises ``InvalidInput`` if that is not a number from 0.001 to 1000.
+    """
+    stated = os.environ.get("RFEDGE_MAX_FIELD_GB")
+    if stated is None:
+        return DECODED_BYTES
+    try:
+        max_gb = float(stated)
+    except ValueError:
+        max_gb = 0.0
+    if not 0.001 <= max_gb <= 1000:
+        raise InvalidInput("RFEDGE_MAX_FIELD_GB", f"{stated[:20]!r} is not a number 0.001..1000")
+    return round(max_gb * 1e9)
 
 
 def open_splats(name: Path | str, *, threads: int) -> SplatField:

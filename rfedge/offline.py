@@ -8,25 +8,24 @@ the packets' size.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import tee
 
-from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import DEFAULT_EFFORT, CodecConfig
+from rfcore.codec.h264.ffmpeg import H264Decoder
+from rfcore.codec.h264.splice import PictureDecoder
 from rfcore.codec.packet import DeltaPacket
-from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
+from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice, without_field
 from rfcore.codec.sender.frame_costs import FrameCosts
-from rfcore.codec.sender.pose_search import PoseSearch, Refined
 from rfcore.codec.sender.steering import NO_STEERING, Steering
 from rfcore.dataset import Dataset
 from rfcore.errors import CodecError, DatasetError, InvalidData, PacketRejected
 from rfcore.field import RadianceField, render_field_view
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
-from rfcore.views import FieldView
+from rfcore.views import FieldView, PosedPicture
 from rfcore.wire.checks import MAX_PAYLOAD_BYTES
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.drive_file import CodedDrive
@@ -38,6 +37,7 @@ __all__ = [
     "CodingSettings",
     "DecodedFrame",
     "FrameInput",
+    "Locate",
     "decode_drive",
     "decode_frames",
     "decode_promised",
@@ -50,6 +50,8 @@ CAMERA_ID = "front"
 RENDERER = RendererContract(RENDERER_CONTRACT, exact=True)
 FITTING = FrameChoice(limit_bytes=MAX_PAYLOAD_BYTES)
 LEFT_TO_THE_ENCODER = FrameChoice()
+Locate = Callable[[PosedPicture, I420], FieldView | None]
+"""Finds a picture's pose: what the field shows there, None if the camera is lost."""
 EPOCH = 1
 """Of a stream that is coded and decoded in one go."""
 
@@ -58,13 +60,15 @@ EPOCH = 1
 class FrameInput:
     """A frame to code, with what the field shows at its pose, and how it is to be coded.
 
-    ``costs`` are those of the frame's blocks, as far as they are known already.
+    ``costs`` are those of the frame's blocks, as far as they are known already. ``lost``: its pose
+    is not known, and it is coded without the field.
     """
 
     frame: I420
     view: FieldView
     choice: FrameChoice = LEFT_TO_THE_ENCODER
     costs: FrameCosts | None = None
+    lost: bool = False
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,8 @@ def encode_frames(encoder: DeltaEncoder, inputs: Iterable[FrameInput]) -> Iterat
     """
     state = encoder.start(EPOCH)
     for given in inputs:
-        encoded = encoder.encode(state, given.frame, given.view, given.choice, given.costs)
+        choice = without_field(given.choice, state) if given.lost else given.choice
+        encoded = encoder.encode(state, given.frame, given.view, choice, given.costs)
         state = encoded.state
         yield CodedFrame(given, encoded)
 
@@ -140,12 +145,13 @@ def decode_promised(
 
 @dataclass(frozen=True)
 class CodingSettings:
-    """How the P pictures are coded: an x264 preset, a constant rate factor (1..51), and where and
-    from which pose."""
+    """How the P pictures are coded: an effort, a constant rate factor (1..51), and where;
+    ``check_decode`` as in ``DeltaEncoder``."""
 
-    preset: str = "medium"
+    effort: str = DEFAULT_EFFORT
     crf: float = 23.0
     steering: Steering = NO_STEERING
+    check_decode: bool = False
 
 
 @dataclass(frozen=True)
@@ -156,52 +162,48 @@ class DecodedFrame:
     frame: I420
 
 
-def encode_drive(dataset: Dataset, field: RadianceField, settings: CodingSettings) -> CodedDrive:
+def encode_drive(
+    dataset: Dataset,
+    field: RadianceField,
+    settings: CodingSettings,
+    locate: Locate | None = None,
+) -> CodedDrive:
     """Code every picture of a drive against the field's render at its pose.
+
+    ``locate`` finds the poses; without it they are the dataset's.
 
     Raises ``DatasetError`` if the pictures are not all of one camera, ``CodecError`` for a picture
     whose slice is too long for a message at every CRF.
     """
     intrinsics = dataset.pictures[0].camera.intrinsics
-    config = CodecConfig(intrinsics.width_px, intrinsics.height_px, settings.preset, settings.crf)
-    encoder = DeltaEncoder(config)
-    coded_frames = encode_frames(encoder, _placed(dataset, field, settings))
+    config = CodecConfig(intrinsics.width_px, intrinsics.height_px, settings.effort, settings.crf)
+    encoder = DeltaEncoder(config, check_decode=settings.check_decode)
+    coded_frames = encode_frames(encoder, _placed(dataset, field, settings, locate))
     frames = []
     for picture, coded in zip(dataset.pictures, coded_frames, strict=True):
         _require_fit(picture.name, coded.encoded)
-        pose = coded.given.view.camera.world_from_cam
+        pose = None if coded.given.lost else coded.given.view.camera.world_from_cam
         frames.append(Frame(CAMERA_ID, picture.time_ns, pose, b"", coded.encoded.packet))
     camera = CameraDescription(CAMERA_ID, intrinsics, encoder.header)
     return CodedDrive(Hello(OFFLINE_VEHICLE, (camera,), (field.field_id,), RENDERER), tuple(frames))
 
 
 def _placed(
-    dataset: Dataset, field: RadianceField, settings: CodingSettings
+    dataset: Dataset, field: RadianceField, settings: CodingSettings, locate: Locate | None
 ) -> Iterator[FrameInput]:
     """Read one picture after another and render the field at the pose it is coded at."""
     intrinsics = dataset.pictures[0].camera.intrinsics
     choice = replace(FITTING, qp_map=settings.steering.qp_map)
-    place = _placer(field, settings)
     for picture in dataset.pictures:
         if picture.camera.intrinsics != intrinsics:
             raise DatasetError(f"{picture.name}: its camera differs from the first picture's")
         frame = i420_from_rgb(picture.read())
-        placed = place(frame, picture.camera.rounded())
-        yield FrameInput(frame, placed.view, choice, placed.costs)
-
-
-def _placer(field: RadianceField, settings: CodingSettings) -> Callable[[I420, Camera], Refined]:
-    """Return a function that finds the pose to code a frame at, and renders the field there."""
-
-    def render_at(camera: Camera) -> FieldView:
-        return render_field_view(field, camera)
-
-    refine_ms = settings.steering.refine_pose_ms
-    if refine_ms is None:
-        return lambda frame, camera: Refined(render_at(camera), FrameCosts(frame))
-    search = PoseSearch(refine_ms, time.perf_counter_ns)
-    crf = settings.crf
-    return lambda frame, camera: search.refine(frame, render_at(camera), render_at, crf)
+        if locate is None:
+            yield FrameInput(frame, render_field_view(field, picture.camera.rounded()), choice)
+        else:
+            view = locate(picture, frame)
+            shown = view or FieldView.nothing(intrinsics)
+            yield FrameInput(frame, shown, choice, lost=view is None)
 
 
 def _require_fit(name: str, encoded: Encoded) -> None:
@@ -213,8 +215,12 @@ def _require_fit(name: str, encoded: Encoded) -> None:
         )
 
 
-def decode_drive(drive: CodedDrive, field: RadianceField) -> Iterator[DecodedFrame]:
-    """Reconstruct every frame, in order.
+def decode_drive(
+    drive: CodedDrive,
+    field: RadianceField,
+    open_decoder: Callable[[tuple[int, int]], PictureDecoder] = H264Decoder,
+) -> Iterator[DecodedFrame]:
+    """Reconstruct every frame, in order, with a decoder that ``open_decoder`` makes.
 
     Raises ``InvalidData`` if the drive was coded against another field, ``PacketRejected`` at the
     first packet that fails a check.
@@ -227,12 +233,16 @@ def decode_drive(drive: CodedDrive, field: RadianceField) -> Iterator[DecodedFra
     arrivals = (
         Arrival(
             frame.packet,
-            render_field_view(field, frame.camera(camera.intrinsics), frame.quality),
+            camera.posed(frame).view(field, camera.intrinsics),
         )
         for frame in drive.frames
     )
     epoch = drive.frames[0].packet.epoch if drive.frames else EPOCH
-    pictures = decode_frames(DeltaDecoder(camera.codec), arrivals, epoch=epoch)
-    for frame, picture in zip(drive.frames, pictures, strict=True):
-        assert picture is not None, "every packet of a file arrives"
-        yield DecodedFrame(frame.packet.sequence, picture)
+    decoder = DeltaDecoder(camera.codec, open_decoder=open_decoder)
+    try:
+        pictures = decode_frames(decoder, arrivals, epoch=epoch)
+        for frame, picture in zip(drive.frames, pictures, strict=True):
+            assert picture is not None, "every packet of a file arrives"
+            yield DecodedFrame(frame.packet.sequence, picture)
+    finally:
+        decoder.close()

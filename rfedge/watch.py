@@ -32,7 +32,7 @@ from rfcore.image import I420, png_bytes
 from rfcore.native.yuv import rgb_from_i420
 from rfcore.wire.address import Address, check_handshake
 from rfcore.wire.checks import check_name
-from rfcore.wire.conventions import CHANNEL_OPTIONS
+from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import (
     Departure,
@@ -81,9 +81,10 @@ class PictureFolder:
             "epoch": picture.epoch,
             "sequence": picture.sequence,
             "capture_time_ns": picture.capture_time_ns,
+            "instant": picture.instant or None,
             "age_ms": picture.age_ns / 1e6,
-            "translation_m": picture.pose.translation_m,
-            "rotation_wxyz": picture.pose.rotation,
+            "translation_m": None if picture.pose is None else picture.pose.translation_m,
+            "rotation_wxyz": None if picture.pose is None else picture.pose.rotation,
             "field": picture.field_id,
             "digest": picture.reconstruction_digest.hex(),
             "missed": picture.skipped,
@@ -160,8 +161,6 @@ def _even(picture: I420) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     return flat.reshape(height * 3 // 2, width)
 
 
-LONGEST_MESSAGE_BYTES = 64 << 20
-"""A raw picture of 8192x4320 px and its header."""
 CONNECT_S = 10.0
 LOOK_EVERY_S = 0.05
 """How often the main thread looks whether a signal came or the watcher ended."""
@@ -340,14 +339,10 @@ def _started(watcher: TwinWatcher) -> Future[None]:
 
 
 def _open_channel(settings: WatchSettings) -> grpc.Channel:
-    options = (
-        *(o for o in CHANNEL_OPTIONS if o[0] != "grpc.max_receive_message_length"),
-        ("grpc.max_receive_message_length", LONGEST_MESSAGE_BYTES),
-    )
     if settings.tls is None:
-        return grpc.insecure_channel(settings.address, options=options)
+        return grpc.insecure_channel(settings.address, options=CONSUMER_OPTIONS)
     credentials = settings.tls.channel_credentials()
-    return grpc.secure_channel(settings.address, credentials, options=options)
+    return grpc.secure_channel(settings.address, credentials, options=CONSUMER_OPTIONS)
 
 
 def _problem(error: grpc.RpcError) -> str:
@@ -359,9 +354,12 @@ def _problem(error: grpc.RpcError) -> str:
 def _line(message: TwinPicture | Departure) -> str:
     if isinstance(message, Departure):
         return f"{message.vehicle_id}/{message.camera_id} left"
-    x_m, y_m, z_m = message.pose.translation_m
+    where = "lost"
+    if message.pose is not None:
+        where = "at {:.2f} {:.2f} {:.2f} m".format(*message.pose.translation_m)
+    instant = f"instant {message.instant}  " if message.instant else ""
     return (
-        f"{message.vehicle_id}/{message.camera_id} {message.epoch}:{message.sequence:<6} "
-        f"age {message.age_ns / 1e6:6.1f} ms  at {x_m:.2f} {y_m:.2f} {z_m:.2f} m  "
+        f"{message.vehicle_id}/{message.camera_id} {message.epoch}:{message.sequence:<6} {instant}"
+        f"age {message.age_ns / 1e6:6.1f} ms  {where}  "
         f"{len(message.picture)} bytes  missed {message.skipped}"
     )

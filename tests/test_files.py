@@ -1,10 +1,11 @@
 """A file appears whole or not at all."""
 
+import os
 from pathlib import Path
 
 import pytest
 
-from rfcore.files import whole_file, write_whole
+from rfcore.files import whole_file, whole_folder, write_whole
 
 
 def test_text_and_bytes_replace_what_was_there(tmp_path: Path) -> None:
@@ -28,3 +29,36 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
         fail_halfway(path)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_is_on_the_disk_before_it_gets_its_name_and_its_name_before_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[tuple[str, list[str]]] = []
+
+    def noted(descriptor: int) -> None:
+        target = Path(f"/proc/self/fd/{descriptor}").readlink()
+        names = sorted(path.name for path in tmp_path.iterdir())
+        synced.append((target.name, names))
+
+    monkeypatch.setattr(os, "fsync", noted)
+    write_whole(tmp_path / "a.bin", b"new")
+    assert synced == [("a.bin.part", ["a.bin.part"]), (tmp_path.name, ["a.bin"])]
+
+
+def test_a_folder_is_on_the_disk_with_all_it_holds_before_it_gets_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[tuple[str, bool]] = []
+
+    def noted(descriptor: int) -> None:
+        target = Path(f"/proc/self/fd/{descriptor}").readlink()
+        synced.append((target.name, (tmp_path / "out").exists()))
+
+    monkeypatch.setattr(os, "fsync", noted)
+    with whole_folder(tmp_path / "out") as folder:
+        (folder / "inner").mkdir()
+        (folder / "inner" / "a.txt").write_text("a")
+        (folder / "b.txt").write_text("b")
+    assert set(synced[:-2]) == {("inner", False), ("a.txt", False), ("b.txt", False)}
+    assert synced[-2:] == [("out.part", False), (tmp_path.name, True)]

@@ -23,6 +23,16 @@ def test_a_png_comes_back_byte_for_byte(size: tuple[int, int], tmp_path: Path) -
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"], "no partial file is left"
 
 
+def test_a_picture_beyond_the_budget_is_refused_before_it_is_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_png(tmp_path / "a.png", noise(64, 48))
+    monkeypatch.setattr("rfcore.image.MAX_PICTURE_PX", 64 * 48 - 1)
+    monkeypatch.setattr("rfcore.image.EXACT_CONVERSION", None)  # none is to get so far
+    with pytest.raises(DatasetError, match=r"a\.png: 48x64 px is above 3071 pixels; scale it"):
+        read_rgb(tmp_path / "a.png")
+
+
 def test_a_lossless_webp_comes_back_byte_for_byte(tmp_path: Path) -> None:
     rgb = noise(36, 64)
     cv2.imwrite(str(tmp_path / "a.webp"), rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 101])

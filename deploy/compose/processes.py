@@ -5,7 +5,8 @@
 The commands are those of the compose file, word by word; only places differ. Each service gets a
 loopback address of its own (127.77.0.N) in place of its host name, so that every port stays as it
 is, and a folder of its own in place of the container's root, where its mounts are symbolic links.
-Memory and CPU limits of the compose file are not applied. Images of others are not started, except
+Memory and CPU limits of the compose file are not applied. Servers of root are told to decode in a
+sandbox all the same: the containers have a user for that. Images of others are not started, except
 Prometheus, which is Debian's program. At the end it prints the CPU time of each service with its
 children, and of the whole machine.
 """
@@ -22,8 +23,10 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import psutil
@@ -40,13 +43,23 @@ STOP_TIMEOUT_S = 10.0
 
 @dataclass(frozen=True)
 class Service:
-    """One service of the compose file; ``mounts`` maps a path in the container to its source."""
+    """One service of the compose file; ``mounts`` maps a path in the container to its source.
+
+    ``health``: port and path that answer while it is well, ``:9100/metrics``; empty for a one-shot
+    service. ``environment``: beside that of this process.
+    """
 
     name: str
     command: tuple[str, ...]
     mounts: dict[str, str]
     after: tuple[str, ...]
-    lasting: bool
+    health: str
+    environment: dict[str, str]
+
+    @property
+    def lasting(self) -> bool:
+        """Whether it runs until it is stopped."""
+        return bool(self.health)
 
 
 @dataclass(frozen=True)
@@ -66,14 +79,24 @@ def read_services(
         if content["image"] != OURS and name not in names:
             continue
         mounts = [volume.split(":")[:2] for volume in content.get("volumes", ())]
+        variables = content.get("environment", {})
         services[name] = Service(
             name,
             tuple(_filled(str(word), environment) for word in content["command"]),
             {target: source for source, target in mounts},
             tuple(content.get("depends_on", ())),
-            "healthcheck" in content,
+            _health(content.get("healthcheck")) if content["image"] == OURS else ":9090/-/ready",
+            {key: _filled(value, environment) for key, value in variables.items()},
         )
     return services
+
+
+def _health(check: dict[str, Any] | None) -> str:
+    """Return what deploy/healthy.sh asks for, from its words: healthy PORT [PATH]."""
+    if check is None:
+        return ""
+    _, _, port, *path = check["test"]
+    return f":{port}{path[0] if path else '/metrics'}"
 
 
 def _filled(text: str, environment: dict[str, str]) -> str:
@@ -109,8 +132,10 @@ def _placed(text: str, service: Service, places: dict[str, Place]) -> str:
     names = "|".join(sorted(map(re.escape, places), key=len, reverse=True))
     text = re.sub(rf"\b({names})(?=:\d)", lambda found: places[found[1]].address, text)
     if "--hosts" in text:
-        before, _, hosts = text.partition("--hosts")
-        text = before + "--hosts" + re.sub(names, lambda found: places[found[0]].address, hosts)
+        before, _, after = text.partition("--hosts")
+        hosts, end, rest = after.partition(";")
+        hosts = re.sub(names, lambda found: places[found[0]].address, hosts)
+        text = f"{before}--hosts{hosts}{end}{rest}"
     for target in service.mounts:
         top = "/" + target.split("/")[1]
         text = re.sub(rf"(?<![\w./-]){re.escape(top)}(?=/|\s|$)", str(own.root) + top, text)
@@ -154,16 +179,22 @@ class Processes:
         self._folder = folder
         self.running: dict[str, subprocess.Popen[bytes]] = {}
 
-    def start(self, name: str, words: list[str]) -> subprocess.Popen[bytes]:
+    def start(
+        self, name: str, words: list[str], variables: Mapping[str, str] = MappingProxyType({})
+    ) -> subprocess.Popen[bytes]:
         """Start a service; what it writes goes to ``FOLDER/NAME.log``."""
-        environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+        environment = {
+            **os.environ,
+            **variables,
+            "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        }
         with (self._folder / f"{name}.log").open("wb") as log:
             process = subprocess.Popen(words, stdout=log, stderr=log, env=environment, cwd=ROOT)
         self.running[name] = process
         return process
 
     def wait_healthy(self, name: str, url: str) -> None:
-        """Wait until the service serves metrics; raise ``RuntimeError`` if it ends or does not."""
+        """Wait until the service answers at ``url``; raise ``RuntimeError`` if it does not."""
         deadline_s = time.monotonic() + START_TIMEOUT_S
         while time.monotonic() < deadline_s:
             if self.running[name].poll() is not None:
@@ -201,7 +232,8 @@ def run(folder: Path, minutes: float, prometheus: str) -> None:
     declared = dict(re.findall(r"^(\w+)=(.*)$", (ROOT / ".env").read_text(), re.MULTILINE))
     environment = {name: os.environ.get(name) or value for name, value in declared.items()}
     services = read_services(compose, environment)
-    services.pop("urls")
+    for name in ("urls", "watch"):
+        services.pop(name)
     places = places_of(services, folder)
     processes = Processes(folder)
     try:
@@ -222,9 +254,11 @@ def _start(service: Service, places: dict[str, Place], processes: Processes, fol
     words = words_of(service, places)
     if words[0] == "cav-agent":
         words.append(f"--report={folder / service.name}.jsonl")
-    process = processes.start(service.name, words)
+    if words[0] == "mec-server" and os.geteuid() == 0:
+        words.append("--sandbox-as-root")
+    process = processes.start(service.name, words, service.environment)
     if service.lasting:
-        processes.wait_healthy(service.name, f"http://{place.address}:9100/metrics")
+        processes.wait_healthy(service.name, f"http://{place.address}{service.health}")
     else:
         del processes.running[service.name]
         if process.wait(START_TIMEOUT_S) != 0:

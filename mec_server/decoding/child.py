@@ -1,9 +1,9 @@
 """The decoder process: runs FFmpeg's H.264 decoder alone, with as few rights as possible.
 
-Started by ``mec_server.decoding.process`` as ``python -m mec_server.decoding.child SOCKET MEMORY``,
-two inherited descriptors; it ends when the socket is closed. Before it reads the first byte that
-comes from a vehicle it gives up what it will not need: address space, descriptors, files,
-processes, core dumps. The limit of CPU time is for one request and is moved on before each.
+Started by ``mec_server.decoding.process`` as ``python -m mec_server.decoding.child CONFINEMENT
+SOCKET MEMORY``, the last two inherited descriptors; it ends when the socket is closed. Before it
+reads the first byte that comes from a vehicle it confines itself (``rfcore.confinement``). The
+limit of CPU time is for one request and is moved on before each.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from mec_server.decoding.protocol import (
     request_from_bytes,
 )
 from rfcore.codec.h264.ffmpeg import H264Decoder
+from rfcore.confinement.confine import Confinement, ProcessLimits, confine
 from rfcore.errors import CodecError
 from rfcore.image import I420
 
-__all__ = ["ADDRESS_SPACE_BYTES", "REQUEST_CPU_S", "confine", "main"]
+__all__ = ["LIMITS", "REQUEST_CPU_S", "main"]
 
-ADDRESS_SPACE_BYTES = 1 << 30
+LIMITS = ProcessLimits(address_space_bytes=1 << 30)
 """0.2 GiB is the interpreter; a 4096x2304 picture is 14 MB, and FFmpeg holds some twenty."""
 
 REQUEST_CPU_S = 5
-DESCRIPTORS = 16
 
 
 class DecoderChild:
@@ -87,18 +87,6 @@ class DecoderChild:
             offset += plane.size
 
 
-def confine() -> None:
-    """Give up for good what decoding does not need."""
-    for limit, value in (
-        (resource.RLIMIT_AS, ADDRESS_SPACE_BYTES),
-        (resource.RLIMIT_NOFILE, DESCRIPTORS),
-        (resource.RLIMIT_FSIZE, 0),
-        (resource.RLIMIT_NPROC, 0),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        resource.setrlimit(limit, (value, value))
-
-
 def _allow_cpu() -> None:
     """Let the kernel end this process if the next request keeps it busy for too long."""
     used = resource.getrusage(resource.RUSAGE_SELF)
@@ -108,9 +96,10 @@ def _allow_cpu() -> None:
 
 def main() -> None:
     """Serve until the socket closes."""
-    control = socket.socket(fileno=int(sys.argv[1]))
-    child = DecoderChild(mmap.mmap(int(sys.argv[2]), MEMORY_BYTES))
-    confine()
+    confinement, control_fd, memory_fd = sys.argv[1:]
+    control = socket.socket(fileno=int(control_fd))
+    child = DecoderChild(mmap.mmap(int(memory_fd), MEMORY_BYTES))
+    confine(Confinement(confinement), LIMITS)
     control.send(DONE)
     while request := control.recv(MAX_REQUEST_BYTES):
         _allow_cpu()

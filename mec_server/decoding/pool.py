@@ -8,12 +8,13 @@ as long as the pool.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 
-from mec_server.decoding.process import DecoderLost, DecoderProcess
+from mec_server.decoding.process import DecoderLost, DecoderProcess, Waiting
 from mec_server.decoding.protocol import INPUT_BYTES, Command
+from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import CodecError, RfedgeError
 from rfcore.image import I420
 
@@ -24,21 +25,24 @@ MAX_STAGED = 15
 
 
 class DecoderPool:
-    """Starts decoder processes by ``wrapper``.
+    """Starts decoder processes of ``program``.
 
     ``lost`` is called for each that dies in use, ``start_failed`` with what a spare could not be
-    started for, on the starter's thread; whoever takes that spare has another one started.
+    started for, on the starter's thread; whoever takes that spare has another one started. In the
+    context of ``waiting`` a thread waits for an answer that does not come at once.
     """
 
     def __init__(
         self,
-        wrapper: Sequence[str],
+        program: ConfinedProgram,
         lost: Callable[[DecoderLost], None],
         start_failed: Callable[[Exception], None],
+        waiting: Waiting = nullcontext,
     ) -> None:
         self.lost = lost
+        self.waiting = waiting
         self._start_failed = start_failed
-        self._wrapper = tuple(wrapper)
+        self._program = program
         self._lock = threading.Lock()
         self._starter = ThreadPoolExecutor(1, "decoder-starter")
         self._spare = self._starter.submit(self._start)
@@ -84,7 +88,7 @@ class DecoderPool:
             raise
 
     def _start(self) -> DecoderProcess:
-        process = DecoderProcess(self._wrapper)
+        process = DecoderProcess(self._program)
         process.wait_until_ready()
         return process
 
@@ -164,7 +168,7 @@ class ChildDecoder:
 
     def _request(self, process: DecoderProcess, command: Command, *numbers: int) -> None:
         try:
-            process.ask(command, *numbers)
+            process.ask(command, *numbers, waiting=self._pool.waiting)
         except DecoderLost as lost:
             self._process = None
             process.close()

@@ -9,13 +9,13 @@ from __future__ import annotations
 import fcntl
 import mmap
 import os
+import select
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from enum import StrEnum
 
 from mec_server.decoding.protocol import (
@@ -26,15 +26,22 @@ from mec_server.decoding.protocol import (
     Command,
     request_to_bytes,
 )
+from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import CodecError, RfedgeError
 
-__all__ = ["DecoderLost", "DecoderProcess", "LossCause", "child_environment"]
+__all__ = ["DecoderLost", "DecoderProcess", "LossCause", "Waiting"]
 
 START_S = 20.0
 """Time limit of its start: 0.3 s on an idle machine, more on one that swaps or is overloaded."""
 
 ANSWER_S = 2.0
 """Time limit of an answer: a thousand times what a 640x360 picture takes."""
+
+PATIENCE_S = 0.1
+"""An answer that takes longer is waited for without holding a worker of the server."""
+
+Waiting = Callable[[], AbstractContextManager[None]]
+"""Makes a context in which a thread waits, so that another one may work in its place."""
 
 SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
@@ -56,43 +63,30 @@ class DecoderLost(CodecError):
         self.pid = pid
 
 
-def child_environment() -> Mapping[str, str]:
-    """Return the environment variables of a decoder process."""
-    inherited = ("PYTHONPATH", "LD_LIBRARY_PATH")
-    own = {"OPENBLAS_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
-    return own | {name: os.environ[name] for name in inherited if name in os.environ}
-
-
 class DecoderProcess:
-    """A decoder process, started by ``wrapper``: a command line that runs its own arguments.
+    """A decoder process: ``program`` is ``mec_server.decoding.child`` in its confinement.
 
     Make it on a thread that outlives the process: bubblewrap ends with the thread that started it.
     """
 
-    def __init__(self, wrapper: Sequence[str] = ()) -> None:
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
-        memory_fd = os.memfd_create("decoder", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        try:
+    def __init__(self, program: ConfinedProgram) -> None:
+        with ExitStack() as until_started:
+            self._errors = until_started.enter_context(tempfile.TemporaryFile())
+            memory_fd = os.memfd_create("decoder", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+            until_started.callback(os.close, memory_fd)
             os.ftruncate(memory_fd, MEMORY_BYTES)
             fcntl.fcntl(memory_fd, fcntl.F_ADD_SEALS, SEALS)
-            self._memory = mmap.mmap(memory_fd, MEMORY_BYTES)
+            self._memory = until_started.enter_context(mmap.mmap(memory_fd, MEMORY_BYTES))
             self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            until_started.enter_context(self._control)
             with theirs:
-                self._process = self._start(wrapper, theirs.fileno(), memory_fd)
-        finally:
+                self._process = self._start(program, theirs.fileno(), memory_fd)
+            until_started.pop_all()
             os.close(memory_fd)
         self.pid = self._process.pid
 
-    def _start(self, wrapper: Sequence[str], *descriptors: int) -> subprocess.Popen[bytes]:
-        python = [sys.executable, "-P", "-m", "mec_server.decoding.child"]
-        return subprocess.Popen(
-            [*wrapper, *python, *map(str, descriptors)],
-            pass_fds=descriptors,
-            env=child_environment(),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=self._errors,
-        )
+    def _start(self, program: ConfinedProgram, *descriptors: int) -> subprocess.Popen[bytes]:
+        return program.start(list(map(str, descriptors)), descriptors, stderr=self._errors)
 
     def wait_until_ready(self) -> None:
         """Return when it answers; raise ``RfedgeError`` with its last line of errors otherwise."""
@@ -111,14 +105,15 @@ class DecoderProcess:
         """Whether it runs."""
         return self._process.poll() is None
 
-    def ask(self, command: Command, *numbers: int) -> None:
-        """Send a request and wait for its answer.
+    def ask(self, command: Command, *numbers: int, waiting: Waiting = nullcontext) -> None:
+        """Send a request and wait for its answer, for long in the context of ``waiting``.
 
         Raises ``DecoderLost``, or ``CodecError`` if FFmpeg refuses.
         """
         with suppress(OSError):  # a process that ended is noticed when its answer is received
             self._control.send(request_to_bytes(command, *numbers))
-        answer = self._receive(ANSWER_S)
+        with nullcontext() if self._answers_within(PATIENCE_S) else waiting():
+            answer = self._receive(ANSWER_S)
         if answer != DONE:
             raise CodecError(answer[1:].decode(errors="replace"))
 
@@ -137,6 +132,11 @@ class DecoderProcess:
         self._control.close()
         self._memory.close()
         self._errors.close()
+
+    def _answers_within(self, patience_s: float) -> bool:
+        poll = select.poll()
+        poll.register(self._control, select.POLLIN)
+        return bool(poll.poll(patience_s * 1e3))
 
     def _receive(self, within_s: float) -> bytes:
         self._control.settimeout(within_s)
@@ -159,7 +159,13 @@ class DecoderProcess:
             self._process.kill()
             return DecoderLost(LossCause.EXIT, self.pid, "hung up and was killed")
         number = -status if status < 0 else status - 128  # as bubblewrap and shells pass it on
-        if number > 0:
-            name = signal.Signals(number).name
-            return DecoderLost(LossCause.SIGNAL, self.pid, f"was killed by {name}")
+        if number in signal.valid_signals():
+            return DecoderLost(LossCause.SIGNAL, self.pid, f"was killed by {_signal_name(number)}")
         return DecoderLost(LossCause.EXIT, self.pid, f"ended with status {status}")
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # real-time signals have no names of their own
+        return f"signal {number}"

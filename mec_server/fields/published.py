@@ -50,10 +50,10 @@ class PublishedFields:
         return self.tiles != before
 
     def _take(self, tiles: tuple[Tile, ...]) -> None:
-        ready = {tile.field_id for tile in self.tiles}
-        for tile in tiles:
-            if tile.field_id not in ready:
-                self._open_field(tile.field_id)
+        ready = {field_id for tile in self.tiles for field_id in tile.renderable_ids}
+        for field_id in (field_id for tile in tiles for field_id in tile.renderable_ids):
+            if field_id not in ready:
+                self._open_field(field_id)
         self.tiles = tiles
 
     def _stamp(self) -> Stamp:
@@ -65,4 +65,7 @@ class PublishedFields:
 
 
 def _named(tiles: tuple[Tile, ...]) -> list[str]:
-    return [f"{tile.name} {tile.version}" for tile in tiles]
+    return [
+        " ".join([tile.name, str(tile.version), *(f"{x.name}:{x.version}" for x in tile.lights)])
+        for tile in tiles
+    ]

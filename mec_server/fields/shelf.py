@@ -7,28 +7,24 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from os import SEEK_END
 from pathlib import Path
 from typing import Protocol
 
-import structlog
-
 from rfcore.errors import InvalidInput
-from rfcore.field import FieldStore, RadianceField, Renderer
-from rfcore.wire.settings import RenderSettings
+from rfcore.field import RadianceField
 
-__all__ = ["CHUNK_BYTES", "FieldShelf", "Store", "field_loader", "read_chunks"]
+__all__ = ["CHUNK_BYTES", "FieldShelf", "Store", "read_chunk"]
 
-log = structlog.get_logger()
+CHUNK_BYTES = 64 * 1024
+"""As much as a connection's window: what a peer that does not read costs in memory."""
 
-CHUNK_BYTES = 256 * 1024
-"""A quarter of the receive limit."""
-
-MAX_OPEN_FIELDS = 4
+MAX_OPEN_FIELDS = 8
 
 
 class Store(Protocol):
-    """A directory of field archives, as ``rfcore.field.FieldStore``."""
+    """Field archives, as ``mec_server.fields.index.FieldIndex``."""
 
     def ids(self) -> Sequence[str]:
         """Return the ids of the fields there."""
@@ -40,13 +36,13 @@ class Store(Protocol):
 class FieldShelf:
     """A cache of opened fields of ``store``: ``load`` opens one, the least recently used leaves."""
 
-    def __init__(self, store: Store, load: Callable[[str], Renderer]) -> None:
+    def __init__(self, store: Store, load: Callable[[str], RadianceField]) -> None:
         self._store = store
         self._load = load
-        self._open: OrderedDict[str, Renderer] = OrderedDict()
+        self._open: OrderedDict[str, RadianceField] = OrderedDict()
         self._lock = threading.Lock()
 
-    def open(self, field_id: str) -> Renderer:
+    def open(self, field_id: str) -> RadianceField:
         """Return a field, ready to render; raise ``UnknownField`` or ``FieldFormatError``."""
         with self._lock:
             if field_id not in self._open:
@@ -67,43 +63,17 @@ class FieldShelf:
         return len(ids)
 
 
-def field_loader(
-    store: FieldStore, render: RenderSettings, *, opened: Callable[[RadianceField], None]
-) -> Callable[[str], RadianceField]:
-    """Return a function that opens a field of ``store``: checked, and with its renderer built.
+def read_chunk(path: Path, offset_bytes: int) -> bytes:
+    """Return up to ``CHUNK_BYTES`` of a file from ``offset_bytes`` on; nothing at its end.
 
-    ``opened`` is called with each field. The function raises ``UnknownField``,
-    ``FieldFormatError`` or ``BackendUnavailable``.
+    Each chunk opens the file and closes it: a transfer that is cut, or that nobody reads, holds
+    none open. Raises ``InvalidInput`` for an offset past the end, and ``OSError``.
     """
-
-    def load(field_id: str) -> RadianceField:
-        field = store.load(field_id, threads=render.threads, isa=render.isa)
-        field.prepare()
-        log.info(
-            "field opened",
-            field=field_id,
-            kind=field.metadata.kind,
-            primitives=field.primitives,
-            isa=field.isa,
-        )
-        opened(field)
-        return field
-
-    return load
-
-
-def read_chunks(path: Path, offset_bytes: int) -> Iterator[tuple[int, bytes]]:
-    """Yield (offset, bytes) of a file from ``offset_bytes`` on.
-
-    Raises ``InvalidInput`` for an offset past the end.
-    """
-    size_bytes = path.stat().st_size
-    if offset_bytes > size_bytes:
-        raise InvalidInput(
-            "offset_bytes", f"{offset_bytes} is past the end of a field of {size_bytes} bytes"
-        )
-    with path.open("rb") as file:
+    with path.open("rb", buffering=0) as file:
+        size_bytes = file.seek(0, SEEK_END)
+        if offset_bytes > size_bytes:
+            raise InvalidInput(
+                "offset_bytes", f"{offset_bytes} is past the end of a field of {size_bytes} bytes"
+            )
         file.seek(offset_bytes)
-        while chunk := file.read(CHUNK_BYTES):
-            yield offset_bytes, chunk
-            offset_bytes += len(chunk)
+        return file.read(CHUNK_BYTES)

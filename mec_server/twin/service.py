@@ -10,17 +10,19 @@ import asyncio
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import grpc
 import structlog
 
-from mec_server.config import ConsumerLimits
+from mec_server.peers import Slots, abort
 from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
-from mec_server.twin.state import Mailbox, Twin, TwinView
-from rfcore.errors import InvalidInput
+from mec_server.twin.state import Covers, Mailbox, Twin, TwinView
+from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded
 from rfcore.image import I420, jpeg_bytes, png_bytes
 from rfcore.native.yuv import rgb_from_i420
+from rfcore.wire.status import status_of
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
@@ -32,7 +34,7 @@ from rfcore.wire.twin import (
 from rfcore.wire.v1 import twin_pb2 as pb
 from rfcore.wire.v1 import twin_pb2_grpc
 
-__all__ = ["TwinPictures", "TwinService", "encoded"]
+__all__ = ["Sight", "TwinPictures", "TwinService", "encoded"]
 
 log = structlog.get_logger()
 
@@ -75,25 +77,39 @@ def encoded(picture: I420, encoding: PictureEncoding) -> bytes:
 Context = grpc.aio.ServicerContext[pb.WatchRequest, pb.WatchResponse]
 
 
+@dataclass(frozen=True)
+class Sight:
+    """What one consumer may see: ``covers`` says it of a picture, and ``check_vehicles`` raises
+    ``AccessDenied`` for vehicles asked for by name that it can never see."""
+
+    covers: Covers
+    check_vehicles: Callable[[frozenset[str]], None]
+
+
 class TwinService(twin_pb2_grpc.TwinServiceServicer):
     """Streams the pictures of ``twin`` to consumers.
 
-    ``failed`` is called with an unexpected exception, which ends the stream that met it.
+    ``slots`` says how many may watch; one that took nothing for ``stalled_s`` is too slow.
+    ``failed`` is called with an unexpected exception, which ends the stream that met it. ``sight``
+    says what the peer of a call may see.
     """
 
     def __init__(
         self,
         twin: Twin,
         metrics: TwinMetrics,
-        limits: ConsumerLimits,
+        slots: Slots,
+        stalled_s: float,
         failed: Callable[[Exception], None],
+        sight: Callable[[Context], Sight],
     ) -> None:
         self._twin = twin
+        self._sight = sight
         self._metrics = metrics
-        self._limits = limits
+        self._slots = slots
+        self._stalled_s = stalled_s
         self._failed = failed
         self._pictures = TwinPictures()
-        self._watching = 0
         self._draining = asyncio.Event()
 
     def register(self, server: grpc.aio.Server) -> None:
@@ -114,38 +130,41 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         """Send pictures until the consumer leaves, reads too slowly, or the server drains."""
         try:
             subscription = subscription_from_wire(request)
-        except InvalidInput as error:
-            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
-        if self._watching >= self._limits.consumers:
+            sight = self._sight(context)
+            sight.check_vehicles(subscription.vehicle_ids)
+        except (InvalidInput, AccessDenied) as error:
+            await context.abort(status_of(error), str(error))
+        try:
+            held = self._slots.hold(context)
+        except LimitExceeded as error:
             self._metrics.ended.labels(ConsumerEnd.REFUSED).inc()
-            await context.abort(
-                grpc.StatusCode.RESOURCE_EXHAUSTED,
-                f"{self._watching} consumers watch, {self._limits.consumers} may; try again later",
-            )
-        self._watching += 1
+            await abort(context, error)
+        with held:
+            await self._watch(subscription, sight.covers, context)
+
+    async def _watch(self, subscription: Subscription, covers: Covers, context: Context) -> None:
         self._metrics.consumers.inc()
         end = ConsumerEnd.LEFT
+        consumer = _Consumer(self._twin, self._pictures, self._metrics, context)
         try:
-            end = await _Consumer(self._twin, self._pictures, self._metrics, context).serve(
-                subscription, self._limits.stalled_s, self._draining
-            )
+            end = await consumer.serve(subscription, covers, self._stalled_s, self._draining)
         except Exception as error:
             self._failed(error)
             raise
         finally:
-            self._watching -= 1
             self._metrics.consumers.dec()
             self._metrics.ended.labels(end).inc()
             log.info("consumer ended", peer=context.peer(), reason=str(end))
-        if end is ConsumerEnd.SLOW:
+        if consumer.unread is not None:
+            await consumer.unread  # gRPC sends no status before what is being written
             await context.abort(
                 grpc.StatusCode.RESOURCE_EXHAUSTED,
-                f"nothing was taken for {self._limits.stalled_s:g} s; read faster",
+                f"nothing was taken for {self._stalled_s:g} s; read faster",
             )
 
 
 class _Consumer:
-    """Writes what arrives in one mailbox."""
+    """Writes what arrives in one mailbox. ``unread``: what a slow consumer has not taken."""
 
     def __init__(
         self, twin: Twin, pictures: TwinPictures, metrics: TwinMetrics, context: Context
@@ -155,12 +174,17 @@ class _Consumer:
         self._metrics = metrics
         self._context = context
         self._arrived = asyncio.Event()
+        self.unread: asyncio.Task[None] | None = None
 
     async def serve(
-        self, subscription: Subscription, stalled_s: float, draining: asyncio.Event
+        self,
+        subscription: Subscription,
+        covers: Covers,
+        stalled_s: float,
+        draining: asyncio.Event,
     ) -> ConsumerEnd:
         """Write what arrives, to the end; return how it ended."""
-        mailbox = self._twin.watch(subscription, self._arrived.set)
+        mailbox = self._twin.watch(subscription, self._arrived.set, covers)
         drained = asyncio.create_task(draining.wait())
         try:
             await self._context.send_initial_metadata(
@@ -177,9 +201,12 @@ class _Consumer:
                     timeout=stalled_s,
                     return_when=asyncio.FIRST_COMPLETED,
                 )
-                if not writing.done():
+                if not writing.done() and draining.is_set():
                     writing.cancel()
-                    return ConsumerEnd.DRAINED if draining.is_set() else ConsumerEnd.SLOW
+                    return ConsumerEnd.DRAINED
+                if not writing.done():
+                    self.unread = writing
+                    return ConsumerEnd.SLOW
                 writing.result()
             return ConsumerEnd.DRAINED
         finally:
@@ -223,4 +250,9 @@ def _message(view: TwinView, age_s: float, mailbox: Mailbox, data: bytes) -> Twi
         encoding=mailbox.subscription.encoding,
         picture=data,
         skipped=mailbox.skipped[view.key],
+        payload_bytes=len(packet.payload),
+        references=packet.references,
+        clock=view.frame.clock,
+        localisation=view.frame.localisation,
+        instant=view.frame.instant,
     )

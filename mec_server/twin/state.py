@@ -17,10 +17,13 @@ from rfcore.image import I420
 from rfcore.wire.messages import Frame
 from rfcore.wire.twin import Departure, Subscription
 
-__all__ = ["CameraKey", "Mailbox", "Twin", "TwinView"]
+__all__ = ["CameraKey", "Covers", "Mailbox", "Twin", "TwinView"]
 
 CameraKey = tuple[str, str]
 """(vehicle id, camera id)"""
+
+Covers = Callable[[str, str], bool]
+"""Whether a consumer may see the pictures of a vehicle (id) against a field (id)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +45,11 @@ class TwinView:
         """Which camera it is of."""
         return (self.vehicle_id, self.frame.camera_id)
 
+    @property
+    def captured_s(self) -> float:
+        """When it was captured, on the server's own clock: no vehicle can claim the future."""
+        return self.reconstructed_s - self.latency_s
+
     def age_s(self, now: float) -> float:
         """Return the seconds since capture; a clock that is set back makes it no younger."""
         return self.latency_s + max(0.0, now - self.reconstructed_s)
@@ -50,8 +58,15 @@ class TwinView:
 class Mailbox:
     """What one consumer has not taken yet; ``arrived`` is called for each new entry."""
 
-    def __init__(self, subscription: Subscription, arrived: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        subscription: Subscription,
+        arrived: Callable[[], None],
+        covers: Covers = lambda _vehicle_id, _field_id: True,
+    ) -> None:
         self.subscription = subscription
+        self._covers = covers
+        self._known: set[CameraKey] = set()
         self.skipped: Counter[CameraKey] = Counter()
         self._arrived = arrived
         self._entries: OrderedDict[tuple[CameraKey, type], TwinView | Departure] = OrderedDict()
@@ -62,7 +77,7 @@ class Mailbox:
     def put(self, key: CameraKey, entry: TwinView | Departure) -> bool:
         """Keep ``entry``: a picture in place of an older one of its camera, or of its departure; a
         departure behind its last picture. Return whether a picture was missed."""
-        if not self.subscription.includes(key[0]):
+        if not (self.subscription.includes(key[0]) and self._may_see(key, entry)):
             return False
         missed = isinstance(entry, TwinView) and (key, TwinView) in self._entries
         if isinstance(entry, TwinView):
@@ -73,6 +88,15 @@ class Mailbox:
         self._arrived()
         return missed
 
+    def _may_see(self, key: CameraKey, entry: TwinView | Departure) -> bool:
+        """Whether the consumer may know of ``entry``: a departure, if it has seen the camera."""
+        if isinstance(entry, Departure):
+            return key in self._known
+        if not self._covers(entry.vehicle_id, entry.field_id):
+            return False
+        self._known.add(key)
+        return True
+
     def take(self) -> TwinView | Departure | None:
         """Return what waits longest, or None."""
         if not self._entries:
@@ -80,6 +104,7 @@ class Mailbox:
         (key, _), entry = self._entries.popitem(last=False)
         if isinstance(entry, Departure):
             self.skipped.pop(key, None)
+            self._known.discard(key)
         return entry
 
 
@@ -97,7 +122,7 @@ class Twin:
         if (
             newest is not None
             and newest.session_id != view.session_id
-            and newest.frame.capture_time_ns > view.frame.capture_time_ns
+            and newest.captured_s > view.captured_s
         ):
             return
         self._views[view.key] = view
@@ -110,9 +135,15 @@ class Twin:
                 del self._views[key]
                 self._tell(key, Departure(*key))
 
-    def watch(self, subscription: Subscription, arrived: Callable[[], None]) -> Mailbox:
-        """Return a new consumer's mailbox, filled with the newest picture of each camera."""
-        mailbox = Mailbox(subscription, arrived)
+    def watch(
+        self,
+        subscription: Subscription,
+        arrived: Callable[[], None],
+        covers: Covers = lambda _vehicle_id, _field_id: True,
+    ) -> Mailbox:
+        """Return a new consumer's mailbox, filled with the newest picture of each camera that it
+        asks for and ``covers``."""
+        mailbox = Mailbox(subscription, arrived, covers)
         for key, view in self._views.items():
             mailbox.put(key, view)
         self._mailboxes.append(mailbox)

@@ -21,6 +21,7 @@ __all__ = [
     "BLOCK_MEANS_TOLERANCE",
     "block_mean_difference",
     "block_mean_digest",
+    "median_block_mean_difference",
 ]
 
 _BLOCKS_PER_SIDE = 8
@@ -45,6 +46,15 @@ def block_mean_difference(a: bytes, b: bytes) -> int:
     """Return the largest difference of the block means of two pictures, in levels."""
     means = (np.frombuffer(digest, np.uint8).astype(np.int16) for digest in (a, b))
     return int(np.abs(np.subtract(*means)).max())
+
+
+def median_block_mean_difference(a: I420, b: I420) -> float:
+    """Return the median of the block means' differences, in levels: how far two lights are apart.
+
+    What stands in less than half of the blocks, as vehicles do, does not count.
+    """
+    means = (np.frombuffer(block_mean_digest(p), np.uint8).astype(np.int16) for p in (a, b))
+    return float(np.median(np.abs(np.subtract(*means))))
 
 
 def _blocks(side: int) -> tuple[NDArray[np.intp], NDArray[np.int64]]:

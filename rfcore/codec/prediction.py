@@ -38,9 +38,12 @@ class Prediction:
         """Return the prediction with the render of ``view`` changed by ``photometric``."""
         return Prediction(replace(view, render=adapt(view.render, photometric)), past, threads)
 
-    def past_of(self, picture: I420) -> Past:
-        """Return what later frames predict from once this frame was decoded to ``picture``."""
-        return Past(picture, replace(self.view, opacity=None))
+    def past_of(self, picture: I420, digest: bytes | None = None) -> Past:
+        """Return what later frames predict from once this frame was decoded to ``picture``.
+
+        ``digest``: the picture's, where it is known already.
+        """
+        return Past(picture, replace(self.view, opacity=None), digest)
 
     @property
     def available(self) -> frozenset[Reference]:

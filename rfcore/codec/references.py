@@ -48,7 +48,7 @@ def is_temporal(references: References) -> bool:
 
 
 def check_references(references: References) -> References:
-    """Return ``references``; raise ``InvalidInput`` for more than 3 or repeated ones."""
+    """Return ``references``; raise ``InvalidInput`` for more than 4 or repeated ones."""
     count = len(references)
     if count > 1 and (count > REFERENCE_FRAMES or len(set(references)) != count):
         names = ", ".join(reference.name for reference in references)

@@ -32,11 +32,13 @@ class Past:
 
     picture: I420
     view: FieldView
+    known_digest: bytes | None = None
+    """The picture's digest, where it was computed already."""
 
     @cached_property
     def digest(self) -> bytes:
         """The digest of the picture, by which packets name the frame."""
-        return self.picture.digest()
+        return self.picture.digest() if self.known_digest is None else self.known_digest
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.dataset.source import Source, SourcePicture, SourcePoints
 from rfcore.dataset.undistort import pinhole_of, undistorted
 from rfcore.errors import DatasetError, InvalidInput
+from rfcore.geodesy import Anchor
 from rfcore.image import Rgb
 from rfcore.views import PointCloud, PosedPicture
 
@@ -105,7 +106,8 @@ class Dataset:
     they increase. ``points`` is ``None`` when the dataset has none. ``undistorted`` counts the
     pictures that are resampled to take a lens out, ``sorted_out`` those that are listed but were
     deleted as blurred (``rfcore.dataset.transforms``). ``exposure_varies`` where the dataset says
-    that every picture has an exposure of its own.
+    that every picture has an exposure of its own. ``anchor`` is of the tile's axes,
+    where the dataset states one.
     """
 
     pictures: tuple[PosedPicture, ...]
@@ -115,6 +117,7 @@ class Dataset:
     undistorted: int = 0
     sorted_out: int = 0
     exposure_varies: bool = False
+    anchor: Anchor | None = None
 
 
 def assemble(source: Source, options: ReadOptions) -> Dataset:
@@ -137,6 +140,7 @@ def assemble(source: Source, options: ReadOptions) -> Dataset:
         undistorted=sum(picture.camera.lens is not None for picture in source.pictures),
         sorted_out=source.sorted_out,
         exposure_varies=source.exposure_varies,
+        anchor=source.anchor.relative_to(origin) if source.anchor is not None else None,
     )
 
 

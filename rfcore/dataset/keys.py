@@ -12,18 +12,20 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rfcore.camera import Pose
 from rfcore.errors import DatasetError, InvalidInput
+from rfcore.geodesy import Anchor, anchor_of_values
 from rfcore.lens import BrownLens, FisheyeLens, Lens
 from rfcore.tables import Table
 
 __all__ = [
     "LENS_KEYS",
     "POSE_SHAPES",
+    "anchor_at",
     "finite_numbers",
     "lens_of",
     "load_json",
@@ -49,8 +51,18 @@ def read_file(file: Path) -> bytes:
         raise DatasetError(f"{file}: cannot be read ({error.strerror})") from error
 
 
+MAX_JSON_BYTES = 1 << 27
+"""200,000 pictures at 600 bytes each; parsed, JSON takes some ten times its size."""
+
+
 def load_json(file: Path) -> Any:
     """Return the content of a JSON file; raise ``DatasetError`` naming it."""
+    try:
+        size_bytes = file.stat().st_size
+    except OSError as error:
+        raise DatasetError(f"{file}: cannot be read ({error.strerror})") from error
+    if size_bytes > MAX_JSON_BYTES:
+        raise DatasetError(f"{file}: {size_bytes} bytes, more than {MAX_JSON_BYTES}; split it")
     try:
         return json.loads(read_file(file))
     except (ValueError, RecursionError) as error:
@@ -64,6 +76,16 @@ def table_at(where: str, values: object) -> Table:
         return DatasetError(f"{where}: key '{key}' {problem}" if key else f"{where}: {problem}")
 
     return Table(values, fail)
+
+
+def anchor_at(where: str, values: Mapping[str, Any] | None) -> Anchor | None:
+    """Return the anchor that a table states (``rfcore.geodesy``), None where there is no table."""
+    if values is None:
+        return None
+    try:
+        return anchor_of_values(values)
+    except InvalidInput as error:
+        raise DatasetError(f"{where}: {error}") from error
 
 
 def pose_of_rows(where: str, key: str, rows: Sequence[Sequence[float]]) -> Pose:

@@ -1,8 +1,9 @@
 """A dataset of any format, recognised by the files that are there.
 
 ``transforms.json`` (nerfstudio, instant-ngp), a COLMAP model, a KITTI odometry sequence, INRIA's
-``cameras.json``, or ``camera.toml`` for a recording of one's own. A folder with more than one of
-them is ambiguous: the file itself is to be named.
+``cameras.json``, ``camera.toml`` for a recording of one's own, or what servers recorded: one
+``recording.jsonl``, or a folder that they lie below, together in order of time. A folder with more
+than one of the others is ambiguous: the file itself is to be named.
 """
 
 from __future__ import annotations
@@ -15,16 +16,18 @@ from rfcore.dataset.assemble import Dataset, Distortion, ReadOptions, assemble
 from rfcore.dataset.colmap import colmap_model_folder, read_colmap_source
 from rfcore.dataset.inria import read_inria_source
 from rfcore.dataset.kitti import read_kitti_source
+from rfcore.dataset.recorded_session import RECORDING_NAME, read_recorded_source, recordings_under
 from rfcore.dataset.recording import read_recording_source
 from rfcore.dataset.source import Source
 from rfcore.dataset.transforms import read_transforms_source, transforms_file
 from rfcore.errors import DatasetError
 
-__all__ = ["read_dataset", "read_source", "refuse_video"]
+__all__ = ["is_video", "read_dataset", "read_source", "refuse_video"]
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
 EXPECTED = (
-    "transforms.json, sparse/0 of COLMAP, calib.txt of KITTI, cameras.json of INRIA, camera.toml"
+    "transforms.json, sparse/0 of COLMAP, calib.txt of KITTI, cameras.json of INRIA, camera.toml, "
+    "recording.jsonl of a server"
 )
 
 
@@ -52,6 +55,8 @@ def read_source(path: Path) -> Source:
     refuse_video(path)
     if path.suffix == ".toml":
         return read_recording_source(path)
+    if path.name == RECORDING_NAME:
+        return read_recorded_source(path)
     if path.name == "calib.txt":
         return read_kitti_source(path.parent)
     if path.suffix in (".bin", ".txt"):
@@ -61,13 +66,17 @@ def read_source(path: Path) -> Source:
     return read_inria_source(path) if path.name == "cameras.json" else read_transforms_source(path)
 
 
+def is_video(path: Path) -> bool:
+    """Tell whether a file is a video, by its name."""
+    return path.suffix.lower() in VIDEOS and not path.is_dir()
+
+
 def refuse_video(path: Path) -> None:
     """Raise ``DatasetError`` for a video, saying how pictures with poses are made of it."""
-    if path.suffix.lower() in VIDEOS:
+    if is_video(path):
         raise DatasetError(
-            f"{path}: is a video, which has no poses; take pictures out of it and find theirs: "
-            f"mkdir frames && ffmpeg -i {shlex.quote(str(path))} -vf fps=2 -q:v 2 "
-            "frames/%05d.jpg && rfedge scene poses frames --matching sequential --out DATASET; or, "
+            f"{path}: is a video, which has no poses; find those of its sharpest frames: "
+            f"rfedge scene poses {shlex.quote(str(path))} --out DATASET; or, "
             "with a trajectory, describe it in a camera.toml (docs/data.md)"
         )
 
@@ -75,6 +84,9 @@ def refuse_video(path: Path) -> None:
 def _read_folder(folder: Path) -> Source:
     """Read the one dataset a folder holds; several are a ``DatasetError`` that asks which."""
     found = _candidates(folder)
+    recorded = [] if found else recordings_under(folder)
+    if recorded:
+        return read_recorded_source(*recorded)
     if not found:
         raise DatasetError(f"{folder}: no dataset is recognised there (none of {EXPECTED})")
     if len(found) > 1:

@@ -38,33 +38,43 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from rfcore.camera import Intrinsics, Pose
+from rfcore.camera import Intrinsics
 from rfcore.dataset.keys import (
-    POSE_SHAPES,
+    anchor_at,
     lens_of,
-    pose_of_rows,
     read_file,
     table_at,
     text_lines,
 )
 from rfcore.dataset.picture_file import SUFFIXES, check_size, inside, read_picture
+from rfcore.dataset.recorded_poses import RecordedPoses
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
-from rfcore.dataset.trajectory import NS_PER_S, Trajectory, read_trajectory, time_ns
+from rfcore.dataset.trajectory import NS_PER_S, time_ns
 from rfcore.dataset.video import Video
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import Rgb
 from rfcore.tables import Range, Table
 
-__all__ = ["read_recording_source"]
+__all__ = ["RecordingCamera", "read_recording_camera", "read_recording_source"]
 
 SECTIONS = {
     "camera": "model width_px height_px fx_px fy_px cx_px cy_px k1 k2 k3 k4 p1 p2",
     "pictures": "video folder rate_hz times every",
     "trajectory": "file time_offset_s max_gap_s outside body_from_cam",
     "points": "file",
+    "anchor": "latitude_deg longitude_deg height_m enu_from_world point_m",
 }
-OPTIONAL = ("points",)
+REQUIRED = ("camera", "pictures", "trajectory")
+
+
+@dataclass(frozen=True)
+class RecordingCamera:
+    """A ``camera.toml`` without its pictures: the camera, and its poses over time if it has any."""
+
+    camera: SourceCamera
+    poses: RecordedPoses | None = None
 
 
 @dataclass(frozen=True)
@@ -82,62 +92,41 @@ def read_recording_source(file: Path) -> Source:
     where = f"{file}: [camera]"
     camera = _camera(where, content["camera"])
     timed = _timed_pictures(file, content["pictures"], camera.intrinsics)
-    poses = _Poses.of(file, content["trajectory"])
+    poses = RecordedPoses.of(file, content["trajectory"])
     pictures = tuple(
         SourcePicture(
             where=f"{file}: {picture.name}",
             name=picture.name,
             camera=camera,
-            world_from_cam=poses.at(f"{file}: {picture.name}", poses.time_ns(picture)),
+            world_from_cam=poses.at(f"{file}: {picture.name}", picture.time_ns),
             read=picture.read,
-            time_ns=poses.time_ns(picture),
+            time_ns=picture.time_ns + poses.offset_ns,
         )
         for picture in timed
-        if poses.wanted(picture)
+        if poses.wanted(picture.time_ns)
     )
-    return Source(file, pictures, _points(file, content), len(timed) - len(pictures))
+    dropped = len(timed) - len(pictures)
+    anchor = anchor_at(str(file), _values_of(content.get("anchor")))
+    return Source(file, pictures, _points(file, content), dropped, anchor=anchor)
 
 
-@dataclass(frozen=True)
-class _Poses:
-    """Where the camera is at a picture's time."""
+def read_recording_camera(file: Path) -> RecordingCamera:
+    """Read the sections [camera] and, if it is there, [trajectory] of a ``camera.toml``.
 
-    trajectory: Trajectory
-    offset_ns: int
-    max_gap_ns: int
-    drop_outside: bool
-    body_from_cam: Pose
-
-    @staticmethod
-    def of(file: Path, keys: Table) -> _Poses:
-        where = f"{file}: [trajectory]"
-        outside = keys.choice("outside", ("refuse", "drop"), "refuse")
-        body_from_cam = Pose.identity()
-        if "body_from_cam" in keys:
-            rows = keys.matrix("body_from_cam", POSE_SHAPES)
-            body_from_cam = pose_of_rows(where, "body_from_cam", rows)
-        offset_s = keys.number("time_offset_s", default=0.0)
-        max_gap_s = keys.number("max_gap_s", Range(0.0), 1.0)
-        return _Poses(
-            trajectory=read_trajectory(inside(where, file.parent, keys.text("file"))),
-            offset_ns=round(offset_s * NS_PER_S),
-            max_gap_ns=round(max_gap_s * NS_PER_S),
-            drop_outside=outside == "drop",
-            body_from_cam=body_from_cam,
-        )
-
-    def time_ns(self, picture: TimedPicture) -> int:
-        return picture.time_ns + self.offset_ns
-
-    def wanted(self, picture: TimedPicture) -> bool:
-        return not self.drop_outside or self.trajectory.covers(self.time_ns(picture))
-
-    def at(self, where: str, time: int) -> Pose:
-        world_from_body = self.trajectory.pose_at(where, time, self.max_gap_ns)
-        return world_from_body.compose(self.body_from_cam)
+    For cameras that send now. Raises ``DatasetError`` naming the file and key.
+    """
+    content = _load(file, required=("camera",))
+    poses = RecordedPoses.of(file, content["trajectory"]) if "trajectory" in content else None
+    return RecordingCamera(_camera(f"{file}: [camera]", content["camera"]), poses)
 
 
-def _load(file: Path) -> dict[str, Table]:
+def _values_of(table: Table | None) -> dict[str, Any] | None:
+    if table is None:
+        return None
+    return {key: table.value(key) for key in SECTIONS["anchor"].split() if key in table}
+
+
+def _load(file: Path, required: Sequence[str] = REQUIRED) -> dict[str, Table]:
     """Return the file's sections, each with no other keys than it may have."""
     try:
         content = tomllib.loads(read_file(file).decode())
@@ -151,7 +140,7 @@ def _load(file: Path) -> dict[str, Table]:
         if section in content:
             tables[section] = table_at(f"{file}: [{section}]", content[section])
             tables[section].require_known(known.split())
-        elif section not in OPTIONAL:
+        elif section in required:
             raise DatasetError(f"{file}: section [{section}] is missing")
     return tables
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rfcore.camera import Intrinsics, Pose
 from rfcore.errors import DatasetError, FieldFormatError, InvalidInput
 from rfcore.field.ply_table import Table, read_vertices
+from rfcore.geodesy import Anchor
 from rfcore.image import Rgb
 from rfcore.lens import Lens
 
@@ -66,7 +67,8 @@ class Source:
 
     ``file`` says what there is; ``sorted_out`` counts pictures it lists that were deleted on
     purpose, by the rules of its format; ``exposure_varies`` where it says that the camera chose
-    exposure or white balance anew for each picture.
+    exposure or white balance anew for each picture; ``anchor`` where it says what point
+    of its world is where on the Earth.
     """
 
     file: Path
@@ -74,6 +76,7 @@ class Source:
     points: SourcePoints | None = None
     sorted_out: int = 0
     exposure_varies: bool = False
+    anchor: Anchor | None = None
 
 
 def read_points(path: Path) -> SourcePoints:

@@ -10,6 +10,8 @@ left out, as that program does; any other missing picture is an error.
 nerfstudio's ``applied_transform`` A (a rotation and a shift) and ``applied_scale`` s say what was
 done to the poses and points before the file was written, ``file = s (A original)``; it is undone,
 so that the world is the one that was measured, in its metres.
+
+A key of our own, ``anchor``, states where on the Earth that world is (``rfcore.geodesy``).
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.dataset.keys import POSE_SHAPES, lens_of, load_json, pose_of_rows, table_at
+from rfcore.dataset.keys import POSE_SHAPES, anchor_at, lens_of, load_json, pose_of_rows, table_at
 from rfcore.dataset.picture_file import check_size, find_picture, inside, picture_file, read_picture
 from rfcore.dataset.source import Source, SourceCamera, SourcePicture, SourcePoints, read_points
 from rfcore.errors import DatasetError, InvalidInput
@@ -69,7 +71,9 @@ def read_transforms_source(file: Path) -> Source:
     if applied is not None:
         pictures = tuple(_moved(picture, applied) for picture in pictures)
         points = applied.undo_points(points) if points is not None else None
-    return Source(file, pictures, points, len(frames) - len(kept), _exposure_varies(top))
+    missing = len(frames) - len(kept)
+    anchor = anchor_at(str(file), content.get("anchor"))
+    return Source(file, pictures, points, missing, _exposure_varies(top), anchor)
 
 
 def transforms_file(folder: Path) -> Path | None:

@@ -12,19 +12,13 @@ from pathlib import Path
 from threading import Lock
 
 import av
-import numpy as np
 from av.error import FFmpegError
-from av.video.reformatter import Colorspace
 
 from rfcore.camera import Intrinsics
 from rfcore.errors import DatasetError
-from rfcore.image import EXACT_CONVERSION, Rgb
+from rfcore.image import Rgb, rgb_from_video_frame
 
 __all__ = ["Video"]
-
-UNSPECIFIED_MATRIX = 2
-"""ITU-T H.273, MatrixCoefficients."""
-HD_LINES = 720
 
 
 class Video:
@@ -59,7 +53,7 @@ class Video:
         """Return frame ``index`` as uint8 [H, W, 3]."""
         with self._lock:
             try:
-                return _rgb(self._frame(index))
+                return rgb_from_video_frame(self._frame(index))
             except (FFmpegError, StopIteration) as error:
                 raise DatasetError(
                     f"{self.file}: frame {index} cannot be decoded ({error})"
@@ -99,11 +93,3 @@ class Video:
             turned = "nothing" if first is None else f"frames to be turned by {first.rotation}"
             raise DatasetError(f"{self.file}: holds {turned} degrees; encode it upright first")
         self._container.seek(self._pts[0], stream=self._stream)
-
-
-def _rgb(frame: av.VideoFrame) -> Rgb:
-    matrix = frame.colorspace
-    if matrix == UNSPECIFIED_MATRIX:
-        matrix = Colorspace.ITU709 if frame.height >= HD_LINES else Colorspace.ITU601
-    rgb = frame.reformat(format="rgb24", src_colorspace=matrix, interpolation=EXACT_CONVERSION)
-    return np.ascontiguousarray(rgb.to_ndarray())

@@ -18,6 +18,7 @@ from rfcore.camera import Intrinsics, Pose
 from rfcore.dataset.source import SourceCamera, SourcePoints
 from rfcore.field.ply_table import write_vertices
 from rfcore.files import write_whole
+from rfcore.geodesy import Anchor, anchor_values
 from rfcore.lens import FisheyeLens
 
 __all__ = ["POINTS_NAME", "WrittenPicture", "transforms_of", "write_points", "write_transforms"]
@@ -37,12 +38,20 @@ class WrittenPicture:
 
 
 def write_transforms(
-    folder: Path, pictures: Sequence[WrittenPicture], points: SourcePoints | None
+    folder: Path,
+    pictures: Sequence[WrittenPicture],
+    points: SourcePoints | None,
+    anchor: Anchor | None = None,
 ) -> None:
-    """Write ``points.ply``, if there are points, and then ``transforms.json``."""
+    """Write ``points.ply``, if there are points, and then ``transforms.json``.
+
+    ``anchor`` is of the dataset's own world.
+    """
     if points is not None:
         write_points(folder / POINTS_NAME, points)
     content = transforms_of(pictures, POINTS_NAME if points is not None else None)
+    if anchor is not None:
+        content = {"anchor": anchor_values(anchor), **content}
     write_whole(folder / "transforms.json", json.dumps(content, indent=1) + "\n")
 
 

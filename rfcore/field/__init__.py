@@ -8,8 +8,9 @@ from rfcore.field.interface import (
     render_field_view,
 )
 from rfcore.field.ngp import NgpField
-from rfcore.field.ply import read_ply, read_ply_antialiased, write_ply
+from rfcore.field.ply import write_ply
 from rfcore.field.quality import FULL, Quality
+from rfcore.field.splat_file import read_splat_file
 from rfcore.field.splats import SplatField
 from rfcore.field.store import FieldStore, load_field, save_field
 
@@ -24,8 +25,7 @@ __all__ = [
     "Renderer",
     "SplatField",
     "load_field",
-    "read_ply",
-    "read_ply_antialiased",
+    "read_splat_file",
     "render_field_view",
     "save_field",
     "write_ply",

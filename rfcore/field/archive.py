@@ -43,6 +43,8 @@ PREFIX_ZEROS = 16
 ALIGN_BYTES = 64
 MAX_HEADER_BYTES = 1 << 20
 MAX_DIMENSIONS = 4
+MAX_EMPTY_SIZE = 1 << 40
+"""Product of an empty array's other sides: numpy refuses shapes beyond 2^63."""
 DTYPES = ("<f4", "<f2", "<f8", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8")
 
 Array = NDArray[Any]
@@ -178,7 +180,9 @@ def _described(entry: Any) -> tuple[str, np.dtype[Any], tuple[int, ...]]:
         raise _Damage(f"array '{name}' has dtype {dtype!r}, not one of {', '.join(DTYPES)}")
     sizes = shape if isinstance(shape, list) and len(shape) <= MAX_DIMENSIONS else [-1]
     if any(type(size) is not int or size < 0 for size in sizes):
-        raise _Damage(f"array '{name}' has shape {shape!r}")
+        raise _Damage(f"array '{name}' has shape {str(shape)[:60]}")
+    if 0 in sizes and math.prod(filter(None, sizes)) > MAX_EMPTY_SIZE:
+        raise _Damage(f"array '{name}' has shape {str(shape)[:60]}, of nothing")
     return name, np.dtype(dtype), tuple(sizes)
 
 

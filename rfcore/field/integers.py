@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import lzma
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,15 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["LIMIT", "MAX_INFLATION", "Integers", "decode_columns", "encode_columns"]
+__all__ = [
+    "LIMIT",
+    "MAX_INFLATION",
+    "Columns",
+    "Integers",
+    "decode_columns",
+    "encode_columns",
+    "open_columns",
+]
 
 DICTIONARY_BYTES = 1 << 20
 FILTERS = (
@@ -73,17 +83,45 @@ def decode_columns(
     The stream must hold exactly as many bytes as ``header`` and ``shape`` say, and no number of
     2^25 or more.
     """
+    return open_columns(header, stream, shape).rows(slice(None))
+
+
+@dataclass(frozen=True)
+class Columns:
+    """A decoded stream, of which rows are made when they are asked for.
+
+    ``planes`` uint8 [sum of ``widths``, N]: the bytes of the columns, lowest first.
+    """
+
+    planes: NDArray[np.uint8]
+    lowest: Sequence[int]
+    widths: Sequence[int]
+
+    def __len__(self) -> int:
+        return int(self.planes.shape[1])
+
+    def rows(self, part: slice) -> Integers:
+        """Return int32 [n, C]; raise ``InvalidInput`` for a number of 2^25 or more."""
+        planes = self.planes[:, part]
+        values = np.empty((len(self.widths), planes.shape[1]), np.int32)
+        ends = accumulate(self.widths)
+        for column, (low, width, end) in enumerate(
+            zip(self.lowest, self.widths, ends, strict=True)
+        ):
+            values[column] = _column(planes[end - width : end]) + low
+        return values.T
+
+
+def open_columns(
+    header: Mapping[str, Any], stream: NDArray[np.uint8], shape: tuple[int, int]
+) -> Columns:
+    """Return the columns of ``shape`` [N, C], as bytes; raises as ``decode_columns``."""
     count, columns = shape
     lowest = _checked(header["lowest"], columns, -LIMIT, LIMIT)
     widths = _checked(header["bytes"], columns, 1, 4)
     data = _inflated(stream, count * sum(widths))
     planes = np.frombuffer(data, np.uint8).reshape(sum(widths), count)
-    values = np.empty((columns, count), np.int32).T
-    first = 0
-    for column, (low, width) in enumerate(zip(lowest, widths, strict=True)):
-        values[:, column] = _column(planes[first : first + width]) + low
-        first += width
-    return values
+    return Columns(planes, lowest, widths)
 
 
 def _column(planes: NDArray[np.uint8]) -> Integers:

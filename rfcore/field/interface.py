@@ -23,6 +23,7 @@ from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive
 from rfcore.field.quality import FULL, Quality
+from rfcore.geodesy import Anchor, anchor_of_values, anchor_values
 from rfcore.native.yuv import field_view_from_view
 from rfcore.views import FieldView, View
 
@@ -80,6 +81,7 @@ class FieldMetadata:
     empty when it was imported. ``held_out_psnr_db`` and ``held_out_ssim`` are means over pictures
     it was not trained on, ``None`` when nobody measured. ``antialiased`` says how splats are to be
     drawn: with the opacity that makes up for the screen-space blur, because they were trained so.
+    ``anchor`` says where on the Earth the field's own axes are, ``None`` where nobody stated it.
     """
 
     name: str = ""
@@ -89,6 +91,7 @@ class FieldMetadata:
     held_out_ssim: float | None = None
     antialiased: bool = False
     kind: str = SPLATS
+    anchor: Anchor | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -156,7 +159,9 @@ def render_field_view(renderer: Renderer, camera: Camera, quality: Quality = FUL
 def stored_metadata(metadata: FieldMetadata, bounds: Bounds) -> dict[str, Any]:
     """Return what the header says of a field."""
     values = asdict(metadata)
-    del values["kind"]
+    del values["kind"], values["anchor"]
+    if metadata.anchor is not None:
+        values["anchor"] = anchor_values(metadata.anchor)
     return {**values, "bounds": {"low_m": list(bounds.low_m), "high_m": list(bounds.high_m)}}
 
 
@@ -180,6 +185,7 @@ def metadata_of_header(kind: str, stored: Mapping[str, Any]) -> FieldMetadata:
         held_out_ssim=_measured(stored, "held_out_ssim"),
         antialiased=antialiased,
         kind=kind,
+        anchor=anchor_of_values(stored["anchor"]) if "anchor" in stored else None,
     )
 
 

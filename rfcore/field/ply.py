@@ -18,18 +18,28 @@ instead of three (2D Gaussian Splatting's discs).
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import TileOrigin
 from rfcore.errors import FieldFormatError, InvalidInput
-from rfcore.field.ply_table import Table, read_comments, read_vertices, write_vertices
+from rfcore.field.ply_table import (
+    Header,
+    Table,
+    read_rows,
+    read_vertex_header,
+    write_vertices,
+)
+from rfcore.field.splat_archive import check_decoded_size
 from rfcore.raster.gaussians import Gaussians
 
-__all__ = ["read_ply", "read_ply_antialiased", "write_ply"]
+__all__ = ["antialiased_of", "read_open_ply", "write_ply"]
 
 XYZ = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
@@ -39,9 +49,6 @@ ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 REST_COUNTS = (0, 9, 24, 45)
 """3 ((D + 1)^2 - 1) coefficients beyond the first band for SH degree D = 0..3."""
 
-CONVERTED = (".splat", ".ksplat", ".spz", ".sog")
-"""Formats that keep fewer bits than .ply and that splat-transform converts."""
-OTHERS = (".sogs", ".gltf", ".glb")
 MODES = {"splatrendermode:mip": True, "splatrendermode:default": False}
 """Comments without their spaces, in lower case, and whether splats are drawn antialiased."""
 POSTSHOT_MODES = {"antialiased1": True, "antialiased0": False}
@@ -49,38 +56,50 @@ POSTSHOT_MODES = {"antialiased1": True, "antialiased0": False}
 F32 = NDArray[np.float32]
 
 
-def read_ply(path: Path, tile_origin: TileOrigin | None = None) -> Gaussians:
-    """Read Gaussians of SH degree 0..3; ``tile_origin`` is taken off the means in float64.
+def read_open_ply(
+    path: Path, file: BinaryIO, tile_origin: TileOrigin | None, max_bytes: int
+) -> Gaussians:
+    """Read Gaussians of SH degree 0..3; ``tile_origin`` is taken off the means in float64, ``path``
+    is the file's name.
 
-    Raises ``FieldFormatError`` naming the file and the property or Gaussian at fault.
+    Raises ``FieldFormatError`` naming the file and the property or Gaussian at fault, and for
+    Gaussians that take more than ``max_bytes`` of memory.
     """
-    _check_suffix(path)
-    table = read_vertices(path, (*XYZ, *DC, "opacity", *SCALES, *ROTATION))
-    if "filter_3D" in (table.dtype.names or ()):
+    header = read_vertex_header(path, file, (*XYZ, *DC, "opacity", *SCALES, *ROTATION))
+    if "filter_3D" in (header.dtype.names or ()):
         raise FieldFormatError(
             f"{path}: has filter_3D of Mip-Splatting; fuse it with its create_fused_ply.py first"
         )
-    rest = _rest_names(path, table)
+    rest, origin = _rest_names(path, header), tile_origin or TileOrigin()
+    count, coefficients = header.count, 1 + len(rest) // 3
     try:
-        return Gaussians(
-            means=_means(table, tile_origin if tile_origin is not None else TileOrigin()),
-            quaternions=_columns(table, ROTATION),
-            log_scales=_columns(table, SCALES),
-            opacity_logits=_columns(table, ("opacity",))[:, 0].copy(),
-            sh=_coefficients(table, rest),
-        )
+        check_decoded_size(count, math.isqrt(coefficients) - 1, max_bytes)
+        arrays = {
+            "means": np.empty((count, 3), np.float32),
+            "quaternions": np.empty((count, 4), np.float32),
+            "log_scales": np.empty((count, 3), np.float32),
+            "opacity_logits": np.empty(count, np.float32),
+            "sh": np.empty((count, coefficients, 3), np.float32),
+        }
+        for start, rows in read_rows(path, file, header):
+            part = slice(start, start + len(rows))
+            arrays["means"][part] = _means(rows, origin)
+            arrays["quaternions"][part] = _columns(rows, ROTATION)
+            arrays["log_scales"][part] = _columns(rows, SCALES)
+            arrays["opacity_logits"][part] = _columns(rows, ("opacity",))[:, 0]
+            arrays["sh"][part] = _coefficients(rows, rest)
+        return Gaussians(**arrays)
     except InvalidInput as error:
         raise FieldFormatError(f"{path}: {error}") from error
 
 
-def read_ply_antialiased(path: Path) -> bool | None:
-    """Return how the header says its splats are to be drawn, ``None`` where it does not say.
+def antialiased_of(path: Path, comments: Sequence[str]) -> bool | None:
+    """Return how the comments of a header say that splats are drawn; ``None`` if they do not.
 
-    Raises ``FieldFormatError`` when the header cannot be read or names a mode there is not.
+    Raises ``FieldFormatError`` when they name a mode there is not.
     """
-    _check_suffix(path)
     stated = None
-    for comment in read_comments(path):
+    for comment in comments:
         text = "".join(comment.lower().split())
         if text in MODES or text in POSTSHOT_MODES:
             stated = {**MODES, **POSTSHOT_MODES}[text]
@@ -115,19 +134,8 @@ def write_ply(path: Path, gaussians: Gaussians, *, antialiased: bool | None = No
     write_vertices(path, table, comments[antialiased])
 
 
-def _check_suffix(path: Path) -> None:
-    suffix = path.suffix.lower()
-    if suffix in OTHERS:
-        raise FieldFormatError(f"{path}: {suffix} is not read; export the splats as .ply")
-    if suffix in CONVERTED:
-        raise FieldFormatError(
-            f"{path}: {suffix} is not read; convert it first (npm package @playcanvas/"
-            f"splat-transform): splat-transform {path.name} {path.stem}.ply"
-        )
-
-
-def _rest_names(path: Path, table: Table) -> tuple[str, ...]:
-    present = {name for name in table.dtype.names or () if re.fullmatch(r"f_rest_\d+", name)}
+def _rest_names(path: Path, header: Header) -> tuple[str, ...]:
+    present = {name for name in header.dtype.names or () if re.fullmatch(r"f_rest_\d+", name)}
     names = tuple(f"f_rest_{i}" for i in range(len(present)))
     if len(present) not in REST_COUNTS or present != set(names):
         raise FieldFormatError(

@@ -8,7 +8,8 @@ properties; text of nine digits gives back the float32 it was written from.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,14 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import FieldFormatError
-from rfcore.files import whole_file
+from rfcore.files import DECODED_BYTES, whole_file
 
 __all__ = [
     "ASCII",
     "Header",
     "Table",
-    "read_comments",
     "read_header",
+    "read_rows",
+    "read_vertex_header",
     "read_vertices",
     "write_vertices",
 ]
@@ -84,7 +86,7 @@ def _lines(path: Path, file: BinaryIO) -> list[str]:
     lines: list[str] = []
     while file.tell() < MAX_HEADER_BYTES:
         line = file.readline(MAX_HEADER_BYTES)
-        lines.append(line.decode("latin-1").strip())
+        lines.append(_printable(line.decode("latin-1").strip()))
         if lines[0] != "ply":
             raise FieldFormatError(f"{path}: does not start with 'ply'")
         if lines[-1] == "end_header":
@@ -92,6 +94,11 @@ def _lines(path: Path, file: BinaryIO) -> list[str]:
         if not line:
             break
     raise FieldFormatError(f"{path}: no 'end_header' in the first {MAX_HEADER_BYTES} bytes")
+
+
+def _printable(text: str) -> str:
+    """Return text whose control characters, which a terminal might obey, are question marks."""
+    return "".join(c if c.isprintable() or c == "\t" else "?" for c in text)
 
 
 def _check_first_element(path: Path, words: list[list[str]], elements: list[int]) -> None:
@@ -138,27 +145,45 @@ def read_vertices(path: Path, required: Sequence[str]) -> Table:
     """Return the vertices of a PLY file as a structured array [N].
 
     Raises ``FieldFormatError``, which names the file and what is wrong with it, when the header
-    cannot be read, lacks a ``required`` property, or claims more rows than the file holds.
+    cannot be read, lacks a ``required`` property, or claims more rows than the file holds or more
+    than ``DECODED_BYTES`` of memory.
     """
     try:
         with path.open("rb") as file:
-            header = read_header(path, file)
-            _check_properties(path, header, required)
-            _check_size(path, header, file)
-            if header.format == ASCII:
-                return _text_rows(path, header, file)
-            return np.fromfile(file, dtype=header.dtype, count=header.count)
+            header = read_vertex_header(path, file, required)
+            size_bytes = header.count * header.dtype.itemsize
+            if size_bytes > DECODED_BYTES:
+                raise FieldFormatError(
+                    f"{path}: {header.count} vertices take {size_bytes / 1e9:.2f} GB, the limit "
+                    f"is {DECODED_BYTES / 1e9:.2f} GB; write fewer points"
+                )
+            table = np.empty(header.count, header.dtype)
+            for start, rows in read_rows(path, file, header):
+                table[start : start + len(rows)] = rows
+            return table
     except OSError as error:
         raise FieldFormatError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def read_comments(path: Path) -> tuple[str, ...]:
-    """Return the comments of a PLY file's header; raise ``FieldFormatError`` as above."""
-    try:
-        with path.open("rb") as file:
-            return read_header(path, file).comments
-    except OSError as error:
-        raise FieldFormatError(f"{path}: cannot be read ({error.strerror})") from error
+def read_vertex_header(path: Path, file: BinaryIO, required: Sequence[str]) -> Header:
+    """Read the header of an open file and check it as ``read_vertices`` does."""
+    header = read_header(path, file)
+    _check_properties(path, header, required)
+    _check_size(path, header, file)
+    return header
+
+
+def read_rows(path: Path, file: BinaryIO, header: Header) -> Iterator[tuple[int, Table]]:
+    """Yield (number of the first, rows) for a few thousand rows at a time, until all are read.
+
+    ``file`` stands behind the header. Raises ``FieldFormatError``, ``OSError``.
+    """
+    for start in range(0, header.count, ROWS_AT_ONCE):
+        wanted = min(ROWS_AT_ONCE, header.count - start)
+        if header.format == ASCII:
+            yield start, _text_rows(path, header, file, start, wanted)
+        else:
+            yield start, _binary_rows(path, header, file, start, wanted)
 
 
 def write_vertices(path: Path, table: Table, comments: Sequence[str] = ()) -> None:
@@ -184,7 +209,9 @@ def _check_properties(path: Path, header: Header, required: Sequence[str]) -> No
 
 
 def _check_size(path: Path, header: Header, file: BinaryIO) -> None:
-    left_bytes = path.stat().st_size - file.tell()
+    start = file.tell()
+    left_bytes = file.seek(0, os.SEEK_END) - start
+    file.seek(start)
     row_bytes = header.dtype.itemsize
     if header.format == ASCII:
         row_bytes = SHORTEST_VALUE_BYTES * len(header.dtype.names or ())
@@ -196,21 +223,27 @@ def _check_size(path: Path, header: Header, file: BinaryIO) -> None:
         )
 
 
-def _text_rows(path: Path, header: Header, file: BinaryIO) -> Table:
+def _binary_rows(path: Path, header: Header, file: BinaryIO, start: int, wanted: int) -> Table:
+    data = file.read(wanted * header.dtype.itemsize)
+    rows = len(data) // header.dtype.itemsize
+    if rows < wanted:
+        raise FieldFormatError(f"{path}: {start + rows} rows, the header claims {header.count}")
+    return np.frombuffer(data, header.dtype)
+
+
+def _text_rows(path: Path, header: Header, file: BinaryIO, start: int, wanted: int) -> Table:
     names = header.dtype.names or ()
     limit_bytes = LONGEST_VALUE_BYTES * len(names)
-    table = np.empty(header.count, header.dtype)
-    for start in range(0, header.count, ROWS_AT_ONCE):
-        wanted = min(ROWS_AT_ONCE, header.count - start)
-        lines = [line for _ in range(wanted) if (line := file.readline(limit_bytes))]
-        values = _numbers(path, lines, start, len(names))
-        if len(lines) < wanted:
-            raise FieldFormatError(
-                f"{path}: {start + len(lines)} rows, the header claims {header.count}"
-            )
-        with np.errstate(over="ignore"):
-            for column, name in enumerate(names):
-                table[name][start : start + len(lines)] = values[:, column]
+    lines = [line for _ in range(wanted) if (line := file.readline(limit_bytes))]
+    values = _numbers(path, lines, start, len(names))
+    if len(lines) < wanted:
+        raise FieldFormatError(
+            f"{path}: {start + len(lines)} rows, the header claims {header.count}"
+        )
+    table = np.empty(wanted, header.dtype)
+    with np.errstate(over="ignore"):
+        for column, name in enumerate(names):
+            table[name] = values[:, column]
     return table
 
 

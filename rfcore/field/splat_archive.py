@@ -15,7 +15,7 @@ of the raw 37.4 MB, at a loss of 0.05 dB on the held-out drive.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields, replace
 from typing import Any
 
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive, Array
 from rfcore.field.importance import reordered
-from rfcore.field.integers import Integers, decode_columns, encode_columns
+from rfcore.field.integers import Columns, Integers, encode_columns, open_columns
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
 from rfcore.field.quality import DETAILS, LevelOfDetail, LevelsOfDetail, kept_of
 from rfcore.field.splat_grid import (
@@ -37,16 +37,21 @@ from rfcore.field.splat_grid import (
     level_of,
     numbers_of,
 )
+from rfcore.files import DECODED_BYTES
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
 
 __all__ = [
     "ENCODING",
+    "check_decoded_size",
     "compressed_archive",
     "splat_archive",
     "splats_of_archive",
     "splats_of_compressed",
 ]
 
+
+SPLATS_AT_ONCE = 1 << 16
+"""Decoded at once, so that their numbers as int32 and float64 take little; a multiple of BLOCK."""
 
 ENCODING = "grid-1"
 MORTON_BITS = 21
@@ -91,31 +96,87 @@ def compressed_archive(
     return Archive(SPLATS, {**stored_metadata(metadata, bounds), "encoding": encoding}, arrays)
 
 
-def splats_of_compressed(archive: Archive) -> tuple[Gaussians, LevelsOfDetail]:
-    """Return the splats of a compressed archive.
+def splats_of_compressed(
+    archive: Archive, max_bytes: int = DECODED_BYTES
+) -> tuple[Gaussians, LevelsOfDetail]:
+    """Return the splats of a compressed archive, which take ``max_bytes`` at most.
 
-    Raises ``InvalidInput``, ``KeyError`` or ``TypeError`` for one that holds none; every size is
-    checked before it is allocated.
+    Raises ``InvalidInput``, ``KeyError`` or ``TypeError`` for one that holds none or more; every
+    size is checked before it is allocated. Beside the splats it takes a quarter of their memory.
     """
     encoding = archive.metadata["encoding"]
     if encoding["name"] != ENCODING:
         raise InvalidInput("encoding", f"{encoding['name']!r} is not '{ENCODING}'")
     count = _whole(encoding, "count", MAX_GAUSSIANS)
-    shapes = _shapes(count, _whole(encoding, "sh_degree", 3), archive)
+    sh_degree = _whole(encoding, "sh_degree", 3)
+    check_decoded_size(count, sh_degree, max_bytes)
+    shapes = _shapes(count, sh_degree, archive)
     if set(shapes) != set(archive.arrays):
         raise InvalidInput("encoding", f"arrays {', '.join(archive.arrays)} are not its streams")
     steps, streams = Steps(**encoding["steps"]), encoding["streams"]
-    parts = {
-        name: decode_columns(streams[name], archive.arrays[name], shape)
+    columns = {
+        name: open_columns(streams[name], archive.arrays[name], shape)
         for name, shape in shapes.items()
     }
-    numbers = SplatNumbers(**{f.name: parts[f.name] for f in fields(SplatNumbers)})
-    levels = {
-        detail: level_of(parts[_name(detail)], numbers, steps)
-        for detail in DETAILS[1:]
-        if _name(detail) in parts
+    levels = {detail: name for detail in DETAILS[1:] if (name := _name(detail)) in columns}
+    return _gaussians(columns, count, steps), {
+        detail: _level(columns[name], columns, steps) for detail, name in levels.items()
     }
-    return gaussians_of(numbers, steps), levels
+
+
+def check_decoded_size(count: int, sh_degree: int, max_bytes: int) -> None:
+    """Raise ``InvalidInput`` if so many splats take more than ``max_bytes`` as float32."""
+    size_bytes = 4 * count * (11 + 3 * (sh_degree + 1) ** 2)
+    if size_bytes > max_bytes:
+        raise InvalidInput(
+            "splats",
+            f"{count} of SH degree {sh_degree} take {size_bytes / 1e9:.2f} GB of memory, over the "
+            f"limit of {max_bytes / 1e9:.2f} GB; if you trust the file, raise it "
+            "(--max-field-gb; RFEDGE_MAX_FIELD_GB for rfedge)",
+        )
+
+
+def _numbers(columns: Mapping[str, Columns], part: slice) -> SplatNumbers:
+    """Return the numbers of some splats; ``part`` starts with a block."""
+    blocks = slice(part.start // BLOCK, -(-part.stop // BLOCK))
+    return SplatNumbers(
+        **{
+            f.name: columns[f.name].rows(blocks if f.name == "blocks" else part)
+            for f in fields(SplatNumbers)
+        }
+    )
+
+
+def _parts(count: int) -> Iterator[slice]:
+    for start in range(0, count, SPLATS_AT_ONCE):
+        yield slice(start, min(start + SPLATS_AT_ONCE, count))
+
+
+def _gaussians(columns: Mapping[str, Columns], count: int, steps: Steps) -> Gaussians:
+    coefficients = len(columns["sh"].widths) // 3
+    shapes = {
+        "means": (count, 3),
+        "quaternions": (count, 4),
+        "log_scales": (count, 3),
+        "opacity_logits": (count,),
+        "sh": (count, coefficients, 3),
+    }
+    arrays = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
+    for part in _parts(count):
+        some = gaussians_of(_numbers(columns, part), steps)
+        for name, array in arrays.items():
+            array[part] = getattr(some, name)
+    return Gaussians(**arrays)
+
+
+def _level(own: Columns, columns: Mapping[str, Columns], steps: Steps) -> LevelOfDetail:
+    kept = len(own)
+    level = LevelOfDetail(np.empty((kept, 3), np.float32), np.empty(kept, np.float32))
+    for part in _parts(kept):
+        some = level_of(own.rows(part), _numbers(columns, part), steps)
+        level.log_scales[part] = some.log_scales
+        level.opacity_logits[part] = some.opacity_logits
+    return level
 
 
 def _shapes(count: int, sh_degree: int, archive: Archive) -> dict[str, tuple[int, int]]:
@@ -186,13 +247,16 @@ def splat_archive(gaussians: Gaussians, levels: LevelsOfDetail, metadata: FieldM
     return Archive(SPLATS, stored_metadata(metadata, Bounds.around(gaussians.means)), arrays)
 
 
-def splats_of_archive(archive: Archive) -> tuple[Gaussians, LevelsOfDetail]:
+def splats_of_archive(
+    archive: Archive, max_bytes: int = DECODED_BYTES
+) -> tuple[Gaussians, LevelsOfDetail]:
     """Return the content of an archive, raw or compressed.
 
-    Raises ``InvalidInput`` if it does not hold splats; see also ``splats_of_compressed``.
+    Raises ``InvalidInput`` if it does not hold splats; see also ``splats_of_compressed``. Those of
+    a raw archive take no memory beside the file's.
     """
     if "encoding" in archive.metadata:
-        return splats_of_compressed(archive)
+        return splats_of_compressed(archive, max_bytes)
     arrays = dict(archive.arrays)
     levels = {
         detail: LevelOfDetail(*(arrays.pop(_own(detail, name)) for name in LEVEL_NAMES))

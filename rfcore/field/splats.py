@@ -20,9 +20,8 @@ from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadat
 from rfcore.field.quality import FULL, LevelsOfDetail, Quality, check_levels, splats_at_detail
 from rfcore.field.scale import colour_at_scale, view_at_scale
 from rfcore.field.splat_archive import compressed_archive, splat_archive, splats_of_compressed
-from rfcore.native.backend import check_backend
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.native import Rasterizer
+from rfcore.raster.native import Rasterizer, check_renderer
 from rfcore.views import View
 
 __all__ = ["SplatField"]
@@ -34,7 +33,8 @@ class SplatField:
     ``levels`` is what the lower levels of detail have of their own (``rfcore.field.quality``).
     ``archive`` is the one the field came from, ``None`` for one that was just made.
     ``threads`` and ``isa`` choose how it renders, never what: every choice gives the same bytes.
-    Raises ``BackendUnavailable`` if this machine lacks ``isa``. Safe to share between threads.
+    ``isa`` may be an OpenCL device. Raises ``BackendUnavailable`` if this machine lacks it. Safe to
+    share between threads.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class SplatField:
             raise InvalidInput("field.kind", f"'{self.metadata.kind}' is not '{SPLATS}'")
         self.levels = dict(levels or {})
         check_levels(gaussians, self.levels)
-        self.isa = check_backend(threads, isa)
+        self.isa = check_renderer(threads, isa)
         self._threads = threads
         self._archive = archive
         self._rasterizers: dict[float, Rasterizer] = {}
@@ -95,9 +95,20 @@ class SplatField:
     def described(self, metadata: FieldMetadata) -> SplatField:
         """Return the same splats with other metadata, another field."""
         old = self.archive()
-        described = {**old.metadata, **stored_metadata(metadata, self.bounds)}
+        if old.kind != SPLATS:
+            return SplatField(
+                self.gaussians, metadata, levels=self.levels, threads=self._threads, isa=self.isa
+            )
+        kept = {key: value for key, value in old.metadata.items() if key != "anchor"}
+        described = {**kept, **stored_metadata(metadata, self.bounds)}
         archive = Archive(SPLATS, described, old.arrays)
         return self._like(self.gaussians, metadata, self.levels, archive)
+
+    def derived(
+        self, gaussians: Gaussians, metadata: FieldMetadata, archive: Archive
+    ) -> SplatField:
+        """Return the field ``archive`` that has ``gaussians`` and this one's levels of detail."""
+        return self._like(gaussians, metadata, self.levels, archive)
 
     def prepare(self, quality: Quality = FULL) -> None:
         """Make the renderer of ``quality``; without this the first picture makes it."""

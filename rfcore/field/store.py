@@ -3,6 +3,9 @@
 ``decode_field`` makes a field that renders out of an archive's bytes, ``encode_field`` the reverse;
 ``READERS`` is the one place that knows which kinds of field there are.
 
+A colour layer (``rfcore.field.layer``) needs its base, which ``open_base`` finds by its id, or the
+folder that the layer's file is in.
+
 In a directory (``FieldStore``) a file named ``<field id>.rff`` is listed by its name, any other
 ``.rff`` file by its SHA-256, so that ``street.rff`` may simply be put there. Contents are checked
 when a field is added or loaded.
@@ -11,13 +14,13 @@ when a field is added or loaded.
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rfcore.errors import FieldFormatError, InvalidInput, UnknownField
 from rfcore.field.archive import Archive, decode_archive, encode_archive, read_file
+from rfcore.field.folder import FIELD_ID, SUFFIX, FieldFolder
 from rfcore.field.interface import (
     NGP,
     SPLATS,
@@ -26,21 +29,31 @@ from rfcore.field.interface import (
     bounds_of_header,
     metadata_of_header,
 )
+from rfcore.field.layer import LAYER, base_of_layer, layered_field
 from rfcore.field.ngp import NgpField, ngp_of_archive
 from rfcore.field.splat_archive import splats_of_archive
 from rfcore.field.splats import SplatField
-from rfcore.files import write_whole
+from rfcore.files import DECODED_BYTES, write_whole
+from rfcore.geodesy import Anchor, anchor_values
+from rfcore.raster.renderers import is_opencl
 
 __all__ = [
     "FIELD_ID",
     "READERS",
     "FieldFile",
     "FieldStore",
+    "OpenBase",
+    "anchored_file",
     "decode_field",
     "encode_field",
+    "load_checked",
     "load_field",
     "save_field",
 ]
+
+
+OpenBase = Callable[[str], RadianceField]
+"""Opens the base of a layer by its id; raises ``UnknownField``."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +65,24 @@ class FieldFile:
     field_id: str
     threads: int
     isa: str | None
+    max_bytes: int
+    open_base: OpenBase
+
+
+def _layer(file: FieldFile) -> RadianceField:
+    base_id = base_of_layer(file.archive)
+    if base_id is None or FIELD_ID.fullmatch(base_id) is None:
+        raise InvalidInput("layer.base", f"{base_id!r} is no field id")
+    base = file.open_base(base_id)
+    if not isinstance(base, SplatField):
+        raise InvalidInput("layer.base", f"{base_id} is a field of {base.metadata.kind}")
+    field = layered_field(file.archive, base, file.metadata)
+    field.field_id = file.field_id
+    return field
 
 
 def _splats(file: FieldFile) -> RadianceField:
-    gaussians, levels = splats_of_archive(file.archive)
+    gaussians, levels = splats_of_archive(file.archive, file.max_bytes)
     field = SplatField(
         gaussians,
         file.metadata,
@@ -73,7 +100,8 @@ def _splats(file: FieldFile) -> RadianceField:
 
 def _ngp(file: FieldFile) -> RadianceField:
     numbers = ngp_of_archive(file.archive)
-    field = NgpField(numbers, file.metadata, threads=file.threads, isa=file.isa)
+    isa = None if is_opencl(file.isa) else file.isa  # hash grids have no kernels for devices
+    field = NgpField(numbers, file.metadata, threads=file.threads, isa=isa)
     field.field_id = file.field_id
     stated = bounds_of_header(file.archive.metadata)
     if stated != field.bounds:
@@ -81,7 +109,11 @@ def _ngp(file: FieldFile) -> RadianceField:
     return field
 
 
-READERS: Mapping[str, Callable[[FieldFile], RadianceField]] = {SPLATS: _splats, NGP: _ngp}
+READERS: Mapping[str, Callable[[FieldFile], RadianceField]] = {
+    SPLATS: _splats,
+    NGP: _ngp,
+    LAYER: _layer,
+}
 """Makes the field of a file, by its archive's kind."""
 
 
@@ -90,25 +122,66 @@ def encode_field(field: RadianceField) -> bytes:
     return encode_archive(field.archive())
 
 
+def _no_base(field_id: str) -> RadianceField:
+    raise UnknownField(f"a layer is nothing without its base, field {field_id}: put both together")
+
+
 def decode_field(
-    data: bytes, source: str = "field", *, threads: int = 1, isa: str | None = None
+    data: bytes,
+    source: str = "field",
+    *,
+    threads: int = 1,
+    isa: str | None = None,
+    max_bytes: int = DECODED_BYTES,
+    open_base: OpenBase = _no_base,
 ) -> RadianceField:
-    """Return the field of an archive; raise ``FieldFormatError`` naming ``source`` if damaged."""
+    """Return the field of an archive; its splats take ``max_bytes`` of memory at most.
+
+    Raises ``FieldFormatError`` naming ``source`` if it is damaged or larger, and for a layer what
+    ``open_base`` raises.
+    """
     archive = decode_archive(data, source)
     if archive.kind not in READERS:
         known = ", ".join(READERS)
         raise FieldFormatError(f"{source}: holds a field of kind '{archive.kind}', not {known}")
     try:
-        metadata = metadata_of_header(archive.kind, archive.metadata)
+        kind = SPLATS if archive.kind == LAYER else archive.kind
+        metadata = metadata_of_header(kind, archive.metadata)
         field_id = hashlib.sha256(data).hexdigest()
-        return READERS[archive.kind](FieldFile(archive, metadata, field_id, threads, isa))
+        file = FieldFile(archive, metadata, field_id, threads, isa, max_bytes, open_base)
+        return READERS[archive.kind](file)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise FieldFormatError(f"{source}: {error}") from error
 
 
-def load_field(path: Path, *, threads: int = 1, isa: str | None = None) -> RadianceField:
+def load_field(
+    path: Path, *, threads: int = 1, isa: str | None = None, max_bytes: int = DECODED_BYTES
+) -> RadianceField:
     """Read a field archive; raise ``FieldFormatError`` naming the file and what is wrong."""
-    return decode_field(read_file(path), str(path), threads=threads, isa=isa)
+    data = read_file(path)
+
+    def beside(field_id: str) -> RadianceField:
+        paths = FieldFolder(path.parent).look().paths
+        if field_id not in paths:
+            raise UnknownField(
+                f"{path}: is a layer of field {field_id}, which {path.parent} lacks; put it there"
+            )
+        return load_checked(
+            paths[field_id], field_id, threads=threads, isa=isa, max_bytes=max_bytes
+        )
+
+    return decode_field(
+        data, str(path), threads=threads, isa=isa, max_bytes=max_bytes, open_base=beside
+    )
+
+
+def anchored_file(path: Path, anchor: Anchor, out: Path) -> str:
+    """Write the field of ``path`` with another anchor to ``out``; return its id."""
+    archive = decode_archive(read_file(path))
+    stated = {**archive.metadata, "anchor": anchor_values(anchor)}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    field = decode_field(encode_archive(replace(archive, metadata=stated)))
+    return save_field(field, out)
 
 
 def save_field(field: RadianceField, path: Path) -> str:
@@ -121,19 +194,13 @@ def save_field(field: RadianceField, path: Path) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-SUFFIX = ".rff"
-FIELD_ID = re.compile(r"[0-9a-f]{64}")
-"""What a field id looks like: the hexadecimal digits of a SHA-256."""
-Stamp = tuple[Path, int, int]
-
-
 class FieldStore:
     """The fields of one directory, which is made if it is not there. Safe to share by processes."""
 
     def __init__(self, directory: Path) -> None:
         directory.mkdir(parents=True, exist_ok=True)
         self._directory = directory
-        self._hashed: dict[Stamp, str] = {}
+        self._folder = FieldFolder(directory)
 
     def ids(self) -> tuple[str, ...]:
         """Return the ids of the fields that are here, sorted."""
@@ -147,37 +214,62 @@ class FieldStore:
             raise UnknownField(f"field {field_id!r} is not in {self._directory}; it holds {here}")
         return files[field_id]
 
-    def load(self, field_id: str, *, threads: int = 1, isa: str | None = None) -> RadianceField:
+    def load(
+        self,
+        field_id: str,
+        *,
+        threads: int = 1,
+        isa: str | None = None,
+        max_bytes: int = DECODED_BYTES,
+    ) -> RadianceField:
         """Load a field; raise ``UnknownField``, or ``FieldFormatError`` if it is damaged."""
         path = self.path(field_id)
-        data = read_file(path)
-        _checked_id(data, field_id, str(path))
-        return decode_field(data, str(path), threads=threads, isa=isa)
+
+        def base(of_id: str) -> RadianceField:
+            return load_checked(
+                self.path(of_id), of_id, threads=threads, isa=isa, max_bytes=max_bytes
+            )
+
+        return load_checked(
+            path, field_id, threads=threads, isa=isa, max_bytes=max_bytes, open_base=base
+        )
 
     def add(self, source: bytes | Path, field_id: str | None = None) -> str:
         """Add an archive and return its id; the file appears whole or not at all.
 
         When ``field_id`` is given the SHA-256 is compared before anything is parsed. Raises
-        ``FieldFormatError`` and leaves the store as it was when the archive is not whole.
+        ``FieldFormatError`` and leaves the store as it was when the archive is not whole, and
+        ``UnknownField`` for a layer whose base is not here.
         """
         data = read_file(source) if isinstance(source, Path) else source
         name = str(source) if isinstance(source, Path) else "field"
         found = _checked_id(data, field_id, name)
-        decode_field(data, name)
+        decode_field(data, name, open_base=self.load)
         write_whole(self._directory / f"{found}{SUFFIX}", data)
         return found
 
-    def _files(self) -> dict[str, Path]:
-        return {self._id_of(path): path for path in sorted(self._directory.glob(f"*{SUFFIX}"))}
+    def _files(self) -> Mapping[str, Path]:
+        return self._folder.look().paths
 
-    def _id_of(self, path: Path) -> str:
-        if FIELD_ID.fullmatch(path.stem):
-            return path.stem
-        stat = path.stat()
-        stamp = (path, stat.st_mtime_ns, stat.st_size)
-        if stamp not in self._hashed:
-            self._hashed[stamp] = hashlib.sha256(read_file(path)).hexdigest()
-        return self._hashed[stamp]
+
+def load_checked(
+    path: Path,
+    field_id: str,
+    *,
+    threads: int = 1,
+    isa: str | None = None,
+    max_bytes: int = DECODED_BYTES,
+    open_base: OpenBase = _no_base,
+) -> RadianceField:
+    """Load the field of a file whose SHA-256 is ``field_id``, compared before anything is parsed.
+
+    Raises ``FieldFormatError``, and for a layer what ``open_base`` raises.
+    """
+    data = read_file(path)
+    _checked_id(data, field_id, str(path))
+    return decode_field(
+        data, str(path), threads=threads, isa=isa, max_bytes=max_bytes, open_base=open_base
+    )
 
 
 def _checked_id(data: bytes, expected: str | None, source: str) -> str:

@@ -2,11 +2,13 @@
 
 For each hypothesis around the prior, nearest first: render there, match features of the picture and
 the render, solve for the pose (``rfcore.localise.matching``); then once more from a render at the
-pose found, which resembles the picture more. A pose is accepted if it passes three checks:
+pose found, which resembles the picture more. A pose is accepted if it passes four checks:
 
 * inliers: enough matches agree with it;
 * prior: it is not implausibly far from what was known;
-* agreement: the render at the pose resembles the picture, pixel on pixel, far better than chance.
+* alignment: aligned photometrically, the pose is where the picture and its render agree;
+* agreement: the render at the pose resembles the picture, pixel on pixel, far better than chance;
+* nearness: what is near lies where the picture has it, or far matches alone made the pose.
 
 Otherwise the next hypothesis is tried, and after the last one the camera is lost: no pose is given.
 No clock and no chance: the same picture, field and prior give the same answer.
@@ -15,7 +17,7 @@ No clock and no chance: the same picture, field and prior give the same answer.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from itertools import islice
 
@@ -24,14 +26,13 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
-from rfcore.extras import needs
-from rfcore.field import FULL, Quality, Renderer
+from rfcore.field import FULL, Quality, Renderer, render_field_view
+from rfcore.localise.agreement import agreement, eight_bits, near_on_the_spot
 from rfcore.localise.matching import Features, Solution, features, grey, lifted, matched, solved
 from rfcore.localise.prior import PosePrior, hypotheses
-from rfcore.views import View
-
-with needs("localise"):
-    import cv2
+from rfcore.localise.structure import Pyramid
+from rfcore.localise.track import HALF, Track, TrackSettings, begun
+from rfcore.views import FieldView, View
 
 __all__ = [
     "Localised",
@@ -39,21 +40,16 @@ __all__ = [
     "LocaliserSettings",
     "Lost",
     "Obstacle",
-    "agreement",
     "median_depth",
 ]
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 
-BLUR_PX = 3.0
-"""Standard deviation of the blur that is taken away: what is coarser is lighting, not structure."""
-NEAR_PX = 8
-"""Displacements up to this are not chance: a picture resembles its own neighbourhood."""
-ON_THE_SPOT_PX = 1
-"""How far from zero displacement a picture may resemble the render at its own pose best."""
-LEAST_SHOWN = 0.2
-"""Share of the picture that the field must show for the comparison to mean anything."""
+MOST_ALIGNMENTS = 3
+"""A pose that alignment still moves is aligned again, so often at most: of few matches, all far
+away, features make poses that are decimetres off, and one alignment goes half the way.
+"""
 
 
 @dataclass(frozen=True)
@@ -71,10 +67,16 @@ class LocaliserSettings:
     """Features of a render need a depth that its renderer trusts this far, 0..1."""
     inlier_px: float = 2.0
     """Matches that reproject this near agree with a pose."""
+    first_inlier_px: float = 3.0
+    """And this near in the first round, in which picture and render were taken metres apart."""
     least_inliers: int = 20
     """So many matches must agree with a pose."""
+    least_first_inliers: int = 8
+    """And so many after the first round; chance alone makes 6."""
     least_agreement: float = 10.0
     """Standard deviations of chance by which the render at a pose must resemble the picture."""
+    least_on_the_spot: float = 0.4
+    """Share of the nearer half of the picture that must lie where the render has it."""
     rounds: int = 2
     """Renders and solutions of a hypothesis."""
     most_hypotheses: int = 37
@@ -147,7 +149,10 @@ class Localiser:
         expected = (self._intrinsics.height_px, self._intrinsics.width_px, 3)
         if rgb.shape != expected or rgb.dtype != np.uint8:
             raise InvalidInput("picture", f"{rgb.dtype} {rgb.shape} must be uint8 {expected}")
-        luma = grey(rgb)
+        return self.localise_luma(grey(rgb), prior)
+
+    def localise_luma(self, luma: U8, prior: PosePrior) -> Localised | Lost:
+        """Return the pose of the camera that took a picture of full-range luma, uint8 [H, W]."""
         seen = features(luma, self._settings.features)
         if len(seen.uv_px) < self._settings.least_inliers:
             return Lost(Obstacle.FEW_FEATURES, 0)
@@ -160,9 +165,9 @@ class Localiser:
             if not prior.allows(solution.world_from_cam):
                 furthest = max(furthest, Obstacle.IMPLAUSIBLE)
                 continue
-            alike = agreement(luma, self._render(solution.world_from_cam))
-            if alike >= self._settings.least_agreement:
-                return Localised(solution, alike, tried)
+            alike = self._agreement(luma, solution)
+            if alike is not None:
+                return Localised(*alike, tried)
             furthest = Obstacle.UNLIKE
         return Lost(furthest, tried)
 
@@ -179,58 +184,50 @@ class Localiser:
         s, k = self._settings, self._intrinsics
         solution = None
         for number in range(s.rounds):
-            if solution is not None and number:
+            if solution is not None:
                 start, view = solution.world_from_cam, self._render(solution.world_from_cam)
-            drawn = features(grey(_eight_bits(view.colour)), s.features)
+            drawn = features(grey(eight_bits(view.colour)), s.features)
             found = lifted(matched(seen, drawn, s.ratio), view, k, s.least_confidence)
-            solution = solved(found, k, start, s.inlier_px)
-            if solution is None:
+            solution = solved(found, k, start, s.inlier_px if number else s.first_inlier_px)
+            least = s.least_inliers if number else s.least_first_inliers
+            if solution is None or solution.inliers < least:
                 return None
-        assert solution is not None
-        return solution if solution.inliers >= s.least_inliers else None
+        return solution
+
+    def _agreement(self, luma: U8, solution: Solution) -> tuple[Solution, float] | None:
+        """Return the solution aligned photometrically, and its agreement; None if refuted."""
+        levels, least = Pyramid(luma), self._settings
+        track = self._settled(levels, solution.world_from_cam)
+        if track is None:
+            return None
+        drawn = track.template.structures[HALF]
+        if near_on_the_spot(levels[HALF], drawn, track.view) < least.least_on_the_spot:
+            return None
+        alike = agreement(luma, self._render(track.world_from_cam))
+        if alike < least.least_agreement:
+            return None
+        return replace(solution, world_from_cam=track.world_from_cam), alike
+
+    def _settled(self, levels: Pyramid, near: Pose) -> Track | None:
+        """Return a pose aligned with a picture's pyramid; None where that refutes it."""
+
+        def render_at(pose: Pose) -> FieldView:
+            return render_field_view(
+                self._renderer, Camera(self._intrinsics, pose).rounded(), self._quality
+            )
+
+        settings, track = TrackSettings(), None
+        for _ in range(MOST_ALIGNMENTS):
+            track = begun(0, near, None, levels, render_at, settings)
+            if track is None:
+                return None
+            near = track.world_from_cam
+            if track.correction_px <= settings.redraw_px:
+                break
+        return track
 
     def _render(self, world_from_cam: Pose) -> View:
         return self._renderer.render(Camera(self._intrinsics, world_from_cam), self._quality)
-
-
-def agreement(luma: U8, view: View) -> float:
-    """Return how much better than chance a picture uint8 [H, W] resembles a render on the spot.
-
-    Both are reduced to local structure (blur taken away, divided by local contrast), so that
-    exposure and slow changes of light do not count. Of their cross-correlation at all cyclic
-    displacements, the value at zero is compared with those further away than ``NEAR_PX``: in
-    standard deviations above their mean. 0 where the best place is not zero displacement, to
-    ``ON_THE_SPOT_PX``, or where the field shows too little of the picture.
-    """
-    shown = view.opacity > 0.5
-    if shown.mean() < LEAST_SHOWN:
-        return 0.0
-    picture = _structure(luma.astype(np.float32), shown)
-    drawn = _structure(grey(_eight_bits(view.colour)).astype(np.float32), shown)
-    spectrum = np.fft.rfft2(picture) * np.conj(np.fft.rfft2(drawn))
-    likeness = np.fft.irfft2(spectrum, s=luma.shape)
-    rows, columns = (np.minimum(np.arange(n), n - np.arange(n)) for n in luma.shape)
-    distance_px = np.maximum(rows[:, None], columns[None, :])
-    chance = likeness[distance_px > NEAR_PX]
-    spread = float(chance.std()) if chance.size else 0.0
-    best = np.unravel_index(int(likeness.argmax()), likeness.shape)
-    if spread == 0.0 or distance_px[best] > ON_THE_SPOT_PX:
-        return 0.0
-    return float((likeness[0, 0] - chance.mean()) / spread)
-
-
-def _structure(luma: F32, shown: NDArray[np.bool_]) -> F32:
-    """Return luma [H, W] less its blur, by local contrast, 0 where the field shows nothing."""
-    fine = luma - cv2.GaussianBlur(luma, (0, 0), BLUR_PX)
-    contrast = np.sqrt(cv2.GaussianBlur(fine * fine, (0, 0), 2 * BLUR_PX))
-    flat: F32 = np.where(shown, fine / (contrast + np.float32(4)), np.float32(0))
-    return flat
-
-
-def _eight_bits(colour: F32) -> U8:
-    """Return colour float32 [H, W, 3], nominally 0..1, as uint8."""
-    eight_bits: U8 = np.clip(colour * 255 + 0.5, 0, 255).astype(np.uint8)
-    return eight_bits
 
 
 def median_depth(view: View) -> float:

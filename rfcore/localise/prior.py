@@ -21,7 +21,7 @@ from rfcore.motion import quaternion_from_vector, rotation_vector
 
 __all__ = ["PosePrior", "hypotheses", "moved"]
 
-REACH_OF_DEPTH = 0.15
+REACH_OF_DEPTH = 0.25
 """Distance between rings, as a share of the scene's median depth."""
 REACH_DEG = 12.0
 """Yaw between hypotheses; of a field of view of 60 degrees or more, four fifths stay in view."""

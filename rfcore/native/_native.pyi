@@ -173,18 +173,26 @@ def warp_i420(
 # --- h264 -------------------------------------------------------------------
 
 class SliceCoder:
-    def __init__(self, width: int, height: int, isa: str) -> None: ...
+    def __init__(self, width: int, height: int, isa: str, threads: int = 1) -> None: ...
     def encode(
         self,
         frame: tuple[_U8, _U8, _U8],
         references: Sequence[tuple[_U8, _U8, _U8]],
         slice_qp: int,
         qp: NDArray[np.int8],
+        forced: NDArray[np.int8],
         lambda_q8: NDArray[np.uint32],
         motion_q8: NDArray[np.uint32],
-        effort: tuple[int, int, int, int],
+        effort: tuple[int, int, int, int, int, int],
+        deblocked: bool,
+        vertical_reach: int,
         out: tuple[_U8, _U8, _U8],
+        modes: NDArray[np.int8],
     ) -> bytes: ...
+
+# --- blake2b ----------------------------------------------------------------
+
+def blake2b_pair(head: bytes, first: list[_U8], second: list[_U8]) -> tuple[bytes, bytes]: ...
 
 # --- pcm --------------------------------------------------------------------
 

@@ -1,8 +1,9 @@
 """The native rasterizer: what everything but tests renders with.
 
 The same function as ``rfcore.raster.reference``, whose docstrings define it, in float32 and
-bit-exact: the same Gaussians and camera give the same bytes on every instruction set and for every
-number of threads.
+bit-exact: the same Gaussians and camera give the same bytes on every instruction set, for every
+number of threads and on OpenCL devices (``rfcore.raster.opencl``), which count as one more
+instruction set here: ``opencl`` or ``opencl:DEVICE``.
 
 What float32 cannot express is not drawn: Gaussians nearer than 0.01 m or beyond 1e9 m along the
 optical axis, or wider than 1e9 px in the picture. Colours are limited to 0..1e18. A quaternion
@@ -13,23 +14,32 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from threading import Lock
+from typing import TYPE_CHECKING
 
 import numpy as np
+import structlog
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.native import _native
 from rfcore.native.backend import FLOAT32_MAX, check_backend
 from rfcore.raster.gaussians import F32, Gaussians
+from rfcore.raster.renderers import DEVICES, is_opencl
 from rfcore.views import View
+
+if TYPE_CHECKING:
+    from rfcore.raster.opencl import DeviceRasterizer
 
 __all__ = [
     "RasterStatistics",
     "Rasterizer",
     "bands_to_use",
+    "check_renderer",
     "native_camera",
     "overlaps_limited",
 ]
+
+log = structlog.get_logger()
 
 
 @dataclass(frozen=True)
@@ -83,13 +93,31 @@ class overlaps_limited:  # noqa: N801 - reads as a condition in a with statement
             raise InvalidInput("gaussians", str(error)) from error
 
 
+def check_renderer(threads: int, isa: str | None) -> str:
+    """Return what to render with, as ``check_backend``; an OpenCL device is opened and checked.
+
+    Raises ``BackendUnavailable`` also for a device whose bytes are not those of the CPU.
+    """
+    if isa is None or not is_opencl(isa):
+        return check_backend(threads, isa)
+    from rfcore.raster.opencl import open_device
+
+    check_backend(threads, None)
+    open_device(isa.partition(":")[2])
+    return isa
+
+
 class Rasterizer:
     """A copy of one set of Gaussians, ready to be rendered; may be shared between threads.
 
-    ``isa`` forces one of ``available_isas()`` (default: the best); ``threads`` is 1..256. Neither
-    changes a byte of any picture. ``antialiased`` must be what the Gaussians were trained with.
-    Raises ``BackendUnavailable`` or ``InvalidInput``. Rendering raises ``InvalidInput`` when the
-    Gaussians overlap more than 2^28 regions of 64x64 pixels, and for an ``sh_degree`` they lack.
+    ``isa`` forces one of ``available_isas()`` (default: the best) or an OpenCL device; ``threads``
+    is 1..256. Neither changes a byte of any picture. ``antialiased`` must be what the Gaussians
+    were trained with. Raises ``BackendUnavailable`` or ``InvalidInput``. Rendering raises
+    ``InvalidInput`` when the Gaussians overlap more than 2^28 regions of 64x64 pixels, and for an
+    ``sh_degree`` they lack.
+
+    When an OpenCL device fails, the CPU draws the same picture and every one after it: ``isa`` says
+    so from then on, and a line is logged.
     """
 
     def __init__(
@@ -100,36 +128,99 @@ class Rasterizer:
         isa: str | None = None,
         antialiased: bool = False,
     ) -> None:
-        self.isa = check_backend(threads, isa)
+        self.isa = check_renderer(threads, isa)
         self.threads = threads
         self.antialiased = antialiased
         self.sh_degree = gaussians.sh_degree
-        g = gaussians
-        arrays = (g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh)
-        self._native = _native.Rasterizer(*arrays, threads, self.isa, antialiased)
         self._lock = Lock()
+        self._gaussians: Gaussians | None = None
+        self._cpu: _native.Rasterizer | None = None
+        self._device: DeviceRasterizer | None = None
+        if is_opencl(self.isa):
+            self._gaussians = gaussians
+            self._move_to_device()
+        else:
+            self._cpu = self._native_rasterizer(gaussians, self.isa)
 
     def render(self, camera: Camera, *, sh_degree: int | None = None) -> View:
         """Render colour, depth and opacity with the bands up to ``sh_degree`` (default: all)."""
         shape = (camera.intrinsics.height_px, camera.intrinsics.width_px)
         view = View(*(np.empty(s, np.float32) for s in ((*shape, 3), shape, shape)))
-        seen_from, degree = native_camera(camera), bands_to_use(sh_degree, self.sh_degree)
-        with self._lock, overlaps_limited():
-            self._native.render(seen_from, degree, view.colour, view.depth, view.opacity)
+        self._draw(camera, sh_degree, view.colour, view.depth, view.opacity)
         return view
 
     def render_colour(self, camera: Camera, *, sh_degree: int | None = None) -> F32:
         """Render colour [H, W, 3] alone: the same bytes as ``render``'s, a little sooner."""
         colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
-        seen_from, degree = native_camera(camera), bands_to_use(sh_degree, self.sh_degree)
-        with self._lock, overlaps_limited():
-            self._native.render_colour(seen_from, degree, colour)
+        self._draw(camera, sh_degree, colour)
         return colour
 
     def statistics(self, camera: Camera) -> RasterStatistics:
-        """Count what rendering this view takes; slower than rendering it."""
+        """Count what rendering this view takes on the CPU; slower than rendering it."""
         seen_from = native_camera(camera)
         with self._lock, overlaps_limited():
-            counts = self._native.statistics(seen_from)
+            counts = self._on_cpu().statistics(seen_from)
         pixels = camera.intrinsics.width_px * camera.intrinsics.height_px
         return RasterStatistics(*counts, blends_per_px=counts[3] / pixels)
+
+    def _draw(
+        self,
+        camera: Camera,
+        sh_degree: int | None,
+        colour: F32,
+        depth: F32 | None = None,
+        opacity: F32 | None = None,
+    ) -> None:
+        seen_from, degree = native_camera(camera), bands_to_use(sh_degree, self.sh_degree)
+        with self._lock, overlaps_limited():
+            if self._drawn_by_device(camera, degree, colour, depth, opacity):
+                return
+            if depth is None or opacity is None:
+                self._on_cpu().render_colour(seen_from, degree, colour)
+            else:
+                self._on_cpu().render(seen_from, degree, colour, depth, opacity)
+
+    def _drawn_by_device(
+        self, camera: Camera, degree: int, colour: F32, depth: F32 | None, opacity: F32 | None
+    ) -> bool:
+        if self._device is None:
+            return False
+        from rfcore.raster.opencl import DeviceFull, DeviceLost
+
+        try:
+            self._device.draw(camera, degree, colour, depth, opacity)
+        except DeviceFull as error:
+            DEVICES.add_full()
+            log.warning("opencl picture drawn by cpu", reason=str(error))
+            return False
+        except DeviceLost as error:
+            self._leave_device(error)
+            return False
+        return True
+
+    def _move_to_device(self) -> None:
+        from rfcore.raster.opencl import DeviceLost, DeviceRasterizer, open_device
+
+        assert self._gaussians is not None
+        device = open_device(self.isa.partition(":")[2])
+        try:
+            self._device = DeviceRasterizer(device, self._gaussians, antialiased=self.antialiased)
+        except DeviceLost as error:
+            self._leave_device(error)
+
+    def _leave_device(self, error: Exception) -> None:
+        self._device = None
+        self.isa = check_backend(self.threads, None)
+        DEVICES.add_lost()
+        log.error("opencl device lost", reason=str(error), isa=self.isa)
+
+    def _on_cpu(self) -> _native.Rasterizer:
+        """Return the native renderer; of Gaussians on a device, made when it is first needed."""
+        if self._cpu is None:
+            assert self._gaussians is not None
+            self._cpu = self._native_rasterizer(self._gaussians, check_backend(self.threads, None))
+        return self._cpu
+
+    def _native_rasterizer(self, g: Gaussians, isa: str) -> _native.Rasterizer:
+        arrays = (g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh)
+        return _native.Rasterizer(*arrays, self.threads, isa, self.antialiased)

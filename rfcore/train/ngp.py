@@ -20,6 +20,7 @@ from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.field import NgpField
 from rfcore.field.interface import NGP
+from rfcore.geodesy import Anchor
 from rfcore.ngp.shape import (
     HashGrid,
     Marching,
@@ -171,9 +172,10 @@ class NgpTrainer(FieldTrainer):
         name: str = "",
         tile_origin: TileOrigin | None = None,
         held_out: HeldOut | None = None,
+        anchor: Anchor | None = None,
     ) -> NgpField:
         """Return what has been learnt so far as a field."""
-        metadata = self._metadata(name, tile_origin, held_out)
+        metadata = self._metadata(name, tile_origin, held_out, anchor=anchor)
         numbers, config = self._trainable.parameters(), self.config
         return NgpField(numbers, metadata, threads=config.threads, isa=config.isa)
 

@@ -19,13 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import TileOrigin
+from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import InvalidInput, TrainingDiverged
 from rfcore.field import SplatField
 from rfcore.field.interface import SPLATS
+from rfcore.geodesy import Anchor
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
-from rfcore.raster.trainable import TrainableRasterizer, TrainingState
+from rfcore.raster.trainable import LearningRates, TrainableRasterizer, TrainingState
 from rfcore.train.checkpoint import Checkpoint
+from rfcore.train.poses import PoseCorrection, PoseModel, pose_gradient, typical_depth_m
 from rfcore.train.schedule import (
     Bands,
     DensityControl,
@@ -62,6 +64,8 @@ class SplatTrainingConfig:
     """Train for the antialiased mode; the field says so."""
     exposure: bool = False
     """Learn an affine map of colours per picture; the field is that of the mean picture."""
+    refine_poses: bool = False
+    """Learn a correction of every picture's pose; the dataset's poses stay right on average."""
     threads: int = 1
     isa: str | None = None
 
@@ -72,6 +76,8 @@ class SplatTrainingConfig:
             raise InvalidInput("training.iterations", f"{self.iterations} is outside 1..1000000")
         if not 0.01 <= self.initial_scale <= 10:
             raise InvalidInput("training.initial_scale", f"{self.initial_scale} not in 0.01..10")
+        if self.refine_poses and self.exposure:
+            raise InvalidInput("training.refine_poses", "goes without exposure: learn one of them")
 
 
 class SplatTrainer(FieldTrainer):
@@ -101,6 +107,10 @@ class SplatTrainer(FieldTrainer):
         digest = _training_digest(pictures_digest, initial, self.config, seed)
         super().__init__(self.config.iterations, digest)
         self._exposure = ExposureModel(len(self._targets)) if self.config.exposure else None
+        self._names = [picture.name for picture in pictures]
+        cameras = [target.camera for target in self._targets]
+        self.depth_m = typical_depth_m(initial, cameras)
+        self._poses = PoseModel(cameras, self.depth_m) if self.config.refine_poses else None
         self._rasterizer = self._rasterizer_of(initial)
 
     @property
@@ -112,15 +122,28 @@ class SplatTrainer(FieldTrainer):
         """Return the parameters as they are now."""
         return self._rasterizer.gaussians()
 
+    def cameras(self) -> list[Camera]:
+        """Return the pictures' cameras as they are now."""
+        if self._poses is None:
+            return [target.camera for target in self._targets]
+        return [self._poses.camera(view) for view in range(len(self._targets))]
+
+    def pose_corrections(self) -> list[PoseCorrection]:
+        """Return how far each picture's pose was moved; none where poses are held."""
+        return [] if self._poses is None else self._poses.corrections(self._names)
+
     def field(
         self,
         name: str = "",
         tile_origin: TileOrigin | None = None,
         held_out: HeldOut | None = None,
+        anchor: Anchor | None = None,
     ) -> SplatField:
         """Return what has been learnt so far as a field."""
         config = self.config
-        metadata = self._metadata(name, tile_origin, held_out, antialiased=config.antialiased)
+        metadata = self._metadata(
+            name, tile_origin, held_out, anchor=anchor, antialiased=config.antialiased
+        )
         return SplatField(self.gaussians(), metadata, threads=config.threads, isa=config.isa)
 
     def checkpoint(self) -> Checkpoint:
@@ -140,6 +163,8 @@ class SplatTrainer(FieldTrainer):
         values = {"beta_powers": list(state.beta_powers), "watch": self._watch.values()}
         if self._exposure is not None:
             arrays |= self._exposure.arrays()
+        if self._poses is not None:
+            arrays |= self._poses.arrays()
         return Checkpoint(self.kind, self.training_digest, self.iteration, values, arrays)
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -158,6 +183,8 @@ class SplatTrainer(FieldTrainer):
         self._rasterizer.set_optimiser(state)
         if self._exposure is not None:
             self._exposure.restore(arrays)
+        if self._poses is not None:
+            self._poses.restore(arrays)
         self._watch.restore(checkpoint.values["watch"])
         self._order = view_order(len(self._targets), self._order_rng())
         for _ in islice(self._order, checkpoint.iteration):
@@ -175,6 +202,8 @@ class SplatTrainer(FieldTrainer):
             config.rates.at(progress, self._unit_m), len(self._rasterizer)
         )
         exposure = self._exposure.of_view(view) if self._exposure is not None else None
+        if self._poses is not None:
+            return self._descend_with_pose(self._poses, view, rates, progress)
         loss = self._rasterizer.iterate(
             target.camera,
             target.colour(),
@@ -184,6 +213,20 @@ class SplatTrainer(FieldTrainer):
         )
         if self._exposure is not None and exposure is not None:
             self._exposure.step(view, exposure.gradient, config.rates.factor(progress))
+        return loss
+
+    def _descend_with_pose(
+        self, poses: PoseModel, view: int, rates: LearningRates, progress: float
+    ) -> float:
+        """Do one step of Adam on the Gaussians and on the picture's pose; return the loss."""
+        camera, rasterizer = poses.camera(view), self._rasterizer
+        rasterizer.forward(camera, sh_degree=self.config.bands.at(progress))
+        loss = rasterizer.loss(self._targets[view].colour())
+        rasterizer.backward()
+        centre_m = camera.world_from_cam.translation_m
+        gradient = pose_gradient(self.gaussians(), rasterizer.gradients(), centre_m)
+        rasterizer.adam_step(rates)
+        poses.step(view, gradient, progress)
         return loss
 
     def _after_iteration(self, progress: float) -> None:

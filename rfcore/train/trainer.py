@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput, TrainingDiverged
 from rfcore.field import FieldMetadata, RadianceField
+from rfcore.geodesy import Anchor
 from rfcore.metrics import psnr, ssim
 from rfcore.train.checkpoint import Checkpoint
 from rfcore.views import PosedPicture
@@ -116,6 +117,7 @@ class FieldTrainer(ABC):
         name: str = "",
         tile_origin: TileOrigin | None = None,
         held_out: HeldOut | None = None,
+        anchor: Anchor | None = None,
     ) -> RadianceField:
         """Return what has been learned so far."""
 
@@ -145,6 +147,7 @@ class FieldTrainer(ABC):
         tile_origin: TileOrigin | None,
         held_out: HeldOut | None,
         *,
+        anchor: Anchor | None = None,
         antialiased: bool = False,
     ) -> FieldMetadata:
         """Return the metadata of the field learned so far."""
@@ -156,6 +159,7 @@ class FieldTrainer(ABC):
             held_out_ssim=held_out.ssim if held_out is not None else None,
             antialiased=antialiased,
             kind=self.kind,
+            anchor=anchor,
         )
 
 

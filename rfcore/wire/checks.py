@@ -15,6 +15,7 @@ __all__ = [
     "FIELD_ID_PREFIX_BYTES",
     "MAX_CAMERAS",
     "MAX_FIELDS",
+    "MAX_LEVER_ARM_M",
     "MAX_PAYLOAD_BYTES",
     "MAX_RATE_HZ",
     "MAX_TRANSLATION_M",
@@ -26,8 +27,11 @@ __all__ = [
     "shown",
 ]
 
-MAX_CAMERAS = 16
-"""Cameras in one Hello."""
+MAX_CAMERAS = 32
+"""Cameras in one Hello: teleoperation has 4 (3GPP TS 22.156), the published rig 18."""
+
+MAX_LEVER_ARM_M = 100.0
+"""A camera this far from its rig's origin is on another vehicle."""
 
 MAX_FIELDS = 64
 """Fields in one Hello or FieldNotice."""

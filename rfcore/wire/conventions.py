@@ -10,6 +10,7 @@ from typing import Final
 __all__ = [
     "AGENT_PROCESS",
     "CHANNEL_OPTIONS",
+    "CONSUMER_OPTIONS",
     "FRAME_BUDGET_BUCKETS_S",
     "MAX_MESSAGE_BYTES",
     "RENDERER_CONTRACT",
@@ -70,6 +71,14 @@ CHANNEL_OPTIONS: Final[Options] = (
     ("grpc.use_local_subchannel_pool", 1),
 )
 
+LONGEST_PICTURE_BYTES: Final = 64 << 20
+"""A raw picture of 8192x4320 px and its header, as a consumer of the twin may ask for it."""
+
+CONSUMER_OPTIONS: Final[Options] = (
+    *(o for o in CHANNEL_OPTIONS if o[0] != "grpc.max_receive_message_length"),
+    ("grpc.max_receive_message_length", LONGEST_PICTURE_BYTES),
+)
+
 SERVER_OPTIONS: Final[Options] = (
     *SHARED_OPTIONS,
     # Permits the clients' keepalive with margin: by default a ping more often than every five
@@ -86,5 +95,7 @@ SERVER_OPTIONS: Final[Options] = (
     # By default a peer may take two minutes over its handshake, and hold a connection for it; and
     # there may be any number of connections.
     ("grpc.server_handshake_timeout_ms", 5_000),
+    # A peer that shakes hands and then asks for nothing does not keep its connection.
+    ("grpc.max_connection_idle_ms", 15_000),
     ("grpc.max_allowed_incoming_connections", 1_024),
 )

@@ -14,7 +14,7 @@ from typing import cast
 from google.protobuf.message import DecodeError
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import CodecConfig, Coder, effort_of_preset, preset_of
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.references import Reference, References
@@ -24,6 +24,7 @@ from rfcore.wire.checks import (
     FIELD_ID_PREFIX_BYTES,
     MAX_CAMERAS,
     MAX_FIELDS,
+    MAX_LEVER_ARM_M,
     MAX_PAYLOAD_BYTES,
     MAX_RATE_HZ,
     MAX_TRANSLATION_M,
@@ -40,6 +41,12 @@ from rfcore.wire.messages import (
     FrameAddress,
     Hello,
     RendererContract,
+)
+from rfcore.wire.sensing import (
+    clock_from_wire,
+    clock_to_wire,
+    localisation_from_wire,
+    localisation_to_wire,
 )
 from rfcore.wire.v1 import edge_pb2 as pb
 
@@ -110,6 +117,7 @@ def _hello_from_wire(hello: pb.Hello) -> Hello:
         RendererContract(
             check_name("hello.renderer.name", hello.renderer.name), hello.renderer.exact
         ),
+        hello.allow_recording,
     )
 
 
@@ -131,14 +139,26 @@ def _camera_from_wire(field: str, camera: pb.CameraDescription) -> CameraDescrip
         intrinsics,
         codec,
         check_range(f"{field}.rate_hz", camera.rate_hz, 0.0, MAX_RATE_HZ),
+        _extrinsics_from_wire(f"{field}.camera_from_rig", camera),
     )
 
 
+def _extrinsics_from_wire(field: str, camera: pb.CameraDescription) -> Pose | None:
+    if not camera.HasField("camera_from_rig"):
+        return None
+    try:
+        pose = _pose_of(camera.camera_from_rig)
+    except InvalidInput as error:
+        raise InvalidInput(f"{field}.{error.field}", error.problem) from error
+    for axis, metres in zip("xyz", pose.translation_m, strict=True):
+        check_range(f"{field}.{axis}_m", metres, -MAX_LEVER_ARM_M, MAX_LEVER_ARM_M)
+    return pose
+
+
 def _codec_from_wire(header: pb.StreamHeader) -> StreamHeader:
+    effort = header.effort or effort_of_preset(check_name("codec.preset", header.preset))
     return StreamHeader(
-        CodecConfig(
-            header.width_px, header.height_px, check_name("codec.preset", header.preset), header.crf
-        ),
+        CodecConfig(header.width_px, header.height_px, effort, header.crf),
         check_bytes("codec.sps", header.sps, 4, 1024),
         check_bytes("codec.pps", header.pps, 2, 1024),
     )
@@ -150,6 +170,7 @@ def _hello_to_wire(hello: Hello) -> pb.Hello:
         cameras=[_camera_to_wire(camera) for camera in hello.cameras],
         field_ids=hello.field_ids,
         renderer=pb.RendererContract(name=hello.renderer.name, exact=hello.renderer.exact),
+        allow_recording=hello.allow_recording,
     )
 
 
@@ -168,12 +189,14 @@ def _camera_to_wire(camera: CameraDescription) -> pb.CameraDescription:
         codec=pb.StreamHeader(
             width_px=config.width_px,
             height_px=config.height_px,
-            preset=config.preset,
+            preset=preset_of(config.effort) if config.coder is Coder.X264 else "",
+            effort=config.effort if config.coder is Coder.OWN else "",
             crf=config.crf,
             sps=camera.codec.sps,
             pps=camera.codec.pps,
         ),
         rate_hz=camera.rate_hz,
+        camera_from_rig=None if camera.camera_from_rig is None else _double(camera.camera_from_rig),
     )
 
 
@@ -194,6 +217,9 @@ def _frame_from_wire(frame: pb.Frame) -> Frame:
         check_absent_or("frame.field_id_prefix", frame.field_id_prefix, FIELD_ID_PREFIX_BYTES),
         _packet_from_wire(frame),
         _quality_from_wire(frame.quality) if frame.HasField("quality") else FULL,
+        clock_from_wire(frame.capture_clock),
+        localisation_from_wire(frame.localisation),
+        frame.instant,
     )
 
 
@@ -210,21 +236,26 @@ def _quality_from_wire(quality: pb.Quality) -> Quality:
         raise InvalidInput(f"frame.{error.field}", error.problem) from error
 
 
-def _pose_from_wire(frame: pb.Frame) -> Pose:
+def _pose_from_wire(frame: pb.Frame) -> Pose | None:
     """Return a checked pose; ``Pose`` itself refuses what is not finite or not a rotation."""
+    if not frame.HasField("pose") and not frame.pose_f32:
+        return None
     if frame.HasField("pose"):
         check_range("frame.pose_f32", len(frame.pose_f32), 0, 0)
-        p = frame.pose
-        numbers = [p.x_m, p.y_m, p.z_m, p.rotation_w, p.rotation_x, p.rotation_y, p.rotation_z]
+        checked = _pose_of(frame.pose)
     else:
         check_range("frame.pose_f32", len(frame.pose_f32), 7, 7)
-        numbers = frame.pose_f32[:]
-    x_m, y_m, z_m, w, x, y, z = numbers
-    checked = Pose((x_m, y_m, z_m), (w, x, y, z))
+        x_m, y_m, z_m, w, x, y, z = frame.pose_f32
+        checked = Pose((x_m, y_m, z_m), (w, x, y, z))
+    x_m, y_m, z_m = checked.translation_m
     check_range("pose.x_m", x_m, -MAX_TRANSLATION_M, MAX_TRANSLATION_M)
     check_range("pose.y_m", y_m, -MAX_TRANSLATION_M, MAX_TRANSLATION_M)
     check_range("pose.z_m", z_m, -MAX_TRANSLATION_M, MAX_TRANSLATION_M)
     return checked
+
+
+def _pose_of(p: pb.Pose) -> Pose:
+    return Pose((p.x_m, p.y_m, p.z_m), (p.rotation_w, p.rotation_x, p.rotation_y, p.rotation_z))
 
 
 def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
@@ -270,6 +301,9 @@ def _frame_to_wire(frame: Frame) -> pb.Frame:
         crc32=packet.crc32,
         base_digest=packet.base_digest,
         photometric=packet.photometric,
+        capture_clock=clock_to_wire(frame.clock),
+        localisation=localisation_to_wire(frame.localisation),
+        instant=frame.instant,
     )
     _add_pose(message, frame.pose)
     if frame.quality != FULL:
@@ -286,13 +320,20 @@ def _quality_to_wire(quality: Quality) -> pb.Quality:
     )
 
 
-def _add_pose(message: pb.Frame, pose: Pose) -> None:
-    """Put the pose in, in 4 bytes a number if that keeps every bit."""
+def _add_pose(message: pb.Frame, pose: Pose | None) -> None:
+    """Put the pose in, if there is one, in 4 bytes a number if that keeps every bit."""
+    if pose is None:
+        return
     numbers = (*pose.translation_m, *pose.rotation)
     if tuple(array("f", numbers)) == numbers:
         message.pose_f32.extend(numbers)
         return
-    x_m, y_m, z_m, w, x, y, z = numbers
-    message.pose.CopyFrom(
-        pb.Pose(x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z)
+    message.pose.CopyFrom(_double(pose))
+
+
+def _double(pose: Pose) -> pb.Pose:
+    x_m, y_m, z_m = pose.translation_m
+    w, x, y, z = pose.rotation
+    return pb.Pose(
+        x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
     )

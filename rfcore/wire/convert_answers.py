@@ -32,7 +32,8 @@ REASONS_BACK = {number: reason for reason, number in REASONS.items()}
 def server_messages_from_bytes(data: bytes) -> list[ServerMessage]:
     """Parse what a server sent at once: a message, or an answer and the Credit after it.
 
-    Raises ``ProtocolError`` if it is not one of its messages.
+    A message that only a newer server knows is left out: the list is then empty, and its caller
+    counts it. Raises ``ProtocolError`` if the bytes are no message, or one with impossible values.
     """
     response = pb.StreamResponse()
     try:
@@ -51,8 +52,6 @@ def server_messages_from_bytes(data: bytes) -> list[ServerMessage]:
             messages.append(FieldNotice(tuple(response.field_notice.field_ids)))
     if response.HasField("credit"):
         messages.append(Credit(response.credit.camera_id, response.credit.frames))
-    if not messages:
-        raise ProtocolError("the server sent a message this vehicle does not know; update it")
     return messages
 
 
@@ -115,12 +114,9 @@ def _put_ack(wire: pb.Ack, ack: Ack) -> None:
 
 
 def _nack_from_wire(nack: pb.Nack) -> Nack:
-    reason = REASONS_BACK.get(nack.reason)
-    if reason is None:
-        raise ProtocolError(f"the server gave reject reason {nack.reason}, unknown here")
     return Nack(
         FrameAddress(nack.camera_id, nack.epoch, nack.sequence),
-        reason,
+        REASONS_BACK.get(nack.reason, RejectReason.UNSPECIFIED),
         nack.problem,
         nack.count,
         nack.last_good_sequence if nack.HasField("last_good_sequence") else None,

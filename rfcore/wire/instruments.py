@@ -9,18 +9,31 @@ from __future__ import annotations
 
 import math
 import platform
+import socket
+import threading
+import time
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from http.server import ThreadingHTTPServer
 from importlib.metadata import version
 from itertools import accumulate
+from typing import Any
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, ProcessCollector, start_http_server
-from prometheus_client.core import HistogramMetricFamily, Metric
+from prometheus_client import CollectorRegistry, Counter, Gauge, ProcessCollector
+from prometheus_client.core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    HistogramMetricFamily,
+    Metric,
+)
+from prometheus_client.exposition import MetricsHandler
 from prometheus_client.registry import Collector
 from prometheus_client.utils import floatToGoString
 
 from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.raster.renderers import DEVICES, DeviceRecord
 from rfcore.wire.conventions import FRAME_BUDGET_BUCKETS_S, RENDERER_CONTRACT
 
 __all__ = ["DurationHistogram", "DurationSeries", "Family", "Instruments", "MetricsEndpoint"]
@@ -151,6 +164,11 @@ class Instruments:
             self.families.append(Family(name, kind, text))
         ProcessCollector(registry=self.registry)
 
+    def devices(self, record: DeviceRecord = DEVICES) -> None:
+        """Declare which OpenCL devices were opened and how often the CPU stood in for one."""
+        self.families += DEVICE_FAMILIES
+        self.registry.register(_Devices(record))
+
     def _declare(self, family: Family) -> None:
         if not family.name.startswith("rfedge_"):
             raise InvalidInput("metric.name", f"{family.name} must begin with rfedge_")
@@ -159,6 +177,42 @@ class Instruments:
         if family.kind == "histogram" and not family.name.endswith("_seconds"):
             raise InvalidInput("metric.name", f"{family.name} holds time; end it in _seconds")
         self.families.append(family)
+
+
+DEVICE_FAMILIES = (
+    Family(
+        "rfedge_opencl_device_info",
+        "gauge",
+        "1 for each OpenCL device that passed its self-check and was opened.",
+        ("device", "driver", "build"),
+    ),
+    Family(
+        "rfedge_opencl_fallbacks_total",
+        "counter",
+        "Times the CPU drew instead: lost (a device failed, for good), full (one picture).",
+        ("reason",),
+    ),
+)
+
+
+class _Devices(Collector):
+    """Reads a record of devices when it is asked."""
+
+    def __init__(self, record: DeviceRecord) -> None:
+        self._record = record
+
+    def collect(self) -> Iterable[Metric]:
+        """Return the info of each device and the fallbacks."""
+        info, fallbacks = DEVICE_FAMILIES
+        gauge = GaugeMetricFamily(info.name, info.text, labels=info.labels)
+        for opened in list(self._record.opened):
+            gauge.add_metric(opened, 1)
+        counter = CounterMetricFamily(
+            fallbacks.name.removesuffix("_total"), fallbacks.text, labels=fallbacks.labels
+        )
+        counter.add_metric(("lost",), self._record.lost)
+        counter.add_metric(("full",), self._record.full)
+        return (gauge, counter)
 
 
 PROCESS_FAMILIES = (
@@ -176,6 +230,61 @@ PROCESS_FAMILIES = (
 """What prometheus_client's own ``ProcessCollector`` adds on Linux."""
 
 
+MAX_SCRAPES = 8
+"""Connections that are served at once; each takes a thread, further ones are closed."""
+
+SCRAPE_S = 5.0
+"""How long one may take, from its connection on."""
+
+
+class _BoundedServer(ThreadingHTTPServer):
+    """A thread a connection, a few at once, none for longer than ``SCRAPE_S``."""
+
+    daemon_threads = True
+
+    def __init__(self, host: str, port: int, registry: CollectorRegistry) -> None:
+        self.address_family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        self._open: dict[socket.socket, float] = {}
+        self._lock = threading.Lock()
+        super().__init__((host, port), _QuietHandler.factory(registry))
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection on a thread of its own, or close it if there are too many."""
+        with self._lock:
+            if len(self._open) >= MAX_SCRAPES:
+                self.shutdown_request(request)
+                return
+            self._open[request] = time.monotonic() + SCRAPE_S
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve one connection to its end."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            with self._lock:
+                self._open.pop(request, None)
+
+    def service_actions(self) -> None:
+        """Cut connections that are over their time; called twice a second."""
+        now = time.monotonic()
+        with self._lock:
+            late = [request for request, until_s in self._open.items() if now > until_s]
+        for request in late:
+            with suppress(OSError):
+                request.shutdown(socket.SHUT_RDWR)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of connections that broke: a peer must not fill the log."""
+
+
+class _QuietHandler(MetricsHandler):
+    timeout = SCRAPE_S
+
+    def log_message(self, *_: Any) -> None:
+        """Say nothing of requests."""
+
+
 class MetricsEndpoint:
     """Serves the metrics of ``registry`` at ``http://host:port/metrics`` until ``close``.
 
@@ -185,13 +294,15 @@ class MetricsEndpoint:
 
     def __init__(self, registry: CollectorRegistry, host: str, port: int) -> None:
         try:
-            self._server, self._thread = start_http_server(port, host, registry)
+            self._server = _BoundedServer(host, port, registry)
         except OSError as error:
             raise RfedgeError(
                 f"cannot serve metrics on {host}:{port}: {error.strerror or error}; "
                 "give another --metrics-port, or 0 for a free one"
             ) from error
         self.port = self._server.server_port
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
         """Stop serving, and give the port back."""

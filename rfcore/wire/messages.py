@@ -6,13 +6,16 @@ that knows both forms. A value of these types that came through ``convert`` has 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.camera import Camera, Intrinsics, Pose, camera_on_rig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.errors import RejectReason
-from rfcore.field.quality import FULL, Quality
+from rfcore.field import FULL, Quality, Renderer, render_field_view
+from rfcore.localise.fix import State
+from rfcore.views import FieldView
+from rfcore.wire.sensing import ClockKind
 
 __all__ = [
     "Ack",
@@ -51,48 +54,77 @@ class RendererContract:
 @dataclass(frozen=True)
 class CameraDescription:
     """One camera of a vehicle: its geometry, how its pictures are coded, and how many a second it
-    would send (0: not stated)."""
+    would send (0: not stated).
+
+    ``camera_from_rig``: its place on a rig, whose pose its frames carry; ``None``: their own.
+    """
 
     camera_id: str
     intrinsics: Intrinsics
     codec: StreamHeader
     rate_hz: float = 0.0
+    camera_from_rig: Pose | None = None
+
+    def posed(self, frame: Frame) -> Frame:
+        """Return ``frame`` as it came, with the pose of its camera in place of the rig's."""
+        if self.camera_from_rig is None or frame.pose is None:
+            return frame
+        return replace(frame, pose=camera_on_rig(frame.pose, self.camera_from_rig))
 
 
 @dataclass(frozen=True)
 class Hello:
-    """The first message of a stream."""
+    """The first message of a stream.
+
+    ``allow_recording``: whether the server may keep the pictures beyond the newest one.
+    """
 
     vehicle_id: str
     cameras: tuple[CameraDescription, ...]
     field_ids: tuple[str, ...]
     renderer: RendererContract
+    allow_recording: bool = False
 
 
 @dataclass(frozen=True)
 class Frame:
     """One coded picture.
 
-    ``pose`` is world_from_cam, tile-relative; it takes half the bytes on the wire when it is
-    ``Pose.rounded``. An empty ``field_id_prefix`` means the first field of Hello. ``quality`` is
-    what the vehicle rendered the field with, and what the server is to render it with.
+    ``pose`` is world_from_cam, tile-relative, or world_from_rig until ``CameraDescription.posed``;
+    it takes half the bytes on the wire when it is ``Pose.rounded``. ``None``: the camera is lost,
+    and the field shows nothing to either end. ``instant``: pictures of a rig with the same number
+    were taken together; 0: it stands alone.
+    An empty ``field_id_prefix`` means the first field of Hello. ``quality`` is
+    what the vehicle rendered the field with, and what the server is to render it with. ``clock``:
+    what a live camera's ``capture_time_ns`` rests on. ``localisation``: of a vehicle that finds its
+    camera in the field; ``None``: the pose was given.
     """
 
     camera_id: str
     capture_time_ns: int
-    pose: Pose
+    pose: Pose | None
     field_id_prefix: bytes
     packet: DeltaPacket
     quality: Quality = FULL
+    clock: ClockKind | None = None
+    localisation: State | None = None
+    instant: int = 0
 
     @property
     def address(self) -> FrameAddress:
         """Return camera, epoch and sequence."""
         return FrameAddress(self.camera_id, self.packet.epoch, self.packet.sequence)
 
-    def camera(self, intrinsics: Intrinsics) -> Camera:
-        """Return the posed camera that took the picture."""
-        return Camera(intrinsics, self.pose)
+    def camera(self, intrinsics: Intrinsics) -> Camera | None:
+        """Return the posed camera that took the picture; ``None`` if it is lost."""
+        return None if self.pose is None else Camera(intrinsics, self.pose)
+
+    def view(self, field: Renderer, intrinsics: Intrinsics) -> FieldView:
+        """Return what ``field`` shows at the frame's pose; nothing if the camera is lost."""
+        camera = self.camera(intrinsics)
+        if camera is None:
+            return FieldView.nothing(intrinsics)
+        return render_field_view(field, camera, self.quality)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ import structlog
 from tyro.conf import EnumChoicesFromValues, FlagCreatePairsOff, OmitArgPrefixes, arg
 
 from rfcore.errors import InvalidInput
+from rfcore.files import DECODED_BYTES
+from rfcore.raster.renderers import CPU, renderer_isa
 from rfcore.wire.tls import TlsFiles
 
 __all__ = [
@@ -62,10 +64,34 @@ class RenderSettings:
     """Threads per render."""
     isa: str | None = None
     """Instruction set to force (avx512, avx2, scalar); the best of this machine without it."""
+    max_field_gb: Annotated[float, arg(name="max-field-gb")] = DECODED_BYTES / 1e9
+    """Memory that the splats of a field may take; a small file can hold very many."""
+    renderer: Annotated[str, arg(metavar="cpu|opencl[:DEVICE]")] = CPU
+    """Splats are drawn by the CPU, or by an OpenCL device: its number or a part of its name; the
+    first GPU without. A device whose bytes are not those of the CPU is refused."""
+
+    @property
+    def field_isa(self) -> str | None:
+        """What fields are opened with: ``isa``, or the OpenCL device."""
+        return renderer_isa(self.renderer, self.isa)
+
+    def check(self) -> None:
+        """Raise ``BackendUnavailable`` for what this machine lacks; opens an OpenCL device."""
+        from rfcore.raster.native import check_renderer  # numpy, which --help does without
+
+        check_renderer(self.threads, self.field_isa)
+
+    @property
+    def max_field_bytes(self) -> int:
+        """``max_field_gb`` in bytes."""
+        return round(self.max_field_gb * 1e9)
 
     def __post_init__(self) -> None:
+        if not 0.001 <= self.max_field_gb <= 1000:
+            raise InvalidInput("max-field-gb", f"{self.max_field_gb:g} is outside 0.001..1000")
         if not 1 <= self.threads <= 256:
             raise InvalidInput("threads", f"{self.threads} is outside 1..256")
+        renderer_isa(self.renderer, self.isa)
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,18 @@ server that publishes no tiles serves its fields everywhere.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from rfcore.errors import InvalidInput
-from rfcore.wire.checks import check_field_id, check_name
+from rfcore.wire.checks import check_field_id, check_name, check_range
 from rfcore.wire.v1 import field_pb2 as pb
 
-__all__ = ["MAX_TILES", "Area", "Tile", "tile_message", "tile_of"]
+__all__ = ["MAX_LIGHTS", "MAX_TILES", "Area", "Tile", "TileLight", "tile_message", "tile_of"]
 
 MAX_TILES = 64
 """Tiles one server publishes."""
+MAX_LIGHTS = 7
+"""Lights of a tile, beside its own field: what both ends keep open."""
 
 
 @dataclass(frozen=True)
@@ -44,22 +46,71 @@ class Area:
 
 
 @dataclass(frozen=True)
+class TileLight:
+    """Another field of a tile, of the street under light ``name``; version ``version`` of the tile.
+
+    ``base_field_id``: the field that it is a colour layer on, empty for a field of its own.
+    ``passes``: how many it was learnt from; ``time_of_day_h``: when, UTC, None where nobody said.
+    """
+
+    name: str
+    field_id: str
+    version: int
+    base_field_id: str = ""
+    passes: int = 0
+    time_of_day_h: float | None = None
+
+    def __post_init__(self) -> None:
+        check_name("light.name", self.name)
+        check_field_id("light.field_id", self.field_id)
+        if self.base_field_id:
+            check_field_id("light.base_field_id", self.base_field_id)
+        if self.version < 1 or self.passes < 0:
+            raise InvalidInput(
+                "light", f"version {self.version} and {self.passes} passes must be 1 and 0 or more"
+            )
+        if self.time_of_day_h is not None:
+            check_range("light.time_of_day_h", self.time_of_day_h, 0.0, 24.0)
+
+    @property
+    def field_ids(self) -> tuple[str, ...]:
+        """The archives it takes: its base, if it is a layer, and its own."""
+        return tuple(filter(None, (self.base_field_id, self.field_id)))
+
+
+@dataclass(frozen=True)
 class Tile:
-    """Version ``version`` of tile ``name`` is field ``field_id``; ``area`` None: everywhere."""
+    """Version ``version`` of tile ``name`` is field ``field_id``; ``area`` None: everywhere.
+
+    ``lights``: fields of the same ground under other lights; a vehicle takes what fits.
+    """
 
     name: str
     field_id: str
     version: int = 1
     area: Area | None = None
     margin_m: float = 0.0
+    lights: tuple[TileLight, ...] = ()
 
     def __post_init__(self) -> None:
+        if len(self.lights) > MAX_LIGHTS:
+            raise InvalidInput("tile.lights", f"{len(self.lights)} are more than {MAX_LIGHTS}")
         check_name("tile.name", self.name)
         check_field_id("tile.field_id", self.field_id)
         if self.version < 1:
             raise InvalidInput("tile.version", f"{self.version} is below 1")
         if not 0 <= self.margin_m < math.inf:
             raise InvalidInput("tile.margin_m", f"{self.margin_m} must be finite and not negative")
+
+    @property
+    def renderable_ids(self) -> tuple[str, ...]:
+        """The fields that frames may refer to, the tile's own first."""
+        return tuple(dict.fromkeys((self.field_id, *(light.field_id for light in self.lights))))
+
+    @property
+    def archive_ids(self) -> frozenset[str]:
+        """Every archive that belongs to the tile, the bases of layers too."""
+        return frozenset((self.field_id, *(i for light in self.lights for i in light.field_ids)))
 
     def distance_m(self, east_m: float, north_m: float) -> float:
         """Return how far outside the tile's area a point is; 0 inside, and 0 everywhere without."""
@@ -73,7 +124,11 @@ class Tile:
 def tile_message(tile: Tile) -> pb.Tile:
     """Return a tile as protobuf."""
     message = pb.Tile(
-        name=tile.name, field_id=tile.field_id, version=tile.version, margin_m=tile.margin_m
+        name=tile.name,
+        field_id=tile.field_id,
+        version=tile.version,
+        margin_m=tile.margin_m,
+        lights=[pb.TileLight(**asdict(light)) for light in tile.lights],
     )
     if tile.area is not None:
         message.area.CopyFrom(
@@ -93,4 +148,18 @@ def tile_of(message: pb.Tile) -> Tile:
     if message.HasField("area"):
         sides = message.area
         area = Area((sides.west_m, sides.south_m), (sides.east_m, sides.north_m))
-    return Tile(message.name, message.field_id, message.version, area, message.margin_m)
+    if len(message.lights) > MAX_LIGHTS:
+        raise InvalidInput("tile.lights", f"{len(message.lights)} are more than {MAX_LIGHTS}")
+    lights = tuple(map(_light_of, message.lights))
+    return Tile(message.name, message.field_id, message.version, area, message.margin_m, lights)
+
+
+def _light_of(message: pb.TileLight) -> TileLight:
+    return TileLight(
+        name=message.name,
+        field_id=message.field_id,
+        version=message.version,
+        base_field_id=message.base_field_id,
+        passes=message.passes,
+        time_of_day_h=message.time_of_day_h if message.HasField("time_of_day_h") else None,
+    )

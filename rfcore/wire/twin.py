@@ -6,13 +6,23 @@ that is wrong ``ProtocolError``.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Final, cast
 
 from rfcore.camera import Intrinsics, Pose
+from rfcore.codec.references import Reference, References
 from rfcore.errors import InvalidInput, ProtocolError
+from rfcore.localise.fix import State
 from rfcore.wire.checks import check_name, check_range
+from rfcore.wire.sensing import (
+    ClockKind,
+    clock_from_wire,
+    clock_to_wire,
+    localisation_from_wire,
+    localisation_to_wire,
+)
 from rfcore.wire.v1 import edge_pb2, twin_pb2
 
 __all__ = [
@@ -54,7 +64,12 @@ class Subscription:
 
 @dataclass(frozen=True)
 class TwinPicture:
-    """One reconstructed picture; ``pose`` is world_from_cam, tile-relative."""
+    """One reconstructed picture; ``pose`` is world_from_cam, tile-relative; ``None``: lost.
+
+    ``payload_bytes``: of the slice it was made from, 0 from a server that does not say.
+    ``instant``: pictures of a vehicle's session with the same number were taken together; 0: the
+    camera stands alone.
+    """
 
     vehicle_id: str
     camera_id: str
@@ -63,13 +78,18 @@ class TwinPicture:
     sequence: int
     capture_time_ns: int
     age_ns: int
-    pose: Pose
+    pose: Pose | None
     intrinsics: Intrinsics
     field_id: str
     reconstruction_digest: bytes
     encoding: PictureEncoding
     picture: bytes
     skipped: int = 0
+    payload_bytes: int = 0
+    references: References = ()
+    clock: ClockKind | None = None
+    localisation: State | None = None
+    instant: int = 0
 
 
 @dataclass(frozen=True)
@@ -123,8 +143,6 @@ def twin_message_from_wire(response: twin_pb2.WatchResponse) -> TwinPicture | De
 
 
 def _picture_to_wire(message: TwinPicture) -> twin_pb2.TwinPicture:
-    x_m, y_m, z_m = message.pose.translation_m
-    w, x, y, z = message.pose.rotation
     k = message.intrinsics
     return twin_pb2.TwinPicture(
         vehicle_id=message.vehicle_id,
@@ -134,9 +152,7 @@ def _picture_to_wire(message: TwinPicture) -> twin_pb2.TwinPicture:
         sequence=message.sequence,
         capture_time_ns=message.capture_time_ns,
         age_ns=message.age_ns,
-        pose=edge_pb2.Pose(
-            x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
-        ),
+        pose=None if message.pose is None else _pose_to_wire(message.pose),
         intrinsics=edge_pb2.Intrinsics(
             width_px=k.width_px,
             height_px=k.height_px,
@@ -150,7 +166,25 @@ def _picture_to_wire(message: TwinPicture) -> twin_pb2.TwinPicture:
         encoding=_encoding_to_wire(message.encoding),
         picture=message.picture,
         skipped=message.skipped,
+        payload_bytes=message.payload_bytes,
+        references=[cast(edge_pb2.Reference.ValueType, int(r)) for r in message.references],
+        capture_clock=clock_to_wire(message.clock),
+        localisation=localisation_to_wire(message.localisation),
+        instant=message.instant,
     )
+
+
+def _pose_to_wire(pose: Pose) -> edge_pb2.Pose:
+    x_m, y_m, z_m = pose.translation_m
+    w, x, y, z = pose.rotation
+    return edge_pb2.Pose(
+        x_m=x_m, y_m=y_m, z_m=z_m, rotation_w=w, rotation_x=x, rotation_y=y, rotation_z=z
+    )
+
+
+def _pose_from_wire(pose: edge_pb2.Pose) -> Pose:
+    rotation = (pose.rotation_w, pose.rotation_x, pose.rotation_y, pose.rotation_z)
+    return Pose((pose.x_m, pose.y_m, pose.z_m), rotation)
 
 
 def _picture_from_wire(picture: twin_pb2.TwinPicture) -> TwinPicture:
@@ -163,17 +197,26 @@ def _picture_from_wire(picture: twin_pb2.TwinPicture) -> TwinPicture:
         sequence=picture.sequence,
         capture_time_ns=picture.capture_time_ns,
         age_ns=picture.age_ns,
-        pose=Pose(
-            (pose.x_m, pose.y_m, pose.z_m),
-            (pose.rotation_w, pose.rotation_x, pose.rotation_y, pose.rotation_z),
-        ),
+        pose=_pose_from_wire(pose) if picture.HasField("pose") else None,
         intrinsics=Intrinsics(k.width_px, k.height_px, k.fx_px, k.fy_px, k.cx_px, k.cy_px),
         field_id=picture.field_id,
         reconstruction_digest=picture.reconstruction_digest,
         encoding=_encoding_from_wire(picture.encoding),
         picture=picture.picture,
         skipped=picture.skipped,
+        payload_bytes=picture.payload_bytes,
+        references=_references_from_wire(picture.references),
+        clock=clock_from_wire(picture.capture_clock),
+        localisation=localisation_from_wire(picture.localisation),
+        instant=picture.instant,
     )
+
+
+def _references_from_wire(numbers: Iterable[int]) -> References:
+    try:
+        return tuple(Reference(number) for number in numbers)
+    except ValueError as error:
+        raise InvalidInput("picture.references", f"{error}; update this end") from error
 
 
 def _encoding_to_wire(encoding: PictureEncoding) -> twin_pb2.PictureEncoding.ValueType:

@@ -21,18 +21,25 @@ Rows = Literal["all", "native", "modes"]
 the specialisations of the renderer instead."""
 
 
-def run_case(case: str, *, rows: Rows = "all", field: Path | None = None) -> dict[str, Any]:
+def run_case(
+    case: str, *, rows: Rows = "all", field: Path | None = None, isa: str | None = None
+) -> dict[str, Any]:
     """Run one of ``CASES`` and return its result, of kind ``bench``.
 
-    ``rows`` matters to ``raster`` alone, ``field`` (an archive of the street) to ``ngp``.
+    ``rows`` matters to ``raster`` alone, and so does ``isa``, an OpenCL device to be measured
+    beside the CPU; ``field`` (an archive of the street) to ``ngp``.
 
     Raises ``InvalidInput`` for an unknown case, ``RfedgeError`` when a result is wrong.
     """
     made = provenance([] if field is None else [field])
-    return make_result("bench", made, {"case": case, "rows": _rows_of(case, rows, field)})
+    return make_result("bench", made, {"case": case, "rows": _rows_of(case, rows, field, isa)})
 
 
-def _rows_of(case: str, rows: Rows, field: Path | None) -> Sequence[object]:
+def _rows_of(case: str, rows: Rows, field: Path | None, isa: str | None) -> Sequence[object]:
+    if case == "raster" and isa is not None:
+        from rfedge.bench.opencl import opencl_rows
+
+        return opencl_rows(isa)
     if case == "raster":
         from rfedge.bench.raster import mode_rows, raster_rows
 

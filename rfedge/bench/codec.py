@@ -1,10 +1,11 @@
-"""Time the delta codec on both ends: 640x360 and 1280x720, 200k Gaussians, medium, CRF 23.
+"""Time the delta codec on both ends: 640x360 and 1280x720, 200k Gaussians, CRF 23.
 
 With one thread, which is what the receiver's times are for, and with two. The camera frame is the
 street's own render from the true pose plus seeded texture and boxes the field has never seen, so
 the P picture has something to code; the camera drives 20 cm a frame. Each size is coded against one
-reference (the render) and against three (previous frame, render, correction). On every frame the
-receiver's picture must equal the sender's closed loop.
+reference (the render) and against three (previous frame, render, correction), by our slice coder
+and by x264 medium: every frame by all of them, one after another, so that what disturbs the machine
+disturbs them alike. On every frame the receiver's picture must equal the sender's closed loop.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from rfcore.codec.references import Reference, References
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.errors import CodecError
 from rfcore.image import I420
+from rfcore.metrics import psnr
 from rfcore.native.yuv import field_view_from_view, i420_from_rgb
 from rfcore.raster.native import Rasterizer
 from rfcore.views import FieldView
@@ -37,60 +39,106 @@ SIZES_PX = ((640, 360), (1280, 720))
 ONE: References = (Reference.RENDER,)
 THREE: References = (Reference.PREVIOUS, Reference.RENDER, Reference.CORRECTION)
 THREADS = (1, 2)
+EFFORTS = ("default", "fast", "x264-medium")
 STEP_M = 0.2
 REPETITIONS = 20
 WARM_UP = 3
 
 
-@dataclass(frozen=True)
-class CodecSetup:
-    """Everything one size needs: a renderer, the codec's two ends, and the first camera."""
+class Coding:
+    """Both ends of one coder, frame after frame, and the milliseconds of every stage."""
 
-    rasterizer: Rasterizer
-    camera: Camera
-    encoder: DeltaEncoder
-    decoder: DeltaDecoder
+    def __init__(self, size_px: tuple[int, int], effort: str, threads: int) -> None:
+        self.effort = effort
+        config = CodecConfig(*size_px, effort)
+        self._encoder = DeltaEncoder(config, clock_ns=perf_counter_ns, threads=threads)
+        self._decoder = DeltaDecoder(self._encoder.header, clock_ns=perf_counter_ns)
+        self._sent, self._received = self._encoder.start(1), self._decoder.start(1)
+        self._sender: dict[str, list[float]] = {}
+        self._receiver: dict[str, list[float]] = {}
+        self._payload_bytes: list[int] = []
+        self._psnr_db: list[float] = []
 
-    def at(self, index: int) -> Camera:
-        """Return the camera of frame ``index``."""
-        x_m, y_m, z_m = self.camera.world_from_cam.translation_m
-        pose = replace(self.camera.world_from_cam, translation_m=(x_m, y_m, z_m + STEP_M * index))
-        return Camera(self.camera.intrinsics, pose)
+    def code(self, frame: I420, view: FieldView, render_ms: float, choice: FrameChoice) -> None:
+        """Code and decode one frame, and note its times."""
+        total_ms, encoded = _timed(lambda: self._encoder.encode(self._sent, frame, view, choice))
+        decode_ms, decoded = _timed(
+            lambda: self._decoder.decode(self._received, encoded.packet, view)
+        )
+        if decoded.frame.digest() != encoded.reconstruction.digest():
+            raise CodecError("the receiver's picture differs from the sender's closed loop")
+        self._sent, self._received = encoded.state, decoded.state
+        _note(self._sender, render_ms, total_ms, encoded.stage_ns)
+        _note(self._receiver, render_ms, decode_ms, decoded.stage_ns)
+        self._payload_bytes.append(len(encoded.packet.payload))
+        self._psnr_db.append(psnr(decoded.frame.y, frame.y))
 
-    def render(self, camera: Camera) -> FieldView:
-        """Render as both ends do: field, then the project's own YUV conversion."""
-        return field_view_from_view(self.rasterizer.render(camera), camera)
+    def row(self, threads: int, size_px: tuple[int, int], references: int) -> CodecRow:
+        """Return the medians of all frames after the first few."""
+        return CodecRow(
+            threads=threads,
+            width=size_px[0],
+            height=size_px[1],
+            references=references,
+            effort=self.effort,
+            payload_bytes=statistics.median(self._payload_bytes[WARM_UP:]),
+            psnr_db=statistics.median(self._psnr_db[WARM_UP:]),
+            sender_ms=_medians(self._sender),
+            receiver_ms=_medians(self._receiver),
+        )
 
 
 @dataclass(frozen=True)
 class CodecRow:
-    """One number of threads, size and number of references: median ms of each stage."""
+    """A coder at one number of threads, size and number of references: median ms a stage."""
 
     threads: int
     width: int
     height: int
     references: int
+    effort: str
+    payload_bytes: float
+    psnr_db: float
+    """Of the luma; times of two coders compare where it is about the same."""
     sender_ms: Mapping[str, float]
     receiver_ms: Mapping[str, float]
 
 
 def codec_rows() -> list[CodecRow]:
-    """Return a row for each number of threads, size and number of references."""
+    """Return a row for each number of threads, size, number of references and coder."""
     gaussians = street_gaussians()
     return [
-        _row(_setup(rasterizer, threads, *size), threads, references)
+        row
         for threads, rasterizer in ((n, Rasterizer(gaussians, threads=n)) for n in THREADS)
-        for size in SIZES_PX
+        for size_px in SIZES_PX
         for references in (ONE, THREE)
+        for row in _rows(rasterizer, threads, size_px, references)
     ]
 
 
-def _setup(rasterizer: Rasterizer, threads: int, width_px: int, height_px: int) -> CodecSetup:
-    camera = street_camera(width_px, height_px)
-    config = CodecConfig(width_px, height_px)
-    encoder = DeltaEncoder(config, clock_ns=perf_counter_ns, threads=threads)
-    decoder = DeltaDecoder(encoder.header, clock_ns=perf_counter_ns)
-    return CodecSetup(rasterizer, camera, encoder, decoder)
+def _rows(
+    rasterizer: Rasterizer, threads: int, size_px: tuple[int, int], references: References
+) -> list[CodecRow]:
+    first = street_camera(*size_px)
+    codings = [Coding(size_px, effort, threads) for effort in EFFORTS]
+    for index in range(WARM_UP + REPETITIONS):
+        camera = _moved(first, index)
+        frame = _camera_frame(rasterizer.render_colour(camera))
+        render_ms, view = _timed(
+            lambda: field_view_from_view(rasterizer.render(camera), camera)  # noqa: B023
+        )
+        choice = FrameChoice(references if index else ONE)
+        turn = index % len(codings)
+        for coding in (*codings[turn:], *codings[:turn]):
+            coding.code(frame, view, render_ms, choice)
+    return [coding.row(threads, size_px, len(references)) for coding in codings]
+
+
+def _moved(camera: Camera, index: int) -> Camera:
+    """Return the camera of frame ``index``."""
+    x_m, y_m, z_m = camera.world_from_cam.translation_m
+    pose = replace(camera.world_from_cam, translation_m=(x_m, y_m, z_m + STEP_M * index))
+    return Camera(camera.intrinsics, pose)
 
 
 def _camera_frame(colour: np.ndarray[Any, np.dtype[np.float32]]) -> I420:
@@ -102,38 +150,6 @@ def _camera_frame(colour: np.ndarray[Any, np.dtype[np.float32]]) -> I420:
         top, left = int(rng.integers(height // 2, height)), int(rng.integers(0, width))
         rgb[top : top + height // 8, left : left + width // 8] = rng.integers(0, 255, 3)
     return i420_from_rgb(np.clip(rgb, 0, 255).astype(np.uint8))
-
-
-def _row(setup: CodecSetup, threads: int, references: References) -> CodecRow:
-    sender: dict[str, list[float]] = {}
-    receiver: dict[str, list[float]] = {}
-    send_state, receive_state = setup.encoder.start(1), setup.decoder.start(1)
-    for repetition in range(WARM_UP + REPETITIONS):
-        camera = setup.at(repetition)
-        frame = _camera_frame(setup.rasterizer.render_colour(camera))
-        render_ms, view = _timed(lambda: setup.render(camera))  # noqa: B023
-        choice = FrameChoice(references if repetition else ONE)
-        total_ms, encoded = _timed(
-            lambda: setup.encoder.encode(send_state, frame, view, choice)  # noqa: B023
-        )
-        decode_ms, decoded = _timed(
-            lambda: setup.decoder.decode(receive_state, encoded.packet, view)  # noqa: B023
-        )
-        if decoded.frame.digest() != encoded.reconstruction.digest():
-            raise CodecError("the receiver's picture differs from the sender's closed loop")
-        send_state, receive_state = encoded.state, decoded.state
-        if repetition >= WARM_UP:
-            _note(sender, render_ms, total_ms, encoded.stage_ns)
-            _note(receiver, render_ms, decode_ms, decoded.stage_ns)
-    k = setup.camera.intrinsics
-    return CodecRow(
-        threads=threads,
-        width=k.width_px,
-        height=k.height_px,
-        references=len(references),
-        sender_ms={stage: statistics.median(ms) for stage, ms in sender.items()},
-        receiver_ms={stage: statistics.median(ms) for stage, ms in receiver.items()},
-    )
 
 
 def _timed(call: Callable[[], T]) -> tuple[float, T]:
@@ -148,3 +164,7 @@ def _note(
     stages = {"render": render_ms, **{name: ns / 1e6 for name, ns in stage_ns.items()}}
     for name, ms in {**stages, "total": render_ms + coding_ms}.items():
         series.setdefault(name, []).append(ms)
+
+
+def _medians(series: Mapping[str, list[float]]) -> dict[str, float]:
+    return {stage: statistics.median(ms[WARM_UP:]) for stage, ms in series.items()}

@@ -16,12 +16,12 @@ from pathlib import Path
 from time import perf_counter_ns
 
 from mec_server.config import DecoderKind
-from mec_server.decoding.decoders import Decoders
+from mec_server.decoding.decoders import Decoders, DecoderSettings
 from mec_server.decoding.process import LossCause
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.state import DecoderState
 from rfcore.errors import RfedgeError
-from rfcore.field import RadianceField, load_field, render_field_view
+from rfcore.field import RadianceField, load_field
 from rfcore.views import FieldView
 from rfcore.wire.messages import Frame
 from rfedge.loadtest.prerecorded import PrerecordedDrive, prerecorded_drive
@@ -31,7 +31,12 @@ __all__ = ["DecoderRow", "decoder_rows"]
 
 FIELD = sample_path("fields/street.rff")
 DRIVE = sample_path("street/transforms_drive_vehicles.json")
-KINDS = (DecoderKind.IN_PROCESS, DecoderKind.CHILD, DecoderKind.BUBBLEWRAP)
+KINDS = (
+    DecoderKind.IN_PROCESS,
+    DecoderKind.CHILD,
+    DecoderKind.LANDLOCK,
+    DecoderKind.BUBBLEWRAP,
+)
 LAPS = 5
 """How many times the drive is decoded, after one pass to warm up."""
 
@@ -66,7 +71,9 @@ def decoder_rows() -> list[DecoderRow]:
 
 
 def _decoder(kind: DecoderKind, drive: PrerecordedDrive, opened: ExitStack) -> DeltaDecoder:
-    decoders = Decoders(kind, True, _fail, lambda _: None)  # taking the spare raises
+    decoders = Decoders(
+        DecoderSettings(kind, as_root=True), _fail, lambda _: None
+    )  # taking the spare raises
     decoders.start()
     opened.callback(decoders.close)
     header = drive.hello.cameras[0].codec
@@ -82,7 +89,7 @@ def _fail(cause: LossCause) -> None:
 def _times(
     drive: PrerecordedDrive, field: RadianceField, decoders: dict[DecoderKind, DeltaDecoder]
 ) -> dict[DecoderKind, list[float]]:
-    views = [render_field_view(field, f.camera(drive.intrinsics), f.quality) for f in drive.chain]
+    views = [f.view(field, drive.intrinsics) for f in drive.chain]
     times_ms: dict[DecoderKind, list[float]] = {kind: [] for kind in decoders}
     for lap in range(1 + LAPS):
         states = {kind: decoder.start(0) for kind, decoder in decoders.items()}

@@ -12,14 +12,14 @@ from __future__ import annotations
 import ipaddress
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.extras import needs
-from rfcore.files import whole_folder
+from rfcore.files import whole_folder, write_whole
 from rfcore.wire.checks import shown
 from rfcore.wire.identity import Role, identity_uri
 
@@ -33,6 +33,7 @@ __all__ = [
     "CertificateInfo",
     "Issued",
     "Members",
+    "add_certificates",
     "certify",
     "read_certificates",
     "write_certificates",
@@ -51,9 +52,19 @@ class Members:
     vehicles: tuple[str, ...]
     consumers: tuple[str, ...] = ()
     hosts: tuple[str, ...] = ("localhost", "127.0.0.1", "::1")
+    operators: tuple[str, ...] = ()
+
+    @property
+    def clients(self) -> tuple[tuple[Role, tuple[str, ...]], ...]:
+        """Everyone but the server, by role."""
+        return (
+            (Role.VEHICLE, self.vehicles),
+            (Role.CONSUMER, self.consumers),
+            (Role.OPERATOR, self.operators),
+        )
 
     def __post_init__(self) -> None:
-        for role, names in ((Role.VEHICLE, self.vehicles), (Role.CONSUMER, self.consumers)):
+        for role, names in self.clients:
             for name in names:
                 identity_uri(role, name)
             if len(set(names)) != len(names):
@@ -84,19 +95,69 @@ class _Authority:
 
 def certify(members: Members, now: datetime, days: int) -> tuple[Issued, ...]:
     """Make an authority and sign a certificate for everyone, good for ``days`` from ``now``."""
-    if not 1 <= days <= MAX_DAYS:
-        raise InvalidInput("days", f"{days} is outside 1..{MAX_DAYS}")
+    _check_days(days)
     authority = _authority(now, days)
     server = [x509.UniformResourceIdentifier(identity_uri(Role.SERVER, "edge"))]
     issued = [
         _issued("ca", "the authority", authority.certificate, authority.key),
         _signed(authority, "server", [*server, *(_host_name(host) for host in members.hosts)]),
     ]
-    for role, names in ((Role.VEHICLE, members.vehicles), (Role.CONSUMER, members.consumers)):
+    return (*issued, *_clients(authority, members))
+
+
+def _clients(authority: _Authority, members: Members) -> Iterator[Issued]:
+    for role, names in members.clients:
         for name in names:
             uri = x509.UniformResourceIdentifier(identity_uri(role, name))
-            issued.append(_signed(authority, f"{role}-{name}", [uri]))
-    return tuple(issued)
+            yield _signed(authority, f"{role}-{name}", [uri])
+
+
+def add_certificates(
+    folder: Path, members: Members, now: datetime, days: int
+) -> tuple[Issued, ...]:
+    """Sign certificates for further vehicles, consumers and operators with the authority of
+    ``folder``, and write them into it; those that are there stay as they are.
+
+    Raises ``InvalidInput`` for a name that has a certificate already, or a folder without the
+    authority's key; ``InvalidData`` for a key that is not the authority's.
+    """
+    _check_days(days)
+    issued = tuple(_clients(_read_authority(folder, now, days), members))
+    if not issued:
+        raise InvalidInput("certs", "name at least one vehicle, consumer or operator to add")
+    there = [one.name for one in issued if (folder / f"{one.name}.pem").exists()]
+    if there:
+        raise InvalidInput("certs", f"{folder} has a certificate of {', '.join(there)} already")
+    for one in issued:
+        _write_key(folder / f"{one.name}.key", one.key)
+        write_whole(folder / f"{one.name}.pem", one.certificate.decode("ascii"))
+    return issued
+
+
+def _read_authority(folder: Path, now: datetime, days: int) -> _Authority:
+    try:
+        pem, secret = ((folder / name).read_bytes() for name in ("ca.pem", "ca.key"))
+    except OSError as error:
+        raise InvalidInput("certs", f"{folder} does not hold ca.pem and ca.key") from error
+    try:
+        certificate = x509.load_pem_x509_certificate(pem)
+        key = serialization.load_pem_private_key(secret, None)
+    except (TypeError, ValueError) as error:
+        raise InvalidData(f"{folder} holds no authority: {error}") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or (
+        key.public_key() != certificate.public_key()
+    ):
+        raise InvalidData(f"{folder / 'ca.key'} is not the key of ca.pem")
+    if now + timedelta(days=days) > certificate.not_valid_after_utc:
+        raise InvalidInput(
+            "days", f"{days} is beyond the authority's end, {certificate.not_valid_after_utc:%F}"
+        )
+    return _Authority(certificate, key, now, days)
+
+
+def _check_days(days: int) -> None:
+    if not 1 <= days <= MAX_DAYS:
+        raise InvalidInput("days", f"{days} is outside 1..{MAX_DAYS}")
 
 
 def _authority(now: datetime, days: int) -> _Authority:

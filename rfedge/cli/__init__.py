@@ -30,7 +30,9 @@ from rfedge.cli.measure import Bench, Eval, LoadTest
 from rfedge.cli.render import Render
 from rfedge.cli.scene import Scene
 from rfedge.cli.services import Certs, Link, Watch
+from rfedge.cli.size import Size
 from rfedge.cli.train import Train
+from rfedge.cli.twin import Twin
 
 __all__ = ["main", "parse"]
 
@@ -44,8 +46,10 @@ Verb = (
     | Annotated[Localise, subcommand("localise")]
     | Annotated[Link, subcommand("link")]
     | Annotated[LoadTest, subcommand("loadtest")]
+    | Annotated[Size, subcommand("size")]
     | Annotated[Scene, subcommand("scene")]
     | Annotated[Watch, subcommand("watch")]
+    | Annotated[Twin, subcommand("twin")]
     | Annotated[Certs, subcommand("certs")]
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Eval, subcommand("eval")]

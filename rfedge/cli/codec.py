@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from rfedge.arguments import DATASET, FIELD, FOLDER, check_folder, open_field
+from rfcore.codec.h264.config import CoderSettings
+from rfedge.arguments import DATASET, FIELD, FOLDER, RENDERER, check_folder, open_field
+
+if TYPE_CHECKING:
+    from rfcore.dataset import Dataset
+    from rfcore.field import RadianceField
+    from rfedge.offline import Locate
 
 __all__ = ["Decode", "Encode"]
 
@@ -25,38 +31,58 @@ class Encode:
     """The field: an archive (.rff), or a name."""
     out: Annotated[Path, RFV]
     """The coded drive to write."""
-    preset: Annotated[str, arg(metavar="PRESET")] = "medium"
-    """x264 preset of the P pictures."""
+    coding: OmitArgPrefixes[CoderSettings] = CoderSettings()
     crf: float = 23.0
-    """x264 constant rate factor, 1 (best) to 51."""
+    """Quality, x264's constant rate factor, 1 (best) to 51."""
     mask: Annotated[Path | None, arg(metavar="PICTURE")] = None
     """Picture of the camera's size, white where frames are to be coded finer."""
     mask_qp: int = -6
     """Added to H.264's quantiser in the mask, -24..24; -6 halves its step."""
-    refine_pose_ms: float | None = None
-    """Time a frame to look for a pose of fewer bits near the measured one; from about 100 on."""
+    localise: bool = False
+    """Find the poses in the field, from the dataset's as a sensor with --pose-errors sees them;
+    frames whose pose is not found are coded without the field."""
+    pose_errors: Annotated[str, arg(metavar="MODEL")] = "exact"
+    """With --localise: exact, white-small, white-large, offset, gnss, or KEY=VALUE,... of
+    rfcore.localise.pose_errors (noise_m, offset_m, walk_m, rate_hz, latency_s, silent_s, ...)."""
+    seed: int = 1
+    """Seed of the pose errors."""
     threads: int = 2
     """Threads of the rasterizer."""
+    renderer: Annotated[str, RENDERER] = "cpu"
+    """Splats are drawn by the CPU or an OpenCL device, with the same bytes."""
 
     def run(self) -> None:
         """Code the drive and print its size."""
         from rfcore.codec.sender.steering import SteeringSettings
         from rfcore.dataset import read_dataset
+        from rfcore.raster.renderers import renderer_isa
         from rfcore.wire.drive_file import write_drive
         from rfedge.offline import CodingSettings, encode_drive
 
-        field = open_field(self.field, threads=self.threads)
+        isa = renderer_isa(self.renderer)
+        field = open_field(self.field, threads=self.threads, isa=isa)
         dataset = read_dataset(self.drive, tile_origin=field.metadata.tile_origin)
-        asked = SteeringSettings(self.mask, self.mask_qp, self.refine_pose_ms)
+        asked = SteeringSettings(self.mask, self.mask_qp)
         k = dataset.pictures[0].camera.intrinsics
         steering = asked.steering((k.width_px, k.height_px))
-        coded = encode_drive(dataset, field, CodingSettings(self.preset, self.crf, steering))
+        settings = CodingSettings(self.coding.name, self.crf, steering, self.coding.check_decode)
+        coded = encode_drive(dataset, field, settings, self._located(field, dataset))
         write_drive(self.out, coded)
         payload_bytes = sum(len(frame.packet.payload) for frame in coded.frames)
         print(
             f"{self.out}: {len(coded.frames)} frames, {self.out.stat().st_size:,} bytes, "
             f"of which payload {payload_bytes:,}"
         )
+
+    def _located(self, field: RadianceField, dataset: Dataset) -> Locate | None:
+        """Return what finds the poses, if that is asked for."""
+        if not self.localise:
+            return None
+        from rfcore.localise.pose_errors import parse_error_model
+        from rfedge.located import LocatedDrive
+
+        errors = parse_error_model(self.pose_errors)
+        return LocatedDrive(field, dataset.pictures, errors, self.seed).locate
 
 
 @dataclass(frozen=True)
@@ -69,20 +95,35 @@ class Decode:
     """The field: an archive (.rff), or a name."""
     out: Annotated[Path, FOLDER]
     """Folder for the PNG files."""
+    decoder: Literal["auto", "bubblewrap", "landlock", "child", "in-process"] = "auto"
+    """Where H.264 is decoded, as for mec-server; auto: the best sandbox that works here."""
     threads: int = 2
     """Threads of the rasterizer."""
+    renderer: Annotated[str, RENDERER] = "cpu"
+    """Splats are drawn by the CPU or an OpenCL device, with the same bytes."""
 
     def run(self) -> None:
         """Decode every frame; stop at the first packet that fails a check."""
+        from mec_server.config import DecoderKind
+        from mec_server.decoding.decoders import Decoders, DecoderSettings
         from rfcore.image import write_png
         from rfcore.native.yuv import rgb_from_i420
+        from rfcore.raster.renderers import renderer_isa
         from rfcore.wire.drive_file import read_drive
         from rfedge.offline import decode_drive
 
         check_folder(self.out, "a folder for PNG files")
         drive = read_drive(self.coded)
-        field = open_field(self.field, threads=self.threads)
+        isa = renderer_isa(self.renderer)
+        field = open_field(self.field, threads=self.threads, isa=isa)
         self.out.mkdir(parents=True, exist_ok=True)
-        for decoded in decode_drive(drive, field):
-            write_png(self.out / f"{decoded.sequence:06d}.png", rgb_from_i420(decoded.frame))
+        # A decoder of root becomes another user, and nothing but it runs on what the file says.
+        settings = DecoderSettings(DecoderKind(self.decoder), as_root=True)
+        decoders = Decoders(settings, count_loss=lambda _: None, start_failed=lambda _: None)
+        decoders.start()
+        try:
+            for decoded in decode_drive(drive, field, decoders.open):
+                write_png(self.out / f"{decoded.sequence:06d}.png", rgb_from_i420(decoded.frame))
+        finally:
+            decoders.close()
         print(f"{self.out}: {len(drive.frames)} frames")

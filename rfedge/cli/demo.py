@@ -8,6 +8,7 @@ from typing import Annotated
 
 from tyro.conf import arg
 
+from rfcore.codec.h264.config import DEFAULT_EFFORT
 from rfedge.arguments import FOLDER
 from rfedge.samples import sample_path
 
@@ -37,10 +38,12 @@ class Demo:
     """Throughput of the link in either direction, bit/s."""
     link_delay_ms: float = 20.0
     """One-way delay of the link, ms."""
+    effort: Annotated[str, arg(metavar="EFFORT")] = DEFAULT_EFFORT
+    """Of the P pictures' coder: fast, default, thorough; x264-PRESET codes them with x264."""
     preset: Annotated[str, arg(metavar="PRESET")] = "medium"
-    """x264 preset of the P pictures."""
+    """x264 preset of what the P pictures are compared with."""
     crf: float = 23.0
-    """x264 constant rate factor, 1 (best) to 51."""
+    """Quality, x264's constant rate factor, 1 (best) to 51."""
     threads: int = 2
     """Threads of each renderer."""
 
@@ -62,11 +65,15 @@ class Demo:
             rate_hz=self.rate_hz,
             link_bps=self.link_bps,
             link_delay_ms=self.link_delay_ms,
+            effort=self.effort,
             preset=self.preset,
             crf=self.crf,
             threads=self.threads,
         )
         run = run_demo(settings, console)
-        write_report(self.out / "report.html", run.result, run.pictures)
+        video = self.out / "reconstructed.mp4"
+        write_report(self.out / "report.html", run.result, run.pictures, video)
         print_summary(console, run.result, self.out)
+        # Not wrapped to the terminal's width: to be copied in one go.
+        print(f"in a browser: {run.twin_command(self.out)}")
         run.require_complete()

@@ -8,8 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
-from rfedge.arguments import DATASET, FIELD, IMPORTED, PLY, RFF, open_field, open_splats
+from rfedge.arguments import (
+    DATASET,
+    FIELD,
+    IMPORTED,
+    RFF,
+    SPLATS,
+    field_path,
+    max_field_bytes,
+    open_field,
+    open_splats,
+)
 from rfedge.cli.field_tiles import FieldList, FieldPublish, FieldRollback
+from rfedge.cli.field_update import FieldDisagree, FieldUpdate
 
 if TYPE_CHECKING:
     from rfcore.camera import Camera, TileOrigin
@@ -20,6 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Field",
+    "FieldAnchor",
     "FieldCheck",
     "FieldExport",
     "FieldImport",
@@ -31,10 +43,12 @@ __all__ = [
 
 @dataclass(frozen=True)
 class FieldImport:
-    """Read a .ply of INRIA, gsplat, nerfstudio, OpenSplat, Brush or SuperSplat."""
+    """Read splats: a .ply of INRIA, gsplat, nerfstudio, OpenSplat, Brush or SuperSplat, or a
+    .spz."""
 
-    ply: Annotated[Path, Positional, PLY]
-    """The file; properties are found by name, text and binary alike."""
+    splats: Annotated[Path, Positional, SPLATS]
+    """The file; properties of a .ply are found by name, text and binary alike. Axes stay the
+    file's: a .spz that its makers' own tool made from a .ply is turned half round x against it."""
     name: Annotated[str, arg(metavar="NAME")]
     """What to call the field; every command that takes a field knows it by this name."""
     out: Annotated[Path | None, RFF] = None
@@ -50,6 +64,8 @@ class FieldImport:
     SplatRenderMode comment does not say so."""
     raw: bool = False
     """Keep every float32 as it is instead of compressing to about a tenth."""
+    unconfined: bool = False
+    """Read the file in this process and not in a sandbox: for files of your own."""
     threads: int = 2
     """Threads of the renderer that predicts the time of a frame."""
 
@@ -59,7 +75,7 @@ class FieldImport:
 
         from rfcore.camera import TileOrigin
         from rfcore.errors import InvalidInput
-        from rfcore.field import FieldMetadata, SplatField, read_ply_antialiased, save_field
+        from rfcore.field import FieldMetadata, SplatField, save_field
         from rfedge.fields.describe import print_levels, size_mb
         from rfedge.fields.viewpoints import look_around
 
@@ -68,10 +84,10 @@ class FieldImport:
         if out.exists() and not self.replace:
             raise InvalidInput("name", f"{out} is there already: take another name, or --replace")
         origin = TileOrigin(*self.tile_origin)
-        stated = read_ply_antialiased(self.ply)
+        splats, stated = self._splats(origin)
         antialiased = self.antialiased or stated is True
         metadata = FieldMetadata(self.name, origin, antialiased=antialiased)
-        field = SplatField(self._splats(origin), metadata, threads=self.threads)
+        field = SplatField(splats, metadata, threads=self.threads)
         field = field if self.raw else field.compressed()
         out.parent.mkdir(parents=True, exist_ok=True)
         field_id = save_field(field, out)
@@ -88,31 +104,44 @@ class FieldImport:
             return f"not drawn antialiased: the file does not say whether to; {tries}"
         return f"{'drawn' if stated else 'not drawn'} antialiased, as the file says"
 
-    def _splats(self, origin: TileOrigin) -> Gaussians:
-        """Return the file's splats in the tile's frame, the most important first."""
+    def _splats(self, origin: TileOrigin) -> tuple[Gaussians, bool | None]:
+        """Return the file's splats in the tile's frame, the most important first, and how it says
+        that they are drawn."""
         from rfcore.errors import InvalidInput
-        from rfcore.field import read_ply
         from rfcore.field.importance import most_important_first, reordered, visible_area
         from rfcore.field.similarity import moved, read_field_from_world
 
         back = read_field_from_world(self.transform).inverse() if self.transform else None
-        splats = read_ply(self.ply, origin if back is None else None)
+        splats, stated = self._read(origin if back is None else None)
         if not len(splats):
-            raise InvalidInput("ply", f"{self.ply} holds no splats")
+            raise InvalidInput("splats", f"{self.splats} holds no splats")
         if back is not None:
             splats = moved(splats, back.localised(origin))
-        return reordered(splats, most_important_first(visible_area(splats)))
+        return reordered(splats, most_important_first(visible_area(splats))), stated
+
+    def _read(self, origin: TileOrigin | None) -> tuple[Gaussians, bool | None]:
+        from rfcore.field import read_splat_file
+        from rfedge.fields.confined_reader import BEST_FIRST, read_confined
+
+        max_bytes = max_field_bytes()
+        if self.unconfined:
+            return read_splat_file(self.splats, origin, max_bytes)
+        splats, stated, confinement = read_confined(self.splats, origin, max_bytes)
+        if confinement is not BEST_FIRST[0]:
+            print(f"read in a lesser sandbox ({confinement}): {BEST_FIRST[0]} does not work here")
+        return splats, stated
 
 
 @dataclass(frozen=True)
 class FieldExport:
-    """Write a field's splats in the property order of the reference implementation."""
+    """Write a field's splats for other programs, as .ply or .spz."""
 
     field: Annotated[Path, Positional, FIELD]
     """The archive (.rff), or the field's name."""
-    out: Annotated[Path, PLY]
-    """The file to write; positions are relative to the tile's origin. A SplatRenderMode comment
-    says how the splats are to be drawn."""
+    out: Annotated[Path, arg(metavar="FILE.ply|.spz")]
+    """The file to write; positions are relative to the tile's origin. As .ply in the property order
+    of the reference implementation, with a SplatRenderMode comment that says how the splats are to
+    be drawn; as .spz, lossy and a tenth of the size, for viewers in a browser."""
     detail: float = 1.0
     """Share of the splats: 1, 0.5, 0.25 or 0.1."""
 
@@ -120,13 +149,16 @@ class FieldExport:
         """Load and export."""
         from rfcore.field import Quality, write_ply
         from rfcore.field.quality import splats_at_detail
+        from rfcore.field.spz import write_spz
 
-        _check_out(self.out, ".ply")
+        write = write_spz if self.out.suffix == ".spz" else write_ply
+        if write is write_ply:
+            _check_out(self.out, ".ply")
         detail = Quality(self.detail).detail
         field = open_splats(self.field, threads=1)
         splats = splats_at_detail(field.gaussians, field.levels, detail)
         self.out.parent.mkdir(parents=True, exist_ok=True)
-        write_ply(self.out, splats, antialiased=field.metadata.antialiased)
+        write(self.out, splats, antialiased=field.metadata.antialiased)
         print(f"{self.out}: {len(splats):,} splats of SH degree {splats.sh_degree}")
 
 
@@ -335,15 +367,58 @@ def _check_out(out: Path, suffix: str) -> None:
 
 
 @dataclass(frozen=True)
+class FieldAnchor:
+    """State or show where on the Earth a field is, for poses from satellite navigation."""
+
+    field: Annotated[Path, Positional, FIELD]
+    """The archive (.rff), or the field's name."""
+    at: Annotated[tuple[float, float, float] | None, arg(metavar="LATITUDE LONGITUDE HEIGHT")] = (
+        None
+    )
+    """WGS 84, degrees, and metres above the ellipsoid; without this the anchor is shown."""
+    point_m: Annotated[tuple[float, float, float], arg(metavar="X Y Z")] = (0.0, 0.0, 0.0)
+    """The point of the field that is there, m; default: its origin."""
+    enu_from_world: Annotated[tuple[float, float, float, float], arg(metavar="W X Y Z")] = (
+        1.0,
+        0.0,
+        0.0,
+        0.0,
+    )
+    """Rotation of the field's axes to east, north, up; default: they are these."""
+    out: Annotated[Path | None, RFF] = None
+    """The archive to write; with --at. Another anchor makes another field id."""
+
+    def run(self) -> None:
+        """Show the anchor, or write the field with another."""
+        from rfcore.errors import InvalidInput
+        from rfcore.field.store import anchored_file
+        from rfcore.geodesy import Anchor
+        from rfedge.fields.describe import anchor_text
+
+        if (self.at is None) != (self.out is None):
+            raise InvalidInput("at", "goes with --out: the field with an anchor is another field")
+        if self.at is None or self.out is None:
+            print(anchor_text(open_field(self.field, threads=1).metadata.anchor))
+            return
+        _check_out(self.out, ".rff")
+        anchor = Anchor(*self.at, self.enu_from_world, self.point_m)
+        field_id = anchored_file(field_path(self.field), anchor, self.out)
+        print(f"{self.out}: field {field_id}, {anchor_text(anchor)}")
+
+
+@dataclass(frozen=True)
 class Field:
     """Import, inspect, check, slim, refine, export and publish radiance fields."""
 
     verb: Annotated[
         Annotated[FieldImport, subcommand("import")]
+        | Annotated[FieldAnchor, subcommand("anchor")]
         | Annotated[FieldInfo, subcommand("info")]
         | Annotated[FieldCheck, subcommand("check")]
         | Annotated[FieldSlim, subcommand("slim")]
         | Annotated[FieldLevels, subcommand("levels")]
+        | Annotated[FieldUpdate, subcommand("update")]
+        | Annotated[FieldDisagree, subcommand("disagree")]
         | Annotated[FieldExport, subcommand("export")]
         | Annotated[FieldPublish, subcommand("publish")]
         | Annotated[FieldList, subcommand("list")]

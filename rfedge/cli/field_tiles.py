@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from rfedge.arguments import FIELD, FOLDER, field_path
+
+if TYPE_CHECKING:
+    from rfcore.wire.tile_manifest import VersionLabel
+    from rfcore.wire.tiles import Tile
 
 __all__ = ["FieldList", "FieldPublish", "FieldRollback"]
 
@@ -29,21 +33,30 @@ class FieldPublish:
     """West, south, east, north side of the ground it is for, m; as before, at first everywhere."""
     margin_m: float | None = None
     """How far beyond its ground the field serves where a neighbour does not; at first 0."""
+    light: str = ""
+    """Publish it as the tile under another light of this name, beside the tile's own field; a
+    vehicle takes what is nearest to its frames. A colour layer (field update) is published so."""
+    time_of_day_h: float | None = None
+    """Hours of the day, UTC, at which that light is."""
+    passes: int = 0
+    """How many passes it was learnt from."""
 
     def run(self) -> None:
         """Publish, and say what is current."""
         from datetime import UTC, datetime
 
+        from rfcore.wire.publish import Ground, publish
+        from rfcore.wire.tile_manifest import VersionLabel
         from rfcore.wire.tiles import Area
-        from rfedge.fields.publish import Ground, publish
 
         area = None
         if self.area is not None:
             west_m, south_m, east_m, north_m = self.area
             area = Area((west_m, south_m), (east_m, north_m))
         ground = Ground(area, self.margin_m)
-        tile = publish(self.folder, self.tile, field_path(self.field), ground, datetime.now(UTC))
-        print(f"{tile.name} is version {tile.version}, field {tile.field_id}")
+        label = VersionLabel(self.light, "", self.passes, self.time_of_day_h)
+        now, path = datetime.now(UTC), field_path(self.field)
+        print(_current(publish(self.folder, self.tile, path, ground, now, label), self.light))
 
 
 @dataclass(frozen=True)
@@ -67,8 +80,9 @@ class FieldList:
                 ground = f"{low[0]:g}, {low[1]:g} to {high[0]:g}, {high[1]:g} m"
             print(f"{name}: {ground}, margin {tile.margin_m:g} m")
             for number, field_id in enumerate(tile.field_ids, 1):
-                mark = "*" if number == tile.current else " "
-                print(f"{mark} {number:3}  {tile.times[number - 1]}  {field_id}")
+                is_current = number == tile.current or number in tile.lights.values()
+                mark, light = "*" if is_current else " ", _light_text(tile.label(number))
+                print(f"{mark} {number:3}  {tile.times[number - 1]}  {field_id}{light}")
 
 
 @dataclass(frozen=True)
@@ -81,10 +95,29 @@ class FieldRollback:
     """The tile to take back."""
     to: int | None = None
     """The version that was good; the one before the current without it."""
+    light: str = ""
+    """Take back a light of the tile; one without an earlier version is withdrawn."""
 
     def run(self) -> None:
         """Roll back, and say what is current."""
-        from rfedge.fields.publish import roll_back
+        from rfcore.wire.publish import roll_back
 
-        tile = roll_back(self.folder, self.tile, self.to)
-        print(f"{tile.name} is version {tile.version}, field {tile.field_id}")
+        print(_current(roll_back(self.folder, self.tile, self.to, self.light), self.light))
+
+
+def _current(tile: Tile, light: str) -> str:
+    """Say what is current, of a light or of the tile itself."""
+    if not light:
+        return f"{tile.name} is version {tile.version}, field {tile.field_id}"
+    for one in tile.lights:
+        if one.name == light:
+            return f"{tile.name}, {light}: version {one.version}, field {one.field_id}"
+    return f"{tile.name}, {light}: withdrawn"
+
+
+def _light_text(label: VersionLabel) -> str:
+    if not label.light:
+        return ""
+    hour = "" if label.time_of_day_h is None else f" at {label.time_of_day_h:.1f} h"
+    layer = f", a layer on {label.base_field_id[:16]}" if label.base_field_id else ""
+    return f"  {label.light}{hour}, {label.passes} passes{layer}"

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from rfedge.arguments import DATASET, FIELD, field_path, open_field
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
+
+    from rfcore.field import RadianceField
+    from rfcore.localise.prior import PosePrior
+    from rfcore.views import PosedPicture
+    from rfedge.experiments.localisation.feed import RecordedFeed
 
 __all__ = ["Localise"]
 
@@ -31,6 +41,17 @@ class Localise:
     """Seed of the starts."""
     out: Annotated[Path | None, arg(metavar="FILE.tum")] = None
     """Write the pose found of each picture, a TUM line each; what was lost is a comment."""
+    pose_feed: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Start from a recorded feed of NMEA or JSON lines (docs/localise.md) instead, one search a
+    picture; its times are the drive's. Deviations are those the feed states."""
+    feed_offset_s: float = 0.0
+    """Add to the feed's times to get the drive's, seconds."""
+    camera_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The camera seen from the feed's antenna: metres forward, left, up."""
+    rate: float = 10.0
+    """Pictures a second, where the dataset has no times."""
+    report: Annotated[Path | None, arg(metavar="FILE.html")] = None
+    """Write a page: errors over time, matches drawn, what was lost and why."""
     json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
     """Write one JSON object to this file; `-` is standard output."""
     threads: int = 2
@@ -42,11 +63,14 @@ class Localise:
         from rich.progress import track
 
         from rfcore.dataset import read_dataset
-        from rfedge.experiments.localisation import (
+        from rfedge.experiments.localisation.feed import typical_start
+        from rfedge.experiments.localisation.report import write_localise_report
+        from rfedge.experiments.localisation.starts import (
             attempts,
             parse_start_error,
             result_of,
             row_text,
+            searches_from,
             summary,
             write_poses,
         )
@@ -56,10 +80,23 @@ class Localise:
         field = open_field(self.field, threads=self.threads)
         pictures = read_dataset(self.drive, tile_origin=field.metadata.tile_origin).pictures
         counts = (len(pictures) if self.tries is None else self.tries, self.false_starts)
-        searches = attempts(field, pictures, error, counts, self.seed)
-        shown = Console(stderr=True)
+        shown, feed = Console(stderr=True), None
+        if self.pose_feed is None:
+            searches = attempts(field, pictures, error, counts, self.seed)
+        else:
+            feed = self._feed()
+            priors = self._priors(feed, field, pictures, shown)
+            counts = (sum(prior is not None for prior in priors), 0)
+            searches = searches_from(field, pictures, priors)
+            error = typical_start(pictures, priors)
         done = list(track(searches, "Localising", total=sum(counts), console=shown))
+        if feed is not None:
+            told = feed.time_offset(pictures, done)
+            shown.print(f"{self.pose_feed}: {told}", highlight=False)
         row = summary(str(self.drive), error, done)
+        if self.report is not None:
+            write_localise_report(self.report, field, row, done)
+            shown.print(f"{self.report}: errors over time and matches", highlight=False)
         if self.out is not None:
             found = write_poses(self.out, done)
             shown.print(f"{self.out}: {found} poses", highlight=False)
@@ -67,3 +104,37 @@ class Localise:
             write_result(self.json, result_of([row], [field_path(self.field), self.drive]))
         if self.json != "-":
             print(row_text(row))
+
+    def _feed(self) -> RecordedFeed:
+        from rfcore.errors import InvalidInput
+        from rfedge.experiments.localisation.feed import RecordedFeed
+
+        assert self.pose_feed is not None
+        if self.tries is not None or self.false_starts:
+            raise InvalidInput("pose_feed", "goes without --tries and --false-starts")
+        return RecordedFeed.read(self.pose_feed, self.feed_offset_s)
+
+    def _priors(
+        self,
+        feed: RecordedFeed,
+        field: RadianceField,
+        pictures: Sequence[PosedPicture],
+        console: Console,
+    ) -> list[PosePrior | None]:
+        """Return what the feed knows of each picture's pose; say what is wrong with the feed."""
+        from cav_agent.pose_feed.placing import CameraMount, Place
+        from rfcore.errors import InvalidInput
+
+        place = Place(
+            field.metadata.anchor, field.metadata.tile_origin, CameraMount(self.camera_at)
+        )
+        priors = feed.priors(pictures, place, field.bounds, self.rate)
+        for problem, times in feed.problems.items():
+            console.print(f"{self.pose_feed}: {problem}, {times} times", highlight=False)
+        if not any(priors):
+            raise InvalidInput(
+                "pose_feed",
+                f"{self.pose_feed}: none of {feed.fixes} fixes is before a picture of the drive; "
+                "its times are to be the drive's: see --feed-offset-s",
+            )
+        return priors

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import DATASET, FIELD, check_folder, open_field
+from rfedge.arguments import DATASET, FIELD, RENDERER, check_folder, open_field
 
 __all__ = ["Render"]
 
@@ -43,12 +43,15 @@ class Render:
     """Threads of the renderer."""
     isa: str | None = None
     """Force an instruction set: avx512, avx2, neon or scalar."""
+    renderer: Annotated[str, RENDERER] = "cpu"
+    """Splats are drawn by the CPU or an OpenCL device, with the same bytes."""
 
     def run(self) -> None:
         """Render the path."""
         from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidInput
         from rfcore.field import Quality
+        from rfcore.raster.renderers import renderer_isa
         from rfedge.fields.viewpoints import (
             OrbitSettings,
             drive_viewpoints,
@@ -62,7 +65,9 @@ class Render:
         if not film:
             check_folder(self.out, "a folder for PNG files, or a video ending in .mp4")
         quality = Quality(self.detail, self.sh_degree)
-        field = open_field(self.field, threads=self.threads, isa=self.isa)
+        field = open_field(
+            self.field, threads=self.threads, isa=renderer_isa(self.renderer, self.isa)
+        )
         if self.path == "orbit" or (self.path is None and self.drive is None):
             viewpoints = orbit_viewpoints(field, OrbitSettings(self.frames, *self.size, up=self.up))
         elif self.drive is None:

@@ -10,13 +10,22 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from rfedge.arguments import DATASET, FOLDER, SIZE, parse_size
+from rfedge.arguments import (
+    DATASET,
+    FIELD,
+    FOLDER,
+    SIZE,
+    field_path,
+    is_field_file,
+    open_field,
+    parse_size,
+)
 from rfedge.cli.scene_street import SceneBuild, ScenePlan, SceneSheet, SceneSizes
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["Scene", "SceneConvert", "ScenePoses", "SceneRecordCarla"]
+__all__ = ["Scene", "SceneConvert", "SceneFeed", "ScenePoses", "SceneRecordCarla"]
 
 
 @dataclass(frozen=True)
@@ -48,20 +57,26 @@ class SceneConvert:
 class ScenePoses:
     """Find the poses of pictures with COLMAP, in a new world or in a dataset's own."""
 
-    images: Annotated[Path, Positional, FOLDER]
-    """Folder of pictures (PNG, JPEG, WebP), in order of their names."""
+    images: Annotated[Path, Positional, arg(metavar="FOLDER|VIDEO")]
+    """Folder of pictures (PNG, JPEG, WebP), in order of their names; or a video, of which the
+    sharpest frames are taken. Stopped, it goes on with those that are in OUT.frames."""
     out: Annotated[Path, FOLDER]
     """The folder to make: pictures, points and transforms.json."""
     register_to: Annotated[Path | None, DATASET] = None
-    """A dataset whose world the poses shall be in; its poses and cameras are held."""
+    """A dataset whose world the poses shall be in; its poses and cameras are held. Or a field
+    (an archive or a name), where its pictures are not at hand: the camera must be given then."""
     camera: Literal["dataset", "estimate"] = "dataset"
     """With --register-to: take the dataset's camera, or estimate the intrinsics."""
     camera_model: Annotated[str, arg(metavar="MODEL")] = "SIMPLE_RADIAL"
     """COLMAP camera model of the new pictures, where it is not the dataset's camera."""
     parameters: Annotated[tuple[float, ...], arg(metavar="NUMBER ...")] = ()
     """Its known parameters in COLMAP's order, which are held; default: estimated."""
-    matching: Literal["exhaustive", "sequential"] = "exhaustive"
-    """Match all pairs, or neighbours in a long drive."""
+    up: Literal["z", "y", "-y"] = "z"
+    """Which axis is up in the field registered to."""
+    per_second: float = 2.0
+    """Of a video: how many pictures a second."""
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Match all pairs, or neighbours in a long drive; auto: neighbours in a video, else all."""
     max_side_px: int = 1600
     """Longest side at which features are looked for."""
     features: int = 8192
@@ -73,15 +88,74 @@ class ScenePoses:
 
     def run(self) -> None:
         """Place the pictures and write the dataset; say which ones could not be placed."""
+        import shutil
         import signal
 
+        from rfcore.dataset.read import is_video
+
+        field = self._field()
+        if field is None:
+            import rfedge.datasets.poses  # noqa: F401 (COLMAP's handler comes with its import)
+
+        # That handler would print a C++ stack and leave its folder behind.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        if not is_video(self.images):
+            self._place(self.images, field)
+            return
+        frames = self.out.with_name(f"{self.out.name}.frames")
+        self._place(self._frames(frames), field)
+        shutil.rmtree(frames)
+
+    def _frames(self, folder: Path) -> Path:
         from rich.console import Console
 
+        from rfcore.errors import InvalidInput
+        from rfedge.datasets.video_frames import sharpest_frames
+
+        if self.out.exists():
+            raise InvalidInput("out", f"{self.out} exists already; name another folder")
+        with _shown(Console(stderr=True)) as tell:
+            count = sharpest_frames(self.images, folder, self.per_second, tell)
+            tell(f"{count} frames in {folder}")
+        return folder
+
+    def _place(self, images: Path, field: Path | None) -> None:
+        if field is None:
+            self._among_pictures(images)
+        else:
+            self._in_field(images, field)
+
+    def _field(self) -> Path | None:
+        """Return the archive to register to, told by its content; None for a dataset or none."""
+        if self.register_to is None:
+            return None
+        if self.register_to.exists():
+            return self.register_to if is_field_file(self.register_to) else None
+        return field_path(self.register_to)
+
+    def _in_field(self, images: Path, field: Path) -> None:
+        from rich.console import Console
+
+        from rfedge.fields.register import RegisterSettings, register_pictures
+
+        settings = RegisterSettings(self.camera_model, self.parameters, self.up)
+        opened = open_field(field, threads=self.threads)
+        with _shown(Console(stderr=True)) as tell:
+            line = register_pictures(images, self.out, opened, settings, tell)
+        print(line)
+
+    def _among_pictures(self, images: Path) -> None:
+        from rich.console import Console
+
+        from rfcore.dataset.read import is_video
         from rfedge.datasets.colmap_features import Matching, PoseSettings, SharedCamera
         from rfedge.datasets.poses import pose_dataset
 
+        matching = self.matching
+        if matching == "auto":
+            matching = "sequential" if is_video(self.images) else "exhaustive"
         settings = PoseSettings(
-            matching=Matching(self.matching),
+            matching=Matching(matching),
             camera=SharedCamera(self.camera),
             model=self.camera_model,
             parameters=self.parameters,
@@ -90,11 +164,87 @@ class ScenePoses:
             threads=self.threads,
             seed=self.seed,
         )
-        # COLMAP's own handler would print a C++ stack and leave its folder behind.
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
         with _shown(Console(stderr=True)) as tell:
-            line = pose_dataset(self.images, self.out, self.register_to, settings, tell)
+            line = pose_dataset(images, self.out, self.register_to, settings, tell)
         print(line)
+
+
+@dataclass(frozen=True)
+class SceneFeed:
+    """Write a drive's poses as a vehicle's sensors would state them: NMEA or JSON, with errors."""
+
+    drive: Annotated[Path, Positional, DATASET]
+    """Posed pictures; their poses are the truth."""
+    out: Annotated[str, arg(metavar="FILE|udp:HOST:PORT")]
+    """The file to write, or where to send it to, line by line at its own pace."""
+    field: Annotated[Path | None, FIELD] = None
+    """The field whose anchor says where on the Earth the drive is; default: the dataset's own."""
+    form: Literal["nmea", "geodetic", "xyz"] = "nmea"
+    """NMEA sentences, or JSON lines in WGS 84 or in the drive's own axes (docs/localise.md)."""
+    errors: Annotated[str, arg(metavar="NAME,KEY=VALUE,...")] = "gnss"
+    """exact, white-small, white-large, offset or gnss, and what to change of it:
+    noise_m, noise_deg, offset_m, offset_deg, walk_m, walk_s, rate_hz, latency_s, silent_from_s,
+    silent_s."""
+    camera_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The camera seen from the antenna: metres forward, left, up (cav-agent --camera-at)."""
+    start_s: float | None = None
+    """Unix time of the first picture; default: its time in the dataset, or now for udp."""
+    rate: float = 10.0
+    """Pictures a second, where the dataset has no times."""
+    seed: int = 1
+    """Seed of the errors."""
+
+    def run(self) -> None:
+        """Write the file, or send it."""
+        from time import time
+
+        from cav_agent.pose_feed.placing import CameraMount
+        from rfcore.camera import TileOrigin
+        from rfcore.dataset import read_dataset
+        from rfcore.files import write_whole
+        from rfcore.localise.pose_errors import parse_error_model
+        from rfedge.datasets.pose_feed import FeedPlan, feed_lines, times_of
+
+        errors = parse_error_model(self.errors)
+        anchor, origin = None, TileOrigin()
+        if self.field is not None:
+            metadata = open_field(self.field, threads=1).metadata
+            anchor, origin = metadata.anchor, metadata.tile_origin
+        dataset = read_dataset(self.drive, tile_origin=origin if self.field else None)
+        live = self.out.startswith("udp:")
+        stated_s = dataset.pictures[0].time_ns / 1e9
+        plan = FeedPlan(
+            form=self.form,
+            errors=errors,
+            start_s=self.start_s if self.start_s is not None else time() if live else stated_s,
+            seed=self.seed,
+            anchor=anchor or dataset.anchor,
+            origin=dataset.tile_origin,
+            mount=CameraMount(self.camera_at),
+        )
+        poses = [picture.camera.world_from_cam for picture in dataset.pictures]
+        lines = feed_lines(poses, times_of(dataset.pictures, self.rate), plan)
+        if live:
+            _send(lines, self.out)
+        else:
+            write_whole(Path(self.out), "".join(text for _, text in lines))
+        print(f"{self.out}: {len(lines)} fixes")
+
+
+def _send(lines: list[tuple[float, str]], target: str) -> None:
+    """Send each text in a datagram when it is due."""
+    import socket
+    from time import monotonic, sleep
+
+    from cav_agent.pose_feed.settings import parse_source
+
+    source, begun_s = parse_source(target), monotonic()
+    address = (source.host, source.port)
+    family = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)[0][0]
+    with socket.socket(family, socket.SOCK_DGRAM) as sender:
+        for due_s, text in lines:
+            sleep(max(0.0, begun_s + due_s - monotonic()))
+            sender.sendto(text.encode("ascii"), address)
 
 
 @contextmanager
@@ -178,6 +328,7 @@ class Scene:
         Annotated[SceneBuild, subcommand("build")]
         | Annotated[SceneConvert, subcommand("convert")]
         | Annotated[ScenePoses, subcommand("poses")]
+        | Annotated[SceneFeed, subcommand("feed")]
         | Annotated[ScenePlan, subcommand("plan")]
         | Annotated[SceneSheet, subcommand("sheet")]
         | Annotated[SceneSizes, subcommand("sizes")]

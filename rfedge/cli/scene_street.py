@@ -6,7 +6,7 @@ what its effects cost, put built scenes on one page, and count the bytes of thei
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -42,7 +42,12 @@ class SceneBuild:
     """Only frames a:b of the chosen splits, counted through drive, train, eval in that order."""
     split: Annotated[str, arg(metavar="SPLIT")] = "default"
     """drive, train, eval, a list of them with commas, or all; default: all, but without train where
-    the scene's field was trained on another scene."""
+    the scene's field was trained on another scene. rig: the drive by several cameras, with rig.toml
+    for `cav-agent --rig`."""
+    rig: Annotated[str | None, arg(metavar="CAMERAS")] = None
+    """For --split rig: which cameras, with commas, of the car's 18 (low, mid or high with _front,
+    _front_left, _front_right, _left, _right, _back), or all; default: the mid row's front, left,
+    right and back."""
 
     def run(self) -> None:
         """Build."""
@@ -56,7 +61,10 @@ class SceneBuild:
         from rfedge.street.build.run import Settings, build_scene
 
         size_px = parse_size(self.size) if self.size is not None else None
-        selection = Selection(load_scene(self.scene), self.split, self.frames, size_px)
+        scene = load_scene(self.scene)
+        if self.rig is not None:
+            scene = replace(scene, drive=replace(scene.drive, rig=self.rig))
+        selection = Selection(scene, self.split, self.frames, size_px)
         settings = Settings(self.out, self.spp, self.workers)
         build_scene(selection, settings, Console(soft_wrap=True))
 

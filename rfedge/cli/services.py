@@ -120,6 +120,8 @@ class CertsInit:
     """Vehicles; each certificate is good for that name (cav-agent --vehicle) only."""
     consumers: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("watch",)
     """Who may watch the twin and ask for the server's health, without being a vehicle."""
+    operators: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
+    """Who may see everything, whatever consumers are granted."""
     hosts: Annotated[tuple[str, ...], arg(metavar="HOST ...")] = ("localhost", "127.0.0.1", "::1")
     """Names and addresses by which vehicles reach the server."""
     days: int = 365
@@ -133,12 +135,38 @@ class CertsInit:
 
         from rfedge.certs.authority import Members, certify, write_certificates
 
-        members = Members(self.vehicles, self.consumers, self.hosts)
+        members = Members(self.vehicles, self.consumers, self.hosts, self.operators)
         issued = certify(members, datetime.now(UTC), self.days)
         write_certificates(self.out, issued, replace=self.replace)
         for certificate in issued:
             print(f"{self.out / certificate.name}.pem  {certificate.identity}")
         print(f"keep {self.out / 'ca.key'} away from servers and vehicles")
+
+
+@dataclass(frozen=True)
+class CertsAdd:
+    """Add certificates to a folder, by its authority; those that are there stay as they are."""
+
+    folder: Annotated[Path, Positional, FOLDER] = Path("out/certs")
+    """The folder of `rfedge certs init`, with the authority's key."""
+    vehicles: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
+    """Vehicles to add."""
+    consumers: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
+    """Consumers to add; what they may see stands in the server's --access file."""
+    operators: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
+    """Operators to add."""
+    days: int = 90
+    """How long the certificates are good."""
+
+    def run(self) -> None:
+        """Sign, write, and say what is where."""
+        from datetime import UTC, datetime
+
+        from rfedge.certs.authority import Members, add_certificates
+
+        members = Members(self.vehicles, self.consumers, operators=self.operators)
+        for one in add_certificates(self.folder, members, datetime.now(UTC), self.days):
+            print(f"{self.folder / one.name}.pem  {one.identity}")
 
 
 @dataclass(frozen=True)
@@ -172,7 +200,9 @@ class Certs:
     """Certificates for mec-server, vehicles and consumers."""
 
     verb: Annotated[
-        Annotated[CertsInit, subcommand("init")] | Annotated[CertsShow, subcommand("show")],
+        Annotated[CertsInit, subcommand("init")]
+        | Annotated[CertsAdd, subcommand("add")]
+        | Annotated[CertsShow, subcommand("show")],
         arg(name=""),
     ]
 

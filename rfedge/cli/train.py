@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,7 +19,8 @@ if TYPE_CHECKING:
     from rfcore.dataset import Dataset
     from rfcore.field import RadianceField
     from rfcore.train import NgpTrainingConfig, SplatTrainingConfig
-    from rfedge.training.run import TrainingJob
+    from rfedge.training.run import Trained, TrainingJob
+    from rfedge.training.view import Snapshots
 
 __all__ = ["Train"]
 
@@ -83,6 +87,16 @@ class Train:
     report: Annotated[Path | None, arg(metavar="FILE.html")] = None
     """Write a page with held-out pictures and the curve of quality over time; needs --holdout or
     --held-out."""
+    view: Annotated[str | None, arg(metavar="HOST:PORT")] = None
+    """Show the splats in a browser while they are trained, and the pictures of --held-out beside
+    them: 127.0.0.1:8080; elsewhere than on this machine with the environment's
+    RFEDGE_TWIN_TOKEN (docs/twin.md)."""
+    refine_poses: bool = False
+    """Learn the pictures' poses with the field, and write them to OUT.tum; for poses of GNSS or
+    odometry. Held-out pictures are measured at aligned poses as well."""
+    align_held_out: bool = False
+    """Measure held-out pictures also at poses aligned with the field, to compare with
+    --refine-poses."""
     kind: Literal["splats", "ngp"] = "splats"
     """3D Gaussians, or the hash grid of Instant-NGP, which takes none of their settings."""
 
@@ -104,13 +118,17 @@ class Train:
                 "shows pictures that were not trained on, and none are held out: add --holdout 8 "
                 "(every 8th picture) or --held-out DATASET",
             )
+        if self.refine_poses and self.kind == "ngp":
+            raise InvalidInput("refine_poses", "goes with --kind splats alone")
         console = Console(stderr=self.json == "-")
         job = self._job()
-        trained = train(job, console)
+        with self._shown(console) as show:
+            trained = train(job, console, show)
         field = self._finished(job, trained.field, console)
         self.out.parent.mkdir(parents=True, exist_ok=True)
         field_id = save_field(field, self.out)
         console.print(f"{self.out}: field {field_id}, {trained.primitives:,} primitives")
+        self._write_poses(job, trained, console)
         result = training_result(job, trained, field, self.out)
         if self.json is not None:
             write_result(self.json, result)
@@ -119,6 +137,41 @@ class Train:
 
             write_training_report(self.report, result, field, job.held_out)
             console.print(f"{self.report}: held-out pictures and the curve over time")
+
+    @contextmanager
+    def _shown(self, console: Console) -> Iterator[Snapshots | None]:
+        """Serve the page that --view asks for; yield what writes its snapshots."""
+        if self.view is None:
+            yield None
+            return
+        from rfcore.errors import InvalidInput
+        from rfcore.wire.address import Address
+        from rfedge.training.view import shown_in_browser
+        from rfedge.twin.web import WebSettings
+
+        if self.kind == "ngp":
+            raise InvalidInput("view", "a hash grid has no splats to draw; --kind splats has")
+        token = os.environ.get("RFEDGE_TWIN_TOKEN")
+        settings = WebSettings(Address.parse("view", self.view), token)
+        drive = self.held_out if self.size is None and not self.undistort else None
+        with shown_in_browser(settings, drive, lambda url: console.print(f"open {url}")) as made:
+            yield made
+
+    def _write_poses(self, job: TrainingJob, trained: Trained, console: Console) -> None:
+        from rfedge.training.refined_poses import write_refined_poses
+
+        if trained.aligned is not None:
+            aligned_db = trained.aligned.psnr_db
+            console.print(f"  {aligned_db:.2f} dB held out at poses aligned with the field")
+        refinement = trained.refinement
+        if refinement is None:
+            return
+        out, dataset = self.out.with_suffix(".tum"), job.dataset
+        write_refined_poses(out, dataset.pictures, refinement.cameras, dataset.tile_origin)
+        console.print(
+            f"{out}: {len(dataset.pictures)} poses, moved by {refinement.median_m:.3f} m and "
+            f"{refinement.median_deg:.3f} degrees (median)"
+        )
 
     def _job(self) -> TrainingJob:
         from rfedge.training.loop import LoopLimits
@@ -133,7 +186,16 @@ class Train:
             measurements=12 if self.kind == "splats" else 4,  # rendering a hash grid takes seconds
         )
         config = self._config(dataset.exposure_varies)
-        return TrainingJob(self.name, dataset, held_out, config, self.seed, limits, self.resume)
+        return TrainingJob(
+            name=self.name,
+            dataset=dataset,
+            held_out=held_out,
+            config=config,
+            seed=self.seed,
+            limits=limits,
+            resume=self.resume,
+            align_held_out=self.refine_poses or self.align_held_out,
+        )
 
     def _views(self) -> tuple[Dataset, Dataset | None]:
         from rfedge.training.views import ViewChoice, read_views
@@ -167,7 +229,8 @@ class Train:
         if limit is not None:
             config = replace(config, density=DensityControl(limit=limit))
         bands = Bands(self.sh_degree, SH_RISE if self.sh_degree else 0.0)
-        return replace(config, bands=bands, antialiased=self.antialiased, exposure=exposure_varies)
+        config = replace(config, bands=bands, antialiased=self.antialiased)
+        return replace(config, exposure=exposure_varies, refine_poses=self.refine_poses)
 
     def _finished(
         self, job: TrainingJob, trained: RadianceField, console: Console

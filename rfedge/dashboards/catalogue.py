@@ -202,6 +202,49 @@ VEHICLE = Dashboard(
             ),
         ),
         Panel(
+            "Pose in the field",
+            "Share of frames that were tracked; the others are coded without the field. Only with "
+            "--localise.",
+            Unit.SHARE,
+            (
+                Query(
+                    "sum by (instance) (rate(rfedge_agent_pose_frames_total"
+                    "{instance=~'$instance', state='tracking'}[$__rate_interval])) / "
+                    "sum by (instance) (rate(rfedge_agent_pose_frames_total"
+                    "{instance=~'$instance'}[$__rate_interval]))"
+                ),
+            ),
+        ),
+        Panel(
+            "Correction of the pose",
+            "Metres between the pose found and what the sensors said. Only with --localise.",
+            Unit.COUNT,
+            (Query("rfedge_agent_pose_correction_metres{instance=~'$instance'}"),),
+        ),
+        Panel(
+            "Poses of the vehicle's sensors",
+            "Fixes a second that are used, and problems a second by reason. Only with --pose-feed.",
+            Unit.COUNT,
+            (
+                Query(
+                    "sum(rate(rfedge_agent_pose_feed_fixes_total"
+                    "{instance=~'$instance'}[$__rate_interval]))",
+                    "used",
+                ),
+                Query(
+                    "sum by (reason) (rate(rfedge_agent_pose_feed_problems_total"
+                    "{instance=~'$instance'}[$__rate_interval]))",
+                    "{{reason}}",
+                ),
+            ),
+        ),
+        Panel(
+            "Time offset of the pose feed",
+            "Seconds to add to the feed's times to get the camera's; 0 until the motion tells.",
+            Unit.SECONDS,
+            (Query("rfedge_agent_pose_feed_offset_seconds{instance=~'$instance'}"),),
+        ),
+        Panel(
             "Memory",
             "Resident memory of the agent; flat after the field is loaded.",
             Unit.BYTES,
@@ -278,6 +321,34 @@ CAPACITY = Dashboard(
                 Query(
                     f"process_open_fds{{job='mec-server', {SERVER}}} "
                     f"/ process_max_fds{{job='mec-server', {SERVER}}}"
+                ),
+            ),
+        ),
+        Panel(
+            "Budgets",
+            "Share of what may be held that is held: by all, and by the identity that holds most.",
+            Unit.SHARE,
+            tuple(
+                Query(
+                    f"sum by (resource) (rfedge_server_{held}{{{SERVER}}}) "
+                    f"/ (sum by (resource) (rfedge_server_{budget}{{{SERVER}}}) > 0)",
+                    f"{whose}: {{{{resource}}}}",
+                )
+                for held, budget, whose in (
+                    ("held", "budget", "all"),
+                    ("most_held", "identity_budget", "one"),
+                )
+            ),
+        ),
+        Panel(
+            "Refused",
+            "Calls, streams and frames a second that a limit refused; all zero where all is well.",
+            Unit.PER_S,
+            (
+                Query(
+                    f"sum by (limit) (rate(rfedge_server_limited_total{{{SERVER}}}"
+                    "[$__rate_interval]))",
+                    "{{limit}}",
                 ),
             ),
         ),

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from rfcore.camera import TileOrigin
 from rfcore.dataset import Dataset, read_dataset
 from rfcore.dataset.source import SourceCamera, SourcePoints
 from rfcore.dataset.write import WrittenPicture, write_transforms
 from rfcore.errors import InvalidInput
 from rfcore.files import whole_folder
+from rfcore.geodesy import Anchor
 from rfcore.image import write_png
 
 __all__ = ["convert_dataset"]
@@ -47,9 +49,16 @@ def convert_dataset(
                     time_ns=picture.time_ns if timed else None,
                 )
             )
-        write_transforms(folder, written, _global_points(dataset))
+        write_transforms(folder, written, _global_points(dataset), _global_anchor(dataset))
     lens = f", {dataset.undistorted} of the dataset's undistorted" if dataset.undistorted else ""
     return f"{out}: {len(written)} pictures{lens}"
+
+
+def _global_anchor(dataset: Dataset) -> Anchor | None:
+    if dataset.anchor is None:
+        return None
+    east_m, north_m, up_m = astuple(dataset.tile_origin)
+    return dataset.anchor.relative_to(TileOrigin(-east_m, -north_m, -up_m))
 
 
 def _global_points(dataset: Dataset) -> SourcePoints | None:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import CodecConfig, effort_of_preset
 from rfcore.codec.h264.ffmpeg import EncoderOptions, H264Decoder, PictureKind, encode_pictures
 from rfcore.errors import InvalidInput
 from rfcore.image import I420, Rgb
@@ -121,7 +121,7 @@ def saving_at_equal_psnr(curve: Sequence[RatePoint], coded_bytes: float, psnr_db
 
 
 def _point(frames: Sequence[I420], preset: str, crf: float, quality: Quality) -> RatePoint:
-    config = CodecConfig(*frames[0].size_px, preset=preset, crf=crf)
+    config = CodecConfig(*frames[0].size_px, effort_of_preset(preset), crf)
     options = EncoderOptions(config.coded_size_px, preset, crf, params={"keyint": "1"})
     units = encode_pictures(options, [(frame, PictureKind.I) for frame in frames])
     sizes = [sum(map(len, slice_nals(unit))) for unit in units]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,9 @@ import numpy as np
 from rich.console import Console
 
 from rfcore.camera import Camera
+from rfcore.codec.h264.config import CoderSettings, check_effort
 from rfcore.dataset import Dataset, read_dataset, verify_manifest
+from rfcore.dataset.recorded_session import read_recorded_part, recordings_under
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField, load_field, render_field_view
 from rfcore.image import Rgb, read_rgb
@@ -36,6 +39,8 @@ __all__ = ["DRIVES", "DemoRun", "DemoSettings", "run_demo"]
 DRIVES = ("empty", "vehicles")
 VEHICLE = "demo"
 CAMERA = "front"
+RECORDED = "recorded"
+"""Folder of what the server reconstructed of a drive, as a dataset."""
 DRIVE_TIMEOUT_S = 300.0
 
 
@@ -51,6 +56,7 @@ class DemoSettings:
     rate_hz: float
     link_bps: float
     link_delay_ms: float
+    effort: str
     preset: str
     crf: float
     threads: int
@@ -60,6 +66,7 @@ class DemoSettings:
             raise InvalidInput("link-bps", f"{self.link_bps:g} must be above 0 bit/s")
         if not self.rate_hz > 0:
             raise InvalidInput("rate-hz", f"{self.rate_hz:g} must be above 0 Hz")
+        check_effort("effort", self.effort)
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,12 @@ class DemoRun:
 
     result: Mapping[str, Any]
     pictures: Mapping[str, Sequence[Pictures]]
+    field: Path
+
+    def twin_command(self, out: Path) -> str:
+        """Return what shows the last drive in a browser: field, and what the server made of it."""
+        recorded = out / "work" / DRIVES[-1] / RECORDED
+        return shlex.join(("rfedge", "twin", str(self.field), "--drive", str(recorded)))
 
     def require_complete(self) -> None:
         """Raise ``RfedgeError`` unless every frame was reconstructed with a matching digest."""
@@ -105,7 +118,7 @@ def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
     pairs = (np.hstack([p.camera, p.reconstruction]) for drive in pictures.values() for p in drive)
     write_mp4(settings.out / "reconstructed.mp4", pairs, settings.rate_hz)
     write_result(settings.out / "result.json", result)
-    return DemoRun(result, pictures)
+    return DemoRun(result, pictures, field_path)
 
 
 def _refuse_foreign_folder(folder: Path) -> None:
@@ -130,20 +143,20 @@ def _drive_outcome(
     drive_path = settings.sample / f"transforms_drive_{drive}.json"
     _run_processes(settings, drive_path, field_path, field.field_id, work)
     agent_rows = _json_lines(work / "agent.jsonl")
-    saved = work / "saved" / VEHICLE / CAMERA
-    index = {_address(row): row for row in _json_lines(saved / "index.jsonl")}
+    parts = [read_recorded_part(file) for file in recordings_under(work / RECORDED)]
+    recorded = {(r.epoch, r.sequence): (part, r) for part in parts for r in part.pictures}
     dataset = read_dataset(drive_path)
-    if not index:
+    if not recorded:
         raise RfedgeError(f"drive {drive}: the server reconstructed nothing, see {work}")
     return DriveOutcome(
         agent_rows=agent_rows,
-        server_digests={address: row["digest"] for address, row in index.items()},
+        server_digests={address: row.digest for address, (_, row) in recorded.items()},
         link=json.loads((work / "link.json").read_text()),
         pictures=_pictures(
             dataset,
             field,
             agent_rows,
-            {address: saved / row["file"] for address, row in index.items()},
+            {address: part.path(row) for address, (part, row) in recorded.items()},
         ),
         wrong_street=wrong_street,
         preset=settings.preset,
@@ -157,7 +170,7 @@ def _run_processes(
 ) -> None:
     server_command = [
         *command_of("mec-server"),
-        *("--fields", str(field_path.parent), "--save", str(work / "saved")),
+        *("--fields", str(field_path.parent), "--record", str(work / "recorded")),
         *("--listen", "127.0.0.1:0", "--threads", str(settings.threads)),
     ]
     with service("mec-server", server_command, work) as server:
@@ -173,8 +186,9 @@ def _run_processes(
                 *("--server", link.address, "--drive", str(drive_path), "--camera", CAMERA),
                 *("--fields", str(field_path.parent), "--field", field_id, "--vehicle", VEHICLE),
                 *("--rate", str(settings.rate_hz), "--pace", "lockstep"),
-                *("--crf", str(settings.crf), "--preset", settings.preset),
+                *("--crf", str(settings.crf), *CoderSettings.of(settings.effort).arguments),
                 *("--threads", str(settings.threads), "--report", str(work / "agent.jsonl")),
+                *("--give-up-s", "30", "--allow-recording"),
             ]
             run_to_end("cav-agent", agent_command, work, DRIVE_TIMEOUT_S)
 
@@ -193,7 +207,7 @@ def _pictures(
     dataset: Dataset,
     field: RadianceField,
     agent_rows: list[dict[str, Any]],
-    saved: Mapping[FrameAddress, Path],
+    recorded: Mapping[FrameAddress, Path],
 ) -> list[Pictures]:
     """Pair each reconstructed frame with its camera picture and its render."""
     posed = {picture.name: picture for picture in dataset.pictures}
@@ -202,10 +216,10 @@ def _pictures(
             row["name"],
             posed[row["name"]].read(),
             _rendered(field, posed[row["name"]].camera),
-            read_rgb(saved[_address(row)]),
+            read_rgb(recorded[_address(row)]),
         )
         for row in agent_rows
-        if _address(row) in saved
+        if _address(row) in recorded
     ]
 
 

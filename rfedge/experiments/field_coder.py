@@ -1,7 +1,7 @@
 """Our codec as one more coder of a clip: a field's renders, any references, whole wire messages.
 
 A frame's bytes are those of the message that would go over the link: pose, digests, header and
-slice. The sender's processor time holds the render, the choice of references, x264 and the closed
+slice. The sender's processor time holds the render, the choice of references, coding and the closed
 loop. Pictures are what a receiver decoded from those very packets, not what the sender believes.
 """
 
@@ -108,7 +108,7 @@ class FieldCoder:
         name: str,
         version: str,
         *,
-        preset: str,
+        effort: str,
         references: References | None = None,
         photometric: Photometric | None = None,
         points: Sequence[float] = CRFS,
@@ -119,7 +119,7 @@ class FieldCoder:
         self.limits = LIMITS
         self._program = version
         self._rendered = rendered
-        self._preset = preset
+        self._effort = effort
         self._foregrounds = foregrounds
         self._choice = FrameChoice(references=references, photometric=photometric)
         # Temporal references exist from the second frame on.
@@ -135,7 +135,7 @@ class FieldCoder:
             references = references_name(choice.references)
         light = "chosen" if choice.photometric is None else str(tuple(choice.photometric))
         return (
-            f"{self._program}; preset {self._preset}, references {references}, light {light}, "
+            f"{self._program}; effort {self._effort}, references {references}, light {light}, "
             f"views {self._rendered.digest}, foregrounds {self._foregrounds_digest()}"
         )
 
@@ -152,7 +152,7 @@ class FieldCoder:
         count = len(self._rendered.views)
         if not 0 < len(frames) <= count:
             raise InvalidInput("frames", f"{len(frames)} are outside the 1..{count} rendered")
-        config = CodecConfig(*frames[0].size_px, preset=self._preset, crf=point)
+        config = CodecConfig(*frames[0].size_px, effort=self._effort, crf=point)
         began_ns = process_time_ns()
         encoder = DeltaEncoder(config)
         coded = list(encode_frames(encoder, self._inputs(frames)))

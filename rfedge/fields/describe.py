@@ -17,12 +17,13 @@ from rfcore.camera import Camera
 from rfcore.field import FULL, Quality, RadianceField, SplatField
 from rfcore.field.quality import DETAILS, kept_of
 from rfcore.field.store import encode_field
+from rfcore.geodesy import Anchor
 from rfcore.metrics import psnr
 from rfcore.views import PosedPicture
 from rfedge.fields.check import to_rgb
 from rfedge.timing import median_ms
 
-__all__ = ["describe_field", "frame_ms", "print_levels", "size_mb"]
+__all__ = ["anchor_text", "describe_field", "frame_ms", "print_levels", "size_mb"]
 
 
 def frame_ms(
@@ -54,6 +55,7 @@ def describe_field(field: RadianceField) -> list[tuple[str, str]]:
         ("held out", _quality(m.held_out_psnr_db, m.held_out_ssim)),
         ("trained on", m.training_digest or "unknown (imported)"),
         ("tile origin", f"{origin.east_m:g}, {origin.north_m:g}, {origin.up_m:g} m"),
+        ("anchor", anchor_text(m.anchor)),
         ("bounds", f"{_corner(box.low_m)} to {_corner(box.high_m)} m"),
     ]
     if isinstance(field, SplatField):
@@ -103,6 +105,14 @@ def _quality(psnr_db: float | None, ssim: float | None) -> str:
     if psnr_db is None:
         return "not measured"
     return f"{psnr_db:.2f} dB" + (f", SSIM {ssim:.3f}" if ssim is not None else "")
+
+
+def anchor_text(anchor: Anchor | None) -> str:
+    """Return where on the Earth a field is, as text."""
+    if anchor is None:
+        return "none: `rfedge field anchor` states one"
+    where = f"{anchor.latitude_deg:.8f}, {anchor.longitude_deg:.8f} deg, {anchor.height_m:.3f} m"
+    return f"{where} at {_corner(anchor.point_m)} m"
 
 
 def _corner(corner_m: tuple[float, float, float]) -> str:

@@ -30,6 +30,7 @@ __all__ = [
     "drive_viewpoints",
     "look_around",
     "looking_at",
+    "middle_of",
     "orbit",
     "orbit_viewpoints",
     "pictures_along",
@@ -65,7 +66,7 @@ class OrbitSettings:
 
 def orbit(field: RadianceField, settings: OrbitSettings) -> list[Camera]:
     """Return the cameras of one turn around the field."""
-    middle, radius_m = _middle(field)
+    middle, radius_m = middle_of(field)
     up = np.array(UPS[settings.up])
     east, north = _across(up)
     intrinsics = _intrinsics(settings.width_px, settings.height_px)
@@ -82,7 +83,7 @@ def look_around(
     field: RadianceField, width_px: int = 640, height_px: int = 360, up: str = "z"
 ) -> list[Camera]:
     """Return four cameras in the middle of the field, a quarter turn apart."""
-    middle, radius_m = _middle(field)
+    middle, radius_m = middle_of(field)
     east, north = _across(np.array(UPS[up]))
     intrinsics = _intrinsics(width_px, height_px)
     return [
@@ -105,7 +106,7 @@ def _intrinsics(width_px: int, height_px: int) -> Intrinsics:
     return Intrinsics(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2)
 
 
-def _middle(field: RadianceField) -> tuple[F64, float]:
+def middle_of(field: RadianceField) -> tuple[F64, float]:
     """Return where the field is and its radius in metres, at least a millimetre."""
     if isinstance(field, SplatField) and len(field.gaussians):
         means = field.gaussians.means.astype(np.float64)

@@ -24,8 +24,8 @@ class Command:
     out: Path
     record: Path | None = None
 
-    def run(self, *, find_limit: bool) -> LoadResult:
-        """Run once, or search for the largest number of vehicles that is held."""
+    def run(self, *, find_limit: bool, repeated: int = 1) -> LoadResult:
+        """Run ``repeated`` times, or search for the largest number of vehicles that is held."""
         console = Console()
         runs: list[Run] = []
 
@@ -37,8 +37,10 @@ class Command:
 
         if find_limit:
             largest_held(self.load.vehicles, held)
-        else:
+        for _ in range(0 if find_limit else repeated):
             held(self.load.vehicles)
+        if repeated > 1:
+            runs = [replace(x, row=replace(x.row, run=n)) for n, x in enumerate(runs, 1)]
         result = LoadResult(sorted(runs, key=lambda run: run.load.vehicles))
         write_load_result(result, self.out)
         if self.record is not None:

@@ -18,7 +18,7 @@ from random import Random
 from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from rfcore.camera import Intrinsics, Pose
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import DEFAULT_EFFORT, CodecConfig
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.dataset import read_dataset
@@ -66,22 +66,26 @@ class PrerecordedDrive:
 
 
 def prerecorded_drive(
-    drive: Path, field: RadianceField, cache: Path, preset: str = "medium", crf: float = 23.0
+    drive: Path,
+    field: RadianceField,
+    cache: Path,
+    effort: str = DEFAULT_EFFORT,
+    crf: float = 23.0,
 ) -> Path:
     """Return the folder in ``cache`` of ``drive`` coded against ``field``; code it if it is new."""
-    text = f"{RENDERER_CONTRACT} {field.field_id} {drive.resolve()} {preset} {crf}"
+    text = f"{RENDERER_CONTRACT} {field.field_id} {drive.resolve()} {effort} {crf}"
     folder = cache / hashlib.sha256(text.encode()).hexdigest()[:16]
     if not (folder / "alone.rfv").exists():
         pictures = read_dataset(drive, tile_origin=field.metadata.tile_origin).pictures
-        _coded(pictures, field, preset, crf).write(folder)
+        _coded(pictures, field, effort, crf).write(folder)
     return folder
 
 
 def _coded(
-    pictures: Sequence[PosedPicture], field: RadianceField, preset: str, crf: float
+    pictures: Sequence[PosedPicture], field: RadianceField, effort: str, crf: float
 ) -> PrerecordedDrive:
     intrinsics = pictures[0].camera.intrinsics
-    config = CodecConfig(intrinsics.width_px, intrinsics.height_px, preset, crf)
+    config = CodecConfig(intrinsics.width_px, intrinsics.height_px, effort, crf)
     pipeline = Pipeline(field, config, time.perf_counter_ns)
     captures = [_capture(index, picture) for index, picture in enumerate(pictures)]
     chain = [_frame(pipeline, capture, 0, capture.index - 1) for capture in captures]

@@ -117,6 +117,7 @@ KEY = (
     "link",
     "vehicle_ms",
     "admission",
+    "run",
 )
 """Fields that tell one load from another: a recorded row is replaced by one that has the same."""
 
@@ -136,6 +137,9 @@ class LoadResult:
         """Return the result in a line."""
         load, row = self.runs[0].load, self.runs[0].row
         what = f"{load.mode}, {row.width}x{row.height}, {load.hz:g} Hz"
+        if row.run is not None:
+            times = sum(run.verdict.held for run in self.runs)
+            return f"{_vehicles(load.vehicles)} held in {times} of {len(self.runs)} runs ({what})"
         if len(self.runs) > 1:
             return f"{_vehicles(self.most_held)} held ({what})"
         held = "held" if self.most_held else "not held"
@@ -196,8 +200,8 @@ def _key(row: LoadRow) -> tuple[Any, ...]:
     return tuple(getattr(row, name) for name in KEY)
 
 
-def _order(row: LoadRow) -> tuple[int, str, float, int]:
-    return list(Mode).index(Mode(row.mode)), row.kind, row.hz, row.vehicles
+def _order(row: LoadRow) -> tuple[int, str, float, int, int]:
+    return list(Mode).index(Mode(row.mode)), row.kind, row.hz, row.vehicles, row.run or 0
 
 
 def _vehicles(count: int) -> str:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rfcore.codec.h264.config import DEFAULT_EFFORT, CoderSettings
 from rfcore.field import load_field
 from rfedge.demo.processes import Service, command_of, service
 from rfedge.loadtest.drive import drive_live, drive_prerecorded
@@ -36,7 +37,7 @@ class TestBed:
     """Folder that keeps prerecorded drives."""
     work: Path
     """Folder for the logs of the processes."""
-    preset: str = "medium"
+    effort: str = DEFAULT_EFFORT
     crf: float = 23.0
 
     __test__ = False
@@ -91,6 +92,8 @@ class LoadRow:
     command: str | None = None
     """In a file of several runs, as ``revision``: how this row was made."""
     revision: str | None = None
+    run: int | None = None
+    """Number of the run, from 1, where a load is repeated."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,7 @@ def run_load(load: Load, bed: TestBed) -> Run:
 def _recorded(load: Load, bed: TestBed) -> Path:
     field = load_field(bed.field)
     if load.mode is not Mode.TRANSPORT:
-        return prerecorded_drive(bed.drive, field, bed.cache, bed.preset, bed.crf)
+        return prerecorded_drive(bed.drive, field, bed.cache, bed.effort, bed.crf)
     folder = bed.cache / f"payload-{load.size_bytes}"
     payload_drive(field.field_id, load.size_bytes).write(folder)
     return folder
@@ -167,7 +170,8 @@ def _agent(bed: TestBed) -> Sequence[str]:
     return [
         *command_of("cav-agent"),
         *("--drive", str(bed.drive), "--fields", str(bed.field.parent)),
-        *("--preset", bed.preset, "--crf", str(bed.crf), "--loop"),
+        *CoderSettings.of(bed.effort).arguments,
+        *("--crf", str(bed.crf), "--loop"),
     ]
 
 

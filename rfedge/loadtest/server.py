@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mec_server.__main__ import serve
-from mec_server.config import AdmissionLimits, ServerConfig
+from mec_server.config import AdmissionLimits, ServerBudget, ServerConfig
 from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
 from mec_server.reconstruction import (
     Decoder,
@@ -116,7 +116,9 @@ def main(arguments: list[str]) -> None:
         listen="127.0.0.1:0",
         workers=int(workers),
         admission=AdmissionLimits(load=0.0),
+        server_budget=ServerBudget(decoders=100_000),  # it has none: nothing is to be kept free
         ready_file=Path(ready_file),
+        address_connections=0,  # every vehicle of the test is at one address
     )
     configure_logs(sys.stderr)
     opened = passing if Mode(mode) is Mode.TRANSPORT else with_kept_renders()

@@ -26,6 +26,60 @@ class FaultRow:
     bound: str
     measured: str
     passed: bool
+    covers: str | None = None
+    """Which of ``KINDS`` it is, split by spaces."""
+    test: str | None = None
+    """The case of ``tests/fault`` that measured it."""
+
+
+KINDS = {
+    "F1": "server killed",
+    "F2": "vehicle killed",
+    "F3": "server or vehicle stopped for seconds",
+    "F4": "silent partition",
+    "F5": "link that flaps",
+    "F6": "packet loss x RTT x rate",
+    "F7": "slow reader",
+    "F8": "rate collapse",
+    "F9": "bit flips",
+    "F10": "malformed payloads",
+    "F11": "replayed, reordered packets",
+    "F12": "wrong field",
+    "F13": "render mismatch",
+    "F14": "poses that are not numbers",
+    "F15": "compressed bombs",
+    "F16": "resolution bombs",
+    "F17": "decoder crash or hang",
+    "F18": "wrong clocks",
+    "F19": "full disk",
+    "F20": "damaged field file",
+    "F21": "out of memory",
+    "F22": "handshake and HTTP/2 floods",
+    "F23": "hostile vehicle",
+    "F24": "expired and revoked certificates",
+    "F25": "rolling update",
+    "F26": "metrics reader that is slow or dead",
+    "F27": "version skew",
+    "F28": "mistaken options",
+    "L1": "load: transport only",
+    "L2": "load: receiver without render",
+    "L3": "load: full loop",
+    "L4": "load: each vehicle on a link of its own",
+    "L5": "connection storm",
+    "L6": "load: twice what is held",
+    "L7": "soak",
+}
+"""Kinds of fault (F) and load (L) that this project holds itself against."""
+
+ELSEWHERE = {
+    "L1": "`make load-transport`",
+    "L2": "`make load-receiver`",
+    "L3": "`make load-full`",
+    "L4": "`make load-links`",
+    "L6": "`make load-overload`",
+    "L7": "`make soak`",
+}
+"""Loads are measured by these commands, not by the fault suite."""
 
 
 OPENING = """# What happens when things break
@@ -51,6 +105,12 @@ and after, and with those of a *control*, a vehicle on a server of its own: what
 machine's doing. Byte-equal means that the digests of the pictures at the server are those of a
 stream that begins there and has no fault. Namespaces and mounts need root; without it those cases
 are skipped.
+
+Loss is of IP packets, so that the kernels' TCP meets it as it does on a road: what is lost is sent
+again and comes late, behind it everything waits, and pictures that are too old by then are dropped
+before they are coded. No picture is damaged by loss; what it costs is time and, with
+`--max-delay-ms`, quality, since a link that answers late is taken for a slow one. Datagrams that
+would leave lost pictures behind are not used.
 """
 
 
@@ -63,7 +123,21 @@ def faults_page(path: Path) -> str:
         f"## Scoreboard\n\n{passed} of {len(rows)} hold. `{result['command']}` at "
         f"`{result['revision']}`; {machine['cpu']}, {machine['cores']} cores, {machine['isa']}.\n"
     )
-    return "\n".join([OPENING, score, *_sections(rows)])
+    return "\n".join([OPENING, score, *_kinds(rows), *_sections(rows)])
+
+
+def _kinds(rows: list[FaultRow]) -> Iterator[str]:
+    """Yield the table of kinds, each with the rows that test it; results before it have none."""
+    if not any(row.covers for row in rows):
+        return
+    cells = []
+    for kind, what in KINDS.items():
+        tested = [row for row in rows if kind in (row.covers or "").split()]
+        by = ", ".join(row.fault for row in tested) or ELSEWHERE.get(kind, "**not tested**")
+        held = sum(row.passed for row in tested)
+        cells.append((kind, what, by, f"{held} of {len(tested)}" if tested else ""))
+    yield table(("kind", "fault", "tested by", "hold"), cells)
+    yield ""
 
 
 def _sections(rows: list[FaultRow]) -> Iterator[str]:

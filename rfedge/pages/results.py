@@ -14,15 +14,20 @@ from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfedge.bench import bench_section
 from rfedge.demo.report import demo_section
+from rfedge.experiments.adapt.report import adapt_section
 from rfedge.experiments.compare.figures import write_compare_figures
 from rfedge.experiments.compare.report import compare_section
 from rfedge.experiments.ladder.page import write_ladder_figure
 from rfedge.experiments.latency.report import latency_section, write_latency_figures
+from rfedge.experiments.localisation.rows import localise_section
 from rfedge.experiments.never_worse.report import never_worse_section
 from rfedge.experiments.paper.figures import write_paper_figures
 from rfedge.experiments.paper.report import PaperRow, paper_section
 from rfedge.experiments.robust.report import robust_section, write_robust_figure
+from rfedge.experiments.slice_coder.report import slice_coder_section
+from rfedge.loadtest.live.report import live_section
 from rfedge.loadtest.result import load_section
+from rfedge.loadtest.rig.report import rig_section
 from rfedge.report.tables import heading
 from rfedge.results import Result, read_result, rows_of
 from rfedge.training.report import training_section
@@ -37,16 +42,21 @@ Machines are shared and noisy: compare within a table, not across hosts.
 
 
 SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
+    "adapt": adapt_section,
     "bench": bench_section,
     "compare": compare_section,
     "demo": demo_section,
     "faults": lambda path, result: _reference(path, result, "faults", "reliability"),
     "ladder": lambda path, result: _reference(path, result, "rungs", "ladder"),
     "latency": latency_section,
+    "live": live_section,
     "loadtest": load_section,
+    "localise": localise_section,
     "never-worse": never_worse_section,
     "paper": paper_section,
+    "rig": rig_section,
     "robust": robust_section,
+    "slice-coder": slice_coder_section,
     "stability": lambda path, result: _reference(path, result, "cases", "stability"),
 }
 """How each kind of result is shown; some have a page of their own."""

@@ -56,7 +56,7 @@ LINES = ("#2563eb", "#d97706", "#0f766e", "#be185d", "#6d28d9", "#4d7c0f")
 MARKERS = ("o", "s", "^", "D", "v", "P")
 """A colour and a marker for each line of a plot, so that they differ in grey as well."""
 BLUE, GREY = LINES[0], "#aab4bf"
-DIFFERENCE_GAIN = 4
+DIFFERENCE_GAIN = 8
 """Factor that small differences of pictures are made visible by."""
 Lines = list[list[str]]
 """A CSV file: its header, then its lines."""
@@ -90,6 +90,14 @@ STYLE: dict[Any, Any] = {
 }
 
 
+def _frame_chart(frames: int) -> tuple[Figure, Any]:
+    """Return a chart over frames whose axes lie where those of every other such chart do."""
+    figure, axes = plt.subplots(figsize=(7.2, 2.6))
+    figure.subplots_adjust(left=0.11, right=0.98, bottom=0.2, top=0.87)
+    axes.set_xlim(-0.7, frames - 0.3)
+    return figure, axes
+
+
 def bytes_chart(payload_bytes: Sequence[int], packet_bytes: Sequence[int]) -> str:
     """Return a bar chart of payload and header bytes of every frame.
 
@@ -97,14 +105,14 @@ def bytes_chart(payload_bytes: Sequence[int], packet_bytes: Sequence[int]) -> st
     """
     _check_series(payload_bytes, packet_bytes)
     with mpl.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(7.2, 2.4))
+        figure, axes = _frame_chart(len(packet_bytes))
         number = range(len(packet_bytes))
         header = [a - b for a, b in zip(packet_bytes, payload_bytes, strict=True)]
         axes.bar(number, payload_bytes, color=PAYLOAD, label="payload: the P slice")
         axes.bar(number, header, bottom=payload_bytes, color=HEADER, label="pose and header")
         axes.set(xlabel="frame", ylabel="bytes")
         axes.legend(frameon=False, ncols=2, loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
-        return svg(figure)
+        return svg(figure, whole=True)
 
 
 def quality_chart(reconstruction_db: Sequence[float], render_db: Sequence[float]) -> str:
@@ -114,23 +122,15 @@ def quality_chart(reconstruction_db: Sequence[float], render_db: Sequence[float]
     """
     _check_series(reconstruction_db, render_db)
     with mpl.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(7.2, 2.4))
-        for values, colour, label in (
-            (reconstruction_db, RECONSTRUCTION, "reconstruction"),
-            (render_db, RENDER, "render alone"),
+        figure, axes = _frame_chart(len(reconstruction_db))
+        for values, colour, label, along in (
+            (reconstruction_db, RECONSTRUCTION, "reconstruction", 0.0),
+            (render_db, RENDER, "render alone", 0.22),
         ):
             axes.plot(values, color=colour, linewidth=2, marker="o", markersize=3)
-            axes.annotate(
-                label,
-                (len(values) - 1, values[-1]),
-                xytext=(8, 0),
-                textcoords="offset points",
-                color=colour,
-                va="center",
-            )
+            axes.annotate(label, (along, 1.05), xycoords="axes fraction", color=colour, fontsize=9)
         axes.set(xlabel="frame", ylabel="PSNR against the camera, dB")
-        axes.margins(x=0.02)
-        return svg(figure)
+        return svg(figure, whole=True)
 
 
 def curve_chart(curve: Sequence[Sequence[float]]) -> str:
@@ -195,13 +195,16 @@ def new_axes(height_in: float = 2.8) -> tuple[Any, Any]:
     return plt.subplots(figsize=(7.2, height_in))
 
 
-def svg(figure: Any) -> str:
-    """Return a figure as an SVG element, and close it."""
+def svg(figure: Any, *, whole: bool = False) -> str:
+    """Return a figure as an SVG element, and close it.
+
+    ``whole``: with its margins as they are, so that charts of one layout align side by side.
+    """
     buffer = io.StringIO()
     figure.savefig(
         buffer,
         format="svg",
-        bbox_inches="tight",
+        bbox_inches=None if whole else "tight",
         transparent=True,
         metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")),
     )
@@ -211,9 +214,9 @@ def svg(figure: Any) -> str:
 
 
 def amplified_difference(shown: Rgb, camera: Rgb) -> Rgb:
-    """Return the absolute difference times ``DIFFERENCE_GAIN``, uint8 [H, W, 3]."""
-    difference = np.abs(shown.astype(np.int16) - camera)
-    return np.asarray(np.minimum(difference * DIFFERENCE_GAIN, 255), dtype=np.uint8)
+    """Return ``shown - camera`` times ``DIFFERENCE_GAIN``, around mid-grey, uint8 [H, W, 3]."""
+    difference = shown.astype(np.int16) - camera
+    return np.asarray(np.clip(128 + difference * DIFFERENCE_GAIN, 0, 255), dtype=np.uint8)
 
 
 def embedded(captions: Iterable[tuple[str, Rgb]]) -> list[dict[str, str]]:

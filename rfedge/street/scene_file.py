@@ -1,7 +1,9 @@
 """Scene files: the street, where cameras drive, which pictures are taken, which effects run.
 
 ``samples/scenes/NAME.toml`` holds the ready-made ones. A scene runs exactly the effects it names in
-``[effects.<name>]`` (``rfedge.street.effects``).
+``[effects.<name>]`` (``rfedge.street.effects``). A scene of several ``[[passes]]`` is that many
+drives through one street, each with its own ``lane_offset_m`` and its own effects beside the
+scene's; ``NAME:2`` is the second of them, ``NAME`` the first.
 
 Each table of the file becomes a frozen dataclass (``read_record``). A field's type is ``bool``,
 ``int``, ``float``, ``str`` or a tuple of numbers; ``Annotated`` metadata holds its ``Range`` or
@@ -13,13 +15,14 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from dataclasses import field as with_factory
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 from rfcore.errors import InvalidInput
 from rfcore.tables import Range, Table
+from rfedge.datasets.rig import mounts_named
 from rfedge.samples import sample_path
 from rfedge.street.effects import EFFECTS, EffectKind, load_effect
 from rfedge.street.geometry.layout import Geometry
@@ -125,6 +128,8 @@ def _lines_of_keys(text: str) -> dict[str, int]:
 
 
 SCENES = sample_path("scenes")
+PASS_MARK = ":"
+LANE_OFFSET_M = Range(-5, 5)
 Size = Annotated[tuple[int, int], Range(16, 8192)]
 
 
@@ -161,8 +166,10 @@ class Drive:
     speed_mps: Annotated[float, Range(0, 60)] = 9.0
     rate_hz: Annotated[float, Range(1, 120)] = 30.0
     thinned_hz: Annotated[tuple[float, ...], Range(0.1, 120)] = (10.0, 2.0)
-    lane_offset_m: Annotated[float, Range(-5, 5)] = 0.0
+    lane_offset_m: Annotated[float, LANE_OFFSET_M] = 0.0
     size_px: Size = (640, 360)
+    rig: str = "mid_front,mid_left,mid_right,mid_back"
+    """Which of the car's cameras take the split ``rig`` (``rfedge.datasets.rig``), or all."""
 
     @property
     def frames(self) -> int:
@@ -175,6 +182,7 @@ class Drive:
                 raise InvalidInput(
                     "thinned_hz", f"{rate_hz:g} does not divide rate_hz = {self.rate_hz:g}"
                 )
+        mounts_named(self.rig)
 
 
 @dataclass(frozen=True)
@@ -191,6 +199,7 @@ class Scene:
     """A scene file, checked. ``field`` names the scene whose training views its field saw.
 
     ``effects`` holds the settings of each declared effect by its name, in the order they run.
+    ``passes`` is how many drives the file declares, of which this is one, or 0.
     """
 
     name: str
@@ -202,6 +211,7 @@ class Scene:
     drive: Drive = Drive()
     pose_noise: LocalisationNoise = LocalisationNoise()
     effects: Mapping[str, Any] = with_factory(default_factory=dict)
+    passes: int = 0
 
 
 PARTS = {
@@ -215,26 +225,54 @@ PARTS = {
 
 
 def load_scene(name_or_path: str) -> Scene:
-    """Read a ready-made scene by its name or any scene file by its path.
+    """Read a ready-made scene by its name or any scene file by its path, or one pass of either.
 
     Raises ``InvalidInput`` naming the file, the line and the key. Only the modules of the effects
     that the scene declares are imported.
     """
-    file = TomlFile(_path(name_or_path))
+    base, _, number = name_or_path.partition(PASS_MARK)
+    file = TomlFile(_path(base))
     top = file.top
-    top.require_known(sorted({"name", "field", "effects", *PARTS}))
-    declared = top.table("effects", {})
-    declared.require_known(sorted(effect.name for effect in EFFECTS))
-    order = [effect for effect in EFFECTS if effect.name in declared]
+    top.require_known(sorted({"name", "field", "effects", "passes", *PARTS}))
+    passes = top.items("passes", default=[])
+    chosen = _chosen_pass(file, passes, number)
+    parts: dict[str, Any] = {
+        key: read_record(top.table(key, {}), kind) for key, kind in PARTS.items()
+    }
+    if "lane_offset_m" in chosen:
+        offset_m = chosen.number("lane_offset_m", LANE_OFFSET_M)
+        parts["drive"] = replace(parts["drive"], lane_offset_m=offset_m)
+    return Scene(
+        name=top.text("name") + (f"{PASS_MARK}{number}" if number else ""),
+        field=top.text("field"),
+        effects=_effects(top.table("effects", {}), chosen.table("effects", {})),
+        passes=len(passes),
+        **parts,
+    )
+
+
+def _chosen_pass(file: TomlFile, passes: list[Any], number: str) -> Table:
+    """Return the table of the pass ``number``, the first where none is named."""
+    if number and not (re.fullmatch("[1-9][0-9]{0,3}", number) and int(number) <= len(passes)):
+        raise file.error("passes", f"'{number}' is none of {len(passes)} passes")
+    index = int(number or 1) - 1
+    chosen = Table(passes[index] if passes else {}, file.error, f"passes[{index}]")
+    chosen.require_known(("effects", "lane_offset_m"))
+    return chosen
+
+
+def _effects(scene: Table, own: Table) -> dict[str, Any]:
+    """Return the settings of the scene's effects and of a pass's own, which replace them."""
+    names = sorted(effect.name for effect in EFFECTS)
+    scene.require_known(names)
+    own.require_known(names)
+    order = [effect for effect in EFFECTS if effect.name in scene or effect.name in own]
     lights = [effect.name for effect in order if effect.kind is EffectKind.LIGHT]
     if len(lights) > 1:
-        raise declared.error(lights[1], f"is a second light beside {lights[0]}")
-    return Scene(
-        name=top.text("name"),
-        field=top.text("field"),
-        effects={e.name: read_record(declared.table(e.name), load_effect(e)) for e in order},
-        **{key: read_record(top.table(key, {}), kind) for key, kind in PARTS.items()},
-    )
+        table = own if lights[1] in own else scene
+        raise table.error(lights[1], f"is a second light beside {lights[0]}")
+    tables = ((e, (own if e.name in own else scene).table(e.name)) for e in order)
+    return {effect.name: read_record(table, load_effect(effect)) for effect, table in tables}
 
 
 def _path(name_or_path: str) -> Path:

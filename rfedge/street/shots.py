@@ -3,6 +3,7 @@
 * ``drive``: the moving camera at the full rate; lower rates are every n-th frame of it.
 * ``train``: cars with the camera rig pass through the street, alternately in both directions; at
   each of ``views`` places the next camera of the rig takes one picture.
+* ``rig``: several cameras of the car that takes the drive, all at each instant; only if asked for.
 * ``eval``: all cameras of the rig at ``stations`` between the places of ``train``.
 """
 
@@ -17,10 +18,18 @@ import numpy as np
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
-from rfedge.datasets.rig import RIG
+from rfedge.datasets.rig import RIG, mounts_named
 from rfedge.street.geometry.layout import Layout
 from rfedge.street.scene_file import Scene
-from rfedge.street.trajectory import CameraMotion, drive_motion, drive_pose, mounted, on_lane
+from rfedge.street.trajectory import (
+    CameraMotion,
+    drive_motion,
+    drive_pose,
+    mounted,
+    on_lane,
+    rig_motion,
+    rig_pose,
+)
 
 __all__ = ["Selection", "Shot", "Split", "shots_of", "thinned_indices"]
 
@@ -39,6 +48,7 @@ class Split(StrEnum):
     DRIVE = "drive"
     TRAIN = "train"
     EVAL = "eval"
+    RIG = "rig"
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,8 @@ def shots_of(scene: Scene, split: Split, size_px: tuple[int, int] | None = None)
     if split is Split.DRIVE:
         k = _intrinsics(size_px or scene.drive.size_px, scene.rig.fov_deg)
         return [_drive_shot(scene, i, k) for i in range(scene.drive.frames)]
+    if split is Split.RIG:
+        return _rig_shots(scene, _intrinsics(size_px or scene.drive.size_px, scene.rig.fov_deg))
     settings, poses = (
         (scene.train, _train_poses(scene))
         if split is Split.TRAIN
@@ -96,6 +108,22 @@ def _drive_shot(scene: Scene, index: int, intrinsics: Intrinsics) -> Shot:
         time_s=time_s,
         motion=drive_motion(scene.drive, time_s),
     )
+
+
+def _rig_shots(scene: Scene, intrinsics: Intrinsics) -> list[Shot]:
+    """Return the rig's shots, instant by instant, in the order of the cameras."""
+    drive, mounts = scene.drive, mounts_named(scene.drive.rig)
+    moments = [(i / drive.rate_hz, mount) for i in range(drive.frames) for mount in mounts]
+    return [
+        Shot(
+            split=Split.RIG,
+            index=index,
+            camera=Camera(intrinsics, rig_pose(drive, mount, time_s)),
+            time_s=time_s,
+            motion=rig_motion(drive, mount, time_s),
+        )
+        for index, (time_s, mount) in enumerate(moments)
+    ]
 
 
 def _train_poses(scene: Scene) -> list[Pose]:
@@ -157,10 +185,11 @@ class Selection:
 
     def _splits(self) -> list[Split]:
         if self.splits == "all":
-            return list(Split)
+            return [split for split in Split if split is not Split.RIG]
         if self.splits == "default":
             own_field = self.scene.field == self.scene.name
-            return [split for split in Split if own_field or split is not Split.TRAIN]
+            usual = (Split.DRIVE, Split.TRAIN, Split.EVAL)
+            return [split for split in usual if own_field or split is not Split.TRAIN]
         names = self.splits.split(",")
         for name in names:
             if name not in list(Split):

@@ -7,7 +7,9 @@ driving towards +x are at y < 0. Camera axes are OpenCV's.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -26,6 +28,8 @@ __all__ = [
     "measured_pose",
     "mounted",
     "on_lane",
+    "rig_motion",
+    "rig_pose",
 ]
 
 
@@ -76,6 +80,18 @@ def mounted(mount: Mount, place: F64, heading_rad: float) -> Pose:
 
 def drive_pose(drive: Drive, time_s: float) -> Pose:
     """Return world_from_cam of the drive, centred on the street, with a car's sway."""
+    place, yaw_rad = _car(drive, time_s)
+    pitch = PITCH_RAD * np.sin(2 * np.pi * time_s / PITCH_PERIOD_S)
+    return looking(place + np.array([0.0, 0.0, EYE_UP_M]), yaw_rad, float(pitch))
+
+
+def rig_pose(drive: Drive, mount: Mount, time_s: float) -> Pose:
+    """Return world_from_cam of a camera on the car that takes the drive, which does not pitch."""
+    return mounted(mount, *_car(drive, time_s))
+
+
+def _car(drive: Drive, time_s: float) -> tuple[F64, float]:
+    """Return place on the road and heading of the car that takes the drive."""
     x_m = drive.speed_mps * (time_s - 0.5 * drive.duration_s)
     rate = 2 * np.pi / SWAY_PERIOD_S
     left_m = drive.lane_offset_m + SWAY_M * np.sin(rate * time_s)
@@ -83,14 +99,22 @@ def drive_pose(drive: Drive, time_s: float) -> Pose:
     sideways_mps = SWAY_M * rate * np.cos(rate * time_s)
     heading = np.arctan2(sideways_mps, max(drive.speed_mps, 1.0))
     yaw = heading + YAW_RAD * np.sin(2 * np.pi * time_s / YAW_PERIOD_S)
-    pitch = PITCH_RAD * np.sin(2 * np.pi * time_s / PITCH_PERIOD_S)
-    return looking(place + np.array([0.0, 0.0, EYE_UP_M]), float(yaw), float(pitch))
+    return place, float(yaw)
 
 
 def drive_motion(drive: Drive, time_s: float) -> CameraMotion:
     """Return the drive's velocity and turn rate by differences over 2 ms."""
-    before, after = (drive_pose(drive, time_s + step) for step in (-STEP_S, STEP_S))
-    now = np.array(drive_pose(drive, time_s).rotation_matrix())
+    return _motion(partial(drive_pose, drive), time_s)
+
+
+def rig_motion(drive: Drive, mount: Mount, time_s: float) -> CameraMotion:
+    """Return those of a camera on the car that takes the drive."""
+    return _motion(partial(rig_pose, drive, mount), time_s)
+
+
+def _motion(pose_at: Callable[[float], Pose], time_s: float) -> CameraMotion:
+    before, after = (pose_at(time_s + step) for step in (-STEP_S, STEP_S))
+    now = np.array(pose_at(time_s).rotation_matrix())
     moved = np.array(after.translation_m) - np.array(before.translation_m)
     turned = np.array(rotation_vector(before.inverse().compose(after).rotation))
     velocity = now.T @ moved / (2 * STEP_S)

@@ -21,6 +21,7 @@ from rfcore.train import held_out_quality
 from rfcore.train.levels import LevelFitConfig, with_levels
 from rfcore.views import PosedPicture
 from rfedge.results import make_result, provenance
+from rfedge.training.refined_poses import PoseRefinement
 from rfedge.training.run import Trained, TrainingJob
 
 __all__ = ["finish_field", "fit_levels", "training_result"]
@@ -65,6 +66,14 @@ def fit_levels(
         return with_levels(field, cameras, config, show)
 
 
+def _refinement(refinement: PoseRefinement | None) -> dict[str, float] | None:
+    """Return how far poses were moved, for the result."""
+    if refinement is None:
+        return None
+    names = ("median_m", "p95_m", "median_deg", "p95_deg")
+    return {name: getattr(refinement, name) for name in names}
+
+
 def training_result(
     job: TrainingJob, trained: Trained, written: RadianceField, archive: Path
 ) -> dict[str, Any]:
@@ -83,6 +92,8 @@ def training_result(
             "views": len(job.held_out.pictures) if job.held_out is not None else 0,
         },
         "as_trained": asdict(trained.quality) if trained.quality is not None else None,
+        "held_out_aligned": asdict(trained.aligned) if trained.aligned is not None else None,
+        "pose_refinement": _refinement(trained.refinement),
         "seconds": trained.seconds,
         "iterations": trained.iterations,
         "primitives": trained.primitives,

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -21,6 +23,7 @@ from rfedge.arguments import time_text
 
 __all__ = ["LoopLimits", "LoopStatus", "TrainingLoop", "run_showing"]
 
+Result = TypeVar("Result")
 Measure = Callable[[RadianceField], float]
 MAX_MINUTES = 7 * 24 * 60.0
 
@@ -58,7 +61,11 @@ class LoopStatus:
 
 
 class TrainingLoop:
-    """Runs a trainer to its end. ``clock`` returns seconds that never go back."""
+    """Runs a trainer to its end. ``clock`` returns seconds that never go back.
+
+    ``show`` is given the trainer after each iteration (``rfedge.training.view``); what it takes is
+    no time of training.
+    """
 
     def __init__(
         self,
@@ -66,8 +73,10 @@ class TrainingLoop:
         limits: LoopLimits,
         measure: Measure | None,
         clock: Callable[[], float],
+        show: Callable[[FieldTrainer], None] | None = None,
     ) -> None:
         self.trainer = trainer
+        self._show = show
         self.curve: list[tuple[float, float]] = []
         """Seconds of training and held-out PSNR in dB."""
         self._limits, self._measure, self._clock = limits, measure, clock
@@ -110,6 +119,8 @@ class TrainingLoop:
                 self._save(limits.checkpoint)
             if self._measure is not None and self._measurement_is_due():
                 self._take_measurement(self._measure)
+            if self._show is not None:
+                self._aside(partial(self._show, trainer))
             psnr_db = self.curve[-1][1] if self.curve else None
             tell(
                 LoopStatus(self.progress, trainer.iteration, done.loss, trainer.primitives, psnr_db)
@@ -121,9 +132,15 @@ class TrainingLoop:
         return points > 0 and (ended or self.progress >= (len(self.curve) + 1) / points)
 
     def _take_measurement(self, measure: Measure) -> None:
-        at_s, before_s = self.seconds, self._clock()
-        self.curve.append((at_s, measure(self.trainer.field())))
+        at_s = self.seconds
+        self.curve.append((at_s, self._aside(lambda: measure(self.trainer.field()))))
+
+    def _aside(self, work: Callable[[], Result]) -> Result:
+        """Do what is no training; its time does not count."""
+        before_s = self._clock()
+        done = work()
         self._aside_s += self._clock() - before_s
+        return done
 
     def _save(self, path: Path) -> None:
         checkpoint = self.trainer.checkpoint()

@@ -7,7 +7,7 @@ within 15 % of the estimate.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,7 @@ from rfcore.train import (
 from rfcore.train.start import random_points
 from rfcore.views import PosedPicture
 from rfedge.training.loop import LoopLimits, TrainingLoop, run_showing
+from rfedge.training.refined_poses import PoseRefinement, aligned_quality, refinement_of
 
 __all__ = [
     "UNLIMITED_ITERATIONS",
@@ -125,6 +126,8 @@ class TrainingJob:
     seed: int
     limits: LoopLimits = field(default_factory=partial(LoopLimits, measurements=0))
     resume: bool = False
+    align_held_out: bool = False
+    """Measure held-out pictures at poses aligned with the field, too."""
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,9 @@ class Trained:
     primitives: int
     curve: tuple[tuple[float, float], ...]
     """Seconds of training and held-out PSNR in dB."""
+    refinement: PoseRefinement | None = None
+    aligned: HeldOut | None = None
+    """``quality`` at poses of the held-out pictures that were aligned with the field."""
 
 
 def training_config(
@@ -160,8 +166,10 @@ def train_field(job: TrainingJob, console: Console) -> SplatField:
     return trained
 
 
-def train(job: TrainingJob, console: Console) -> Trained:
-    """Train to the end, showing progress, held-out PSNR and time left.
+def train(
+    job: TrainingJob, console: Console, show: Callable[[FieldTrainer], None] | None = None
+) -> Trained:
+    """Train to the end, showing progress, held-out PSNR and time left; ``show``: ``TrainingLoop``.
 
     Says what memory it takes before it starts. Raises ``InvalidInput`` when that is not there, and
     ``TrainingDiverged`` when the run is lost; the last good checkpoint stays.
@@ -171,7 +179,7 @@ def train(job: TrainingJob, console: Console) -> Trained:
     measure = None
     if job.held_out is not None:
         measure = partial(mean_psnr_db, pictures=_in_memory(job.held_out.pictures))
-    loop = TrainingLoop(trainer, job.limits, measure, monotonic)
+    loop = TrainingLoop(trainer, job.limits, measure, monotonic, show)
     if job.resume:
         loop.resume()
         console.print(f"  going on after iteration {trainer.iteration:,}, {loop.seconds:.0f} s")
@@ -179,8 +187,15 @@ def train(job: TrainingJob, console: Console) -> Trained:
     seconds = loop.seconds
     quality = _quality(trainer, job)
     _announce_end(seconds, quality, console)
+    field = trainer.field(job.name, job.dataset.tile_origin, quality, job.dataset.anchor)
+    aligned = None
+    if job.align_held_out and job.held_out is not None:
+        held_out = job.held_out.pictures
+        aligned = aligned_quality(trainer, field, held_out, job.config.threads)
     return Trained(
-        field=trainer.field(job.name, job.dataset.tile_origin, quality),
+        field=field,
+        refinement=refinement_of(trainer),
+        aligned=aligned,
         quality=quality,
         seconds=seconds,
         iterations=trainer.iteration,

@@ -21,7 +21,7 @@ INTRINSICS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)
 
 @pytest.fixture
 def hello() -> Hello:
-    header = StreamHeader(CodecConfig(32, 16, "medium", 23.0), b"\x67" * 20, b"\x68" * 5)
+    header = StreamHeader(CodecConfig(32, 16, "default", 23.0), b"\x67" * 20, b"\x68" * 5)
     camera = CameraDescription("front", INTRINSICS, header)
     return Hello("cav-1", (camera,), ("ab" * 32,), RendererContract(RENDERER_CONTRACT, exact=True))
 

@@ -133,3 +133,40 @@ def test_a_rate_that_is_granted_later_is_kept_from_then_on() -> None:
     then = [schedule.next_capture(k / 10) for k in range(10, 40)]
     assert first == list(range(10))
     assert [i for i in then if i is not None] == [10, 14, 19, 24, 29, 34, 39]
+
+
+def ended(make_capture: MakeCapture, outcome: Outcome, reason: EndReason) -> FrameResult:
+    return FrameResult(make_capture(0), outcome, reason)
+
+
+def test_lockstep_of_a_rig_waits_for_every_camera(make_capture: MakeCapture) -> None:
+    schedule = Lockstep(2, cameras=3)
+    assert schedule.next_capture(0.0) == 0
+    for _ in range(2):
+        schedule.ended(ended(make_capture, Outcome.ACKED, EndReason.NONE))
+        assert schedule.next_capture(1.0) is None
+    schedule.ended(ended(make_capture, Outcome.ACKED, EndReason.NONE))
+    assert schedule.next_capture(2.0) == 1
+
+
+def test_lockstep_takes_an_instant_again_of_which_a_picture_was_lost(
+    make_capture: MakeCapture,
+) -> None:
+    schedule = Lockstep(2, cameras=2)
+    assert schedule.next_capture(0.0) == 0
+    schedule.ended(ended(make_capture, Outcome.LOST, EndReason.STREAM_LOST))
+    schedule.ended(ended(make_capture, Outcome.ACKED, EndReason.NONE))
+    assert schedule.next_capture(1.0) == 0
+
+
+def test_a_camera_whose_picture_cannot_be_coded_does_not_end_the_drive(
+    make_capture: MakeCapture,
+) -> None:
+    schedule = Lockstep(2, cameras=2)
+    assert schedule.next_capture(0.0) == 0
+    schedule.ended(ended(make_capture, Outcome.DROPPED, EndReason.NOT_CODED))
+    schedule.ended(ended(make_capture, Outcome.ACKED, EndReason.NONE))
+    assert schedule.next_capture(1.0) == 1
+    schedule.ended(ended(make_capture, Outcome.DROPPED, EndReason.NOT_CODED))
+    with pytest.raises(RfedgeError, match="could not be coded"):
+        schedule.ended(ended(make_capture, Outcome.DROPPED, EndReason.NOT_CODED))

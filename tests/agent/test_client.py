@@ -10,10 +10,20 @@ import grpc
 import pytest
 from structlog.testing import capture_logs
 
-from cav_agent.client import CameraSource, CameraTaken, StreamClient
+from cav_agent.client import CameraSource, CameraTaken, FieldNotServed, StreamClient
 from cav_agent.config import AgentLimits
-from cav_agent.frames import Capture, EncodedFrame, EncodeJob, EndReason, FrameResult, Outcome
+from cav_agent.drive_pictures import OneCamera, RecordedPictures
+from cav_agent.frames import (
+    Capture,
+    EncodedFrame,
+    EncodeJob,
+    EndReason,
+    FrameResult,
+    Outcome,
+    RetryReason,
+)
 from cav_agent.session import AgentSession
+from rfcore.codec.sender.steering import SteeringSettings
 from rfcore.errors import CodecError, ProtocolError, RejectReason, RfedgeError
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
@@ -119,6 +129,8 @@ class Heard:
 
     results: list[FrameResult] = field(default_factory=list)
     connections: list[bool] = field(default_factory=list)
+    retries: list[RetryReason] = field(default_factory=list)
+    unknown: int = 0
     on_result: Callable[[], None] = lambda: None
 
     def ended(self, result: FrameResult) -> None:
@@ -127,6 +139,12 @@ class Heard:
 
     def connected(self, is_connected: bool) -> None:
         self.connections.append(is_connected)
+
+    def retrying(self, reason: RetryReason) -> None:
+        self.retries.append(reason)
+
+    def message_unknown(self) -> None:
+        self.unknown += 1
 
     @property
     def outcomes(self) -> list[tuple[int, str]]:
@@ -157,7 +175,8 @@ def open_client(
         pictures = tuple(make_capture(index).picture for index in range(4))
         limits = limits or AgentLimits()
         session = AgentSession(hello, limits)
-        source = CameraSource(pictures, coder, executor)
+        drive = OneCamera("front", RecordedPictures(pictures), SteeringSettings())
+        source = CameraSource(drive.take, coder, executor)
         return StreamClient(server, session, source, heard, limits)  # type: ignore[arg-type]
 
     return make
@@ -198,7 +217,7 @@ async def test_a_client_streams_from_its_welcome_until_it_is_to_finish(
         grpc.StatusCode.INVALID_ARGUMENT,
         grpc.StatusCode.NOT_FOUND,
         grpc.StatusCode.PERMISSION_DENIED,
-        grpc.StatusCode.FAILED_PRECONDITION,
+        grpc.StatusCode.UNAUTHENTICATED,
     ],
 )
 async def test_a_refusal_that_another_try_would_repeat_ends_the_stream_with_its_reason(
@@ -209,6 +228,72 @@ async def test_a_refusal_that_another_try_would_repeat_ends_the_stream_with_its_
     with pytest.raises(ProtocolError, match=r"^hello\.field_ids: none is here$"):
         await client.run()
     assert len(server.streams) == 1
+
+
+async def test_a_field_that_is_gone_ends_the_stream_and_has_the_tiles_asked_for_again(
+    open_client: OpenClient,
+) -> None:
+    server = MemoryServer(lambda _: refusal(grpc.StatusCode.NOT_FOUND, "field ab: not here"))
+    with pytest.raises(FieldNotServed, match="not here"):
+        await open_client(server, Heard()).run()
+    assert server.fields_changed.is_set()
+
+
+async def test_one_failed_precondition_is_tried_again(open_client: OpenClient) -> None:
+    once: Answer = lambda _: refusal(grpc.StatusCode.FAILED_PRECONDITION, "not yet")  # noqa: E731
+    server, heard = MemoryServer(once, welcoming), Heard()
+    client = open_client(server, heard)
+    client.capture(0)
+    heard.on_result = client.finish
+    await client.run()
+    assert heard.outcomes == [(0, "acked")]
+    assert heard.retries == [RetryReason.STREAM]
+
+
+async def test_a_message_of_a_newer_server_is_counted_and_ignored(open_client: OpenClient) -> None:
+    """Field 100 of StreamResponse, which this vehicle's protocol does not have."""
+    newer = b"\xa2\x06\x03new"
+
+    class NewerStream(MemoryStream):
+        async def write(self, data: bytes) -> None:
+            self._down.put_nowait(newer)
+            await super().write(data)
+
+    class NewerServer(MemoryServer):
+        def stream_stream(self, method: str) -> Callable[..., MemoryStream]:  # noqa: ARG002
+            self.streams.append(NewerStream(welcoming))
+            return lambda **_: self.streams[-1]
+
+    server, heard = NewerServer(welcoming), Heard()
+    client = open_client(server, heard)
+    client.capture(0)
+    heard.on_result = client.finish
+    await client.run()
+    assert heard.outcomes == [(0, "acked")]
+    assert heard.unknown == 2, "one before the Welcome, one before the Ack"
+    assert heard.retries == []
+
+
+async def test_bytes_that_are_no_message_cost_the_stream_and_not_the_drive(
+    open_client: OpenClient,
+) -> None:
+    class BrokenStream(MemoryStream):
+        async def write(self, data: bytes) -> None:  # noqa: ARG002
+            self._down.put_nowait(b"\xff\xff\xff")
+
+    class BrokenOnce(MemoryServer):
+        def stream_stream(self, method: str) -> Callable[..., MemoryStream]:  # noqa: ARG002
+            kind = MemoryStream if self.streams else BrokenStream
+            self.streams.append(kind(welcoming))
+            return lambda **_: self.streams[-1]
+
+    server, heard = BrokenOnce(welcoming), Heard()
+    client = open_client(server, heard)
+    client.capture(0)
+    heard.on_result = client.finish
+    await client.run()
+    assert heard.outcomes == [(0, "acked")]
+    assert heard.retries == [RetryReason.STREAM]
 
 
 async def test_a_lost_stream_is_opened_again_and_the_next_picture_goes_on(

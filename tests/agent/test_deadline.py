@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cav_agent.deadline import DeadlineController, DeadlineLimits, Step
+from cav_agent.deadline import DeadlineController, DeadlineLimits, DeadlineRungs, Step
 from rfcore.codec.sender.ladder import MeasuredRung, Rung
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality
 
 SLOW = MeasuredRung(Rung(), 80.0, 30.0, 0.0)
 MIDDLE = MeasuredRung(Rung(references=1), 40.0, 25.0, 10.0)
-FAST = MeasuredRung(Rung(Quality(0.25), 1, preset="ultrafast"), 20.0, 12.0, 60.0)
+FAST = MeasuredRung(Rung(Quality(0.25), 1, effort="fast"), 20.0, 12.0, 60.0)
 RUNGS = (SLOW, MIDDLE, FAST)
 PERIOD_S = 0.1
 
@@ -100,6 +100,20 @@ def test_climbs_that_are_taken_back_become_rarer() -> None:
     assert gaps[-1] < 70, "but never stop"
 
 
+def test_frames_without_the_field_say_only_that_they_were_late() -> None:
+    """They leave out the render: a lower rung is not climbed from because of them."""
+    machine = Machine(100)
+    machine.drive(2, 1.6)
+    controller = machine.controller
+    assert controller.current is MIDDLE
+    slowness = controller.slowness
+    for k in range(100):
+        assert controller.measured_in_part(MIDDLE, 5.0, machine.now + k) is None
+    assert (controller.slowness, controller.current) == (slowness, MIDDLE)
+    steps = [controller.measured_in_part(MIDDLE, 250.0, machine.now + 100 + k) for k in range(9)]
+    assert [step.after for step in steps if step is not None] == [FAST]
+
+
 @given(st.lists(st.floats(0.05, 20), min_size=1, max_size=60), st.floats(1, 500))
 def test_whatever_the_load_the_rung_is_one_of_the_ladders(
     loads: list[float], deadline_ms: float
@@ -130,3 +144,24 @@ def test_times_that_cannot_be_are_refused(bad: float) -> None:
 def test_a_controller_without_rungs_is_refused() -> None:
     with pytest.raises(InvalidInput, match="ladder: has no rungs"):
         DeadlineController((), 10)
+
+
+def test_the_deadline_of_a_rig_is_that_of_all_its_cameras_together() -> None:
+    controller = DeadlineController(RUNGS, 100.0)
+    seen: list[float | None] = []
+    rungs = DeadlineRungs(controller, lambda c, _: seen.append(c.slowness))
+    for instant in (1, 2):
+        for _ in range(4):
+            rungs.coded(0.030, 100.0 + instant, instant)
+    assert seen == [pytest.approx(4 * 30.0 / SLOW.sender_ms)]
+    assert controller.late
+    assert controller.current is not SLOW
+
+
+def test_a_camera_that_stands_alone_is_measured_frame_by_frame() -> None:
+    controller = DeadlineController(RUNGS, 100.0)
+    seen: list[float | None] = []
+    rungs = DeadlineRungs(controller, lambda c, _: seen.append(c.slowness))
+    for _ in range(3):
+        rungs.coded(0.080, 100.0)
+    assert seen == [1.0, 1.0, 1.0]

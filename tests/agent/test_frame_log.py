@@ -24,6 +24,7 @@ from cav_agent.metrics import AgentMetrics
 from cav_agent.rate_control import ByteBudget
 from rfcore.codec.sender.ladder import MeasuredRung, Rung
 from rfcore.errors import RejectReason
+from rfcore.localise.fix import Fix, State
 from rfcore.wire.address import Address
 from rfcore.wire.messages import StageTimes
 from rfcore.wire.tiles import Tile
@@ -161,6 +162,19 @@ def test_a_fall_of_quality_and_its_rise_are_logged_with_what_the_path_carries(
     assert (falls["event"], falls["crf_before"], falls["crf"]) == ("quality falls", 23.0, 35.0)
     assert (rises["event"], rises["crf_before"], rises["crf"]) == ("quality rises", 35.0, 23.0)
     assert (falls["target_bytes"], falls["proven_mbps"]) == (500, 2.0)
+
+
+def test_the_pose_feeds_time_offset_is_a_metric_and_logged_when_it_changed(
+    observer: DriveObserver, registry: CollectorRegistry, acked: FrameResult
+) -> None:
+    assert acked.encoded is not None
+    with capture_logs() as lines:
+        for offset_s in (None, 0.21, 0.23, 0.4):
+            fix = Fix(State.TRACKING, 0, feed_offset_s=offset_s)
+            observer.ended(replace(acked, encoded=replace(acked.encoded, fix=fix)))
+    told = [line["seconds"] for line in lines if line["event"] == "pose feed's time offset"]
+    assert told == [0.21, 0.4]
+    assert registry.get_sample_value("rfedge_agent_pose_feed_offset_seconds") == 0.4
 
 
 def test_a_handover_is_counted_by_its_cause_and_names_server_and_tile(

@@ -11,15 +11,16 @@ from prometheus_client import CollectorRegistry
 from cav_agent.client import CameraTaken, StreamObserver
 from cav_agent.config import AgentConfig, AgentLimits, PaceKind
 from cav_agent.frame_log import DriveObserver
-from cav_agent.frames import Capture, EndReason, FrameResult, Outcome
+from cav_agent.frames import Capture, EndReason, FrameResult, Outcome, RetryReason
 from cav_agent.handover import ServedTile
 from cav_agent.handover_controller import HandoverController
 from cav_agent.metrics import AgentMetrics
 from cav_agent.tile_stream import OpenStream, TileStream
-from rfcore.errors import ProtocolError, RfedgeError
+from rfcore.errors import FieldFormatError, ProtocolError, RfedgeError
 from rfcore.wire.address import Address
 from rfcore.wire.tiles import Area, Tile
 
+REFUSED = ProtocolError("hello.field_ids: none is here")
 ADDRESSES = (Address("127.0.0.1", 1), Address("127.0.0.1", 2))
 
 
@@ -55,6 +56,9 @@ class MemoryClient:
         self._finishing = asyncio.Event()
 
     def capture(self, index: int) -> None:
+        if self._error is not None:
+            self.left_behind.append(self._make_capture(index))
+            return
         self.captured.append(index)
         self._on_capture(index)
         result = FrameResult(self._make_capture(index), Outcome.ACKED)
@@ -79,6 +83,13 @@ class MemoryClient:
         if self._error is not None:
             raise self._error
         await self._finishing.wait()
+        if self._error is not None:
+            raise self._error
+
+    def break_off(self, error: Exception) -> None:
+        """End the stream from the server's side."""
+        self._error = error
+        self.finish()
 
 
 @dataclass
@@ -91,6 +102,10 @@ class Site:
     clients: dict[ServedTile, list[MemoryClient]] = field(default_factory=dict)
     streaming: dict[int, set[ServedTile]] = field(default_factory=dict)
     """Who had a stream when a picture was captured."""
+    breaks_at: int | None = None
+    """The picture at which the stream that takes it is refused, once it was answered."""
+    failing: int = 0
+    """How many streams after a tile's first one are refused at once."""
 
     async def prepare(self, served: ServedTile) -> OpenStream:
         if served in self.failing_fields:
@@ -98,6 +113,9 @@ class Site:
 
         def open_stream(observer: StreamObserver) -> MemoryClient:
             error = self.errors.get(served)
+            if served in self.clients and self.failing:
+                self.failing -= 1
+                error = REFUSED
             client = MemoryClient(observer, self.make_capture, error, self._note_streaming)
             self.clients.setdefault(served, []).append(client)
             return client
@@ -105,6 +123,10 @@ class Site:
         return open_stream  # type: ignore[return-value]
 
     def _note_streaming(self, index: int) -> None:
+        if index == self.breaks_at:
+            self.breaks_at = None
+            (client,) = (c for clients in self.clients.values() for c in clients)
+            client.break_off(REFUSED)
         self.streaming[index] = {
             served
             for served, clients in self.clients.items()
@@ -182,11 +204,34 @@ async def test_the_only_stream_that_fails_ends_the_drive_with_its_error(
         await drive(WEST).run()
 
 
+async def test_a_server_that_welcomed_the_vehicle_once_is_tried_again_for_ever(
+    drive: Drive, site: Site, registry: CollectorRegistry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cav_agent.tile_stream.FIRST_RETRY_S", 0.001)
+    monkeypatch.setattr("cav_agent.tile_stream.LONGEST_RETRY_S", 0.001)
+    site.breaks_at, site.failing = 1, 3
+    await drive(WEST, give_up_s=0.0).run()
+    assert site.captured(WEST) == [0, 1, 2, 3]
+    assert len(site.clients[WEST]) == 5, "one that broke, three that were refused, one that went on"
+    retried = registry.get_sample_value("rfedge_agent_retries_total", {"reason": "refused"})
+    assert retried == 4
+
+
+async def test_no_server_for_as_long_as_may_be_ends_the_drive(
+    drive: Drive, site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cav_agent.tile_stream.FIRST_RETRY_S", 0.001)
+    site.errors[WEST] = RfedgeError("UNAVAILABLE")
+    with pytest.raises(RfedgeError, match="UNAVAILABLE"):
+        await drive(WEST, give_up_s=1.2).run()
+    assert len(site.clients[WEST]) > 1
+
+
 async def test_a_field_that_cannot_be_prepared_ends_the_drive_with_its_error(
     drive: Drive, site: Site
 ) -> None:
-    site.failing_fields[WEST] = RfedgeError("field 0a0a does not arrive")
-    with pytest.raises(RfedgeError, match="does not arrive"):
+    site.failing_fields[WEST] = FieldFormatError("field 0a0a is damaged")
+    with pytest.raises(FieldFormatError, match="is damaged"):
         await drive(WEST).run()
     assert site.clients == {}
 
@@ -210,6 +255,12 @@ async def test_one_of_two_streams_that_fails_is_held_back_and_tried_again(
             results.append(result)
 
         def connected(self, is_connected: bool) -> None:
+            """Not looked at."""
+
+        def retrying(self, reason: RetryReason) -> None:
+            """Not looked at."""
+
+        def message_unknown(self) -> None:
             """Not looked at."""
 
     site.errors[WEST] = ProtocolError("draining")
@@ -247,6 +298,12 @@ async def test_a_field_is_prepared_once_for_all_streams_of_its_tile(site: Site) 
             raise AssertionError(result)
 
         def connected(self, is_connected: bool) -> None:
+            """Not looked at."""
+
+        def retrying(self, reason: RetryReason) -> None:
+            """Not looked at."""
+
+        def message_unknown(self) -> None:
             """Not looked at."""
 
     stream = TileStream(WEST, prepare, Observer())

@@ -154,5 +154,15 @@ def test_every_label_but_a_fields_id_has_few_values(
         for name in sample.labels
         if family.name.startswith("rfedge_agent_")
     }
-    closed = {"result", "reason", "references", "stage", "cause", "direction", "kind", "le"}
+    closed = {
+        "result",
+        "reason",
+        "references",
+        "stage",
+        "cause",
+        "direction",
+        "kind",
+        "state",
+        "le",
+    }
     assert names - closed == {"field"}

@@ -11,14 +11,17 @@ from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline, PipelineOptions, Stopwatch
 from cav_agent.rate_control import ByteBudget
 from rfcore.camera import Camera
+from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.qp_map import QpMap
+from rfcore.codec.references import Reference
 from rfcore.codec.sender.ladder import Rung
 from rfcore.codec.sender.steering import Steering
 from rfcore.errors import InvalidInput
-from rfcore.field import Quality
-from rfcore.image import Rgb
-from rfcore.views import View
+from rfcore.field import Quality, render_field_view
+from rfcore.image import I420, Rgb
+from rfcore.localise.fix import Fix, State
+from rfcore.views import FieldView, View
 from rfcore.wire.messages import FrameAddress
 
 LIMIT_BYTES = 300
@@ -42,7 +45,7 @@ def noisy(make_capture: Callable[..., Capture]) -> Capture:
 
 
 def test_a_noise_picture_is_coded_until_its_slice_is_below_the_limit(noisy: Capture) -> None:
-    config = CodecConfig(32, 16, preset="ultrafast", crf=10)
+    config = CodecConfig(32, 16, effort="fast", crf=10)
     free = Pipeline(Grey(), config, lambda: 0).encode(EncodeJob(noisy, 0, 1))
     made = Pipeline(Grey(), config, lambda: 0, PipelineOptions(LIMIT_BYTES)).encode(
         EncodeJob(noisy, 0, 1)
@@ -53,7 +56,7 @@ def test_a_noise_picture_is_coded_until_its_slice_is_below_the_limit(noisy: Capt
 
 
 def test_block_means_are_sent_only_where_the_server_is_not_exact(noisy: Capture) -> None:
-    pipeline = Pipeline(Grey(), CodecConfig(32, 16, preset="ultrafast"), lambda: 0)
+    pipeline = Pipeline(Grey(), CodecConfig(32, 16, effort="fast"), lambda: 0)
     lengths = [
         len(pipeline.encode(EncodeJob(noisy, 0, 1, exact=exact)).packet.render_block_means)
         for exact in (True, False)
@@ -62,7 +65,7 @@ def test_block_means_are_sent_only_where_the_server_is_not_exact(noisy: Capture)
 
 
 def test_a_budget_of_bytes_is_aimed_at_and_costs_quality(noisy: Capture) -> None:
-    config = CodecConfig(32, 16, preset="ultrafast", crf=10)
+    config = CodecConfig(32, 16, effort="fast", crf=10)
     pipeline = Pipeline(Grey(), config, lambda: 0)
     crfs, lengths = [], []
     for target in (1e6, 150.0, 150.0):
@@ -75,7 +78,7 @@ def test_a_budget_of_bytes_is_aimed_at_and_costs_quality(noisy: Capture) -> None
 
 
 def test_a_map_reaches_the_encoder(noisy: Capture) -> None:
-    config = CodecConfig(32, 16, preset="ultrafast", crf=30)
+    config = CodecConfig(32, 16, effort="fast", crf=30)
     coarser = Steering(QpMap(np.full((1, 2), 12, np.int8)))
     plain = Pipeline(Grey(), config, lambda: 0).encode(EncodeJob(noisy, 0, 1))
     made = Pipeline(Grey(), config, lambda: 0, PipelineOptions(steering=coarser)).encode(
@@ -84,13 +87,38 @@ def test_a_map_reaches_the_encoder(noisy: Capture) -> None:
     assert len(made.packet.payload) < 0.7 * len(plain.packet.payload)
 
 
-def test_the_pose_sent_is_the_one_that_was_rendered(noisy: Capture) -> None:
-    """A grey field says nothing of the pose, so the measured one stays; the time is kept."""
-    config, refining = CodecConfig(32, 16, preset="ultrafast"), Steering(refine_pose_ms=50)
-    pipeline = Pipeline(Grey(), config, lambda: 0, PipelineOptions(steering=refining))
-    made = pipeline.encode(EncodeJob(noisy, 0, 1))
-    assert made.pose == noisy.picture.camera.world_from_cam
-    assert "refine" in made.stage_s
+class Places:
+    """Finds the pose of every second frame, where the dataset has it."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def locate(self, capture: Capture, frame: I420, rung: Rung) -> Fix:
+        del frame
+        self.calls += 1
+        if self.calls % 2:
+            return Fix(State.LOCALISING, capture.capture_time_ns)
+        view = render_field_view(Grey(), capture.picture.camera.rounded(), rung.quality)
+        return Fix(State.TRACKING, capture.capture_time_ns, view)
+
+
+def test_lost_frames_are_coded_without_the_field_and_found_ones_with_it(noisy: Capture) -> None:
+    config, options = CodecConfig(32, 16, effort="fast"), PipelineOptions(tracking=Places())
+    pipeline = Pipeline(Grey(), config, lambda: 0, options)
+    decoder = DeltaDecoder(pipeline.header)
+    state, base = decoder.start(0), None
+    for number, references in enumerate([(), None, (Reference.PREVIOUS,), None]):
+        made = pipeline.encode(EncodeJob(noisy, 0, 1, base=base))
+        lost = number % 2 == 0
+        assert made.fix is not None
+        assert (made.fix.world_from_cam is None) == lost
+        assert references is None or made.packet.references == references
+        camera = noisy.picture.camera
+        view = FieldView.nothing(camera.intrinsics)
+        if not lost:
+            view = render_field_view(Grey(), camera.rounded())
+        state = decoder.decode(state, made.packet, view).state
+        base = FrameAddress("front", 0, number)
 
 
 class StepClock:
@@ -108,11 +136,25 @@ class RecordedRungs(FixedRung):
     """One rung; keeps what it was told of every frame."""
 
     def __init__(self) -> None:
-        super().__init__(Rung(preset="ultrafast"))
+        super().__init__(Rung(effort="fast"))
         self.sender_s: list[float] = []
+        self.in_field: list[bool] = []
 
-    def coded(self, sender_s: float, now: float) -> None:  # noqa: ARG002
+    def coded(
+        self, sender_s: float, now: float, instant: int = 0, *, in_field: bool = True
+    ) -> None:
+        del now, instant
         self.sender_s.append(sender_s)
+        self.in_field.append(in_field)
+
+
+def test_rungs_hear_which_frames_were_coded_without_the_field(noisy: Capture) -> None:
+    rungs = RecordedRungs()
+    options = PipelineOptions(rungs=rungs, tracking=Places())
+    pipeline = Pipeline(Grey(), CodecConfig(32, 16, effort="fast"), StepClock(), options)
+    for _ in range(4):
+        pipeline.encode(EncodeJob(noisy, 0, 1))
+    assert rungs.in_field == [False, True, False, True]
 
 
 def test_loading_the_picture_is_measured_apart_from_the_senders_stages(noisy: Capture) -> None:
@@ -123,7 +165,7 @@ def test_loading_the_picture_is_measured_apart_from_the_senders_stages(noisy: Ca
         return noisy.picture.read()
 
     slow = replace(noisy, picture=replace(noisy.picture, read=load))
-    config = CodecConfig(32, 16, preset="ultrafast")
+    config = CodecConfig(32, 16, effort="fast")
     made = Pipeline(Grey(), config, clock, PipelineOptions(rungs=rungs)).encode(
         EncodeJob(slow, 0, 1)
     )
@@ -143,13 +185,13 @@ def test_laps_add_up_to_the_time_that_passed() -> None:
 
 
 def test_a_picture_of_another_size_is_refused_by_name_and_both_sizes(noisy: Capture) -> None:
-    pipeline = Pipeline(Grey(), CodecConfig(64, 16, preset="ultrafast"), lambda: 0)
+    pipeline = Pipeline(Grey(), CodecConfig(64, 16, effort="fast"), lambda: 0)
     with pytest.raises(InvalidInput, match=r"000\.png: 32x16 px, the stream is coded at 64x16 px"):
         pipeline.encode(EncodeJob(noisy, 0, 1))
 
 
 def test_a_base_that_is_no_longer_kept_counts_as_none(noisy: Capture) -> None:
-    pipeline = Pipeline(Grey(), CodecConfig(32, 16, preset="ultrafast"), lambda: 0)
+    pipeline = Pipeline(Grey(), CodecConfig(32, 16, effort="fast"), lambda: 0)
     gone = FrameAddress("front", 7, 99)
     packet = pipeline.encode(EncodeJob(noisy, 0, 1, base=gone)).packet
     assert packet.base_digest == b""

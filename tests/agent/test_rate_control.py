@@ -103,7 +103,7 @@ class StreetCoder:
         pictures = read_dataset(Path("samples/street/transforms_drive_vehicles.json")).pictures
         self._frames = [i420_from_rgb(picture.read()) for picture in pictures]
         self._views = [render_field_view(field, picture.camera) for picture in pictures]
-        self._encoder = DeltaEncoder(CodecConfig(640, 360, "ultrafast", LOWEST_CRF))
+        self._encoder = DeltaEncoder(CodecConfig(640, 360, "fast", LOWEST_CRF))
         self._state = self._encoder.start(0)
         self._model = RateModel()
         self.psnr_db: dict[int, float] = {}

@@ -17,7 +17,7 @@ def short(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The first frames of the sample drive, coded fast."""
 
     def coded(drive: Path, field: Any, cache: Path) -> Path:
-        whole = PrerecordedDrive.read(prerecorded_drive(drive, field, cache, "ultrafast"))
+        whole = PrerecordedDrive.read(prerecorded_drive(drive, field, cache, "fast"))
         PrerecordedDrive(whole.hello, whole.chain[:5], whole.alone[:5]).write(tmp_path)
         return tmp_path
 

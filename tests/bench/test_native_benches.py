@@ -1,15 +1,19 @@
 """Benches check before they time, and their rows have the published keys."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from forward_isas import POCL
+from rfcore.camera import Camera
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.native import Rasterizer
+from rfcore.views import View
 from rfedge import timing
-from rfedge.bench import print_rows, raster, run_case, train
+from rfedge.bench import opencl, print_rows, raster, run_case, train
 from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.results import write_result
 
@@ -18,6 +22,10 @@ RASTER_KEYS = [
     *("native_ms", "reference_ms", "max_abs_error"),
 ]
 MODE_KEYS = ["width", "height", "gaussians", "isa", "mode", "native_ms", "ratio"]
+OPENCL_KEYS = [
+    *("width", "height", "gaussians", "device", "device_ms", "device_view_ms"),
+    *("isa", "threads", "native_ms", "native_view_ms", "ratio"),
+]
 TRAIN_KEYS = ["width", "height", "gaussians", "threads", "iteration_ms"]
 
 
@@ -32,6 +40,29 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(raster, "SIZES_PX", ((30, 20), (48, 32)))
     monkeypatch.setattr(raster, "REFERENCE_SIZES_PX", ((30, 20),))
     monkeypatch.setattr(train, "SIZES_PX", ((48, 32),))
+
+
+@pytest.mark.slow
+def test_a_device_is_named_with_its_driver_beside_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opencl, "street_gaussians", lambda: street_gaussians(1000))
+    monkeypatch.setattr(opencl, "SIZES_PX", ((30, 20), (48, 32)))
+    rows = run_case("raster", isa=POCL)["rows"]
+    assert [list(row) for row in rows] == [OPENCL_KEYS] * 2
+    assert all("PoCL" in row["device"] and row["device_ms"] > 0 for row in rows)
+
+
+@pytest.mark.slow
+def test_a_device_that_draws_other_bytes_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opencl, "street_gaussians", lambda: street_gaussians(1000))
+    render = Rasterizer.render
+
+    def brighter(self: Rasterizer, camera: Camera) -> View:
+        view = render(self, camera)
+        return replace(view, opacity=view.opacity + 1) if self.isa == POCL else view
+
+    monkeypatch.setattr(Rasterizer, "render", brighter)
+    with pytest.raises(RfedgeError, match="the opacity of opencl:Portable is not that of"):
+        run_case("raster", isa=POCL)
 
 
 @pytest.mark.usefixtures("small")

@@ -7,9 +7,16 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 
-from rfcore.errors import AccessDenied, InvalidInput
+from rfcore.errors import AccessDenied, InvalidData, InvalidInput
 from rfcore.wire.identity import PeerIdentity, Role, identity_uri, peer_identity
-from rfedge.certs.authority import Issued, Members, certify, read_certificates, write_certificates
+from rfedge.certs.authority import (
+    Issued,
+    Members,
+    add_certificates,
+    certify,
+    read_certificates,
+    write_certificates,
+)
 
 NOW = datetime(2030, 1, 2, tzinfo=UTC)
 
@@ -118,3 +125,71 @@ def test_an_unencrypted_peer_is_nobody_and_a_nameless_certificate_is_not_that() 
     assert peer_identity({}) is None
     assert peer_identity({"transport_security_type": [b"insecure"]}) is None
     assert peer_identity({"transport_security_type": [b"ssl"]}) == PeerIdentity(())
+
+
+def test_a_certificate_is_added_without_touching_the_others(
+    issued: tuple[Issued, ...], tmp_path: Path
+) -> None:
+    folder = tmp_path / "c"
+    write_certificates(folder, issued)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    members = Members(("cav-2",), operators=("op",))
+    added = add_certificates(folder, members, NOW, 5)
+    assert [one.name for one in added] == ["vehicle-cav-2", "operator-op"]
+    assert {name: (folder / name).read_bytes() for name in before} == before
+    authority = x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes())
+    for one in added:
+        path = folder / f"{one.name}.key"
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        certificate = x509.load_pem_x509_certificate((folder / f"{one.name}.pem").read_bytes())
+        certificate.verify_directly_issued_by(authority)
+
+
+@pytest.mark.parametrize(
+    ("change", "members", "days", "error"),
+    [
+        (None, Members(("cav-1",)), 5, "has a certificate of vehicle-cav-1 already"),
+        (None, Members(()), 5, "name at least one"),
+        (None, Members(("cav-2",)), 50, "beyond the authority's end"),
+        ("ca.key", Members(("cav-2",)), 5, "is not the key of ca.pem"),
+        ("ca.pem", Members(("cav-2",)), 5, "does not hold ca.pem and ca.key"),
+    ],
+)
+def test_an_addition_that_cannot_be_made_leaves_the_folder_as_it_was(
+    issued: tuple[Issued, ...],
+    tmp_path: Path,
+    change: str | None,
+    members: Members,
+    days: int,
+    error: str,
+) -> None:
+    folder = tmp_path / "c"
+    write_certificates(folder, issued)
+    if change == "ca.key":
+        (folder / "ca.key").write_bytes((folder / "server.key").read_bytes())
+    elif change is not None:
+        (folder / change).unlink()
+    before = sorted(path.name for path in folder.iterdir())
+    with pytest.raises((InvalidInput, InvalidData), match=error):
+        add_certificates(folder, members, NOW, days)
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def test_serial_and_end_are_read_as_the_library_reads_them(issued: tuple[Issued, ...]) -> None:
+    for one in issued:
+        certificate = x509.load_pem_x509_certificate(one.certificate)
+        context = {"transport_security_type": [b"ssl"], "x509_pem_cert": [one.certificate]}
+        peer = peer_identity(context)
+        assert peer is not None
+        assert (peer.serial, peer.until) == (
+            certificate.serial_number,
+            certificate.not_valid_after_utc,
+        )
+
+
+@pytest.mark.parametrize(
+    "damage", [b"", b"-----BEGIN-----AAAA-----END-----", b"-----a-----MIIB-----b-----"]
+)
+def test_a_certificate_that_cannot_be_read_lets_nobody_in(damage: bytes) -> None:
+    with pytest.raises(InvalidData, match="cannot be read"):
+        peer_identity({"transport_security_type": [b"ssl"], "x509_pem_cert": [damage]})

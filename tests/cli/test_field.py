@@ -10,13 +10,22 @@ import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import FieldFormatError, InvalidData, InvalidInput
-from rfcore.field import FieldMetadata, SplatField, load_field, read_ply, save_field, write_ply
+from rfcore.field import (
+    FieldMetadata,
+    SplatField,
+    load_field,
+    read_splat_file,
+    save_field,
+    write_ply,
+)
 from rfcore.field.similarity import Similarity, moved
+from rfcore.geodesy import Anchor
 from rfcore.image import read_rgb, write_png
 from rfcore.raster.gaussians import Gaussians
 from rfedge.arguments import field_path
 from rfedge.cli.codec import Decode, Encode
 from rfedge.cli.field import (
+    FieldAnchor,
     FieldCheck,
     FieldExport,
     FieldImport,
@@ -85,11 +94,11 @@ def test_an_imported_ply_is_found_by_its_name_and_exported_exactly(
     field = load_field(here / "out/fields/street.rff")
     assert (field.metadata.name, field.metadata.antialiased) == ("street", True)
     FieldExport(Path("street"), here / "back.ply").run()
-    back = read_ply(here / "back.ply")
+    back = read_splat_file(here / "back.ply")[0]
     a, b = (g.means[np.lexsort(g.means.T)] for g in (splats, back))
     np.testing.assert_array_equal(a, b, "every value survives; the order is of importance")
     FieldExport(Path("street"), here / "tenth.ply", detail=0.1).run()
-    np.testing.assert_array_equal(read_ply(here / "tenth.ply").sh, back.sh[:20])
+    np.testing.assert_array_equal(read_splat_file(here / "tenth.ply")[0].sh, back.sh[:20])
 
 
 def test_a_field_of_nerfstudio_comes_back_to_its_world(
@@ -266,3 +275,24 @@ def test_a_name_means_the_same_field_to_encode_and_decode(
     assert (here / "by-name.rfv").read_bytes() == (here / "by-path.rfv").read_bytes()
     Decode(here / "by-name.rfv", Path("mine"), here / "pictures").run()
     assert len(list((here / "pictures").iterdir())) == 5
+
+
+def test_a_field_gets_an_anchor_and_keeps_it(tmp_path, capsys, splats):
+    street = tmp_path / "street.rff"
+    save_field(SplatField(splats).compressed(), street)
+    anchored = tmp_path / "anchored.rff"
+    FieldAnchor(street, at=(48.137, 11.575, 519.0), out=anchored).run()
+    capsys.readouterr()
+    FieldAnchor(anchored).run()
+    assert "48.13700000, 11.57500000 deg, 519.000 m" in capsys.readouterr().out
+    again = tmp_path / "again.rff"
+    FieldAnchor(anchored, at=(48.0, 11.0, 0.0), out=again).run()
+    field, before = load_field(again), load_field(street)
+    assert field.metadata.anchor == Anchor(48.0, 11.0)
+    assert replace(field.metadata, anchor=None) == before.metadata
+    assert field.field_id != before.field_id
+
+
+def test_an_anchor_without_an_archive_to_write_is_refused(tmp_path):
+    with pytest.raises(InvalidInput, match="goes with --out"):
+        FieldAnchor(tmp_path / "street.rff", at=(48.0, 11.0, 0.0)).run()

@@ -17,16 +17,18 @@ from rfedge.cli import main
 
 VERBS = (
     *("demo", "train", "render", "encode", "decode", "localise"),
-    *("link", "loadtest", "watch", "bench"),
+    *("link", "loadtest", "watch", "twin", "bench", "size"),
 )
-EVAL_VERBS = ("eval compare", "eval never-worse", "eval paper", "eval robust")
+EVAL_VERBS = tuple(
+    f"eval {verb}" for verb in ("adapt", "compare", "never-worse", "paper", "robust", "sizing")
+)
 CERTS_VERBS = ("certs init", "certs show")
 SCENE_VERBS = ("scene build", "scene convert", "scene poses", "scene record-carla")
 FIELD_VERBS = tuple(
     f"field {verb}" for verb in ("import", "info", "check", "slim", "levels", "export")
 )
 GROUPS = ("field", "scene", "eval", "certs")
-MOST_VERBS = 14
+MOST_VERBS = 16
 EMPTY_STREET = str(Path(__file__).parents[2] / "samples/scenes/street-empty.toml")
 SAMPLES = Path(__file__).parents[2] / "samples"
 FIELD = str(SAMPLES / "fields/street.rff")

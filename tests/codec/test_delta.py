@@ -1,6 +1,6 @@
 """Each check of the receiver, in its order, with the reason it gives; and inexact renderers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +8,7 @@ import pytest
 
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.references import RENDER_ONLY
+from rfcore.codec.references import RENDER_ONLY, Reference
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
@@ -53,6 +53,15 @@ def psnr_y_db(a: I420, b: I420) -> float:
         ({"crc32": 0}, RejectReason.CRC_MISMATCH),
         ({"render_digest": bytes(16), "crc32": 0}, RejectReason.CRC_MISMATCH),
         ({"render_digest": bytes(16), "payload": b""}, RejectReason.RENDER_MISMATCH),
+        ({"render_digest": bytes(16), "payload": b"\x65"}, RejectReason.RENDER_MISMATCH),
+        (
+            {
+                "render_digest": bytes(16),
+                "references": (Reference.PREVIOUS,),
+                "base_digest": b"none",
+            },
+            RejectReason.RENDER_MISMATCH,
+        ),
         ({"payload": b""}, RejectReason.RECONSTRUCTION_MISMATCH),
         ({"payload": b"\x41"}, RejectReason.MALFORMED_PAYLOAD),
         ({"payload": b"\x41\x9a\x22"}, RejectReason.DECODER_FAILED),
@@ -217,18 +226,34 @@ def test_packets_that_cannot_be_are_refused_by_field(
         replace(sent.packet, **change)  # type: ignore[arg-type]
 
 
-def test_frames_of_one_stream_may_have_any_preset(pair: PairMaker) -> None:
-    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, preset="veryfast"))
+@pytest.mark.parametrize(
+    "efforts",
+    [
+        ("fast", "default", None, "thorough"),
+        ("x264-ultrafast", "x264-medium", None, "x264-veryslow"),
+    ],
+)
+def test_frames_of_one_stream_may_have_any_effort(
+    pair: PairMaker, efforts: Sequence[str | None]
+) -> None:
+    own = efforts[0] == "fast"
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="default" if own else "x264-veryfast"))
     decoder = DeltaDecoder(encoder.header)
     sending, receiving = encoder.start(1), decoder.start(1)
     payloads = set()
-    for preset in ("ultrafast", "medium", None, "veryslow"):
-        choice = FrameChoice(preset=preset, references=RENDER_ONLY)
+    for effort in efforts:
+        choice = FrameChoice(effort=effort, references=RENDER_ONLY)
         made = encoder.encode(sending, *pair(*SIZE_PX), choice=choice)
         got = decoder.decode(receiving, made.packet, pair(*SIZE_PX)[1])
         assert got.frame.digest() == made.reconstruction.digest()
         sending, receiving = made.state, got.state
         payloads.add(made.packet.payload)
-    assert len(payloads) == 4, "the preset reaches the encoder"
-    with pytest.raises(InvalidInput, match="preset: 'placebo' is none of"):
-        FrameChoice(preset="placebo")
+    assert len(payloads) == 4 - own, "the effort reaches the encoder"
+    other = FrameChoice(effort="x264-fast" if own else "fast")
+    with pytest.raises(InvalidInput, match="is none of the stream's coder"):
+        encoder.encode(sending, *pair(*SIZE_PX), choice=other)
+
+
+def test_an_effort_of_no_coder_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="effort: 'placebo' is none of"):
+        FrameChoice(effort="placebo")

@@ -1,4 +1,4 @@
-"""No slice above its limit: the machine by itself on models of a rate, and x264 on noise."""
+"""No slice above its limit: the machine by itself on models of a rate, and our coder on noise."""
 
 import math
 from collections.abc import Callable
@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
+from rfcore.codec.sender.picture_coder import CodedPicture
 from rfcore.codec.sender.rate import MAX_TRIES, code_to_fit
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
@@ -20,8 +21,10 @@ ViewMaker = Callable[[I420], FieldView]
 SIZE_PX = (160, 96)
 
 
-def halving(first_bytes: int, crf_to_halve: float) -> Callable[[float], bytes]:
-    return lambda crf: bytes(max(1, round(first_bytes * 2 ** ((23 - crf) / crf_to_halve))))
+def halving(first_bytes: int, crf_to_halve: float) -> Callable[[float], CodedPicture]:
+    return lambda crf: CodedPicture(
+        bytes(max(1, round(first_bytes * 2 ** ((23 - crf) / crf_to_halve))))
+    )
 
 
 @given(
@@ -36,10 +39,10 @@ def test_whatever_the_rate_it_fits_if_the_highest_crf_does(
     code = halving(first_bytes, crf_to_halve)
     made = code_to_fit(code, crf, limit_bytes)
     assert made.tries <= MAX_TRIES
-    assert made.payload == code(made.crf)
+    assert made.coded == code(made.crf)
     assert crf <= made.crf <= 51
-    assert (len(made.payload) <= limit_bytes) or made.crf == 51
-    if len(code(crf)) <= limit_bytes:
+    assert (len(made.coded.payload) <= limit_bytes) or made.crf == 51
+    if len(code(crf).payload) <= limit_bytes:
         assert (made.crf, made.tries) == (crf, 1)
 
 
@@ -52,7 +55,7 @@ def test_a_steady_rate_takes_three_codings_and_wastes_a_tenth(
     limit_bytes = first_bytes // 2
     made = code_to_fit(halving(first_bytes, crf_to_halve), 23, limit_bytes)
     assert made.tries <= 3
-    assert 0.94 * 2 ** (-1 / 6) < len(made.payload) / limit_bytes <= 1
+    assert 0.94 * 2 ** (-1 / 6) < len(made.coded.payload) / limit_bytes <= 1
     assert made.crf <= 23 + crf_to_halve * (1 + math.log2(1 / 0.95)) + 1.01
 
 
@@ -77,7 +80,7 @@ def test_noise_is_coded_again_until_it_fits_and_decodes(
 
 def test_what_no_crf_makes_fit_comes_back_too_long(noise: PictureMaker, view_of: ViewMaker) -> None:
     frame, view = noise(*SIZE_PX, 1), view_of(noise(*SIZE_PX, 2))
-    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, preset="ultrafast"))
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="fast"))
     choice = FrameChoice(limit_bytes=1)
     made = encoder.encode(encoder.start(0), frame, view, choice=choice)
     assert len(made.packet.payload) > 1

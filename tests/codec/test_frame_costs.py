@@ -99,7 +99,7 @@ def test_many_short_lived_pictures_are_never_mistaken_for_one_another(pair: Pair
 def test_coding_a_frame_under_rate_control_computes_no_picture_twice(
     pair: PairMaker, calls: list[tuple[int, int]]
 ) -> None:
-    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, preset="ultrafast"))
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="fast"))
     state, model = encoder.start(1), RateModel()
     for index in range(3):
         frame, view = pair(*SIZE_PX, 2.0 * index)

@@ -20,7 +20,9 @@ DATA = Path(__file__).parents[1] / "data"
 FRAMES = 7
 
 
-@pytest.mark.parametrize("name", ["delta_packets.npz", "delta_packets_long.npz"])
+@pytest.mark.parametrize(
+    "name", ["delta_packets_own.npz", "delta_packets.npz", "delta_packets_long.npz"]
+)
 def test_golden_packets_decode_to_their_digests(name: str) -> None:
     with np.load(DATA / name, allow_pickle=False) as stored:
         arrays = dict(stored)

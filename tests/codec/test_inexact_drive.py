@@ -37,7 +37,7 @@ def test_over_300_frames_the_error_does_not_grow_and_is_visible(pair: PairMaker)
     """+-1 level is noise of variance 2/3 on the reference. It reaches the picture unchanged where
     the slice copies, and deblocking or interpolation only average it: so every single frame stays
     within 2/3 and a margin of 1/2 of the sender's, the last ones like the first ones."""
-    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, preset="ultrafast", crf=30))
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="fast", crf=30))
     decoder = DeltaDecoder(encoder.header, exact=False)
     sending, receiving = encoder.start(0), decoder.start(0)
     rng = np.random.default_rng(3)

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from rfcore.codec.sender.ladder import MeasuredRung, Rung, front, read_ladder
+from rfcore.codec.h264.config import Coder
+from rfcore.codec.sender.ladder import MeasuredRung, Rung, TrackingEffort, front, read_ladder
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.field import Quality
 
@@ -14,28 +15,47 @@ from rfcore.field import Quality
 def row(ms: float, rate: float, crf: float = 28.0, **knobs: Any) -> dict[str, Any]:
     settings = {
         "kind": "splats", "detail": 1.0, "sh_degree": None, "samples_per_ray": None, "scale": 1.0,
-        "references": 3, "photometric": True, "preset": "medium", "crf": crf, **knobs,
+        "references": 3, "photometric": True, "effort": "default", "crf": crf, **knobs,
     }  # fmt: skip
     return {"settings": settings, "sender_ms": ms, "receiver_ms": 10.0, "rate_percent": rate}
 
 
-def write(path: Path, *rows: dict[str, Any], kind: str = "ladder") -> Path:
-    path.write_text(json.dumps({"kind": kind, "rows": rows}))
+def write(
+    path: Path,
+    *rows: dict[str, Any],
+    kind: str = "ladder",
+    tracking: tuple[dict[str, Any], ...] = (),
+) -> Path:
+    path.write_text(json.dumps({"kind": kind, "rows": rows, "tracking": tracking}))
     return path
 
 
+def track(effort: str, ms: float | None, rate: float | None, **knobs: Any) -> dict[str, Any]:
+    settings = row(1, 0, **knobs)["settings"]
+    kept = {
+        key: settings[key] for key in ("kind", "detail", "sh_degree", "samples_per_ray", "scale")
+    }
+    return {"settings": kept, "tracking": effort, "track_ms": ms, "rate_percent": rate}
+
+
 def test_a_rung_is_named_by_what_distinguishes_it() -> None:
-    assert Rung().name == "100% 3ref medium"
-    low = Rung(Quality(0.25, 0, 16, 0.5), 0, photometric=False, preset="ultrafast")
-    assert low.name == "25% sh0 16samples half-size render-only no-light ultrafast"
-    assert Rung(references=2, fast_unsent=True).name == "100% 2ref rough medium"
+    assert Rung().name == "100% 3ref default"
+    low = Rung(Quality(0.25, 0, 16, 0.5), 0, photometric=False, effort="fast")
+    assert low.name == "25% sh0 16samples half-size render-only no-light fast"
+    assert Rung(tracking=TrackingEffort.HALF).name == "100% 3ref default track-half"
 
 
-def test_a_ladder_measured_before_references_could_be_rough_has_none_that_are(
-    tmp_path: Path,
-) -> None:
-    path = write(tmp_path / "ladder.json", row(80, 0), row(60, 3, rough=True))
-    assert [r.rung.fast_unsent for r in read_ladder(path, "splats", 28)] == [False, True]
+def test_a_ladder_has_rungs_of_one_coder(tmp_path: Path) -> None:
+    """Those without an effort, from before there were two, are of x264."""
+    old, rough = row(80, 0, preset="medium"), row(60, 3, preset="medium", rough=True)
+    for stored in (old, rough):
+        del stored["settings"]["effort"]
+    path = write(tmp_path / "ladder.json", row(40, 0), old, rough)
+    assert [r.rung.effort for r in read_ladder(path, "splats", 28)] == ["default"]
+    (kept,) = read_ladder(path, "splats", 28, Coder.X264)
+    assert (kept.rung.effort, kept.sender_ms) == ("x264-medium", 80)
+    with pytest.raises(InvalidData, match="no rungs for splats with the coder own"):
+        read_ladder(write(tmp_path / "old.json", old), "splats", 28)
 
 
 def test_the_front_is_faster_step_by_step_and_never_worse_than_what_it_leaves_out() -> None:
@@ -56,14 +76,53 @@ def test_a_ladder_is_read_for_its_kind_and_the_nearest_crf(tmp_path: Path) -> No
     path = write(
         tmp_path / "ladder.json",
         row(80, 0),
-        row(50, 9, detail=0.5, sh_degree=1, references=1, photometric=False, preset="veryfast"),
+        row(50, 9, detail=0.5, sh_degree=1, references=1, photometric=False, effort="fast"),
         row(70, 0, crf=35.0),
         row(9, 0, kind="ngp"),
     )
     rungs = read_ladder(path, "splats", 23.0)
     assert [r.sender_ms for r in rungs] == [80, 50]
-    assert rungs[1].rung == Rung(Quality(0.5, 1), 1, photometric=False, preset="veryfast")
+    assert rungs[1].rung == Rung(Quality(0.5, 1), 1, photometric=False, effort="fast")
     assert [r.sender_ms for r in read_ladder(path, "splats", 50.0)] == [70]
+
+
+def test_a_sender_that_localises_plans_with_the_time_and_rate_of_tracking(tmp_path: Path) -> None:
+    """Each rung with each effort at its quality; the efforts that lost the drive are left out."""
+    tracks = (
+        track("full", 20, 1.0),
+        track("once", 12, 2.0),
+        track("half", 6, 10.0),
+        track("full", 9, 50.0, detail=0.5),
+        track("once", None, None, detail=0.5),
+        track("half", 1, 0.0, kind="ngp"),
+    )
+    rows = row(40, 0), row(30, 20, effort="fast"), row(20, 50, detail=0.5), row(5, 99, detail=0.1)
+    path = write(tmp_path / "ladder.json", *rows, tracking=tracks)
+    assert [r.sender_ms for r in read_ladder(path, "splats", 28)] == [40, 30, 20, 5]
+    planned = read_ladder(path, "splats", 28, tracking=True)
+    assert [(r.rung.tracking, r.sender_ms) for r in planned] == [
+        ("full", 60),
+        ("once", 52),
+        ("half", 46),
+        ("once", 42),
+        ("half", 36),
+        ("full", 29),
+    ]
+    rates = [r.rate_percent for r in planned]
+    assert rates == pytest.approx([1.0, 2.0, 10.0, 22.4, 32.0, 125.0])
+
+
+def test_a_ladder_without_times_of_tracking_is_none_for_a_sender_that_localises(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "ladder.json"
+    path.write_text(json.dumps({"kind": "ladder", "rows": [row(40, 0)]}))  # an older one
+    assert read_ladder(path, "splats", 28)
+    with pytest.raises(InvalidData, match=r"ladder\.json.*no times of tracking.*eval ladder"):
+        read_ladder(path, "splats", 28, tracking=True)
+    write(path, row(40, 0), tracking=(track("full", -1, 0),))
+    with pytest.raises(InvalidData, match=r"track_ms.*above 0"):
+        read_ladder(path, "splats", 28, tracking=True)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +147,7 @@ def test_a_file_that_is_no_ladder_is_refused_by_name(
         read_ladder(tmp_path / "nowhere.json", "splats", 23.0)
 
 
-@pytest.mark.parametrize("knob", [{"references": 4}, {"references": -1}, {"preset": "placebo"}])
+@pytest.mark.parametrize("knob", [{"references": 5}, {"references": -1}, {"effort": "placebo"}])
 def test_a_rung_that_is_none_is_refused(knob: dict[str, Any]) -> None:
     with pytest.raises(InvalidInput, match=f"rung.{next(iter(knob))}"):
         Rung(**knob)

@@ -79,9 +79,9 @@ def left_half(qp_offset: int, size_px: tuple[int, int] = SIZE_PX) -> QpMap:
     return qp_map_of_mask(mask, size_px, qp_offset)
 
 
-@pytest.mark.parametrize("preset", ["ultrafast", "veryfast", "medium"])
-def test_bits_go_where_the_mask_is(pair: PairMaker, preset: str) -> None:
-    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, preset=preset, crf=26))
+@pytest.mark.parametrize("effort", ["fast", "default", "thorough", "x264-veryfast"])
+def test_bits_go_where_the_mask_is(pair: PairMaker, effort: str) -> None:
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort=effort, crf=26))
     pictures = pair(*SIZE_PX)
     plain = code(encoder, pictures, FrameChoice(RENDER_ONLY, photometric=()))
     finer = code(encoder, pictures, FrameChoice(RENDER_ONLY, photometric=(), qp_map=left_half(-8)))
@@ -94,7 +94,7 @@ def test_bits_go_where_the_mask_is(pair: PairMaker, preset: str) -> None:
 
 
 def test_a_map_of_nothing_changes_no_byte(pair: PairMaker) -> None:
-    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, preset="veryfast"))
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="fast"))
     pictures = pair(*SIZE_PX)
     plain = code(encoder, pictures, FrameChoice(RENDER_ONLY))
     nothing = QpMap(np.zeros(MBS, np.int8))
@@ -106,7 +106,7 @@ def test_a_map_of_nothing_changes_no_byte(pair: PairMaker) -> None:
 def test_odd_sizes_and_the_ends_of_the_range_decode(
     pair: PairMaker, size_px: tuple[int, int], qp_offset: int
 ) -> None:
-    encoder = DeltaEncoder(CodecConfig(*size_px, preset="veryfast"))
+    encoder = DeltaEncoder(CodecConfig(*size_px, effort="fast"))
     frame, render = pair(*size_px)
     mask = np.ones((size_px[1], size_px[0]))
     choice = FrameChoice(RENDER_ONLY, qp_map=qp_map_of_mask(mask, size_px, qp_offset))

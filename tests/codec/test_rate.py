@@ -13,9 +13,13 @@ from rfcore.codec.references import INTRA, RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.sender.frame_costs import FrameCosts
 from rfcore.codec.sender.rate import CLIMB_CRF, BitsCurve, RateModel, RateTarget, bits_curve
+from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
+from rfcore.field import load_field, render_field_view
 from rfcore.image import I420
+from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView
+from rfedge.samples import sample_path
 
 PictureMaker = Callable[..., I420]
 PairMaker = Callable[..., tuple[I420, FieldView]]
@@ -112,9 +116,37 @@ def test_a_target_that_cannot_be_is_refused(size_bytes: float) -> None:
         RateTarget(size_bytes)
 
 
-def test_x264_meets_a_target(pair: PairMaker) -> None:
+@pytest.mark.sample
+@pytest.mark.slow
+def test_drives_meet_their_targets_within_a_twentieth() -> None:
+    """Each frame coded once; the first three teach the factor. Half of the rest, over all targets,
+    miss by less; at a single target the median may be a little above."""
+    misses = [misses_of_a_drive(size_bytes)[3:] for size_bytes in (2000, 4000, 8000, 16000)]
+    assert np.median(misses) < 0.05
+    assert max(map(np.median, misses)) < 0.07
+
+
+def misses_of_a_drive(size_bytes: int) -> list[float]:
+    """Return by what share each frame of the sample's drive with vehicles misses its target."""
+    field = load_field(sample_path("fields/street.rff"))
+    pictures = read_dataset(sample_path("street/transforms_drive_vehicles.json")).pictures
+    k = pictures[0].camera.intrinsics
+    encoder = DeltaEncoder(CodecConfig(k.width_px, k.height_px, crf=1))
+    state, model, misses = encoder.start(0), RateModel(), []
+    for picture in pictures:
+        view = render_field_view(field, picture.camera.rounded())
+        choice = FrameChoice(target=RateTarget(size_bytes, model))
+        made = encoder.encode(state, i420_from_rgb(picture.read()), view, choice)
+        assert made.rate is not None
+        assert made.tries == 1
+        state, model = made.state, made.rate
+        misses.append(abs(len(made.packet.payload) / size_bytes - 1))
+    return misses
+
+
+def test_a_coder_meets_a_target(pair: PairMaker) -> None:
     """Within a third once one frame has taught the factor; pictures differ by their shift."""
-    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, preset="veryfast"))
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="fast"))
     state, model, misses = encoder.start(0), RateModel(), []
     for i in range(7):
         frame, render = pair(*SIZE_PX, 3.0 * i)
@@ -129,7 +161,7 @@ def test_x264_meets_a_target(pair: PairMaker) -> None:
 
 
 def test_a_target_never_goes_below_the_crf_asked_for(pair: PairMaker) -> None:
-    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, preset="ultrafast", crf=30))
+    encoder = DeltaEncoder(CodecConfig(*SIZE_PX, effort="fast", crf=30))
     choice = FrameChoice(RENDER_ONLY, target=RateTarget(1e6))
     made = encoder.encode(encoder.start(0), *pair(*SIZE_PX), choice=choice)
     plain = encoder.encode(encoder.start(0), *pair(*SIZE_PX), choice=FrameChoice(RENDER_ONLY))

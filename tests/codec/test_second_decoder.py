@@ -14,6 +14,10 @@ import numpy as np
 import pytest
 
 from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.header import own_header
+from rfcore.codec.h264.slice_coder import Effort, MacroblockMode, SliceCoder
+from rfcore.codec.h264.splice import SpliceDecoder
 from rfcore.image import I420
 from rfedge.bench.fuzz import make_stream
 
@@ -50,6 +54,53 @@ def record(size_px: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> Recordi
     return recording
 
 
+def pattern(rng: np.random.Generator, size_px: tuple[int, int], shift: int) -> I420:
+    """Blocks with noise, shifted by so many samples."""
+    width_px, height_px = size_px
+    cells = np.random.default_rng(1).integers(30, 220, (height_px // 7 + 3, width_px // 7 + 9))
+    blocks = np.kron(cells, np.ones((7, 7), np.int64))
+    planes = []
+    for step in (1, 2, 2):
+        at = shift // step
+        part = blocks[at : at + height_px // step, 2 * at : 2 * at + width_px // step]
+        planes.append((part + rng.integers(-5, 6, part.shape)).astype(np.uint8))
+    return I420(*planes)
+
+
+def record_own_slices(
+    size_px: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> tuple[Recording, int]:
+    """A stream of our own slices, every mode forced at low and high quantisers, filtered or not;
+    and how many pictures it has, references included."""
+    config = CodecConfig(*size_px)
+    header = own_header(config)
+    coder, splice = SliceCoder(header), SpliceDecoder(header)
+    recording = Recording(splice._decoder)
+    monkeypatch.setattr(splice, "_decoder", recording)
+    rng = np.random.default_rng(2)
+    macroblocks = config.macroblocks
+    pictures = 0
+    for number in range(4 * len(MacroblockMode)):
+        mode = MacroblockMode(number % len(MacroblockMode))
+        inter = mode < MacroblockMode.INTRA_16X16
+        references = [pattern(rng, size_px, 2 * k) for k in range(number % 4 or int(inter))]
+        forced = np.where(rng.integers(0, 3, macroblocks) > 0, int(mode), -1).astype(np.int8)
+        coded = coder.encode(
+            pattern(rng, size_px, 1),
+            references,
+            12 + 11 * (number // len(MacroblockMode)),
+            effort=list(Effort)[number % 3],
+            deblocked=number % 5 > 0,
+            offsets=rng.integers(-6, 7, macroblocks).astype(np.int8),
+            forced=forced,
+        )
+        splice.predict_from(*references)
+        shown = splice.decode(coded.payload)
+        assert np.array_equal(shown.y, coded.reconstruction.y)
+        pictures += max(1, len(references)) + 1
+    return recording, pictures
+
+
 @pytest.fixture(scope="module")
 def openh264() -> Callable[[bytes, tuple[int, int], Path], list[bytes]]:
     """Return a function that decodes a stream into I420 frames."""
@@ -80,8 +131,23 @@ def test_openh264_and_ffmpeg_show_the_same_pictures(
 ) -> None:
     recording = record(size_px, monkeypatch)
     assert len(recording.pictures) == PICTURES
-    shown = openh264(b"".join(recording.units), size_px, tmp_path)
-    assert len(shown) == PICTURES
+    check_both_show(recording, PICTURES, openh264(b"".join(recording.units), size_px, tmp_path))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size_px", [(176, 144), (72, 56), (1280, 720)])
+def test_openh264_and_ffmpeg_agree_on_every_mode_of_our_own_slices(
+    size_px: tuple[int, int],
+    openh264: Callable[[bytes, tuple[int, int], Path], list[bytes]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    recording, pictures = record_own_slices(size_px, monkeypatch)
+    check_both_show(recording, pictures, openh264(b"".join(recording.units), size_px, tmp_path))
+
+
+def check_both_show(recording: Recording, pictures: int, shown: list[bytes]) -> None:
+    assert len(shown) == len(recording.pictures) == pictures
     for number, (theirs, ours) in enumerate(zip(shown, recording.pictures, strict=True)):
         planes = b"".join(np.ascontiguousarray(plane).tobytes() for plane in ours.planes)
         assert theirs == planes, f"picture {number}"

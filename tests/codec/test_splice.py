@@ -8,7 +8,7 @@ import pytest
 
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.bitstream import join_nals
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import CodecConfig, effort_of_preset
 from rfcore.codec.h264.ffmpeg import H264Decoder, PictureKind, encode_pictures
 from rfcore.codec.h264.slices import slice_options
 from rfcore.codec.sender.encoder import DeltaEncoder
@@ -49,7 +49,7 @@ def test_the_receiver_gets_the_senders_reconstruction_on_every_frame(
 )
 def test_large_pictures_splice(width_px: int, height_px: int, pair: PairMaker) -> None:
     frame, render = pair(width_px, height_px)
-    encoder = DeltaEncoder(CodecConfig(width_px, height_px, preset="ultrafast"))
+    encoder = DeltaEncoder(CodecConfig(width_px, height_px, effort="fast"))
     encoded = encoder.encode(encoder.start(0), frame, render)
     decoder = DeltaDecoder(encoder.header)
     decoded = decoder.decode(decoder.start(0), encoded.packet, render)
@@ -60,13 +60,15 @@ def test_large_pictures_splice(width_px: int, height_px: int, pair: PairMaker) -
 CONTENTS = ["street", "black", "white", "zero", "full", "noise"]
 
 
-@pytest.mark.parametrize(("crf", "preset"), [(1.0, "veryfast"), (51.0, "medium")])
+@pytest.mark.parametrize(
+    ("crf", "effort"), [(1.0, "fast"), (51.0, "default"), (1.0, "x264-veryfast")]
+)
 @pytest.mark.parametrize(("seen", "rendered"), list(product(CONTENTS, CONTENTS)))
 def test_any_frame_against_any_render_splices_at_extreme_quantisers(
     seen: str,
     rendered: str,
     crf: float,
-    preset: str,
+    effort: str,
     picture: PictureMaker,
     flat: PictureMaker,
     noise: PictureMaker,
@@ -81,7 +83,7 @@ def test_any_frame_against_any_render_splices_at_extreme_quantisers(
         "noise": lambda seed: noise(66, 50, seed),
     }
     frame, render = make[seen](1), view_of(make[rendered](2))
-    encoder = DeltaEncoder(CodecConfig(66, 50, preset=preset, crf=crf))
+    encoder = DeltaEncoder(CodecConfig(66, 50, effort, crf))
     encoded = encoder.encode(encoder.start(0), frame, render)
     decoder = DeltaDecoder(encoder.header)
     decoded = decoder.decode(decoder.start(0), encoded.packet, render)
@@ -97,7 +99,7 @@ def test_the_splice_loses_less_than_a_tenth_of_a_decibel_to_what_x264_meant(
 ) -> None:
     """It may gain: where nothing changed the splice shows the render itself, x264 a coded one."""
     frame, render = pair(320, 192)
-    config = CodecConfig(320, 192, preset=preset, crf=crf)
+    config = CodecConfig(320, 192, effort_of_preset(preset), crf)
     encoder = DeltaEncoder(config)
     encoded = encoder.encode(encoder.start(0), frame, render)
     units = encode_pictures(

@@ -42,9 +42,3 @@ def test_a_mask_that_is_no_picture_is_refused(tmp_path: Path) -> None:
 def test_an_offset_out_of_range_is_refused(mask: Path) -> None:
     with pytest.raises(InvalidInput, match="-40 and 0 must be within"):
         SteeringSettings(mask, mask_qp=-40).steering((64, 48))
-
-
-@pytest.mark.parametrize("refine_ms", [0.0, -1.0, 10_001.0, float("nan"), float("inf")])
-def test_a_time_that_cannot_be_is_refused(refine_ms: float) -> None:
-    with pytest.raises(InvalidInput, match="refine_pose_ms"):
-        SteeringSettings(refine_pose_ms=refine_ms)

@@ -307,3 +307,13 @@ def test_a_picture_outside_the_trajectory_is_left_out_when_that_is_declared(
     dataset = read_dataset(folder)
     assert [found.name for found in dataset.pictures] == ["drive_000001", "drive_000002"]
     assert dataset.sorted_out == 1
+
+
+def test_a_transforms_file_beyond_the_budget_is_refused_unread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
+    monkeypatch.setattr("rfcore.dataset.keys.MAX_JSON_BYTES", 13)
+    monkeypatch.setattr("rfcore.dataset.keys.read_file", None)  # none is to get so far
+    with pytest.raises(DatasetError, match=r"transforms\.json: 14 bytes, more than 13; split it"):
+        read_dataset(tmp_path)

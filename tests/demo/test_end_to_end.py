@@ -2,11 +2,19 @@
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import tyro
+from tyro.conf import OmitSubcommandPrefixes
+
+from rfcore.dataset import read_dataset
+from rfcore.field import load_field
+from rfedge.cli import Verb
 
 KEYS = {
     "frames",
@@ -49,9 +57,18 @@ def test_the_server_ends_up_with_the_vehicles_pictures(tiny_sample: Path, tmp_pa
         assert entry["payload_bytes"] < entry["packet_bytes"] < entry["wire_bytes"]
         assert entry["psnr_db"] > entry["rf_psnr_db"], "the delta improves on the render"
         assert set(entry["latency_ms"]) == {"p50", "p99"}
+    in_a_browser(done.stdout)
     page = (tmp_path / "demo" / "report.html").read_text()
     assert re.findall(r"(?:src|href)=.(?!data:|#)[^>]*", page) == [], "the page is self-contained"
     assert (tmp_path / "demo" / "reconstructed.mp4").stat().st_size > 0
+
+
+def in_a_browser(said: str) -> None:
+    """The line that the demo ends with names a field and a drive that `rfedge twin` takes."""
+    (command,) = re.findall(r"^in a browser: rfedge (.*)$", said, re.MULTILINE)
+    verb: Any = tyro.cli(Verb, args=shlex.split(command), config=(OmitSubcommandPrefixes,))
+    assert load_field(Path(verb.target)).primitives > 0
+    assert len(read_dataset(verb.drive).pictures) == 4
 
 
 def test_a_damaged_sample_is_one_clear_error_and_nothing_is_written(

@@ -18,7 +18,7 @@ from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.drive_file import read_drive, write_drive
 from rfedge.offline import CodingSettings, decode_drive, encode_drive
 
-SETTINGS = CodingSettings(preset="veryfast", crf=27.0)
+SETTINGS = CodingSettings(effort="fast", crf=27.0)
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def test_a_decoded_file_is_the_senders_closed_loop(
 ) -> None:
     path = tmp_path / "drive.rfv"
     write_drive(path, encode_drive(drive, field, SETTINGS))
-    encoder = DeltaEncoder(CodecConfig(96, 64, "veryfast", 27.0))
+    encoder = DeltaEncoder(CodecConfig(96, 64, "fast", 27.0))
     state = encoder.start(1)
     decoded = list(decode_drive(read_drive(path), field))
     assert [frame.sequence for frame in decoded] == [0, 1, 2, 3]
@@ -48,13 +48,13 @@ def test_a_decoded_file_is_the_senders_closed_loop(
         assert frame.frame.digest() == own.reconstruction.digest()
 
 
-def test_a_drive_coded_with_a_mask_and_refined_poses_decodes(
+def test_a_drive_coded_with_a_mask_decodes(
     drive: Dataset, field: SplatField, tmp_path: Path
 ) -> None:
     mask = np.zeros((64, 96, 3), np.uint8)
     mask[:32] = 255
     write_png(tmp_path / "mask.png", mask)
-    asked = SteeringSettings(tmp_path / "mask.png", -8, refine_pose_ms=5000.0)
+    asked = SteeringSettings(tmp_path / "mask.png", -8)
     settings = replace(SETTINGS, steering=asked.steering((96, 64)))
     plain, coded = (encode_drive(drive, field, how) for how in (SETTINGS, settings))
     bits = [sum(len(frame.packet.payload) for frame in made.frames) for made in (plain, coded)]

@@ -3,8 +3,10 @@
 import asyncio
 import importlib.util
 import json
+import os
 import re
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -18,11 +20,13 @@ import cav_agent.__main__ as agent_command
 import mec_server.__main__ as server_command
 from rfcore.dataset import read_dataset
 from rfcore.link.profile_file import read_link
+from rfcore.wire.address import Address
 from rfcore.wire.tls import TlsFiles
 from rfedge.cli import Verb
 from rfedge.cli.field_tiles import FieldPublish
 from rfedge.cli.services import CertsInit
 from rfedge.link.proxy import ProxySettings
+from rfedge.twin.web import WebSettings
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
@@ -62,18 +66,36 @@ def host_path(name: str, path: str) -> Path:
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that the one-shot service makes, by the very words it runs."""
-    folder = tmp_path_factory.mktemp("certs") / "demo"
-    words = [word.replace("/certs/demo", str(folder)) for word in command("certificates")]
-    tyro.cli(Verb, args=words[1:], config=(OmitSubcommandPrefixes,)).run()
+    """The folders that the one-shot service fills, by the very line it runs."""
+    folder = tmp_path_factory.mktemp("certificates")
+    for path in mounts("certificates").values():
+        (folder / path.lstrip("/")).mkdir(parents=True, exist_ok=True)
+    line = filled(SERVICES["certificates"]["command"][2])
+    line = re.sub(r"/(certs|keys)\b", rf"{folder}/\1", line)
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    for _ in range(2):  # when services are started again, nothing is made anew
+        subprocess.run(["sh", "-c", line], check=True, env=os.environ | {"PATH": path})
     return folder
+
+
+def mounts(name: str) -> dict[str, str]:
+    """Return where a service has its volumes, by their names."""
+    volumes = (volume.split(":") for volume in SERVICES[name].get("volumes", []))
+    return {source: target for source, target, *_ in volumes}
+
+
+def keys_of(name: str, certificates: Path) -> Path:
+    """Return what a service sees at /certs."""
+    (volume,) = (source for source, target in mounts(name).items() if target == "/certs")
+    return certificates / mounts("certificates")[volume].lstrip("/")
 
 
 def config_of(
     name: str, module: Any, certificates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Any:
     """Return what a service's program makes of its command line."""
-    words = [word.replace("/certs/demo", str(certificates)) for word in command(name)]
+    own = keys_of(name, certificates)
+    words = [re.sub("=/certs/", f"={own}/", word) for word in command(name)]
     words = [re.sub(r"=/(fields|cache)$", f"={tmp_path}", word) for word in words]
     words = [re.sub(r"=/pictures/.*$", f"={tmp_path}", word) for word in words]
     configs: list[Any] = []
@@ -103,6 +125,30 @@ def test_a_vehicle_takes_its_command_line_and_is_whom_its_certificate_names(
     assert config.vehicle == name
     assert config.transport.tls().certificate.name == f"vehicle-{name}.pem"
     assert config.loop, "a demo goes on"
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_a_service_holds_its_own_key_and_the_authority_s_only_where_it_signs(
+    name: str, certificates: Path
+) -> None:
+    if "/certs" not in mounts(name).values() or name == "certificates":
+        assert not any(volume.startswith(("keys", "authority")) for volume in mounts(name)) or (
+            name == "certificates"
+        )
+        return
+    own = keys_of(name, certificates)
+    (key,) = own.glob("*.key")
+    assert key.stat().st_mode & 0o777 == 0o600
+    assert key.name != "ca.key"
+    assert f"--tls-key=/certs/{key.name}" in command(name)
+    assert sorted(path.name for path in own.iterdir()) == ["ca.pem", key.name, f"{key.stem}.pem"]
+
+
+def test_places_of_keys_belong_to_the_user_of_the_image() -> None:
+    made = (
+        (ROOT / "Dockerfile").read_text().partition("install -d -o rfedge")[2].partition("COPY")[0]
+    )
+    assert set(mounts("certificates").values()) <= set(made.split())
 
 
 @pytest.mark.parametrize("name", running("rfedge"))
@@ -235,7 +281,21 @@ def test_everything_that_is_served_is_scraped() -> None:
     }
     serving = {name for name in OURS if any("--metrics-port" in w for w in command(name))}
     assert targets == {f"{name}:9100" for name in serving}
-    assert serving == {name for name in OURS if name in LASTING}
+    assert serving == {name for name in OURS if name in LASTING} - {"twin"}
+
+
+def test_the_twin_has_a_certificate_of_its_own_and_a_token() -> None:
+    verb: Any = tyro.cli(Verb, args=command("twin")[1:], config=(OmitSubcommandPrefixes,))
+    init: Any = tyro.cli(Verb, args=command("certificates")[1:], config=(OmitSubcommandPrefixes,))
+    assert verb.target == f"{running('mec-server')[0]}:50051"
+    assert verb.tls_key.stem.removeprefix("consumer-") in init.verb.consumers
+    assert verb.tls_key.name not in " ".join(command("watch")), "a key is one service's"
+    token = filled(SERVICES["twin"]["environment"]["RFEDGE_TWIN_TOKEN"])
+    WebSettings(Address.parse("http", verb.http), token)
+    (port,) = SERVICES["twin"]["ports"]
+    assert filled(port) == f"127.0.0.1:{ENV['TWIN_PORT']}:{verb.http.rpartition(':')[2]}"
+    assert SERVICES["twin"]["healthcheck"]["test"][2] == verb.http.rpartition(":")[2]
+    assert f":{ENV['TWIN_PORT']}/?token={token}" in filled(SERVICES["urls"]["command"][2])
 
 
 @pytest.mark.parametrize("name", SERVICES)

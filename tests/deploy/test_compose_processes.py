@@ -64,12 +64,12 @@ def test_vehicles_still_have_their_names_and_connect_to_their_links() -> None:
         assert f"--vehicle=cav-{number}" in words
         assert f"--server={PLACES[f'link-{number}'].address}:50051" in words
         root = PLACES[f"cav-{number}"].root
-        assert f"--tls-cert={root}/certs/demo/vehicle-cav-{number}.pem" in words
+        assert f"--tls-cert={root}/certs/vehicle-cav-{number}.pem" in words
 
 
 def test_the_certificates_name_the_addresses_that_are_connected_to() -> None:
     text = processes.words_of(SERVICES["certificates"], PLACES)[2]
-    hosts = text.partition("--hosts ")[2].split()
+    hosts = text.partition("--hosts ")[2].partition(";")[0].split()
     servers = [PLACES[name].address for name in SERVICES if name.startswith(("rsu", "link"))]
     assert set(servers) <= set(hosts)
     assert "cav-1 cav-2 cav-3 cav-4" in text, "vehicles are names, not places"
@@ -104,7 +104,13 @@ def test_prometheus_scrapes_the_same_targets_under_the_same_names(tmp_path: Path
             name, port = entry["labels"]["instance"].split(":")
             assert entry["targets"] == [f"{PLACES[name].address}:{port}"]
             instances.add(name)
-    assert instances == {name for name in SERVICES if SERVICES[name].lasting}
+    assert instances == {name for name in SERVICES if SERVICES[name].health == ":9100/metrics"}
+    assert SERVICES["twin"].health == ":8080/healthy"
+
+
+def test_a_service_gets_its_variables() -> None:
+    assert SERVICES["twin"].environment == {"RFEDGE_TWIN_TOKEN": ENV["TWIN_TOKEN"]}
+    assert SERVICES["rsu-a"].environment == {}
 
 
 def test_variables_are_filled_in_and_a_dollar_of_the_shell_stays_one() -> None:

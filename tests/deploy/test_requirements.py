@@ -49,7 +49,7 @@ def test_the_runtime_image_lacks_reports_and_evaluation() -> None:
     assert "torch" not in wanted("full")
 
 
-def test_the_demo_needs_no_extra() -> None:
+def test_the_demo_needs_no_extra_but_the_page_that_it_points_to() -> None:
     base = {canonicalize_name(name) for name in wanted("demo")}
     assert {"numpy", "matplotlib", "nanobind"} <= base
     assert not {"torch", "scipy", "opencv-contrib-python-headless", "pytest"} & base
@@ -102,6 +102,13 @@ def test_no_committed_file_names_a_package_index() -> None:
             assert found is None, f"{name}: {found}"
 
 
+STEPS = (
+    *("build-full", "check", "test", "test-slow"),
+    *("test-asan", "fuzz", "test-fault-core", "soak-short"),
+)
+"""What CI does on each push."""
+
+
 def ledger(tmp_path: Path, makefile: str) -> subprocess.CompletedProcess[str]:
     """Run ``.ci/run`` above a Makefile of the test's own."""
     (tmp_path / ".ci").mkdir()
@@ -113,18 +120,40 @@ def ledger(tmp_path: Path, makefile: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_ci_prints_minutes_of_every_step(tmp_path: Path) -> None:
-    done = ledger(tmp_path, "build-full check test test-slow soak-short:\n\t@true\n")
-    lines = done.stdout.splitlines()[-6:]
-    for line, step in zip(lines, ("build-full", "check", "test", "test-slow"), strict=False):
+    done = ledger(tmp_path, f"{' '.join(STEPS)}:\n\t@true\n")
+    lines = done.stdout.splitlines()[-len(STEPS) - 1 :]
+    for line, step in zip(lines, STEPS, strict=False):
         assert re.fullmatch(rf"{step} +\d+\.\d min  passed", line)
     assert re.fullmatch(r"total +\d+\.\d min  of 45", lines[-1])
     assert done.returncode == 0
 
 
 def test_ci_goes_on_after_a_step_that_failed_and_fails(tmp_path: Path) -> None:
-    done = ledger(tmp_path, "build-full test test-slow soak-short:\n\t@true\ncheck:\n\t@false\n")
+    others = " ".join(step for step in STEPS if step != "check")
+    done = ledger(tmp_path, f"{others}:\n\t@true\ncheck:\n\t@false\n")
     assert re.search(r"^check +\d+\.\d min  FAILED\ntest +\d+\.\d min  passed$", done.stdout, re.M)
     assert done.returncode == 1
+
+
+FAILING_TEST = """
+check:
+\t@mkdir -p .pytest_cache/v/cache
+\t@printf '{\\n  "tests/test_a.py::test_b": true\\n}' > .pytest_cache/v/cache/lastfailed
+\t@echo "$$PYTEST_ADDOPTS" | grep -q -- --last-failed && %s
+"""
+
+
+@pytest.mark.parametrize(
+    ("again", "outcome"), [("true", "passed at the second try"), ("false", "FAILED")]
+)
+def test_ci_runs_failed_tests_alone_once_more_and_names_them(
+    tmp_path: Path, again: str, outcome: str
+) -> None:
+    others = " ".join(step for step in STEPS if step != "check")
+    done = ledger(tmp_path, f"{others}:\n\t@true\n{FAILING_TEST % again}")
+    assert "\nflaky: tests/test_a.py::test_b\n" in done.stdout
+    assert re.search(rf"^check +\d+\.\d min  {outcome}$", done.stdout, re.M)
+    assert done.returncode == (outcome == "FAILED")
 
 
 def test_wheels_are_built_for_an_interpreter_that_is_named(tmp_path: Path) -> None:

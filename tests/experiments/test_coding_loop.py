@@ -20,7 +20,7 @@ from rfedge.offline import (
     encode_frames,
 )
 
-CONFIG = CodecConfig(96, 64, preset="ultrafast", crf=28.0)
+CONFIG = CodecConfig(96, 64, effort="fast", crf=28.0)
 
 
 @pytest.fixture(scope="module")

@@ -114,7 +114,13 @@ def test_a_module_that_lacks_something_itself_is_told_from_one_that_is_not_there
 def test_a_window_that_does_not_rise_is_refused(tmp_path, window):
     with pytest.raises(InvalidInput, match="window"):
         CompareJob(
-            Path("f.rff"), ("a@1=b",), "veryfast", tmp_path / "c.json", tmp_path, window_db=window
+            Path("f.rff"),
+            ("a@1=b",),
+            "fast",
+            "veryfast",
+            tmp_path / "c.json",
+            tmp_path,
+            window_db=window,
         )
 
 
@@ -122,6 +128,7 @@ def job_of(thumbnail, folder, **change):
     given = {
         "field": thumbnail.field,
         "drives": (thumbnail.drive,),
+        "effort": "fast",
         "preset": "ultrafast",
         "out": folder / "compare.json",
         "cells": folder / "cells",
@@ -144,7 +151,7 @@ def test_a_comparison_says_what_it_will_do_before_it_starts(compared):
     first = said.splitlines()[0]
     assert first.startswith("BD-rates over 33..36 dB: 49 clips to code, about ")
     assert "Points are added where a curve does not span the window" in said
-    assert re.search(r"rfedge-ultrafast-\w+ also at 41", said)
+    assert re.search(r"rfedge-fast-\w+ also at 41", said)
 
 
 def test_every_curve_spans_the_window_that_was_asked_for(compared):
@@ -187,7 +194,7 @@ def test_a_finished_comparison_is_not_coded_again(compared):
 
 def test_a_window_nobody_reaches_ends_the_comparison_before_its_long_part(thumbnail, tmp_path):
     job = job_of(thumbnail, tmp_path, window_db=(15.0, 18.0))
-    with pytest.raises(InvalidInput, match=r"15\.\.18 dB is not within .*rfedge-ultra.* reaches"):
+    with pytest.raises(InvalidInput, match=r"15\.\.18 dB is not within .*rfedge-fast.* reaches"):
         run_compare(job, Console(quiet=True))
     assert len(list(job.cells.iterdir())) <= 8, "our own ends alone were coded"
     assert not job.out.exists()
@@ -218,6 +225,7 @@ def test_a_decimated_drive_is_every_fifth_frame_at_a_fifth_of_the_rate(tmp_path)
         field=SAMPLES / "fields" / "street.rff",
         drives=(),
         decimated=(f"empty@10={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
+        effort="fast",
         preset="veryfast",
         out=tmp_path / "compare.json",
         cells=tmp_path / "cells",
@@ -234,7 +242,7 @@ def test_a_decimated_drive_is_every_fifth_frame_at_a_fifth_of_the_rate(tmp_path)
 
 def test_a_comparison_of_nothing_is_refused(tmp_path):
     with pytest.raises(InvalidInput, match="there is none"):
-        CompareJob(Path("field.rff"), (), "veryfast", tmp_path / "compare.json", tmp_path)
+        CompareJob(Path("field.rff"), (), "fast", "veryfast", tmp_path / "compare.json", tmp_path)
 
 
 @pytest.mark.slow
@@ -244,6 +252,7 @@ def test_a_quick_comparison_writes_rows_and_goes_on_from_its_cells(tmp_path, mon
     job = CompareJob(
         field=SAMPLES / "fields" / "street.rff",
         drives=(f"empty@10={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
+        effort="fast",
         preset="veryfast",
         out=tmp_path / "compare.json",
         cells=tmp_path / "cells",

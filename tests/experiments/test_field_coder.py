@@ -37,7 +37,7 @@ FRAMES = [i420_from_colour(street(1).render_colour(camera)) for camera in CAMERA
 
 
 def coded(field, point=23.0, **how):
-    coder = FieldCoder(render_clip(field, CAMERAS), "ours", "test", preset="veryfast", **how)
+    coder = FieldCoder(render_clip(field, CAMERAS), "ours", "test", effort="fast", **how)
     return coder.code(FRAMES, 10, point)
 
 
@@ -61,7 +61,7 @@ def test_the_references_are_told_frame_by_frame():
 def test_processor_time_holds_the_render():
     seen = render_clip(street(2), CAMERAS)
     slow = replace(seen, render_cpu_ms=1e6)
-    clip = FieldCoder(slow, "ours", "test", preset="veryfast").code(FRAMES[:2], 10, 30.0)
+    clip = FieldCoder(slow, "ours", "test", effort="fast").code(FRAMES[:2], 10, 30.0)
     assert clip.cpu_ms == pytest.approx(5e5, rel=0.1)
 
 
@@ -70,13 +70,13 @@ def test_processor_time_is_coding_and_the_frames_share_of_rendering(monkeypatch)
     clock = iter((1_000_000, 8_000_000))
     seen = replace(render_clip(street(2), CAMERAS), render_cpu_ms=40.0)
     monkeypatch.setattr(field_coder, "process_time_ns", lambda: next(clock))
-    clip = FieldCoder(seen, "ours", "test", preset="veryfast").code(FRAMES[:2], 10, 30.0)
+    clip = FieldCoder(seen, "ours", "test", effort="fast").code(FRAMES[:2], 10, 30.0)
     assert clip.cpu_ms == pytest.approx(7 + 20)
 
 
 def test_without_rendering_there_is_still_coding_to_be_timed():
     seen = replace(render_clip(street(2), CAMERAS), render_cpu_ms=0.0)
-    assert FieldCoder(seen, "ours", "test", preset="veryfast").code(FRAMES, 10, 30.0).cpu_ms > 0
+    assert FieldCoder(seen, "ours", "test", effort="fast").code(FRAMES, 10, 30.0).cpu_ms > 0
 
 
 def test_squared_errors_of_the_foreground_are_noted_frame_by_frame():
@@ -88,7 +88,7 @@ def test_squared_errors_of_the_foreground_are_noted_frame_by_frame():
 
 
 def versions(**change):
-    given = {"field": street(2), "preset": "veryfast", "program": "a"} | change
+    given = {"field": street(2), "effort": "fast", "program": "a"} | change
     field, program = given.pop("field"), given.pop("program")
     return FieldCoder(render_clip(field, CAMERAS), "ours", program, **given).version
 
@@ -96,7 +96,7 @@ def versions(**change):
 @pytest.mark.parametrize(
     "change",
     [
-        {"preset": "medium"},
+        {"effort": "x264-medium"},
         {"program": "b"},
         {"field": street(3)},
         {"references": RENDER_ONLY},
@@ -114,12 +114,12 @@ def test_the_same_codec_has_the_same_version_again():
 
 
 def test_other_poses_are_another_version():
-    near = FieldCoder(render_clip(street(2), CAMERAS), "ours", "a", preset="veryfast").version
-    far = FieldCoder(render_clip(street(2), CAMERAS[::-1]), "ours", "a", preset="veryfast").version
+    near = FieldCoder(render_clip(street(2), CAMERAS), "ours", "a", effort="fast").version
+    far = FieldCoder(render_clip(street(2), CAMERAS[::-1]), "ours", "a", effort="fast").version
     assert near != far
 
 
 def test_more_frames_than_were_rendered_are_refused():
-    coder = FieldCoder(render_clip(street(1), CAMERAS[:2]), "ours", "test", preset="veryfast")
+    coder = FieldCoder(render_clip(street(1), CAMERAS[:2]), "ours", "test", effort="fast")
     with pytest.raises(InvalidInput, match=r"1\.\.2"):
         coder.code(FRAMES, 10, 23.0)

@@ -69,7 +69,7 @@ def test_every_rung_is_measured_once_and_the_full_one_first(kind, quick):
 
 @pytest.mark.sample
 def test_a_ladder_is_measured_written_drawn_and_read_by_an_agent(tmp_path, monkeypatch):
-    rungs = [Rung(preset="veryfast"), Rung(Quality(0.1), 0, preset="ultrafast")]
+    rungs = [Rung(effort="fast"), Rung(Quality(0.1), 0, effort="fast")]
     monkeypatch.setattr(run, "rungs_for", lambda _kind, **_: rungs)
     job = LadderJob(
         [SAMPLES / "fields/street.rff"],
@@ -92,14 +92,20 @@ def test_a_ladder_is_measured_written_drawn_and_read_by_an_agent(tmp_path, monke
         assert cheap["sender_stage_ms"]["render"] < full["sender_stage_ms"]["render"]
     assert low[0]["rate_percent"] > 30
     assert [r.rung for r in read_ladder(job.out, "splats", 28)] == rungs
+    efforts = [(row["settings"]["detail"], row["tracking"]) for row in result["tracking"]]
+    assert efforts == [(d, e) for d in (1.0, 0.1) for e in ("full", "once", "half")]
+    planned = read_ladder(job.out, "splats", 28, tracking=True)
+    assert {r.rung.quality for r in planned} <= {rung.quality for rung in rungs}
+    assert all(r.sender_ms > min(row["sender_ms"] for row in result["rows"]) for r in planned)
     monkeypatch.setattr(run, "measure_rung", lambda *_: pytest.fail("measured again"))
     assert run_ladder(job, Console(quiet=True)) == result
     svg, numbers = write_ladder_figure(result, tmp_path / "figures")
     assert svg.read_text().startswith("<?xml")
     assert len(numbers.read_text().splitlines()) == 3
     page = ladder_page(result, {"run": {"curve": [[25, 26.0], [300, 28.97]]}})
-    assert "| splats 10% render-only ultrafast crf28 | yes |" in page
+    assert "| splats 10% render-only fast crf28 | yes |" in page
     assert "| run | 300 | 28.97 |" in page
+    assert "| splats 100% | half |" in page
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +114,7 @@ def measured(thumbnail):
     drive, field = read_drive(thumbnail.drive), load_field(thumbnail.field)
     seen = time_renders(field, drive, Quality())
     return {
-        references: measure_rung(drive, seen, Rung(references=references, preset="ultrafast"), 28.0)
+        references: measure_rung(drive, seen, Rung(references=references, effort="fast"), 28.0)
         for references in (3, 0)
     }
 
@@ -141,7 +147,7 @@ def test_bits_of_a_rung_are_those_of_whole_messages_in_the_steady_state(measured
         render_clip(field, drive.cameras),
         "ours",
         "test",
-        preset="ultrafast",
+        effort="fast",
         references=RENDER_ONLY,
     )
     clip = coder.code(drive.frames, 10, 28.0)

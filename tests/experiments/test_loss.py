@@ -103,7 +103,7 @@ def drive(thumbnail):
 @pytest.fixture(scope="module")
 def coder(drive, thumbnail):
     seen = render_clip(load_field(thumbnail.field), drive.cameras)
-    return FrameCoder(drive.frames, seen, "ultrafast", 30.0)
+    return FrameCoder(drive.frames, seen, "fast", 30.0)
 
 
 def crossing_of(drive, share, rtt_s=0.05, seed=1):

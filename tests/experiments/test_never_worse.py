@@ -88,7 +88,9 @@ def test_a_row_tells_excess_without_header_and_whether_it_holds(tmp_path, seen):
         )
         for f in drive().frames
     ]
-    table = NeverWorse(Drive(drive().name, drive().pictures, noisy), seen, "veryfast", "test")
+    table = NeverWorse(
+        Drive(drive().name, drive().pictures, noisy), seen, "fast", "veryfast", "test"
+    )
     rows = list(table.rows(CellStore(tmp_path)))
     assert [(row.control, row.at_db) for row in rows] == [
         (control, db) for control in CONTROLS for db in (31.0, 33.0, 35.0)
@@ -105,7 +107,7 @@ def test_a_row_tells_excess_without_header_and_whether_it_holds(tmp_path, seen):
 
 def test_a_job_without_drives_is_refused():
     with pytest.raises(InvalidInput, match="drives"):
-        NeverWorseJob(Path("f.rff"), (), (), "veryfast", Path("o.json"), Path("cells"))
+        NeverWorseJob(Path("f.rff"), (), (), "fast", "veryfast", Path("o.json"), Path("cells"))
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +117,7 @@ def on_the_thumbnail(thumbnail, tmp_path_factory):
         field=thumbnail.field,
         drives=(thumbnail.drive,),
         decimated=(),
+        effort="fast",
         preset="ultrafast",
         out=folder / "never.json",
         cells=folder / "cells",
@@ -162,6 +165,7 @@ def test_on_the_sample_no_field_makes_it_worse(tmp_path):
         field=SAMPLES / "fields" / "street.rff",
         drives=(f"empty@10={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
         decimated=(),
+        effort="fast",
         preset="veryfast",
         out=tmp_path / "never.json",
         cells=tmp_path / "cells",

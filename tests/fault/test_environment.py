@@ -22,19 +22,20 @@ from rfedge.certs.authority import Members, certify, write_certificates
 
 STORM = 200
 ADMITTED = 64
+LISTED_S = 20.0
 STORM_S = 6.0
 """Long enough for a 99th percentile, with those who were admitted staying."""
 
 
 @pytest.mark.usefixtures("as_root")
 async def test_a_full_disk(site: Any, case: Any, appears: Any, tmp_path: Path) -> None:
-    case.about("disk full", "recording to a tmpfs of 64 KiB")
+    case.about("disk full", "recording to a tmpfs of 64 KiB", "F19")
     small = tmp_path / "small"
     small.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", small], check=True)
     try:
-        server = await site.server("--save", str(small))
-        bystander = site.start_vehicle(server.address, "bystander")
+        server = await site.server("--record", str(small))
+        bystander = site.start_vehicle(server.address, "bystander", "--allow-recording")
         await appears(lambda: server.entries("recording stopped, streaming goes on"))
         full_s = time.time()
         await appears(lambda: len(bystander.acked(full_s)) >= 10)
@@ -61,7 +62,7 @@ async def test_a_full_disk(site: Any, case: Any, appears: Any, tmp_path: Path) -
 async def test_a_damaged_field(
     site: Any, street: Any, case: Any, coded: Any, raw_vehicle: Any, tmp_path: Path
 ) -> None:
-    case.about("field file damaged", "a bit flipped, cut in half, under a server that runs")
+    case.about("field file damaged", "a bit flipped, cut in half, under a server that runs", "F20")
     store = tmp_path / "store"
     store.mkdir()
     for path in street.store.glob("*.rff"):
@@ -76,24 +77,29 @@ async def test_a_damaged_field(
     before_bytes = server.rss_bytes()
     for damaged in (bytes(flipped), bytes(good[: len(good) // 2])):
         (store / f"{street.other_id}.rff").write_bytes(damaged)
-        async with raw_vehicle(server.address) as vehicle:
-            await vehicle.say(replace(coded.hello, field_ids=(street.other_id,)))
-            statuses.append(await vehicle.end())
-            told.append(await vehicle.stream.details())
-    await asyncio.sleep(1.0)  # long enough for the bystander to send some pictures
+        async with asyncio.timeout(LISTED_S):
+            while True:  # a new file is listed by the second look that finds it the same
+                async with raw_vehicle(server.address) as vehicle:
+                    await vehicle.say(replace(coded.hello, field_ids=(street.other_id,)))
+                    status, said = await vehicle.end(), await vehicle.stream.details()
+                if status is not grpc.StatusCode.NOT_FOUND:
+                    break
+                await asyncio.sleep(0.2)
+        statuses.append(status)
+        told.append(said)
     case.over()
     case.holds("DATA_LOSS, naming the sum", set(statuses) == {grpc.StatusCode.DATA_LOSS})
     case.holds("and the file's", all(street.other_id in text for text in told))
     case.at_most("memory grows by", (server.rss_bytes("VmHWM") - before_bytes) / 1e6, 32, "MB")
     errors = [str(entry["error"]) for entry in server.entries("stream closed")]
-    case.holds("log says it", sum(street.other_id in error for error in errors) == 2)
+    case.holds("log says it", all(any(text in error for error in errors) for text in told))
     await case.spares(bystander)
     case.finish()
 
 
 async def test_a_viewer_that_does_not_read(streaming: Any, case: Any) -> None:
     server, bystander = streaming
-    case.about("viewer that does not read", "Watch, and nothing taken from the stream")
+    case.about("viewer that does not read", "Watch, and nothing taken from the stream", "F7")
     await case.calm()
     async with AsyncExitStack() as stack:
         for _ in range(4):
@@ -117,7 +123,7 @@ async def test_a_viewer_that_does_not_read(streaming: Any, case: Any) -> None:
 
 
 async def test_an_expired_certificate(site: Any, case: Any, tmp_path: Path) -> None:
-    case.about("certificate expired", "a vehicle's certificate of 60 days ago, good for 30")
+    case.about("certificate expired", "a vehicle's certificate of 60 days ago, good for 30", "F24")
     members = Members(("cav-1", "bystander"))
     now = datetime.now(UTC)
     for folder, age in (("old", timedelta(days=60)), ("new", timedelta())):
@@ -149,13 +155,52 @@ async def test_an_expired_certificate(site: Any, case: Any, tmp_path: Path) -> N
     case.finish()
 
 
+async def test_a_revoked_certificate(site: Any, case: Any, appears: Any, tmp_path: Path) -> None:
+    case.about(
+        "certificate revoked, and let in again", "a line in the server's --access file", "F24"
+    )
+    root, access = tmp_path / "certs", tmp_path / "access.toml"
+    members = Members(("cav-1", "bystander"))
+    write_certificates(root, certify(members, datetime.now(UTC), days=2))
+    access.write_text("")
+
+    def tls(name: str) -> tuple[str, ...]:
+        files = {"--tls-cert": f"{name}.pem", "--tls-key": f"{name}.key", "--tls-ca": "ca.pem"}
+        return tuple(str(x) for option, file in files.items() for x in (option, root / file))
+
+    server = await site.server(*tls("server"), "--access", str(access))
+    bystander = await site.vehicle(server.address, "bystander", *tls("vehicle-bystander"))
+    victim = await site.vehicle(server.address, "cav-1", *tls("vehicle-cav-1"))
+    await case.calm()
+    access.write_text('revoked = ["spiffe://rfedge/vehicle/cav-1"]')
+    revoked_s = time.time()
+    await appears(lambda: server.entries("call ended"))
+    case.at_most("its open stream is ended", time.time() - revoked_s, 2)
+    await appears(lambda: victim.entries("stream given up for now"))
+    (told, *_) = victim.entries("stream given up for now")
+    case.holds("vehicle's log says revoked", "revoked" in told["problem"])
+    case.holds("no frame of it is taken any more", victim.acked(revoked_s + 2) == [])
+    await asyncio.sleep(1.0)  # long enough for the bystander to send some pictures
+    access.write_text("")
+    again_s = time.time()
+    await appears(lambda: victim.acked(again_s))
+    case.over()
+    case.at_most("back after it is let in again", victim.acked_at_s(again_s)[0] - again_s, 10)
+    counted = server.value("rfedge_server_refused_certificates_total")
+    case.holds("metric counts it", counted >= 1)
+    await case.spares(bystander)
+    case.finish()
+
+
 def held(server: Any, kind: str) -> int:
     """Return how many descriptors ("fd") or threads ("task") a server has."""
     return len(list(Path(f"/proc/{server.process.pid}/{kind}").iterdir()))
 
 
 async def test_a_storm_of_connections(site: Any, case: Any, coded: Any) -> None:
-    case.about(f"{STORM} vehicles at once", f"{STORM} connections, {ADMITTED} streams allowed")
+    case.about(
+        f"{STORM} vehicles at once", f"{STORM} connections, {ADMITTED} streams allowed", "F22 L5"
+    )
     server = await site.server("--max-streams", str(ADMITTED))
     bystander = await site.vehicle(server.address, "bystander")
     descriptors, threads = held(server, "fd"), held(server, "task")
@@ -188,6 +233,9 @@ async def test_a_storm_of_connections(site: Any, case: Any, coded: Any) -> None:
         case.over()
         counts = Counter(ended for ended, _ in told)
         refused = STORM - counts["welcome"]
+        told_what = ", ".join(f"{status} {n}" for status, n in sorted(counts.items()))
+        case.bounds.append("statuses")
+        case.measured.append(told_what)
         case.holds(
             f"some admitted, at most {ADMITTED - 1}, all others RESOURCE_EXHAUSTED",
             0 < counts["welcome"] < ADMITTED and counts["RESOURCE_EXHAUSTED"] == refused,
@@ -197,7 +245,9 @@ async def test_a_storm_of_connections(site: Any, case: Any, coded: Any) -> None:
         counted = [server.value("rfedge_server_limited_total", limit=limit) for limit in limits]
         case.holds("metric counts the refused", sum(counted) == refused)
         closed = [entry for entry in server.entries("stream closed") if entry["error"]]
-        case.holds("log has them", len(server.entries("stream refused") + closed) == refused)
+        # A stream beyond the budget is refused before it is one, and counted; others are logged.
+        unlogged = server.value("rfedge_server_log_lines_suppressed_total") + counted[0]
+        case.holds("log has those refused at their Hello", len(closed) + unlogged >= refused)
     while server.value("rfedge_server_sessions") > 1:
         await asyncio.sleep(0.01)
     await case.spares(bystander)

@@ -79,7 +79,7 @@ def wire(as_root: None) -> Iterator[Wire]:  # noqa: ARG001
 
 
 async def test_a_silent_partition(wire: Wire, site: Any, case: Any, appears: Any) -> None:
-    case.about("silent partition of 10 s", "nft drop between network namespaces, both ways")
+    case.about("silent partition of 10 s", "nft drop between network namespaces, both ways", "F4")
     reachable = ("--allow-insecure", "--decoder", "in-process")
     server = await site.server(
         *reachable, listen=f"{wire.far_address}:0", within=wire.within(wire.far)
@@ -102,6 +102,31 @@ async def test_a_silent_partition(wire: Wire, site: Any, case: Any, appears: Any
     old = [x for x in victim.lines() if cut_s < x["capture_time_ns"] / 1e9 < healed_s - 1.0]
     case.holds("nothing from meanwhile is sent", all(x["result"] != "acked" for x in old))
     case.recovers_exactly(victim, healed_s)
+    await case.spares(bystander)
+    case.finish()
+
+
+async def test_a_link_that_flaps(wire: Wire, site: Any, case: Any, appears: Any) -> None:
+    case.about("link down for 1 s, every 3 s", "ip link set down and up, three times", "F5")
+    reachable = ("--allow-insecure", "--decoder", "in-process")
+    far, near = wire.within(wire.far), wire.within(wire.near)
+    server = await site.server(*reachable, listen=f"{wire.far_address}:0", within=far)
+    bystander = await site.vehicle(server.address, "bystander", "--allow-insecure", within=far)
+    victim = await site.vehicle(server.address, "cav-1", "--allow-insecure", within=near)
+    await case.calm()
+    back_s = []
+    for _ in range(3):
+        subprocess.run([*near, "ip", "link", "set", "rfnear", "down"], check=True)
+        await asyncio.sleep(1.0)
+        subprocess.run([*near, "ip", "link", "set", "rfnear", "up"], check=True)
+        up_s = time.time()
+        await appears(lambda since=up_s: victim.acked(since))
+        back_s.append(victim.acked_at_s(up_s)[0] - up_s)
+        await asyncio.sleep(2.0)
+    case.over()
+    case.at_most("slowest return of the stream", max(back_s), 2)
+    epochs = [x["epoch"] for x in victim.acked()]
+    case.holds("epochs only grow", epochs == sorted(epochs))
     await case.spares(bystander)
     case.finish()
 
@@ -151,7 +176,9 @@ async def middlebox(to: str) -> AsyncIterator[tuple[Middlebox, str]]:
 
 async def test_a_middlebox_that_forwards_nothing(site: Any, case: Any, appears: Any) -> None:
     """Every byte is acknowledged here, so only frames that nobody answers tell."""
-    case.about("middlebox that forwards nothing for 10 s", "a TCP proxy, connections left open")
+    case.about(
+        "middlebox that forwards nothing for 10 s", "a TCP proxy, connections left open", "F4"
+    )
     server = await site.server()
     bystander = await site.vehicle(server.address, "bystander")
     async with middlebox(server.address) as (box, address):
@@ -186,7 +213,9 @@ def write_collapse(folder: Path, good_s: float, bad_s: float) -> Path:
 
 
 async def test_a_collapse_of_the_rate(site: Any, case: Any, appears: Any, tmp_path: Path) -> None:
-    case.about("rate collapse 10 -> 0.3 Mbit/s for 6 s", "rfedge link with a trace; CRF 1, 20 Hz")
+    case.about(
+        "rate collapse 10 -> 0.3 Mbit/s for 6 s", "rfedge link with a trace; CRF 1, 20 Hz", "F8"
+    )
     server = await site.server()
     bystander = await site.vehicle(server.address, "bystander")
     ready = tmp_path / "link-ready"

@@ -61,7 +61,7 @@ async def test_damaged_packets(
 ) -> None:
     server, bystander = streaming
     rng = random.Random(SEED)
-    case.about(f"{damage.__name__} packets", f"every other message of 50 Hz, seed {SEED}")
+    case.about(f"{damage.__name__} packets", f"every other message of 50 Hz, seed {SEED}", "F9 F10")
     answers: Counter[str] = Counter()
     wrong, sent = 0, 0
     async with raw_vehicle(server.address) as vehicle:
@@ -91,7 +91,7 @@ async def test_damaged_packets(
 
 async def test_replayed_packets(streaming: Any, case: Any, coded: Any, raw_vehicle: Any) -> None:
     server, bystander = streaming
-    case.about("replayed packets", "each frame again, and those of an older epoch")
+    case.about("replayed packets", "each frame again, and those of an older epoch", "F11")
     told: Counter[tuple[str, str]] = Counter()
     async with raw_vehicle(server.address) as vehicle:
         await vehicle.greet(coded.hello)
@@ -116,7 +116,7 @@ async def test_replayed_packets(streaming: Any, case: Any, coded: Any, raw_vehic
 
 async def test_reordered_packets(streaming: Any, case: Any, coded: Any, raw_vehicle: Any) -> None:
     server, bystander = streaming
-    case.about("reordered packets", "pairs sent the wrong way round")
+    case.about("reordered packets", "pairs sent the wrong way round", "F11")
     told: Counter[str] = Counter()
     exact = True
     async with raw_vehicle(server.address) as vehicle:
@@ -149,7 +149,9 @@ async def test_a_wrong_field_version(
     street: Any, streaming: Any, case: Any, coded: Any, raw_vehicle: Any
 ) -> None:
     server, bystander = streaming
-    case.about("wrong field version", "Hello with another field's id; frames with its prefix")
+    case.about(
+        "wrong field version", "Hello with another field's id; frames with its prefix", "F12"
+    )
     await case.calm()
     async with raw_vehicle(server.address) as vehicle:
         notice = await vehicle.ask(replace(coded.hello, field_ids=(street.other_id,)))
@@ -180,7 +182,9 @@ async def test_poses_that_are_not_numbers(
     streaming: Any, case: Any, coded: Any, raw_vehicle: Any
 ) -> None:
     server, bystander = streaming
-    case.about("poses of NaN, infinity, 1e30 m, no rotation", "one number of each other frame")
+    case.about(
+        "poses of NaN, infinity, 1e30 m, no rotation", "one number of each other frame", "F14"
+    )
     values = itertools.cycle([math.nan, math.inf, -math.inf, 1e30])
     fields = itertools.cycle(["x_m", "y_m", "z_m", "rotation_w", "rotation_z"])
     refused = taken = 0
@@ -224,7 +228,7 @@ async def compressing(address: str) -> AsyncIterator[Any]:
 
 async def test_a_gzip_bomb(streaming: Any, case: Any) -> None:
     server, bystander = streaming
-    case.about("gzip bomb", "messages of 64 MiB of zeros, compressed to 64 KiB")
+    case.about("gzip bomb", "messages of 64 MiB of zeros, compressed to 64 KiB", "F15")
     before_bytes = server.rss_bytes()
     await case.calm()
     bomb, statuses = bytes(64 << 20), []
@@ -242,8 +246,10 @@ async def test_a_gzip_bomb(streaming: Any, case: Any) -> None:
 
 async def test_a_resolution_bomb(streaming: Any, case: Any, coded: Any, raw_vehicle: Any) -> None:
     server, bystander = streaming
-    case.about("resolution bomb", "SPS of 4096x2304 for a 76x52 stream: in Hello, in a payload")
-    large = DeltaEncoder(CodecConfig(4096, 2304, "ultrafast")).header
+    case.about(
+        "resolution bomb", "SPS of 4096x2304 for a 76x52 stream: in Hello, in a payload", "F16"
+    )
+    large = DeltaEncoder(CodecConfig(4096, 2304, "fast")).header
     (camera,) = coded.hello.cameras
     small = camera.codec
     header = StreamHeader(small.config, large.sps, large.pps)
@@ -278,7 +284,7 @@ async def test_a_clock_that_is_wrong(
     skew_s: int, streaming: Any, case: Any, coded: Any, raw_vehicle: Any
 ) -> None:
     server, bystander = streaming
-    case.about(f"clock {skew_s:+} s off", "capture times of one vehicle")
+    case.about(f"clock {skew_s:+} s off", "capture times of one vehicle", "F18")
     taken = 0
     async with raw_vehicle(server.address) as vehicle:
         await vehicle.greet(coded.hello)

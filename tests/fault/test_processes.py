@@ -23,7 +23,7 @@ async def port_opens(address: str) -> float:
 
 
 async def test_kill_9_of_the_server(site: Any, case: Any, appears: Any) -> None:
-    case.about("server killed", "kill -9, then started again on its port")
+    case.about("server killed", "kill -9, then started again on its port", "F1")
     first = await site.server()
     vehicle = await site.vehicle(first.address, "cav-1")
     killed_s = first.send(signal.SIGKILL)
@@ -43,7 +43,7 @@ async def test_kill_9_of_the_server(site: Any, case: Any, appears: Any) -> None:
 
 
 async def test_kill_9_of_an_agent(site: Any, case: Any, appears: Any) -> None:
-    case.about("vehicle killed", "kill -9")
+    case.about("vehicle killed", "kill -9", "F2")
     server = await site.server("--decoder", "child")
     bystander = await site.vehicle(server.address, "bystander")
     victim = await site.vehicle(server.address, "cav-1")
@@ -65,7 +65,7 @@ async def test_kill_9_of_an_agent(site: Any, case: Any, appears: Any) -> None:
 async def test_kill_9_of_a_decoder(
     site: Any, case: Any, coded: Any, raw_vehicle: Any, appears: Any
 ) -> None:
-    case.about("decoder process killed", "kill -9 of the process of one camera")
+    case.about("decoder process killed", "kill -9 of the process of one camera", "F17")
     server = await site.server("--decoder", "child")
     (of_bystander,) = server.decoders()
     bystander = await site.vehicle(server.address, "bystander")
@@ -100,7 +100,7 @@ async def test_kill_9_of_a_decoder(
 
 
 async def test_an_agent_stopped_for_5_s(site: Any, case: Any, appears: Any) -> None:
-    case.about("vehicle stopped for 5 s", "SIGSTOP, SIGCONT")
+    case.about("vehicle stopped for 5 s", "SIGSTOP, SIGCONT", "F3")
     server = await site.server()
     bystander = await site.vehicle(server.address, "bystander")
     victim = await site.vehicle(server.address, "cav-1")
@@ -120,7 +120,7 @@ async def test_an_agent_stopped_for_5_s(site: Any, case: Any, appears: Any) -> N
 
 
 async def test_a_server_stopped_for_5_s(site: Any, case: Any, appears: Any) -> None:
-    case.about("server stopped for 5 s", "SIGSTOP, SIGCONT")
+    case.about("server stopped for 5 s", "SIGSTOP, SIGCONT", "F3")
     server = await site.server()
     vehicle = await site.vehicle(server.address, "cav-1")
     stopped_s = server.send(signal.SIGSTOP)
@@ -138,7 +138,7 @@ async def test_a_server_stopped_for_5_s(site: Any, case: Any, appears: Any) -> N
 
 
 async def test_a_rolling_restart(site: Any, case: Any, appears: Any) -> None:
-    case.about("server replaced", "SIGTERM, then another process on its port")
+    case.about("server replaced", "SIGTERM, then another process on its port", "F25")
     first = await site.server()
     vehicles = [await site.vehicle(first.address, f"cav-{i}") for i in range(2)]
     told_s = first.send(signal.SIGTERM)

@@ -119,6 +119,7 @@ def array_entry(**change: Any) -> dict[str, Any]:
     [
         (array_entry(shape=[2_000_000_000, 59]), "472000000000 bytes does not fit"),
         (array_entry(shape=[2**63, 2**63, 2**63]), "does not fit"),
+        (array_entry(shape=[0, 2**62]), r"shape \[0, 4611686018427387904\], of nothing"),
         (array_entry(shape=[-1]), r"shape \[-1\]"),
         (array_entry(shape=[True]), r"shape \[True\]"),
         (array_entry(shape=[1.0]), r"shape \[1.0\]"),

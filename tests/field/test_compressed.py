@@ -13,7 +13,14 @@ from hypothesis import strategies as st
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import FieldFormatError, InvalidInput
-from rfcore.field import FieldMetadata, Quality, SplatField, load_field, save_field
+from rfcore.field import (
+    FieldMetadata,
+    Quality,
+    SplatField,
+    load_field,
+    save_field,
+    splat_archive,
+)
 from rfcore.field.archive import Archive, decode_archive, encode_archive
 from rfcore.field.quality import DETAILS, LevelOfDetail, kept_of
 from rfcore.field.splat_archive import compressed_archive, splats_of_compressed
@@ -170,7 +177,8 @@ def with_encoding(field: SplatField, change: dict[str, Any]) -> bytes:
     [
         ({"name": "grid-2"}, "'grid-2' is not 'grid-1'"),
         ({"count": 2_000_000_000}, "count: 2000000000 is not a whole number"),
-        ({"count": 50_000_000}, "a bomb"),
+        ({"count": 50_000_000}, "raise it"),
+        ({"count": 1_000_000}, "a bomb"),
         ({"count": 21}, "does not hold"),
         ({"count": -1}, "count: -1"),
         ({"count": True}, "count: True"),
@@ -231,7 +239,7 @@ def test_streams_made_to_harm_give_splats_or_are_refused(
 
 
 def test_a_count_that_lies_allocates_nothing(make_gaussians) -> None:
-    lie = with_encoding(field_of(make_gaussians(20, 3)).compressed(), {"count": 50_000_000})
+    lie = with_encoding(field_of(make_gaussians(20, 3)).compressed(), {"count": 5_000_000})
     tracemalloc.start()
     try:
         with pytest.raises(FieldFormatError, match="a bomb"):
@@ -239,3 +247,27 @@ def test_a_count_that_lies_allocates_nothing(make_gaussians) -> None:
         assert tracemalloc.get_traced_memory()[1] < 10 * len(lie) + 1_000_000
     finally:
         tracemalloc.stop()
+
+
+def test_splats_decoded_in_parts_are_those_decoded_at_once(
+    make_gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field = field_of(make_gaussians(700, 2), 0.5, 0.1)
+    at_once = splats_of_compressed(field.compressed().archive())
+    monkeypatch.setattr(splat_archive, "SPLATS_AT_ONCE", BLOCK)
+    in_parts = splats_of_compressed(field.compressed().archive())
+    for one, other in zip(
+        (at_once[0], *at_once[1].values()), (in_parts[0], *in_parts[1].values()), strict=True
+    ):
+        for name in vars(one):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_a_field_beyond_the_memory_it_may_take_is_refused_before_it_is_decoded(
+    make_gaussians,
+) -> None:
+    data = encode_field(field_of(make_gaussians(700, 3)).compressed())
+    size_bytes = 700 * 59 * 4
+    assert decode_field(data, max_bytes=size_bytes).primitives == 700
+    with pytest.raises(FieldFormatError, match=r"700 of SH degree 3 take 0\.00 GB of memory, over"):
+        decode_field(data, max_bytes=size_bytes - 1)

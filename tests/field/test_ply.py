@@ -1,5 +1,6 @@
 """INRIA .ply files: exact both ways, by header name, refused with a reason."""
 
+import os
 import tracemalloc
 from pathlib import Path
 
@@ -10,11 +11,17 @@ from hypothesis import strategies as st
 
 from rfcore.camera import TileOrigin
 from rfcore.errors import FieldFormatError
-from rfcore.field.ply import read_ply, read_ply_antialiased, write_ply
+from rfcore.field import ply_table
+from rfcore.field.ply import write_ply
 from rfcore.field.ply_table import read_vertices, write_vertices
+from rfcore.field.splat_file import read_splat_file
 from rfcore.raster.gaussians import Gaussians
 
 NAMES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+
+
+def read_ply(path: Path, tile_origin: TileOrigin | None = None, **limits: int) -> Gaussians:
+    return read_splat_file(path, tile_origin, **limits)[0]
 
 
 def assert_equal(a: Gaussians, b: Gaussians) -> None:
@@ -220,13 +227,12 @@ def test_text_that_is_not_rows_of_numbers_is_refused_by_name(
         read_ply(tmp_path / "b.ply")
 
 
-@pytest.mark.parametrize("suffix", ["splat", "ksplat", "spz", "sog", "SPZ"])
-@pytest.mark.parametrize("read", [read_ply, read_ply_antialiased])
+@pytest.mark.parametrize("suffix", ["splat", "ksplat", "sog", "SOG"])
 def test_other_formats_of_splats_are_refused_with_the_command_that_converts_them(
-    tmp_path: Path, suffix: str, read
+    tmp_path: Path, suffix: str
 ) -> None:
     with pytest.raises(FieldFormatError, match=rf"splat-transform a\.{suffix} a\.ply$"):
-        read(tmp_path / f"a.{suffix}")
+        read_ply(tmp_path / f"a.{suffix}")
 
 
 @pytest.mark.parametrize("suffix", ["gltf", "glb"])
@@ -243,7 +249,7 @@ def test_how_splats_are_drawn_survives_a_ply_and_changes_no_splat(
 ) -> None:
     gaussians = make_gaussians(3, 1)
     write_ply(tmp_path / "a.ply", gaussians, antialiased=antialiased)
-    assert read_ply_antialiased(tmp_path / "a.ply") is antialiased
+    assert read_splat_file(tmp_path / "a.ply")[1] is antialiased
     assert_equal(read_ply(tmp_path / "a.ply"), gaussians)
 
 
@@ -274,19 +280,19 @@ def test_every_spelling_in_use_is_read_and_the_last_counts(
     write_ply(tmp_path / "a.ply", make_gaussians(1, 0))
     lines = "".join(f"comment {text}\n" for text in comments)
     edited(tmp_path / "a.ply", "element vertex", f"{lines}element vertex")
-    assert read_ply_antialiased(tmp_path / "a.ply") is stated
+    assert read_splat_file(tmp_path / "a.ply")[1] is stated
 
 
 def test_a_mode_there_is_not_is_refused_by_name(make_gaussians, tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", make_gaussians(1, 0), antialiased=True)
     edited(tmp_path / "a.ply", "SplatRenderMode: mip", "SplatRenderMode: 2dgs")
     with pytest.raises(FieldFormatError, match="'SplatRenderMode: 2dgs' names neither mode"):
-        read_ply_antialiased(tmp_path / "a.ply")
+        read_splat_file(tmp_path / "a.ply")
 
 
 def test_the_header_of_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FieldFormatError, match=r"none\.ply: cannot be read"):
-        read_ply_antialiased(tmp_path / "none.ply")
+        read_splat_file(tmp_path / "none.ply")
 
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
@@ -302,3 +308,40 @@ def test_a_count_that_lies_allocates_nothing(make_gaussians, tmp_path: Path, for
         assert tracemalloc.get_traced_memory()[1] < 1_000_000
     finally:
         tracemalloc.stop()
+
+
+def test_a_sparse_file_of_a_terabyte_is_one_error(make_gaussians, tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", make_gaussians(3, 3))
+    header, end, _ = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(header.replace(b"vertex 3", b"vertex 4000000000") + end)
+    os.truncate(tmp_path / "a.ply", 10**12)
+    with pytest.raises(FieldFormatError, match=r"4000000000 of SH degree 3 take 944\.00 GB"):
+        read_ply(tmp_path / "a.ply")
+    with pytest.raises(FieldFormatError, match=r"4000000000 vertices take 9\d\d\.00 GB"):
+        read_vertices(tmp_path / "a.ply", ())
+
+
+def test_a_terminal_is_told_nothing_by_a_header(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(b"ply\nformat \x1b]0;owned\x07 1.0\nend_header\n")
+    with pytest.raises(FieldFormatError) as refused:
+        read_ply(tmp_path / "a.ply")
+    assert "format ?]0;owned? 1.0" in str(refused.value)
+    assert str(refused.value).isprintable()
+
+
+def test_splats_beyond_the_memory_they_may_take_are_refused(make_gaussians, tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", make_gaussians(3, 0))
+    assert_equal(read_ply(tmp_path / "a.ply", max_bytes=3 * 56), make_gaussians(3, 0))
+    with pytest.raises(FieldFormatError, match="raise it"):
+        read_ply(tmp_path / "a.ply", max_bytes=3 * 56 - 1)
+
+
+def test_parts_of_a_file_make_the_whole(
+    make_gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gaussians = make_gaussians(10, 1)
+    write_ply(tmp_path / "a.ply", gaussians)
+    as_text(tmp_path / "a.ply", tmp_path / "b.ply")
+    monkeypatch.setattr(ply_table, "ROWS_AT_ONCE", 3)
+    for name in ("a.ply", "b.ply"):
+        assert_equal(read_ply(tmp_path / name), gaussians)

@@ -20,12 +20,13 @@ from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from cav_agent.vehicle import Vehicle
-from mec_server.config import ServerConfig
+from mec_server.config import RecordSettings, ServerConfig
 from mec_server.reconstruction import OpenCameras, open_cameras
 from mec_server.server import EdgeServer
-from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.camera import Camera, Intrinsics, Pose, camera_on_rig
+from rfcore.codec.h264.config import CodecConfig, CoderSettings
 from rfcore.dataset import read_dataset
+from rfcore.dataset.rig import RIG_FILE, Rig, RigCamera, write_rig
 from rfcore.field import SplatField, save_field
 from rfcore.image import write_png
 from rfcore.raster.gaussians import Gaussians
@@ -81,6 +82,42 @@ def write_drive(folder: Path, field: SplatField) -> None:
     (folder / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
 
 
+def on_rig(yaw_rad: float, x_m: float = 0.0) -> Pose:
+    """Return camera_from_rig of a camera turned to the right and moved along x."""
+    turn = Pose((0.0, 0.0, 0.0), (math.cos(yaw_rad / 2), 0.0, math.sin(yaw_rad / 2), 0.0))
+    return Pose((x_m, 0.1, 0.0), turn.rotation).inverse()
+
+
+def write_rig_drives(folder: Path, field: SplatField, cameras: int, frames: int = FRAMES) -> Path:
+    """Write a rig of ``cameras`` that look at the field side by side; return its file."""
+    rng = np.random.default_rng(11)
+    rig = Rig(
+        tuple(
+            RigCamera(f"cam{i}", on_rig(0.05 * (i - cameras // 2), 0.02 * i), folder / f"cam{i}")
+            for i in range(cameras)
+        )
+    )
+    for camera in rig.cameras:
+        entries = []
+        assert camera.drive is not None
+        camera.drive.mkdir(parents=True)
+        for i in range(frames):
+            world_from_rig = Pose((0.05 * i, 0.0, -0.2 * i), (1.0, 0.0, 0.0, 0.0))
+            pose = camera_on_rig(world_from_rig, camera.camera_from_rig)
+            colour = field.render(Camera(INTRINSICS, pose)).colour
+            rgb = np.clip(colour * 255 + rng.normal(scale=4, size=colour.shape), 0, 255)
+            write_png(camera.drive / f"{i:03}.png", rgb.astype(np.uint8))
+            rows = zip(pose.rotation_matrix(), pose.translation_m, strict=True)
+            opengl = [[r[0], -r[1], -r[2], t] for r, t in rows]
+            matrix = [*opengl, [0, 0, 0, 1]]
+            entries.append({"file_path": f"{i:03}.png", "transform_matrix": matrix})
+        top = {"w": 76, "h": 52, "fl_x": 50.0, "fl_y": 50.0, "cx": 38.0, "cy": 26.0}
+        text = json.dumps({**top, "frames": entries})
+        (camera.drive / "transforms.json").write_text(text)
+    write_rig(folder / RIG_FILE, rig)
+    return folder / RIG_FILE
+
+
 @dataclass(frozen=True)
 class Street:
     """A field with its id, a store that holds it, a drive, and a store with another field."""
@@ -121,10 +158,10 @@ class CodedStreet:
 @pytest.fixture(scope="session")
 def coded(street: Street) -> CodedStreet:
     pictures = read_dataset(street.drive).pictures
-    pipeline = Pipeline(street.field, CodecConfig(76, 52, "ultrafast"), time.perf_counter_ns)
+    pipeline = Pipeline(street.field, CodecConfig(76, 52, "fast"), time.perf_counter_ns)
     camera = CameraDescription("front", INTRINSICS, pipeline.header)
     contract = RendererContract(RENDERER_CONTRACT, exact=True)
-    hello = Hello("cav-raw", (camera,), (street.field_id,), contract)
+    hello = Hello("cav-raw", (camera,), (street.field_id,), contract, allow_recording=True)
     prefix = bytes.fromhex(street.field_id)[:8]
     frames = []
     for i, picture in enumerate(pictures):
@@ -148,6 +185,8 @@ def serve(street: Street) -> Callable[..., Any]:
 
     @asynccontextmanager
     async def run(opened: OpenCameras = open_cameras, **changes: Any) -> AsyncIterator[EdgeServer]:
+        if "record" in changes:
+            changes["record"] = RecordSettings(changes["record"])
         config = replace(ServerConfig(street.store, "127.0.0.1:0"), **secured(changes))
         server = EdgeServer(config, opened)
         await server.start()
@@ -180,7 +219,8 @@ def travel(street: Street, tmp_path: Path) -> Callable[..., Awaitable[DriveRecor
             street.store,
             pace=PaceKind.LOCKSTEP,
             field=street.field_id,
-            preset="ultrafast",
+            coding=CoderSettings(effort="fast", check_decode=True),
+            allow_recording=True,
             report=report,
         )
         counts = await Vehicle(replace(config, **secured(changes))).run()
@@ -281,6 +321,10 @@ class Driving:
         name = "rfedge_agent_handovers_total"
         return int(self._vehicle.registry.get_sample_value(name, {"cause": cause}) or 0)
 
+    def value(self, name: str) -> float | None:
+        """Return a metric without labels."""
+        return self._vehicle.registry.get_sample_value(name)
+
     async def until(self, holds: Callable[[], bool]) -> None:
         """Wait until something holds, while the vehicle drives."""
         async with asyncio.timeout(60):
@@ -306,7 +350,8 @@ def vehicle(street: Street, tmp_path: Path) -> Callable[..., Any]:
             street.drive,
             street.store,
             pace=PaceKind.LOCKSTEP,
-            preset="ultrafast",
+            coding=CoderSettings(effort="fast", check_decode=True),
+            allow_recording=True,
             report=tmp_path / "driving.jsonl",
         )
         config = replace(config, **changes)

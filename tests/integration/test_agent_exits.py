@@ -11,7 +11,7 @@ from typing import Any
 async def end_of_agent(street: Any, server: str, *more: str) -> tuple[int, list[str]]:
     """Run an agent to its end; return its status and its lines that are no log entries."""
     given = {"server": server, "drive": street.drive, "fields": street.store}
-    given |= {"field": street.field_id, "preset": "ultrafast", "pace": "lockstep"}
+    given |= {"field": street.field_id, "effort": "fast", "pace": "lockstep"}
     arguments = [part for name, value in given.items() for part in (f"--{name}", str(value))]
     agent = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "cav_agent", *arguments, *more, stderr=subprocess.PIPE

@@ -133,7 +133,7 @@ async def test_a_hello_of_another_resolution_is_refused_by_name_and_may_be_corre
             assert isinstance(nack, Nack)
             assert nack.problem.startswith(named)
         large = replace(camera.intrinsics, width_px=152)
-        config = CodecConfig(152, 52, "ultrafast")
+        config = CodecConfig(152, 52, "fast")
         bad = replace(camera, intrinsics=large, codec=StreamHeader(config, header.sps, header.pps))
         nack = await vehicle.ask(replace(coded.hello, cameras=(bad,)))
         assert isinstance(nack, Nack)

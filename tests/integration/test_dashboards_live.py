@@ -21,7 +21,7 @@ from rfedge.demo.processes import command_of
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy" / "prometheus"
-PATIENCE_S = 240.0
+PATIENCE_S = 90.0
 
 pytestmark = [pytest.mark.slow, pytest.mark.prometheus]
 
@@ -123,7 +123,7 @@ async def street_in_motion(street: Any, folder: Path) -> AsyncIterator[dict[str,
         ports = {}
         server = await start(
             *command_of("mec-server"), "--fields", street.store, "--listen", "127.0.0.1:0",
-            "--metrics-port", 0, "--ready-file", folder / "server", "--save", folder / "saved",
+            "--metrics-port", 0, "--ready-file", folder / "server", "--record", folder / "saved",
         )  # fmt: skip
         ports["mec-server"] = await server.says(metrics_port)
         address = await written(folder / "server")
@@ -135,7 +135,8 @@ async def street_in_motion(street: Any, folder: Path) -> AsyncIterator[dict[str,
         agent = await start(
             *command_of("cav-agent"), "--server", await written(folder / "link"), "--loop",
             "--drive", street.drive, "--fields", street.store,
-            "--rate", 5, "--preset", "ultrafast", "--metrics-port", 0,
+            "--rate", 5, "--effort", "fast", "--localise", "--metrics-port", 0,
+            "--allow-recording",
         )  # fmt: skip
         ports["cav-agent"] = await agent.says(metrics_port)
         watcher = await start(*command_of("rfedge"), "watch", address, "--encoding", "jpeg")

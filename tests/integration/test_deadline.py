@@ -11,7 +11,7 @@ import pytest
 
 from rfcore.errors import InvalidData
 
-FULL, LOW = "100% 3ref ultrafast", "10% sh0 render-only ultrafast"
+FULL, LOW = "100% 3ref fast", "10% sh0 render-only fast"
 
 
 def write_ladder(path: Path, full_ms: float, low_ms: float) -> Path:
@@ -20,7 +20,7 @@ def write_ladder(path: Path, full_ms: float, low_ms: float) -> Path:
     def row(ms: float, rate: float, **knobs: Any) -> dict[str, Any]:
         settings = {
             "kind": "splats", "detail": 1.0, "sh_degree": None, "samples_per_ray": None,
-            "scale": 1.0, "references": 3, "photometric": True, "preset": "ultrafast",
+            "scale": 1.0, "references": 3, "photometric": True, "effort": "fast",
             "crf": 23.0, **knobs,
         }  # fmt: skip
         return {"settings": settings, "sender_ms": ms, "receiver_ms": 1.0, "rate_percent": rate}
@@ -44,7 +44,7 @@ async def drive(street: Any, tmp_path: Path, *more: str) -> list[dict[str, Any]]
             await asyncio.sleep(0.005)
         given = {"server": ready.read_text().strip(), "drive": street.drive}
         given |= {"fields": street.store, "field": street.field_id, "pace": "lockstep"}
-        given |= {"preset": "ultrafast", "report": report}
+        given |= {"effort": "fast", "report": report}
         arguments = [part for name, value in given.items() for part in (f"--{name}", str(value))]
         agent = await start(sys.executable, "-m", "cav_agent", *arguments, *more)
         assert await agent.wait() == 0
@@ -84,6 +84,15 @@ async def test_frames_on_different_rungs_follow_each_other_in_one_stream(
     assert [line["rung"] for line in record.lines[:2]] == [LOW, FULL]
     for line in record.lines:
         assert line["server_digest"] == line["reconstruction_digest"]
+
+
+async def test_a_vehicle_that_localises_wants_a_ladder_with_times_of_tracking(
+    serve: Any, travel: Any, tmp_path: Path
+) -> None:
+    ladder = write_ladder(tmp_path / "ladder.json", 1e3, 1e-3)
+    async with serve() as server:
+        with pytest.raises(InvalidData, match=r"no times of tracking.*rfedge eval ladder"):
+            await travel(server.address, deadline_ms=33.0, ladder=ladder, localise=True)
 
 
 async def test_a_deadline_without_a_ladder_says_how_to_make_one(

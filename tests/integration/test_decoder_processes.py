@@ -27,16 +27,42 @@ def processes_of_decoders() -> list[int]:
 
 
 @pytest.mark.parametrize(
-    "kind", [DecoderKind.CHILD, pytest.param(DecoderKind.BUBBLEWRAP, marks=pytest.mark.slow)]
+    "kind",
+    [
+        DecoderKind.CHILD,
+        DecoderKind.LANDLOCK,
+        pytest.param(DecoderKind.BUBBLEWRAP, marks=pytest.mark.slow),
+    ],
 )
 async def test_where_it_is_decoded_changes_no_byte(kind: Any, serve: Any, travel: Any) -> None:
     async with serve(decoder=DecoderKind.IN_PROCESS) as server:
         here = await travel(server.address)
-    async with serve(decoder=kind) as server:
+    async with serve(decoder=kind, sandbox_as_root=True) as server:
         there = await travel(server.address)
     assert here.counts == there.counts == {"acked": 6}
     for key in ("reconstruction_digest", "server_digest", "payload_bytes"):
         assert [line[key] for line in here.lines] == [line[key] for line in there.lines]
+
+
+async def test_a_decoder_that_hangs_holds_no_worker(
+    coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    async with (
+        serve(decoder=DecoderKind.CHILD, workers=1) as server,
+        raw_vehicle(server.address) as vehicle,
+    ):
+        (of_vehicle,) = processes_of_decoders()
+        await vehicle.greet(coded.hello)
+        assert await vehicle.told(coded.frames[0]) == ("ack", 0)
+        async with raw_vehicle(server.address) as other:
+            await other.greet(replace(coded.hello, vehicle_id="cav-other"))
+            os.kill(of_vehicle, signal.SIGSTOP)
+            hung = asyncio.create_task(vehicle.told(coded.frames[1]))
+            for frame in coded.frames[:3]:
+                assert isinstance(await other.ask(frame), Ack)
+            assert not hung.done(), "the others are served while it is waited for"
+            assert await hung == ("decoder_failed", 1)
+            assert await other.farewell() is not None
 
 
 async def test_a_decoder_killed_between_frames_costs_the_next_one_and_no_other_vehicle(

@@ -17,6 +17,7 @@ from cav_agent.handover import ServedTile
 from cav_agent.metrics import AgentMetrics
 from cav_agent.server_connection import server_connections
 from rfcore.camera import TileOrigin
+from rfcore.codec.h264.config import CoderSettings
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import FieldMetadata, FieldStore, SplatField, save_field
 from rfcore.wire.tiles import Tile
@@ -25,7 +26,9 @@ from rfcore.wire.tiles import Tile
 @pytest.fixture
 def config(street: Any) -> AgentConfig:
     """Nobody listens at the server's address: what is not in the store cannot be fetched."""
-    config = AgentConfig("127.0.0.1:1", street.drive, street.store, preset="ultrafast")
+    config = AgentConfig(
+        "127.0.0.1:1", street.drive, street.store, coding=CoderSettings(effort="fast")
+    )
     return replace(config, limits=replace(config.limits, give_up_s=0.05))
 
 
@@ -48,13 +51,13 @@ async def test_tiles_of_one_field_share_what_is_prepared(street: Any, config: Ag
     )
     assert west is east
     assert west.field.field_id == street.field_id
-    assert west.codec.size_px == (76, 52)
+    assert west.cameras[0].codec.size_px == (76, 52)
     assert len(west.pictures) == 6
 
 
 async def test_a_field_that_is_here_needs_no_server(street: Any, config: AgentConfig) -> None:
     prepared = await cache_of(config).prepared(served(street.field_id))
-    assert prepared.rungs.current.preset == "ultrafast"
+    assert prepared.rungs.current.effort == "fast"
 
 
 async def test_a_failure_is_not_kept(street: Any, config: AgentConfig, tmp_path: Path) -> None:

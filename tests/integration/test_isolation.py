@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from mec_server.config import AdmissionLimits, DecoderKind
+from mec_server.connection_cap import ConnectionCap
 from mec_server.decode_jobs import DecodeJob, OpenJob
 from mec_server.metrics import BackgroundTask
 from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
@@ -298,6 +300,35 @@ async def publications_fail(scene: Scene) -> Any:
     return server
 
 
+async def fields_fail(scene: Scene) -> Any:
+    async with scene.serve() as server:
+        scene.patch.setattr(server._index, "refresh", surprise)
+        await until(lambda: failed(server, BackgroundTask.FIELDS))
+        await drive_on(scene, server)
+        looked = threading.Event()
+        scene.patch.setattr(server._index, "refresh", looked.set)
+        await asyncio.to_thread(looked.wait, 30)
+        assert looked.is_set()
+    return server
+
+
+async def connections_fail(scene: Scene) -> Any:
+    sweep, looked = "mec_server.connection_cap.ConnectionCap.sweep", threading.Event()
+
+    def seen(_: ConnectionCap) -> Counter[str]:
+        looked.set()
+        return Counter()
+
+    async with scene.serve() as server:
+        scene.patch.setattr(sweep, surprise)
+        await until(lambda: failed(server, BackgroundTask.CONNECTIONS))
+        await drive_on(scene, server)
+        scene.patch.setattr(sweep, seen)
+        await asyncio.to_thread(looked.wait, 30)
+        assert looked.is_set()
+    return server
+
+
 async def opening_fails(scene: Scene) -> Any:
     def opened(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
         return surprise() if job.hello.vehicle_id == "cav-bad" else open_cameras(job, fields, tools)
@@ -368,8 +399,8 @@ async def decoder_start_fails(scene: Scene) -> Any:
 
 
 async def recording_fails(scene: Scene) -> Any:
-    scene.patch.setattr("mec_server.recorder.write_png", surprise)
-    async with scene.serve(save=scene.folder) as server:
+    scene.patch.setattr("mec_server.recorder.png_bytes", surprise)
+    async with scene.serve(record=scene.folder) as server:
         await drive_on(scene, server)
         await until(lambda: failed(server, BackgroundTask.RECORDING))
         assert counted(server, "rfedge_server_recording") == 0
@@ -385,8 +416,28 @@ async def drive_on(scene: Scene, server: Any) -> None:
         assert await vehicle.farewell() is grpc.StatusCode.OK
 
 
+async def access_fails(scene: Scene) -> Any:
+    scene.patch.setattr("mec_server.server.SWEEP_EVERY_S", 0.001)
+    async with scene.serve() as server:
+        sweep, swept = server._guard.sweep, asyncio.Event()
+        scene.patch.setattr(server._guard, "sweep", surprise)
+        await until(lambda: failed(server, BackgroundTask.ACCESS))
+
+        def good_again() -> None:
+            swept.set()
+            sweep()
+
+        scene.patch.setattr(server._guard, "sweep", good_again)
+        async with asyncio.timeout(30):
+            await swept.wait()
+        return server
+
+
 SABOTAGE: dict[BackgroundTask, Callable[[Scene], Awaitable[Any]]] = {
     BackgroundTask.PUBLICATIONS: publications_fail,
+    BackgroundTask.ACCESS: access_fails,
+    BackgroundTask.FIELDS: fields_fail,
+    BackgroundTask.CONNECTIONS: connections_fail,
     BackgroundTask.OPENING: opening_fails,
     BackgroundTask.OUTCOME: outcome_fails,
     BackgroundTask.CLOSING: closing_fails,

@@ -7,7 +7,7 @@ from typing import Any
 import grpc
 import pytest
 
-from mec_server.config import VehicleQuota
+from mec_server.config import IdentityBudget, ServerBudget
 from rfcore.wire.conventions import AGENT_PROCESS, RETRY_AFTER
 from rfcore.wire.messages import Hello, Nack
 
@@ -25,15 +25,16 @@ def with_camera(hello: Hello, camera_id: str) -> Hello:
 async def test_a_stream_beyond_the_vehicles_own_is_refused_and_another_vehicles_is_not(
     coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
-    async with AsyncExitStack() as stack, serve(quota=VehicleQuota(streams=2)) as server:
+    two = IdentityBudget(streams=2)
+    async with AsyncExitStack() as stack, serve(identity_budget=two) as server:
         for name in ("front", "rear"):
             vehicle = await stack.enter_async_context(raw_vehicle(server.address))
             await vehicle.greet(with_camera(coded.hello, name))
         third = await stack.enter_async_context(raw_vehicle(server.address))
         await third.say(with_camera(coded.hello, "left"))
         assert await third.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
-        assert "2 streams open, 2 may be" in await third.stream.details()
-        assert limited(server, "vehicle_streams") == 1
+        assert "2 streams, asked for 1 more, 2 may be" in await third.stream.details()
+        assert limited(server, "identity_streams") == 1
         other = await stack.enter_async_context(raw_vehicle(server.address))
         await other.greet(replace(coded.hello, vehicle_id="cav-other"))
         assert await vehicle.farewell() is grpc.StatusCode.OK
@@ -44,11 +45,12 @@ async def test_a_stream_beyond_the_vehicles_own_is_refused_and_another_vehicles_
 async def test_a_stream_beyond_the_servers_is_refused_before_it_said_anything(
     coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
-    async with serve(max_streams=1) as server, raw_vehicle(server.address) as vehicle:
+    one = ServerBudget(streams=1)
+    async with serve(server_budget=one) as server, raw_vehicle(server.address) as vehicle:
         await vehicle.greet(coded.hello)
         async with raw_vehicle(server.address) as other:
             assert await other.end() is grpc.StatusCode.RESOURCE_EXHAUSTED
-            assert "1 streams are open" in await other.stream.details()
+            assert "have 1 streams" in await other.stream.details()
         assert limited(server, "server_streams") == 1
         assert await vehicle.told(coded.frames[0]) == ("ack", 0)
 
@@ -56,15 +58,17 @@ async def test_a_stream_beyond_the_servers_is_refused_before_it_said_anything(
 async def test_frames_beyond_the_rate_are_answered_with_the_limit(
     coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
-    quota = VehicleQuota(frames_per_s=2)
-    async with serve(quota=quota) as server, raw_vehicle(server.address) as vehicle:
+    budget = IdentityBudget(messages_per_s=2)
+    async with serve(identity_budget=budget) as server, raw_vehicle(server.address) as vehicle:
         await vehicle.greet(coded.hello)
         answers = [await vehicle.ask(frame) for frame in coded.frames]
         refused = [a for a in answers if isinstance(a, Nack)]
         assert len(refused) >= 1, "six frames, two a second"
         assert {str(nack.reason) for nack in refused} == {"overloaded"}
-        assert refused[0].problem == "frame_rate: more than 2 frames a second"
-        assert limited(server, "frame_rate") == len(refused)
+        assert refused[0].problem.startswith(
+            "identity_messages: more than 2 messages a second; come again in "
+        )
+        assert limited(server, "identity_messages") == len(refused)
         assert await vehicle.farewell() is grpc.StatusCode.OK
 
 
@@ -120,7 +124,7 @@ async def test_streams_of_one_agent_process_may_share_a_camera(
 async def test_an_agent_that_fell_silent_is_replaced_by_another_and_told_why(
     coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mec_server.quotas.CAMERA_SILENT_S", 0.0)
+    monkeypatch.setattr("mec_server.ledger.active_cameras.CAMERA_SILENT_S", 0.0)
     async with (
         serve() as server,
         raw_vehicle(server.address) as silent,
@@ -138,7 +142,8 @@ async def test_a_hello_refused_for_its_camera_holds_nothing(
     coded: Any, serve: Any, raw_vehicle: Any
 ) -> None:
     """Two streams are allowed: one that was refused must not use up the second."""
-    async with serve(quota=VehicleQuota(streams=2)) as server, raw_vehicle(server.address) as first:
+    two = IdentityBudget(streams=2)
+    async with serve(identity_budget=two) as server, raw_vehicle(server.address) as first:
         await first.greet(coded.hello)
         for _ in range(3):
             async with raw_vehicle(server.address) as refused:

@@ -25,7 +25,7 @@ PATIENT = Bounds(deadline_ms=60_000.0, on_time_percent=0.0, fairness=0.0, settli
 @pytest.fixture(scope="session")
 def recorded(street: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return prerecorded_drive(
-        street.drive, street.field, tmp_path_factory.mktemp("recorded"), "ultrafast"
+        street.drive, street.field, tmp_path_factory.mktemp("recorded"), "fast"
     )
 
 
@@ -47,7 +47,7 @@ def test_prerecorded_frames_decode_in_a_chain_and_alone(street: Any, recorded: P
 
 def test_a_coded_drive_is_coded_once(street: Any, recorded: Path) -> None:
     before = (recorded / "chain.rfv").stat().st_mtime_ns
-    again = prerecorded_drive(street.drive, street.field, recorded.parent, "ultrafast")
+    again = prerecorded_drive(street.drive, street.field, recorded.parent, "fast")
     assert (again, (again / "chain.rfv").stat().st_mtime_ns) == (recorded, before)
 
 
@@ -128,7 +128,7 @@ def test_the_command_leaves_a_page_and_rows(
         mode, 2, 5.0, 2.0, 0.5, link=root / link if link else None, kind=kind, bounds=PATIENT
     )
     field = next(street.store.glob("*.rff"))
-    bed = TestBed(field, street.drive, 2, tmp_path / "cache", tmp_path / "work", "ultrafast")
+    bed = TestBed(field, street.drive, 2, tmp_path / "cache", tmp_path / "work", "fast")
     committed = tmp_path / "results.json"
     result = Command(load, bed, tmp_path / "out", committed).run(find_limit=False)
     assert result.most_held == 2, result.runs[0].verdict.broken

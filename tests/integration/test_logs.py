@@ -37,12 +37,12 @@ async def test_the_vehicle_says_which_frame_was_lost_with_its_connection(
         async with serve() as server:
             first = LinkProxy(ProxySettings(str(server.address), uplink_bps=20e3, delay_ms=0.0))
             address = await first.start()
-            travelling = asyncio.create_task(travel(address))
+            travelling = asyncio.create_task(travel(address, crf=10.0))  # 3 kB a frame
             while not server.registry.get_sample_value(
                 "rfedge_server_frames_total", {"result": "acked", "reason": ""}
             ):
                 await asyncio.sleep(0.001)
-            while first._up.held_bytes < 300:  # the next frame is on its way, at 20 kbit/s
+            while first._up.held_bytes < 150:  # the next frame is on its way, at 20 kbit/s
                 await asyncio.sleep(0.001)
             await first.stop()
             second = LinkProxy(ProxySettings(str(server.address), listen=str(address)))

@@ -25,6 +25,8 @@ from cav_agent.config import AgentConfig, AgentLimits, PaceKind
 from cav_agent.vehicle import Vehicle
 from mec_server.config import ServerConfig
 from mec_server.server import EdgeServer
+from recorded import recorded
+from rfcore.codec.h264.config import CoderSettings
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.settings import MetricsSettings, TransportSettings
 
@@ -63,8 +65,9 @@ async def server_process(street: Any, ready: Path, *more: str) -> AsyncIterator[
 def agent_arguments(street: Any, address: str, report: Path) -> list[str]:
     given = {"server": address, "drive": street.drive, "fields": street.store}
     given |= {"camera": "front", "rate": 10, "pace": "lockstep", "field": street.field_id}
-    given |= {"preset": "ultrafast", "report": report}
-    return [part for name, value in given.items() for part in (f"--{name}", str(value))]
+    given |= {"effort": "fast", "report": report}
+    options = [part for name, value in given.items() for part in (f"--{name}", str(value))]
+    return [*options, "--allow-recording"]
 
 
 def acked_at_s(report: Path) -> list[float]:
@@ -103,7 +106,7 @@ async def test_a_vehicle_goes_on_within_a_second_of_its_killed_server_coming_bac
             pace=PaceKind.LOCKSTEP,
             loop=True,
             field=street.field_id,
-            preset="ultrafast",
+            coding=CoderSettings(effort="fast"),
             report=report,
         )
         vehicle = Vehicle(config)
@@ -132,7 +135,7 @@ async def test_a_drive_ends_with_exit_0_and_a_server_told_to_stop_does_too(
 ) -> None:
     ready, report = tmp_path / "ready", tmp_path / "report.jsonl"
     saved = tmp_path / "saved"
-    options = ("--listen", "127.0.0.1:0", "--save", str(saved), "--metrics-port", "0")
+    options = ("--listen", "127.0.0.1:0", "--record", str(saved), "--metrics-port", "0")
     async with server_process(street, ready, *options) as server:
         agent = await start(
             "cav_agent", *agent_arguments(street, ready.read_text().strip(), report)
@@ -143,7 +146,7 @@ async def test_a_drive_ends_with_exit_0_and_a_server_told_to_stop_does_too(
         _, log = await server.communicate()
         assert server.returncode == 0, log
     assert len(acked_at_s(report)) == 6
-    assert len(list((saved / "cav-1/front").glob("*.png"))) == 6
+    assert len(recorded(saved, "cav-1", "front")) == 6
     for line in log.decode().splitlines():
         assert json.loads(line)["level"] in ("info", "warning"), "logs are JSON off a terminal"
 
@@ -212,7 +215,7 @@ async def test_no_server_is_an_error_after_the_time_allowed(street: Any) -> None
         street.drive,
         street.store,
         field=street.field_id,
-        preset="ultrafast",
+        coding=CoderSettings(effort="fast"),
         limits=AgentLimits(give_up_s=0.3),
     )
     with pytest.raises(RfedgeError, match=r"no server welcomed this vehicle within 0\.3 s"):
@@ -237,7 +240,7 @@ async def test_a_disk_that_refuses_stops_the_recording_and_not_the_streaming(
     serve: Any, travel: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "cav-1").write_text("a file where the pictures' folder should be")
-    async with serve(save=tmp_path) as server:
+    async with serve(record=tmp_path) as server:
         assert server.registry.get_sample_value("rfedge_server_recording") == 1
         record = await travel(server.address)
     assert record.counts == {"acked": 6}
@@ -249,7 +252,9 @@ async def test_plaintext_is_served_to_this_machine_only_unless_allowed(serve: An
         async with serve(listen="0.0.0.0:0"):
             pass
     async with serve(
-        listen="0.0.0.0:0", transport=TransportSettings(allow_insecure=True)
+        listen="0.0.0.0:0",
+        sandbox_as_root=True,
+        transport=TransportSettings(allow_insecure=True),
     ) as server:
         assert server.address.port > 0
 
@@ -327,6 +332,9 @@ async def test_a_server_gives_its_ports_back_when_it_stops_or_cannot_start(
     assert not is_served(first)
 
 
+NO_FIELDS = "no fields to serve: every vehicle will be refused"
+
+
 async def test_a_server_without_fields_warns_and_takes_up_those_that_come(
     serve: Any, street: Any, travel: Any, tmp_path: Path
 ) -> None:
@@ -334,11 +342,14 @@ async def test_a_server_without_fields_warns_and_takes_up_those_that_come(
     folder.mkdir()
     with capture_logs() as logs:
         async with serve(fields=folder) as server:
-            (warning,) = [line for line in logs if line["log_level"] == "warning"]
-            assert warning["event"] == "no fields to serve: every vehicle will be refused"
+            (warning,) = [line for line in logs if line["event"] == NO_FIELDS]
+            assert warning["log_level"] == "warning"
             assert warning["folder"] == str(folder)
             assert "put field archives (.rff) into this folder" in warning["remedy"]
             shutil.copy(street.store / "street.rff", folder)
+            async with asyncio.timeout(30):
+                while not any(line["event"] == "fields listed" for line in logs):
+                    await asyncio.sleep(0.02)
             assert (await travel(server.address)).counts == {"acked": 6}
 
 
@@ -346,4 +357,4 @@ async def test_a_server_with_fields_does_not_warn(serve: Any) -> None:
     with capture_logs() as logs:
         async with serve():
             pass
-    assert [line for line in logs if line["log_level"] == "warning"] == []
+    assert NO_FIELDS not in {line["event"] for line in logs}

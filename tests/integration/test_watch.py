@@ -14,7 +14,7 @@ import grpc
 import numpy as np
 import pytest
 
-from mec_server.config import ConsumerLimits
+from mec_server.config import ServerBudget, SessionLimits
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import I420, read_rgb
 from rfcore.native.yuv import rgb_from_i420
@@ -104,8 +104,8 @@ async def test_a_consumer_that_never_reads_slows_no_vehicle_and_is_let_go(
     serve: Any, travel: Any
 ) -> None:
     """Its window is full after a few pictures; misses are counted; after 3 s it is let go."""
-    limits = ConsumerLimits(stalled_s=3.0)
-    async with serve(consumers=limits) as server:
+    limits = SessionLimits(stalled_s=3.0)
+    async with serve(limits=limits) as server:
         value = server.registry.get_sample_value
         async with consumer(server.address, Subscription(encoding=PictureEncoding.I420)):
             while not value("rfedge_twin_pictures_missed_total"):
@@ -121,14 +121,14 @@ async def test_a_consumer_that_never_reads_slows_no_vehicle_and_is_let_go(
 async def test_consumers_are_limited_and_one_that_leaves_makes_room(
     serve: Any, travel: Any
 ) -> None:
-    async with serve(consumers=ConsumerLimits(consumers=1)) as server:
+    async with serve(server_budget=ServerBudget(watches=1)) as server:
         value = server.registry.get_sample_value
         async with consumer(server.address, Subscription()) as first:
             await travel(server.address)
             assert isinstance(await next_of(first), TwinPicture)
             async with consumer(server.address, Subscription()) as second:
                 assert await second.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-                assert "1 consumers watch, 1 may" in await second.details()
+                assert "have 1 watches, asked for 1 more, 1 may be" in await second.details()
         while value("rfedge_twin_consumers"):
             await asyncio.sleep(0.01)
         assert value("rfedge_twin_consumers_ended_total", {"reason": "left"}) == 1
@@ -244,8 +244,8 @@ async def test_a_watcher_that_is_told_to_stop_leaves_a_whole_video(
 async def test_a_server_that_refuses_a_watcher_is_one_clear_error(
     serve: Any, watch_command: Any
 ) -> None:
-    async with serve(consumers=ConsumerLimits(consumers=0)) as server:
-        with pytest.raises(RfedgeError, match="resource_exhausted: 0 consumers watch, 0 may"):
+    async with serve(server_budget=ServerBudget(watches=0)) as server:
+        with pytest.raises(RfedgeError, match="identity_watches: this identity has 0 watches"):
             await watch_command(server.address)
 
 

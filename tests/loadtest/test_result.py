@@ -218,3 +218,13 @@ def _texts(svg: str) -> list[ElementTree.Element]:
 
 def test_vehicles_are_prerecorded_or_live_and_nothing_else() -> None:
     assert [str(kind) for kind in Vehicles] == ["prerecorded", "live"]
+
+
+def test_runs_of_one_load_are_rows_of_their_own_and_replace_those_before(tmp_path: Path) -> None:
+    path = tmp_path / "loadtest.json"
+    for on_time in (90.0, 99.5):
+        rows = [row_of(run=n, on_time_percent=on_time + n / 10) for n in (1, 2, 3)]
+        one = run_of(8, held=True)
+        record(path, LoadResult([replace(one, row=row) for row in rows]))
+    kept = rows_of(LoadRow, read_result(path)["rows"])
+    assert [(row.run, row.on_time_percent) for row in kept] == [(1, 99.6), (2, 99.7), (3, 99.8)]

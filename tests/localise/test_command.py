@@ -2,22 +2,33 @@
 
 import json
 import math
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rfcore.camera import Camera, Intrinsics, Pose
+from cav_agent.pose_feed.placing import Place
+from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
+from rfcore.dataset import read_dataset
 from rfcore.dataset.trajectory import read_trajectory
-from rfcore.errors import InvalidInput
+from rfcore.errors import InvalidData, InvalidInput
+from rfcore.field import Bounds, load_field
 from rfcore.localise.localiser import Localised, Lost, Obstacle
 from rfcore.localise.matching import Solution
+from rfcore.localise.pose_errors import PoseErrorModel
 from rfcore.motion import rotation_vector
 from rfcore.views import PosedPicture
 from rfedge.cli.localise import Localise
-from rfedge.experiments.localisation import (
+from rfedge.cli.scene import SceneConvert, SceneFeed
+from rfedge.datasets.pose_feed import FeedPlan, feed_lines
+from rfedge.experiments.localisation.feed import RecordedFeed
+from rfedge.experiments.localisation.report import write_localise_report
+from rfedge.experiments.localisation.starts import (
     Attempt,
     StartError,
+    attempts,
     displaced,
     parse_start_error,
     row_text,
@@ -43,10 +54,14 @@ def attempt(
 ) -> Attempt:
     """A search that was lost, or found a pose; right where it is within 0.01 m."""
     if error_m is None:
-        return Attempt(picture(number, time_ns), false_start, LOST, None, None, False, 100.0)
+        return Attempt(
+            picture(number, time_ns), false_start, POSE, LOST, None, None, False, 100.0, 90.0
+        )
     found = Localised(Solution(POSE, 90, 0.5), 80.0, 1)
     right = error_m < 0.01 and not false_start
-    return Attempt(picture(number, time_ns), false_start, found, error_m, 0.02, right, 300.0)
+    return Attempt(
+        picture(number, time_ns), false_start, POSE, found, error_m, 0.02, right, 300.0, 250.0
+    )
 
 
 def test_a_start_is_exactly_as_far_off_as_asked_and_mostly_level() -> None:
@@ -72,6 +87,7 @@ def test_a_summary_counts_right_poses_of_tries_and_wrong_ones_of_all() -> None:
     assert row.median_m == 0.004
     assert row.p95_m == pytest.approx(0.004 + 0.9 * 0.996)
     assert row.localise_ms == 300.0
+    assert row.localise_cpu_ms == 250.0
     assert "50.0 % of 4 localised" in row_text(row)
 
 
@@ -120,3 +136,79 @@ def test_the_command_localises_the_samples_drive(
     assert row["median_m"] < 0.03
     assert len(read_trajectory(out).poses) == 3
     assert "100.0 % of 3 localised" in capsys.readouterr().out
+
+
+@pytest.mark.sample
+def test_the_report_shows_errors_matches_and_what_was_lost(tmp_path: Path) -> None:
+    field = load_field(SAMPLES / "fields/street.rff")
+    pictures = read_dataset(SAMPLES / "street/transforms_drive_empty.json").pictures
+    done = list(attempts(field, pictures[:1], ERROR, (1, 1), 1))
+    dark = replace(pictures[1], read=lambda: np.zeros((360, 640, 3), np.uint8))
+    done += attempts(field, [dark], ERROR, (1, 0), 1)
+    out = tmp_path / "report.html"
+    write_localise_report(out, field, summary("drive", ERROR, done), done)
+    page = out.read_text()
+    assert "50.0 % of 2 pictures found their pose" in page
+    assert f"<td>{dark.name}</td><td>the picture has too few features" in page
+    assert "The best pose" in page
+    assert "The first one lost" in page
+    assert "Pictures the field cannot have" in page
+    assert page.count("data:image/jpeg;base64,") == 4
+    agree, count = re.search(r"render: (\d+) of (\d+) matches agree", page).groups()
+    assert 0.5 * int(count) < int(agree) <= int(count)
+    assert page.count("<svg") == 2
+
+
+@pytest.mark.sample
+def test_a_recorded_feed_says_where_to_search(tmp_path: Path) -> None:
+    drive, feed = SAMPLES / "street/transforms_drive_empty.json", tmp_path / "feed.jsonl"
+    SceneFeed(drive, str(feed), form="xyz", errors="gnss,rate_hz=5", seed=2).run()
+    result = tmp_path / "result.json"
+    pictures = 4
+    short = tmp_path / "drive"
+    SceneConvert(drive, short, every=6).run()
+    Localise(short, SAMPLES / "fields/street.rff", pose_feed=feed, json=str(result)).run()
+    (row,) = json.loads(result.read_text())["rows"]
+    assert row["tries"] == pictures
+    assert row["localised_percent"] == 100.0
+    assert 0.3 < row["start_m"] < 10.0
+
+
+@pytest.mark.sample
+def test_a_feed_of_another_time_is_refused(tmp_path: Path) -> None:
+    drive, feed = SAMPLES / "street/transforms_drive_empty.json", tmp_path / "feed.jsonl"
+    SceneFeed(drive, str(feed), form="xyz", start_s=1.7e9).run()
+    with pytest.raises(InvalidInput, match="see --feed-offset-s"):
+        Localise(drive, SAMPLES / "fields/street.rff", pose_feed=feed).run()
+    feed.write_text("nothing\n")
+    with pytest.raises(InvalidData, match="holds no fix"):
+        Localise(drive, SAMPLES / "fields/street.rff", pose_feed=feed).run()
+
+
+@pytest.mark.parametrize("late_s", [-0.25, 0.4])
+def test_poses_that_were_found_tell_how_late_a_feed_is(tmp_path: Path, late_s: float) -> None:
+    poses = [Pose((8.0 * math.sin(0.15 * n), 0.6 * n, 0.0), POSE.rotation) for n in range(60)]
+    times_s = [10.0 + 0.1 * n for n in range(60)]
+    pictures = [
+        replace(picture(n, round(time_s * 1e9)), camera=replace(CAMERA, world_from_cam=pose))
+        for n, (time_s, pose) in enumerate(zip(times_s, poses, strict=True))
+    ]
+    errors = PoseErrorModel(offset_m=1.0, rate_hz=5.0)
+    plan = FeedPlan("xyz", errors, times_s[0] + late_s)
+    file = tmp_path / "feed.jsonl"
+    file.write_text("".join(text for _, text in feed_lines(poses, times_s, plan)))
+    feed = RecordedFeed.read(file, 0.0)
+    place = Place(None, TileOrigin())
+    feed.priors(pictures, place, Bounds((-99, -99, -99), (99, 99, 99)), 10.0)
+    done = [
+        replace(
+            attempt(n, 0.001),
+            picture=p,
+            answer=Localised(Solution(p.camera.world_from_cam, 90, 0.5), 80.0, 1),
+        )
+        for n, p in enumerate(pictures)
+    ]
+    told = feed.time_offset(pictures, done)
+    found = re.match(r"add (-?[\d.]+) s to its times", told)
+    assert found is not None, told
+    assert float(found[1]) == pytest.approx(-late_s, abs=0.05)

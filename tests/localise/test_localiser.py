@@ -8,21 +8,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.camera import Camera, Intrinsics, Pose, Vec3
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
-from rfcore.field import FULL, Quality, RadianceField, load_field
+from rfcore.field import FULL, Quality, RadianceField, load_field, render_field_view
+from rfcore.localise.agreement import agreement, near_on_the_spot
 from rfcore.localise.localiser import (
     Localised,
     Localiser,
     LocaliserSettings,
     Lost,
     Obstacle,
-    agreement,
     median_depth,
 )
 from rfcore.localise.matching import grey
 from rfcore.localise.prior import PosePrior, moved
+from rfcore.localise.structure import halved, structure
 from rfcore.motion import rotation_vector
 from rfcore.views import PosedPicture, View
 
@@ -109,6 +110,30 @@ def test_a_pose_that_looks_unlike_is_not_claimed() -> None:
     prior = PosePrior(taken.camera.world_from_cam, 2.0, 3.0)
     answer = Localiser(field(), taken.camera.intrinsics, strict).localise(taken.read(), prior)
     assert answer == Lost(Obstacle.UNLIKE, 2)
+
+
+def test_a_pose_that_only_far_things_agree_with_is_not_claimed() -> None:
+    taken = picture(9)
+    strict = LocaliserSettings(least_on_the_spot=1.1, most_hypotheses=2)
+    prior = PosePrior(taken.camera.world_from_cam, 2.0, 3.0)
+    answer = Localiser(field(), taken.camera.intrinsics, strict).localise(taken.read(), prior)
+    assert answer == Lost(Obstacle.UNLIKE, 2)
+
+
+def on_the_spot(taken: PosedPicture, by_m: Vec3) -> float:
+    pose = moved(taken.camera.world_from_cam, by_m)
+    view = render_field_view(field(), Camera(taken.camera.intrinsics, pose))
+    picture, drawn = (structure(halved(luma)) for luma in (grey(taken.read()), view.render.y))
+    return near_on_the_spot(picture, drawn, view)
+
+
+def test_near_things_tell_a_pose_from_one_decimetres_away_that_far_things_cannot() -> None:
+    """Of poses ahead and behind, where the middle of the picture hardly moves."""
+    limit = LocaliserSettings().least_on_the_spot
+    for taken in (picture(9), picture(12, "vehicles")):
+        assert on_the_spot(taken, (0.0, 0.0, 0.0)) > 1.4 * limit
+        for by_m in ((0.0, 0.0, 0.5), (0.0, 0.0, -0.5), (0.4, 0.0, 0.0)):
+            assert on_the_spot(taken, by_m) < 0.7 * limit
 
 
 class Emptiness:

@@ -1,13 +1,14 @@
 // Codes one picture and writes every byte that came of it, for test_aarch64_slices.py to compare
 // with the bytes of the machine that runs the tests.
 //
-// usage: exactness_slices ISA THREADS SCENE RESULT (one thread, whatever is asked for)
+// usage: exactness_slices ISA THREADS SCENE RESULT
 //
-// SCENE: int32 width, height, references, qp, effort[4]; uint32 lambda_q8[52], motion_q8[52]; int8
+// SCENE: int32 width, height, references, qp, effort[6], deblocked; uint32 lambda_q8[52], motion_q8[52]; int8
 // quantiser of every macroblock; bytes Y, U, V of the picture, then of every reference.
 // RESULT: slice data; bytes Y, U, V of the reconstruction.
 #include <algorithm>
 #include <cstdint>
+#include <cstdlib>
 
 #include "exactness_file.h"
 #include "h264/slice_coder.h"
@@ -37,19 +38,23 @@ struct Planes {
     int width_, height_;
 };
 
-void run(const char* isa, const char* scene, const char* result) {
+void run(const char* isa, int threads, const char* scene, const char* result) {
     File in(scene, "rb"), out(result, "wb");
-    const auto header = in.read<std::int32_t>(8);
+    const auto header = in.read<std::int32_t>(11);
     const int width = header[0], height = header[1], references = header[2];
-    SliceCoder coder(width, height, kernels_for(isa));
+    SliceCoder coder(width, height, kernels_for(isa), threads);
     SliceSettings settings = {};
     settings.slice_qp = header[3];
-    settings.effort = {header[4], header[5], header[6] != 0, header[7]};
+    settings.effort = {header[4], header[5], header[6] != 0, header[7], header[8], header[9]};
+    settings.deblocked = header[10] != 0;
     const auto weights = in.read<std::uint32_t>(104);
     std::copy_n(weights.data(), 52, settings.lambda_q8);
     std::copy_n(weights.data() + 52, 52, settings.motion_q8);
     const auto qp = in.read<std::int8_t>(static_cast<size_t>(coder.width_mb() * coder.height_mb()));
     settings.qp = qp.data();
+    const std::vector<std::int8_t> forced(qp.size(), kAnyMode);
+    settings.forced = forced.data();
+    settings.vertical_reach = 252;
     Planes frame(in, width, height);
     std::vector<Planes> pictures;
     for (int i = 0; i < references; ++i) pictures.emplace_back(in, width, height);
@@ -68,7 +73,7 @@ void run(const char* isa, const char* scene, const char* result) {
 int main(int argc, char** argv) {
     try {
         if (argc != 5) throw std::runtime_error("usage: exactness_slices ISA THREADS SCENE RESULT");
-        run(argv[1], argv[3], argv[4]);
+        run(argv[1], std::atoi(argv[2]), argv[3], argv[4]);
     } catch (const std::exception& error) {
         std::fprintf(stderr, "exactness_slices: %s\n", error.what());
         return 1;

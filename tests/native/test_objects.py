@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 BUILD = Path(__file__).parents[2] / "build"
-OBJECTS = sorted(BUILD.glob("*/CMakeFiles/kernels_*.dir/**/*.o"))
+OBJECTS = sorted(
+    path for path in BUILD.glob("*/CMakeFiles/kernels_*.dir/**/*.o") if "asan" not in path.parts
+)
 MERGEABLE = set("vVwWu")
 """Types of `nm` for weak and unique symbols."""
 

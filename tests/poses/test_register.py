@@ -178,7 +178,7 @@ def test_too_few_pictures_are_refused(tmp_path: Path) -> None:
 def test_a_video_is_refused_with_the_commands_that_help(tmp_path: Path, folder: bool) -> None:
     video = tmp_path / "phone.MOV"
     video.write_bytes(b"\0\0\0 ftypqt")
-    with pytest.raises(DatasetError, match=r"phone\.MOV: is a video.*ffmpeg -i .*scene poses"):
+    with pytest.raises(DatasetError, match=r"phone\.MOV: is a video.*rfedge scene poses"):
         pose_dataset(tmp_path if folder else video, tmp_path / "out", None, SETTINGS)
     assert not (tmp_path / "out").exists()
 

@@ -1,13 +1,17 @@
 """Scenes with known properties, and every way to run the native rasterizer."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 
+from forward_isas import WORST_CASE, forward_isas
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.native.backend import available_isas
 from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.opencl import Device, opening
+from rfcore.raster.opencl.device import BUILDS, Build, build_device, find_device
+from rfcore.raster.opencl.self_check import check_device
 
 SceneMaker = Callable[..., Gaussians]
 CameraMaker = Callable[..., Camera]
@@ -49,6 +53,38 @@ def scene() -> SceneMaker:
 @pytest.fixture
 def camera() -> CameraMaker:
     return make_camera
+
+
+UNGUARDED = Build("unguarded", ("-DWORST_CASE", "-cl-mad-enable", "-cl-denorms-are-zero"))
+WORST = Build("worst", (*BUILDS[1].options, *UNGUARDED.options))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def worst_case_device() -> Iterator[None]:
+    """Give ``open_device`` a device called worst-case, with the build of that name."""
+
+    def open_first(wanted: str) -> Device:
+        if wanted != WORST_CASE.partition(":")[2]:
+            return first_exact(wanted)
+        device = build_device(find_device("Portable"), WORST)
+        check_device(device)
+        return device
+
+    first_exact = opening._first_exact
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(opening, "_first_exact", open_first)
+        yield
+
+
+@pytest.fixture(scope="session")
+def unguarded() -> Build:
+    """Return the options of the worst build without the kernels' precautions."""
+    return UNGUARDED
+
+
+@pytest.fixture(params=forward_isas())
+def forward_isa(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
 
 
 @pytest.fixture(params=available_isas())

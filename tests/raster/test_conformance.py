@@ -1,10 +1,10 @@
 """One body, every implementation of the splats: held to the float64 definition on the CPU.
 
-The torch definition in float32, the native kernels on every instruction set, and where there is a
-CUDA device the definition on it and gsplat. Alphas stay below every implementation's ceiling.
+The torch definition in float32, the native kernels on every instruction set and on OpenCL (which
+cannot train). Alphas stay below every implementation's ceiling.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from forward_isas import forward_isas
 from rfcore.camera import Camera
 from rfcore.native.backend import available_isas
 from rfcore.raster import reference
@@ -46,10 +47,10 @@ def native(isa: str) -> Implementation:
     def gradients(
         gaussians: Gaussians, camera: Camera, weights: np.ndarray, antialiased: bool
     ) -> dict[str, np.ndarray]:
-        trainable = TrainableRasterizer(gaussians, isa=isa, antialiased=antialiased)
-        trainable.forward(camera)
-        trainable.backward(weights)
-        return trainable.gradients()
+        rasterizer = TrainableRasterizer(gaussians, isa=isa, antialiased=antialiased)
+        rasterizer.forward(camera)
+        rasterizer.backward(weights)
+        return rasterizer.gradients()
 
     return Implementation(draw, gradients)
 
@@ -75,17 +76,21 @@ def torch_based(
     return Implementation(draw, gradients)
 
 
-def implementations() -> Iterator[str]:
-    yield "definition-float32"
-    yield from (f"native-{isa}" for isa in available_isas())
+DEFINITION_FLOAT32 = "definition-float32"
 
 
-@pytest.fixture(params=list(implementations()))
+@pytest.fixture(params=[DEFINITION_FLOAT32, *forward_isas()])
 def implementation(request: pytest.FixtureRequest) -> Implementation:
-    name = str(request.param)
-    if name.startswith("native-"):
-        return native(name.removeprefix("native-"))
-    return torch_based(reference.render)
+    return _named(str(request.param))
+
+
+@pytest.fixture(params=[DEFINITION_FLOAT32, *available_isas()])
+def trainable(request: pytest.FixtureRequest) -> Implementation:
+    return _named(str(request.param))
+
+
+def _named(name: str) -> Implementation:
+    return torch_based(reference.render) if name == DEFINITION_FLOAT32 else native(name)
 
 
 @pytest.fixture
@@ -110,14 +115,14 @@ def test_it_draws_the_definition(
 
 
 def test_its_gradients_are_those_of_the_definition(
-    implementation: Implementation, gaussians: Gaussians, camera: CameraMaker, antialiased: bool
+    trainable: Implementation, gaussians: Gaussians, camera: CameraMaker, antialiased: bool
 ) -> None:
     view_from = camera(61, 37)
     weights = np.random.default_rng(5).normal(size=(37, 61, 3)).astype(F32)
-    got = implementation.draw(gaussians, view_from, antialiased)
+    got = trainable.draw(gaussians, view_from, antialiased)
     want = DEFINITION.draw(gaussians, view_from, antialiased)
     weights[np.abs(got.opacity - want.opacity) > PICTURE_TOLERANCE] = 0
-    gradients = implementation.gradients(gaussians, view_from, weights, antialiased)
+    gradients = trainable.gradients(gaussians, view_from, weights, antialiased)
     for name, wanted in DEFINITION.gradients(gaussians, view_from, weights, antialiased).items():
         error = np.linalg.norm(gradients[name] - wanted) / np.linalg.norm(wanted)
         assert error < GRADIENT_TOLERANCE, name

@@ -43,12 +43,12 @@ def forward_camera(width_px: int = 33, height_px: int = 17) -> Camera:
 
 
 def test_every_instruction_set_and_thread_count_gives_the_same_bytes(
-    scene: SceneMaker, camera: CameraMaker, isa: str, threads: int, antialiased: bool
+    scene: SceneMaker, camera: CameraMaker, forward_isa: str, threads: int, antialiased: bool
 ) -> None:
     definition = Rasterizer(scene(700), isa="scalar", antialiased=antialiased).render(camera())
-    view = Rasterizer(scene(700), threads=threads, isa=isa, antialiased=antialiased).render(
-        camera()
-    )
+    rasterizer = Rasterizer(scene(700), threads=threads, isa=forward_isa, antialiased=antialiased)
+    view = rasterizer.render(camera())
+    assert rasterizer.isa == forward_isa
     assert view_bytes(view) == view_bytes(definition)
     assert 0.2 < float(view.opacity.mean()) < 0.95
 
@@ -144,12 +144,12 @@ def test_colour_alone_is_the_colour_of_the_view(scene: SceneMaker, camera: Camer
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_fewer_bands_are_the_picture_of_a_field_that_has_no_more(
-    scene: SceneMaker, camera: CameraMaker, isa: str, degree: int
+    scene: SceneMaker, camera: CameraMaker, forward_isa: str, degree: int
 ) -> None:
     full = scene(300, 3)
     cut = replace(full, sh=np.ascontiguousarray(full.sh[:, : (degree + 1) ** 2]))
-    want = Rasterizer(cut, isa=isa).render(camera())
-    rasterizer = Rasterizer(full, isa=isa)
+    want = Rasterizer(cut, isa=forward_isa).render(camera())
+    rasterizer = Rasterizer(full, isa=forward_isa)
     got = rasterizer.render(camera(), sh_degree=degree)
     assert view_bytes(got) == view_bytes(want)
     alone = rasterizer.render_colour(camera(), sh_degree=degree)

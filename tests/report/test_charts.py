@@ -2,6 +2,7 @@
 
 import base64
 import csv
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -158,9 +159,18 @@ def test_a_figure_without_its_numbers_is_refused(tmp_path: Path, lines: list[lis
 def test_a_difference_is_amplified_and_never_wraps() -> None:
     shown = np.array([[[0, 100, 255]]], np.uint8)
     camera = np.array([[[10, 90, 0]]], np.uint8)
-    expected = [[[10 * DIFFERENCE_GAIN, 10 * DIFFERENCE_GAIN, 255]]]
-    assert amplified_difference(shown, camera).tolist() == expected
-    assert amplified_difference(camera, shown).tolist() == expected
+    step = 10 * DIFFERENCE_GAIN
+    assert amplified_difference(shown, camera).tolist() == [[[128 - step, 128 + step, 255]]]
+    assert amplified_difference(camera, shown).tolist() == [[[128 + step, 128 - step, 0]]]
+
+
+def test_the_charts_of_the_frames_lie_in_one_frame() -> None:
+    """Side by side, frame k stands over frame k, and the axes at one height."""
+    drawn = [bytes_chart([9, 8, 7], [10, 9, 8]), quality_chart([34.0, 35.0, 36.0], [28.0] * 3)]
+    boxes = [parsed(svg).get("viewBox") for svg in drawn]
+    assert boxes[0] == boxes[1]
+    axes = [re.findall(r"<clipPath.*?>\s*<rect (.*?)/>", svg, re.DOTALL) for svg in drawn]
+    assert axes[0] == axes[1] != []
 
 
 def test_pictures_are_embedded_whole_with_their_captions() -> None:

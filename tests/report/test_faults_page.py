@@ -1,12 +1,13 @@
 """The committed page of faults is what the committed scoreboard says."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.pages.faults import FaultRow, faults_page
+from rfedge.pages.faults import ELSEWHERE, KINDS, FaultRow, faults_page
 from rfedge.results import Provenance, make_result, write_result
 
 ROOT = Path(__file__).parents[2]
@@ -67,3 +68,21 @@ def test_a_row_that_lacks_its_verdict_is_refused(tmp_path: Path) -> None:
     row = {"fault": "f", "injected_with": "i", "bound": "b", "measured": "m"}
     with pytest.raises(InvalidInput, match="lacks passed"):
         faults_page(scoreboard(tmp_path / "faults.json", row))
+
+
+def test_each_kind_of_fault_is_listed_with_the_rows_that_test_it(tmp_path: Path) -> None:
+    rows = [
+        FaultRow("it flaps", "ip link", "b", "1 s", passed=True, covers="F5 L5"),
+        FaultRow("it flaps again", "ip link", "b", "9 s", passed=False, covers="F5"),
+    ]
+    page = faults_page(scoreboard(tmp_path / "faults.json", *rows))
+    assert "| F5 | link that flaps | it flaps, it flaps again | 1 of 2 |" in page
+    assert "| L5 | connection storm | it flaps | 1 of 1 |" in page
+    assert "| F6 | packet loss x RTT x rate | **not tested** |" in page
+
+
+def test_every_kind_of_fault_has_a_case_that_names_it_or_a_command_that_measures_it() -> None:
+    sources = "".join(path.read_text() for path in (ROOT / "tests/fault").glob("test_*.py"))
+    named = {kind for text in re.findall(r'"((?:[FL]\d+ ?)+)"', sources) for kind in text.split()}
+    assert named <= set(KINDS)
+    assert set(KINDS) - named - set(ELSEWHERE) == set()

@@ -17,6 +17,7 @@ HOST = {"cpu": "C", "cores": 2, "isa": "avx2"}
 MADE = Provenance("rfedge bench codec", "abc123", False, HOST, {})
 ANY_ROW = {"bench", "ladder", "faults", "stability"}
 """Kinds that the page shows whatever their rows hold, or only counts."""
+RIG = {"link_bps": 1e6, "crf": 23.0, "rate_hz": 2.0, "max_delay_ms": 500.0}
 CODEC_ROW = {"width": 64, "sender_ms": {"render": 1.25, "total": 3.0}, "reference_ms": None}
 RUN = {
     "views": 120,
@@ -132,7 +133,7 @@ def test_a_foreign_file_is_refused_by_name(tmp_path: Path) -> None:
 
 
 def test_an_unknown_kind_is_refused_with_those_there_are(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match=r"speed\.json: kind 'speed' is none of bench, compare"):
+    with pytest.raises(InvalidInput, match=r"speed\.json: kind 'speed' is none of adapt, bench"):
         page_of(tmp_path, "speed", rows=[])
 
 
@@ -147,7 +148,8 @@ def test_rows_of_another_shape_are_refused_by_every_section(tmp_path: Path, kind
     content = {"rows": [{"colour": 1}], "needed": [{"colour": 1}], "disturbances": []}
     content |= {"frames": {"count": 1, "drive": "d"}, "equal_rate_kbps": 1.0, "quality_db": 33.0}
     content |= {"played_frames": 1, "requirement": {"share": 0.9, "frames_needed": 9}}
-    content |= {"sequences": {"empty": {"colour": 1}}}
+    content |= {"sequences": {"empty": {"colour": 1}}, "settings": RIG}
+    content |= {"ages": [{"colour": 1}], "ingest": [], "sources": [], "sessions": []}
     with pytest.raises(InvalidInput, match=r"row 0 lacks .* and has unknown colour"):
         page_of(tmp_path, kind, **content)
 

@@ -17,7 +17,7 @@ FIELD = "ab" * 32
 
 @pytest.fixture
 def hello() -> Hello:
-    header = StreamHeader(CodecConfig(32, 16, "medium", 23.0), b"\x67" * 20, b"\x68" * 5)
+    header = StreamHeader(CodecConfig(32, 16, "default", 23.0), b"\x67" * 20, b"\x68" * 5)
     intrinsics = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)
     cameras = tuple(CameraDescription(name, intrinsics, header) for name in ("front", "rear"))
     return Hello("cav-1", cameras, (FIELD,), RendererContract(RENDERER_CONTRACT, exact=True))

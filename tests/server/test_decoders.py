@@ -2,33 +2,32 @@
 
 import os
 import signal
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import structlog
 from prometheus_client import CollectorRegistry
 
 from mec_server.config import DecoderKind
-from mec_server.decoding import decoders as bubblewrap
+from mec_server.decoding import decoders as decoder_kinds
 from mec_server.decoding import pool as decoder_pool
 from mec_server.decoding import process
-from mec_server.decoding.child import ADDRESS_SPACE_BYTES
-from mec_server.decoding.decoders import Decoders, bubblewrap_command
+from mec_server.decoding.child import LIMITS
+from mec_server.decoding.decoders import Decoders, DecoderSettings, decoder_program
 from mec_server.decoding.pool import ChildDecoder, DecoderPool
-from mec_server.decoding.process import DecoderLost, LossCause, child_environment
+from mec_server.decoding.process import DecoderLost, LossCause
 from mec_server.metrics import ServerMetrics
 from rfcore.codec.h264.ffmpeg import EncoderOptions, H264Decoder, PictureKind, encode_pictures
+from rfcore.confinement import start
+from rfcore.confinement.confine import Confinement
+from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import BackendUnavailable, CodecError, RfedgeError
 from rfcore.image import I420
 
 SIZE_PX = (96, 64)
-WRAPPERS = {
-    "child": lambda: (),
-    "bubblewrap": lambda: bubblewrap_command(child_environment()),
-}
 
 
 def clip(size_px: tuple[int, int], count: int) -> list[bytes]:
@@ -53,14 +52,18 @@ def unexpected(error: Exception) -> None:
     raise AssertionError(f"a spare process could not be started: {error}")
 
 
-KINDS = ["child", pytest.param("bubblewrap", marks=pytest.mark.slow)]
-"""The sandbox takes a program that ``make test-slow`` installs."""
+KINDS = [
+    DecoderKind.CHILD,
+    DecoderKind.LANDLOCK,
+    pytest.param(DecoderKind.BUBBLEWRAP, marks=pytest.mark.slow),
+]
+"""The last one takes a program that ``make test-slow`` installs."""
 
 
 @pytest.fixture(scope="module", params=KINDS)
 def pool(request: pytest.FixtureRequest) -> Iterator[DecoderPool]:
-    """Processes with limits, and the same in a sandbox."""
-    made = DecoderPool(WRAPPERS[request.param](), lambda lost: LOST.append(lost), unexpected)
+    """Processes with limits, and those that are confined."""
+    made = DecoderPool(decoder_program(request.param), lambda lost: LOST.append(lost), unexpected)
     made.wait_until_ready()
     yield made
     made.close()
@@ -167,7 +170,7 @@ def test_a_process_has_the_limits_it_is_said_to_have(
     decoder.decode(units[0])
     lines = Path(f"/proc/{python_of(decoder)}/limits").read_text().splitlines()
     limits = {line[:26].strip(): line[26:].split()[:2] for line in lines}
-    assert limits["Max address space"] == [str(ADDRESS_SPACE_BYTES)] * 2
+    assert limits["Max address space"] == [str(LIMITS.address_space_bytes)] * 2
     assert limits["Max open files"] == ["16", "16"]
     for nothing in ("Max file size", "Max processes", "Max core file size"):
         assert limits[nothing] == ["0", "0"]
@@ -190,7 +193,8 @@ def test_bubblewrap_shows_no_network_no_process_and_no_file_of_ours(
 ) -> None:
     ours = tmp_path / "ours"
     ours.write_text("seen")
-    pool = DecoderPool(WRAPPERS["bubblewrap"](), lambda _: None, unexpected)
+    program = decoder_program(DecoderKind.BUBBLEWRAP)
+    pool = DecoderPool(program, lambda _: None, unexpected)
     decoder = pool.open(SIZE_PX)
     try:
         decoder.decode(units[0])
@@ -204,69 +208,104 @@ def test_bubblewrap_shows_no_network_no_process_and_no_file_of_ours(
             assert not (root / str(file).lstrip("/")).exists()
         mounts = (proc / "mounts").read_text().splitlines()
         writable = [m.split()[1] for m in mounts if "rw" in m.split()[3].split(",")]
-        assert all(place.startswith(("/dev", "/proc")) for place in writable), writable
+        assert writable == []
+        assert not (root / "proc").exists()
     finally:
         decoder.close()
         pool.close()
 
 
 @pytest.fixture
-def decoders() -> Callable[[DecoderKind, bool], Decoders]:
-    return lambda kind, reachable: Decoders(kind, reachable, lambda _: None, unexpected)
+def decoders() -> Callable[..., Decoders]:
+    """Make decoders; tests may run as root."""
+
+    def make(kind: DecoderKind, reachable: bool = True, as_root: bool = True) -> Decoders:
+        return Decoders(DecoderSettings(kind, reachable, as_root), lambda _: None, unexpected)
+
+    return make
+
+
+def started_kind(decoders: Decoders) -> DecoderKind:
+    decoders.start()
+    decoders.close()
+    return decoders.kind
 
 
 @pytest.mark.slow
-def test_auto_decodes_in_the_server_only_where_no_other_machine_can_reach_it(
+def test_auto_decodes_in_the_server_only_where_no_other_machine_can_reach_it(decoders: Any) -> None:
+    with structlog.testing.capture_logs() as lines:
+        assert decoders(DecoderKind.AUTO, False).kind is DecoderKind.IN_PROCESS
+    (warning,) = (line for line in lines if line["log_level"] == "warning")
+    assert warning["event"] == "decoding in the server's own process"
+    assert started_kind(decoders(DecoderKind.AUTO)) is DecoderKind.BUBBLEWRAP
+
+
+def test_auto_without_bubblewrap_takes_landlock_and_says_so(
     decoders: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert decoders(DecoderKind.AUTO, False).kind is DecoderKind.IN_PROCESS
-    exposed = decoders(DecoderKind.AUTO, True)
-    exposed.start()
-    exposed.close()
-    assert exposed.kind is DecoderKind.BUBBLEWRAP
-    monkeypatch.setattr(bubblewrap.shutil, "which", lambda _: None)
-    without = decoders(DecoderKind.AUTO, True)
-    without.start()
-    without.close()
-    assert without.kind is DecoderKind.CHILD
+    monkeypatch.setattr(start.shutil, "which", lambda _: None)
+    with structlog.testing.capture_logs() as logs:
+        assert started_kind(decoders(DecoderKind.AUTO)) is DecoderKind.LANDLOCK
+    (warning,) = [line for line in logs if line["log_level"] == "warning"]
+    assert warning["decoder"] == "landlock"
+    assert "bwrap is not on PATH" in warning["problem"]
+    assert {"event": "decoding", "decoder": "landlock", "log_level": "info"} in logs
+
+
+def test_auto_never_decodes_without_a_sandbox(
+    decoders: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(start.shutil, "which", lambda _: None)
+    monkeypatch.setitem(decoder_kinds.CONFINEMENTS, DecoderKind.LANDLOCK, "no-such-confinement")
+    with pytest.raises(BackendUnavailable, match=r"no sandbox .* ask for it: --decoder child"):
+        decoders(DecoderKind.AUTO).start()
 
 
 def test_a_sandbox_that_was_asked_for_and_cannot_be_had_is_an_error(
     decoders: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bubblewrap.shutil, "which", lambda _: None)
+    monkeypatch.setattr(start.shutil, "which", lambda _: None)
     with pytest.raises(BackendUnavailable, match=r"bwrap is not on PATH; install bubblewrap"):
-        decoders(DecoderKind.BUBBLEWRAP, True).start()
-    monkeypatch.setattr(bubblewrap.shutil, "which", lambda _: "/bin/false")
+        decoders(DecoderKind.BUBBLEWRAP).start()
+    monkeypatch.setattr(start.shutil, "which", lambda _: "/bin/false")
     with pytest.raises(BackendUnavailable, match=r"^decoder bubblewrap: .* ended with status 1"):
-        decoders(DecoderKind.BUBBLEWRAP, True).start()
+        decoders(DecoderKind.BUBBLEWRAP).start()
 
 
-NO_ROOM = (sys.executable, "-c", "raise SystemExit('no room')")
-"""What a process is started by in place of a sandbox; ends at once."""
+@pytest.mark.parametrize("kind", [DecoderKind.AUTO, DecoderKind.LANDLOCK, DecoderKind.BUBBLEWRAP])
+def test_root_decodes_in_a_sandbox_only_when_told(
+    kind: DecoderKind, decoders: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(start.os, "geteuid", lambda: 0)
+    with pytest.raises(BackendUnavailable, match="give --sandbox-as-root"):
+        decoders(kind, as_root=False).start()
+
+
+def ends_at_once(module: str = "rfcore.no_such_module") -> ConfinedProgram:
+    return ConfinedProgram(module, Confinement.LIMITS, {})
 
 
 def test_a_process_that_cannot_start_says_why() -> None:
-    pool = DecoderPool(NO_ROOM, lambda _: None, unexpected)
-    with pytest.raises(RfedgeError, match="ended with status 1 at its start: no room"):
+    pool = DecoderPool(ends_at_once(), lambda _: None, unexpected)
+    with pytest.raises(RfedgeError, match=r"ended with status 1 at its start: .*no_such_module"):
         pool.wait_until_ready()
     pool.close()
 
 
 def test_a_spare_that_cannot_be_started_is_reported_though_nobody_waits_for_it() -> None:
     failures: list[Exception] = []
-    pool = DecoderPool(NO_ROOM, lambda _: None, failures.append)
-    with pytest.raises(RfedgeError, match="no room"):
+    pool = DecoderPool(ends_at_once(), lambda _: None, failures.append)
+    with pytest.raises(RfedgeError, match="no_such_module"):
         pool.take()
     pool.close()
     assert failures
-    assert all("no room" in str(error) for error in failures)
+    assert all("no_such_module" in str(error) for error in failures)
 
 
 def test_a_lost_decoder_is_counted_by_cause(units: Sequence[bytes]) -> None:
     registry = CollectorRegistry()
     count_loss = ServerMetrics(registry).count_lost_decoder
-    made = Decoders(DecoderKind.CHILD, True, count_loss, unexpected)
+    made = Decoders(DecoderSettings(DecoderKind.CHILD), count_loss, unexpected)
     made.start()
     decoder: Any = made.open(SIZE_PX)
     os.kill(python_of(decoder), signal.SIGSEGV)

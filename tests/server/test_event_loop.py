@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mec_server import event_loop
 from mec_server.event_loop import FairQueue, LazyTimer, Workers, repeat_forever
 
 
@@ -127,6 +128,44 @@ def test_one_worker_does_work_in_the_order_of_asking() -> None:
     assert asyncio.run(run()) == list(range(100))
 
 
+def test_while_others_come_one_owner_leaves_them_a_worker_and_all_its_work_is_done() -> None:
+    async def run() -> tuple[int, int]:
+        workers = Workers(3, unexpected, crowded=lambda: True)
+        gate, lock = threading.Event(), threading.Lock()
+        two_busy, all_ended, done = threading.Event(), asyncio.Event(), asyncio.Event()
+        busy = most = 0
+
+        def work() -> None:
+            nonlocal busy, most
+            with lock:
+                busy += 1
+                most = max(most, busy)
+                if busy == 2:
+                    two_busy.set()
+            assert gate.wait(30)
+            with lock:
+                busy -= 1
+
+        def end(outcome: object) -> None:
+            ended.append(outcome)
+            if len(ended) == 8:
+                all_ended.set()
+
+        ended: list[object] = []
+        for _ in range(8):
+            workers.submit("greedy", work, end)
+        workers.submit("modest", lambda: None, lambda _: done.set())
+        await asyncio.wait_for(done.wait(), 30)
+        assert await asyncio.to_thread(two_busy.wait, 30)
+        gate.set()
+        await asyncio.wait_for(all_ended.wait(), 30)  # closing keeps no worker back for others
+        await asyncio.to_thread(workers.close)
+        await asyncio.sleep(0)
+        return most, len(ended)
+
+    assert asyncio.run(run()) == (2, 8)
+
+
 def test_outcomes_that_wait_together_wake_the_loop_once() -> None:
     async def run() -> int:
         workers, loop = Workers(1, unexpected), asyncio.get_running_loop()
@@ -181,6 +220,48 @@ async def test_workers_let_owners_take_turns() -> None:
     await last.wait()
     await asyncio.to_thread(workers.close)
     assert order == ["greedy", "modest", "greedy", "greedy", "greedy", "greedy"]
+
+
+async def test_another_thread_works_while_a_worker_waits_for_something_outside() -> None:
+    workers = Workers(1, unexpected)
+    answered, waited = threading.Event(), asyncio.Event()
+
+    def wait() -> None:
+        with workers.waiting():
+            assert answered.wait(60), "the only worker was held"
+
+    for _ in range(3):
+        waited.clear()
+        workers.submit("cav-1", wait, lambda _: waited.set())
+        workers.submit("cav-2", answered.set, lambda _: None)
+        await waited.wait()
+        answered.clear()
+    with workers.waiting():  # not a worker: nobody stands in for it
+        pass
+    workers.close()
+    assert not any(thread.is_alive() for thread in workers._threads)
+
+
+async def test_no_more_threads_than_the_limit_stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(event_loop, "MAX_SUBSTITUTES", 2)
+    workers, all_done = Workers(1, unexpected), asyncio.Event()
+    waiting = threading.Semaphore(0)
+    end = threading.Event()
+
+    def wait() -> None:
+        with workers.waiting():
+            waiting.release()
+            end.wait(60)
+
+    for number in range(8):
+        last = number == 7
+        workers.submit("cav-1", wait, lambda _, last=last: all_done.set() if last else None)
+    for _ in range(3):
+        await asyncio.to_thread(waiting.acquire)
+    assert len(workers._threads) == 3
+    end.set()
+    await all_done.wait()
+    workers.close()
 
 
 async def test_a_callback_that_raises_is_reported_and_the_next_ones_run() -> None:

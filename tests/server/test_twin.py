@@ -80,14 +80,35 @@ def test_a_consumer_gets_only_the_vehicles_it_named(view: MakeView) -> None:
     assert taken(mailbox) == [("cav-2", 0), ("cav-2", None)]
 
 
+def test_a_capture_time_in_the_far_future_freezes_nobodys_twin(view: MakeView) -> None:
+    """The server's own estimate of the time of capture counts, not what a stream claims."""
+    twin = Twin()
+    twin.show(view(session="impostor", captured_ns=2**63 - 1))
+    later = replace(view(session="own", sequence=7, captured_ns=600), reconstructed_s=10.1)
+    twin.show(later)
+    assert taken(twin.watch(Subscription(), lambda: None)) == [("cav-1", 7)]
+
+
+def test_a_consumer_gets_what_it_may_see_and_departures_of_what_it_has_seen(
+    view: MakeView,
+) -> None:
+    twin = Twin()
+    mailbox = twin.watch(Subscription(), lambda: None, lambda vehicle_id, _: vehicle_id == "cav-1")
+    for name in ("cav-1", "cav-2"):
+        twin.show(view(name, session=name))
+    for name in ("cav-1", "cav-2"):
+        twin.leave(name)
+    assert taken(mailbox) == [("cav-1", 0), ("cav-1", None)]
+
+
 def test_a_vehicle_with_two_streams_is_one_vehicle_and_the_newest_capture_wins(
     view: MakeView,
 ) -> None:
     """As in a handover: the old stream's late picture does not replace the new stream's."""
     twin = Twin()
-    twin.show(view(session="old", sequence=5, captured_ns=500))
-    twin.show(view(session="new", sequence=0, captured_ns=600))
-    twin.show(view(session="old", sequence=6, captured_ns=550))
+    for session, sequence, captured_s in (("old", 5, 9.5), ("new", 0, 9.6), ("old", 6, 9.55)):
+        shown = view(session=session, sequence=sequence)
+        twin.show(replace(shown, latency_s=shown.reconstructed_s - captured_s))
     mailbox = twin.watch(Subscription(), lambda: None)
     twin.leave("old")
     assert taken(mailbox) == [("cav-1", 0)], "the old stream takes nobody with it"

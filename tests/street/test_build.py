@@ -15,6 +15,7 @@ import pytest
 from rich.console import Console
 
 from rfcore.dataset import read_dataset, verify_manifest
+from rfcore.dataset.rig import read_rig, read_rig_drive
 from rfcore.dataset.source import read_points
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.street.build import run
@@ -247,3 +248,17 @@ def test_a_shot_says_where_it_belongs() -> None:
     files = ShotFiles.of(Path("x"), shot)
     assert files.picture_name == "train/images/000002.png"
     assert files.picture == Path("x/train/images/000002.png")
+
+
+def test_a_rig_is_recorded_with_a_file_that_the_agent_reads(tmp_path: Path) -> None:
+    drive = Drive(duration_s=0.3, rate_hz=10.0, thinned_hz=(), rig="mid_front,mid_back,low_left")
+    build(tmp_path, replace(SCENE, drive=drive), "rig", frames="0:8")
+    rig = read_rig(tmp_path)
+    assert [camera.name for camera in rig.cameras] == ["mid_front", "mid_back", "low_left"]
+    instants = read_rig_drive(rig)
+    assert len(instants) == 2, "the third is not whole"
+    for instant in instants:
+        assert instant.world_from_rig.translation_m[2] == pytest.approx(0.0, abs=1e-6)
+        heights = [p.camera.world_from_cam.translation_m[2] for p in instant.pictures.values()]
+        assert heights == pytest.approx([2.5, 2.5, 0.5], abs=1e-6)
+        assert instant.pictures["low_left"].read().shape == (18, 32, 3)

@@ -1,5 +1,6 @@
 """Effects do what their law says, and one that is not declared does not exist for a scene."""
 
+import math
 import shutil
 import subprocess
 import sys
@@ -13,9 +14,11 @@ import pytest
 
 from rfcore.camera import Pose
 from rfcore.dataset.undistort import pinhole_of, undistorted
+from rfcore.errors import InvalidInput
 from rfcore.lens import LensCamera
 from rfedge.street.assembly import apply_effects
 from rfedge.street.effects import EFFECTS, load_effect, rng_of
+from rfedge.street.effects.auto_exposure import AutoExposure
 from rfedge.street.effects.exposure import ExposureDrift
 from rfedge.street.effects.haze import Haze
 from rfedge.street.effects.lens import LensDistortion
@@ -144,6 +147,23 @@ def test_exposure_swings_by_its_stops(frame: LinearFrame) -> None:
     for time_s, gain in ((0.0, 1.0), (1.0, 2.0), (3.0, 0.5)):
         seen = drift.apply(replace(frame, time_s=time_s), rng()).colour
         np.testing.assert_allclose(seen, frame.colour * gain, rtol=1e-6)
+
+
+def test_automatic_exposure_overshoots_and_settles(frame: LinearFrame) -> None:
+    """After half a period the gain is past its aim by exp(-t / settle), a whole one before it."""
+    hunting = AutoExposure(at_s=(1.0,), steps=(1.0,), settle_s=0.5, period_s=0.4)
+    expected = {
+        0.9: 0.0,
+        1.0: 0.0,
+        1.2: 1 + math.exp(-0.4),
+        1.4: 1 - math.exp(-0.8),
+        11.0: 1.0,
+    }
+    for time_s, stops in expected.items():
+        seen = hunting.apply(replace(frame, time_s=time_s), rng()).colour
+        np.testing.assert_allclose(seen, frame.colour * 2.0**stops, rtol=1e-5)
+    with pytest.raises(InvalidInput, match="steps: are 1 at 2 times"):
+        AutoExposure(at_s=(1.0, 2.0), steps=(1.0,))
 
 
 def test_noise_has_the_mean_and_the_variance_of_its_electrons() -> None:

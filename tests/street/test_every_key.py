@@ -31,10 +31,18 @@ SPECIAL = {
     "along_m": (3.0,),
     "oncoming_m": (5.0,),
     "rate_hz": 60.0,
+    "rig": "mid_front,mid_back",
     "cameras": 17,
     "drops": 400,
     "turbidity": 4.0,
+    "side": -1,
+    "at_s": (0.2, 1.5),
+    "steps": (0.4, -0.8),
+    "day": 3,
 }
+SKY_TIMES_S = (0.0, 1.2, 1.4, 2.8, 4.2)
+ON = {"turnover": {"day": 3}}
+"""What else must be set for a key to change anything."""
 
 
 def changed(settings: Any, key: str) -> Any:
@@ -53,10 +61,15 @@ def digest(*values: Any) -> str:
 def world_digest(world: World) -> str:
     meshes = [(m.material, m.vertices, m.uv) for m in world.meshes]
     movers = [(m.world_from_mover(1.0), [mesh.vertices for mesh in m.meshes]) for m in world.movers]
+    skies = [world.sky_at(t) for t in SKY_TIMES_S] if world.sky_at else [world.sky]
     looks = [(m.colour, m.roughness) for m in world.materials.values()]
-    shown = world.sky.radiance * world.sky.exposure
-    sun = (*world.sky.sun_towards, *(world.sky.exposure * np.array(world.sky.sun_radiance)))
-    return digest(meshes, movers, looks, np.round(shown, 4), np.round(sun, 4))
+    lights = [sky_numbers(sky) for sky in skies]
+    return digest(meshes, movers, looks, lights)
+
+
+def sky_numbers(sky: Sky) -> Any:
+    sun = (*sky.sun_towards, *(sky.exposure * np.array(sky.sun_radiance)))
+    return np.round(sky.radiance * sky.exposure, 4), np.round(sun, 4)
 
 
 @pytest.fixture(autouse=True)
@@ -70,6 +83,7 @@ def low_skies(monkeypatch: pytest.MonkeyPatch) -> None:
         return overcast_sky(unevenness, white, rng, height=16)
 
     monkeypatch.setattr("rfedge.street.effects.dusk.sunny_sky", sunny)
+    monkeypatch.setattr("rfedge.street.effects.evening.sunny_sky", sunny)
     monkeypatch.setattr("rfedge.street.effects.overcast.overcast_sky", grey)
     blank = Sky(np.full((16, 32, 3), 0.5, np.float32))
     monkeypatch.setattr("rfedge.street.assembly.clear_sky", lambda _rng: blank)
@@ -92,15 +106,15 @@ def posts_for_trees(layout: Layout, _rng: np.random.Generator) -> Part:
     ids=lambda value: value if isinstance(value, str) else value.name,
 )
 def test_a_key_of_an_effect_changes_what_it_makes(effect: Any, key: str) -> None:
-    settings = load_effect(effect)()
+    settings = load_effect(effect)(**ON.get(key, {}))
     made = frame_digest if effect.on_frames else changed_digest
     assert made(settings, effect) != made(changed(settings, key), effect)
 
 
 @lru_cache(maxsize=64)
 def changed_digest(settings: Any, effect: Any) -> str:
-    layout = Layout(Geometry(length_m=20.0))
-    sky = Sky(np.full((16, 32, 3), 0.5, np.float32))
+    layout = Layout(Geometry(length_m=40.0))
+    sky = Sky(np.full((16, 32, 3), 0.5, np.float32), sun_radiance=(2.0, 2.0, 2.0))
     bare = World(layout, sky).plus(Part((), (Material("asphalt", (0.1, 0.1, 0.1)),)))
     return world_digest(settings.change(bare, rng_of(effect, 1, 0)))
 

@@ -125,7 +125,7 @@ def test_the_committed_page_shows_the_committed_plans() -> None:
     rows = json.loads((ROOT / "results" / "scenes" / "plan.json").read_text())["rows"]
     assert plan_table(rows) in (ROOT / "docs" / "scenes.md").read_text()
     ready_made = {path.stem for path in (ROOT / "samples" / "scenes").glob("*.toml")}
-    assert {row["scene"] for row in rows} == ready_made
+    assert {row["scene"] for row in rows} <= ready_made, "a scene that is gone has no row"
 
 
 def test_a_result_says_where_it_came_from(plan: MeasuredPlan, tmp_path: Path) -> None:

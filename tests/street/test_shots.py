@@ -155,7 +155,7 @@ def test_a_selection_counts_through_the_splits(splits: str, frames: str | None, 
 def test_a_scene_with_anothers_field_is_not_trained_on() -> None:
     parked = replace(SCENE, name="street-parked")
     assert {shot.split for shot in Selection(parked).shots()} == {Split.DRIVE, Split.EVAL}
-    assert {shot.split for shot in Selection(parked, "all").shots()} == set(Split)
+    assert {shot.split for shot in Selection(parked, "all").shots()} == set(Split) - {Split.RIG}
 
 
 @pytest.mark.parametrize(
@@ -189,3 +189,26 @@ def test_the_empty_streets_drive_has_sixteen_frames_at_two_hertz(
     trained = places(shots_of(scene, Split.TRAIN))[:, 0]
     assert trained.min() < x.min()
     assert x.max() < trained.max()
+
+
+def test_the_rig_drives_as_the_drive_does_and_only_if_asked_for() -> None:
+    scene = replace(SCENE, drive=Drive(duration_s=0.5, rate_hz=10.0, thinned_hz=()))
+    assert all(shot.split is not Split.RIG for shot in Selection(scene, "all").shots())
+    shots = Selection(scene, "rig").shots()
+    assert len(shots) == 5 * 4
+    for instant in range(5):
+        front, left, right, back = shots[4 * instant : 4 * instant + 4]
+        assert {s.time_s for s in (front, left, right, back)} == {instant / 10.0}
+        ahead = forward(drive_pose(scene.drive, front.time_s)) * (1, 1, 0)
+        ahead /= np.linalg.norm(ahead)
+        assert forward(front.camera.world_from_cam) @ ahead == pytest.approx(1.0, abs=1e-6)
+        assert forward(back.camera.world_from_cam) @ ahead == pytest.approx(-1.0, abs=1e-6)
+        sideways = np.cross((0.0, 0.0, 1.0), ahead)
+        assert forward(left.camera.world_from_cam) @ sideways == pytest.approx(1.0, abs=1e-6)
+        assert forward(right.camera.world_from_cam) @ sideways == pytest.approx(-1.0, abs=1e-6)
+        assert left.motion.velocity_mps[0] == pytest.approx(9.0, abs=0.5), "it drives to its right"
+
+
+def test_a_rig_of_cameras_that_are_not_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="roof"):
+        Drive(rig="mid_front,roof")

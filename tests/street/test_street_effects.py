@@ -4,6 +4,7 @@ import hashlib
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,18 @@ from rfcore.native import _native
 from rfedge.street import load_scene
 from rfedge.street.effects import EFFECTS, EffectKind, load_effect
 from rfedge.street.effects.dusk import Dusk
+from rfedge.street.effects.evening import Evening, daylight
 from rfedge.street.effects.overcast import Overcast
 from rfedge.street.effects.parked import ParkedVehicles
+from rfedge.street.effects.passing_cloud import PassingCloud
 from rfedge.street.effects.traffic import Traffic
+from rfedge.street.effects.tunnel import Tunnel
 from rfedge.street.effects.wet_road import WetRoad
+from rfedge.street.effects.works import Works
 from rfedge.street.geometry.layout import Geometry, Layout
 from rfedge.street.geometry.mesh import Label, Mesh, placed
 from rfedge.street.geometry.road import road
+from rfedge.street.geometry.sky import DUSK, NOON, Daylight, sunny_sky
 from rfedge.street.geometry.world import Sky, World
 from rfedge.street.shots import Split, shots_of
 
@@ -36,12 +42,25 @@ def rng() -> np.random.Generator:
 def street() -> World:
     """60 m of road without anything on it, under a plain sky."""
     layout = Layout(Geometry(length_m=60.0))
-    sky = Sky(np.full((16, 32, 3), 0.5, np.float32))
+    sky = Sky(np.full((16, 32, 3), 0.5, np.float32), sun_radiance=(8.0, 8.0, 8.0))
     return World(layout, sky).plus(road(layout, rng()))
+
+
+@pytest.fixture(autouse=True)
+def low_evenings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evening skies of few rows and without clouds, which are made at once."""
+
+    def sunny(day: Daylight, rng: np.random.Generator) -> Sky:
+        return sunny_sky(replace(day, cover=0.0), rng, height=16)
+
+    monkeypatch.setattr("rfedge.street.effects.evening.sunny_sky", sunny)
 
 
 def digest(world: World) -> str:
     found = hashlib.sha256(world.sky.radiance.tobytes())
+    if world.sky_at is not None:
+        later = world.sky_at(2.0)
+        found.update(later.radiance.tobytes() + repr(later.sun_radiance).encode())
     moving = [
         placed(m, mover.world_from_mover(0.7)) for mover in world.movers for m in mover.meshes
     ]
@@ -81,6 +100,87 @@ def test_the_share_of_occupied_bays_is_the_declared_one(street: World) -> None:
     ]
     assert counts[0] == 0
     assert counts[0] < counts[1] < counts[2]
+
+
+def painted_at(world: World, before: World) -> set[float]:
+    """Where along the street vehicles' bodies have been parked."""
+    meshes = world.meshes[len(before.meshes) :]
+    return {float(mesh.vertices[0, 0]) for mesh in meshes if is_paint(mesh)}
+
+
+def test_some_parked_vehicles_stay_and_others_change_from_day_to_day(street: World) -> None:
+    today, kept, gone = (
+        painted_at(ParkedVehicles(0.6, day, turnover).change(street, rng()), street)
+        for day, turnover in ((0, 0.5), (4, 0.0), (4, 1.0))
+    )
+    assert kept == today
+    assert gone.isdisjoint(today)
+    some = painted_at(ParkedVehicles(0.6, 4, 0.5).change(street, rng()), street)
+    assert some & today
+    assert some - today
+
+
+def test_nothing_parks_in_a_building_site_and_the_lanes_stay_free(street: World) -> None:
+    """Other bays have the vehicles that they have without the site."""
+    site = Works(start_m=-10.0, length_m=20.0).change(street, rng())
+    fence = np.concatenate([m.vertices for m in site.meshes[len(street.meshes) :]])
+    assert fence[:, 1].min() > 4.0, "the lanes are free"
+    assert fence[:, 0].min() > -10.1
+    assert fence[:, 0].max() < 10.1
+    parked = ParkedVehicles(1.0)
+    beside = painted_at(parked.change(site, rng()), site)
+    everywhere = painted_at(parked.change(street, rng()), street)
+    assert beside < everywhere
+    bays = [bay for bay in site.layout.bays if bay.side == 1]
+    assert all(abs(bay.x_m) > 12.0 for bay in bays)
+    with pytest.raises(InvalidInput, match="side: is 0"):
+        Works(side=0)
+
+
+def test_a_tunnel_hides_the_sky_over_its_stretch(street: World) -> None:
+    roofed = Tunnel(start_m=-5.0, length_m=10.0, height_m=5.0).change(street, rng())
+    concrete = roofed.meshes[-1].vertices
+    assert (concrete[:, 0].min(), concrete[:, 0].max()) == (-5.0, 5.0)
+    assert concrete[:, 2].max() == pytest.approx(5.4)
+    inside = (np.abs(concrete[:, 1]) < 6.6) & (concrete[:, 2] < 5.0)
+    assert not inside.any(), "the road is free"
+
+
+def test_an_evening_goes_from_noon_to_dusk() -> None:
+    assert daylight(0.0) == NOON
+    assert daylight(1.0) == DUSK
+    assert DUSK.elevation_deg < daylight(0.5).elevation_deg < NOON.elevation_deg
+
+
+def test_the_sun_of_an_evening_sinks_in_every_frame_and_then_stays(street: World) -> None:
+    evening = Evening(0.0, 1.0, over_s=10.0)
+    heights = [daylight(evening.share_at(t)).elevation_deg for t in np.arange(300) / 30]
+    assert (np.diff(heights) < 0).all()
+    sinking = evening.change(street, rng())
+    assert sinking.sky_at is not None
+    assert sinking.sky_at(5.0).sun_towards[2] < sinking.sky.sun_towards[2]
+    late = sinking.sky_at(10.0), sinking.sky_at(20.0)
+    np.testing.assert_array_equal(late[0].radiance, late[1].radiance)
+    assert Evening(0.5, 0.5).change(street, rng()).sky_at is None, "a light that stays is one sky"
+
+
+def test_a_passing_cloud_dims_the_sun_alone_and_leaves(street: World) -> None:
+    cloudy = PassingCloud(1.0, 0.5, 2.0, passed=0.1).change(street, rng())
+    assert cloudy.sky_at is not None
+    light = [cloudy.sky_at(t) for t in (0.0, 1.0, 1.25, 1.5, 3.5, 3.75, 4.0, 9.0)]
+    shares = [sky.sun_radiance[0] / 8.0 for sky in light]
+    assert shares == pytest.approx([1.0, 1.0, 0.55, 0.1, 0.1, 0.55, 1.0, 1.0])
+    assert all(sky.radiance is street.sky.radiance for sky in light)
+
+
+def test_a_cloud_passes_over_a_sinking_sun(street: World) -> None:
+    evening = Evening().change(street, rng())
+    both = PassingCloud(passed=0.5).change(evening, rng())
+    assert both.sky_at is not None
+    assert evening.sky_at is not None
+    shaded, clear = both.sky_at(2.0), evening.sky_at(2.0)
+    assert shaded.sun_towards == clear.sun_towards
+    assert shaded.sun_radiance[0] == pytest.approx(0.5 * clear.sun_radiance[0])
 
 
 def test_traffic_keeps_right_and_its_speed(street: World) -> None:
@@ -182,23 +282,26 @@ print(*sorted(n for n in sys.modules if n.startswith("rfedge.street.effects.")))
 print(Path(rfedge.__file__).parents[1])
 """
 SMALL = 'name = "x"\nfield = "x"\n[geometry]\nlength_m = 40\ntrees = false\n'
-HALVES = (
-    ("parked", "overcast", "haze", "lens", "exposure"),
+PARTS = (
+    ("parked", "works", "overcast", "haze", "lens", "exposure"),
     ("traffic", "dusk", "wet_road", "rain", "rolling_shutter", "noise"),
+    ("tunnel", "evening", "passing_cloud", "auto_exposure"),
 )
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("declared", HALVES, ids="-".join)
+@pytest.mark.parametrize("declared", PARTS, ids="-".join)
 def test_a_build_neither_imports_nor_needs_what_is_not_declared(
     tmp_path: Path, declared: tuple[str, ...]
 ) -> None:
-    """Each effect is undeclared in one half; there its file is deleted, and no byte changes.
+    """Each effect is undeclared in two parts; there its file is deleted, and no byte changes.
 
     Both run without an editable install's finder, which would lead them to the checkout.
     """
-    assert sorted(HALVES[0] + HALVES[1]) == sorted(effect.name for effect in EFFECTS)
+    assert sorted(name for part in PARTS for name in part) == sorted(
+        effect.name for effect in EFFECTS
+    )
     text = SMALL + "".join(f"[effects.{name}]\n" for name in declared)
     (tmp_path / "s.toml").write_text(text)
     for package in ("rfedge", "rfcore"):

@@ -155,3 +155,16 @@ def test_a_log_gets_a_line_at_each_twentieth_with_the_time_left() -> None:
     assert len(lines) == 20
     assert lines[9].startswith("  50%: 100 iterations, 7 primitives, loss 0.0100")
     assert lines[9].endswith(", 3 min left")  # 100 steps of 2 s
+
+
+def test_what_showing_the_field_takes_is_no_time_of_training() -> None:
+    steps, shown = Steps(5), []
+
+    def show(trainer: Any) -> None:
+        shown.append(trainer.iteration)
+        steps.now_s += 50.0
+
+    loop = TrainingLoop(steps, LoopLimits(), None, lambda: steps.now_s, show)
+    loop.run(lambda _: None)
+    assert shown == [1, 2, 3, 4, 5]
+    assert loop.seconds == 10.0

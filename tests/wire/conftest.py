@@ -17,7 +17,7 @@ PAYLOAD = bytes(range(200))
 
 @pytest.fixture
 def hello() -> Hello:
-    header = StreamHeader(CodecConfig(32, 16, "medium", 23.0), b"\x67" * 20, b"\x68" * 5)
+    header = StreamHeader(CodecConfig(32, 16, "default", 23.0), b"\x67" * 20, b"\x68" * 5)
     return Hello(
         "cav-1",
         (CameraDescription("front", INTRINSICS, header),),

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rfcore.camera import Pose
+from rfcore.camera import Intrinsics, Pose, camera_on_rig
+from rfcore.codec.h264.config import EFFORTS, Coder
 from rfcore.errors import InvalidInput, ProtocolError, RejectReason, RfedgeError
 from rfcore.field import Quality
 from rfcore.wire.convert import (
@@ -41,6 +42,57 @@ def test_a_hello_survives_the_wire(hello: Hello) -> None:
 
 def test_a_frame_survives_the_wire(frame: Frame) -> None:
     assert client_message_from_bytes(client_message_to_bytes(frame)) == frame
+
+
+def on_rig(hello: Hello, camera_from_rig: Pose) -> Hello:
+    (camera,) = hello.cameras
+    return replace(hello, cameras=(replace(camera, camera_from_rig=camera_from_rig),))
+
+
+def test_extrinsics_and_instants_survive_the_wire(hello: Hello, frame: Frame) -> None:
+    rig = on_rig(hello, Pose((0.1, -1.5, 2.0), (0.5, -0.5, 0.5, -0.5)))
+    assert client_message_from_bytes(client_message_to_bytes(rig)) == rig
+    later = replace(frame, instant=7)
+    assert client_message_from_bytes(client_message_to_bytes(later)) == later
+
+
+def test_both_ends_find_the_same_camera_on_the_rig(hello: Hello, frame: Frame) -> None:
+    camera_from_rig = Pose((0.1, -1.5, 2.0), (0.6, 0.0, 0.8, 0.0))
+    received = client_message_from_bytes(client_message_to_bytes(on_rig(hello, camera_from_rig)))
+    assert isinstance(received, Hello)
+    assert frame.pose is not None
+    posed = received.cameras[0].posed(frame)
+    assert posed == replace(frame, pose=camera_on_rig(frame.pose, camera_from_rig))
+    assert posed.pose is not None
+    point = (3.0, 4.0, 5.0)
+    in_camera = posed.pose.inverse().apply(point)
+    in_rig = frame.pose.inverse().apply(point)
+    assert in_camera == pytest.approx(camera_from_rig.apply(in_rig))
+
+
+def test_without_extrinsics_a_frame_has_the_pose_of_its_camera(hello: Hello, frame: Frame) -> None:
+    assert hello.cameras[0].posed(frame) is frame
+    lost = replace(frame, pose=None)
+    rig = on_rig(hello, Pose((0.1, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+    assert rig.cameras[0].posed(lost) is lost
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "problem"),
+    [
+        ("x_m", 101.0, r"cameras\[0\].camera_from_rig.x_m: 101.0 is outside -100..100"),
+        ("z_m", math.nan, "camera_from_rig.pose.translation_m: .* finite"),
+        ("rotation_w", 3.0, "camera_from_rig.pose.rotation: quaternion of norm"),
+    ],
+)
+def test_extrinsics_that_cannot_be_are_refused(
+    hello: Hello, field: str, value: float, problem: str
+) -> None:
+    rig = on_rig(hello, Pose((0.1, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+    request = pb.StreamRequest.FromString(client_message_to_bytes(rig))
+    setattr(request.hello.cameras[0].camera_from_rig, field, value)
+    with pytest.raises(InvalidInput, match=problem):
+        client_message_from_bytes(request.SerializeToString())
 
 
 ADDRESS = FrameAddress("front", 2, 7)
@@ -82,6 +134,11 @@ def test_a_rate_that_cannot_be_granted_is_refused(rate_hz: float) -> None:
 Change = Callable[[pb.StreamRequest], object]
 
 
+def _with_half_a_pose(message: pb.StreamRequest) -> None:
+    message.frame.ClearField("pose")
+    message.frame.pose_f32.extend([0.0] * 3)
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [
@@ -89,7 +146,7 @@ Change = Callable[[pb.StreamRequest], object]
         (lambda m: setattr(m.frame.pose, "y_m", math.inf), "pose.translation_m"),
         (lambda m: setattr(m.frame.pose, "z_m", 2e6), r"pose.z_m: 2000000.0 is outside"),
         (lambda m: setattr(m.frame.pose, "rotation_w", 0.9), "pose.rotation: quaternion of norm"),
-        (lambda m: m.frame.ClearField("pose"), "frame.pose_f32: 0 is outside 7..7"),
+        (_with_half_a_pose, "frame.pose_f32: 3 is outside 7..7"),
         (lambda m: m.frame.pose_f32.extend([0.0] * 7), "frame.pose_f32: 7 is outside 0..0"),
         (lambda m: setattr(m.frame, "camera_id", "../etc"), "frame.camera_id: '../etc'"),
         (lambda m: setattr(m.frame, "camera_id", "a" * 65), "frame.camera_id"),
@@ -118,11 +175,19 @@ def test_a_bad_value_refuses_the_frame_by_name(frame: Frame, change: Change, nam
     assert (address.epoch, address.sequence) == (3, request.frame.sequence)
 
 
+def test_a_frame_whose_camera_is_lost_has_no_pose_and_shows_nothing(frame: Frame) -> None:
+    lost = replace(frame, pose=None)
+    message = client_message_to_bytes(lost)
+    assert len(message) < len(client_message_to_bytes(frame))
+    assert client_message_from_bytes(message) == lost
+    assert lost.camera(Intrinsics(4, 2, 1.0, 1.0, 2.0, 1.0)) is None
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [
         (lambda m: m.hello.ClearField("cameras"), "hello.cameras: 0"),
-        (lambda m: m.hello.cameras.extend([m.hello.cameras[0]] * 16), "hello.cameras: 17"),
+        (lambda m: m.hello.cameras.extend([m.hello.cameras[0]] * 32), "hello.cameras: 33"),
         (lambda m: m.hello.cameras.extend([m.hello.cameras[0]]), "same camera_id"),
         (lambda m: setattr(m.hello, "vehicle_id", ""), "hello.vehicle_id: ''"),
         (lambda m: setattr(m.hello, "vehicle_id", ".hidden"), "hello.vehicle_id"),
@@ -244,4 +309,35 @@ def test_a_quality_off_the_ladder_spoils_its_frame_alone(
     request = pb.StreamRequest.FromString(client_message_to_bytes(frame))
     request.frame.quality.CopyFrom(pb.Quality(**knobs))
     with pytest.raises(FrameRefused, match=named):
+        client_message_from_bytes(request.SerializeToString())
+
+
+@pytest.mark.parametrize("effort", EFFORTS)
+def test_every_effort_survives_the_wire(hello: Hello, effort: str) -> None:
+    """A preset of x264 goes as vehicles from before the slice coder send it."""
+    camera = hello.cameras[0]
+    config = replace(camera.codec.config, effort=effort)
+    sent = replace(hello, cameras=(replace(camera, codec=replace(camera.codec, config=config)),))
+    data = client_message_to_bytes(sent)
+    assert client_message_from_bytes(data) == sent
+    codec = pb.StreamRequest.FromString(data).hello.cameras[0].codec
+    assert (codec.preset == "") == (config.coder is Coder.OWN)
+    assert (codec.effort == "") == (config.coder is Coder.X264)
+
+
+@pytest.mark.parametrize(
+    ("preset", "effort", "named"),
+    [
+        ("placebo", "", "effort: 'x264-placebo' is none of fast"),
+        ("", "", "codec.preset: ''"),
+        ("", "extreme", "effort: 'extreme' is none of fast"),
+    ],
+)
+def test_a_coder_that_is_not_known_here_is_refused_by_name(
+    hello: Hello, preset: str, effort: str, named: str
+) -> None:
+    request = pb.StreamRequest.FromString(client_message_to_bytes(hello))
+    codec = request.hello.cameras[0].codec
+    codec.preset, codec.effort = preset, effort
+    with pytest.raises(InvalidInput, match=named):
         client_message_from_bytes(request.SerializeToString())

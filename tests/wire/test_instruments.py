@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from prometheus_client import CollectorRegistry, Histogram, generate_latest
 
 from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.raster.renderers import DeviceRecord
 from rfcore.wire.conventions import FRAME_BUDGET_BUCKETS_S
 from rfcore.wire.instruments import Instruments, MetricsEndpoint
 from rfedge.pages.metrics import families, metrics_page
@@ -147,3 +148,17 @@ def test_an_endpoint_serves_until_it_is_closed_and_names_a_port_in_use() -> None
 def test_a_host_that_is_not_ours_is_named_too() -> None:
     with pytest.raises(RfedgeError, match=r"cannot serve metrics on 192\.0\.2\.1:0: Cannot assign"):
         MetricsEndpoint(CollectorRegistry(), "192.0.2.1", 0)
+
+
+def test_devices_and_what_the_cpu_drew_for_them_are_served() -> None:
+    registry, record = CollectorRegistry(), DeviceRecord()
+    Instruments(registry).devices(record)
+    for _ in range(2):
+        record.add_opened("GPU", "Platform 1, driver 2", "plain")
+    record.add_lost()
+    assert generate_latest(registry).count(b"rfedge_opencl_device_info{") == 1
+    labels = {"device": "GPU", "driver": "Platform 1, driver 2", "build": "plain"}
+    assert registry.get_sample_value("rfedge_opencl_device_info", labels) == 1
+    fallbacks = "rfedge_opencl_fallbacks_total"
+    assert registry.get_sample_value(fallbacks, {"reason": "lost"}) == 1
+    assert registry.get_sample_value(fallbacks, {"reason": "full"}) == 0

@@ -5,7 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.camera import Intrinsics, Pose
+from rfcore.codec.references import Reference
 from rfcore.errors import InvalidInput, ProtocolError
+from rfcore.localise.fix import State
+from rfcore.wire.sensing import ClockKind
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
@@ -21,6 +24,7 @@ from rfcore.wire.v1 import twin_pb2
 PICTURE = TwinPicture(
     "cav-1", "front", "s-1", 3, 7, 10**18, 5, Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)),
     Intrinsics(4, 2, 1.0, 1.5, 2.0, 1.0), "ab" * 32, b"d" * 16, PictureEncoding.PNG, b"png", 9,
+    4321, (Reference.WARP, Reference.RENDER), ClockKind.ARRIVAL, State.TRACKING, 12,
 )  # fmt: skip
 
 
@@ -53,6 +57,10 @@ def test_an_unknown_encoding_is_refused() -> None:
 
 
 def test_an_impossible_picture_is_the_servers_fault() -> None:
+    bad = twin_message_to_wire(PICTURE)
+    bad.picture.references.append(77)  # type: ignore[arg-type]
+    with pytest.raises(ProtocolError, match=r"picture\.references: 77"):
+        twin_message_from_wire(bad)
     bad = twin_message_to_wire(PICTURE)
     bad.picture.pose.x_m = float("nan")
     with pytest.raises(ProtocolError, match="impossible picture"):

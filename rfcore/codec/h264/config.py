@@ -1,5 +1,9 @@
 """A stream's configuration, and the H.264 level its size needs.
 
+How much a coder tries is its *effort*, one name for both coders: ``fast``, ``default`` and
+``thorough`` are those of our slice coder, ``x264-medium`` and its like are x264's presets. A stream
+keeps its coder, because the two write different parameter sets; any frame may have another effort.
+
 Options are checked here against closed lists, because x264 ignores an option it does not know;
 ``rfcore.codec.h264.header`` checks afterwards that the encoder did what it was asked.
 """
@@ -7,10 +11,26 @@ Options are checked here against closed lists, because x264 ignores an option it
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["CRF_RANGE", "MAX_MACROBLOCKS", "MAX_SIDE_PX", "PRESETS", "CodecConfig", "check_crf"]
+__all__ = [
+    "CRF_RANGE",
+    "DEFAULT_EFFORT",
+    "EFFORTS",
+    "MAX_MACROBLOCKS",
+    "MAX_SIDE_PX",
+    "PRESETS",
+    "CodecConfig",
+    "Coder",
+    "CoderSettings",
+    "check_crf",
+    "check_effort",
+    "coder_of",
+    "effort_of_preset",
+    "preset_of",
+]
 
 PRESETS = (
     "ultrafast",
@@ -25,6 +45,12 @@ PRESETS = (
 )
 """x264's presets, but not placebo, which costs several times veryslow and gains nothing."""
 
+OWN_EFFORTS = ("fast", "default", "thorough")
+DEFAULT_EFFORT = "default"
+_X264 = "x264-"
+EFFORTS = (*OWN_EFFORTS, *(f"{_X264}{preset}" for preset in PRESETS))
+"""Of both coders."""
+
 CRF_RANGE = (1.0, 51.0)
 """Below 1 x264 leaves High profile for lossless High 4:4:4, which needs other parameter sets."""
 
@@ -36,8 +62,13 @@ MAX_MACROBLOCKS = 36_864
 PICTURES_PER_SECOND = 50
 """The rate levels are chosen for: 25 frames, each with the I_PCM picture it predicts from."""
 
-REFERENCE_FRAMES = 3
-"""Fixed so that one set of parameter sets serves any number of references up to it."""
+REFERENCE_FRAMES = 4
+"""Of one frame, at most. Fixed for a stream, so that its parameter sets serve any number up to it;
+streams of x264 have ``X264_REFERENCE_FRAMES``."""
+X264_REFERENCE_FRAMES = 3
+
+DEFAULT_REFERENCES = 3
+"""How many an encoder chooses at most, unless it is told otherwise."""
 
 _LEVELS = (
     (10, 1_485, 99, 396),
@@ -59,6 +90,36 @@ _LEVELS = (
 to the one before (2, 4.1) or need a constraint flag (1b)."""
 
 
+class Coder(StrEnum):
+    """What codes the slices."""
+
+    OWN = "own"
+    X264 = "x264"
+
+
+def coder_of(effort: str) -> Coder:
+    """Return the coder that has ``effort``."""
+    return Coder.X264 if effort.startswith(_X264) else Coder.OWN
+
+
+def effort_of_preset(preset: str) -> str:
+    """Return the effort that x264's ``preset`` is."""
+    return f"{_X264}{preset}"
+
+
+def preset_of(effort: str) -> str:
+    """Return the x264 preset that ``effort`` is; raise ``InvalidInput`` for one of our coder."""
+    if coder_of(effort) is not Coder.X264:
+        raise InvalidInput("effort", f"{effort!r} is no preset of x264")
+    return effort.removeprefix(_X264)
+
+
+def check_effort(field: str, effort: str) -> None:
+    """Raise ``InvalidInput`` naming ``field`` unless one of the coders has ``effort``."""
+    if effort not in EFFORTS:
+        raise InvalidInput(field, f"{effort!r} is none of {', '.join(EFFORTS)}")
+
+
 def check_crf(field: str, crf: float) -> None:
     """Raise ``InvalidInput`` naming ``field`` unless ``crf`` is within ``CRF_RANGE``."""
     low, high = CRF_RANGE
@@ -70,12 +131,14 @@ def check_crf(field: str, crf: float) -> None:
 class CodecConfig:
     """One stream's size and quality. Raises ``InvalidInput`` naming the field that is wrong.
 
-    ``crf`` is x264's constant rate factor: lower is better, 6 steps halve the quantiser.
+    ``effort`` is one of ``EFFORTS``. ``crf``, x264's constant rate factor: lower is better, 6 steps
+    halve the quantiser; our coder takes it for a constant quantiser
+    (``rfcore.codec.sender.picture_coder``).
     """
 
     width_px: int
     height_px: int
-    preset: str = "medium"
+    effort: str = DEFAULT_EFFORT
     crf: float = 23.0
 
     def __post_init__(self) -> None:
@@ -91,9 +154,13 @@ class CodecConfig:
                 f"{self.width_px}x{self.height_px} px are {self.macroblocks} macroblocks, more "
                 f"than the {MAX_MACROBLOCKS} of H.264 level 5.2; scale the pictures down",
             )
-        if self.preset not in PRESETS:
-            raise InvalidInput("codec.preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
+        check_effort("codec.effort", self.effort)
         check_crf("codec.crf", self.crf)
+
+    @property
+    def coder(self) -> Coder:
+        """What codes the slices."""
+        return coder_of(self.effort)
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -116,13 +183,66 @@ class CodecConfig:
         return self.size_mbs[0] * self.size_mbs[1]
 
     @property
+    def reference_frames(self) -> int:
+        """How many references a frame has at most, which the parameter sets say."""
+        return REFERENCE_FRAMES if self.coder is Coder.OWN else X264_REFERENCE_FRAMES
+
+    @property
     def level_idc(self) -> int:
         """The lowest level that allows this size at 25 frames a second (A.3.1, table A-1)."""
         rate = PICTURES_PER_SECOND * self.macroblocks
-        stored = REFERENCE_FRAMES * self.macroblocks
+        stored = self.reference_frames * self.macroblocks
         side = max(self.size_mbs)
         for level_idc, max_rate, max_size, max_stored in _LEVELS:
             small_enough = self.macroblocks <= max_size and side * side <= 8 * max_size
             if small_enough and rate <= max_rate and stored <= max_stored:
                 return level_idc
         raise InvalidInput("codec.size", f"{self.size_px} px fit no level of H.264")
+
+
+@dataclass(frozen=True)
+class CoderSettings:
+    """What codes the slices, and how hard it tries: the form on a command line."""
+
+    coder: Coder = Coder.OWN
+    """own: this project's slice coder. x264: for comparison, through FFmpeg."""
+    effort: str | None = None
+    """Of our coder: fast, default or thorough."""
+    preset: str | None = None
+    """With --coder x264: ultrafast to veryslow, normally medium."""
+    check_decode: bool = False
+    """Decode every slice on the vehicle, too, to see that it is what its coder promised."""
+
+    def __post_init__(self) -> None:
+        other = self.preset if self.coder is Coder.OWN else self.effort
+        if other is not None:
+            mine, named = ("effort", "preset")[:: 1 if self.coder is Coder.OWN else -1]
+            raise InvalidInput(
+                named, f"{other!r}: --coder {self.coder} has no --{named} but --{mine}"
+            )
+        if self.effort is not None and self.effort not in OWN_EFFORTS:
+            raise InvalidInput("effort", f"{self.effort!r} is none of {', '.join(OWN_EFFORTS)}")
+        if self.preset is not None and self.preset not in PRESETS:
+            raise InvalidInput("preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
+
+    @staticmethod
+    def of(effort: str) -> CoderSettings:
+        """Return the settings of an effort as ``CodecConfig`` has it."""
+        check_effort("effort", effort)
+        if coder_of(effort) is Coder.OWN:
+            return CoderSettings(effort=effort)
+        return CoderSettings(Coder.X264, preset=preset_of(effort))
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """The settings as a command line gives them."""
+        if self.coder is Coder.OWN:
+            return ("--effort", self.name)
+        return ("--coder", str(self.coder), "--preset", preset_of(self.name))
+
+    @property
+    def name(self) -> str:
+        """The effort as ``CodecConfig`` has it."""
+        if self.coder is Coder.OWN:
+            return self.effort or DEFAULT_EFFORT
+        return effort_of_preset(self.preset or "medium")

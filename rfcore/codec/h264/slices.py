@@ -1,4 +1,6 @@
-"""The sender's x264 run: reference pictures that are not sent, then the frame as one slice.
+"""x264 as the coder of slices: reference pictures that are not sent, then the frame as one slice.
+
+For comparison with our own coder (``rfcore.codec.h264.slice_coder``), which needs no such detour.
 
 A fresh encoder codes each frame, so every frame may have its own references, quality and analysis.
 Why x264 is configured as it is; figures are for a 640x360 street with vehicles that the field does
@@ -32,12 +34,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rfcore.codec.h264.bitstream import split_nals
-from rfcore.codec.h264.config import REFERENCE_FRAMES, CodecConfig
+from rfcore.codec.h264.config import X264_REFERENCE_FRAMES, CodecConfig, preset_of
 from rfcore.codec.h264.ffmpeg import EncoderOptions, PictureKind, encode_pictures
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, NAL_PPS, NAL_SPS, nal_type
 from rfcore.codec.h264.qp_map import QpMap
-from rfcore.errors import CodecError
+from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 
 __all__ = ["CodedSlice", "SliceCoding", "encode_slice", "slice_options"]
@@ -70,11 +72,9 @@ _PARTITIONS = {
 """Of x264's presets; no commas, which would end an option within a zone."""
 
 _UNSENT_MARGIN = 17
-_FAST_UNSENT_MARGIN = 8
-"""CRF less the quantiser of unsent pictures, normally and with ``fast_unsent``. On the
-first sample with three references, CRF 20 to 32, bits at equal PSNR against quantisers of 3 to 8:
-18, 17, 12, 8 and 4 take 0.4, 0.3, 1, 3 and 7 % more; of the time at CRF 29 they leave 85, 80, 75,
-67 and 65 %."""
+"""CRF less the quantiser of unsent pictures. On the first sample with three references, CRF 20 to
+32, bits at equal PSNR against quantisers of 3 to 8: 18, 17, 12, 8 and 4 take 0.4, 0.3, 1, 3 and 7 %
+more; of the time at CRF 29 they leave 85, 80, 75, 67 and 65 %."""
 
 _LOWEST_UNSENT_QP = 8
 """Between 2 and 8 P slices change by 0.3 %, and the time of the unsent pictures by a fifth."""
@@ -95,13 +95,12 @@ class CodedSlice:
 class SliceCoding:
     """How one slice is coded. ``crf`` replaces the configured one, ``qp_map`` is added to it.
 
-    ``fast_unsent``: see ``_UNSENT_MARGIN``. ``threads``: more than two gain nothing; with two the
-    slice may differ by a few bytes, because x264 searches motion less far up and down.
+    ``threads``: more than two gain nothing; with two the slice may differ by a few bytes, because
+    x264 searches motion less far up and down.
     """
 
     crf: float | None = None
     qp_map: QpMap | None = None
-    fast_unsent: bool = False
     threads: int = 1
 
 
@@ -117,9 +116,13 @@ def encode_slice(
     """Encode ``frame`` against ``references``, the last one reference 0; against none as an I
     picture.
 
-    Raises ``CodecError`` if x264 makes anything but one slice of the frame. The caller checks
-    sizes, and the header.
+    Raises ``CodecError`` if x264 makes anything but one slice of the frame, ``InvalidInput`` for
+    more references than its streams have. The caller checks sizes, and the header.
     """
+    if len(references) > X264_REFERENCE_FRAMES:
+        raise InvalidInput(
+            "references", f"{len(references)} are more than the {X264_REFERENCE_FRAMES} of x264"
+        )
     kinds = [PictureKind.I, *[PictureKind.P] * len(references)]
     regions = () if coding.qp_map is None else coding.qp_map.regions()
     options = slice_options(config, len(references), coding)
@@ -143,7 +146,7 @@ def slice_options(
     params = {
         "keyint": "infinite",
         "scenecut": "0",
-        "ref": str(REFERENCE_FRAMES),
+        "ref": str(X264_REFERENCE_FRAMES),
         "stitchable": "1",
         "level": str(config.level_idc),
         "cabac": "1",
@@ -154,17 +157,17 @@ def slice_options(
         "mixed-refs": "1",
         "trellis": str(_TRELLIS),
     }
-    if config.preset == "ultrafast":
+    preset = preset_of(config.effort)
+    if preset == "ultrafast":
         params["weightp"] = "1"
     crf = config.crf if coding.crf is None else coding.crf
     if references:
-        margin = _FAST_UNSENT_MARGIN if coding.fast_unsent else _UNSENT_MARGIN
-        params |= _unsent_params(config.preset, references, crf, margin)
+        params |= _unsent_params(preset, references, crf)
     threads = min(coding.threads, _MAX_THREADS, references + 1)
-    return EncoderOptions(config.coded_size_px, config.preset, crf, params, threads=threads)
+    return EncoderOptions(config.coded_size_px, preset, crf, params, threads=threads)
 
 
-def _unsent_params(preset: str, references: int, crf: float, margin: int) -> Mapping[str, str]:
+def _unsent_params(preset: str, references: int, crf: float) -> Mapping[str, str]:
     sent = {
         "b": "1",
         "subme": str(_SUBME[preset]),
@@ -172,13 +175,13 @@ def _unsent_params(preset: str, references: int, crf: float, margin: int) -> Map
         "partitions": _PARTITIONS[preset],
         "no-deblock": "0",
     }
-    unsent_qp = max(_LOWEST_UNSENT_QP, round(crf) - margin)
+    unsent_qp = max(_LOWEST_UNSENT_QP, round(crf) - _UNSENT_MARGIN)
     unsent = {"q": str(unsent_qp), "ref": "1", "me": "dia", "merange": "4"}
     zones = [_zone(references, references, sent)]
     if references > 1:
         zones.insert(0, _zone(1, references - 1, unsent))
     return {
-        "ipratio": f"{2 ** (margin / 6):.3f}",
+        "ipratio": f"{2 ** (_UNSENT_MARGIN / 6):.3f}",
         "subme": "2",
         "trellis": "0",
         "partitions": "none",

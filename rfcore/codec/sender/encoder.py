@@ -12,25 +12,38 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from rfcore.codec.block_means import block_mean_digest
-from rfcore.codec.h264.config import PRESETS, REFERENCE_FRAMES, CodecConfig, check_crf
+from rfcore.codec.h264.config import (
+    DEFAULT_REFERENCES,
+    REFERENCE_FRAMES,
+    CodecConfig,
+    check_crf,
+    check_effort,
+)
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.h264.pcm_picture import without_zeros
 from rfcore.codec.h264.qp_map import QpMap, check_qp_map
-from rfcore.codec.h264.slices import SliceCoding, encode_slice
-from rfcore.codec.h264.splice import SpliceDecoder, grey
+from rfcore.codec.h264.splice import SpliceDecoder
 from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket
 from rfcore.codec.photometric import Photometric
 from rfcore.codec.prediction import Prediction
-from rfcore.codec.references import References, check_references, is_temporal
+from rfcore.codec.references import (
+    INTRA,
+    Reference,
+    References,
+    check_references,
+    is_temporal,
+)
 from rfcore.codec.sender.frame_costs import FrameCosts
+from rfcore.codec.sender.picture_coder import Asked, CodedPicture, picture_coder
 from rfcore.codec.sender.rate import FittedSlice, RateModel, RateTarget, bits_curve, code_to_fit
 from rfcore.codec.sender.reference_choice import choose_photometric, choose_references
 from rfcore.codec.state import EncoderState, Past
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
+from rfcore.native.digest import digest_pair
 from rfcore.views import FieldView
 
-__all__ = ["DeltaEncoder", "Encoded", "FrameChoice"]
+__all__ = ["DeltaEncoder", "Encoded", "FrameChoice", "without_field"]
 
 Clock = Callable[[], int]
 
@@ -51,26 +64,24 @@ class FrameChoice:
     """The change of the render's light, see there; ``None`` leaves it to the encoder."""
     pose_only: bool = False
     """Send no slice: the frame is its only reference."""
-    max_references: int = REFERENCE_FRAMES
-    """How many the encoder may choose: each costs as much time as coding a frame."""
+    max_references: int = DEFAULT_REFERENCES
+    """How many the encoder may choose."""
     block_means: bool = False
     """Send those of the render, by which a receiver whose renderer is not exact tells rounding from
     a wrong pose."""
     limit_bytes: int | None = None
     """A longer slice is coded again at higher CRFs (``rfcore.codec.sender.rate``); one that is too
     long even at the highest is returned all the same."""
-    preset: str | None = None
-    """Replaces the configured preset; the parameter sets of a stream are those of any."""
+    effort: str | None = None
+    """Replaces the configured effort, by another of the same coder."""
     target: RateTarget | None = None
     """Bytes aimed at, by a CRF that is predicted before coding and never below ``crf``."""
     qp_map: QpMap | None = None
     """Where the frame is coded finer or coarser."""
-    fast_unsent: bool = False
-    """x264 predicts from cheaper copies of the references: saves time and costs bits."""
 
     def __post_init__(self) -> None:
-        if self.preset is not None and self.preset not in PRESETS:
-            raise InvalidInput("preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
+        if self.effort is not None:
+            check_effort("effort", self.effort)
         if self.references is not None:
             check_references(self.references)
         if self.crf is not None:
@@ -88,13 +99,23 @@ class FrameChoice:
 LEFT_TO_THE_ENCODER = FrameChoice()
 
 
+def without_field(choice: FrameChoice, state: EncoderState) -> FrameChoice:
+    """Return the choice for a frame whose pose is not known: temporal, or intra without a past.
+
+    Its view is ``FieldView.nothing``. Frames after it may use the field again at once.
+    """
+    references = INTRA if state.past is None else (Reference.PREVIOUS,)
+    return replace(choice, references=references, photometric=())
+
+
 @dataclass(frozen=True)
 class Encoded:
     """A packet, what the receiver will see, and the sender's next state.
 
-    ``stage_ns`` has "references" (warp, choice), "encode" (x264) and "closed_loop" (decoding as the
-    receiver does, digests). ``tries``: how often the frame was coded to fit a limit. ``crf``: the
-    one it was coded at in the end. ``rate``: the target's model with this frame learnt.
+    ``stage_ns`` has "references" (warp, choice), "encode" (the slice) and "closed_loop" (digests,
+    and decoding as the receiver does where that is needed). ``tries``: how often the frame was
+    coded to fit a limit. ``crf``: the one it was coded at in the end. ``rate``: the target's model
+    with this frame learnt.
     """
 
     packet: DeltaPacket
@@ -120,28 +141,36 @@ class DeltaEncoder:
     """Codes frames one by one. Raises ``CodecError`` if x264 writes other parameter sets than the
     configuration calls for.
 
-    ``threads`` are for making references and coding. References are the same with any number;
-    slices may differ by a few bytes between one and more.
+    ``threads`` are for making references and coding. References and our coder's slices are the same
+    with any number; x264's may differ by a few bytes between one and more. ``check_decode``: decode
+    what our coder makes, and raise ``CodecError`` unless the picture is the one it promised; x264's
+    slices are always decoded.
     """
 
     def __init__(
-        self, config: CodecConfig, clock_ns: Clock = _stopped_clock, threads: int = 1
+        self,
+        config: CodecConfig,
+        clock_ns: Clock = _stopped_clock,
+        threads: int = 1,
+        *,
+        check_decode: bool = False,
     ) -> None:
         if threads < 1:
             raise InvalidInput("threads", f"{threads} must be at least 1")
         self._config = config
         self._clock_ns = clock_ns
         self._threads = threads
-        self._header = encode_slice(config, [grey(config)], grey(config)).header
+        self._check_decode = check_decode
+        self._coder = picture_coder(config, threads)
         try:
-            self._splice = SpliceDecoder(self._header)
+            self._splice = SpliceDecoder(self.header)
         except InvalidInput as error:
             raise CodecError(f"x264 wrote other parameter sets than asked for: {error}") from error
 
     @property
     def header(self) -> StreamHeader:
         """What a receiver needs before the first packet."""
-        return self._header
+        return self._coder.header
 
     def start(self, epoch: int) -> EncoderState:
         """Return the state before the first packet of a (re)started stream."""
@@ -159,7 +188,7 @@ class DeltaEncoder:
 
         ``costs``: those of this very frame, where some are known already. Raises ``InvalidInput``
         for a frame or view that is not of the configured size, or references that cannot be made;
-        ``CodecError`` if x264 fails.
+        ``CodecError`` if coding fails.
         """
         self._check(frame, view, choice)
         started_ns = self._clock_ns()
@@ -168,15 +197,16 @@ class DeltaEncoder:
         chosen_ns = self._clock_ns()
         made, rate = self._coded(costs, plan, choice)
         encoded_ns = self._clock_ns()
-        reconstruction = self._reconstruct(plan.pictures, made.payload)
-        past = plan.prediction.past_of(reconstruction)
+        reconstruction = self._reconstruction(plan.pictures, made.coded)
+        render_digest, digest = digest_pair(view.render, reconstruction)
+        past = plan.prediction.past_of(reconstruction, digest)
         packet = DeltaPacket(
             epoch=state.epoch,
             sequence=state.next_sequence,
-            render_digest=view.render.digest(),
+            render_digest=render_digest,
             render_block_means=block_mean_digest(view.render) if choice.block_means else b"",
             reconstruction_digest=past.digest,
-            payload=made.payload,
+            payload=made.coded.payload,
             crc32=0,
             references=plan.references,
             base_digest=_base_digest(state.past) if is_temporal(plan.references) else b"",
@@ -228,13 +258,14 @@ class DeltaEncoder:
         curve = bits_curve(costs, plan.pictures, lowest)
         crf = target.model.crf_for(target.size_bytes, curve, plan.references)
         made = self._fitted(plan.pictures, costs.frame, crf, choice)
-        return made, target.model.after(made.crf, curve, plan.references, len(made.payload))
+        size_bytes = len(made.coded.payload)
+        return made, target.model.after(made.crf, curve, plan.references, size_bytes)
 
     def _fitted(
         self, pictures: tuple[I420, ...], frame: I420, crf: float, choice: FrameChoice
     ) -> FittedSlice:
         if choice.pose_only:
-            return FittedSlice(b"", crf, 1)
+            return FittedSlice(CodedPicture(b""), crf, 1)
         code = partial(self._slice, pictures, frame, choice)
         if choice.limit_bytes is None:
             return FittedSlice(code(crf), crf, 1)
@@ -242,19 +273,22 @@ class DeltaEncoder:
 
     def _slice(
         self, pictures: tuple[I420, ...], frame: I420, choice: FrameChoice, crf: float
-    ) -> bytes:
-        config = replace(self._config, preset=choice.preset or self._config.preset)
-        coding = SliceCoding(crf, choice.qp_map, choice.fast_unsent, self._threads)
-        coded = encode_slice(config, pictures, frame, coding)
-        if (coded.header.sps, coded.header.pps) != (self._header.sps, self._header.pps):
-            raise CodecError("x264 changed its parameter sets within a stream")
-        return coded.payload
+    ) -> CodedPicture:
+        asked = Asked(crf, choice.effort or self._config.effort, choice.qp_map)
+        return self._coder.code(frame, pictures, asked)
 
-    def _reconstruct(self, pictures: tuple[I420, ...], payload: bytes) -> I420:
-        if not payload:
+    def _reconstruction(self, pictures: tuple[I420, ...], coded: CodedPicture) -> I420:
+        """Return what the receiver will see; decode only where the coder does not say."""
+        if not coded.payload:
             return without_zeros(pictures[0])
+        promised = coded.reconstruction
+        if promised is not None and not self._check_decode:
+            return promised
         self._splice.predict_from(*pictures)
-        return self._splice.decode(payload)
+        decoded = self._splice.decode(coded.payload)
+        if promised is not None and decoded.digest() != promised.digest():
+            raise CodecError("a decoder makes another picture of the slice than its coder")
+        return decoded
 
 
 def _base_digest(past: Past | None) -> bytes:

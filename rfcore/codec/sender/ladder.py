@@ -3,7 +3,8 @@
 A rung is everything a sender may decide about a frame except its CRF. What the receiver must know
 of it (how the field is rendered, which references) travels with each frame, so every frame may be
 coded at another rung than the one before. ``rfedge eval ladder`` measures rungs and writes the file
-that ``read_ladder`` reads.
+that ``read_ladder`` reads. A sender that finds its poses in the field has tracking to decide
+about, too: each effort of it has times and rates of its own, which are added to a rung's.
 """
 
 from __future__ import annotations
@@ -11,15 +12,53 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from rfcore.codec.h264.config import PRESETS, REFERENCE_FRAMES
+from rfcore.codec.h264.config import (
+    DEFAULT_EFFORT,
+    DEFAULT_REFERENCES,
+    REFERENCE_FRAMES,
+    Coder,
+    check_effort,
+    coder_of,
+    effort_of_preset,
+)
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.field.quality import FULL, Quality
 
-__all__ = ["FULL_RUNG", "MeasuredRung", "Rung", "front", "read_ladder"]
+__all__ = [
+    "FULL_RUNG",
+    "MeasuredRung",
+    "Rung",
+    "TrackingEffort",
+    "front",
+    "quality_name",
+    "read_ladder",
+]
+
+
+class TrackingEffort(StrEnum):
+    """How hard a frame's pose is looked for in the field, where that is done; the best first."""
+
+    FULL = "full"
+    """The field is drawn again where the pose of the first render turns out to be off."""
+    ONCE = "once"
+    """It is drawn once."""
+    HALF = "half"
+    """It is drawn once, and aligned with the frame from half the resolution on."""
+
+    @property
+    def redraws(self) -> int:
+        """Renders beyond one, at most."""
+        return int(self is TrackingEffort.FULL)
+
+    @property
+    def finest_level(self) -> int:
+        """The finest level of the pyramids that are aligned; each has half the last resolution."""
+        return int(self is TrackingEffort.HALF)
 
 
 @dataclass(frozen=True)
@@ -28,44 +67,49 @@ class Rung:
 
     quality: Quality = FULL
     """How the field is rendered, on both ends."""
-    references: int = REFERENCE_FRAMES
+    references: int = DEFAULT_REFERENCES
     """At most so many pictures are predicted from; 0: the render alone, as the paper has it."""
     photometric: bool = True
     """Whether a change of light is looked for."""
-    preset: str = "medium"
-    """x264's."""
-    fast_unsent: bool = False
-    """As in ``FrameChoice``; tables, logs and result files call it "rough"."""
+    effort: str = DEFAULT_EFFORT
+    """How hard the coder tries."""
+    tracking: TrackingEffort = TrackingEffort.FULL
+    """How hard the pose is looked for, by a sender that does."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.references <= REFERENCE_FRAMES:
             raise InvalidInput(
                 "rung.references", f"{self.references} is outside 0..{REFERENCE_FRAMES}"
             )
-        if self.preset not in PRESETS:
-            raise InvalidInput("rung.preset", f"{self.preset!r} is none of {', '.join(PRESETS)}")
+        check_effort("rung.effort", self.effort)
 
     @property
     def name(self) -> str:
-        """The rung in words, as tables, logs and metrics show it: ``50% sh1 2ref veryfast``."""
-        quality = self.quality
-        parts = [f"{100 * quality.detail:g}%"]
-        if quality.sh_degree is not None:
-            parts.append(f"sh{quality.sh_degree}")
-        if quality.samples_per_ray is not None:
-            parts.append(f"{quality.samples_per_ray}samples")
-        if quality.scale != 1:
-            parts.append("half-size")
+        """The rung in words, as tables, logs and metrics show it: ``50% sh1 2ref fast``."""
+        parts = [quality_name(self.quality)]
         parts.append(f"{self.references}ref" if self.references else "render-only")
         if not self.photometric:
             parts.append("no-light")
-        if self.fast_unsent:
-            parts.append("rough")
-        return " ".join([*parts, self.preset])
+        parts.append(self.effort)
+        if self.tracking is not TrackingEffort.FULL:
+            parts.append(f"track-{self.tracking}")
+        return " ".join(parts)
+
+
+def quality_name(quality: Quality) -> str:
+    """Return the quality in words: ``50% sh1``."""
+    parts = [f"{100 * quality.detail:g}%"]
+    if quality.sh_degree is not None:
+        parts.append(f"sh{quality.sh_degree}")
+    if quality.samples_per_ray is not None:
+        parts.append(f"{quality.samples_per_ray}samples")
+    if quality.scale != 1:
+        parts.append("half-size")
+    return " ".join(parts)
 
 
 FULL_RUNG = Rung()
-"""The best there is, at the default preset."""
+"""The best there is, at the default effort."""
 
 
 @dataclass(frozen=True)
@@ -99,20 +143,27 @@ def front(rungs: Sequence[MeasuredRung]) -> tuple[MeasuredRung, ...]:
     return tuple(kept)
 
 
-def read_ladder(path: Path, kind: str, crf: float) -> tuple[MeasuredRung, ...]:
+def read_ladder(
+    path: Path, kind: str, crf: float, coder: Coder = Coder.OWN, *, tracking: bool = False
+) -> tuple[MeasuredRung, ...]:
     """Return the front of the rungs measured for a field of ``kind`` at the CRF nearest ``crf``.
 
-    Raises ``InvalidData`` naming the file if it is no ladder, or has nothing for such a field.
+    ``tracking``: the sender finds its poses in the field; each rung comes with every effort of
+    tracking that was measured to work at its quality. Raises ``InvalidData`` naming the file if it
+    is no ladder, or has nothing for such a field and coder, or no times of tracking.
     """
     try:
         result = json.loads(path.read_text())
         if result["kind"] != "ladder":
             raise InvalidData("it is a result of another kind")
-        rows = [row for row in result["rows"] if row["settings"]["kind"] == kind]
+        rows = [row for row in result["rows"] if _is_for(row["settings"], kind, coder)]
         if not rows:
-            raise InvalidData(f"it has no rungs for {kind}")
+            raise InvalidData(f"it has no rungs for {kind} with the coder {coder}")
         nearest = min((row["settings"]["crf"] for row in rows), key=lambda have: abs(have - crf))
         measured = [_measured(row) for row in rows if row["settings"]["crf"] == nearest]
+        if tracking:
+            tracks = [row for row in result.get("tracking", ()) if row["settings"]["kind"] == kind]
+            measured = _with_tracking(measured, tracks)
     except (OSError, ValueError, KeyError, TypeError, InvalidInput, InvalidData) as error:
         raise InvalidData(
             f"{path}: not a usable ladder ({error!s}); make one with rfedge eval ladder"
@@ -120,13 +171,57 @@ def read_ladder(path: Path, kind: str, crf: float) -> tuple[MeasuredRung, ...]:
     return front(measured)
 
 
+def _is_for(stored: Mapping[str, Any], kind: str, coder: Coder) -> bool:
+    """Tell whether a row is of that kind of field and coder, and of a rung that still exists."""
+    is_rough = stored.get("rough", False)  # a setting of x264 in ladders without efforts
+    return stored["kind"] == kind and coder_of(_effort(stored)) is coder and not is_rough
+
+
+def _effort(stored: Mapping[str, Any]) -> str:
+    """Return a row's effort; rows from before our slice coder have a preset of x264 instead."""
+    return str(stored["effort"]) if "effort" in stored else effort_of_preset(stored["preset"])
+
+
+def _quality(stored: Mapping[str, Any]) -> Quality:
+    return Quality(
+        stored["detail"], stored["sh_degree"], stored["samples_per_ray"], stored["scale"]
+    )
+
+
+def _with_tracking(
+    rungs: Sequence[MeasuredRung], tracks: Sequence[Mapping[str, Any]]
+) -> list[MeasuredRung]:
+    """Return each rung with each effort of tracking at its quality: its time and rate on top."""
+    made = [
+        _tracked(rung, row)
+        for rung in rungs
+        for row in tracks
+        if row.get("track_ms") is not None and _quality(row["settings"]) == rung.rung.quality
+    ]
+    if not made:
+        raise InvalidData("it has no times of tracking, which a vehicle that localises plans with")
+    return made
+
+
+def _tracked(measured: MeasuredRung, row: Mapping[str, Any]) -> MeasuredRung:
+    track_ms, more_percent = row["track_ms"], row["rate_percent"]
+    if not (math.isfinite(track_ms) and track_ms > 0):
+        raise InvalidInput("ladder.track_ms", f"{track_ms} must be above 0 ms")
+    factor = (1 + measured.rate_percent / 100) * (1 + more_percent / 100)
+    return replace(
+        measured,
+        rung=replace(measured.rung, tracking=TrackingEffort(row["tracking"])),
+        sender_ms=measured.sender_ms + track_ms,
+        rate_percent=100 * (factor - 1),
+    )
+
+
 def _measured(row: Mapping[str, Any]) -> MeasuredRung:
     stored = row["settings"]
     rung = Rung(
-        Quality(stored["detail"], stored["sh_degree"], stored["samples_per_ray"], stored["scale"]),
+        _quality(stored),
         stored["references"],
         stored["photometric"],
-        stored["preset"],
-        fast_unsent=stored.get("rough", False),  # absent from the first ladders
+        _effort(stored),
     )
     return MeasuredRung(rung, row["sender_ms"], row["receiver_ms"], row["rate_percent"])

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from rfcore.codec.h264.config import CRF_RANGE, check_crf
 from rfcore.codec.references import Reference, References
 from rfcore.codec.sender.frame_costs import FrameCosts, RateDistortion
+from rfcore.codec.sender.picture_coder import CodedPicture
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native.warp import BLOCK_PX
@@ -177,14 +178,14 @@ MAX_HALVING_CRF = 48.0
 """CRF steps that are assumed to halve a slice, at the least and at the most."""
 AIM = 0.95
 """Share of the limit that a step aims at: aiming low costs a little, a miss costs a coding."""
-Code = Callable[[float], bytes]
+Code = Callable[[float], CodedPicture]
 
 
 @dataclass(frozen=True)
 class FittedSlice:
     """A slice, the CRF it was coded at, and how often the frame was coded for it."""
 
-    payload: bytes
+    coded: CodedPicture
     crf: float
     tries: int
 
@@ -194,18 +195,19 @@ def code_to_fit(code: Code, crf: float, limit_bytes: int) -> FittedSlice:
 
     What does not fit at the highest CRF is returned as it is: check the length.
     """
-    payload = code(crf)
+    coded = code(crf)
     halving = MIN_HALVING_CRF
     for tries in range(1, MAX_TRIES):
-        if len(payload) <= limit_bytes or crf == CRF_RANGE[1]:
-            return FittedSlice(payload, crf, tries)
+        size_bytes = len(coded.payload)
+        if size_bytes <= limit_bytes or crf == CRF_RANGE[1]:
+            return FittedSlice(coded, crf, tries)
         last = tries == MAX_TRIES - 1
-        excess = math.log2(len(payload) / (AIM * limit_bytes))
+        excess = math.log2(size_bytes / (AIM * limit_bytes))
         following = CRF_RANGE[1] if last else min(crf + max(1.0, halving * excess), CRF_RANGE[1])
         shorter = code(following)
-        halving = _halving_crf(following - crf, len(payload), len(shorter))
-        payload, crf = shorter, following
-    return FittedSlice(payload, crf, MAX_TRIES)
+        halving = _halving_crf(following - crf, size_bytes, len(shorter.payload))
+        coded, crf = shorter, following
+    return FittedSlice(coded, crf, MAX_TRIES)
 
 
 def _halving_crf(step: float, before_bytes: int, after_bytes: int) -> float:

@@ -1,11 +1,10 @@
-"""What a caller asks of every frame beside its quality: a quantiser map and a refined pose.
+"""What a caller asks of every frame beside its quality: a quantiser map.
 
 ``SteeringSettings`` is its form on a command line, where the map is the file of a mask.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from rfcore.image import read_rgb
 
 __all__ = ["NO_STEERING", "Steering", "SteeringSettings"]
 
-LONGEST_REFINE_MS = 10_000
 BRIGHT = 128
 """The level from which a pixel of a mask's file belongs to it, in any channel."""
 
@@ -26,8 +24,6 @@ class Steering:
 
     qp_map: QpMap | None = None
     """Where frames are coded finer or coarser."""
-    refine_pose_ms: float | None = None
-    """Time a frame to look for a pose of fewer bits near the measured one; ``None``: that one."""
 
 
 NO_STEERING = Steering()
@@ -35,28 +31,17 @@ NO_STEERING = Steering()
 
 @dataclass(frozen=True)
 class SteeringSettings:
-    """Where bits go, and from which pose frames are coded."""
+    """Where bits go."""
 
     mask: Path | None = None
     """Picture of the camera's size, white where frames are to be coded finer."""
     mask_qp: int = -6
     """Added to H.264's quantiser in the mask, -24..24; -6 halves its step."""
-    refine_pose_ms: float | None = None
-    """Time a frame to look for a pose of fewer bits near the measured one; from about 100 on."""
-
-    def __post_init__(self) -> None:
-        refine_ms = self.refine_pose_ms
-        if refine_ms is not None and not (
-            math.isfinite(refine_ms) and 0 < refine_ms <= LONGEST_REFINE_MS
-        ):
-            raise InvalidInput(
-                "refine_pose_ms", f"{refine_ms} ms is outside 0..{LONGEST_REFINE_MS} ms"
-            )
 
     def steering(self, size_px: tuple[int, int]) -> Steering:
         """Return it for frames of ``size_px``; raises for a mask that is not of that size."""
         if self.mask is None:
-            return Steering(None, self.refine_pose_ms)
+            return NO_STEERING
         bright = read_rgb(self.mask).max(axis=2) >= BRIGHT
         if bright.shape != size_px[::-1]:
             raise InvalidInput(
@@ -64,4 +49,4 @@ class SteeringSettings:
                 f"{self.mask} has {bright.shape[1]}x{bright.shape[0]} px, the camera "
                 f"{size_px[0]}x{size_px[1]} px",
             )
-        return Steering(qp_map_of_mask(bright, size_px, self.mask_qp), self.refine_pose_ms)
+        return Steering(qp_map_of_mask(bright, size_px, self.mask_qp))

@@ -21,19 +21,22 @@ using InPlane = nb::ndarray<const std::uint8_t, nb::ndim<2>, nb::device::cpu>;
 using OutPlane = nb::ndarray<std::uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Quantisers = nb::ndarray<const std::int8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Weights = nb::ndarray<const std::uint32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using OutModes = nb::ndarray<std::int8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Planes = std::array<InPlane, 3>;
 
 class LockedCoder {
 public:
-    LockedCoder(int width, int height, const std::string& isa)
-        : width_(width), height_(height), coder_(width, height, h264::kernels_for(isa.c_str())) {}
+    LockedCoder(int width, int height, const std::string& isa, int threads)
+        : width_(width), height_(height), coder_(width, height, h264::kernels_for(isa.c_str()), threads) {}
 
     nb::bytes encode(const Planes& frame, const std::vector<Planes>& references, int slice_qp,
-                     Quantisers qp, Weights lambda_q8, Weights motion_q8,
-                     const std::array<int, 4>& effort, const std::array<OutPlane, 3>& out) {
+                     Quantisers qp, Quantisers forced, Weights lambda_q8, Weights motion_q8,
+                     const std::array<int, 6>& effort, bool deblocked, int vertical_reach,
+                     const std::array<OutPlane, 3>& out, OutModes modes) {
         if (references.size() > h264::kMaxReferences || lambda_q8.shape(0) != 52 ||
             motion_q8.shape(0) != 52 ||
-            qp.shape(0) != static_cast<std::size_t>(coder_.width_mb() * coder_.height_mb())) {
+            qp.shape(0) != macroblocks() || forced.shape(0) != macroblocks() ||
+            modes.shape(0) != macroblocks()) {
             throw nb::value_error("arrays do not fit the slice");
         }
         std::array<h264::Picture, h264::kMaxReferences> pictures;
@@ -44,7 +47,11 @@ public:
         settings.qp = qp.data();
         std::copy_n(lambda_q8.data(), 52, settings.lambda_q8);
         std::copy_n(motion_q8.data(), 52, settings.motion_q8);
-        settings.effort = {effort[0], effort[1], effort[2] != 0, effort[3]};
+        settings.effort = {effort[0], effort[1], effort[2] != 0, effort[3], effort[4],
+                           effort[5]};
+        settings.deblocked = deblocked;
+        settings.forced = forced.data();
+        settings.vertical_reach = vertical_reach;
         for (int p = 0; p < 3; ++p) check(out[p].shape(0), out[p].shape(1), p);
         const std::vector<uint8_t>* bytes;
         std::unique_lock<std::mutex> lock(mutex_, std::defer_lock);
@@ -58,11 +65,19 @@ public:
                                       static_cast<int>(out[p].shape(1)),
                                       static_cast<int>(out[p].shape(0)));
             }
+            for (std::size_t i = 0; i < macroblocks(); ++i) {
+                modes.data()[i] = coder_.mode(static_cast<int>(i));
+            }
         }
         return nb::bytes(bytes->data(), bytes->size());
     }
 
 private:
+    std::size_t macroblocks() const {
+        return static_cast<std::size_t>(coder_.width_mb()) *
+               static_cast<std::size_t>(coder_.height_mb());
+    }
+
     void check(std::size_t height, std::size_t width, int plane) const {
         const int high = plane ? (height_ + 1) / 2 : height_;
         const int wide = plane ? (width_ + 1) / 2 : width_;
@@ -91,11 +106,12 @@ private:
 
 void bind_h264(nb::module_& m) {
     nb::class_<LockedCoder>(m, "SliceCoder")
-        .def(nb::init<int, int, const std::string&>(), nb::arg("width"), nb::arg("height"),
-             nb::arg("isa"))
+        .def(nb::init<int, int, const std::string&, int>(), nb::arg("width"), nb::arg("height"),
+             nb::arg("isa"), nb::arg("threads") = 1)
         .def("encode", &LockedCoder::encode, nb::arg("frame"), nb::arg("references"),
-             nb::arg("slice_qp"), nb::arg("qp"), nb::arg("lambda_q8"), nb::arg("motion_q8"),
-             nb::arg("effort"), nb::arg("out"));
+             nb::arg("slice_qp"), nb::arg("qp"), nb::arg("forced"), nb::arg("lambda_q8"), nb::arg("motion_q8"),
+             nb::arg("effort"), nb::arg("deblocked"), nb::arg("vertical_reach"), nb::arg("out"),
+             nb::arg("modes"));
 }
 
 }  // namespace rfcore

@@ -4,6 +4,7 @@
 namespace nb = nanobind;
 
 namespace rfcore {
+void bind_blake2b(nb::module_& m);
 void bind_h264(nb::module_& m);
 void bind_ngp(nb::module_& m);
 void bind_pcm(nb::module_& m);
@@ -14,6 +15,7 @@ void bind_yuv(nb::module_& m);
 
 NB_MODULE(_native, m) {
     m.doc() = "Bit-exact kernels of rfcore; use the wrappers in rfcore.native.";
+    rfcore::bind_blake2b(m);
     rfcore::bind_h264(m);
     rfcore::bind_ngp(m);
     rfcore::bind_pcm(m);

@@ -83,7 +83,20 @@ public:
         return static_cast<size_t>(next_ - begin_);
     }
 
+    // What follows the I_PCM bin (7.3.5): alignment, the samples, then the coder starts anew with
+    // the contexts as they are (9.3.1.2).
+    void samples(const uint8_t* luma, const uint8_t* chroma) {
+        finish();
+        std::memcpy(next_, luma, 256);
+        std::memcpy(next_ + 256, chroma, 128);
+        next_ += 384;
+        low_ = 0;
+        range_ = 510;
+        queued_ = -1;
+    }
+
     size_t size() const { return static_cast<size_t>(next_ - begin_); }
+    size_t bits() const { return 8 * size() + static_cast<size_t>(queued_ + 1); }
 
 private:
     void renormalise() {
@@ -116,6 +129,23 @@ private:
     uint64_t low_ = 0;
     uint32_t range_ = 510;
     int queued_ = -1;  // the first bit is always 0 and is not written (firstBitFlag)
+};
+
+// Follows the states of the contexts alone.
+class ContextTracker {
+public:
+    explicit ContextTracker(Contexts& contexts) : contexts_(contexts) {}
+
+    void bin(int context, int value) {
+        uint8_t& packed = contexts_.state[context];
+        packed = after_symbol(packed, value == (packed & 1));
+    }
+    void bypass(int) {}
+    void bypass_bits(uint32_t, int) {}
+    void terminate(int) {}
+
+private:
+    Contexts& contexts_;
 };
 
 // Adds up what the same calls would cost, in 1/256 bits, with contexts that stay as they are.

@@ -15,6 +15,14 @@ struct Canvas {
 
 // Partitions are not tried where 16x16 is predicted this well, in bits: they would cost as much.
 constexpr uint32_t kWholeBits = 100;
+// Whether nothing is left to code is not looked for where the difference costs more than this, in
+// bits: it is left there.
+constexpr uint32_t kSkipBits = 100;
+
+// What an I_PCM macroblock takes in 1/256 bits: samples, type, alignment and the coder's new start.
+constexpr uint32_t kPcmBits = 256 * (8 * 384 + 16);
+// Added to the cost of a candidate of another mode than the forced one.
+constexpr Cost kForbidden = Cost{1} << 56;
 
 class MacroblockCoder {
 public:
@@ -25,12 +33,41 @@ public:
     const Candidate& decide(int mx, int my, const Around& around) {
         begin(mx, my, around);
         best_ = nullptr;
-        if (job_.reference_count > 0) try_inter();
-        if (best_ == nullptr || wants_intra()) try_intra();
+        forced_ = static_cast<Mode>(job_.forced[my * job_.width_mb + mx]);
+        if (forced_ != kModePcm) {
+            if (job_.reference_count > 0) try_inter();
+            if (best_ == nullptr || forced_ >= kModeIntra16 || wants_intra()) try_intra();
+        }
+        if (best_ == nullptr || (free() && quality_.cost(0, kPcmBits) < best_->cost)) {
+            take_samples();
+        }
         return *best_;
     }
 
 private:
+    // No mode is forced, so that what seems not to pay need not be tried.
+    bool free() const { return forced_ == kAnyMode; }
+
+    bool allowed(const Coded& mb) const {
+        const bool inter = mb.kind == Kind::kInter;
+        return free() || forced_ == (inter ? kMode16x16 + mb.shape
+                                           : kModeOfKind[static_cast<int>(mb.kind)]);
+    }
+
+    // I_PCM, of the source's samples.
+    void take_samples() {
+        Candidate& c = spare();
+        start(c, Kind::kPcm);
+        c.mb.cbp_luma = 15;
+        c.mb.cbp_chroma = 2;
+        c.mb.coded = (1u << 27) - 1;
+        copy_block<16>(source_[0].at, source_[0].stride, c.luma, 16, 16);
+        for (int p = 0; p < 2; ++p) {
+            copy_block<8>(source_[1 + p].at, source_[1 + p].stride, c.chroma[p], 8, 8);
+        }
+        best_ = &c;
+    }
+
     void begin(int mx, int my, const Around& around) {
         around_ = &around;
         x_ = 16 * mx;
@@ -52,9 +89,10 @@ private:
         const auto limit = [](int v, int most) {
             return static_cast<int16_t>(v < -most ? -most : v > most ? most : v);
         };
-        // Vectors stay within 24 samples of the picture, and within level 1's vertical range.
+        // Vectors stay within 24 samples of the picture, and within the level's range.
         range_ = {limit(-4 * (x_ + 24), 2000), limit(4 * (right + 8), 2000),
-                  limit(-4 * (y_ + 24), 252), limit(4 * (below + 8), 252)};
+                  limit(-4 * (y_ + 24), job_.vertical_reach),
+                  limit(4 * (below + 8), job_.vertical_reach)};
     }
 
     Candidate& spare() { return &candidates_[0] == best_ ? candidates_[1] : candidates_[0]; }
@@ -78,6 +116,7 @@ private:
     // Weighs a finished candidate against the best one.
     void weigh(Candidate& c) {
         c.cost = quality_.cost(c.luma_error + c.chroma_error, bits(c));
+        if (!allowed(c.mb)) c.cost += kForbidden;
         if (best_ == nullptr || c.cost < best_->cost) best_ = &c;
     }
 
@@ -95,9 +134,9 @@ private:
                 luma_prediction(reference, x_ + x, y_ + y, mv, width, height, scratch);
             uint8_t* out = luma + 16 * y + x;
             if (width == 16) {
-                copy_block(block.at, block.stride, out, 16, 16, height);
+                copy_block<16>(block.at, block.stride, out, 16, height);
             } else {
-                copy_block(block.at, block.stride, out, 16, 8, height);
+                copy_block<8>(block.at, block.stride, out, 16, height);
             }
             for (int c = 0; c < 2; ++c) {
                 const Plane& plane = reference.chroma[c];
@@ -149,7 +188,7 @@ private:
         set_partition(c.mb, kPartitions[0][0], 0, mv, mv);
         alignas(32) uint8_t luma[256], chroma[2][64];
         predict(c.mb, luma, chroma);
-        const bool nothing = leaves_nothing(luma, chroma);
+        const bool nothing = comes_near(luma) && leaves_nothing(luma, chroma);
         __builtin_memcpy(c.luma, luma, sizeof luma);
         __builtin_memcpy(c.chroma, chroma, sizeof chroma);
         c.luma_error = squared_error<16>(source_[0].at, source_[0].stride, luma, 16);
@@ -157,6 +196,12 @@ private:
                          squared_error<8>(source_[2].at, source_[2].stride, chroma[1], 8);
         weigh(c);
         return nothing;
+    }
+
+    bool comes_near(const uint8_t* luma) const {
+        const uint32_t difference =
+            transformed_difference<16>(source_[0].at, source_[0].stride, luma, 16, 16);
+        return 256 * uint64_t{difference} < uint64_t{kSkipBits} * motion_q8_;
     }
 
     // Whether nothing beside this prediction would be worth its bits.
@@ -203,7 +248,7 @@ private:
 
     void try_inter() {
         field_.begin(*around_);
-        if (try_skip()) return;
+        if (try_skip() && free()) return;
         Found whole[kMaxReferences];
         const Mv starts[3] = {field_.mv[1][0], field_.mv[0][1], skip_vector_};
         for (int r = 0; r < job_.reference_count; ++r) {
@@ -225,7 +270,6 @@ private:
         order(best, second);
         for (int r = 0; r < job_.reference_count; ++r) {
             if (r != best && r != second && !job_.effort.every_reference) continue;
-            if (whole[r].cost > whole[best].cost + whole[best].cost / 2) continue;
             whole[r] = refined(search_of(r, 0, kPartitions[0][0]), r, whole[r]);
         }
         order(best, second);
@@ -235,34 +279,51 @@ private:
         start(c, Kind::kInter);
         set_partition(c.mb, kPartitions[0][0], best, whole[best].mv, predicted);
         finish_inter(c);
-        if (best_->mb.kind == Kind::kInter && best_->mb.cbp_luma == 0) return;
-        if (inter_cost_ < kWholeBits * motion_q8_) return;
+        if (free() && best_->mb.kind == Kind::kInter && best_->mb.cbp_luma == 0) return;
+        if (free() && inter_cost_ < kWholeBits * motion_q8_) return;
         try_parts(whole);
     }
 
-    // Four 8x8 blocks, then the halves that agree with them; the cheapest of these is coded.
+    // Four 8x8 blocks, then the halves that agree with them; the cheapest of these are coded.
     void try_parts(const Found* whole) {
         Coded parts[3];
         uint32_t costs[3];
         costs[2] = search_shape(3, whole, nullptr, parts[2]);
+        if (free() && far_behind(costs[2])) return;
         costs[0] = search_shape(1, whole, &parts[2], parts[0]);
         costs[1] = search_shape(2, whole, &parts[2], parts[1]);
         int least = 0;
         for (int i = 1; i < 3; ++i) {
             if (costs[i] < costs[least]) least = i;
         }
-        if (costs[least] >= inter_cost_) return;
+        if (forced_ >= kMode16x8 && forced_ <= kMode8x8) least = forced_ - kMode16x8;
+        if (free() && costs[least] >= inter_cost_) return;
         inter_cost_ = costs[least];
+        for (int i = 0; i < 3; ++i) {
+            if (i == least || (free() && nearly_least(costs[i], costs[least]))) code_parts(parts[i]);
+        }
+    }
+
+    bool nearly_least(uint32_t cost, uint32_t least) const {
+        return 100 * uint64_t{cost} < uint64_t{least} * unsigned(job_.effort.shapes_reach);
+    }
+
+    void code_parts(const Coded& parts) {
         Candidate& c = spare();
         start(c, Kind::kInter);
-        const Coded& chosen = parts[least];
-        c.mb.shape = chosen.shape;
+        c.mb.shape = parts.shape;
         for (int b = 0; b < 4; ++b) {
-            c.mb.reference[b] = chosen.reference[b];
-            c.mb.mv[b] = chosen.mv[b];
-            c.mb.mvd[b] = chosen.mvd[b];
+            c.mb.reference[b] = parts.reference[b];
+            c.mb.mv[b] = parts.mv[b];
+            c.mb.mvd[b] = parts.mvd[b];
         }
         finish_inter(c);
+    }
+
+    // Where 8x8 blocks are predicted this badly, halves would not be better than the whole either.
+    bool far_behind(uint32_t cost) const {
+        const int reach = job_.effort.halves_reach;
+        return reach > 0 && 100 * uint64_t{cost} > uint64_t{inter_cost_} * unsigned(reach);
     }
 
     // Vectors for every partition of `shape`; `from`, if there, has those of 8x8 blocks to start
@@ -280,13 +341,14 @@ private:
                 if (from && r != from->reference[part.block] && r != from->reference[last]) {
                     continue;
                 }
-                Mv starts[3] = {whole[r].mv, whole[r].mv, whole[r].mv};
-                if (from) {
-                    starts[1] = from->mv[part.block];
-                    starts[2] = from->mv[last];
-                }
                 const Search search = search_of(r, shape, part);
-                Found found = search.first_of(starts, from ? 3 : 1);
+                Mv starts[4] = {whole[r].mv, search.predicted};
+                if (from) {
+                    starts[2] = from->mv[part.block];
+                    starts[3] = from->mv[last];
+                }
+                Found found = search.first_of(starts, from ? 4 : 2);
+                if (job_.effort.every_reference) found = search.refined(found, job_.effort);
                 found.cost += reference_cost(r);
                 if (found.cost < least.cost) {
                     least = found;
@@ -294,7 +356,7 @@ private:
                 }
             }
             const Search search = search_of(index, shape, part);
-            if (!from) least = refined(search, index, least);
+            if (!from && !job_.effort.every_reference) least = refined(search, index, least);
             const Mv least_predicted = search.predicted;
             set_partition(out, part, index, least.mv, least_predicted);
             field_.fill(part, static_cast<int8_t>(index), least.mv);
@@ -306,12 +368,12 @@ private:
     // --- intra ---
 
     bool wants_intra() {
-        return job_.effort.intra_reach == 0 || best_->mb.cbp_luma != 0;
+        return free() && (job_.effort.intra_reach == 0 || best_->mb.cbp_luma != 0);
     }
 
     bool beyond_reach(uint32_t difference) const {
         const int reach = job_.effort.intra_reach;
-        return reach > 0 && 1024 * uint64_t{difference} > uint64_t{inter_cost_} * unsigned(reach);
+        return free() && reach > 0 && 1024 * uint64_t{difference} > uint64_t{inter_cost_} * unsigned(reach);
     }
 
     void try_intra() {
@@ -342,7 +404,7 @@ private:
         // c may have become the best; the chroma of all three kinds is the same.
         Candidate& next = &c == best_ ? spare() : c;
         if (&next != &c) copy_chroma(c, next);
-        if (!try_blocks<8>(next)) return;
+        if (!try_blocks<8>(next) && free()) return;
         Candidate& last = best_ == &next ? spare() : next;
         if (&last != &next) copy_chroma(next, last);
         try_blocks<4>(last);
@@ -350,7 +412,7 @@ private:
 
     // One mode for all of the macroblock beats inter prediction only where it comes near to it.
     bool worth_16(uint32_t difference) const {
-        return job_.effort.intra_reach == 0 || 256 * uint64_t{difference} <= inter_cost_;
+        return !free() || job_.effort.intra_reach == 0 || 256 * uint64_t{difference} <= inter_cost_;
     }
 
     static void copy_chroma(const Candidate& from, Candidate& to) {
@@ -386,8 +448,8 @@ private:
     void begin_canvas() {
         const ptrdiff_t stride = job_.reconstruction_stride[0];
         const uint8_t* at = picture_[0];
-        if (around_->above) copy_block(at - stride, 0, canvas_.at(0, -1), 0, 16, 1);
-        if (around_->above_right) copy_block(at - stride + 16, 0, canvas_.at(16, -1), 0, 8, 1);
+        if (around_->above) copy_block<16>(at - stride, 0, canvas_.at(0, -1), 0, 1);
+        if (around_->above_right) copy_block<8>(at - stride + 16, 0, canvas_.at(16, -1), 0, 1);
         if (around_->above_left) *canvas_.at(-1, -1) = at[-stride - 1];
         for (int y = 0; around_->left && y < 16; ++y) *canvas_.at(-1, y) = at[y * stride - 1];
     }
@@ -435,7 +497,7 @@ private:
             code_intra_block<side>(c, i, raster, strip<side>().of(mode));
             if (quality_.cost(c.luma_error, c.luma_bits) > most) return 2 * i >= kAcross * kAcross;
         }
-        copy_block(canvas_.at(0, 0), Canvas::kStride, c.luma, 16, 16, 16);
+        copy_block<16>(canvas_.at(0, 0), Canvas::kStride, c.luma, 16, 16);
         weigh(c);
         return true;
     }
@@ -487,9 +549,11 @@ private:
         }
         const uint8_t* source = source_[0].at + y * source_[0].stride + x;
         ModeStrip<side>& modes = strip<side>();
+        EdgeMeans<side> means;
+        means.measure(edge);
         for (int mode = 0; mode < kBlockModes; ++mode) {
             if (mode_available(mode, edge)) {
-                predict_block<side>(mode, edge, modes.of(mode), ModeStrip<side>::kStride);
+                predict_block<side>(mode, edge, means, modes.of(mode), ModeStrip<side>::kStride);
             }
         }
         uint32_t differences[ModeStrip<side>::kVectors * ModeStrip<side>::kPerVector];
@@ -526,6 +590,7 @@ private:
     Rates rates_;
     Quality quality_;
     uint32_t motion_q8_ = 0;
+    Mode forced_ = kModeSkip;
     Range range_;
     MotionField field_;
     Mv skip_vector_ = {0, 0};

@@ -10,7 +10,6 @@ enum BlockMode : int8_t {
     kVerticalLeft, kHorizontalUp, kBlockModes
 };
 
-inline int mean2(int a, int b) { return (a + b + 1) >> 1; }
 inline int mean3(int a, int b, int c) { return (a + 2 * b + c + 2) >> 2; }
 inline uint8_t clipped(int v) { return static_cast<uint8_t>(v < 0 ? 0 : v > 255 ? 255 : v); }
 
@@ -18,7 +17,7 @@ inline uint8_t clipped(int v) { return static_cast<uint8_t>(v < 0 ? 0 : v > 255 
 // at[-1 - y] left of it.
 template <int side>
 struct Edge {
-    uint8_t sample[3 * side + 1];
+    uint8_t sample[3 * side + 1] = {};
     bool left, above, corner;
     const uint8_t* at() const { return sample + side; }
 };
@@ -87,77 +86,101 @@ int block_dc(const Edge<side>& e) {
     return 128;
 }
 
-// One sample of 8.3.1.2 (4x4) or 8.3.2.2 (8x8). `p` as in Edge; left samples go downwards from it.
+// What the directional modes of 8.3.1.2 (4x4) and 8.3.2.2 (8x8) consist of: means of two and of
+// three neighbours along the edge. Every row of a prediction is a slice of one of these sequences
+// or of two of them interleaved.
 template <int side>
-int block_sample(int mode, const uint8_t* p, int dc, int x, int y) {
-    const uint8_t* above = p + 1;
-    const auto left = [p](int i) -> int { return p[-1 - i]; };  // left(-1) is the corner
-    const auto top = [p](int i) -> int { return p[1 + i]; };    // top(-1) is the corner
-    switch (mode) {
-        case kVertical: return above[x];
-        case kHorizontal: return left(y);
-        case kDownLeft:
-            return x == side - 1 && y == side - 1
-                       ? (top(2 * side - 2) + 3 * top(2 * side - 1) + 2) >> 2
-                       : mean3(top(x + y), top(x + y + 1), top(x + y + 2));
-        case kDownRight: {
-            const uint8_t* d = p + x - y;
-            return mean3(d[-1], d[0], d[1]);
-        }
-        case kVerticalRight: {
-            const int z = 2 * x - y, i = x - (y >> 1);
-            if (z >= 0) {
-                return z & 1 ? mean3(top(i - 2), top(i - 1), top(i)) : mean2(top(i - 1), top(i));
-            }
-            if (z == -1) return mean3(left(0), p[0], top(0));
-            return mean3(left(y - 2 * x - 1), left(y - 2 * x - 2), left(y - 2 * x - 3));
-        }
-        case kHorizontalDown: {
-            const int z = 2 * y - x, i = y - (x >> 1);
-            if (z >= 0) {
-                return z & 1 ? mean3(left(i - 2), left(i - 1), left(i))
-                             : mean2(left(i - 1), left(i));
-            }
-            if (z == -1) return mean3(left(0), p[0], top(0));
-            return mean3(top(x - 2 * y - 1), top(x - 2 * y - 2), top(x - 2 * y - 3));
-        }
-        case kVerticalLeft: {
-            const int i = x + (y >> 1);
-            return y & 1 ? mean3(top(i), top(i + 1), top(i + 2)) : mean2(top(i), top(i + 1));
-        }
-        case kHorizontalUp: {
-            const int z = x + 2 * y, i = y + (x >> 1);
-            if (z > 2 * side - 3) return left(side - 1);
-            if (z == 2 * side - 3) return (left(side - 2) + 3 * left(side - 1) + 2) >> 2;
-            return z & 1 ? mean3(left(i), left(i + 1), left(i + 2)) : mean2(left(i), left(i + 1));
-        }
-        default: return dc;
-    }
-}
+struct EdgeMeans {
+    static constexpr int kCount = 16 * ((3 * side + 16) / 16);
+    uint8_t means2[kCount], means3[kCount];
 
-template <int side, int mode>
-void predict_block_mode(const Edge<side>& edge, uint8_t* out, ptrdiff_t stride) {
-    const int dc = mode == kDc ? block_dc(edge) : 0;
-    for (int y = 0; y < side; ++y) {
-        for (int x = 0; x < side; ++x) {
-            out[y * stride + x] =
-                static_cast<uint8_t>(block_sample<side>(mode, edge.at(), dc, x, y));
+    // `two(i)`: of p[i] and p[i + 1]; `three(i)`: around p[i], with the outermost samples repeated;
+    // i from -side on.
+    const uint8_t* two(int i) const { return means2 + side + i; }
+    const uint8_t* three(int i) const { return means3 + side + i; }
+
+    void measure(const Edge<side>& edge) {
+        uint8_t p[kCount + 2] = {};
+        __builtin_memcpy(p + 1, edge.sample, sizeof edge.sample);
+        p[0] = p[1];
+        p[3 * side + 2] = p[3 * side + 1];
+        for (int i = 0; i < kCount; i += 16) {
+            Bytes16 a, b, c;
+            __builtin_memcpy(&a, p + i, sizeof a);
+            __builtin_memcpy(&b, p + i + 1, sizeof b);
+            __builtin_memcpy(&c, p + i + 2, sizeof c);
+            const Bytes16 m2 = mean_of_bytes(b, c);
+            // (a + 2 b + c + 2) >> 2 is the mean of b and of (a + c) >> 1, rounded up.
+            const Bytes16 m3 = mean_of_bytes(b, (a & c) + ((a ^ c) >> 1));
+            __builtin_memcpy(means2 + i, &m2, sizeof m2);
+            __builtin_memcpy(means3 + i, &m3, sizeof m3);
         }
     }
+};
+
+// Row y of `out` is `side` samples from `first` + y * `step` on.
+template <int side>
+RF_INLINE void take_rows(const uint8_t* first, int step, uint8_t* out, ptrdiff_t stride, int rows) {
+    for (int y = 0; y < rows; ++y) __builtin_memcpy(out + y * stride, first + y * step, side);
 }
 
 template <int side>
-void predict_block(int mode, const Edge<side>& edge, uint8_t* out, ptrdiff_t stride) {
+void predict_vertical_right(const EdgeMeans<side>& means, uint8_t* out, ptrdiff_t stride) {
+    constexpr int kHalf = side / 2;
+    uint8_t even[side + kHalf], odd[side + kHalf];
+    for (int k = 1; k < kHalf; ++k) {
+        even[kHalf - k] = *means.three(1 - 2 * k);
+        odd[kHalf - k] = *means.three(-2 * k);
+    }
+    __builtin_memcpy(even + kHalf, means.two(0), side);
+    __builtin_memcpy(odd + kHalf, means.three(0), side);
+    take_rows<side>(even + kHalf, -1, out, 2 * stride, kHalf);
+    take_rows<side>(odd + kHalf, -1, out + stride, 2 * stride, kHalf);
+}
+
+template <int side>
+void predict_horizontal_down(const EdgeMeans<side>& means, uint8_t* out, ptrdiff_t stride) {
+    uint8_t sequence[3 * side];
+    for (int j = 0; j < side; ++j) {
+        sequence[2 * j] = *means.two(j - side);
+        sequence[2 * j + 1] = *means.three(j + 1 - side);
+    }
+    __builtin_memcpy(sequence + 2 * side, means.three(1), side);
+    take_rows<side>(sequence + 2 * (side - 1), -2, out, stride, side);
+}
+
+template <int side>
+void predict_horizontal_up(const Edge<side>& edge, const EdgeMeans<side>& means, uint8_t* out,
+                           ptrdiff_t stride) {
+    uint8_t sequence[3 * side];
+    for (int j = 0; j < side - 1; ++j) {
+        sequence[2 * j] = *means.two(-2 - j);
+        sequence[2 * j + 1] = *means.three(-2 - j);
+    }
+    __builtin_memset(sequence + 2 * side - 2, edge.at()[-side], side + 2);
+    take_rows<side>(sequence, 2, out, stride, side);
+}
+
+template <int side>
+void predict_block(int mode, const Edge<side>& edge, const EdgeMeans<side>& means, uint8_t* out,
+                   ptrdiff_t stride) {
     switch (mode) {
-        case kVertical: return predict_block_mode<side, kVertical>(edge, out, stride);
-        case kHorizontal: return predict_block_mode<side, kHorizontal>(edge, out, stride);
-        case kDc: return predict_block_mode<side, kDc>(edge, out, stride);
-        case kDownLeft: return predict_block_mode<side, kDownLeft>(edge, out, stride);
-        case kDownRight: return predict_block_mode<side, kDownRight>(edge, out, stride);
-        case kVerticalRight: return predict_block_mode<side, kVerticalRight>(edge, out, stride);
-        case kHorizontalDown: return predict_block_mode<side, kHorizontalDown>(edge, out, stride);
-        case kVerticalLeft: return predict_block_mode<side, kVerticalLeft>(edge, out, stride);
-        default: return predict_block_mode<side, kHorizontalUp>(edge, out, stride);
+        case kVertical: return take_rows<side>(edge.at() + 1, 0, out, stride, side);
+        case kHorizontal:
+            for (int y = 0; y < side; ++y) {
+                __builtin_memset(out + y * stride, edge.at()[-1 - y], side);
+            }
+            return;
+        case kDownLeft: return take_rows<side>(means.three(2), 1, out, stride, side);
+        case kDownRight: return take_rows<side>(means.three(0), -1, out, stride, side);
+        case kVerticalRight: return predict_vertical_right(means, out, stride);
+        case kHorizontalDown: return predict_horizontal_down(means, out, stride);
+        case kVerticalLeft:
+            take_rows<side>(means.two(1), 1, out, 2 * stride, side / 2);
+            return take_rows<side>(means.three(2), 1, out + stride, 2 * stride, side / 2);
+        case kHorizontalUp: return predict_horizontal_up(edge, means, out, stride);
+        default:
+            for (int y = 0; y < side; ++y) __builtin_memset(out + y * stride, block_dc(edge), side);
     }
 }
 
@@ -174,8 +197,10 @@ void predict_plane(const uint8_t* at, ptrdiff_t stride, uint8_t* out) {
     const int b = (factor * h + 32) >> 6, c = (factor * v + 32) >> 6;
     const int a = 16 * (at[(side - 1) * stride - 1] + at[-stride + side - 1]);
     for (int y = 0; y < side; ++y) {
-        for (int x = 0; x < side; ++x) {
-            out[side * y + x] = clipped((a + b * (x - kHalf + 1) + c * (y - kHalf + 1) + 16) >> 5);
+        for (int x = 0; x < side; x += 8) {
+            const Row8 across = Row8{0, 1, 2, 3, 4, 5, 6, 7} + (x - kHalf + 1);
+            const Row8 v = (across * b + (a + c * (y - kHalf + 1) + 16)) >> 5;
+            store_clipped(v, out + side * y + x);
         }
     }
 }
@@ -198,9 +223,10 @@ inline bool predict_luma16(int mode, const uint8_t* at, ptrdiff_t stride, const 
     }
     const int dc = above && left ? (sum + 16) >> 5 : above || left ? (sum + 8) >> 4 : 128;
     for (int y = 0; y < 16; ++y) {
-        for (int x = 0; x < 16; ++x) {
-            out[16 * y + x] = mode == 0 ? at[-stride + x] : mode == 1 ? at[y * stride - 1]
-                                                                      : static_cast<uint8_t>(dc);
+        if (mode == 0) {
+            __builtin_memcpy(out + 16 * y, at - stride, 16);
+        } else {
+            __builtin_memset(out + 16 * y, mode == 1 ? at[y * stride - 1] : dc, 16);
         }
     }
     return true;
@@ -237,10 +263,11 @@ inline bool predict_chroma8(int mode, const uint8_t* at, ptrdiff_t stride, const
             dc = (from_above + 2) >> 2;
         }
         for (int y = by; y < by + 4; ++y) {
-            for (int x = bx; x < bx + 4; ++x) {
-                out[8 * y + x] = mode == 1   ? at[y * stride - 1]
-                                 : mode == 2 ? at[-stride + x]
-                                             : static_cast<uint8_t>(dc);
+            uint8_t* row = out + 8 * y + bx;
+            if (mode == 2) {
+                __builtin_memcpy(row, at - stride + bx, 4);
+            } else {
+                __builtin_memset(row, mode == 1 ? at[y * stride - 1] : dc, 4);
             }
         }
     }

@@ -7,8 +7,15 @@ namespace rfcore::h264 {
 
 struct Kernels {
     const char* isa;
+    size_t coded_bytes, contexts_bytes;
+    // Decides on one row of macroblocks; rows may run at the same time, begun in order.
+    void (*decide_row)(const SliceJob&, int row);
     // Returns the bytes of slice_data written to `out`, 0 where `capacity` does not hold them.
-    size_t (*encode)(const SliceJob&);
+    // Macroblocks above kMaxMacroblockBits are forced to I_PCM: `again` asks for both passes anew.
+    size_t (*write_slice)(const SliceJob&, bool* again);
+    // Filters a row of the reconstruction in place (8.7), after `write_slice` and, up to one
+    // macroblock further on, the row above.
+    void (*deblock_row)(const SliceJob&, int row);
     // Half-sample planes b, h, j of a padded plane of integer samples (8.4.2.2.1).
     void (*half_samples)(const uint8_t* whole, ptrdiff_t stride, int width, int height,
                          uint8_t* const* out);

@@ -150,19 +150,35 @@ struct Search {
         return 256 * sum + vector_cost(v);
     }
 
-    // One step to the best of the four neighbours at `distance`; false where none is better.
+    // At most `steps` steps, each to the best of the four neighbours at `distance`, until none is
+    // better. Where the last step came from is not measured again: it cost more.
     template <class Measure>
-    bool step(Found& best, int distance, Measure measure) const {
+    void walk(Found& best, int distance, int steps, Measure measure) const {
         static constexpr int8_t kDirections[4][2] = {{1, 0}, {-1, 0}, {0, 1}, {0, -1}};
-        const Mv centre = best.mv;
-        for (const auto& d : kDirections) {
-            const Mv v = {static_cast<int16_t>(centre.x + distance * d[0]),
-                          static_cast<int16_t>(centre.y + distance * d[1])};
-            if (!range.holds(v)) continue;
-            const uint32_t cost = measure(v);
-            if (cost < best.cost) best = {v, cost};
+        int back = -1;
+        while (steps-- > 0) {
+            const Mv centre = best.mv;
+            int taken = -1;
+            for (int i = 0; i < 4; ++i) {
+                const Mv v = {static_cast<int16_t>(centre.x + distance * kDirections[i][0]),
+                              static_cast<int16_t>(centre.y + distance * kDirections[i][1])};
+                if (i == back || !range.holds(v)) continue;
+                const uint32_t cost = measure(v);
+                if (cost >= best.cost) continue;
+                best = {v, cost};
+                taken = i;
+            }
+            if (taken < 0) return;
+            back = taken ^ 1;
         }
-        return !(best.mv == centre);
+    }
+
+    // Whether starts[i] is one of those before it.
+    static bool known(const Mv* starts, int i) {
+        for (int j = 0; j < i; ++j) {
+            if (starts[j] == starts[i]) return true;
+        }
+        return false;
     }
 
     // The best of `starts`: those between samples as they are, and the nearest whole one.
@@ -171,14 +187,14 @@ struct Search {
         for (int i = 0; i < count; ++i) {
             Mv v = range.clamped(starts[i]);
             v = {static_cast<int16_t>((v.x + 2) & ~3), static_cast<int16_t>((v.y + 2) & ~3)};
-            if (!range.holds(v) || (i > 0 && v == best.mv)) continue;
+            if (known(starts, i) || !range.holds(v) || (i > 0 && v == best.mv)) continue;
             const uint32_t cost = whole(v);
             if (cost < best.cost) best = {v, cost};
         }
         best.cost = exact(best.mv);
         for (int i = 0; i < count; ++i) {
             const Mv v = starts[i];
-            if (((v.x | v.y) & 3) == 0 || !range.holds(v)) continue;
+            if (((v.x | v.y) & 3) == 0 || known(starts, i) || !range.holds(v)) continue;
             const uint32_t cost = exact(v);
             if (cost < best.cost) best = {v, cost};
         }
@@ -193,18 +209,15 @@ struct Search {
                             static_cast<int16_t>((start.mv.y + 2) & ~3)};
         Found best = start;
         if (range.holds(rounded)) {
-            Found walk = {rounded, whole(rounded)};
-            for (int i = 0; i < effort.search_steps && step(walk, 4, by_whole); ++i) {
+            Found other = {rounded, whole(rounded)};
+            walk(other, 4, effort.search_steps, by_whole);
+            if (!(other.mv == rounded)) {
+                other.cost = exact(other.mv);
+                if (other.cost < best.cost) best = other;
             }
-            if (!(walk.mv == rounded)) {
-                walk.cost = exact(walk.mv);
-                if (walk.cost < best.cost) best = walk;
-            }
         }
-        for (int i = 0; i < effort.subsample_steps && step(best, 2, by_exact); ++i) {
-        }
-        for (int i = 0; i < effort.subsample_steps && step(best, 1, by_exact); ++i) {
-        }
+        walk(best, 2, effort.subsample_steps, by_exact);
+        walk(best, 1, effort.subsample_steps, by_exact);
         return best;
     }
 };

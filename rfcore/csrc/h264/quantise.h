@@ -133,21 +133,15 @@ constexpr int32_t kLeastLevel = 140;
 template <int count>
 RF_INLINE uint64_t scale(const int32_t* coefficients, const uint16_t* multiplier, int shift,
                          int32_t* scaled) {
-    int32_t any = 0;
     for (int i = 0; i < count; ++i) {
         const uint32_t size =
             static_cast<uint32_t>(coefficients[i] < 0 ? -coefficients[i] : coefficients[i]);
         scaled[i] = static_cast<int32_t>((size * multiplier[i]) >> shift);
-        any |= kLeastLevel - 1 - scaled[i];
     }
-    if (any >= 0) return 0;
-    alignas(8) uint8_t flags[64];
-    for (int i = 0; i < count; ++i) flags[i] = scaled[i] >= kLeastLevel;
+    for (int i = count; i < 8; ++i) scaled[i] = 0;
     uint64_t large = 0;
-    for (int i = 0; i < count; i += 8) {  // eight bytes of 0 or 1 become eight bits
-        uint64_t bytes = 0;
-        __builtin_memcpy(&bytes, flags + i, count < 8 ? count : 8);
-        large |= ((bytes * 0x0102040810204080u) >> 56) << i;
+    for (int i = 0; i < count; i += 8) {
+        large |= static_cast<uint64_t>(above(scaled + i, kLeastLevel - 1)) << i;
     }
     return large;
 }
@@ -222,7 +216,7 @@ inline Quantised take_levels(const RateQuantiser& q, const LevelRates& rates, Ch
 inline Quantised quantise(const RateQuantiser& q, const int32_t* coefficients,
                           const uint16_t* multiplier, const uint16_t* energy, int16_t* levels) {
     const Scan& scan = kScan[q.category];
-    int32_t scaled[64];
+    alignas(32) int32_t scaled[64];
     uint64_t large = q.category == kLuma8 ? scale<64>(coefficients, multiplier, q.shift, scaled)
                      : q.category == kChromaDc
                          ? scale<4>(coefficients, multiplier, q.shift, scaled)

@@ -66,10 +66,11 @@ inline RateQuantiser rate_quantiser(const Quality& quality, Category category, i
     return {*quality.rates, category, flag_context, quality.lambda_q8, shift + more, 2 * (qp / 6)};
 }
 
-inline void copy_block(const uint8_t* from, ptrdiff_t from_stride, uint8_t* to, ptrdiff_t to_stride,
-                       int width, int height) {
+template <int width>
+RF_INLINE void copy_block(const uint8_t* from, ptrdiff_t from_stride, uint8_t* to,
+                          ptrdiff_t to_stride, int height) {
     for (int y = 0; y < height; ++y) {
-        __builtin_memcpy(to + y * to_stride, from + y * from_stride, static_cast<size_t>(width));
+        __builtin_memcpy(to + y * to_stride, from + y * from_stride, width);
     }
 }
 
@@ -83,7 +84,7 @@ inline uint32_t code_block8(const Quality& quality, const uint8_t* source, ptrdi
     const RateQuantiser rate = rate_quantiser(quality, kLuma8, -1, quality.qp);
     const Quantised block = quantise(rate, coefficients, q.multiplier, q.energy, levels);
     if (!block) {
-        copy_block(prediction, stride, out, out_stride, 8, 8);
+        copy_block<8>(prediction, stride, out, out_stride, 8);
         return 0;
     }
     dequantise8(levels, block.coded, quality.qp, coefficients);
@@ -100,7 +101,7 @@ inline uint32_t code_block4(const Quality& quality, int flag_context, const uint
     const RateQuantiser rate = rate_quantiser(quality, kLuma4, flag_context, quality.qp);
     const Quantised block = quantise(rate, coefficients, q.multiplier, q.energy, levels);
     if (!block) {
-        copy_block(prediction, stride, out, out_stride, 4, 4);
+        copy_block<4>(prediction, stride, out, out_stride, 4);
         return 0;
     }
     dequantise4(levels, kLuma4, block.coded, quality.qp, coefficients);

@@ -11,18 +11,21 @@ void SliceCoder::Padded::resize(int width, int height, int border_samples) {
     samples.assign(static_cast<size_t>(stride) * static_cast<size_t>(height + 2 * border) + 64, 0);
 }
 
-SliceCoder::SliceCoder(int width, int height, const Kernels& kernels)
+SliceCoder::SliceCoder(int width, int height, const Kernels& kernels, int threads)
     : width_(width),
       height_(height),
       width_mb_((width + 15) / 16),
       height_mb_((height + 15) / 16),
-      kernels_(kernels) {
+      kernels_(kernels),
+      pool_(threads) {
     for (int p = 0; p < 3; ++p) {
         const int side = p ? 8 : 16;
         frame_[p].resize(side * width_mb_, side * height_mb_, 0);
         reconstruction_[p].resize(side * width_mb_, side * height_mb_, 0);
     }
     macroblocks_.resize(static_cast<size_t>(width_mb_) * static_cast<size_t>(height_mb_));
+    coded_.resize(macroblocks_.size() * kernels.coded_bytes / 8 + 1);
+    contexts_.resize(static_cast<size_t>(height_mb_) * kernels.contexts_bytes / 8 + 1);
 }
 
 // Copies a plane, repeats its last column and row up to whole macroblocks, then all edges over the
@@ -70,36 +73,71 @@ Reference SliceCoder::reference(const Picture& from, int index) {
     return result;
 }
 
-const std::vector<uint8_t>& SliceCoder::encode(const Picture& frame, const Picture* references,
-                                               int reference_count, const SliceSettings& settings) {
+SliceJob SliceCoder::begin(const Picture& frame, const Picture* references, int reference_count) {
     SliceJob job = {};
     job.width_mb = width_mb_;
     job.height_mb = height_mb_;
     job.reference_count = reference_count;
-    for (int i = 0; i < reference_count; ++i) job.references[i] = reference(references[i], i);
+    pool_.run(reference_count + 1, [&](int i) {
+        if (i < reference_count) {
+            job.references[i] = reference(references[i], i);
+        } else {
+            for (int p = 0; p < 3; ++p) take(frame, p, 0, frame_[p]);
+        }
+    });
     for (int p = 0; p < 3; ++p) {
-        take(frame, p, 0, frame_[p]);
         job.frame[p] = {frame_[p].at(), frame_[p].stride};
         job.reconstruction[p] = reconstruction_[p].at();
         job.reconstruction_stride[p] = reconstruction_[p].stride;
     }
-    job.slice_qp = settings.slice_qp;
-    job.qp = settings.qp;
-    job.lambda_q8 = settings.lambda_q8;
-    job.motion_q8 = settings.motion_q8;
-    job.effort = settings.effort;
     job.macroblocks = macroblocks_.data();
-    out_.resize(macroblocks_.size() * 512 + 2 * kMaxMacroblockBytes);
+    job.coded = coded_.data();
+    job.contexts = contexts_.data();
+    job.progress = &wavefront_;
+    job.reached = [](void* progress, int row, int columns) {
+        static_cast<Wavefront*>(progress)->reached(row, columns);
+    };
+    job.await = [](void* progress, int row, int columns) {
+        static_cast<Wavefront*>(progress)->await(row, columns);
+    };
+    return job;
+}
+
+void SliceCoder::over_rows(const SliceJob& job, void (*row)(const SliceJob&, int)) {
+    wavefront_.begin(height_mb_);
+    pool_.run(height_mb_, [&](int my) { row(job, my); });
+}
+
+// Both passes; the second again with more room until its bytes fit.
+size_t SliceCoder::encode_once(SliceJob& job, bool* again) {
+    over_rows(job, kernels_.decide_row);
     for (;;) {
         job.out = out_.data();
         job.capacity = out_.size();
-        const size_t size = kernels_.encode(job);
-        if (size > 0) {
-            out_.resize(size);
-            return out_;
-        }
+        const size_t size = kernels_.write_slice(job, again);
+        if (size > 0) return size;
         out_.resize(2 * out_.size());
     }
+}
+
+const std::vector<uint8_t>& SliceCoder::encode(const Picture& frame, const Picture* references,
+                                               int reference_count, const SliceSettings& settings) {
+    SliceJob job = begin(frame, references, reference_count);
+    job.slice_qp = settings.slice_qp;
+    job.qp = settings.qp;
+    forced_.assign(settings.forced, settings.forced + macroblocks_.size());
+    job.forced = forced_.data();
+    job.vertical_reach = settings.vertical_reach;
+    job.lambda_q8 = settings.lambda_q8;
+    job.motion_q8 = settings.motion_q8;
+    job.effort = settings.effort;
+    out_.resize(macroblocks_.size() * 512 + 2 * kMaxMacroblockBytes);
+    bool again = true;
+    size_t size = 0;
+    while (again) size = encode_once(job, &again);
+    if (settings.deblocked) over_rows(job, kernels_.deblock_row);
+    out_.resize(size);
+    return out_;
 }
 
 void SliceCoder::reconstruction(int plane, uint8_t* out, ptrdiff_t stride, int width,

@@ -354,6 +354,24 @@ void write_intra_type(Sink& sink, const Coded& mb, const Around& around, bool p_
 }
 
 template <class Sink>
+void write_skip_flag(Sink& sink, const Around& around, bool skipped) {
+    const int a = around.left && around.left->kind != Kind::kSkip;
+    const int b = around.above && around.above->kind != Kind::kSkip;
+    sink.bin(11 + a + b, skipped);
+}
+
+// mb_type I_PCM, whose samples follow, with the skip flag before it.
+template <class Sink>
+void write_pcm_type(Sink& sink, const Around& around, bool p_slice) {
+    if (p_slice) {
+        write_skip_flag(sink, around, false);
+        sink.bin(14, 1);
+    }
+    sink.bin(p_slice ? 17 : 3 + not_nxn(around.left) + not_nxn(around.above), 1);
+    sink.terminate(1);
+}
+
+template <class Sink>
 void write_type(Sink& sink, const Coded& mb, const Around& around, bool p_slice) {
     const bool intra = mb.kind >= Kind::kIntra16;
     if (p_slice) sink.bin(14, intra);
@@ -365,13 +383,6 @@ void write_type(Sink& sink, const Coded& mb, const Around& around, bool p_slice)
     } else {
         sink.bin(16, mb.shape == 3);
     }
-}
-
-template <class Sink>
-void write_skip_flag(Sink& sink, const Around& around, bool skipped) {
-    const int a = around.left && around.left->kind != Kind::kSkip;
-    const int b = around.above && around.above->kind != Kind::kSkip;
-    sink.bin(11 + a + b, skipped);
 }
 
 inline int transform8_context(const Around& around) {

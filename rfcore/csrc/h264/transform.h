@@ -4,6 +4,7 @@
 // with D a sum of squared sample differences, R_q8 and lambda_q8 in 1/256.
 #pragma once
 
+#include "h264/lanes.h"
 #include "h264/syntax.h"
 
 namespace {
@@ -95,23 +96,6 @@ constexpr uint8_t kChromaQp[52] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 1
                                    13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25,
                                    26, 27, 28, 29, 29, 30, 31, 32, 32, 33, 34, 34, 35,
                                    35, 36, 36, 37, 37, 37, 38, 38, 38, 39, 39, 39, 39};
-
-typedef int32_t Row8 __attribute__((vector_size(32)));
-typedef int32_t Row4 __attribute__((vector_size(16)));
-typedef uint8_t Bytes8 __attribute__((vector_size(8)));
-typedef uint8_t Bytes4 __attribute__((vector_size(4)));
-
-RF_INLINE Row8 load_row8(const uint8_t* at) {
-    Bytes8 bytes;
-    __builtin_memcpy(&bytes, at, 8);
-    return __builtin_convertvector(bytes, Row8);
-}
-
-RF_INLINE Row4 load_row4(const uint8_t* at) {
-    Bytes4 bytes;
-    __builtin_memcpy(&bytes, at, 4);
-    return __builtin_convertvector(bytes, Row4);
-}
 
 RF_INLINE void transpose4(Row4* r) {
     const Row4 a = __builtin_shuffle(r[0], r[1], Row4{0, 4, 1, 5});
@@ -231,11 +215,8 @@ RF_INLINE void inverse4(const int32_t* coefficients, const uint8_t* prediction, 
     transpose4(r);
     inverse_columns4(r);
     for (int y = 0; y < 4; ++y) {
-        Row4 v = load_row4(prediction + y * stride) + ((r[y] + 32) >> 6);
-        v = v < 0 ? Row4{} : v;
-        v = v > 255 ? Row4{255, 255, 255, 255} : v;
-        const Bytes4 bytes = __builtin_convertvector(v, Bytes4);
-        __builtin_memcpy(out + y * out_stride, &bytes, 4);
+        store_clipped(load_row4(prediction + y * stride) + ((r[y] + 32) >> 6),
+                      out + y * out_stride);
     }
 }
 
@@ -246,13 +227,9 @@ RF_INLINE void inverse8(const int32_t* coefficients, const uint8_t* prediction, 
     inverse_columns8(r);
     transpose8(r);
     inverse_columns8(r);
-    const Row8 most = {255, 255, 255, 255, 255, 255, 255, 255};
     for (int y = 0; y < 8; ++y) {
-        Row8 v = load_row8(prediction + y * stride) + ((r[y] + 32) >> 6);
-        v = v < 0 ? Row8{} : v;
-        v = v > most ? most : v;
-        const Bytes8 bytes = __builtin_convertvector(v, Bytes8);
-        __builtin_memcpy(out + y * out_stride, &bytes, 8);
+        store_clipped(load_row8(prediction + y * stride) + ((r[y] + 32) >> 6),
+                      out + y * out_stride);
     }
 }
 

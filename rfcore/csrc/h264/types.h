@@ -28,7 +28,16 @@ struct Mv {
     int16_t x, y;  // quarters of a luma sample
 };
 
-enum class Kind : uint8_t { kSkip, kInter, kIntra16, kIntra8, kIntra4 };
+enum class Kind : uint8_t { kSkip, kInter, kIntra16, kIntra8, kIntra4, kPcm };
+
+// What a macroblock is coded as: kinds, and the partitions of kInter.
+enum Mode : int8_t {
+    kModeSkip, kMode16x16, kMode16x8, kMode8x16, kMode8x8, kModeIntra16, kModeIntra8, kModeIntra4,
+    kModePcm, kModes
+};
+constexpr int8_t kAnyMode = -1;
+constexpr Mode kModeOfKind[6] = {kModeSkip,   kMode16x16,  kModeIntra16,
+                                 kModeIntra8, kModeIntra4, kModePcm};
 
 constexpr int8_t kNoReference = -1;  // an intra macroblock
 constexpr int8_t kUnavailable = -2;
@@ -36,6 +45,7 @@ constexpr int8_t kUnavailable = -2;
 // Of a coded macroblock, what its neighbours' predictions and contexts depend on.
 struct Neighbour {
     Kind kind;
+    Mode mode;
     bool transform8;
     uint8_t cbp_luma;    // a bit for each 8x8 block
     uint8_t cbp_chroma;  // 0, 1 DC, 2 DC and AC
@@ -54,9 +64,14 @@ struct Neighbour {
 struct Effort {
     int search_steps;      // of the integer motion search
     int subsample_steps;   // of the half- and quarter-sample search
-    bool every_reference;  // 8x8 blocks try all references, else the best two
+    bool every_reference;  // each partition's vector is refined in all references, else in the
+                           // best of them (of 16x16: the best two)
     int intra_reach;       // intra modes are tried where the transformed difference of 16x16
                            // ones is at most this many quarters of inter prediction's; 0: always
+    int halves_reach;      // halves are tried where 8x8 blocks cost at most this many percent of
+                           // the whole; 0: always
+    int shapes_reach;      // partitions are coded, too, that cost at most this many percent of the
+                           // cheapest; at least 100
 };
 
 struct SliceJob {
@@ -68,16 +83,24 @@ struct SliceJob {
     ptrdiff_t reconstruction_stride[3];
     int slice_qp;
     const int8_t* qp;            // QP_Y wanted for each macroblock
+    int8_t* forced;              // Mode of each macroblock, kAnyMode where the coder decides
+    int vertical_reach;          // of vectors, in quarter samples (A.3.1, MaxVmvR)
     const uint32_t* lambda_q8;   // [52] squared error a bit is worth, in 1/256
     const uint32_t* motion_q8;   // [52] absolute transformed difference a bit is worth, in 1/256
     Effort effort;
     Neighbour* macroblocks;  // width_mb * height_mb
+    void* coded;             // as many of Kernels::coded_bytes: macroblocks as they are written
+    void* contexts;          // height_mb of Kernels::contexts_bytes: states that a row hands on
+    void* progress;          // for the two calls below (threads/wavefront.h)
+    void (*reached)(void* progress, int row, int columns);
+    void (*await)(void* progress, int row, int columns);
     uint8_t* out;
     size_t capacity;
 };
 
-// Most bytes of CABAC data that one macroblock of this coder takes: 384 coefficients of at most
-// 46 bins each would be more than I_PCM; the search keeps below (A.3.1: 3200 bits).
+// Most bits of macroblock_layer (A.3.1): 128 more than the samples of an I_PCM macroblock.
+constexpr size_t kMaxMacroblockBits = 3200;
+// Room that is kept for one: 384 levels of at most 47 bits, before it is found to be too large.
 constexpr size_t kMaxMacroblockBytes = 3072;
 
 }  // namespace rfcore::h264

@@ -40,6 +40,7 @@ constexpr std::int16_t kFilter[kSteps][kLanes] = {
 // A vector in the compilers' own notation (GCC, Clang), for any instruction set. Taps are 6 bits
 // so that a column's sum fits: no row of the filter has absolute values of more than 100 in all.
 using Lanes = std::int16_t __attribute__((vector_size(2 * kLanes)));
+using TwoRows = std::int16_t __attribute__((vector_size(4 * kLanes)));
 using Sums = std::int32_t __attribute__((vector_size(2 * kLanes)));
 
 inline Lanes lanes_at(const std::int16_t* from) {
@@ -91,25 +92,39 @@ struct Row {
     std::vector<float> z;
 };
 
+// What the rays of a column have in common: each entry of the rotation's first column times ray_x.
+struct Columns {
+    Columns(const WarpGeometry& g, int width) : x(width), y(width), z(width) {
+        for (int column = 0; column < width; ++column) {
+            const float ray_x = (static_cast<float>(column) + 0.5f - g.cx) / g.fx;
+            x[column] = g.rotation[0] * ray_x;
+            y[column] = g.rotation[3] * ray_x;
+            z[column] = g.rotation[6] * ray_x;
+        }
+    }
+    std::vector<float> x, y, z;
+};
+
 // Where row y of the present picture lies in the previous one, in 1/64 sample; kNowhere outside.
 RFCORE_PER_ISA
-void locate_row(const float* __restrict depth, const WarpGeometry& g, PictureSize size, int y,
-                std::int32_t* __restrict u, std::int32_t* __restrict v, float* __restrict z) {
+void locate_row(const float* __restrict depth, const WarpGeometry& g, const Columns& columns,
+                PictureSize size, int y, std::int32_t* __restrict u, std::int32_t* __restrict v,
+                float* __restrict z) {
     const float ray_y = (static_cast<float>(y) + 0.5f - g.cy) / g.fy;
     const float row_x = g.rotation[1] * ray_y + g.rotation[2];
     const float row_y = g.rotation[4] * ray_y + g.rotation[5];
     const float row_z = g.rotation[7] * ray_y + g.rotation[8];
-    const float r0 = g.rotation[0], r3 = g.rotation[3], r6 = g.rotation[6];
+    const float *column_x = columns.x.data(), *column_y = columns.y.data();
+    const float* column_z = columns.z.data();
     const float t0 = g.translation[0], t1 = g.translation[1], t2 = g.translation[2];
     const float fx = g.fx, fy = g.fy, cx = g.cx, cy = g.cy;
     const float right = static_cast<float>(size.width_px - 1);
     const float bottom = static_cast<float>(size.height_px - 1);
     for (int x = 0; x < size.width_px; ++x) {
-        const float ray_x = (static_cast<float>(x) + 0.5f - cx) / fx;
         const float far = depth[x];
-        const float px = far * (r0 * ray_x + row_x) + t0;
-        const float py = far * (r3 * ray_x + row_y) + t1;
-        const float pz = far * (r6 * ray_x + row_z) + t2;
+        const float px = far * (column_x[x] + row_x) + t0;
+        const float py = far * (column_y[x] + row_y) + t1;
+        const float pz = far * (column_z[x] + row_z) + t2;
         const float at_x = fx * (px / pz) + cx - 0.5f;
         const float at_y = fy * (py / pz) + cy - 0.5f;
         const bool inside = (far > 0.0f) & (pz > kNearest) & (at_x >= 0.0f) & (at_x <= right) &
@@ -192,8 +207,16 @@ void filter_row(const std::int16_t* samples, std::size_t pitch, const Reach& rea
         if (begin[n] < 0) continue;
         const std::int16_t* line = samples + begin[n];
         const Lanes* taps = kDown.each[down[n]];
-        Lanes columns = lanes_at(line) * taps[0];
-        for (int j = 1; j < kTaps; ++j) columns += lanes_at(line + j * pitch) * taps[j];
+        TwoRows rows{};
+        for (int j = 0; j < kTaps; j += 2) {
+            TwoRows two_taps;
+            std::memcpy(&two_taps, taps + j, sizeof two_taps);
+            rows += __builtin_shufflevector(lanes_at(line + j * pitch), lanes_at(line + (j + 1) * pitch),
+                                            0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) *
+                    two_taps;
+        }
+        const Lanes columns = __builtin_shufflevector(rows, rows, 0, 1, 2, 3, 4, 5, 6, 7) +
+                              __builtin_shufflevector(rows, rows, 8, 9, 10, 11, 12, 13, 14, 15);
         sums[n] = products(columns, lanes_at(kFilter[across[n]]));
     }
 }
@@ -251,13 +274,15 @@ void centre_row(const std::int32_t* top_u, const std::int32_t* bottom_u, const s
 // What all rows of one warp share.
 struct Job {
     Job(const WarpInputs& in, const WarpGeometry& geometry, PictureSize size, I420Planes out)
-        : in(in), geometry(geometry), size(size), out(out), half_width((size.width_px + 1) / 2),
+        : in(in), geometry(geometry), columns(geometry, size.width_px), size(size), out(out),
+          half_width((size.width_px + 1) / 2),
           y(in.previous.y, in.previous_render.y, size.width_px, size.height_px),
           u(in.previous.u, in.previous_render.u, half_width, (size.height_px + 1) / 2),
           v(in.previous.v, in.previous_render.v, half_width, (size.height_px + 1) / 2) {}
 
     const WarpInputs& in;
     const WarpGeometry& geometry;
+    Columns columns;
     PictureSize size;
     I420Planes out;
     int half_width;
@@ -287,7 +312,7 @@ private:
     std::int64_t luma(int y, Row& row) {
         const WarpInputs& in = job_.in;
         const std::size_t start = static_cast<std::size_t>(y) * size_.width_px;
-        locate_row(in.depth + start, job_.geometry, size_, y, row.u.data(), row.v.data(), row.z.data());
+        locate_row(in.depth + start, job_.geometry, job_.columns, size_, y, row.u.data(), row.v.data(), row.z.data());
         drop_hidden(in.previous_depth, size_.width_px, row.u.data(), row.v.data(), row.z.data());
         reach(job_.y, row, size_.width_px);
         interpolate(job_.y, row, size_.width_px, in.render.y + start, job_.out.y + start);

@@ -28,6 +28,7 @@ void pack_parameters(const GaussianArrays& from, float* blocks) {
     const size_t stride = static_cast<size_t>(parameter_planes(from.degree)) * kLanes;
     const size_t count = static_cast<size_t>(from.count);
     const size_t padded = (count + kLanes - 1) / kLanes * kLanes;
+    if (count == 0) return;  // blocks may be null then, which memset may not be given
     std::memset(blocks, 0, padded / kLanes * stride * sizeof(float));
     for (size_t n = 0; n < padded; ++n) {
         float* lane = blocks + n / kLanes * stride + n % kLanes;

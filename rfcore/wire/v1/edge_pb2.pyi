@@ -57,6 +57,52 @@ REFERENCE_CORRECTION: Reference.ValueType  # 4
 """The render, with most of that frame's difference from its own render, carried likewise."""
 Global___Reference: _TypeAlias = Reference  # noqa: Y015
 
+class _CaptureClock:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _CaptureClockEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_CaptureClock.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    CAPTURE_CLOCK_UNSPECIFIED: _CaptureClock.ValueType  # 0
+    """A picture of a dataset, or not stated."""
+    CAPTURE_CLOCK_SENDER_REPORT: _CaptureClock.ValueType  # 1
+    """The RTCP sender reports of a live camera."""
+    CAPTURE_CLOCK_ARRIVAL: _CaptureClock.ValueType  # 2
+    """The arrival of a live camera's stream at the vehicle."""
+
+class CaptureClock(_CaptureClock, metaclass=_CaptureClockEnumTypeWrapper):
+    """What a frame's time of capture rests on."""
+
+CAPTURE_CLOCK_UNSPECIFIED: CaptureClock.ValueType  # 0
+"""A picture of a dataset, or not stated."""
+CAPTURE_CLOCK_SENDER_REPORT: CaptureClock.ValueType  # 1
+"""The RTCP sender reports of a live camera."""
+CAPTURE_CLOCK_ARRIVAL: CaptureClock.ValueType  # 2
+"""The arrival of a live camera's stream at the vehicle."""
+Global___CaptureClock: _TypeAlias = CaptureClock  # noqa: Y015
+
+class _Localisation:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _LocalisationEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Localisation.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    LOCALISATION_UNSPECIFIED: _Localisation.ValueType  # 0
+    """The pose was given: by a dataset or a pose feed."""
+    LOCALISATION_LOST: _Localisation.ValueType  # 1
+    LOCALISATION_LOCALISING: _Localisation.ValueType  # 2
+    LOCALISATION_TRACKING: _Localisation.ValueType  # 3
+
+class Localisation(_Localisation, metaclass=_LocalisationEnumTypeWrapper):
+    """What a vehicle that finds its camera in the field knows of the camera's pose."""
+
+LOCALISATION_UNSPECIFIED: Localisation.ValueType  # 0
+"""The pose was given: by a dataset or a pose feed."""
+LOCALISATION_LOST: Localisation.ValueType  # 1
+LOCALISATION_LOCALISING: Localisation.ValueType  # 2
+LOCALISATION_TRACKING: Localisation.ValueType  # 3
+Global___Localisation: _TypeAlias = Localisation  # noqa: Y015
+
 class _RejectReason:
     ValueType = _typing.NewType("ValueType", _builtins.int)
     V: _TypeAlias = ValueType  # noqa: Y015
@@ -168,7 +214,10 @@ class Hello(_message.Message):
     CAMERAS_FIELD_NUMBER: _builtins.int
     FIELD_IDS_FIELD_NUMBER: _builtins.int
     RENDERER_FIELD_NUMBER: _builtins.int
+    ALLOW_RECORDING_FIELD_NUMBER: _builtins.int
     vehicle_id: _builtins.str
+    allow_recording: _builtins.bool
+    """Whether the server may keep the pictures beyond the newest one."""
     @_builtins.property
     def cameras(self) -> _containers.RepeatedCompositeFieldContainer[Global___CameraDescription]: ...
     @_builtins.property
@@ -184,10 +233,11 @@ class Hello(_message.Message):
         cameras: _abc.Iterable[Global___CameraDescription] | None = ...,
         field_ids: _abc.Iterable[_builtins.str] | None = ...,
         renderer: Global___RendererContract | None = ...,
+        allow_recording: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["renderer", b"renderer"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["cameras", b"cameras", "field_ids", b"field_ids", "renderer", b"renderer", "vehicle_id", b"vehicle_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["allow_recording", b"allow_recording", "cameras", b"cameras", "field_ids", b"field_ids", "renderer", b"renderer", "vehicle_id", b"vehicle_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -201,6 +251,7 @@ class CameraDescription(_message.Message):
     INTRINSICS_FIELD_NUMBER: _builtins.int
     CODEC_FIELD_NUMBER: _builtins.int
     RATE_HZ_FIELD_NUMBER: _builtins.int
+    CAMERA_FROM_RIG_FIELD_NUMBER: _builtins.int
     camera_id: _builtins.str
     rate_hz: _builtins.float
     """Pictures per second it would send; 0 or absent: not stated."""
@@ -208,6 +259,12 @@ class CameraDescription(_message.Message):
     def intrinsics(self) -> Global___Intrinsics: ...
     @_builtins.property
     def codec(self) -> Global___StreamHeader: ...
+    @_builtins.property
+    def camera_from_rig(self) -> Global___Pose:
+        """Extrinsics: the camera's place on a rig. Then the poses of its frames are world_from_rig, the
+        same for every camera of an instant; absent: they are world_from_cam.
+        """
+
     def __init__(
         self,
         *,
@@ -215,10 +272,11 @@ class CameraDescription(_message.Message):
         intrinsics: Global___Intrinsics | None = ...,
         codec: Global___StreamHeader | None = ...,
         rate_hz: _builtins.float = ...,
+        camera_from_rig: Global___Pose | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["codec", b"codec", "intrinsics", b"intrinsics"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["camera_from_rig", b"camera_from_rig", "codec", b"codec", "intrinsics", b"intrinsics"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "codec", b"codec", "intrinsics", b"intrinsics", "rate_hz", b"rate_hz"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_from_rig", b"camera_from_rig", "camera_id", b"camera_id", "codec", b"codec", "intrinsics", b"intrinsics", "rate_hz", b"rate_hz"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -272,13 +330,17 @@ class StreamHeader(_message.Message):
     CRF_FIELD_NUMBER: _builtins.int
     SPS_FIELD_NUMBER: _builtins.int
     PPS_FIELD_NUMBER: _builtins.int
+    EFFORT_FIELD_NUMBER: _builtins.int
     width_px: _builtins.int
     height_px: _builtins.int
     preset: _builtins.str
+    """x264's preset, where x264 is the coder; else empty."""
     crf: _builtins.float
     sps: _builtins.bytes
     """H.264 sequence and picture parameter sets, as the encoder made them."""
     pps: _builtins.bytes
+    effort: _builtins.str
+    """How hard the slice coder of rfcore.codec.h264 tries; empty where x264 is the coder."""
     def __init__(
         self,
         *,
@@ -288,10 +350,11 @@ class StreamHeader(_message.Message):
         crf: _builtins.float = ...,
         sps: _builtins.bytes = ...,
         pps: _builtins.bytes = ...,
+        effort: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["crf", b"crf", "height_px", b"height_px", "pps", b"pps", "preset", b"preset", "sps", b"sps", "width_px", b"width_px"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["crf", b"crf", "effort", b"effort", "height_px", b"height_px", "pps", b"pps", "preset", b"preset", "sps", b"sps", "width_px", b"width_px"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -323,7 +386,9 @@ Global___RendererContract: _TypeAlias = RendererContract  # noqa: Y015
 
 @_typing.final
 class Pose(_message.Message):
-    """world_from_cam, relative to the tile's origin: unit quaternion, translation in metres."""
+    """A rigid transform, of a frame world_from_cam (or world_from_rig) relative to the tile's origin: unit
+    quaternion, translation in metres.
+    """
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -418,6 +483,9 @@ class Frame(_message.Message):
     PHOTOMETRIC_FIELD_NUMBER: _builtins.int
     POSE_F32_FIELD_NUMBER: _builtins.int
     QUALITY_FIELD_NUMBER: _builtins.int
+    INSTANT_FIELD_NUMBER: _builtins.int
+    CAPTURE_CLOCK_FIELD_NUMBER: _builtins.int
+    LOCALISATION_FIELD_NUMBER: _builtins.int
     camera_id: _builtins.str
     epoch: _builtins.int
     """A new epoch starts the state of both ends afresh; sequences count from 0 in it."""
@@ -440,9 +508,18 @@ class Frame(_message.Message):
     """The first 4 to 16 bytes of the reconstruction_digest of the earlier frame that the references
     call for; else empty.
     """
+    instant: _builtins.int
+    """The instant of the rig that the picture belongs to, counted from 1: pictures of the same instant
+    were taken together. 0: the camera stands alone.
+    """
+    capture_clock: Global___CaptureClock.ValueType
+    """For those who look at the twin; nothing is decoded by either."""
+    localisation: Global___Localisation.ValueType
     @_builtins.property
     def pose(self) -> Global___Pose:
-        """Either: the pose in float64. Or, in less than half the bytes, pose_f32."""
+        """Either: the pose in float64. Or, in less than half the bytes, pose_f32. Neither: the camera is
+        lost; both ends take a field that shows nothing (grey, no depth) for the field at its pose.
+        """
 
     @_builtins.property
     def references(self) -> _containers.RepeatedScalarFieldContainer[Global___Reference.ValueType]:
@@ -483,10 +560,13 @@ class Frame(_message.Message):
         photometric: _abc.Iterable[_builtins.int] | None = ...,
         pose_f32: _abc.Iterable[_builtins.float] | None = ...,
         quality: Global___Quality | None = ...,
+        instant: _builtins.int = ...,
+        capture_clock: Global___CaptureClock.ValueType = ...,
+        localisation: Global___Localisation.ValueType = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["pose", b"pose", "quality", b"quality"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "camera_id", b"camera_id", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "quality", b"quality", "reconstruction_digest", b"reconstruction_digest", "references", b"references", "render_block_means", b"render_block_means", "render_digest", b"render_digest", "sequence", b"sequence"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "camera_id", b"camera_id", "capture_clock", b"capture_clock", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "instant", b"instant", "localisation", b"localisation", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "quality", b"quality", "reconstruction_digest", b"reconstruction_digest", "references", b"references", "render_block_means", b"render_block_means", "render_digest", b"render_digest", "sequence", b"sequence"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -72,6 +72,7 @@ class Tile(_message.Message):
     VERSION_FIELD_NUMBER: _builtins.int
     AREA_FIELD_NUMBER: _builtins.int
     MARGIN_M_FIELD_NUMBER: _builtins.int
+    LIGHTS_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     field_id: _builtins.str
     version: _builtins.int
@@ -79,6 +80,10 @@ class Tile(_message.Message):
     @_builtins.property
     def area(self) -> Global___Area:
         """Absent: everywhere."""
+
+    @_builtins.property
+    def lights(self) -> _containers.RepeatedCompositeFieldContainer[Global___TileLight]:
+        """The same ground under other lights; a vehicle takes what is nearest to its frames."""
 
     def __init__(
         self,
@@ -88,14 +93,57 @@ class Tile(_message.Message):
         version: _builtins.int = ...,
         area: Global___Area | None = ...,
         margin_m: _builtins.float = ...,
+        lights: _abc.Iterable[Global___TileLight] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["area", b"area"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["area", b"area", "field_id", b"field_id", "margin_m", b"margin_m", "name", b"name", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["area", b"area", "field_id", b"field_id", "lights", b"lights", "margin_m", b"margin_m", "name", b"name", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___Tile: _TypeAlias = Tile  # noqa: Y015
+
+@_typing.final
+class TileLight(_message.Message):
+    """A field of a tile, learnt under another light than the tile's own."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    FIELD_ID_FIELD_NUMBER: _builtins.int
+    VERSION_FIELD_NUMBER: _builtins.int
+    BASE_FIELD_ID_FIELD_NUMBER: _builtins.int
+    PASSES_FIELD_NUMBER: _builtins.int
+    TIME_OF_DAY_H_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    field_id: _builtins.str
+    version: _builtins.int
+    """A version of the tile, counted with all others."""
+    base_field_id: _builtins.str
+    """The field that it is a colour layer on, to be fetched first; empty for a field of its own."""
+    passes: _builtins.int
+    """How many passes of vehicles it was learnt from; 0: not stated."""
+    time_of_day_h: _builtins.float
+    """Hours of the day, UTC, about which they drove."""
+    def __init__(
+        self,
+        *,
+        name: _builtins.str = ...,
+        field_id: _builtins.str = ...,
+        version: _builtins.int = ...,
+        base_field_id: _builtins.str = ...,
+        passes: _builtins.int = ...,
+        time_of_day_h: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_time_of_day_h", b"_time_of_day_h", "time_of_day_h", b"time_of_day_h"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_time_of_day_h", b"_time_of_day_h", "base_field_id", b"base_field_id", "field_id", b"field_id", "name", b"name", "passes", b"passes", "time_of_day_h", b"time_of_day_h", "version", b"version"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__time_of_day_h: _TypeAlias = _typing.Literal["time_of_day_h"]  # noqa: Y015
+    _WhichOneofArgType__time_of_day_h: _TypeAlias = _typing.Literal["_time_of_day_h", b"_time_of_day_h"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__time_of_day_h) -> _WhichOneofReturnType__time_of_day_h | None: ...
+
+Global___TileLight: _TypeAlias = TileLight  # noqa: Y015
 
 @_typing.final
 class Area(_message.Message):

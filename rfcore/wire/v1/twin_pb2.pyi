@@ -125,6 +125,11 @@ class TwinPicture(_message.Message):
     ENCODING_FIELD_NUMBER: _builtins.int
     PICTURE_FIELD_NUMBER: _builtins.int
     SKIPPED_FIELD_NUMBER: _builtins.int
+    PAYLOAD_BYTES_FIELD_NUMBER: _builtins.int
+    REFERENCES_FIELD_NUMBER: _builtins.int
+    INSTANT_FIELD_NUMBER: _builtins.int
+    CAPTURE_CLOCK_FIELD_NUMBER: _builtins.int
+    LOCALISATION_FIELD_NUMBER: _builtins.int
     vehicle_id: _builtins.str
     camera_id: _builtins.str
     session_id: _builtins.str
@@ -141,10 +146,21 @@ class TwinPicture(_message.Message):
     picture: _builtins.bytes
     skipped: _builtins.int
     """Pictures of this camera that this consumer missed, so far."""
+    payload_bytes: _builtins.int
+    """Bytes of the slice that it was made from, and the pictures that slice was predicted from."""
+    instant: _builtins.int
+    """Which instant of the vehicle's rig it belongs to, as in Frame: pictures of one vehicle, session
+    and instant were taken together. 0: the camera stands alone.
+    """
+    capture_clock: _edge_pb2.CaptureClock.ValueType
+    """As the vehicle stated them in its frame."""
+    localisation: _edge_pb2.Localisation.ValueType
     @_builtins.property
     def pose(self) -> _edge_pb2.Pose: ...
     @_builtins.property
     def intrinsics(self) -> _edge_pb2.Intrinsics: ...
+    @_builtins.property
+    def references(self) -> _containers.RepeatedScalarFieldContainer[_edge_pb2.Reference.ValueType]: ...
     def __init__(
         self,
         *,
@@ -162,10 +178,15 @@ class TwinPicture(_message.Message):
         encoding: Global___PictureEncoding.ValueType = ...,
         picture: _builtins.bytes = ...,
         skipped: _builtins.int = ...,
+        payload_bytes: _builtins.int = ...,
+        references: _abc.Iterable[_edge_pb2.Reference.ValueType] | None = ...,
+        instant: _builtins.int = ...,
+        capture_clock: _edge_pb2.CaptureClock.ValueType = ...,
+        localisation: _edge_pb2.Localisation.ValueType = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["intrinsics", b"intrinsics", "pose", b"pose"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ns", b"age_ns", "camera_id", b"camera_id", "capture_time_ns", b"capture_time_ns", "encoding", b"encoding", "epoch", b"epoch", "field_id", b"field_id", "intrinsics", b"intrinsics", "picture", b"picture", "pose", b"pose", "reconstruction_digest", b"reconstruction_digest", "sequence", b"sequence", "session_id", b"session_id", "skipped", b"skipped", "vehicle_id", b"vehicle_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ns", b"age_ns", "camera_id", b"camera_id", "capture_clock", b"capture_clock", "capture_time_ns", b"capture_time_ns", "encoding", b"encoding", "epoch", b"epoch", "field_id", b"field_id", "instant", b"instant", "intrinsics", b"intrinsics", "localisation", b"localisation", "payload_bytes", b"payload_bytes", "picture", b"picture", "pose", b"pose", "reconstruction_digest", b"reconstruction_digest", "references", b"references", "sequence", b"sequence", "session_id", b"session_id", "skipped", b"skipped", "vehicle_id", b"vehicle_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional
 
+from rfcore.codec.h264.config import DEFAULT_EFFORT
+
 __all__ = ["EvalCompare"]
 
 Preset = Literal["ultrafast", "superfast", "veryfast", "faster", "fast", "medium"]
@@ -29,8 +31,10 @@ class EvalCompare:
     background: tuple[str, ...] = ()
     """The same for the empty street of a drive, frame by frame at its poses: tells what is not in
     the field, for the split of the bits and for a rival that sends only the foreground."""
+    effort: str = DEFAULT_EFFORT
+    """Of ours: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: Preset = "veryfast"
-    """x264 preset of ours and of the anchor."""
+    """x264 preset of the anchor."""
     out: Path = Path("out/eval/compare.json")
     """The result file to write."""
     cells: Path = Path("out/eval/compare")
@@ -58,6 +62,7 @@ class EvalCompare:
         job = CompareJob(
             field=field_path(self.field),
             drives=self.drives,
+            effort=self.effort,
             preset=self.preset,
             out=self.out,
             cells=self.cells,

@@ -98,7 +98,7 @@ class SplitClip:
     frames: Sequence[I420]
     rendered: RenderedClip
     foregrounds: Sequence[NDArray[np.bool_]]
-    preset: str
+    effort: str
     crf: float
 
 
@@ -123,7 +123,7 @@ def split_rows(clip: SplitClip) -> list[dict[str, Any]]:
 
 def _frames(clip: SplitClip) -> Iterator[tuple[F64, F64]]:
     """Yield macroblocks and slice bytes by kind for every frame but the first."""
-    encoder = DeltaEncoder(CodecConfig(*clip.frames[0].size_px, preset=clip.preset, crf=clip.crf))
+    encoder = DeltaEncoder(CodecConfig(*clip.frames[0].size_px, effort=clip.effort, crf=clip.crf))
     state, rendered = encoder.start(1), clip.rendered
     for index, frame in enumerate(clip.frames):
         coding = _Coding(encoder, state, rendered.views[index])

@@ -17,6 +17,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
+from rfcore.codec.h264.config import check_effort
 from rfcore.codec.references import RENDER_ONLY
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
@@ -143,6 +144,7 @@ class CompareJob:
 
     field: Path
     drives: Sequence[str]
+    effort: str
     preset: str
     out: Path
     cells: Path
@@ -155,6 +157,7 @@ class CompareJob:
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
+        check_effort("effort", self.effort)
         if not (self.drives or self.decimated):
             raise InvalidInput("drives", "there is none")
         low_db, high_db = self.windows_db[0]
@@ -235,9 +238,9 @@ def _drive_comparison(
     coders = [
         FieldCoder(
             rendered,
-            f"{name}-{job.preset}-{rendered.field_id[:12]}",
+            f"{name}-{job.effort}-{rendered.field_id[:12]}",
             stamp,
-            preset=job.preset,
+            effort=job.effort,
             references=references,
             foregrounds=() if behind is None else foregrounds,
         )

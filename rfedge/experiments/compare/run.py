@@ -131,7 +131,7 @@ def _bits(
 ) -> list[BitShareRow]:
     clip, middle_db = comparison.clip, sum(job.windows_db[0]) / 2
     crf = ours.nearest(middle_db).point
-    split = SplitClip(clip.frames, comparison.rendered, comparison.foregrounds, job.preset, crf)
+    split = SplitClip(clip.frames, comparison.rendered, comparison.foregrounds, job.effort, crf)
     key = {
         **clip_key(clip, comparison.methods[0], crf),
         "split": 1,

@@ -6,6 +6,11 @@ machine. Each is the lower quartile over the frames but the first, which has not
 from: what a frame takes when nothing else disturbs the caches.
 The field is rendered once per quality and its time taken then; what both ends render alike is not
 rendered again for every rung.
+
+Tracking is measured apart: a drive is tracked as a vehicle does it, from the dataset's pose of its
+first picture. Its time is what a frame takes beyond the one render that coding needs in any case:
+of everything but rendering the lower quartile, and the mean number of further renders times one
+render's time.
 """
 
 from __future__ import annotations
@@ -18,14 +23,17 @@ from typing import Any
 
 import numpy as np
 
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.references import RENDER_ONLY, references_name
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
-from rfcore.codec.sender.ladder import Rung
+from rfcore.codec.sender.ladder import Rung, TrackingEffort
 from rfcore.errors import CodecError
 from rfcore.field import Quality, RadianceField, render_field_view
 from rfcore.image import I420
+from rfcore.localise.structure import Pyramid
+from rfcore.localise.track import Effort, Track, TrackSettings, begun, followed
 from rfcore.metrics import ssim
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView
@@ -33,7 +41,7 @@ from rfedge.experiments.clips import Drive, luma_mse, psnr_of_mse
 from rfedge.experiments.field_coder import message_bytes
 from rfedge.offline import CodedFrame, FrameInput, decode_promised, encode_frames
 
-__all__ = ["TimedRenders", "measure_rung", "time_renders"]
+__all__ = ["TimedRenders", "TrackedDrive", "measure_rung", "time_renders", "track_drive"]
 
 SENDER_STAGES = ("references", "encode", "closed_loop")
 RECEIVER_STAGES = ("references", "splice", "decode")
@@ -92,7 +100,7 @@ def measure_rung(drive: Drive, rendered: TimedRenders, rung: Rung, crf: float) -
     Raises ``CodecError`` if the receiver does not see what the sender promised.
     """
     sender, receiver = _Stages(SENDER_STAGES), _Stages(RECEIVER_STAGES)
-    config = CodecConfig(*drive.frames[0].size_px, rung.preset, crf)
+    config = CodecConfig(*drive.frames[0].size_px, rung.effort, crf)
     encoder = DeltaEncoder(config, sender.clock)
     decoder = DeltaDecoder(encoder.header, clock_ns=receiver.clock)
     choice = _choice(rung)
@@ -150,7 +158,6 @@ def _choice(rung: Rung) -> FrameChoice:
         references=None if rung.references else RENDER_ONLY,
         photometric=None if rung.photometric else (),
         max_references=max(1, rung.references),
-        fast_unsent=rung.fast_unsent,
     )
 
 
@@ -166,3 +173,77 @@ def _quartile(spent: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 def _cpu(stages: Mapping[str, tuple[float, float]]) -> dict[str, float]:
     return {name: cpu for name, (cpu, _) in stages.items()}
+
+
+UNSTEADY_FRAMES = 2
+"""Of the first frames the motion is not known."""
+
+
+@dataclass(frozen=True)
+class TrackedDrive:
+    """A drive's views at the poses found, and what a frame's pose took, in ms of processor time
+    beyond one render; ``renders``: the mean number of them."""
+
+    views: tuple[FieldView, ...]
+    track_ms: float
+    renders: float
+
+
+def track_drive(
+    field: RadianceField, drive: Drive, quality: Quality, tracking: TrackingEffort
+) -> TrackedDrive | None:
+    """Track ``drive`` at its rate; ``None`` if a picture is lost on the way."""
+    field.prepare(quality)
+    draw = _TimedDrawing(field, drive.pictures[0].camera.intrinsics, quality)
+    effort = Effort(tracking.redraws, tracking.finest_level)
+    step_ns = round(1e9 / drive.name.rate_hz)
+    tracks: list[Track] = []
+    took_ms: list[float] = []
+    for number, frame in enumerate(drive.frames):
+        began_ns, drawn_ns = process_time_ns(), draw.spent_ns
+        track = _next(tracks, number * step_ns, drive, Pyramid(frame.y), draw, effort)
+        if track is None:
+            return None
+        tracks.append(track)
+        drawing_ns = draw.spent_ns - drawn_ns
+        took_ms.append((process_time_ns() - began_ns - drawing_ns) / 1e6)
+    return _summary(tracks, took_ms, draw.spent_ns / 1e6 / draw.count)
+
+
+def _next(
+    tracks: Sequence[Track],
+    time_ns: int,
+    drive: Drive,
+    picture: Pyramid,
+    draw: _TimedDrawing,
+    effort: Effort,
+) -> Track | None:
+    """Return the track with one picture more, begun at the dataset's pose."""
+    settings = TrackSettings()
+    if tracks:
+        return followed(tracks[-1], time_ns, picture, draw, settings, effort)
+    return begun(time_ns, drive.cameras[0].world_from_cam, None, picture, draw, settings)
+
+
+def _summary(tracks: Sequence[Track], took_ms: Sequence[float], render_ms: float) -> TrackedDrive:
+    renders = float(np.mean([track.renders for track in tracks[UNSTEADY_FRAMES:]]))
+    aligning_ms = float(np.quantile(took_ms[UNSTEADY_FRAMES:], 0.25))
+    views = tuple(track.view for track in tracks)
+    return TrackedDrive(views, aligning_ms + (renders - 1) * render_ms, renders)
+
+
+class _TimedDrawing:
+    """Renders the field at a pose, as it will be sent, and adds up the processor time."""
+
+    def __init__(self, field: RadianceField, intrinsics: Intrinsics, quality: Quality) -> None:
+        self._field, self._intrinsics, self._quality = field, intrinsics, quality
+        self.spent_ns, self.count = 0, 0
+
+    def __call__(self, pose: Pose) -> FieldView:
+        began_ns = process_time_ns()
+        view = render_field_view(
+            self._field, Camera(self._intrinsics, pose).rounded(), self._quality
+        )
+        self.spent_ns += process_time_ns() - began_ns
+        self.count += 1
+        return view

@@ -14,12 +14,21 @@ from typing import Any
 
 from rich.console import Console
 
+from rfcore.codec.sender.ladder import quality_name
 from rfcore.errors import InvalidInput
+from rfcore.field.quality import Quality
 from rfcore.files import write_whole
 from rfedge.report.tables import heading, print_table, table
 from rfedge.results import Result, read_result, rows_of
 
-__all__ = ["LadderRow", "ladder_page", "middle_rows", "print_front", "write_ladder_figure"]
+__all__ = [
+    "LadderRow",
+    "TrackingRow",
+    "ladder_page",
+    "middle_rows",
+    "print_front",
+    "write_ladder_figure",
+]
 
 
 @dataclass(frozen=True)
@@ -56,6 +65,23 @@ class LadderRow:
         return {name: value for name, value in self.settings.items() if name != "crf"}
 
 
+@dataclass(frozen=True)
+class TrackingRow:
+    """One effort of finding the pose in the field at one quality; without times where a picture of
+    the drive was lost. Times are of the processor, in ms a frame, at one thread."""
+
+    settings: Mapping[str, Any]
+    """The kind of field and its quality, as in ``LadderRow``."""
+    tracking: str
+    """``rfcore.codec.sender.ladder.TrackingEffort``."""
+    track_ms: float | None = None
+    """Beyond the one render that is made in any case."""
+    renders: float | None = None
+    """A frame, mean."""
+    rate_percent: float | None = None
+    """Bits at equal quality, more than at the dataset's poses."""
+
+
 INTRODUCTION = """# What accuracy costs in time
 
 Generated from `results/ladder.json` by `make figures`. A rung is everything a sender may decide
@@ -64,7 +90,7 @@ one that fits, and steps down and up while it drives.
 
 * **Times** are milliseconds of processor time a frame with one thread, lower quartiles over the
   drive without its first frame: what one core needs when nothing disturbs it. The sender's hold
-  conversion, render, choice of references, x264 and the closed loop; the receiver's render,
+  conversion, render, choice of references, slice coder and closed loop; the receiver's render,
   references, splice and decoding. Renders are timed once per quality. Where other programs ran
   beside it, rungs that do the same work (with and without `no-light`) show how far a time is off.
 * **Bits** are those of the whole message. **Rate** is bits at equal quality against the first rung
@@ -73,8 +99,9 @@ one that fits, and steps down and up while it drives.
 * **Front**: no other rung at this CRF takes less time without more bits at equal quality.
 * Names: share of the splats drawn (or samples along a ray), `shN` harmonics of at most that degree,
   `half-size` rendered at half the width and height, `Nref` at most N references, `render-only` the
-  paper's single one, `no-light` without looking for a change of light, `rough` with cheaper copies
-  of the references for x264 to predict from, x264's preset.
+  paper's single one, `no-light` without looking for a change of light, the slice
+  coder's effort, `track-once` and `track-half` less effort of finding the pose. Ladders from before
+  that coder: `rough` with cheaper copies of the references for x264 to predict from, x264's preset.
 """
 
 STAGES = (
@@ -116,6 +143,8 @@ def ladder_page(result: Result, runs: Mapping[str, Result]) -> str:
         "## CRF",
         "The first rung at each CRF:",
         _table([row for row in every if row.other_settings == rows[0].other_settings]),
+        "## Finding the pose",
+        _tracking(rows_of(TrackingRow, result.get("tracking", ()))),
         "## The offline side",
         _offline(runs),
     ]
@@ -213,6 +242,34 @@ def _cells(row: LadderRow) -> list[str]:
         f"{row.rate_percent:+.1f}",
         *(f"{row.sender_stage_ms[name]:.1f}" for name, _ in STAGES),
     ]
+
+
+def _tracking(rows: Sequence[TrackingRow]) -> str:
+    """Return what finding the pose takes by quality and effort."""
+    if not rows:
+        return "Not measured here: `cav-agent --localise --deadline-ms` needs a ladder that has it."
+    return (
+        "What `cav-agent --localise` does on top of a rung, in milliseconds beyond the one render, "
+        "and what the poses found cost in bits at equal quality against the dataset's. `full`: the "
+        "field is drawn again where the first render's pose was off; `once`: drawn once; `half`: "
+        "drawn once, and aligned from half the resolution on. Under a deadline each rung is taken "
+        "with each effort, and the times are added. Where a picture of the drive was lost, the "
+        "vehicle leaves the effort out.\n\n"
+        + table(
+            ("field", "tracking", "ms", "renders", "rate %"), [_tracking_cells(row) for row in rows]
+        )
+    )
+
+
+def _tracking_cells(row: TrackingRow) -> list[str]:
+    stored = row.settings
+    quality = Quality(
+        stored["detail"], stored["sh_degree"], stored["samples_per_ray"], stored["scale"]
+    )
+    cells = [f"{stored['kind']} {quality_name(quality)}", row.tracking]
+    if row.track_ms is None or row.renders is None or row.rate_percent is None:
+        return [*cells, "lost", "", ""]
+    return [*cells, f"{row.track_ms:.1f}", f"{row.renders:.2f}", f"{row.rate_percent:+.1f}"]
 
 
 def _offline(runs: Mapping[str, Result]) -> str:

@@ -1,15 +1,17 @@
 """Measure a ladder: fields and a drive in, ``ladder.json`` out.
 
 A rung is one setting of the sender. Measured are, for splats, every level of detail with three, one
-and no temporal references at three presets, and each other setting alone against the full rung; for
+and no temporal references at three efforts, and each other setting alone against the full rung; for
 hash grids, samples along a ray and the picture's scale. A rung is judged by its bits at equal
-quality against the first one, and by whether another beats it in both time and bits.
+quality against the first one, and by whether another beats it in both time and bits. Of each
+quality, every effort of tracking is measured: what finding the pose takes on top, and what poses
+so found cost in bits against the dataset's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from time import monotonic
@@ -18,25 +20,25 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from rfcore.codec.sender.ladder import Rung
+from rfcore.codec.sender.ladder import Rung, TrackingEffort, quality_name
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.field.interface import NGP, SPLATS
 from rfcore.field.quality import DETAILS, Quality
 from rfedge.experiments.cells import CellKey, CellStore, program_version
 from rfedge.experiments.clips import Drive, DriveName, read_drive
-from rfedge.experiments.ladder.measure import TimedRenders, measure_rung, time_renders
-from rfedge.experiments.ladder.page import LadderRow
+from rfedge.experiments.ladder.measure import TimedRenders, measure_rung, time_renders, track_drive
+from rfedge.experiments.ladder.page import LadderRow, TrackingRow
 from rfedge.results import check_result_path, make_result, provenance, rows_of, write_result
 
 __all__ = ["CRFS", "LadderJob", "fronts", "rate_percents", "run_ladder", "rungs_for"]
 
 
+RungRow = Mapping[str, Any]
 CRFS = (23.0, 28.0, 33.0)
-PRESETS = ("medium", "veryfast", "ultrafast")
+EFFORTS = ("default", "thorough", "fast")
 REFERENCES = (3, 1, 0)
 SAMPLES = (None, 32, 8)
-RungRow = Mapping[str, Any]
 
 
 def rungs_for(kind: str, *, quick: bool) -> list[Rung]:
@@ -46,7 +48,7 @@ def rungs_for(kind: str, *, quick: bool) -> list[Rung]:
     if kind == NGP:
         samples = (None, 8) if quick else SAMPLES
         return [
-            Rung(Quality(samples_per_ray=n, scale=scale), preset="veryfast")
+            Rung(Quality(samples_per_ray=n, scale=scale), effort="fast")
             for n in samples
             for scale in ((0.5,) if quick else (1.0, 0.5))
         ]
@@ -55,12 +57,12 @@ def rungs_for(kind: str, *, quick: bool) -> list[Rung]:
 
 def _splat_rungs(quick: bool) -> list[Rung]:
     details = (1.0, 0.25) if quick else DETAILS
-    presets = ("medium", "ultrafast") if quick else PRESETS
+    efforts = ("default", "fast") if quick else EFFORTS
     grid = [
-        Rung(Quality(detail), references, preset=preset)
+        Rung(Quality(detail), references, effort=effort)
         for detail in details
         for references in REFERENCES[:: 2 if quick else 1]
-        for preset in presets
+        for effort in efforts
     ]
     if quick:
         return grid
@@ -68,19 +70,15 @@ def _splat_rungs(quick: bool) -> list[Rung]:
         Rung(Quality(sh_degree=1)),
         Rung(Quality(sh_degree=0)),
         Rung(Quality(scale=0.5)),
+        Rung(references=4),
+        Rung(references=4, effort="thorough"),
         Rung(references=2),
         Rung(photometric=False),
-        Rung(preset="superfast"),
-        *(
-            Rung(Quality(detail), n, fast_unsent=True)
-            for detail in (1.0, 0.5)
-            for n in (3, 2, 1, 0)
-        ),
-        *(Rung(references=n, preset="veryfast", fast_unsent=True) for n in (3, 2, 1, 0)),
+        Rung(references=2, effort="fast"),
     ]
     low = [
-        Rung(Quality(0.5, 1), 1, photometric=False, preset="ultrafast"),
-        Rung(Quality(0.25, 0), 1, photometric=False, preset="ultrafast"),
+        Rung(Quality(0.5, 1), 1, photometric=False, effort="fast"),
+        Rung(Quality(0.25, 0), 1, photometric=False, effort="fast"),
     ]
     return grid + one_knob + low
 
@@ -189,24 +187,49 @@ class Contender:
             "program": self.program,
         }
 
+    def _settings(self, quality: Quality) -> dict[str, Any]:
+        return {
+            "kind": self.field.metadata.kind,
+            "detail": quality.detail,
+            "sh_degree": quality.sh_degree,
+            "samples_per_ray": quality.samples_per_ray,
+            "scale": quality.scale,
+        }
+
     def measured(self, rung: Rung, crf: float) -> Row:
         """Return the row of a rung at a CRF, but for what takes the others to say."""
-        quality, kind = rung.quality, self.field.metadata.kind
+        quality = rung.quality
         return {
-            "rung": f"{kind} {rung.name} crf{crf:g}",
+            "rung": f"{self.field.metadata.kind} {rung.name} crf{crf:g}",
             "settings": {
-                "kind": kind,
-                "detail": quality.detail,
-                "sh_degree": quality.sh_degree,
-                "samples_per_ray": quality.samples_per_ray,
-                "scale": quality.scale,
+                **self._settings(quality),
                 "references": rung.references,
                 "photometric": rung.photometric,
-                "preset": rung.preset,
-                "rough": rung.fast_unsent,
+                "effort": rung.effort,
                 "crf": crf,
             },
             **measure_rung(self.drive, self.rendered(quality), rung, crf),
+        }
+
+    def tracked(self, rung: Rung, tracking: TrackingEffort, placed: Sequence[RungRow]) -> Row:
+        """Return the row of an effort of tracking at a rung's quality; ``placed``: the rung's rows
+        at the dataset's poses."""
+        quality = rung.quality
+        row = {"settings": self._settings(quality), "tracking": str(tracking)}
+        found = track_drive(self.field, self.drive, quality, tracking)
+        if found is None:
+            return row
+        seen = replace(self.rendered(quality), views=found.views)
+        tracked = [
+            {"rung": "tracked", **measure_rung(self.drive, seen, rung, row["settings"]["crf"])}
+            for row in placed
+        ]
+        more_percent = rate_percents([placed, tracked])[1]
+        return {
+            **row,
+            "track_ms": found.track_ms,
+            "renders": found.renders,
+            "rate_percent": more_percent,
         }
 
 
@@ -229,6 +252,8 @@ def run_ladder(job: LadderJob, console: Console) -> dict[str, Any]:
         for rung in contender.rungs
     ]
     rows = _judged(curves)
+    measured = [(c, rung) for c in contenders for rung in c.rungs]
+    tracking = _tracking(list(zip(measured, curves, strict=True)), store, console)
     content = {
         "quick": job.quick,
         "threads": 1,
@@ -244,6 +269,7 @@ def run_ladder(job: LadderJob, console: Console) -> dict[str, Any]:
         ],
         "frames": {"drive": str(job.drive), "count": len(drive.frames), "sha256": drive.digest},
         "rows": rows,
+        "tracking": tracking,
     }
     result = make_result("ladder", made, content)
     write_result(job.out, result)
@@ -272,6 +298,46 @@ def _row(contender: Contender, rung: Rung, crf: float, store: CellStore, console
         return [row]
 
     (row,) = store.rows(contender.key(rung, crf), make)
+    return row
+
+
+def _tracking(
+    measured: Sequence[tuple[tuple[Contender, Rung], Sequence[Row]]],
+    store: CellStore,
+    console: Console,
+) -> list[TrackingRow]:
+    """Measure every effort at each quality of each field, coded as its first rung is."""
+    first: dict[tuple[str, Quality], tuple[Contender, Rung, Sequence[Row]]] = {}
+    for (contender, rung), rows in measured:
+        first.setdefault((contender.field.field_id, rung.quality), (contender, rung, rows))
+    return rows_of(
+        TrackingRow,
+        [
+            _tracking_row(*given, tracking, store, console)
+            for given in first.values()
+            for tracking in TrackingEffort
+        ],
+    )
+
+
+def _tracking_row(
+    contender: Contender,
+    rung: Rung,
+    placed: Sequence[Row],
+    tracking: TrackingEffort,
+    store: CellStore,
+    console: Console,
+) -> Row:
+    def make() -> list[Row]:
+        row = contender.tracked(rung, tracking, placed)
+        took = "lost" if row.get("track_ms") is None else f"{row['track_ms']:.1f} ms"
+        kind, quality = contender.field.metadata.kind, quality_name(rung.quality)
+        console.print(f"  {kind} {quality} track-{tracking}: {took}")
+        return [row]
+
+    name = replace(rung, tracking=tracking).name
+    key = {**contender.key(rung, 0.0), "verb": "ladder-tracking", "rung": f"{name} {tracking}"}
+    (row,) = store.rows(key, make)
     return row
 
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
+from rfcore.codec.h264.config import DEFAULT_EFFORT
 from rfedge.samples import sample_path
 
 __all__ = ["EvalLatency"]
@@ -32,8 +33,10 @@ class EvalLatency:
     """NAME@HZ=DATASET for each drive."""
     traces: tuple[Path, ...] = (sample_path("links/drive.up"),)
     """Recorded uplinks in Mahimahi's format."""
+    effort: str = DEFAULT_EFFORT
+    """Of ours: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: str = "veryfast"
-    """x264 preset of both."""
+    """x264 preset of the other."""
     quality_db: float = 33.0
     """Luma PSNR that both are coded to."""
     out: Path = Path("out/eval/latency.json")
@@ -62,6 +65,7 @@ class EvalLatency:
             field=field_path(self.field),
             drives=self.drives,
             traces=self.traces,
+            effort=self.effort,
             preset=self.preset,
             quality_db=self.quality_db,
             out=self.out,

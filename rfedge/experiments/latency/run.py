@@ -1,6 +1,6 @@
 """How long frames take over links, on a virtual clock: drives and a field in, one result out.
 
-Ours and low-delay x264 of the same preset are coded to the same quality (the CRF is searched in
+Ours and low-delay x264 are coded to the same quality (the CRF is searched in
 steps of a half), then sent over constant rates and over recorded links.
 
 ``tau`` is a message's own transmission time. The network latency adds waiting behind earlier
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from rfcore.codec.h264.config import check_effort
 from rfcore.codec.sender.ladder import Rung
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
@@ -149,6 +150,7 @@ class LatencyJob:
     field: Path
     drives: Sequence[str]
     traces: Sequence[Path]
+    effort: str
     preset: str
     quality_db: float
     out: Path
@@ -157,6 +159,7 @@ class LatencyJob:
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
+        check_effort("effort", self.effort)
         if not 20 <= self.quality_db <= 50:
             raise InvalidInput("quality_db", f"{self.quality_db} dB is outside 20..50 dB")
 
@@ -224,7 +227,7 @@ def _senders(
     drive = read_drive(name, QUICK_FRAMES if job.quick else None)
     rendered, clip = render_clip(field, drive.cameras), drive.clip()
     store = CellStore(job.cells)
-    ours = FieldCoder(rendered, f"rfedge-{job.preset}", program_version(), preset=job.preset)
+    ours = FieldCoder(rendered, f"rfedge-{job.effort}", program_version(), effort=job.effort)
     coded = _at_quality(clip, ours, job.quality_db, store)
     yield Sender(clip, ours.name, coded, _own_stages(job, drive, field, coded.point))
     rival = x264_lowdelay(job.preset)
@@ -238,7 +241,7 @@ def _own_stages(
     job: LatencyJob, drive: Drive, field: RadianceField, crf: float
 ) -> dict[str, float]:
     """Return the milliseconds of both ends, from the ladder's measurement of the full rung."""
-    rung = Rung(preset=job.preset)
+    rung = Rung(effort=job.effort)
     row = measure_rung(drive, time_renders(field, drive, rung.quality), rung, crf)
     ours = {f"sender {name}": ms for name, ms in row["sender_stage_ms"].items()}
     return ours | {f"receiver {name}": ms for name, ms in row["receiver_stage_ms"].items()}

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
+from rfcore.codec.h264.config import DEFAULT_EFFORT
 from rfedge.experiments.compare import Preset
 
 __all__ = ["EvalNeverWorse"]
@@ -26,8 +27,10 @@ class EvalNeverWorse:
     """NAME@HZ=DATASET for each drive."""
     decimated: tuple[str, ...] = ()
     """The same for drives of which every fifth frame is taken, at a fifth of the rate."""
+    effort: str = DEFAULT_EFFORT
+    """Of ours: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: Preset = "veryfast"
-    """x264 preset of ours and of the anchor."""
+    """x264 preset of the anchor."""
     out: Path = Path("out/eval/never-worse.json")
     """The result file to write."""
     cells: Path = Path("out/eval/never-worse")
@@ -48,6 +51,7 @@ class EvalNeverWorse:
             field=field_path(self.field),
             drives=self.drives,
             decimated=self.decimated,
+            effort=self.effort,
             preset=self.preset,
             out=self.out,
             cells=self.cells,

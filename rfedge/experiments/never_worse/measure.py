@@ -1,6 +1,6 @@
 """Never worse than plain x264: with the right field, one of another street, and none at all.
 
-At 31, 33 and 35 dB a frame may cost at most 2 % more than x264 with low delay at the same preset,
+At 31, 33 and 35 dB a frame may cost at most 2 % more than x264 with low delay,
 its header apart. Two controls make the field useless: ``wrong-street`` is the field seen a quarter
 turn to the left, depth and picture alike, and ``black`` is a black picture at depth 0. Both ends
 predict from them; the sender must notice by itself that they are of no use.
@@ -17,6 +17,7 @@ import numpy as np
 from rich.console import Console
 
 from rfcore.camera import Camera, Pose
+from rfcore.codec.h264.config import check_effort
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
@@ -79,10 +80,11 @@ def _black_view(view: FieldView) -> FieldView:
 
 @dataclass(frozen=True)
 class NeverWorse:
-    """One drive under all controls, at one preset; ``program`` names what codes."""
+    """One drive under all controls; ``program`` names what codes."""
 
     drive: Drive
     rendered: Mapping[str, RenderedClip]
+    effort: str
     preset: str
     program: str
 
@@ -97,9 +99,9 @@ class NeverWorse:
         ours: dict[str, ClipCoder] = {
             control: FieldCoder(
                 rendered,
-                f"rfedge-{control}-{self.preset}-{rendered.field_id[:12]}",
+                f"rfedge-{control}-{self.effort}-{rendered.field_id[:12]}",
                 self.program,
-                preset=self.preset,
+                effort=self.effort,
                 points=POINTS,
             )
             for control, rendered in self.rendered.items()
@@ -168,6 +170,7 @@ class NeverWorseJob:
     field: Path
     drives: Sequence[str]
     decimated: Sequence[str]
+    effort: str
     preset: str
     out: Path
     cells: Path
@@ -176,6 +179,7 @@ class NeverWorseJob:
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
+        check_effort("effort", self.effort)
         if not (self.drives or self.decimated):
             raise InvalidInput("drives", "there is none")
 
@@ -190,7 +194,7 @@ def run_never_worse(job: NeverWorseJob, console: Console) -> dict[str, Any]:
     field, made = load_field(job.field), provenance([job.field])
     store = CellStore(job.cells)
     tables = [
-        NeverWorse(drive, controls_of(field, drive), job.preset, program_version())
+        NeverWorse(drive, controls_of(field, drive), job.effort, job.preset, program_version())
         for drive in _drives(job)
     ]
     left_s = sum(seconds_left(table.clip, table.coders.values(), store) for table in tables)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import CodecConfig, effort_of_preset
 from rfcore.codec.h264.ffmpeg import decode_clip
 from rfcore.errors import InvalidInput
 from rfcore.extras import needs
@@ -140,7 +140,7 @@ def _coded(camera: Rgb, render: Rgb, setting: Setting) -> dict[str, Any]:
 
 
 def _decoded(clip: Sequence[bytes], setting: Setting) -> list[I420]:
-    config = CodecConfig(*setting.size_px, preset=setting.preset, crf=setting.crf)
+    config = CodecConfig(*setting.size_px, effort_of_preset(setting.preset), setting.crf)
     width, height = setting.size_px
     pictures = decode_clip(config.coded_size_px, clip)
     return [I420(p.y[:height, :width], p.u, p.v) for p in pictures]

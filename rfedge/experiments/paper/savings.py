@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rfcore.codec.h264.bitstream import split_nals
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import CodecConfig, effort_of_preset
 from rfcore.codec.h264.ffmpeg import EncoderOptions, PictureKind, encode_pictures
 from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, nal_type, parse_slice_start
 from rfcore.errors import CodecError, InvalidInput
@@ -97,7 +97,7 @@ def slice_nals(access_unit: bytes) -> list[bytes]:
 
 
 def _published_options(size_px: tuple[int, int], preset: str, crf: float) -> EncoderOptions:
-    config = CodecConfig(*size_px, preset=preset, crf=crf)
+    config = CodecConfig(*size_px, effort_of_preset(preset), crf)
     return EncoderOptions(
         config.coded_size_px, preset, crf, params={"threads": "1"}, tune=None, rate_hz=1
     )

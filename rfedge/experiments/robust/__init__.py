@@ -8,6 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
+from rfcore.codec.h264.config import DEFAULT_EFFORT
 from rfedge.samples import sample_path
 
 __all__ = ["EvalRobust"]
@@ -31,8 +32,10 @@ class EvalRobust:
     """NAME@HZ=DATASET of a drive in another light than the field's."""
     lane: str | None = None
     """NAME@HZ=DATASET of a drive in another lane than the training views."""
+    effort: str = DEFAULT_EFFORT
+    """Of ours: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: str = "veryfast"
-    """x264 preset of every method."""
+    """x264 preset of the others."""
     quality_db: float = 33.0
     """Luma PSNR at which bits are compared where nothing is lost."""
     frames: int = 36
@@ -59,6 +62,7 @@ class EvalRobust:
             drive=self.drive,
             dusk=self.dusk,
             lane=self.lane,
+            effort=self.effort,
             preset=self.preset,
             quality_db=self.quality_db,
             frames=self.frames,

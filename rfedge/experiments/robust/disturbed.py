@@ -2,7 +2,7 @@
 
 Noise is independent from frame to frame, normal in each axis of translation and rotation, in the
 camera's own axes. Both ends render at the noisy pose, since it is the one that is sent; or the
-sender first refines it, with as much time as that takes.
+sender first aligns the frame with the field's render there.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from rfcore.camera import Camera, Pose
-from rfcore.codec.sender.pose_search import PoseSearch
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, render_field_view
 from rfcore.image import I420
@@ -23,11 +22,6 @@ from rfcore.views import FieldView
 from rfedge.experiments.clips import CodedClip
 
 __all__ = ["NOISES", "PoseNoise", "kbit_at", "noisy_cameras", "refined_cameras"]
-
-UNHURRIED_MS = 1000.0
-"""Of a clock that stands still: the search ends by itself, the same on every machine."""
-REFINE_CRF = 26.0
-"""At which poses are compared; about that of the quality asked for."""
 
 
 @dataclass(frozen=True)
@@ -67,16 +61,22 @@ def noisy_cameras(cameras: Sequence[Camera], noise: PoseNoise, seed: int) -> lis
 def refined_cameras(
     field: RadianceField, frames: Sequence[I420], measured: Sequence[Camera]
 ) -> list[Camera]:
-    """Return the cameras that the search for the pose of fewest bits finds for ``frames``."""
-    search = PoseSearch(UNHURRIED_MS, lambda: 0)
+    """Return where aligning each frame with the field puts its camera; measured where it fails.
 
-    def render_at(camera: Camera) -> FieldView:
-        return render_field_view(field, camera)
+    Each frame by itself, without search and track: what one alignment makes of noise.
+    """
+    from rfcore.localise.structure import Pyramid
+    from rfcore.localise.track import TrackSettings, begun
 
-    return [
-        search.refine(frame, render_at(camera), render_at, REFINE_CRF).view.camera
-        for frame, camera in zip(frames, measured, strict=True)
-    ]
+    def refined(frame: I420, camera: Camera) -> Camera:
+        def render_at(pose: Pose) -> FieldView:
+            return render_field_view(field, Camera(camera.intrinsics, pose).rounded())
+
+        levels = Pyramid(frame.y)
+        track = begun(0, camera.world_from_cam, None, levels, render_at, TrackSettings())
+        return camera if track is None else track.view.camera
+
+    return [refined(frame, camera) for frame, camera in zip(frames, measured, strict=True)]
 
 
 def kbit_at(clips: Sequence[CodedClip], quality_db: float) -> float:

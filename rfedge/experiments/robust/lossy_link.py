@@ -152,7 +152,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Crossing:
-    """A clip of ``frames`` at ``rate_hz``, coded at ``preset`` and ``crf``, over a link."""
+    """A clip of ``frames`` at ``rate_hz``, coded at ``crf``, by x264 at ``preset``, over a link."""
 
     frames: Sequence[I420]
     rate_hz: float
@@ -193,11 +193,11 @@ class FrameCoder:
     """
 
     def __init__(
-        self, clip: Sequence[I420], rendered: RenderedClip, preset: str, crf: float
+        self, clip: Sequence[I420], rendered: RenderedClip, effort: str, crf: float
     ) -> None:
         self.rendered = rendered
         self._clip = clip
-        self._encoder = DeltaEncoder(CodecConfig(*clip[0].size_px, preset, crf))
+        self._encoder = DeltaEncoder(CodecConfig(*clip[0].size_px, effort, crf))
         self._made: dict[tuple[int, bytes, bool], Encoded] = {}
 
     @property

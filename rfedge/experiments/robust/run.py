@@ -18,6 +18,7 @@ import numpy as np
 from rich.console import Console
 
 from rfcore.camera import Camera
+from rfcore.codec.h264.config import check_effort
 from rfcore.codec.photometric import Photometric
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
@@ -62,6 +63,7 @@ class RobustJob:
     drive: str
     dusk: str | None
     lane: str | None
+    effort: str
     preset: str
     quality_db: float
     frames: int
@@ -71,6 +73,7 @@ class RobustJob:
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
+        check_effort("effort", self.effort)
         if self.frames < 4:
             raise InvalidInput("frames", f"{self.frames} must be at least 4")
 
@@ -140,6 +143,7 @@ class Bench:
             "field": self.field.field_id,
             "frames": drive.digest,
             "hz": rate_hz,
+            "effort": self.job.effort,
             "preset": self.job.preset,
             "seed": SEED,
             "program": program_version(),
@@ -169,7 +173,7 @@ class Bench:
         if crf not in self._coders:
             self._coders.clear()
             rendered = render_clip(self.field, self.drive.cameras)
-            self._coders[crf] = FrameCoder(self.drive.frames, rendered, self.job.preset, crf)
+            self._coders[crf] = FrameCoder(self.drive.frames, rendered, self.job.effort, crf)
         return self._coders[crf]
 
     # --- pose and light
@@ -223,9 +227,9 @@ class Bench:
         """Return kilobits a frame at the quality asked for, rendered from ``cameras``."""
         coder = FieldCoder(
             render_clip(self.field, cameras),
-            f"rfedge-{self.job.preset}-{self.field.field_id}",
+            f"rfedge-{self.job.effort}-{self.field.field_id}",
             program_version(),
-            preset=self.job.preset,
+            effort=self.job.effort,
             photometric=photometric,
             points=DISTURBED_CRFS,
         )

@@ -2,15 +2,17 @@
 
 ``transforms_SPLIT.json`` lists the finished shots of a split, ``transforms_drive_RATEhz.json``
 those that a lower rate keeps, ``..._measured.json`` the same pictures with measured poses where the
-scene declares localisation noise. ``transforms.json`` is a copy of the training split's, or of the
-first split's without one. ``build.json`` identifies the build, so that it continues only in its own
-folder.
+scene declares localisation noise. The split ``rig`` is a dataset a camera of the instants that are
+finished, ``transforms_rig_CAMERA.json``, and ``rig.toml`` (``rfcore.dataset.rig``).
+``transforms.json`` is a copy of the training split's, or of the first split's without one.
+``build.json`` identifies the build, so that it continues only in its own folder.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
@@ -22,17 +24,23 @@ import numpy as np
 import rfedge.street
 from rfcore.camera import Pose
 from rfcore.dataset import write_manifest
+from rfcore.dataset.rig import RIG_FILE, Rig, RigCamera, write_rig
 from rfcore.dataset.source import SourceCamera, SourcePoints, read_points
 from rfcore.dataset.write import POINTS_NAME, WrittenPicture, transforms_of, write_points
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfcore.lens import LensCamera
+from rfedge.datasets.rig import mounts_named
 from rfedge.street.build.scene_renderer import RenderJob, ShotFiles, camera_of_pictures
 from rfedge.street.scene_file import Scene
 from rfedge.street.shots import Shot, Split, shots_of, thinned_indices
-from rfedge.street.trajectory import measured_pose
+from rfedge.street.trajectory import measured_pose, mounted
 
 __all__ = ["ORIGIN_NAME", "claim_folder", "list_dataset", "origin_of"]
+
+
+TIMED = (Split.DRIVE, Split.RIG)
+"""Splits whose pictures were taken one after the other."""
 
 
 def list_dataset(job: RenderJob, about: dict[str, Any]) -> dict[str, int]:
@@ -44,7 +52,10 @@ def list_dataset(job: RenderJob, about: dict[str, Any]) -> dict[str, int]:
     first = Split.TRAIN if Split.TRAIN in finished else next(iter(finished))
     write_points(job.folder / POINTS_NAME, _points(job.folder, finished[first]))
     for split, shots in finished.items():
-        _list_split(job, split, shots)
+        if split is Split.RIG:
+            _list_rig(job, shots)
+        else:
+            _list_split(job, split, shots)
         if split is first:
             _write(job.folder / "transforms.json", _written(job, shots, measured=False))
     write_manifest(job.folder, about)
@@ -73,6 +84,21 @@ def _list_split(job: RenderJob, split: Split, shots: Sequence[Shot]) -> None:
             _write(measured, _written(job, chosen, measured=True))
 
 
+def _list_rig(job: RenderJob, shots: Sequence[Shot]) -> None:
+    mounts = mounts_named(job.scene.drive.rig)
+    instants = Counter(shot.index // len(mounts) for shot in shots)
+    cameras = []
+    for number, mount in enumerate(mounts):
+        mine = [shot for shot in shots if shot.index % len(mounts) == number]
+        whole = [shot for shot in mine if instants[shot.index // len(mounts)] == len(mounts)]
+        file = job.folder / f"transforms_{Split.RIG}_{mount.name}.json"
+        if whole:
+            _write(file, _written(job, whole, measured=False))
+        rig_from_cam = mounted(mount, np.zeros(3), 0.0)
+        cameras.append(RigCamera(mount.name, rig_from_cam.inverse(), file))
+    write_rig(job.folder / RIG_FILE, Rig(tuple(cameras)))
+
+
 def _written(job: RenderJob, shots: Sequence[Shot], measured: bool) -> list[WrittenPicture]:
     seen_by = camera_of_pictures(job.scene, shots[0].camera)
     lens = seen_by.lens if isinstance(seen_by, LensCamera) else None
@@ -82,7 +108,7 @@ def _written(job: RenderJob, shots: Sequence[Shot], measured: bool) -> list[Writ
             file_path=ShotFiles.of(job.folder, shot).picture_name,
             camera=camera,
             world_from_cam=_pose(job, shot, measured),
-            time_ns=round(shot.time_s * 1e9) if shot.split is Split.DRIVE else None,
+            time_ns=round(shot.time_s * 1e9) if shot.split in TIMED else None,
         )
         for shot in shots
     ]

@@ -1,8 +1,8 @@
 """The effects a scene may declare: one module each, imported only when it is declared.
 
-They run in the order below. Those of the street change what is rendered (geometry, light,
-surfaces), those of the air and of the sensor change rendered frames, which are linear, so that
-another exposure or another noise needs no new render. A module holds one frozen dataclass, its
+They run in the order below. Those of the street change what is rendered (geometry, light and
+shade, surfaces), those of the air and of the sensor change rendered frames, which are linear, so
+that another exposure or another noise needs no new render. A module holds one frozen dataclass, its
 settings; that of an effect on the street has ``change(world, rng) -> world``, that of an effect on
 frames ``apply(frame, rng) -> frame``. A scene has one light.
 """
@@ -25,6 +25,7 @@ class EffectKind(StrEnum):
 
     GEOMETRY = "geometry"
     LIGHT = "light"
+    SHADE = "shade"
     SURFACE = "surface"
     AIR = "air"
     SENSOR = "sensor"
@@ -46,16 +47,21 @@ class Effect:
 
 
 EFFECTS = (
+    Effect("tunnel", EffectKind.GEOMETRY, "Tunnel", "a stretch of the road is roofed"),
+    Effect("works", EffectKind.GEOMETRY, "Works", "a building site stands beside the lane"),
     Effect("parked", EffectKind.GEOMETRY, "ParkedVehicles", "vehicles stand in the parking bays"),
     Effect("traffic", EffectKind.GEOMETRY, "Traffic", "vehicles drive on both lanes"),
     Effect("dusk", EffectKind.LIGHT, "Dusk", "the sun is low"),
+    Effect("evening", EffectKind.LIGHT, "Evening", "the sun sinks from noon to dusk"),
     Effect("overcast", EffectKind.LIGHT, "Overcast", "clouds hide the sun"),
+    Effect("passing_cloud", EffectKind.SHADE, "PassingCloud", "a cloud hides the sun for a while"),
     Effect("wet_road", EffectKind.SURFACE, "WetRoad", "water darkens the ground and mirrors"),
     Effect("haze", EffectKind.AIR, "Haze", "distant things lose contrast"),
     Effect("rain", EffectKind.AIR, "Rain", "falling drops streak over the picture"),
     Effect("lens", EffectKind.SENSOR, "LensDistortion", "straight lines bend"),
     Effect("rolling_shutter", EffectKind.SENSOR, "RollingShutter", "rows are exposed one by one"),
     Effect("exposure", EffectKind.SENSOR, "ExposureDrift", "brightness drifts over a drive"),
+    Effect("auto_exposure", EffectKind.SENSOR, "AutoExposure", "the exposure overshoots"),
     Effect("noise", EffectKind.SENSOR, "SensorNoise", "photons and electrons are counted"),
 )
 

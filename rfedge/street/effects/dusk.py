@@ -8,26 +8,24 @@ from typing import Annotated
 import numpy as np
 
 from rfcore.tables import Range
-from rfedge.street.geometry.sky import Daylight, sunny_sky
+from rfedge.street.geometry.sky import DUSK, Daylight, sunny_sky
 from rfedge.street.geometry.world import World
 
 __all__ = ["Dusk"]
-
-DUSK_WHITE = 0.9
 
 
 @dataclass(frozen=True)
 class Dusk:
     """Where the sun stands (``azimuth_deg`` from x towards y), how hazy and cloudy it is."""
 
-    azimuth_deg: Annotated[float, Range(-360, 360)] = 197.0
-    elevation_deg: Annotated[float, Range(1, 20)] = 6.0
-    turbidity: Annotated[float, Range(1.8, 10)] = 2.5
-    cover: Annotated[float, Range(0, 0.9)] = 0.4
+    azimuth_deg: Annotated[float, Range(-360, 360)] = DUSK.azimuth_deg
+    elevation_deg: Annotated[float, Range(1, 20)] = DUSK.elevation_deg
+    turbidity: Annotated[float, Range(1.8, 10)] = DUSK.turbidity
+    cover: Annotated[float, Range(0, 0.9)] = DUSK.cover
 
     def change(self, world: World, rng: np.random.Generator) -> World:
         """Return the world under the evening's sky."""
         day = Daylight(
-            self.azimuth_deg, self.elevation_deg, self.turbidity, self.cover, white=DUSK_WHITE
+            self.azimuth_deg, self.elevation_deg, self.turbidity, self.cover, white=DUSK.white
         )
         return replace(world, sky=sunny_sky(day, rng))

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from rfcore.tables import Range
-from rfedge.street.geometry.layout import BAY_LENGTH_M, Place
+from rfedge.street.geometry.layout import BAY_LENGTH_M, Layout, Place
 from rfedge.street.geometry.mesh import Mesh
 from rfedge.street.geometry.vehicle import Vehicle, standing, vehicle
 from rfedge.street.geometry.vehicle_trim import vehicle_materials
@@ -23,18 +23,31 @@ ALONG_M, ACROSS_M, TURN_RAD = 0.2, 0.06, 0.015
 
 @dataclass(frozen=True)
 class ParkedVehicles:
-    """``occupied``: the share of bays with a vehicle in it."""
+    """``occupied``: the share of bays with a vehicle in it. On another ``day`` than 0, the share
+    ``turnover`` of the bays has another vehicle or none.
+    """
 
     occupied: Annotated[float, Range(0, 1)] = 0.7
+    day: Annotated[int, Range(0, 10_000)] = 0
+    turnover: Annotated[float, Range(0, 1)] = 0.5
 
     def change(self, world: World, rng: np.random.Generator) -> World:
         """Return the world with vehicles in its bays; none is longer than its bay."""
         meshes: list[Mesh] = []
-        for bay in world.layout.bays:
-            looks, moved = _fitting(rng), rng.normal(0.0, (ALONG_M, ACROSS_M, TURN_RAD))
-            if rng.random() < self.occupied:
-                meshes += _parked(looks, bay, np.clip(moved, -0.3, 0.3))
+        chance = int(rng.spawn(1)[0].integers(2**63))
+        today = np.random.default_rng([chance, self.day]) if self.day else None
+        for bay in Layout(world.layout.geometry).bays:
+            vehicle_in = self._drawn(rng)
+            if today is not None and today.random() < self.turnover:
+                vehicle_in = self._drawn(today)
+            if vehicle_in is not None and bay in world.layout.bays:
+                meshes += _parked(vehicle_in[0], bay, vehicle_in[1])
         return world.plus(Part(tuple(meshes), vehicle_materials()))
+
+    def _drawn(self, rng: np.random.Generator) -> tuple[Vehicle, np.ndarray] | None:
+        """A vehicle and how it deviates from its bay, or none."""
+        looks, moved = _fitting(rng), rng.normal(0.0, (ALONG_M, ACROSS_M, TURN_RAD))
+        return (looks, np.clip(moved, -0.3, 0.3)) if rng.random() < self.occupied else None
 
 
 def _fitting(rng: np.random.Generator) -> Vehicle:

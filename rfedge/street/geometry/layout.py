@@ -27,6 +27,7 @@ __all__ = [
     "PAVEMENT_UP_M",
     "ROAD_HALF_M",
     "SIDES",
+    "Closure",
     "Geometry",
     "Layout",
     "Place",
@@ -112,10 +113,20 @@ class Plot:
 
 
 @dataclass(frozen=True)
+class Closure:
+    """A stretch of one edge of the road, along x, whose parking bays are closed."""
+
+    side: int
+    start_m: float
+    end_m: float
+
+
+@dataclass(frozen=True)
 class Layout:
     """The plan of a street."""
 
     geometry: Geometry
+    closures: tuple[Closure, ...] = ()
 
     @property
     def start_m(self) -> float:
@@ -168,12 +179,19 @@ class Layout:
 
     @cached_property
     def bays(self) -> tuple[Place, ...]:
-        """Middles of the parking bays, off the crossings; headings along the traffic."""
+        """Middles of the open parking bays, off the crossings; headings along the traffic."""
         found = self._along(BAY_M, 5.0, BAY_LENGTH_M, stagger_m=0.0)
         return tuple(
             Place(p.x_m, p.y_m, 0.0, p.side, np.pi if p.side > 0 else 0.0)
             for p in found
-            if not self.at_crossing(p.x_m, 5.0)
+            if not self.at_crossing(p.x_m, 5.0) and not self._closed(p)
+        )
+
+    def _closed(self, bay: Place) -> bool:
+        reach_m = 0.5 * BAY_LENGTH_M
+        return any(
+            c.side == bay.side and c.start_m - reach_m < bay.x_m < c.end_m + reach_m
+            for c in self.closures
         )
 
     def at_crossing(self, x_m: float, margin_m: float) -> bool:

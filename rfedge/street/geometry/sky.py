@@ -31,6 +31,7 @@ from rfedge.street.geometry.mesh import F32, F64, Colour
 from rfedge.street.geometry.world import Sky
 
 __all__ = [
+    "DUSK",
     "HEIGHT",
     "NOON",
     "SUN_DIAMETER_DEG",
@@ -225,6 +226,7 @@ class Daylight:
 
 
 NOON = Daylight(azimuth_deg=35.0, elevation_deg=52.0, turbidity=3.0, cover=0.35)
+DUSK = Daylight(azimuth_deg=197.0, elevation_deg=6.0, turbidity=2.5, cover=0.4, white=0.9)
 
 
 def clear_sky(rng: np.random.Generator) -> Sky:

@@ -71,13 +71,17 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A street to render. Every material that a mesh names is in ``materials``."""
+    """A street to render. Every material that a mesh names is in ``materials``.
+
+    ``sky`` is the light at time 0; where it changes, ``sky_at(time_s)`` gives that of any time.
+    """
 
     layout: Layout
     sky: Sky
     meshes: tuple[Mesh, ...] = ()
     materials: Mapping[str, Material] = field(default_factory=dict)
     movers: tuple[Mover, ...] = ()
+    sky_at: Callable[[float], Sky] | None = None
 
     def __post_init__(self) -> None:
         moving = (mesh for mover in self.movers for mesh in mover.meshes)

@@ -126,6 +126,7 @@ class MitsubaScene:
         self._surfaces = {
             name: mi.load_dict(surface(mi, material)) for name, material in _used(world).items()
         }
+        self.exposure = world.sky.exposure
         self._light = mi.load_dict(environment(mi, world.sky))
         self._still = self._shapes(joined(world.meshes))
         self._time_s: float | None = None
@@ -134,9 +135,17 @@ class MitsubaScene:
         self.at(0.0)
 
     def at(self, time_s: float) -> None:
-        """Put the movers where they are at that time; nothing to do in a world without any."""
-        if self.scene is not None and (not self._world.movers or time_s == self._time_s):
+        """Put the movers and the light where they are at that time.
+
+        In a world where neither changes there is nothing to do.
+        """
+        changing = self._world.movers or self._world.sky_at
+        if self.scene is not None and (not changing or time_s == self._time_s):
             return
+        if self._world.sky_at is not None:
+            sky = self._world.sky_at(time_s)
+            self.exposure = sky.exposure
+            self._light = self._mi.load_dict(environment(self._mi, sky))
         moving = [
             placed(mesh, mover.world_from_mover(time_s))
             for mover in self._world.movers

@@ -119,7 +119,6 @@ class Renderer:
         self._mi = load_mitsuba(backend, threads)
         self._backend = backend
         self._sampling = sampling
-        self._exposure = np.float32(world.sky.exposure)
         self._loaded = MitsubaScene(self._mi, world)
         self._light = self._mi.load_dict(
             {"type": "path", "max_depth": PATH_DEPTH, "rr_depth": 2 * PATH_DEPTH}
@@ -139,7 +138,8 @@ class Renderer:
         guides = self._pass(sensor, self._guides, GUIDE_SAMPLES)[..., -6:]
         depth_m, labels = cast_pixel_rays(self._mi, self._backend, self._loaded, camera)
         colour = _denoised(noisy, np.clip(guides[..., :3], 0, 1), guides[..., 3:])
-        return RenderedView(np.maximum(colour, 0) * self._exposure, depth_m, labels)
+        exposure = np.float32(self._loaded.exposure)
+        return RenderedView(np.maximum(colour, 0) * exposure, depth_m, labels)
 
     def _pass(self, sensor: Any, integrator: Any, samples: int) -> F32:
         rendered = self._mi.render(

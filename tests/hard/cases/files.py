@@ -14,7 +14,8 @@ from hard.cases.case import Case, Finding, refusal, statement, within
 from hard.cases.scenes import arrays_of, blobs, poisoned
 from rfcore.camera import TileOrigin
 from rfcore.errors import FieldFormatError
-from rfcore.field.ply import read_ply, write_ply
+from rfcore.field.ply import write_ply
+from rfcore.field.splat_file import read_splat_file
 from rfcore.raster.gaussians import Gaussians
 
 __all__ = ["CASES"]
@@ -33,7 +34,7 @@ def _ply_with(value: float) -> Finding:
         assert content.count(mark) == 1
         path.write_bytes(content.replace(mark, bad))
         return _without(
-            folder, refusal(lambda: read_ply(path), FieldFormatError, "means", "1 of 24")
+            folder, refusal(lambda: read_splat_file(path)[0], FieldFormatError, "means", "1 of 24")
         )
 
 
@@ -49,7 +50,7 @@ def _extremes_survive() -> Finding:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "field.ply"
         write_ply(path, extreme)
-        back = read_ply(path)
+        back = read_splat_file(path)[0]
     return statement(_same(extreme, back), "equal bytes", "bytes differ")
 
 
@@ -63,7 +64,7 @@ def _global_coordinates() -> Finding:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "field.ply"
         write_ply(path, moved)
-        back = read_ply(path, origin)
+        back = read_splat_file(path, origin)[0]
     return within(float(np.abs(back.means - home.means).max()), 0.0, "metres")
 
 

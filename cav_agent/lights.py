@@ -1,0 +1,96 @@
+"""Which of a tile's fields frames are coded against: the one whose light they were taken in.
+
+A frame fits a field if the median of the differences between the block means of frame and render is
+small: 0 or 1 level on the yardstick street at noon, vehicles included, 36 to 47 with the field of
+noon at dusk. While the field in use fits, nothing else is looked at; when it does not, the tile's
+other lights are asked for, and those that are there are rendered beside it for one frame in
+``LOOK_EVERY``. Another one is taken if it is clearly nearer, so that two lights between which the
+day is do not take turns.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import structlog
+
+from rfcore.camera import Camera
+from rfcore.codec.block_means import median_block_mean_difference
+from rfcore.field import Quality, RadianceField, render_field_view
+from rfcore.image import I420
+from rfcore.views import FieldView
+
+__all__ = ["TileLights"]
+
+log = structlog.get_logger()
+
+FITS_LEVELS = 6.0
+"""A median difference up to which a field is taken to be in the frame's light."""
+NEARER_LEVELS = 3.0
+"""By how much another light must be nearer."""
+LOOK_EVERY = 5
+
+
+class TileLights:
+    """The fields of one tile that were opened; frames are coded against ``current``.
+
+    ``want`` is called, on the thread that codes frames, each time the field in use does not fit and
+    there may be lights that were not fetched. ``add`` may be called on another thread.
+    """
+
+    def __init__(self, field: RadianceField, want: Callable[[], None] = lambda: None) -> None:
+        self.own = self.current = field
+        self._want = want
+        self._lock = threading.Lock()
+        self._fields: dict[str, RadianceField] = {field.field_id: field}
+        self._until_look = 0
+
+    @property
+    def named_id(self) -> str:
+        """The current field's id as frames name it: empty for the tile's own."""
+        return "" if self.current is self.own else self.current.field_id
+
+    def add(self, field: RadianceField) -> None:
+        """Offer another light; the next frame that does not fit looks at it."""
+        with self._lock:
+            self._fields[field.field_id] = field
+            self._until_look = 0
+
+    def held_ids(self) -> frozenset[str]:
+        """Return the ids of the fields that were opened."""
+        with self._lock:
+            return frozenset(self._fields)
+
+    def view(self, frame: I420, camera: Camera, quality: Quality) -> FieldView:
+        """Return what the field that fits shows at a frame's camera."""
+        view = render_field_view(self.current, camera, quality)
+        if self._until_look > 0:
+            self._until_look -= 1
+            return view
+        difference = median_block_mean_difference(frame, view.render)
+        self._until_look = LOOK_EVERY - 1
+        if difference <= FITS_LEVELS:
+            return view
+        self._want()
+        return self._nearest(frame, view, difference, quality)
+
+    def _nearest(
+        self, frame: I420, view: FieldView, difference: float, quality: Quality
+    ) -> FieldView:
+        with self._lock:
+            others = [field for field in self._fields.values() if field is not self.current]
+        found, limit = view, difference - NEARER_LEVELS
+        for field in others:
+            other = render_field_view(field, view.camera, quality)
+            levels = median_block_mean_difference(frame, other.render)
+            if levels < limit:
+                found, limit, self.current = other, levels, field
+        if found is not view:
+            log.info(
+                "light changed",
+                field=self.current.field_id,
+                before_levels=difference,
+                levels=limit,
+            )
+        return found

@@ -1,0 +1,220 @@
+"""The process that opens a camera and decodes it; the agent's one module that touches FFmpeg.
+
+A camera that hangs leaves its reader inside a system call that nothing but the end of the process
+ends (a V4L2 driver waits without a time limit), and a decoder that a stranger's stream crashes
+takes its process along. Neither may be the agent's, so this is one of its own; the agent kills it.
+
+One thread decodes and keeps the newest frame; the main thread converts and writes it. Frames that
+were superseded meanwhile, or are more than ``rate_hz`` asks for, are dropped before conversion.
+The end of standard input ends the process: the agent is gone.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from threading import Condition, Thread
+
+import av
+from av.error import FFmpegError, InvalidDataError
+from av.video.codeccontext import VideoCodecContext
+
+from cav_agent.live.address import SourceKind
+from cav_agent.live.record import EndRecord, FrameRecord
+from cav_agent.live.settings import ReaderSettings
+from rfcore.image import rgb_from_video_frame
+
+__all__ = ["main"]
+
+NS = 1_000_000_000
+PRODUCER_TIME = struct.Struct("<q")
+"""``AVProducerReferenceTime.wallclock``, microseconds of the Unix epoch: from sender reports."""
+KEPT_TIMES = 64
+EARLY_SHARE = 0.3
+"""Of a period: a frame that much too early is taken all the same, since cameras jitter."""
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """A frame as FFmpeg gave it."""
+
+    frame: av.VideoFrame
+    pts_ns: int | None
+    received_ns: int
+    sender_ns: int | None
+
+    @property
+    def time_ns(self) -> int:
+        """On the source's own clock, if it has one."""
+        return self.received_ns if self.pts_ns is None else self.pts_ns
+
+
+class Newest:
+    """One frame between two threads; a newer one takes its place. ``end`` closes it."""
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._changed = Condition()
+        self._decoded: Decoded | None = None
+        self._end: EndRecord | None = None
+
+    def put(self, decoded: Decoded) -> None:
+        """Offer a frame."""
+        with self._changed:
+            self.dropped += self._decoded is not None
+            self._decoded = decoded
+            self._changed.notify()
+
+    def leave_out(self) -> None:
+        """Count a frame that is not wanted."""
+        with self._changed:
+            self.dropped += 1
+
+    def end(self, end: EndRecord) -> None:
+        """Say that no more come."""
+        with self._changed:
+            self._end = end
+            self._changed.notify()
+
+    def take(self) -> Decoded | EndRecord:
+        """Wait for the newest frame, then for the end."""
+        with self._changed:
+            while self._decoded is None and self._end is None:
+                self._changed.wait()
+            decoded, self._decoded = self._decoded, None
+            return decoded or self._end or EndRecord("")
+
+
+def main() -> None:
+    """Read the source that the one argument describes until it ends."""
+    settings = ReaderSettings.of_json(sys.argv[1])
+    Thread(target=_end_with_agent, daemon=True).start()
+    newest = Newest()
+    Thread(target=_decode, args=(settings, newest), daemon=True).start()
+    while isinstance(taken := newest.take(), Decoded):
+        rgb = rgb_from_video_frame(taken.frame)
+        times = (taken.pts_ns, taken.received_ns, taken.sender_ns)
+        record = FrameRecord(rgb, *times, newest.dropped)
+        _write(record.header(), rgb.data)
+    _write(taken.to_bytes())
+    os._exit(0)  # FFmpeg's own threads may hang with the camera
+
+
+def _end_with_agent() -> None:
+    while os.read(0, 4096):
+        pass
+    os._exit(1)
+
+
+def _write(*parts: bytes | memoryview) -> None:
+    try:
+        for part in parts:
+            left = memoryview(part).cast("B")
+            while left:
+                left = left[os.write(1, left) :]
+    except OSError:
+        os._exit(1)
+
+
+def _decode(settings: ReaderSettings, newest: Newest) -> None:
+    is_file = settings.address.kind is SourceKind.FILE
+    wanted = _EveryPeriod(settings.rate_hz)
+    try:
+        for decoded in _frames(settings):
+            if decoded is not None and wanted.takes(decoded.time_ns):
+                newest.put(decoded)
+            else:
+                newest.leave_out()
+        newest.end(EndRecord("the source ended", is_whole=is_file))
+    except (FFmpegError, OSError, IndexError, ValueError) as error:
+        newest.end(EndRecord(f"{type(error).__name__}: {error}"))
+
+
+class _EveryPeriod:
+    """Takes frames at ``rate_hz`` on average, the first one after each multiple of the period."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = NS / rate_hz
+        self._due_ns: float | None = None
+
+    def takes(self, time_ns: int) -> bool:
+        due, period = self._due_ns, self._period_ns
+        if due is None or abs(time_ns - due) > NS:  # begins, or the time stamps jump
+            self._due_ns = time_ns + period
+            return True
+        if time_ns < due - EARLY_SHARE * period:
+            return False
+        self._due_ns = max(due + period, time_ns + (1 - EARLY_SHARE) * period)
+        return True
+
+
+def _frames(settings: ReaderSettings) -> Iterator[Decoded | None]:
+    """Yield frames as they come, ``None`` for a damaged one; those of a file when they are due."""
+    address = settings.address
+    container = av.open(
+        address.url,
+        format=address.format,
+        options=dict(address.options),
+        timeout=settings.timeout_s,
+    )
+    stream = container.streams.video[0]
+    context = stream.codec_context
+    if not isinstance(context, VideoCodecContext):
+        raise ValueError("the source is of a codec that is not known")
+    context.thread_type = "SLICE"  # threads by frame would delay each by as many frames
+    context.flags |= av.codec.context.Flags.low_delay
+    sent: dict[int, int] = {}
+    first_pts: int | None = None
+    began_ns = time.monotonic_ns()
+    for packet in container.demux(stream):
+        _note_sender_time(packet, sent)
+        for frame in _decoded(packet):
+            if frame is None:
+                yield None
+                continue
+            pts, tick_s = frame.pts, frame.time_base or Fraction(1, 90_000)
+            if pts is not None and address.kind is SourceKind.FILE:
+                first_pts = pts if first_pts is None else first_pts
+                pts -= first_pts
+                _sleep_until(began_ns + round(pts * tick_s * NS))
+            pts_ns = None if pts is None else max(0, round(pts * tick_s * NS))
+            sender_ns = None if frame.pts is None else sent.get(frame.pts)
+            yield Decoded(frame, pts_ns, time.time_ns(), sender_ns)
+
+
+def _decoded(packet: av.Packet[av.VideoStream]) -> Iterator[av.VideoFrame | None]:
+    """Yield a packet's frames, ``None`` where it lost some on the way: others follow.
+
+    A source of which nothing can be decoded is silent to the agent.
+    """
+    try:
+        frames = packet.decode()
+    except InvalidDataError:
+        yield None
+        return
+    for frame in frames:
+        if isinstance(frame, av.VideoFrame):
+            yield None if frame.is_corrupt else frame
+
+
+def _note_sender_time(packet: av.Packet[av.VideoStream], sent: dict[int, int]) -> None:
+    """Remember when the sender took a packet's picture, where RTCP sender reports tell."""
+    if packet.pts is None or not packet.has_sidedata("prft"):
+        return
+    (wallclock_us,) = PRODUCER_TIME.unpack_from(bytes(packet.get_sidedata("prft")))
+    sent[packet.pts] = wallclock_us * 1000
+    while len(sent) > KEPT_TIMES:
+        del sent[next(iter(sent))]
+
+
+def _sleep_until(monotonic_ns: int) -> None:
+    time.sleep(max(0, monotonic_ns - time.monotonic_ns()) / NS)
+
+
+if __name__ == "__main__":
+    main()

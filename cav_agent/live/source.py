@@ -1,0 +1,251 @@
+"""A live source as the agent holds it: its reader's process kept going, and its newest frame.
+
+``LiveSource.step`` is a state machine that reads one record, or opens the source once it is due;
+its clocks and its reader are arguments. ``SourceThread`` is the thread that steps it. A source that
+says nothing for ``timeout_s`` is closed, which kills its process, and opened again after a pause
+that grows up to ``LONGEST_PAUSE_S``. There is one process and one thread at any time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from threading import Event, Lock, Thread
+from typing import Protocol
+
+from cav_agent.backoff import Backoff
+from cav_agent.live.clock import CaptureClock
+from cav_agent.live.record import EndRecord, FrameRecord, Record
+from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.image import Rgb
+from rfcore.wire.sensing import ClockKind
+
+__all__ = [
+    "Clocks",
+    "LiveFrame",
+    "LiveSource",
+    "Reader",
+    "SourceObserver",
+    "SourceProblem",
+    "SourceThread",
+]
+
+NS = 1_000_000_000
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
+OPENING_S = 10.0
+"""For the first frame after opening: a process starts, a camera is asked, a key frame comes."""
+POLL_S = 0.25
+"""A thread that is told to stop notices within this time."""
+
+
+class SourceProblem(StrEnum):
+    """Why a source was lost: a closed set, fit for a metric's label."""
+
+    ENDED = "ended"
+    """The connection was closed, refused or broken, or what came could not be decoded."""
+    SILENT = "silent"
+    """No frame came in time; the camera may hang."""
+    WRONG_SIZE = "wrong_size"
+    """Frames are not of the size that camera.toml says."""
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """A frame of the source: ``rgb`` uint8 [H, W, 3], taken at ``time_ns`` of Unix time.
+
+    ``taken_s`` is the same on the agent's monotonic clock, ``received_s`` when the agent had it.
+    ``pts_ns`` is its presentation time.
+    """
+
+    rgb: Rgb
+    time_ns: int
+    taken_s: float
+    received_s: float
+    clock: ClockKind
+    pts_ns: int | None
+
+
+class Reader(Protocol):
+    """What reads a source (``cav_agent.live.process``)."""
+
+    def read(self, timeout_s: float) -> Record | None:
+        """Return the next record, or None if none came in time; raise ``RfedgeError``."""
+
+    def close(self) -> None:
+        """End it for good, whatever it hangs in."""
+
+
+class SourceObserver(Protocol):
+    """Hears what happens to a source, on the source's thread."""
+
+    def source_open(self, clock: ClockKind) -> None:
+        """Frames come, and their times rest on ``clock``; called again when that changes."""
+
+    def source_lost(self, problem: SourceProblem, text: str, begins: bool) -> None:
+        """It was lost, or could not be opened; ``begins``: it was not lost before."""
+
+    def source_frames(self, taken: int, dropped: int) -> None:
+        """So many more frames were taken over, or dropped before anybody coded them."""
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """Seconds that only go on, nanoseconds of Unix time, and a way to wait."""
+
+    monotonic_s: Callable[[], float] = time.monotonic
+    unix_ns: Callable[[], int] = time.time_ns
+    wait: Callable[[float], object] = time.sleep
+
+
+class LiveSource:
+    """Opens a source by ``open_reader`` and keeps its newest frame.
+
+    ``step`` is for one thread, ``take`` and ``newest`` for any. ``repeats``: a file begins again.
+    """
+
+    def __init__(
+        self,
+        open_reader: Callable[[], Reader],
+        size_px: tuple[int, int],
+        observer: SourceObserver,
+        *,
+        timeout_s: float = 5.0,
+        repeats: bool = False,
+        clocks: Clocks | None = None,
+        arrived: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._open_reader, self._size_px = open_reader, size_px
+        self._observer, self._arrived = observer, arrived
+        self._timeout_s, self._repeats = timeout_s, repeats
+        self._clocks = clocks or Clocks()
+        self._backoff = Backoff(FIRST_PAUSE_S, LONGEST_PAUSE_S)
+        self._lock = Lock()
+        self._newest: LiveFrame | None = None
+        self._reader: Reader | None = None
+        self._clock = CaptureClock()
+        self._kind: ClockKind | None = None
+        self._heard_s = self._retry_at_s = self._clocks.monotonic_s()
+        self._dropped = 0
+        self._is_lost = False
+        self.is_over = False
+        """Whether a file came to its end, once its last frame was taken."""
+
+    @property
+    def newest(self) -> LiveFrame | None:
+        """The frame that ``take`` would return."""
+        return self._newest
+
+    def take(self) -> LiveFrame | None:
+        """Return the newest frame, once."""
+        with self._lock:
+            frame, self._newest = self._newest, None
+            return frame
+
+    def close(self) -> None:
+        """End the reader."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def step(self) -> None:
+        """Read a record or wait a moment; open the source where it is due."""
+        now = self._clocks.monotonic_s()
+        if self._reader is None:
+            if now < self._retry_at_s:
+                self._clocks.wait(min(POLL_S, self._retry_at_s - now))
+                return
+            self._open(now)
+            return
+        try:
+            record = self._reader.read(POLL_S)
+        except RfedgeError as error:
+            record = EndRecord(str(error))
+        self._take(record)
+
+    def _open(self, now: float) -> None:
+        self._clock = CaptureClock(self._clock.last_ns)
+        self._kind = None
+        self._dropped = 0
+        self._heard_s = now
+        try:
+            self._reader = self._open_reader()
+        except OSError as error:
+            self._lose(SourceProblem.ENDED, f"the reader does not start: {error}")
+
+    def _take(self, record: Record | None) -> None:
+        now = self._clocks.monotonic_s()
+        if isinstance(record, FrameRecord):
+            self._take_frame(record, now)
+        elif isinstance(record, EndRecord):
+            self._end(record)
+        else:
+            limit_s = max(self._timeout_s, OPENING_S) if self._kind is None else self._timeout_s
+            if now - self._heard_s >= limit_s:
+                self._lose(SourceProblem.SILENT, f"no frame within {limit_s:g} s")
+
+    def _end(self, record: EndRecord) -> None:
+        if not record.is_whole:
+            self._lose(SourceProblem.ENDED, record.problem)
+            return
+        self.close()
+        self.is_over = not self._repeats
+        self._arrived()
+
+    def _take_frame(self, record: FrameRecord, now: float) -> None:
+        height, width, _ = record.rgb.shape
+        if (width, height) != self._size_px:
+            wanted = f"{self._size_px[0]}x{self._size_px[1]}"
+            text = f"frames are {width}x{height} px, camera.toml says {wanted}"
+            self._lose(SourceProblem.WRONG_SIZE, text)
+            return
+        self._heard_s = now
+        dropped, self._dropped = record.dropped - self._dropped, record.dropped
+        stamp = self._clock.stamp(record.pts_ns, record.received_ns, record.sender_ns)
+        if stamp is None:
+            self._observer.source_frames(0, dropped + 1)
+            return
+        age_s = (self._clocks.unix_ns() - stamp.time_ns) / NS
+        frame = LiveFrame(
+            record.rgb, stamp.time_ns, now - max(0.0, age_s), now, stamp.clock, record.pts_ns
+        )
+        with self._lock:
+            superseded = self._newest is not None
+            self._newest = frame
+        if stamp.clock is not self._kind or self._is_lost:
+            self._kind, self._is_lost = stamp.clock, False
+            self._observer.source_open(stamp.clock)
+        self._backoff.reset()
+        self._observer.source_frames(1, dropped + superseded)
+        self._arrived()
+
+    def _lose(self, problem: SourceProblem, text: str) -> None:
+        self.close()
+        begins, self._is_lost = not self._is_lost, True
+        self._retry_at_s = self._clocks.monotonic_s() + self._backoff.next_s()
+        self._observer.source_lost(problem, text, begins)
+
+
+class SourceThread:
+    """Steps a source on a thread of its own until ``close``."""
+
+    def __init__(self, source: LiveSource) -> None:
+        self._source = source
+        self._closing = Event()
+        self._thread = Thread(target=self._run, name="camera", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread and the reader's process; returns within a moment."""
+        self._closing.set()
+        self._thread.join(10.0)
+        if self._thread.is_alive():
+            raise InvalidInput("source", "its thread does not end")
+
+    def _run(self) -> None:
+        try:
+            while not self._closing.is_set() and not self._source.is_over:
+                self._source.step()
+        finally:
+            self._source.close()

@@ -1,0 +1,126 @@
+"""The archives a server holds, as a snapshot that streams read and a background task renews.
+
+Reading a folder and hashing archives takes as long as the disk likes, so it never happens on the
+event loop: ``refresh`` runs on a thread, and ``ids`` and ``path`` only look at what it found. A new
+file is listed by the second look that finds it unchanged.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import structlog
+
+from rfcore.errors import UnknownField
+from rfcore.field import RadianceField
+from rfcore.field.folder import FIELD_ID, SUFFIX, FieldFolder, FolderListing
+from rfcore.field.store import load_checked
+from rfcore.wire.settings import RenderSettings
+
+__all__ = ["FieldIndex", "field_loader"]
+
+log = structlog.get_logger()
+
+
+class FieldIndex:
+    """The fields of ``directory``, as of the last ``refresh``; it satisfies ``shelf.Store``."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._folder = FieldFolder(directory)
+        self._paths: Mapping[str, Path] = MappingProxyType({})
+        self._skipped: Mapping[Path, str] = {}
+        self._ids: tuple[str, ...] = ()
+        self._opened: dict[str, Path] = {}
+        self._lock = threading.Lock()
+
+    def start(self) -> None:
+        """Take everything that is there now."""
+        self._take(self._folder.look())
+
+    def refresh(self) -> None:
+        """Look again; slow. An entry that is no archive is skipped, and logged once."""
+        before = self._ids
+        self._take(self._folder.look(settled=True))
+        if self._ids != before:
+            log.info("fields listed", fields=len(self._ids))
+
+    def ids(self) -> tuple[str, ...]:
+        """Return the ids of the fields that are here, sorted."""
+        return self._ids
+
+    def path(self, field_id: str) -> Path:
+        """Return the file of a field; raise ``UnknownField`` naming it and what is here."""
+        path = self._paths.get(field_id)
+        if path is None:
+            here = ", ".join(self._ids) or "nothing"
+            raise UnknownField(f"field {field_id!r} is not on this server; it holds {here}")
+        return path
+
+    def published_path(self, field_id: str) -> Path:
+        """Return the file of a field that was published: it is complete before it is named, and
+        may be newer than the last look."""
+        path = self._directory / f"{field_id}{SUFFIX}"
+        named = FIELD_ID.fullmatch(field_id) is not None and path.is_file()
+        return path if named else self.path(field_id)
+
+    def opened(self, field_id: str, path: Path) -> None:
+        """List a field from now on: its content was checked, so it need not settle."""
+        with self._lock:
+            self._opened[field_id] = path
+            self._list({**self._paths, field_id: path})
+
+    def _take(self, listing: FolderListing) -> None:
+        for path, problem in listing.skipped.items():
+            if self._skipped.get(path) != problem:
+                log.warning("entry skipped", path=str(path), problem=problem)
+        self._skipped = listing.skipped
+        with self._lock:
+            new = self._opened.items() - listing.paths.items()
+            self._opened = {field_id: path for field_id, path in new if path.is_file()}
+            self._list({**self._opened, **listing.paths})
+
+    def _list(self, paths: Mapping[str, Path]) -> None:
+        self._paths = paths
+        self._ids = tuple(sorted(paths))
+
+
+def field_loader(
+    index: FieldIndex, render: RenderSettings, *, opened: Callable[[RadianceField], None]
+) -> Callable[[str], RadianceField]:
+    """Return a function that opens a field of ``index``: checked, and with its renderer built.
+
+    ``opened`` is called with each field. The function raises ``UnknownField``,
+    ``FieldFormatError`` or ``BackendUnavailable``.
+    """
+
+    def base(field_id: str) -> RadianceField:
+        path = index.published_path(field_id)
+        return load_checked(path, field_id, max_bytes=render.max_field_bytes)
+
+    def load(field_id: str) -> RadianceField:
+        path = index.published_path(field_id)
+        field = load_checked(
+            path,
+            field_id,
+            threads=render.threads,
+            isa=render.field_isa,
+            max_bytes=render.max_field_bytes,
+            open_base=base,
+        )
+        index.opened(field_id, path)
+        field.prepare()
+        log.info(
+            "field opened",
+            field=field_id,
+            kind=field.metadata.kind,
+            primitives=field.primitives,
+            isa=field.isa,
+        )
+        opened(field)
+        return field
+
+    return load

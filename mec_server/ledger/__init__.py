@@ -1,0 +1,1 @@
+"""Who may use how much of the server: budgets of identities, promised worker time, cameras."""

@@ -1,0 +1,232 @@
+"""Judges what vehicles ask for by everything that limits it, and keeps what each stream was given.
+
+Sans-IO: ``now`` is an argument. ``StreamAccount`` is one stream's side of the ledger: made when the
+stream opens, charged with every message, and closed with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from mec_server.config import AdmissionLimits
+from mec_server.ledger.active_cameras import ActiveCameras, CameraSender
+from mec_server.ledger.budgets import Budget, Limit, Resource, decoders_of
+from mec_server.ledger.ledger import Hold, Ledger, TokenBucket
+from mec_server.ledger.promises import Promises
+from rfcore.errors import LimitExceeded
+from rfcore.wire.messages import Frame, Hello
+
+__all__ = ["CameraMeter", "EntryControl", "StreamAccount"]
+
+RATE_MARGIN = 1.25
+"""A camera may exceed its granted rate by a quarter: its clock and its link are not the server's.
+"""
+
+LEAST_BURST_FRAMES = 8
+"""What a camera may send at once: the frames in flight, each captured anew after a Nack."""
+
+RAW_BYTES_PER_PIXEL = 1.5
+"""Of an I420 picture; a coded one that is larger tells nothing that this would not."""
+
+
+class CameraMeter:
+    """Frames and bytes that one camera may send: its granted rate, with some margin.
+
+    ``rate_hz`` 0: no limit but its identity's.
+    """
+
+    def __init__(self, pixels: int, rate_hz: float, now: float) -> None:
+        self._raw_bytes = RAW_BYTES_PER_PIXEL * pixels
+        self._rate_hz = 0.0
+        self._buckets: tuple[TokenBucket, TokenBucket] | None = None
+        self.grant(rate_hz, now)
+
+    def grant(self, rate_hz: float, now: float) -> None:
+        """Let it send ``rate_hz`` pictures per second from now on."""
+        self._rate_hz = rate_hz
+        if not rate_hz:
+            self._buckets = None
+            return
+        rate = RATE_MARGIN * rate_hz
+        burst = max(rate, float(LEAST_BURST_FRAMES))
+        raw = self._raw_bytes
+        if self._buckets is None:
+            self._buckets = TokenBucket(rate, now, burst), TokenBucket(rate * raw, now, burst * raw)
+            return
+        frames, sizes = self._buckets
+        frames.set_rate(rate, now, burst)
+        sizes.set_rate(rate * raw, now, burst * raw)
+
+    def spend(self, message_bytes: int, now: float) -> None:
+        """Count a frame; raise ``LimitExceeded`` if it is one too many."""
+        if self._buckets is None:
+            return
+        frames, sizes = self._buckets
+        if not frames.take(1, now):
+            wait_s = frames.wait_s(now)
+            raise LimitExceeded(
+                Limit.CAMERA_FRAMES,
+                f"this camera was granted {self._rate_hz:g} pictures a second; "
+                f"come again in {wait_s:.3g} s",
+                wait_s,
+            )
+        if not sizes.take(message_bytes, now):
+            wait_s = sizes.wait_s(now)
+            raise LimitExceeded(
+                Limit.CAMERA_BYTES,
+                f"more bytes than {self._rate_hz:g} pictures a second have uncoded; "
+                f"come again in {wait_s:.3g} s",
+                wait_s,
+            )
+
+
+class StreamAccount:
+    """What one stream holds, and what it is charged for; ``close`` gives everything back.
+
+    ``identity`` is charged. Without certificates (``named`` false) that is the connection until a
+    Hello names a vehicle.
+    """
+
+    def __init__(
+        self, entry: EntryControl, session_id: str, identity: str, named: bool, now: float
+    ) -> None:
+        self.identity = identity
+        self._entry = entry
+        self._session_id = session_id
+        self._named = named
+        self._cameras: dict[str, CameraMeter] = {}
+        self._granted: list[Callable[[], None]] = []
+        self._decoders: Hold | None = None
+        self._stream = entry.ledger.hold(identity, Resource.STREAMS, now)
+
+    def enter(self, hello: Hello, sender: CameraSender, now: float) -> float:
+        """Let the stream in with the cameras of ``hello``; return the rate of each (0: any).
+
+        What an earlier Hello was granted is given back first. Raises ``LimitExceeded``, after
+        which nothing but the stream itself is held.
+        """
+        self._give_back()
+        entry, ledger = self._entry, self._entry.ledger
+        identity = self.identity if self._named else hello.vehicle_id
+        ledger.check_decoders(identity, now)
+        ledger.check_opening(identity, now)
+        self._stream.transfer(identity, now)
+        self.identity = identity
+        try:
+            self._decoders = ledger.hold(identity, Resource.DECODERS, now, decoders_of(hello))
+            self._granted.append(self._release_decoders)
+            self._granted.append(lambda: entry.promises.leave(self._session_id))
+            rate_hz = entry.promises.enter(self._session_id, identity, hello, now)
+            self._granted.append(lambda: entry.cameras.leave(sender))
+            entry.cameras.enter(hello, sender, now)
+        except LimitExceeded:
+            self._give_back()
+            raise
+        self._cameras = {
+            camera.camera_id: CameraMeter(
+                camera.intrinsics.width_px * camera.intrinsics.height_px, rate_hz, now
+            )
+            for camera in hello.cameras
+        }
+        return rate_hz
+
+    def grant(self, rate_hz: float, now: float) -> None:
+        """Let each camera send ``rate_hz`` pictures per second from now on."""
+        for camera in self._cameras.values():
+            camera.grant(rate_hz, now)
+
+    def spend_message(self, message_bytes: int, now: float) -> None:
+        """Count a message, whatever it is; raise ``LimitExceeded`` if it is one too many."""
+        ledger = self._entry.ledger
+        ledger.spend(self.identity, Resource.MESSAGES, 1, now)
+        ledger.spend(self.identity, Resource.BYTES, message_bytes, now)
+
+    def spend_frame(self, frame: Frame, message_bytes: int, now: float) -> None:
+        """Count a frame of a camera; raise ``LimitExceeded`` if it is one too many.
+
+        An identity that kept workers busy for longer than its share waits until that is made up
+        for, unless it is alone.
+        """
+        camera = self._cameras.get(frame.camera_id)
+        if camera is not None:
+            camera.spend(message_bytes, now)
+        if self._entry.promises.is_crowded:
+            self._entry.ledger.check(self.identity, Resource.WORKER_SECONDS, now)
+
+    def expected_s(self) -> float:
+        """Return for how long the next frame will keep a worker busy."""
+        return self._entry.promises.expected_s(self._session_id)
+
+    def worked(self, field_id: str, worker_s: float, now: float, *, complete: bool = True) -> None:
+        """Charge the time for which a frame kept a worker busy; not ``complete``: was rejected."""
+        self._entry.promises.worked(self._session_id, field_id, worker_s, complete=complete)
+        self._entry.ledger.charge(self.identity, Resource.WORKER_SECONDS, worker_s, now)
+
+    def opening_ended(self, opened: bool, now: float) -> None:
+        """Note how the opening of fields and decoders ended."""
+        self._entry.ledger.opening_ended(self.identity, opened, now)
+
+    def take_decoders(self) -> Hold:
+        """Hand over what was granted for decoders to who opens them, and releases it once they
+        are closed: later than the stream, if a decoder hangs."""
+        decoders, self._decoders = self._decoders, None
+        if decoders is None:
+            raise AssertionError("no Hello was let in")
+        return decoders
+
+    def lost_decoder(self, now: float) -> None:
+        """Count a decoder that a packet cost; raise ``LimitExceeded`` if that bars the vehicle."""
+        self._entry.ledger.lost_decoder(self.identity, now)
+
+    def leave(self) -> None:
+        """Give back what Hello was granted: decoders, promised time, cameras."""
+        self._give_back()
+
+    def close(self) -> None:
+        """Give back everything."""
+        self._give_back()
+        self._stream.release()
+
+    def _release_decoders(self) -> None:
+        if self._decoders is not None:
+            self._decoders.release()
+
+    def _give_back(self) -> None:
+        granted, self._granted = self._granted, []
+        self._cameras = {}
+        for give_back in reversed(granted):
+            give_back()
+
+
+class EntryControl:
+    """The ledger, the promises of worker time and the cameras that are sent, of one server."""
+
+    def __init__(
+        self,
+        budgets: Mapping[Resource, Budget],
+        limits: AdmissionLimits,
+        workers: int,
+        share: float,
+        now: float,
+    ) -> None:
+        self.ledger = Ledger(budgets, now)
+        self.promises = Promises(limits, workers, share)
+        self.cameras = ActiveCameras()
+        self.render_deadline_s = limits.render_deadline_s
+
+    def open(self, session_id: str, identity: str, named: bool, now: float) -> StreamAccount:
+        """Return the account of a new stream; raise ``LimitExceeded`` if it is one too many."""
+        return StreamAccount(self, session_id, identity, named, now)
+
+    def reallocate_rates(self, now: float) -> dict[str, float]:
+        """Return the new rates of the sessions whose rate changes.
+
+        An identity that is lent more than its share of the workers may also spend it.
+        """
+        changed = self.promises.reallocate_rates(now)
+        if changed:
+            share = self.ledger.budget(Resource.WORKER_SECONDS).identity
+            for identity in self.promises.identities():
+                rate = max(share, RATE_MARGIN * self.promises.promised_to(identity))
+                self.ledger.refill(identity, Resource.WORKER_SECONDS, rate, now)
+        return changed

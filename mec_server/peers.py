@@ -1,0 +1,119 @@
+"""Peers of gRPC calls: whom a call is charged to, and how it is told that it is refused.
+
+``ChargeRpcs`` charges every call of the server, whatever its service, for as long as it lasts: also
+health checks, and calls whose peer does not read its status.
+"""
+
+from __future__ import annotations
+
+import inspect
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import TYPE_CHECKING, Any, NoReturn, cast
+
+import grpc
+
+from mec_server.ledger.budgets import Resource
+from mec_server.ledger.ledger import Hold, Ledger
+from rfcore.errors import LimitExceeded, RfedgeError
+from rfcore.wire.conventions import RETRY_AFTER
+from rfcore.wire.identity import peer_identity
+from rfcore.wire.status import status_of
+
+__all__ = ["ChargeRpcs", "Slots", "abort", "peer_account"]
+
+Context = grpc.aio.ServicerContext[Any, Any]
+if TYPE_CHECKING:
+    Handler = grpc.RpcMethodHandler[Any, Any]
+
+
+def peer_account(context: Context) -> tuple[str, bool]:
+    """Return whom a call is charged to, and whether a certificate names it.
+
+    Without certificates, or for one without a name, that is the connection.
+    """
+    identity = peer_identity(context.auth_context())
+    if identity is None or not identity.uris:
+        return context.peer(), identity is not None
+    return identity.uris[0], True
+
+
+async def abort(context: Context, error: RfedgeError) -> NoReturn:
+    """End a call with the status of ``error``, and with the time to try again if it has one."""
+    await context.abort(status_of(error), str(error), _retry_after(error))
+    raise AssertionError("abort raises")
+
+
+def _retry_after(error: RfedgeError) -> tuple[tuple[str, str], ...]:
+    after_s = error.retry_after_s if isinstance(error, LimitExceeded) else None
+    return () if after_s is None else ((RETRY_AFTER, str(round(1e3 * after_s))),)
+
+
+class Slots:
+    """Lets calls of one kind hold one of ``resource`` each; ``limited`` counts who is refused."""
+
+    def __init__(self, ledger: Ledger, resource: Resource, limited: Callable[[str], None]) -> None:
+        self._ledger = ledger
+        self._resource = resource
+        self._limited = limited
+
+    def hold(self, context: Context) -> Hold:
+        """Return what the call holds, to be released when it is over; raise ``LimitExceeded``."""
+        identity, _ = peer_account(context)
+        try:
+            return self._ledger.hold(identity, self._resource, time.monotonic())
+        except LimitExceeded as error:
+            self.count(error)
+            raise
+
+    def count(self, error: LimitExceeded) -> None:
+        """Count the limit that refused or ended a call."""
+        self._limited(error.limit)
+
+
+class ChargeRpcs(grpc.aio.ServerInterceptor):
+    """Charges calls to their identities; ``limited`` counts the limit that refused one."""
+
+    def __init__(self, ledger: Ledger, limited: Callable[[str], None]) -> None:
+        self._ledger = ledger
+        self._limited = limited
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[Handler | None]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> Handler | None:
+        """Return the method's handler, charged for."""
+        handler = await continuation(handler_call_details)
+        return None if handler is None else self._charged(handler)
+
+    def _charged(self, handler: Any) -> Handler:
+        """Return ``handler`` with its one behaviour wrapped (see grpc.RpcMethodHandler)."""
+        kinds = ("unary_unary", "unary_stream", "stream_unary", "stream_stream")
+        (name,) = (kind for kind in kinds if getattr(handler, kind) is not None)
+        make = getattr(grpc, f"{name}_rpc_method_handler")
+        behaviour = self._wrapped(getattr(handler, name))
+        made = make(behaviour, handler.request_deserializer, handler.response_serializer)
+        return cast("Handler", made)
+
+    def _wrapped(self, behaviour: Callable[..., Any]) -> Callable[..., Any]:
+        async def call(request: Any, context: Context) -> Any:
+            with await self._hold(context):
+                return await behaviour(request, context)
+
+        async def generate(request: Any, context: Context) -> AsyncIterator[Any]:
+            with await self._hold(context):
+                async for response in behaviour(request, context):
+                    yield response
+
+        return generate if inspect.isasyncgenfunction(behaviour) else call
+
+    async def _hold(self, context: Context) -> Hold:
+        identity, _ = peer_account(context)
+        now = time.monotonic()
+        try:
+            self._ledger.spend(identity, Resource.CALLS, 1, now)
+            return self._ledger.hold(identity, Resource.RPCS, now)
+        except LimitExceeded as error:
+            self._limited(error.limit)
+            await abort(context, error)

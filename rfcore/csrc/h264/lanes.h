@@ -1,0 +1,249 @@
+// Samples as lanes of wider integers and back: one instruction where the instruction set has one.
+//
+// GCC 12 widens sixteen bytes in two halves and narrows by shuffles; both are frequent here. The
+// plain forms are the definition, and what scalar and NEON code is made of.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "simd/inline.h"
+
+#if defined(RF_ISA_AVX2) || defined(RF_ISA_AVX512)
+#define RF_H264_X86 1
+#include <immintrin.h>
+#endif
+
+namespace {
+
+typedef int32_t Row8 __attribute__((vector_size(32)));
+typedef int32_t Row4 __attribute__((vector_size(16)));
+typedef int16_t Short16 __attribute__((vector_size(32)));
+typedef int16_t Short8 __attribute__((vector_size(16)));
+typedef uint8_t Bytes16 __attribute__((vector_size(16)));
+typedef uint8_t Bytes8 __attribute__((vector_size(8)));
+typedef uint8_t Bytes4 __attribute__((vector_size(4)));
+typedef uint32_t Words8 __attribute__((vector_size(32)));
+typedef uint32_t Words4 __attribute__((vector_size(16)));
+
+RF_INLINE Row8 load_row8(const uint8_t* at) {
+#ifdef RF_H264_X86
+    return reinterpret_cast<Row8>(
+        _mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(at))));
+#else
+    Bytes8 bytes;
+    __builtin_memcpy(&bytes, at, 8);
+    return __builtin_convertvector(bytes, Row8);
+#endif
+}
+
+RF_INLINE Row4 load_row4(const uint8_t* at) {
+#ifdef RF_H264_X86
+    int32_t bytes;
+    __builtin_memcpy(&bytes, at, 4);
+    return reinterpret_cast<Row4>(_mm_cvtepu8_epi32(_mm_cvtsi32_si128(bytes)));
+#else
+    Bytes4 bytes;
+    __builtin_memcpy(&bytes, at, 4);
+    return __builtin_convertvector(bytes, Row4);
+#endif
+}
+
+RF_INLINE Short16 load_shorts(const uint8_t* at, Short16) {
+#ifdef RF_H264_X86
+    return reinterpret_cast<Short16>(
+        _mm256_cvtepu8_epi16(_mm_loadu_si128(reinterpret_cast<const __m128i*>(at))));
+#else
+    Bytes16 bytes;
+    __builtin_memcpy(&bytes, at, 16);
+    return __builtin_convertvector(bytes, Short16);
+#endif
+}
+
+// Eight samples from each of two places.
+RF_INLINE Short16 load_shorts(const uint8_t* at, const uint8_t* other) {
+#ifdef RF_H264_X86
+    const __m128i low = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(at));
+    const __m128i high = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(other));
+    return reinterpret_cast<Short16>(_mm256_cvtepu8_epi16(_mm_unpacklo_epi64(low, high)));
+#else
+    uint8_t bytes[16];
+    __builtin_memcpy(bytes, at, 8);
+    __builtin_memcpy(bytes + 8, other, 8);
+    return load_shorts(bytes, Short16{});
+#endif
+}
+
+RF_INLINE Short8 load_shorts(const uint8_t* at, Short8) {
+#ifdef RF_H264_X86
+    return reinterpret_cast<Short8>(
+        _mm_cvtepu8_epi16(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(at))));
+#else
+    Bytes8 bytes;
+    __builtin_memcpy(&bytes, at, 8);
+    return __builtin_convertvector(bytes, Short8);
+#endif
+}
+
+// Lanes clipped to 0..255.
+RF_INLINE void store_clipped(Row8 v, uint8_t* at) {
+#ifdef RF_H264_X86
+    const __m256i w = reinterpret_cast<__m256i>(v);
+    const __m128i s = _mm_packs_epi32(_mm256_castsi256_si128(w), _mm256_extracti128_si256(w, 1));
+    _mm_storel_epi64(reinterpret_cast<__m128i*>(at), _mm_packus_epi16(s, s));
+#else
+    const Row8 most = {255, 255, 255, 255, 255, 255, 255, 255};
+    v = v < 0 ? Row8{} : v;
+    v = v > most ? most : v;
+    const Bytes8 bytes = __builtin_convertvector(v, Bytes8);
+    __builtin_memcpy(at, &bytes, 8);
+#endif
+}
+
+RF_INLINE void store_clipped(Row4 v, uint8_t* at) {
+#ifdef RF_H264_X86
+    const __m128i s = _mm_packs_epi32(reinterpret_cast<__m128i>(v), reinterpret_cast<__m128i>(v));
+    const int32_t bytes = _mm_cvtsi128_si32(_mm_packus_epi16(s, s));
+    __builtin_memcpy(at, &bytes, 4);
+#else
+    v = v < 0 ? Row4{} : v;
+    v = v > 255 ? Row4{255, 255, 255, 255} : v;
+    const Bytes4 bytes = __builtin_convertvector(v, Bytes4);
+    __builtin_memcpy(at, &bytes, 4);
+#endif
+}
+
+// A bit for each of eight values above `limit`.
+RF_INLINE uint32_t above(const int32_t* values, int32_t limit) {
+    Row8 v;
+    __builtin_memcpy(&v, values, sizeof v);
+    const Row8 mask = v > limit;
+#ifdef RF_H264_X86
+    return static_cast<uint32_t>(_mm256_movemask_ps(reinterpret_cast<__m256>(mask)));
+#else
+    uint32_t bits = 0;
+    for (int i = 0; i < 8; ++i) bits |= static_cast<uint32_t>(mask[i] & 1) << i;
+    return bits;
+#endif
+}
+
+// (a + b + 1) >> 1 of each lane.
+template <class Bytes>
+RF_INLINE Bytes mean_of_bytes(Bytes a, Bytes b) {
+    return (a | b) - ((a ^ b) >> 1);
+}
+
+// The low byte of each lane.
+RF_INLINE Bytes8 low_bytes(Short8 v) {
+#ifdef RF_H264_X86
+    const __m128i w = _mm_and_si128(reinterpret_cast<__m128i>(v), _mm_set1_epi16(255));
+    const int64_t bytes = _mm_cvtsi128_si64(_mm_packus_epi16(w, w));
+    Bytes8 result;
+    __builtin_memcpy(&result, &bytes, 8);
+    return result;
+#else
+    return __builtin_convertvector(v, Bytes8);
+#endif
+}
+
+// Of lanes without sign.
+RF_INLINE uint32_t sum_of_lanes(Words4 v) {
+    v += __builtin_shuffle(v, Words4{2, 3, 0, 1});
+    return v[0] + v[1];
+}
+
+RF_INLINE uint32_t sum_of_lanes(Words8 w) {
+    w += __builtin_shuffle(w, Words8{4, 5, 6, 7, 0, 1, 2, 3});
+    return sum_of_lanes(Words4{w[0], w[1], w[2], w[3]});
+}
+
+RF_INLINE uint32_t sum_of_lanes(Short8 v) {
+    const Words4 w = reinterpret_cast<Words4>(v);
+    return sum_of_lanes((w & 0xFFFF) + (w >> 16));
+}
+
+RF_INLINE uint32_t sum_of_lanes(Short16 v) {
+    const Words8 w = reinterpret_cast<Words8>(v);
+    return sum_of_lanes((w & 0xFFFF) + (w >> 16));
+}
+
+// Adds the squares of neighbouring lanes, each within -255..255, to `sum`.
+RF_INLINE void add_squares(Words8& sum, Short16 v) {
+#ifdef RF_H264_X86
+    const __m256i w = reinterpret_cast<__m256i>(v);
+    sum += reinterpret_cast<Words8>(_mm256_madd_epi16(w, w));
+#else
+    const Short16 square = v * v;  // at most 65025: without sign
+    const Words8 pairs = reinterpret_cast<Words8>(square);
+    sum += (pairs & 0xFFFF) + (pairs >> 16);
+#endif
+}
+
+RF_INLINE void add_squares(Words4& sum, Short8 v) {
+#ifdef RF_H264_X86
+    const __m128i w = reinterpret_cast<__m128i>(v);
+    sum += reinterpret_cast<Words4>(_mm_madd_epi16(w, w));
+#else
+    const Short8 square = v * v;
+    const Words4 pairs = reinterpret_cast<Words4>(square);
+    sum += (pairs & 0xFFFF) + (pairs >> 16);
+#endif
+}
+
+template <class Short>
+RF_INLINE Short magnitude(Short v) { return v < 0 ? -v : v; }
+
+template <class Short>
+RF_INLINE Short difference(const uint8_t* a, const uint8_t* b, Short) {
+    return load_shorts(a, Short{}) - load_shorts(b, Short{});
+}
+
+// Sum of absolute differences of a block 8 or 16 wide and at most 16 high.
+template <int width>
+RF_INLINE uint32_t absolute_difference(const uint8_t* a, ptrdiff_t a_stride, const uint8_t* b,
+                                       ptrdiff_t b_stride, int height) {
+#ifdef RF_H264_X86
+    __m128i sum = _mm_setzero_si128();
+    for (int y = 0; y < height; ++y, a += a_stride, b += b_stride) {
+        const __m128i* p = reinterpret_cast<const __m128i*>(a);
+        const __m128i* q = reinterpret_cast<const __m128i*>(b);
+        const __m128i row = width == 16 ? _mm_sad_epu8(_mm_loadu_si128(p), _mm_loadu_si128(q))
+                                        : _mm_sad_epu8(_mm_loadl_epi64(p), _mm_loadl_epi64(q));
+        sum = _mm_add_epi32(sum, row);
+    }
+    return static_cast<uint32_t>(_mm_cvtsi128_si32(sum) + _mm_extract_epi32(sum, 2));
+#else
+    Short8 sum{};
+    for (int y = 0; y < height; ++y, a += a_stride, b += b_stride) {
+        for (int x = 0; x < width; x += 8) sum += magnitude(difference(a + x, b + x, Short8{}));
+    }
+    return sum_of_lanes(sum);
+#endif
+}
+
+template <int side>
+RF_INLINE uint32_t squared_error(const uint8_t* a, ptrdiff_t a_stride, const uint8_t* b,
+                                 ptrdiff_t b_stride) {
+    if constexpr (side == 16) {
+        Words8 sum{};
+        for (int y = 0; y < 16; ++y) {
+            add_squares(sum, difference(a + y * a_stride, b + y * b_stride, Short16{}));
+        }
+        return sum_of_lanes(sum);
+    } else if constexpr (side == 8) {
+        Words4 sum{};
+        for (int y = 0; y < 8; ++y) {
+            add_squares(sum, difference(a + y * a_stride, b + y * b_stride, Short8{}));
+        }
+        return sum_of_lanes(sum);
+    } else {
+        Row4 sum{};
+        for (int y = 0; y < 4; ++y) {
+            const Row4 d = load_row4(a + y * a_stride) - load_row4(b + y * b_stride);
+            sum += d * d;
+        }
+        return sum_of_lanes(reinterpret_cast<Words4>(sum));
+    }
+}
+
+}  // namespace

@@ -1,0 +1,234 @@
+"""The rig file: which cameras a vehicle carries, where on it, and where their pictures come from.
+
+::
+
+    reference = "front"             # by whose poses the rig is placed; default: the first camera
+
+    [[camera]]
+    name = "front"
+    drive = "front"                 # a dataset in time order, beside this file
+    # or, of a camera that sends now:
+    # source = "rtsp://10.0.0.2/front"      # as cav-agent --source
+    # camera_file = "front/camera.toml"     # its size, intrinsics and lens (docs/data.md)
+    camera_from_rig = [[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, 0]]   # extrinsics, 3x4 or 4x4
+    priority = 1.0                  # weight of its quality in the division of bits, 0.1..10
+    mask = "front_mask.png"         # where its frames are coded finer (as cav-agent --mask)
+
+    [[camera]]
+    name = "rear"
+    ...
+
+The rig's own axes are free; the camera's are OpenCV's. A drive states the intrinsics of its camera.
+Picture i of every drive was taken at the same instant.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rfcore.camera import Pose, TileOrigin, camera_on_rig
+from rfcore.dataset.keys import POSE_SHAPES, pose_of_rows, read_file, table_at
+from rfcore.dataset.picture_file import inside
+from rfcore.dataset.read import read_dataset
+from rfcore.errors import DatasetError, InvalidInput
+from rfcore.files import whole_file
+from rfcore.tables import Range, Table
+from rfcore.views import PosedPicture
+
+__all__ = [
+    "MAX_RIG_CAMERAS",
+    "RIG_FILE",
+    "Rig",
+    "RigCamera",
+    "RigInstant",
+    "read_rig",
+    "read_rig_drive",
+    "write_rig",
+]
+
+RIG_FILE = "rig.toml"
+
+MAX_RIG_CAMERAS = 32
+"""As many as one Hello may name (``rfcore.wire.checks.MAX_CAMERAS``)."""
+
+FARTHEST_M = 100.0
+"""A camera further from the rig's origin is on another vehicle."""
+
+AGREE_M, AGREE_RAD = 0.1, math.radians(1.0)
+"""How far a drive's own pose may be from the one that extrinsics and the reference's pose give."""
+
+KEYS = ("name", "drive", "source", "camera_file", "camera_from_rig", "priority", "mask")
+
+
+@dataclass(frozen=True)
+class RigCamera:
+    """One camera: either ``drive`` or ``source`` with ``camera_file`` says what it sees."""
+
+    name: str
+    camera_from_rig: Pose
+    drive: Path | None = None
+    source: str | None = None
+    camera_file: Path | None = None
+    priority: float = 1.0
+    mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The cameras of a vehicle, the reference first."""
+
+    cameras: tuple[RigCamera, ...]
+
+    @property
+    def reference(self) -> RigCamera:
+        """The camera by whose poses the rig is placed."""
+        return self.cameras[0]
+
+    @property
+    def is_live(self) -> bool:
+        """Whether its cameras send now; else they are drives."""
+        return self.reference.source is not None
+
+
+@dataclass(frozen=True)
+class RigInstant:
+    """The pictures of one instant by camera, each at the pose that ``world_from_rig`` gives it."""
+
+    world_from_rig: Pose
+    pictures: dict[str, PosedPicture]
+
+
+def read_rig(path: Path) -> Rig:
+    """Read a rig file, or the ``rig.toml`` of a folder.
+
+    Raises ``DatasetError`` that names file, camera and key.
+    """
+    file = path / RIG_FILE if path.is_dir() else path
+    try:
+        content = tomllib.loads(read_file(file).decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{file}: not TOML ({error})") from error
+    top = table_at(str(file), content)
+    top.require_known(("reference", "camera"))
+    entries = top.items("camera")
+    if not 1 <= len(entries) <= MAX_RIG_CAMERAS:
+        raise top.error("camera", f"has {len(entries)} cameras, outside 1..{MAX_RIG_CAMERAS}")
+    cameras = tuple(_camera(file, i, values) for i, values in enumerate(entries))
+    _check_names(file, cameras)
+    if len({camera.source is None for camera in cameras}) > 1:
+        raise DatasetError(f"{file}: cameras have either all a 'drive' or all a 'source'")
+    name = top.choice("reference", [camera.name for camera in cameras], cameras[0].name)
+    return Rig(tuple(sorted(cameras, key=lambda camera: camera.name != name)))
+
+
+def _camera(file: Path, index: int, values: object) -> RigCamera:
+    keys = table_at(f"{file}: [[camera]] {index}", values)
+    name = keys.text("name")
+    where = f"{file}: camera '{name}'"
+    keys = table_at(where, values)
+    keys.require_known(KEYS)
+    if ("drive" in keys) == ("source" in keys):
+        raise DatasetError(f"{where}: name either a 'drive' or a 'source'")
+    if "source" in keys and "camera_file" not in keys:
+        raise keys.error("camera_file", "is missing: a source needs a camera.toml")
+    pose = pose_of_rows(where, "camera_from_rig", keys.matrix("camera_from_rig", POSE_SHAPES))
+    if max(map(abs, pose.translation_m)) > FARTHEST_M:
+        raise keys.error("camera_from_rig", f"is beyond {FARTHEST_M:g} m from the rig's origin")
+    return RigCamera(
+        name=name,
+        camera_from_rig=pose,
+        drive=_path(where, file, keys, "drive"),
+        source=keys.text("source") if "source" in keys else None,
+        camera_file=_path(where, file, keys, "camera_file"),
+        priority=keys.number("priority", Range(0.1, 10.0), 1.0),
+        mask=_path(where, file, keys, "mask"),
+    )
+
+
+def _path(where: str, file: Path, keys: Table, key: str) -> Path | None:
+    return inside(where, file.parent, keys.text(key)) if key in keys else None
+
+
+def _check_names(file: Path, cameras: Sequence[RigCamera]) -> None:
+    name, count = Counter(camera.name for camera in cameras).most_common(1)[0]
+    if count > 1:
+        raise DatasetError(f"{file}: {count} cameras are named '{name}'")
+
+
+def read_rig_drive(rig: Rig, origin: TileOrigin | None = None) -> tuple[RigInstant, ...]:
+    """Read the drives of a rig; return its instants in time order, posed relative to ``origin``.
+
+    The rig's pose is that of the reference's picture less its extrinsics, rounded as it is sent;
+    the other cameras' poses follow by theirs. Raises ``DatasetError`` where a drive has another
+    number of pictures, or its poses are not those (0.1 m, 1 degree): then the extrinsics are wrong.
+    """
+    drives = {camera.name: _drive(camera, origin) for camera in rig.cameras}
+    reference = rig.reference
+    count = len(drives[reference.name])
+    for name, pictures in drives.items():
+        if len(pictures) != count:
+            raise DatasetError(
+                f"the drive of camera '{name}' has {len(pictures)} pictures, that of "
+                f"'{reference.name}' {count}; picture i of each is of one instant"
+            )
+    return tuple(_instant(rig, {n: drives[n][i] for n in drives}) for i in range(count))
+
+
+def _drive(camera: RigCamera, origin: TileOrigin | None) -> tuple[PosedPicture, ...]:
+    if camera.drive is None:
+        raise InvalidInput("rig", f"camera '{camera.name}' has no drive")
+    pictures = read_dataset(camera.drive, tile_origin=origin).pictures
+    for picture in pictures:
+        if picture.camera.intrinsics != pictures[0].camera.intrinsics:
+            raise DatasetError(
+                f"{camera.drive}: {picture.name} has other intrinsics than {pictures[0].name}; "
+                "a drive is one camera"
+            )
+    return pictures
+
+
+def _instant(rig: Rig, pictures: dict[str, PosedPicture]) -> RigInstant:
+    reference = rig.reference
+    world_from_cam = pictures[reference.name].camera.world_from_cam
+    world_from_rig = world_from_cam.compose(reference.camera_from_rig).rounded()
+    posed = {}
+    for camera in rig.cameras:
+        picture = pictures[camera.name]
+        pose = camera_on_rig(world_from_rig, camera.camera_from_rig)
+        _check_agrees(camera, picture, pose)
+        posed[camera.name] = replace(picture, camera=replace(picture.camera, world_from_cam=pose))
+    return RigInstant(world_from_rig, posed)
+
+
+def _check_agrees(camera: RigCamera, picture: PosedPicture, pose: Pose) -> None:
+    apart = picture.camera.world_from_cam.inverse().compose(pose)
+    metres = math.hypot(*apart.translation_m)
+    radians = 2 * math.acos(min(1.0, abs(apart.rotation[0])))
+    if metres > AGREE_M or radians > AGREE_RAD:
+        raise DatasetError(
+            f"camera '{camera.name}': its drive has {picture.name} {metres:.2f} m and "
+            f"{math.degrees(radians):.2f} degrees from where camera_from_rig puts it; at most "
+            f"{AGREE_M:g} m and {math.degrees(AGREE_RAD):g} degrees"
+        )
+
+
+def write_rig(path: Path, rig: Rig) -> None:
+    """Write a rig of drives; their paths are written relative to the file's folder."""
+    lines = [f'reference = "{rig.reference.name}"']
+    for camera in rig.cameras:
+        if camera.drive is None:
+            raise InvalidInput("rig", f"camera '{camera.name}' has no drive")
+        turn, at = camera.camera_from_rig.rotation_matrix(), camera.camera_from_rig.translation_m
+        rows = [[*row, metres] for row, metres in zip(turn, at, strict=True)]
+        lines += ["", "[[camera]]", f'name = "{camera.name}"']
+        lines.append(f'drive = "{camera.drive.relative_to(path.parent).as_posix()}"')
+        lines += ["camera_from_rig = [", *(f"    {row!r}," for row in rows), "]"]
+        if camera.priority != 1.0:
+            lines.append(f"priority = {camera.priority!r}")
+    with whole_file(path) as file:
+        file.write(("\n".join(lines) + "\n").encode())

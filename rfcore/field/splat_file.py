@@ -1,0 +1,61 @@
+"""Files of splats from other programs, told apart by their names: ``.ply`` and ``.spz``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+from rfcore.camera import TileOrigin
+from rfcore.errors import FieldFormatError
+from rfcore.field.ply import antialiased_of, read_open_ply
+from rfcore.field.ply_table import read_header
+from rfcore.field.spz import read_open_spz
+from rfcore.files import DECODED_BYTES
+from rfcore.raster.gaussians import Gaussians
+
+__all__ = ["SPLAT_SUFFIXES", "check_suffix", "read_open_splat_file", "read_splat_file"]
+
+SPLAT_SUFFIXES = (".ply", ".spz")
+CONVERTED = (".splat", ".ksplat", ".sog")
+"""Formats that keep fewer bits than .ply and that splat-transform converts."""
+OTHERS = (".sogs", ".gltf", ".glb")
+
+
+def read_splat_file(
+    path: Path, tile_origin: TileOrigin | None = None, max_bytes: int = DECODED_BYTES
+) -> tuple[Gaussians, bool | None]:
+    """Return the Gaussians, SH degree 0..3, ``tile_origin`` taken off the means in float64; and how
+    the file says that they are drawn: antialiased, not, or ``None`` where it does not say.
+
+    Raises ``FieldFormatError`` naming the file and what is wrong with it, for a format that is not
+    read, and for Gaussians that take more than ``max_bytes`` of memory.
+    """
+    check_suffix(path)
+    try:
+        with path.open("rb") as file:
+            return read_open_splat_file(path, file, tile_origin, max_bytes)
+    except OSError as error:
+        raise FieldFormatError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def read_open_splat_file(
+    path: Path, file: BinaryIO, tile_origin: TileOrigin | None, max_bytes: int
+) -> tuple[Gaussians, bool | None]:
+    """Read an open file as ``read_splat_file`` does; ``path`` is its name."""
+    if path.suffix.lower() == ".spz":
+        return read_open_spz(path, file, tile_origin, max_bytes)
+    gaussians = read_open_ply(path, file, tile_origin, max_bytes)
+    file.seek(0)
+    return gaussians, antialiased_of(path, read_header(path, file).comments)
+
+
+def check_suffix(path: Path) -> None:
+    """Raise ``FieldFormatError`` for a format that is not read, naming what converts it."""
+    suffix = path.suffix.lower()
+    if suffix in OTHERS:
+        raise FieldFormatError(f"{path}: {suffix} is not read; export the splats as .ply")
+    if suffix in CONVERTED:
+        raise FieldFormatError(
+            f"{path}: {suffix} is not read; convert it first (npm package @playcanvas/"
+            f"splat-transform): splat-transform {path.name} {path.stem}.ply"
+        )

@@ -1,0 +1,374 @@
+"""Following a camera from one picture to the next: prediction, alignment, render, check.
+
+A picture is aligned with the field as it was rendered for the picture before, moved by what is
+predicted, so that alignment needs no render of its own: the one at the pose found is the one that
+the codec needs. It is also a better template, since it stands where the camera stands; what
+aligning with it still corrects is the error of the pose just rendered at. Where that is more than a
+fraction of a pixel, and time allows, the field is rendered again there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Intrinsics, Pose, Vec3
+from rfcore.localise.agreement import agreement_on_track
+from rfcore.localise.alignment import Aligned, Expected, Template, align
+from rfcore.localise.structure import Pyramid
+from rfcore.motion import quaternion_from_vector, rotation_vector
+from rfcore.views import FieldView
+
+__all__ = [
+    "HALF",
+    "Effort",
+    "Motion",
+    "RenderAt",
+    "Track",
+    "TrackSettings",
+    "begun",
+    "followed",
+    "moved_px",
+]
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+HALF = 1
+"""The level of a pyramid at half the resolution."""
+UNKNOWN_AHEAD = (0.0, 0.03, 0.06, 0.1, 0.15)
+"""Motions to the next picture that are tried while none is known: shares of the median depth."""
+NO_TURN = (1.0, 0.0, 0.0, 0.0)
+LEAST_MOVED_OF_DEPTH = 0.01
+"""Shorter movements, as a share of the median depth, do not show the scale of motions."""
+SCALE_GAIN, MOST_SCALED = 0.25, 0.15
+"""Weight of the newest movement in that scale, and how far from 1 it may be."""
+RenderAt = Callable[[Pose], FieldView]
+"""Renders the field at a pose, rounded as it will be sent."""
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """When a track is believed. Lengths are shares of the median depth of what is seen."""
+
+    least_agreement: float = 15.0
+    """``agreement_on_track`` of the render at the pose: between right places, 28 and more, and
+    others, 8 at most."""
+    least_of_last_agreement: float = 0.55
+    """Share of the last picture's agreement: poses that drift fall below before they are wrong."""
+    expected_of_depth: float = 0.02
+    """How far a prediction is off, one sigma; 0.2 m in a street."""
+    expected_deg: float = 0.7
+    drift_of_motion: float = 0.2
+    """Share of the motion since the last picture that a prediction may be wrong by."""
+    settled_of_depth: float = 0.003
+    """How far a pose that was rendered at is expected to be off, one sigma."""
+    settled_deg: float = 0.05
+    redraw_px: float = 0.2
+    """A correction that moves pixels of middling depth by more is worth another render."""
+    most_px: float = 1.5
+    """A pose that is still off by more was not found."""
+    unknown_speed_m_s: float = 10.0
+    """While only one pose is known, the next one may be this far."""
+    fine_levels: int = 1
+    """At so many of the finest levels that take part the pose that was rendered at is corrected."""
+    longest_gap_s: float = 1.5
+    """Over longer times no motion is predicted."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What a frame's tracking may cost beyond the render at the pose sent."""
+
+    renders: int = 1
+    """Renders more, at most."""
+    finest: int = 0
+    """The finest level of the pyramids that takes part."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A steady motion in the camera's axes: metres and a rotation vector, a second."""
+
+    metres: Vec3 = (0.0, 0.0, 0.0)
+    radians: Vec3 = (0.0, 0.0, 0.0)
+
+    @staticmethod
+    def between(before: Pose, after: Pose, seconds: float) -> Motion:
+        """Return the motion that leads from one pose to the other in so many seconds."""
+        moved = before.inverse().compose(after)
+        x, y, z = (value / seconds for value in moved.translation_m)
+        a, b, c = (value / seconds for value in rotation_vector(moved.rotation))
+        return Motion((x, y, z), (a, b, c))
+
+    def over(self, seconds: float) -> Pose:
+        """Return the later camera's pose in the axes of the earlier, after so many seconds."""
+        x, y, z = (value * seconds for value in self.metres)
+        a, b, c = (value * seconds for value in self.radians)
+        return Pose((x, y, z), quaternion_from_vector((a, b, c)))
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A camera that was found in a picture at ``time_ns``.
+
+    ``view``: the field at the pose to send. ``world_from_cam``: the same pose corrected by what
+    aligning with that view still showed, better but never rendered. ``covariance`` [6, 6]: of
+    metres and radians in the camera's axes, by the residuals alone. ``motion``: ``None`` while only
+    one pose is known. ``correction_px``: how far off the pose sent is. ``renders``: made for it.
+    ``motion_scale``: how much longer movements are than aligning with the view before says: as much
+    as the field's depth is wrong there, by which it measures them.
+    """
+
+    time_ns: int
+    view: FieldView
+    template: Template
+    world_from_cam: Pose
+    covariance: F64
+    agreement: float
+    motion: Motion | None
+    correction_px: float
+    renders: int
+    motion_scale: float = 1.0
+
+    def predicted(self, time_ns: int, odometry: Pose | None = None) -> Pose:
+        """Return where the camera is expected at a later time; without motion, where it was."""
+        if odometry is not None:
+            return self.world_from_cam.compose(odometry)
+        motion = self.motion or Motion()
+        return self.world_from_cam.compose(motion.over((time_ns - self.time_ns) / 1e9))
+
+
+def begun(
+    time_ns: int,
+    near: Pose,
+    expected: Expected | None,
+    picture: Pyramid,
+    render_at: RenderAt,
+    settings: TrackSettings,
+) -> Track | None:
+    """Return the track that begins with a picture taken near a pose; None if it is not there.
+
+    ``expected``: how far off the pose is; ``None``: as far as a prediction. Two renders or three.
+    """
+    made = _aligned_anew(time_ns, near, expected, picture, render_at, settings)
+    return None if made is None else _checked(made, picture, render_at, settings, Effort())
+
+
+def followed(
+    track: Track,
+    time_ns: int,
+    picture: Pyramid,
+    render_at: RenderAt,
+    settings: TrackSettings,
+    effort: Effort,
+    odometry: Pose | None = None,
+) -> Track | None:
+    """Return the track with one picture more, a pyramid, taken at ``time_ns``; None if it is lost.
+
+    ``odometry``: the later camera's pose in the axes of the earlier, where a sensor measured it.
+    """
+    seconds = (time_ns - track.time_ns) / 1e9
+    predicted = track.predicted(time_ns, odometry)
+    expected = _expected(track, predicted, seconds, settings)
+    drawn = track.view.camera.world_from_cam
+    aligned = _aligned_from(track, predicted, picture, expected, effort.finest)
+    if aligned is not None:
+        found = _stretched(track, drawn.compose(aligned.motion.inverse()))
+        made = _Candidate(time_ns, found, 0, (track, seconds), found)
+        better = _checked(made, picture, render_at, settings, effort)
+        if better is not None or effort.renders < 1:
+            return better
+    elif effort.renders < 1:
+        return None
+    anew = _aligned_anew(time_ns, predicted, expected, picture, render_at, settings, effort.finest)
+    if anew is None:
+        return None
+    made = replace(anew, before=(track, seconds))
+    return _checked(made, picture, render_at, settings, replace(effort, renders=0))
+
+
+def _aligned_from(
+    track: Track, predicted: Pose, picture: Pyramid, expected: Expected, finest: int
+) -> Aligned | None:
+    """Return the motion from the track's view to a picture, from where it is predicted.
+
+    While no motion is known, several speeds ahead are tried; the one that leaves least is taken.
+    """
+    drawn = track.view.camera.world_from_cam
+    ahead = (0.0,) if track.motion is not None else UNKNOWN_AHEAD
+    found = [
+        align(
+            track.template,
+            picture,
+            predicted.compose(Pose((0.0, 0.0, share * track.template.median_depth), NO_TURN))
+            .inverse()
+            .compose(drawn),
+            expected,
+            finest=finest,
+        )
+        for share in ahead
+    ]
+    return min((f for f in found if f is not None), key=lambda f: f.spread, default=None)
+
+
+def _moved(before: Pose, after: Pose) -> F64:
+    """Return by how much a camera moved, in its axes before."""
+    return np.array(before.inverse().compose(after).translation_m)
+
+
+def _stretched(track: Track, found: Pose) -> Pose:
+    """Return a pose to which the track was followed, its movement scaled as was learnt."""
+    more = (track.motion_scale - 1) * _moved(track.world_from_cam, found)
+    x, y, z = (float(value) for value in more)
+    by = Pose((x, y, z), NO_TURN)
+    return track.world_from_cam.compose(by).compose(track.world_from_cam.inverse()).compose(found)
+
+
+def _aligned_anew(
+    time_ns: int,
+    near: Pose,
+    expected: Expected | None,
+    picture: Pyramid,
+    render_at: RenderAt,
+    settings: TrackSettings,
+    finest: int = 0,
+) -> _Candidate | None:
+    """Return where a picture was taken, by a render near there; None where nothing agrees."""
+    view = render_at(near)
+    template = Template.of(view)
+    if expected is None:
+        metres = settings.expected_of_depth * template.median_depth
+        expected = Expected(metres, math.radians(settings.expected_deg))
+    aligned = align(template, picture, Pose.identity(), expected, finest=finest)
+    if aligned is None:
+        return None
+    found = view.camera.world_from_cam.compose(aligned.motion.inverse())
+    return _Candidate(time_ns, found, 1)
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A pose to be rendered at, and believed or not, after so many ``renders``; ``before``: the
+    track so far, and the seconds since; ``followed_to``: where aligning with its view led."""
+
+    time_ns: int
+    world_from_cam: Pose
+    renders: int
+    before: tuple[Track, float] | None = None
+    followed_to: Pose | None = None
+
+    def motion_scale(self, pose: Pose) -> float:
+        """Return the scale of motions, once the camera was found to be at a pose."""
+        if self.before is None:
+            return 1.0
+        track = self.before[0]
+        if self.followed_to is None:
+            return track.motion_scale
+        taken, made = (_moved(track.world_from_cam, to) for to in (self.followed_to, pose))
+        squared = float(taken @ taken)
+        if squared < (LEAST_MOVED_OF_DEPTH * track.template.median_depth) ** 2:
+            return track.motion_scale
+        seen = track.motion_scale * float(taken @ made) / squared
+        learnt = track.motion_scale + SCALE_GAIN * (seen - track.motion_scale)
+        return min(max(learnt, 1 - MOST_SCALED), 1 + MOST_SCALED)
+
+    def least_agreement(self, settings: TrackSettings) -> float:
+        """Return what the render must reach: enough, and not much less than the last one."""
+        if self.before is None:
+            return settings.least_agreement
+        last = settings.least_of_last_agreement * self.before[0].agreement
+        return max(settings.least_agreement, last)
+
+    def motion_to(self, pose: Pose) -> Motion | None:
+        """Return the motion from the track so far to a pose."""
+        if self.before is None:
+            return None
+        track, seconds = self.before
+        return Motion.between(track.world_from_cam, pose, seconds)
+
+
+def _checked(
+    made: _Candidate,
+    picture: Pyramid,
+    render_at: RenderAt,
+    settings: TrackSettings,
+    effort: Effort,
+) -> Track | None:
+    """Return the candidate as a track if the render there resembles the picture."""
+    view, renders = render_at(made.world_from_cam), made.renders + 1
+    template = Template.of(view)
+    agrees = agreement_on_track(picture[HALF], template.structures[HALF], view)
+    if agrees < made.least_agreement(settings):
+        return None
+    aligned = _settled(template, picture, settings, effort.finest)
+    if aligned is None:
+        return None
+    off_px = moved_px(aligned.motion, template.median_depth, view.camera.intrinsics)
+    if off_px > settings.redraw_px and effort.renders > 0:
+        there = view.camera.world_from_cam.compose(aligned.motion.inverse())
+        again = replace(made, world_from_cam=there, renders=renders)
+        return _checked(
+            again, picture, render_at, settings, replace(effort, renders=effort.renders - 1)
+        )
+    if off_px > settings.most_px:
+        return None
+    pose = view.camera.world_from_cam.compose(aligned.motion.inverse())
+    return Track(
+        made.time_ns,
+        view,
+        template,
+        pose,
+        _covariance(aligned),
+        agrees,
+        made.motion_to(pose),
+        off_px,
+        renders,
+        made.motion_scale(pose),
+    )
+
+
+def _settled(
+    template: Template, picture: Pyramid, settings: TrackSettings, finest: int
+) -> Aligned | None:
+    """Return what still moves a picture against the render at its own pose."""
+    expected = Expected(
+        settings.settled_of_depth * template.median_depth, math.radians(settings.settled_deg)
+    )
+    return align(template, picture, Pose.identity(), expected, settings.fine_levels, finest)
+
+
+def _expected(track: Track, predicted: Pose, seconds: float, settings: TrackSettings) -> Expected:
+    """Return how far the prediction may be off."""
+    moved = track.world_from_cam.inverse().compose(predicted)
+    metres = settings.expected_of_depth * track.template.median_depth
+    metres += settings.drift_of_motion * math.hypot(*moved.translation_m)
+    turned = math.hypot(*rotation_vector(moved.rotation))
+    if track.motion is None:
+        metres += settings.unknown_speed_m_s * seconds
+    radians = math.radians(settings.expected_deg) + settings.drift_of_motion * turned
+    return Expected(metres, radians)
+
+
+def moved_px(motion: Pose, median_depth: float, k: Intrinsics) -> float:
+    """Return about how far a motion moves pixels of middling depth, root mean square.
+
+    Along the optical axis and about it a pixel moves by as much as it is away from the middle.
+    """
+    depth = max(median_depth, 1e-9)
+    x, y, z = (metres / depth for metres in motion.translation_m)
+    a, b, c = rotation_vector(motion.rotation)
+    radius_px = math.sqrt((k.width_px**2 + k.height_px**2) / 12)
+    return math.hypot(k.fx_px * (x + b), k.fx_px * (y - a), radius_px * z, radius_px * c)
+
+
+def _covariance(aligned: Aligned) -> F64:
+    """Return the covariance [6, 6] of a motion; infinite where the picture says nothing."""
+    try:
+        found: F64 = np.linalg.inv(aligned.hessian).astype(np.float64)
+    except np.linalg.LinAlgError:
+        return np.full((6, 6), np.inf)
+    return found

@@ -1,0 +1,283 @@
+"""One set of Gaussians in a device's memory, and the kernels that draw them.
+
+A picture is projected, its visible Gaussians gathered and sorted by depth, their overlaps with
+tiles written down and sorted by tile, and every tile blended. Both sorts are stable, so that ties
+stay in the order of the Gaussians. Two numbers come back in between: how many are visible, and how
+many overlaps there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera
+from rfcore.extras import needs
+from rfcore.raster.gaussians import F32, Gaussians
+from rfcore.raster.opencl.device import Device, DeviceFull, DeviceLost
+
+with needs("opencl"):
+    import pyopencl as cl
+
+__all__ = ["MAX_GROUP_ENTRIES", "MAX_TILE_ENTRIES", "DeviceRasterizer"]
+
+TILE_SIDE_PX = 16
+MAX_GROUP_ENTRIES = 1 << 28
+"""Overlaps of Gaussians and 64x64 pixels; the native kernels refuse more in the same words."""
+MAX_TILE_ENTRIES = 1 << 26
+"""Overlaps of Gaussians and tiles that memory is kept for, 16 bytes each: 1 GiB."""
+SPLAT_BYTES, BOX_BYTES, PREPARED_BYTES, CAMERA_BYTES = 64, 12, 40, 84
+SIDE = 64
+"""Work-items of a group, where a kernel does not say."""
+SCAN_ITEMS, SCAN_BLOCK, SORT_BLOCK, DIGIT_BITS = 256, 2048, 1024, 4
+DEPTH_BITS = 32
+
+U32 = np.uint32
+I32 = np.int32
+NOTHING = np.zeros(1, U32)
+ZERO = U32(0)
+"""Known to the kernels at run time alone (``PRODUCT`` in arithmetic.cl)."""
+
+
+class DeviceRasterizer:
+    """Gaussians on a device; for one thread at a time.
+
+    Raises ``DeviceLost`` when the device fails, here and in ``draw``.
+    """
+
+    def __init__(self, device: Device, gaussians: Gaussians, *, antialiased: bool) -> None:
+        self.device = device
+        self._count, self._degree = len(gaussians), gaussians.sh_degree
+        self._antialiased = I32(antialiased)
+        with _lost_if_it_fails(device):
+            self._queue = cl.CommandQueue(device.context)
+            self._kernels = {k.function_name: k for k in device.program.all_kernels()}
+            self._memory = DeviceMemory(device)
+            self._prepare(gaussians)
+
+    def _prepare(self, g: Gaussians) -> None:
+        count, memory = self._count, self._memory
+        named = {"means": g.means, "sh": g.sh}
+        used_once = {
+            "quaternions": g.quaternions,
+            "scales": g.log_scales,
+            "logits": g.opacity_logits,
+        }
+        for name, array in {**named, **used_once}.items():
+            memory.at_least(name, array.nbytes)
+            if count:
+                cl.enqueue_copy(self._queue, memory[name], np.ascontiguousarray(array))
+        for name, size in (
+            ("prepared", PREPARED_BYTES),
+            ("splats", SPLAT_BYTES),
+            ("boxes", BOX_BYTES),
+        ):
+            memory.at_least(name, size * count)
+        memory.at_least("depth_bits", 4 * count)
+        memory.at_least("marks", 4 * count)
+        memory.at_least("camera", CAMERA_BYTES)
+        arrays = (memory[name] for name in (*used_once, "prepared"))
+        self._run("prepare", count, I32(count), *arrays, ZERO)
+        self._queue.finish()
+        for name in used_once:
+            memory.give_back(name)
+
+    def draw(
+        self,
+        camera: Camera,
+        degree: int,
+        colour: F32,
+        depth: F32 | None = None,
+        opacity: F32 | None = None,
+    ) -> None:
+        """Write ``colour`` [H, W, 3] and, if given, ``depth`` and ``opacity`` [H, W].
+
+        Raises ``ValueError`` as the native kernels do for more than 2^28 overlaps, ``DeviceFull``
+        for what only this device cannot hold, and ``DeviceLost``. None of them leaves a picture.
+        """
+        with _lost_if_it_fails(self.device):
+            self._load(camera)
+            self._project(degree)
+            visible = self._gather()
+            self._place(visible, camera)
+            self._blend(camera)
+            memory, queue = self._memory, self._queue
+            for name, out in (("colour", colour), ("depth", depth), ("opacity", opacity)):
+                if out is not None:
+                    cl.enqueue_copy(queue, out, memory[name], is_blocking=False)
+            queue.finish()
+
+    def _load(self, camera: Camera) -> None:
+        cl.enqueue_copy(self._queue, self._memory["camera"], camera_on_device(camera))
+
+    def _project(self, degree: int) -> None:
+        names = ("camera", "means", "prepared", "sh", "splats", "boxes", "depth_bits")
+        stored = I32((self._degree + 1) ** 2)
+        numbers = (I32(self._count), I32(degree), stored, self._antialiased)
+        self._run("project", self._count, *numbers, *self._buffers(*names), ZERO)
+
+    def _gather(self) -> int:
+        """Sort the visible Gaussians by depth into ``order``; return how many there are."""
+        count = U32(self._count)
+        self._run("mark_visible", self._count, count, *self._buffers("depth_bits", "marks"))
+        visible = int(self._total(self._scan("marks", self._count)))
+        self._reserve_pairs("depths", "order", visible)
+        names = ("depth_bits", "marks", "depths", "order")
+        self._run("gather_visible", self._count, count, *self._buffers(*names))
+        self._sort("depths", "order", visible, DEPTH_BITS)
+        return visible
+
+    def _place(self, visible: int, camera: Camera) -> None:
+        """Sort the overlaps by tile into ``entries``."""
+        memory = self._memory
+        for name in ("starts_of_splats", "group_counts"):
+            memory.at_least(name, 4 * visible)
+        splats = self._buffers("camera", "splats", "boxes", "order")
+        counts = self._buffers("starts_of_splats", "group_counts")
+        self._run("count_tiles", visible, U32(visible), *splats, *counts)
+        entries = self._checked_entries(visible)
+        self._scan("starts_of_splats", visible)
+        self._reserve_pairs("tiles", "entries", entries)
+        places = self._buffers("starts_of_splats", "tiles", "entries")
+        self._run("place_tiles", visible, U32(visible), *splats, *places)
+        tiles = _tiles(camera)
+        self._sort("tiles", "entries", entries, (tiles - 1).bit_length())
+        memory.at_least("starts_of_tiles", 4 * (tiles + 1))
+        starts = self._buffers("tiles", "starts_of_tiles")
+        self._run("find_starts", entries + 1, U32(entries), U32(tiles), *starts)
+
+    def _checked_entries(self, visible: int) -> int:
+        if self._sum("group_counts", visible) > MAX_GROUP_ENTRIES:
+            raise ValueError(
+                f"more than {MAX_GROUP_ENTRIES} overlaps of Gaussians and 64x64 pixels; the "
+                "Gaussians are too large or too many for this picture size"
+            )
+        entries = self._sum("starts_of_splats", visible)
+        if entries > MAX_TILE_ENTRIES:
+            raise DeviceFull(f"{entries} overlaps of Gaussians and tiles exceed {MAX_TILE_ENTRIES}")
+        return entries
+
+    def _blend(self, camera: Camera) -> None:
+        k, memory = camera.intrinsics, self._memory
+        pixels = k.width_px * k.height_px
+        for name, channels in (("colour", 3), ("depth", 1), ("opacity", 1)):
+            memory.at_least(name, 4 * channels * pixels)
+        size = tuple(-(-side // TILE_SIDE_PX) * TILE_SIDE_PX for side in (k.width_px, k.height_px))
+        names = ("camera", "splats", "starts_of_tiles", "entries", "colour", "depth", "opacity")
+        blend = self._kernels["blend"]
+        blend(self._queue, size, (TILE_SIDE_PX, TILE_SIDE_PX), *self._buffers(*names), ZERO)
+
+    def _run(self, kernel: str, items: int, *arguments: Any, side: int = SIDE) -> None:
+        if items:
+            self._kernels[kernel](self._queue, (-(-items // side) * side,), (side,), *arguments)
+
+    def _buffers(self, *names: str) -> list[Any]:
+        return [self._memory[name] for name in names]
+
+    def _reserve_pairs(self, keys: str, values: str, count: int) -> None:
+        for name in (keys, values, f"{keys} moved", f"{values} moved"):
+            self._memory.at_least(name, 4 * count)
+
+    def _scan(self, name: str, count: int, level: int = 0) -> str:
+        """Make exclusive prefix sums in place; return the name of the buffer of their total."""
+        blocks = -(-count // SCAN_BLOCK)
+        sums = f"sums {level}"
+        self._memory.at_least(sums, 4 * max(1, blocks))
+        if not count:
+            cl.enqueue_fill_buffer(self._queue, self._memory[sums], NOTHING, 0, 4)
+        values = self._buffers(name, sums)
+        self._run("scan_blocks", blocks * SCAN_ITEMS, U32(count), *values, side=SCAN_ITEMS)
+        if blocks <= 1:
+            return sums
+        total = self._scan(sums, blocks, level + 1)
+        self._run("add_block_sums", count, U32(count), *self._buffers(name, sums))
+        return total
+
+    def _total(self, name: str) -> np.uint32:
+        total = np.empty(1, U32)
+        cl.enqueue_copy(self._queue, total, self._memory[name])
+        return U32(total[0])
+
+    def _sum(self, name: str, count: int) -> int:
+        blocks = -(-count // SCAN_ITEMS)
+        self._memory.at_least("sums of 64 bits", 8 * blocks)
+        sums = np.zeros(blocks, np.uint64)
+        values = self._buffers(name, "sums of 64 bits")
+        self._run("sum_blocks", count, U32(count), *values, side=SCAN_ITEMS)
+        if blocks:
+            cl.enqueue_copy(self._queue, sums, self._memory["sums of 64 bits"])
+        return int(sums.sum())
+
+    def _sort(self, keys: str, values: str, count: int, bits: int) -> None:
+        """Sort pairs by the lowest ``bits`` of their keys; equal keys keep their order."""
+        if count < 2:
+            return
+        blocks, memory = -(-count // SORT_BLOCK), self._memory
+        memory.at_least("digits", 4 * (blocks << DIGIT_BITS))
+        for shift in range(0, bits, DIGIT_BITS):
+            numbers = (U32(count), U32(shift))
+            self._run("count_digits", blocks * SIDE, *numbers, *self._buffers(keys, "digits"))
+            self._scan("digits", blocks << DIGIT_BITS)
+            names = (keys, values, "digits", f"{keys} moved", f"{values} moved")
+            self._run("move_by_digit", blocks * SIDE, *numbers, *self._buffers(*names))
+            memory.swap(keys, f"{keys} moved")
+            memory.swap(values, f"{values} moved")
+
+
+class DeviceMemory:
+    """Buffers by name. They grow by half when they must, and are kept from picture to picture."""
+
+    def __init__(self, device: Device) -> None:
+        self._context = device.context
+        self._buffers: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        return self._buffers[name]
+
+    def at_least(self, name: str, size_bytes: int) -> None:
+        """Make room for ``size_bytes``; what a buffer held is lost when it grows."""
+        before = self._buffers.get(name)
+        if before is not None and before.size >= size_bytes:
+            return
+        grown = size_bytes if before is None else max(size_bytes, 3 * before.size // 2)
+        self._buffers[name] = cl.Buffer(self._context, cl.mem_flags.READ_WRITE, max(grown, SIDE))
+        if before is not None:
+            before.release()
+
+    def swap(self, one: str, other: str) -> None:
+        """Exchange two names."""
+        buffers = self._buffers
+        buffers[one], buffers[other] = buffers[other], buffers[one]
+
+    def give_back(self, name: str) -> None:
+        """Free a buffer."""
+        self._buffers.pop(name).release()
+
+
+def camera_on_device(camera: Camera) -> NDArray[np.uint8]:
+    """Return the bytes of ``Camera`` in project.cl: float32, rounded once; the position as two."""
+    k = camera.intrinsics
+    rotation = np.array(camera.cam_from_world().rotation_matrix(), np.float64).ravel()
+    position = np.array(camera.world_from_cam.translation_m, np.float64)
+    rest = position - position.astype(np.float32).astype(np.float64)
+    lens = np.array([k.fx_px, k.fy_px, k.cx_px, k.cy_px], np.float64)
+    numbers = np.concatenate([rotation, position, rest, lens]).astype(np.float32)
+    sides = np.array([k.width_px, k.height_px], I32)
+    return np.concatenate([numbers.view(np.uint8), sides.view(np.uint8)])
+
+
+def _tiles(camera: Camera) -> int:
+    k = camera.intrinsics
+    return -(-k.width_px // TILE_SIDE_PX) * -(-k.height_px // TILE_SIDE_PX)
+
+
+@contextmanager
+def _lost_if_it_fails(device: Device) -> Iterator[None]:
+    try:
+        yield
+    except (cl.Error, MemoryError) as error:
+        raise DeviceLost(f"{device.name}: {error}") from error

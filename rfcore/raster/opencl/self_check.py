@@ -1,0 +1,178 @@
+"""What a device must show before its pictures are believed.
+
+What a driver says of itself is no gate: one that reports neither fused multiply-add nor correct
+rounding may be exact, and another that reports both may contract. So its arithmetic is compared on
+bit patterns and whole pictures with the digests of the native kernels, which reach every path:
+all SH degrees, both modes, splats of all sizes, ties, several batches a tile, opaque pixels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.errors import BackendUnavailable
+from rfcore.extras import needs
+from rfcore.raster.gaussians import F32, Gaussians
+from rfcore.raster.opencl.device import Device, DeviceLost
+from rfcore.raster.opencl.renderer import SIDE, DeviceRasterizer
+from rfcore.views import View
+
+with needs("opencl"):
+    import pyopencl as cl
+
+__all__ = ["ARITHMETIC_DIGESTS", "CHECKS", "Check", "check_device"]
+
+OPERATIONS = ("addition", "product", "quotient", "square root", "fused multiply-add", "floor")
+PATTERNS = 1 << 14
+TINY = np.finfo(np.float32).tiny
+
+
+class Chance:
+    """Numbers of a counter mixed by integer arithmetic: the same bits whatever numpy is used."""
+
+    def __init__(self) -> None:
+        self._drawn = 0
+
+    def bits(self, *shape: int) -> NDArray[np.uint32]:
+        """Return 32 bits each (the finalizer of MurmurHash3)."""
+        count = int(np.prod(shape))
+        x = np.arange(self._drawn, self._drawn + count, dtype=np.uint32)
+        self._drawn += count
+        x = x * np.uint32(0x9E3779B9) + np.uint32(0x7F4A7C15)
+        for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+            x = (x ^ x >> np.uint32(shift)) * np.uint32(factor)
+        return (x ^ x >> np.uint32(16)).reshape(shape)
+
+    def uniform(self, low: float, high: float, *shape: int) -> F32:
+        """Return float32 from ``low`` to below ``high``."""
+        unit = (self.bits(*shape) >> np.uint32(8)).astype(np.float32) * np.float32(2.0**-24)
+        return np.float32(low) + np.float32(high - low) * unit
+
+
+def arithmetic_operands() -> tuple[F32, F32, F32]:
+    """Return x, y and z [PATTERNS]: any bits, numbers near 1, small ones, whole ones, specials.
+
+    Subnormals are zero: some devices flush them, and no byte of a picture depends on one.
+    """
+    chance = Chance()
+    return _operand(chance), _operand(chance), _operand(chance)
+
+
+def _operand(chance: Chance) -> F32:
+    specials = np.array([0.0, -0.0, np.inf, -np.inf, 1.0, TINY, 3.4028235e38, -1.0], np.float32)
+    near, small = chance.uniform(-4, 4, PATTERNS), chance.uniform(0, 1e-37, PATTERNS)
+    whole = (chance.bits(PATTERNS) & np.uint32(0xFFF)).astype(np.float32)
+    special = specials[chance.bits(PATTERNS) & np.uint32(7)]
+    kinds = [chance.bits(PATTERNS).view(np.float32), near, small, whole, special]
+    chosen = np.choose(chance.bits(PATTERNS) % np.uint32(len(kinds)), kinds)
+    return canonical(chosen)
+
+
+def canonical(x: F32) -> F32:
+    """Return ``x`` with one NaN for all and without subnormals and negative zeros."""
+    kept = np.where(np.abs(x) < TINY, np.float32(0), x)
+    return np.where(np.isnan(kept), np.float32(np.nan), kept)
+
+
+def digest(*arrays: NDArray[np.float32]) -> str:
+    """Return 16 hexadecimal digits of the bytes of arrays."""
+    return hashlib.blake2b(b"".join(a.tobytes() for a in arrays), digest_size=8).hexdigest()
+
+
+def arithmetic_on(device: Device) -> F32:
+    """Return what the device makes of the operands [6, PATTERNS], canonical."""
+    queue, flags = cl.CommandQueue(device.context), cl.mem_flags
+    operands = [
+        cl.Buffer(device.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=operand)
+        for operand in arithmetic_operands()
+    ]
+    results = np.empty((len(OPERATIONS), PATTERNS), np.float32)
+    made = cl.Buffer(device.context, flags.WRITE_ONLY, results.nbytes)
+    kernel = cl.Kernel(device.program, "arithmetic")
+    kernel(queue, (PATTERNS,), (SIDE,), np.uint32(PATTERNS), *operands, made)
+    cl.enqueue_copy(queue, results, made)
+    return canonical(results)
+
+
+class Check:
+    """One picture of a self-check: how it is drawn, and the digest that the native kernels give."""
+
+    def __init__(self, size_px: tuple[int, int], degree: int, antialiased: bool, want: str) -> None:
+        self.camera, self.degree, self.antialiased = _camera(*size_px), degree, antialiased
+        self.want = want
+
+    def on(self, device: Device, gaussians: Gaussians) -> View:
+        """Return the picture that the device draws."""
+        k = self.camera.intrinsics
+        shape = (k.height_px, k.width_px)
+        view = View(*(np.empty(s, np.float32) for s in ((*shape, 3), shape, shape)))
+        drawn_by = DeviceRasterizer(device, gaussians, antialiased=self.antialiased)
+        drawn_by.draw(self.camera, self.degree, view.colour, view.depth, view.opacity)
+        return view
+
+
+def _camera(width_px: int, height_px: int) -> Camera:
+    focal = 0.5 * max(width_px, height_px)
+    lens = Intrinsics(
+        width_px, height_px, focal, 1.03125 * focal, 0.48 * width_px, 0.53 * height_px
+    )
+    return Camera(lens, Pose((0.25, -0.125, -0.5), (0.96, 0.0, 0.28, 0.0)))
+
+
+def check_gaussians() -> Gaussians:
+    """Return a cloud with walls, needles, ties, a pile of faint splats and odd quaternions."""
+    chance, count = Chance(), 2000
+    means = chance.uniform(-1, 1, count, 3) * np.array([3, 2, 3], np.float32)
+    means[:, 2] += np.float32(4)
+    quaternions = chance.uniform(-1, 1, count, 4)
+    log_scales = chance.uniform(-4, -1.5, count, 3)
+    logits = chance.uniform(-4, 4, count)
+    sh = chance.uniform(-0.5, 0.5, count, 16, 3)
+    log_scales[0:40] = chance.uniform(-6, 1.5, 40, 3)  # needles and discs over many tiles
+    log_scales[40:44] += np.float32(4)  # wider than the picture
+    means[50:90] = means[90:130]  # equal depths
+    means[200:800], logits[200:800] = (0.5, 0.25, 3.0), -3.5  # several batches of one tile
+    quaternions[800:810], quaternions[810:820] = 0, chance.uniform(1e37, 3e38, 10, 4)
+    logits[820:860] = 12  # opaque
+    sh[860:900] *= np.float32(1e30)  # colours at their limit
+    log_scales[900:920] = -30
+    return Gaussians(means, quaternions, log_scales, logits, sh)
+
+
+ARITHMETIC_DIGESTS = {
+    "addition": "549cf4f58061dcd4",
+    "product": "fe88f7d7377d4bcf",
+    "quotient": "8438635ebf714c5a",
+    "square root": "6955cc75193bd2dd",
+    "fused multiply-add": "f9a1463a8f843c9f",
+    "floor": "c21333978a6de98b",
+}
+CHECKS = (
+    Check((200, 120), 3, False, "2ec8ed079366139c"),
+    Check((150, 90), 2, True, "582987017f579d49"),
+    Check((333, 17), 1, False, "75d042a29e85995a"),
+    Check((40, 301), 0, True, "9683b6af3c5839e6"),
+)
+
+
+def check_device(device: Device) -> None:
+    """Raise ``BackendUnavailable`` saying what differs, unless the device is exact."""
+    try:
+        for name, result in zip(OPERATIONS, arithmetic_on(device), strict=True):
+            if digest(result) != ARITHMETIC_DIGESTS[name]:
+                raise BackendUnavailable(f"{device.description}: a {name} is not the IEEE result")
+        gaussians = check_gaussians()
+        for check in CHECKS:
+            view = check.on(device, gaussians)
+            if digest(view.colour, view.depth, view.opacity) != check.want:
+                k = check.camera.intrinsics
+                raise BackendUnavailable(
+                    f"{device.description}: its picture of {k.width_px}x{k.height_px} pixels with "
+                    f"bands up to {check.degree} is not that of the native kernels"
+                )
+    except (DeviceLost, cl.Error) as error:
+        raise BackendUnavailable(f"{device.description}: {error}") from error

@@ -1,0 +1,197 @@
+"""Poses learned with the field: every picture's camera moves a little, down the loss's gradient.
+
+Moving the camera by a translation t in the world is moving all Gaussians by -t; turning it by a
+rotation vector w about its centre c is turning all Gaussians by -w about c. So the gradients of
+means m and quaternions q, which the kernels give, are those of the pose (first order, world axes):
+
+    dL/dt = -sum g_m
+    dL/dw = -sum (m - c) x g_m  -  1/2 sum (q_w g_v - g_w q_v + q_v x g_v),
+
+with q = (q_w, q_v) and its gradient (g_w, g_v). Turning the Gaussians also turns the directions
+they are seen from, which turning the camera does not: for colours that depend on direction the
+second line is off by what that changes, little beside the displacement in the picture.
+
+Corrections have mean zero over the pictures, so that the field stays where the dataset put it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera, Pose, Vec3
+from rfcore.field import SplatField
+from rfcore.motion import quaternion_from_vector, rotation_vector
+from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.trainable import TrainableRasterizer
+from rfcore.views import PosedPicture
+
+__all__ = [
+    "PoseCorrection",
+    "PoseModel",
+    "align_pictures",
+    "corrected",
+    "pose_gradient",
+    "typical_depth_m",
+]
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+"""Of Adam; the second moment of a picture is that of its last hundred visits."""
+STEP_PX = 0.1
+"""Most that a step moves the picture at first, in pixels."""
+ALIGN_STEPS = 40
+"""Of aligning a picture with a field that is held."""
+FALL = 0.05
+"""The rate at the end, as a share of that at the start."""
+
+
+@dataclass(frozen=True)
+class PoseCorrection:
+    """How a picture's pose was changed: metres and degrees."""
+
+    name: str
+    moved_m: float
+    turned_deg: float
+
+
+def pose_gradient(gaussians: Gaussians, gradients: Mapping[str, F32], centre_m: Vec3) -> F64:
+    """Return dL by translation (3) and rotation vector (3) of a camera at ``centre_m``, world axes.
+
+    ``gradients`` are those of ``TrainableRasterizer.gradients`` after its ``backward``.
+    """
+    g_mean = gradients["means"].astype(np.float64)
+    seen = np.flatnonzero(g_mean.any(axis=1))
+    g_mean, q = g_mean[seen], gaussians.quaternions[seen].astype(np.float64)
+    offset = gaussians.means[seen].astype(np.float64) - centre_m
+    g = gradients["quaternions"][seen].astype(np.float64)
+    turn = q[:, :1] * g[:, 1:] - g[:, :1] * q[:, 1:] + np.cross(q[:, 1:], g[:, 1:])
+    swing = np.cross(offset, g_mean) + 0.5 * turn
+    return -np.concatenate([g_mean.sum(axis=0), swing.sum(axis=0)])
+
+
+def typical_depth_m(gaussians: Gaussians, cameras: Sequence[Camera]) -> float:
+    """Return the median distance of the Gaussians in front of the cameras, at least 1 mm.
+
+    A hundred Gaussians and every camera are enough to know it.
+    """
+    step = max(1, len(gaussians) // 100)
+    points = gaussians.means[::step].astype(np.float64)
+    depths = [depth for camera in cameras for depth in _depths(camera, points) if depth > 0]
+    return max(float(np.median(depths)), 1e-3) if depths else 1.0
+
+
+def _depths(camera: Camera, points: F64) -> list[float]:
+    """Return z of points [N, 3] in a camera's axes."""
+    rotation = np.array(camera.world_from_cam.rotation_matrix())
+    depths: list[float] = ((points - camera.world_from_cam.translation_m) @ rotation[:, 2]).tolist()
+    return depths
+
+
+def corrected(camera: Camera, correction: F64) -> Camera:
+    """Return a camera moved and turned, world axes, by a translation and a rotation vector [6]."""
+    x, y, z, a, b, c = correction.tolist()
+    pose = camera.world_from_cam
+    turn = Pose((0.0, 0.0, 0.0), quaternion_from_vector((a, b, c)))
+    rotation = turn.compose(Pose((0.0, 0.0, 0.0), pose.rotation)).rotation
+    px, py, pz = pose.translation_m
+    return replace(camera, world_from_cam=Pose((px + x, py + y, pz + z), rotation))
+
+
+class PoseModel:
+    """The corrections of a run's cameras [V, 6], learned by Adam when a picture is visited.
+
+    ``depth_m``: how far away the scene is, which makes a step of the position that of a turn.
+    """
+
+    def __init__(self, cameras: Sequence[Camera], depth_m: float) -> None:
+        self._cameras = list(cameras)
+        self._depth_m = depth_m
+        shape = (len(self._cameras), 6)
+        self._steps, self._first, self._second = (np.zeros(shape) for _ in range(3))
+        self._visits = np.zeros(len(self._cameras))
+
+    def camera(self, view: int) -> Camera:
+        """Return a picture's camera where it is now."""
+        return corrected(self._cameras[view], self._steps[view] - self._steps.mean(axis=0))
+
+    def step(self, view: int, gradient: F64, progress: float) -> None:
+        """Do one step of Adam; ``progress`` 0..1 lowers its rate."""
+        self._visits[view] += 1
+        first, second = self._first[view], self._second[view]
+        scale = np.array([self._depth_m] * 3 + [1.0] * 3)
+        scaled = gradient * scale  # of a displacement in units of the depth, as of a turn
+        first += (1 - BETA1) * (scaled - first)
+        second += (1 - BETA2) * (scaled * scaled - second)
+        visits = int(self._visits[view])
+        mean = first / (1 - np.multiply.reduce(np.full(visits, BETA1)))
+        square = second / (1 - np.multiply.reduce(np.full(visits, BETA2)))
+        rate = self._rate_rad(view, progress)
+        self._steps[view] -= rate * scale * mean / (np.sqrt(square) + EPSILON)
+
+    def corrections(self, names: Sequence[str]) -> list[PoseCorrection]:
+        """Return what became of the pictures' poses."""
+        found = []
+        for view, name in enumerate(names):
+            before, after = self._cameras[view].world_from_cam, self.camera(view).world_from_cam
+            between = before.inverse().compose(after)
+            turned_deg = math.degrees(math.hypot(*rotation_vector(between.rotation)))
+            found.append(PoseCorrection(name, math.hypot(*between.translation_m), turned_deg))
+        return found
+
+    def arrays(self) -> dict[str, F64]:
+        """Return what ``restore`` goes on from."""
+        parts = {"steps": self._steps, "first": self._first, "second": self._second}
+        copies = {f"poses.{name}": array.copy() for name, array in parts.items()}
+        return copies | {"poses.visits": self._visits.copy()}
+
+    def restore(self, arrays: Mapping[str, F64]) -> None:
+        """Go on from ``arrays``."""
+        self._steps = arrays["poses.steps"].copy()
+        self._first = arrays["poses.first"].copy()
+        self._second = arrays["poses.second"].copy()
+        self._visits = arrays["poses.visits"].copy()
+
+    def _rate_rad(self, view: int, progress: float) -> float:
+        share = FALL + (1 - FALL) * 0.5 * (1 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
+        return STEP_PX * share / self._cameras[view].intrinsics.fx_px
+
+
+def align_pictures(
+    field: SplatField, pictures: Sequence[PosedPicture], depth_m: float, threads: int
+) -> list[PosedPicture]:
+    """Return pictures with poses aligned with a field that is held, each on its own.
+
+    What a vehicle does that finds its pose in the field; for fields that are measured with poses
+    that are themselves wrong.
+    """
+    antialiased = field.metadata.antialiased
+    rasterizer = TrainableRasterizer(field.gaussians, threads=threads, antialiased=antialiased)
+    aligned = []
+    for picture in pictures:
+        model = _Alone([picture.camera], depth_m)
+        target = picture.read().astype(np.float32) / np.float32(255)
+        for number in range(ALIGN_STEPS):
+            camera = model.camera(0)
+            rasterizer.forward(camera)
+            rasterizer.loss(target)
+            rasterizer.backward()
+            centre_m = camera.world_from_cam.translation_m
+            gradient = pose_gradient(field.gaussians, rasterizer.gradients(), centre_m)
+            model.step(0, gradient, number / ALIGN_STEPS)
+        aligned.append(replace(picture, camera=model.camera(0)))
+    return aligned
+
+
+class _Alone(PoseModel):
+    """The camera of one picture, which may go anywhere."""
+
+    def camera(self, view: int) -> Camera:
+        """Return the camera where it is now."""
+        return corrected(self._cameras[view], self._steps[view])

@@ -1,0 +1,143 @@
+"""Which pixels of a frame the other passes contradict: what drove by is not learnt.
+
+A block of 8x8 pixels counts as passing through when its frame is far from the field, and the other
+passes, at the same place of the street, are not: most of them, where the field's depth carries
+their blocks to. What persists over the passes (a parked car, another light) is far in all of them.
+Passes that nobody else saw have no one to contradict them; of one pass alone everything is learnt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.field import RadianceField
+from rfcore.field.interface import render_field_view
+from rfcore.image import I420
+from rfcore.native.warp import BLOCK_PX, warp_i420
+from rfcore.native.yuv import i420_from_rgb
+from rfcore.update.passes import SeenFrame
+from rfcore.views import FieldView
+
+__all__ = ["both", "trusted_pixels"]
+
+FAR_LEVELS = 20
+"""Mean absolute difference of a block's luma above which it does not show what the field does."""
+NEAR_LEVELS = 12
+REACH_M = 6.0
+"""Two frames see the same place if their cameras are nearer than this and look the same way."""
+SAME_WAY = 0.8
+"""Cosine of the angle between the axes of two such cameras."""
+UNKNOWN = 255
+"""Carried differences are below ``CLIPPED``; what the depth does not carry reads as this."""
+CLIPPED = 120
+
+Mask = NDArray[np.bool_]
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Difference:
+    """How far a frame is from the field: luma levels, uint8 [H, W], block by block."""
+
+    view: FieldView
+    levels: NDArray[np.uint8]
+
+
+def trusted_pixels(field: RadianceField, frames: Sequence[SeenFrame]) -> list[Mask | None]:
+    """Return for each frame which pixels [H, W] to learn from; None where all are."""
+    differences = [_difference(field, frame) for frame in frames]
+    return [_trusted(index, frames, differences) for index in range(len(frames))]
+
+
+def both(first: Sequence[Mask | None], second: Sequence[Mask | None]) -> list[Mask | None]:
+    """Return what is trusted by both, frame by frame."""
+    pairs = zip(first, second, strict=True)
+    return [b if a is None else a if b is None else a & b for a, b in pairs]
+
+
+def _difference(field: RadianceField, frame: SeenFrame) -> _Difference:
+    view = render_field_view(field, frame.camera)
+    seen, shown = i420_from_rgb(frame.rgb).y.astype(np.int16), view.render.y.astype(np.int16)
+    means = _block_means(np.abs(seen - shown).astype(np.float32))
+    return _Difference(view, np.clip(means, 0, CLIPPED).astype(np.uint8))
+
+
+def _block_means(plane: F32) -> F32:
+    """Return the mean of each whole 8x8 block at each of its pixels; the rest is 0."""
+    height, width = (side // BLOCK_PX * BLOCK_PX for side in plane.shape)
+    blocks = plane[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, -1, BLOCK_PX)
+    means = blocks.mean(axis=(1, 3), dtype=np.float32)
+    out = np.zeros_like(plane)
+    out[:height, :width] = means.repeat(BLOCK_PX, 0).repeat(BLOCK_PX, 1)
+    return out
+
+
+def _trusted(
+    index: int, frames: Sequence[SeenFrame], differences: Sequence[_Difference]
+) -> Mask | None:
+    own = differences[index]
+    carried = [
+        _carried(differences[other], own.view) for other in _neighbours(index, frames).values()
+    ]
+    if not carried:
+        return None
+    known = np.stack([plane != UNKNOWN for plane in carried])
+    near = np.stack([plane < NEAR_LEVELS for plane in carried])
+    contradicted = 2 * near.sum(axis=0) > known.sum(axis=0)
+    passing = (own.levels > FAR_LEVELS) & contradicted
+    return ~passing if passing.any() else None
+
+
+def _neighbours(index: int, frames: Sequence[SeenFrame]) -> Mapping[int, int]:
+    """Return the nearest frame of every other pass, by the pass's number."""
+    mine = frames[index]
+    nearest: dict[int, tuple[float, int]] = {}
+    position, axis = _position_and_axis(mine)
+    for other, frame in enumerate(frames):
+        if frame.pass_number == mine.pass_number:
+            continue
+        if frame.camera.intrinsics != mine.camera.intrinsics:
+            continue
+        there, looking = _position_and_axis(frame)
+        distance_m = float(np.linalg.norm(there - position))
+        if distance_m > REACH_M or float(axis @ looking) < SAME_WAY:
+            continue
+        best = nearest.get(frame.pass_number)
+        if best is None or distance_m < best[0]:
+            nearest[frame.pass_number] = (distance_m, other)
+    return {number: other for number, (_, other) in nearest.items()}
+
+
+def _position_and_axis(
+    frame: SeenFrame,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    pose = frame.camera.world_from_cam
+    return np.array(pose.translation_m), np.array(pose.rotation_matrix())[:, 2]
+
+
+def _carried(difference: _Difference, now: FieldView) -> NDArray[np.uint8]:
+    """Return the other frame's levels where ``now`` sees them, at most of each 3x3 blocks."""
+    height, width = difference.levels.shape
+    half = np.full(((height + 1) // 2, (width + 1) // 2), 128, np.uint8)
+    blank = FieldView(now.camera, _flat(now.render, UNKNOWN), now.depth)
+    carried = warp_i420(I420(difference.levels, half, half), difference.view, blank).y
+    return _most_around(carried)
+
+
+def _flat(like: I420, level: int) -> I420:
+    y, u, v = (np.full(plane.shape, level, np.uint8) for plane in like.planes)
+    return I420(y, u, v)
+
+
+def _most_around(plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the highest known level within a block's side; parallax moves what depth misses."""
+    known = np.where(plane == UNKNOWN, 0, plane)
+    most = known
+    for axis in (0, 1):
+        shifted = [np.roll(most, step, axis) for step in (-BLOCK_PX, 0, BLOCK_PX)]
+        most = np.maximum.reduce(shifted)
+    return np.where(plane == UNKNOWN, np.uint8(UNKNOWN), most).astype(np.uint8)

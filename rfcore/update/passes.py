@@ -1,0 +1,82 @@
+"""Passes of vehicles along a street, and the frames of them that an update learns from.
+
+Every fourth frame of a pass is held back for the trial; poses are rounded as vehicles send them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera
+from rfcore.errors import InvalidInput
+from rfcore.image import Rgb
+from rfcore.views import PosedPicture
+
+__all__ = ["HOLD_BACK_EVERY", "Pass", "SeenFrame", "check_passes", "split_frames"]
+
+HOLD_BACK_EVERY = 4
+FEWEST_FRAMES = 8
+"""Of a pass: two are held back, one after the other."""
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One drive of one vehicle, in time order; ``identity`` says whose."""
+
+    identity: str
+    pictures: tuple[PosedPicture, ...]
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """What ``camera`` saw: ``rgb`` uint8 [H, W, 3], in the pass of that number."""
+
+    camera: Camera
+    rgb: Rgb
+    pass_number: int
+
+    def colour(self) -> NDArray[np.float32]:
+        """Return the picture as float32 [H, W, 3] in 0..1."""
+        return self.rgb.astype(np.float32) / np.float32(255.0)
+
+
+def check_passes(passes: Sequence[Pass], min_identities: int) -> None:
+    """Raise ``InvalidInput`` for passes that nothing is learnt from."""
+    identities = {drive.identity for drive in passes}
+    if len(identities) < min_identities:
+        raise InvalidInput(
+            "min_identities",
+            f"passes of {len(identities)} vehicle(s) ({', '.join(sorted(identities)) or 'none'}), "
+            f"at least {min_identities} are asked for",
+        )
+    for drive in passes:
+        if len(drive.pictures) < FEWEST_FRAMES:
+            raise InvalidInput(
+                "from", f"{drive.identity}: {len(drive.pictures)} frames, at least {FEWEST_FRAMES}"
+            )
+
+
+def split_frames(passes: Sequence[Pass], most: int) -> tuple[list[SeenFrame], list[SeenFrame]]:
+    """Return the frames to learn from and those held back, ``most`` in all, evenly over the passes.
+
+    Raises ``DatasetError`` for a picture that cannot be read.
+    """
+    learnt: list[SeenFrame] = []
+    held_back: list[SeenFrame] = []
+    for number, drive in enumerate(passes):
+        for place, picture in enumerate(_spread(drive.pictures, max(2, most // len(passes)))):
+            camera = replace(picture.camera, world_from_cam=picture.camera.world_from_cam.rounded())
+            frame = SeenFrame(camera, picture.read(), number)
+            is_held_back = place % HOLD_BACK_EVERY == HOLD_BACK_EVERY // 2
+            (held_back if is_held_back else learnt).append(frame)
+    return learnt, held_back
+
+
+def _spread(pictures: Sequence[PosedPicture], most: int) -> list[PosedPicture]:
+    if len(pictures) <= most:
+        return list(pictures)
+    return [pictures[i] for i in np.linspace(0, len(pictures) - 1, most).round().astype(int)]

@@ -1,0 +1,174 @@
+"""All parameters of a splat field fine-tuned to what passes saw.
+
+Stochastic descent on L1 and D-SSIM, one frame an iteration, from the field as it is. L1 makes every
+splat the median of what it is shown, so what most passes saw wins; pixels that the other passes
+contradict (``rfcore.update.agreement``) are left out: by the field as it was, which decides between
+two passes in its own light, and half-way by what was learnt until then, in another light. Density
+control splits Gaussians where the gradient stays large, and takes away those that have faded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.errors import InvalidInput
+from rfcore.field import SplatField
+from rfcore.field.importance import contributions, most_important_first, reordered
+from rfcore.raster.trainable import LearningRates, TrainableRasterizer
+from rfcore.train.levels import LevelFitConfig, with_levels
+from rfcore.train.schedule import DensityControl, control_density, view_order
+from rfcore.update.agreement import both, trusted_pixels
+from rfcore.update.passes import SeenFrame
+
+__all__ = ["FineTuning", "Progress", "fine_tuned"]
+
+Progress = Callable[[str, int, int], None]
+"""Told what is being done, how much of it is done, and how much there is."""
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class FineTuning:
+    """How to fine-tune. ``threads`` changes how long it takes, nothing else.
+
+    Rates measured on the yardstick street's dusk drive, 18 of 24 frames learnt, 6 held back, with
+    the field of noon (12.4 dB): colours at 5e-3 reach 20.3 dB in 300 iterations, at 2e-2 25.8, at
+    4e-2 28.0; 600 iterations 28.6 dB, 34 s of one core.
+    """
+
+    iterations: int = 600
+    means: float = 2e-3
+    """Metres a step."""
+    log_scales: float = 5e-3
+    quaternions: float = 1e-3
+    opacity: float = 2e-2
+    sh_dc: float = 4e-2
+    sh_rest: float = 1e-3
+    final_factor: float = 0.05
+    """What is left of the rates at the end; they fall all along."""
+    growth: float = 0.02
+    """Of the Gaussians, how many more there may be in the end."""
+    level_iterations: int = 60
+    """Of fitting each lower level of detail anew, where the field has some; 0 leaves prefixes."""
+    seed: int = 0
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.iterations <= 100_000:
+            raise InvalidInput("update.iterations", f"{self.iterations} is outside 1..100000")
+        if not 0 <= self.growth <= 1:
+            raise InvalidInput("update.growth", f"{self.growth} is outside 0..1")
+
+    def rates(self, progress: float) -> LearningRates:
+        """Return Adam's rates at ``progress`` 0..1."""
+        factor = self.final_factor**progress
+        return LearningRates(
+            means=self.means * factor,
+            log_scales=self.log_scales * factor,
+            quaternions=self.quaternions * factor,
+            opacity=self.opacity * factor,
+            sh_dc=self.sh_dc * factor,
+            sh_rest=self.sh_rest * factor,
+        )
+
+    def density(self, count: int) -> DensityControl:
+        """Return how the set of ``count`` Gaussians grows: in five rounds."""
+        limit = count + int(count * self.growth)
+        interval = max(1, self.iterations // 10)
+        return DensityControl(
+            limit=limit, interval=interval, growth=self.growth / 5, start=0.1, stop=0.65
+        )
+
+
+def fine_tuned(
+    field: SplatField,
+    frames: Sequence[SeenFrame],
+    config: FineTuning,
+    progress: Progress | None = None,
+) -> SplatField:
+    """Return another field with all parameters fine-tuned to ``frames``, uncompressed.
+
+    Raises ``InvalidInput`` without frames or splats.
+    """
+    if not frames or not field.primitives:
+        raise InvalidInput("update", f"{len(frames)} frames, {field.primitives} splats: not enough")
+    descent = _Descent(field, frames, config)
+    for iteration in range(config.iterations):
+        if iteration in (0, config.iterations // 2):
+            descent.trust()
+        descent.step(iteration)
+        if progress is not None:
+            progress("fine-tuning", iteration + 1, config.iterations)
+    return _finished(descent.field(), frames, config, bool(field.levels), progress)
+
+
+class _Descent:
+    """A field on its way: ``step`` by ``step``."""
+
+    def __init__(self, field: SplatField, frames: Sequence[SeenFrame], config: FineTuning) -> None:
+        self._start, self._frames, self._config = field, frames, config
+        self._targets = [frame.colour() for frame in frames]
+        self._trusted: Sequence[Mask | None] = [None] * len(frames)
+        self._order = view_order(len(frames), np.random.default_rng(config.seed))
+        self._density = config.density(field.primitives)
+        self._rasterizer = TrainableRasterizer(
+            field.gaussians, threads=config.threads, antialiased=field.metadata.antialiased
+        )
+        self._rasterizer.keep_scores(config.growth > 0)
+
+    def trust(self) -> None:
+        """Leave out from now on what only single passes show."""
+        if len({frame.pass_number for frame in self._frames}) > 1:
+            self._trusted = both(self._trusted, trusted_pixels(self.field(), self._frames))
+
+    def step(self, iteration: int) -> None:
+        """Do one iteration and what follows it."""
+        number, config = next(self._order), self._config
+        progress = iteration / config.iterations
+        camera, rates = self._frames[number].camera, config.rates(progress)
+        target, trusted = self._targets[number], self._trusted[number]
+        rasterizer = self._rasterizer
+        if trusted is None:
+            rasterizer.iterate(camera, target, rates)
+        else:
+            shown = rasterizer.forward(camera).colour
+            rasterizer.loss(np.where(trusted[..., None], target, shown))
+            rasterizer.backward()
+            rasterizer.adam_step(rates)
+        control_density(rasterizer, self._density, iteration + 1, progress, config.seed)
+
+    def field(self) -> SplatField:
+        """Return the field as it is now."""
+        metadata = replace(
+            self._start.metadata, training_digest="", held_out_psnr_db=None, held_out_ssim=None
+        )
+        threads = self._config.threads
+        return SplatField(self._rasterizer.gaussians(), metadata, threads=threads)
+
+
+def _finished(
+    field: SplatField,
+    frames: Sequence[SeenFrame],
+    config: FineTuning,
+    has_levels: bool,
+    progress: Progress | None,
+) -> SplatField:
+    """Return the field with its splats in order of importance and its levels of detail."""
+    cameras = [frame.camera for frame in frames]
+    if has_levels and config.level_iterations:
+        levels = LevelFitConfig(iterations=config.level_iterations, threads=config.threads)
+
+        def told(done: int, total: int) -> None:
+            if progress is not None:
+                progress("levels of detail", done, total)
+
+        return with_levels(field, cameras, levels, told)
+    weights = contributions(
+        field.gaussians, cameras, threads=config.threads, antialiased=field.metadata.antialiased
+    )
+    ordered = reordered(field.gaussians, most_important_first(weights))
+    return SplatField(ordered, field.metadata, threads=config.threads)

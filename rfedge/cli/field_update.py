@@ -1,0 +1,140 @@
+"""``rfedge field update`` and ``disagree``: what passes of vehicles teach about a field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from rfedge.arguments import FIELD, RFF, open_field
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rfcore.field import RadianceField
+    from rfcore.update.passes import Pass
+    from rfcore.update.run import Update, UpdateSettings
+
+__all__ = ["FieldDisagree", "FieldUpdate"]
+
+PNG = arg(metavar="FILE.png")
+
+
+@dataclass(frozen=True)
+class FieldUpdate:
+    """Learn another light, or what has changed, from recorded passes; written only if bits fall."""
+
+    field: Annotated[Path, Positional, FIELD]
+    """The archive (.rff), or the field's name; splats."""
+    recordings: Annotated[tuple[Path, ...], arg(name="from", metavar="DATASET...")]
+    """Passes under one light, a dataset each (docs/data.md)."""
+    out: Annotated[Path, RFF]
+    """The archive to write; a layer belongs into the folder of its base."""
+    learn_as: Annotated[Literal["all", "colours"], arg(name="as")] = "all"
+    """all: another field, every parameter fine-tuned. colours: a colour layer on this field, of a
+    tenth of the bytes, for another light on what is there."""
+    frames: int = 48
+    """Most frames taken of all passes; a quarter of them is held back for the trial."""
+    iterations: int = 600
+    """Of fine-tuning (with --as all)."""
+    min_identities: int = 2
+    """Refuse to learn from fewer passes: what one alone shows may be what drove by."""
+    threads: int = 1
+    """Threads of the renderer."""
+
+    def run(self) -> None:
+        """Learn, try, write."""
+        from rich.console import Console
+
+        from rfcore.errors import InvalidInput
+        from rfcore.field import save_field
+        from rfedge.fields.describe import size_mb
+
+        if self.out.suffix != ".rff":
+            raise InvalidInput("out", f"{self.out} must end in .rff")
+        console = Console()
+        base = open_field(self.field, threads=self.threads)
+        update = _learnt(base, _passes(self.recordings, base), self._settings(), console)
+        for name, percent in update.saved_percent.items():
+            console.print(f"pass {name}: {_change(percent)} on the frames held back")
+        if update.refused:
+            raise InvalidInput("from", f"nothing is written: {update.refused}")
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        field_id = save_field(update.learnt, self.out)
+        console.print(
+            f"{self.out}: field {field_id}, {size_mb(update.learnt):.2f} MB, learnt from "
+            f"{update.frames} frames: {_change(update.mean_saved_percent)}",
+            soft_wrap=True,
+        )
+
+    def _settings(self) -> UpdateSettings:
+        from rfcore.update.colours import ColourFit
+        from rfcore.update.run import LearnAs, UpdateSettings
+        from rfcore.update.splats import FineTuning
+
+        return UpdateSettings(
+            LearnAs(self.learn_as),
+            self.frames,
+            self.min_identities,
+            fine_tuning=FineTuning(self.iterations, threads=self.threads),
+            colours=ColourFit(threads=self.threads),
+        )
+
+
+@dataclass(frozen=True)
+class FieldDisagree:
+    """Show where a field and what was seen of the street disagree."""
+
+    field: Annotated[Path, Positional, FIELD]
+    """The archive (.rff), or the field's name."""
+    recordings: Annotated[tuple[Path, ...], arg(name="from", metavar="DATASET...")]
+    """Passes, a dataset each."""
+    out: Annotated[Path, PNG] = Path("out/field-disagree.png")
+    """Four frames: camera, render, and in red where they differ under the render's own light."""
+    threads: int = 1
+    """Threads of the renderer."""
+
+    def run(self) -> None:
+        """Compare and draw."""
+        from rfcore.image import write_png
+        from rfedge.fields.disagree import disagreement_picture
+
+        field = open_field(self.field, threads=self.threads)
+        passes = _passes(self.recordings, field)
+        picture, lines = disagreement_picture(
+            field, [p for drive in passes for p in drive.pictures]
+        )
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        write_png(self.out, picture)
+        for line in lines:
+            print(line)
+        print(f"{self.out}: camera | render | where they differ, {len(lines)} frames")
+
+
+def _passes(recordings: tuple[Path, ...], base: RadianceField) -> list[Pass]:
+    from rfcore.dataset import read_dataset
+    from rfcore.update.passes import Pass
+
+    origin = base.metadata.tile_origin
+    return [Pass(str(path), read_dataset(path, tile_origin=origin).pictures) for path in recordings]
+
+
+def _learnt(
+    base: RadianceField, passes: list[Pass], settings: UpdateSettings, console: Console
+) -> Update:
+    from rfcore.update.run import learn
+
+    with console.status("learning") as status:
+
+        def told(doing: str, done: int, total: int) -> None:
+            status.update(f"{doing}: {done} of {total}")
+
+        return learn(base, passes, settings, told)
+
+
+def _change(saved_percent: float) -> str:
+    if saved_percent >= 0:
+        return f"{saved_percent:.1f} % fewer bits"
+    return f"{-saved_percent:.1f} % more bits"

@@ -1,0 +1,80 @@
+"""``rfedge size``: how large an uplink, and how many cores, a vehicle's cameras need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, arg
+
+from rfedge.arguments import DATASET, FIELD, FOLDER, SIZE, field_path, parse_size
+from rfedge.sizing.estimate import Assumptions
+
+if TYPE_CHECKING:
+    from rfedge.sizing.estimate import Demand
+    from rfedge.sizing.tables import SizingTables
+
+__all__ = ["Size"]
+
+
+@dataclass(frozen=True)
+class Size:
+    """Say what cameras need of an uplink and of both ends: ours, x264, x265 and SVT-AV1.
+
+    From tables measured on the sample street (docs/sizing.md), or on a drive and field of your own.
+    """
+
+    cameras: int = 1
+    """Cameras of a vehicle, which take their pictures at the same instant."""
+    size: Annotated[str, SIZE] = "1920x1080"
+    """Pixels of a picture."""
+    hz: float = 10.0
+    """Pictures a second of each camera."""
+    db: float = 34.0
+    """Luma PSNR of the reconstruction."""
+    delay_ms: float | None = None
+    """Also the link that brings frames to their reconstruction within so many milliseconds."""
+    share: float = 0.99
+    """Share of the frames that have to be in time."""
+    drive: Annotated[Path | None, DATASET] = None
+    """Measure on this drive instead of the tables (extra eval); with --field."""
+    field: Annotated[Path | None, FIELD] = None
+    """The field of that drive."""
+    frames: int = 24
+    """At most so many frames of it."""
+    cells: Annotated[Path, FOLDER] = Path("out/size")
+    """Folder of its finished pieces: a stopped run goes on."""
+    assumptions: Annotated[Assumptions, OmitArgPrefixes] = Assumptions()
+    json: Annotated[str | None, arg(metavar="FILE.json|-")] = None
+    """Write one JSON object to this file; `-` is standard output."""
+
+    def run(self) -> None:
+        """Estimate and print, or write JSON."""
+        from rich.console import Console
+
+        from rfedge.results import make_result, provenance, write_result
+        from rfedge.sizing.estimate import Demand, estimate
+        from rfedge.sizing.report import print_sizing
+
+        width_px, height_px = parse_size(self.size)
+        demand = Demand(
+            self.cameras, width_px, height_px, self.hz, self.db, self.delay_ms, self.share
+        )
+        sizing = estimate(demand, self._tables(demand), self.assumptions)
+        if self.json is None:
+            print_sizing(Console(), sizing)
+        else:
+            write_result(self.json, make_result("size", provenance(), {"sizing": sizing}))
+
+    def _tables(self, demand: Demand) -> SizingTables:
+        from rfcore.errors import InvalidInput
+        from rfedge.sizing.tables import shipped_tables
+
+        if (self.drive is None) != (self.field is None):
+            raise InvalidInput("drive", "give --drive and --field together, or neither")
+        if self.drive is None or self.field is None:
+            return shipped_tables()
+        from rfedge.sizing.run import own_tables
+
+        return own_tables(self.drive, field_path(self.field), demand, self.frames, self.cells)

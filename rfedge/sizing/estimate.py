@@ -1,0 +1,240 @@
+"""What an uplink has to carry, and what both ends have to compute, for a vehicle's cameras.
+
+Figures are of the steady state: a first frame, and what a camera costs that is lost, come on top.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from tyro.conf import arg
+
+from rfcore.errors import InvalidInput
+from rfedge.sizing.interpolate import Wanted, check_reach, log_at
+from rfedge.sizing.tables import SizingCell, SizingTables
+from rfedge.sizing.uplink import needed_bps
+
+__all__ = ["Assumptions", "Demand", "Estimate", "Sizing", "estimate"]
+
+HEXAGON = math.sqrt(3) / 2
+"""Area of a site's hexagon over the square of the distance between sites."""
+
+
+@dataclass(frozen=True)
+class Demand:
+    """A vehicle's cameras, the quality wanted, and optionally in which time frames must arrive.
+
+    ``psnr_db``: luma PSNR of the mean squared error. ``delay_ms``: from a picture to its
+    reconstruction, for a ``share`` of the frames; None: only the mean rate is asked about.
+    """
+
+    cameras: int
+    width_px: int
+    height_px: int
+    hz: float
+    psnr_db: float
+    delay_ms: float | None = None
+    share: float = 0.99
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.cameras <= 1000:
+            raise InvalidInput("cameras", f"{self.cameras} is outside 1..1000")
+        if min(self.width_px, self.height_px) < 1:
+            raise InvalidInput("size", f"{self.width_px}x{self.height_px} has no pixels")
+        if not 0 < self.hz <= 1000:
+            raise InvalidInput("hz", f"{self.hz:g} is outside 0..1000")
+        if not math.isfinite(self.psnr_db):
+            raise InvalidInput("db", f"{self.psnr_db} is not finite")
+        if self.delay_ms is not None and not 0 < self.delay_ms <= 60_000:
+            raise InvalidInput("delay-ms", f"{self.delay_ms:g} is outside 0..60000")
+        if not 0.5 <= self.share < 1:
+            raise InvalidInput("share", f"{self.share:g} is outside 0.5..1 (1 itself excluded)")
+
+    @property
+    def wanted(self) -> Wanted:
+        """One of the cameras."""
+        return Wanted(self.width_px, self.height_px, self.hz, self.psnr_db)
+
+
+@dataclass(frozen=True)
+class Assumptions:
+    """What the tables do not say: the transport, the cell and the city."""
+
+    overhead_percent: float = 4.0
+    """Bytes of transport over those of frames. RTP, UDP and IPv4 headers of 40 bytes (RFC 3550,
+    768, 791) on packets of 1000 to 1200 bytes are 3.3 to 4 %."""
+    propagation_ms: float = 20.0
+    """One way from the vehicle to the server, empty link; the link of `rfedge demo` has as much."""
+    bandwidth_mhz: float = 100.0
+    """Of the cell's carrier; the widest of 3GPP TS 38.101-1 in band n78."""
+    uplink_share: Annotated[float, arg(name="uplink-share")] = 0.23
+    """Of the carrier's time: DDDSU, one slot of five up and some of the special one."""
+    bits_per_hz: float = 5.4
+    """Average uplink spectral efficiency in bit/s/Hz of a cell: what ITU-R M.2410 requires in
+    dense urban areas; 1.6 in rural ones."""
+    utilisation: float = 0.7
+    """Share of a cell's capacity that may be planned with."""
+    inter_site_m: float = 200.0
+    """Distance between sites: dense urban of ITU-R M.2412; 1732 in its rural areas."""
+    sectors: int = 3
+    """Cells of a site."""
+
+    def __post_init__(self) -> None:
+        for name in ("bandwidth_mhz", "bits_per_hz", "inter_site_m", "sectors"):
+            if not 0 < getattr(self, name) <= 1e6:
+                raise InvalidInput(name, f"{getattr(self, name):g} is outside 0..1e6")
+        for name in ("uplink_share", "utilisation"):
+            if not 0 < getattr(self, name) <= 1:
+                raise InvalidInput(name, f"{getattr(self, name):g} is outside 0..1")
+        for name in ("overhead_percent", "propagation_ms"):
+            if not 0 <= getattr(self, name) <= 1000:
+                raise InvalidInput(name, f"{getattr(self, name):g} is outside 0..1000")
+
+    @property
+    def cell_mbps(self) -> float:
+        """What a cell's uplink may be planned to carry."""
+        return self.bandwidth_mhz * self.uplink_share * self.bits_per_hz * self.utilisation
+
+    @property
+    def cells_per_km2(self) -> float:
+        """Of a hexagonal grid."""
+        return self.sectors / (HEXAGON * (self.inter_site_m / 1e3) ** 2)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One codec: rates in Mbit/s of a vehicle with transport, cores of either end for it.
+
+    ``mbps`` is the mean rate, with the 95 % interval of the nearest cell; ``link_mbps`` the link
+    that keeps the delay, None unless one is asked for and can be kept. A cell holds as many
+    vehicles as its uplink carries of that link, or of the mean rate.
+    """
+
+    codec: str
+    mbps: float
+    low_mbps: float
+    high_mbps: float
+    vehicle_cores: float
+    server_cores: float
+    vehicles_per_cell: int
+    vehicles_per_km2: float
+    link_mbps: float | None = None
+
+
+@dataclass(frozen=True)
+class Sizing:
+    """The estimates, ours first, and in words where they leave what was measured."""
+
+    demand: Demand
+    assumptions: Assumptions
+    measured_on: str
+    estimates: Sequence[Estimate]
+    beyond: Sequence[str] = field(default=())
+
+
+def estimate(
+    demand: Demand, tables: SizingTables, assumptions: Assumptions | None = None
+) -> Sizing:
+    """Return what every codec of ``tables`` needs for ``demand``.
+
+    Raises ``InvalidInput`` for a demand too far outside the tables, or a delay that cannot be kept.
+    """
+    assumptions = assumptions or Assumptions()
+    cells = {codec: tables.of(codec) for codec in tables.codecs}
+    reach = {codec: check_reach(cells[codec], demand.wanted) for codec in cells}
+    left_ms = {codec: _left_ms(demand, cells[codec], assumptions) for codec in cells}
+    return Sizing(
+        demand,
+        assumptions,
+        tables.measured_on,
+        [_estimate(demand, cells[codec], assumptions, left_ms[codec]) for codec in cells],
+        [*_notes(reach), *_late(demand, left_ms)],
+    )
+
+
+def _left_ms(demand: Demand, cells: Sequence[SizingCell], assumptions: Assumptions) -> float | None:
+    """Return the time that is left for sending a frame, None where no delay is asked for.
+
+    A vehicle's cameras are computed in parallel.
+    """
+    if demand.delay_ms is None:
+        return None
+    return demand.delay_ms - sum(_times_ms(demand.wanted, cells)) - assumptions.propagation_ms
+
+
+def _late(demand: Demand, left_ms: Mapping[str, float | None]) -> list[str]:
+    """Return in words who is late on any link; raise ``InvalidInput`` if it is everybody."""
+    notes = [
+        f"{codec}: no link keeps {demand.delay_ms:g} ms: coding, decoding and propagation alone "
+        f"take {demand.delay_ms - left:.0f} ms on one thread of the machine that was measured"
+        for codec, left in left_ms.items()
+        if demand.delay_ms is not None and left is not None and left <= 0
+    ]
+    if len(notes) == len(left_ms):
+        raise InvalidInput("delay-ms", f"{notes[0]}; ask for more")
+    return notes
+
+
+def _notes(reach: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return each note once, with the codecs it is about unless it is about all of them."""
+    about: dict[str, list[str]] = {}
+    for codec, notes in reach.items():
+        for note in notes:
+            about.setdefault(note, []).append(codec)
+    return [
+        note if len(codecs) == len(reach) else f"{', '.join(codecs)}: {note}"
+        for note, codecs in about.items()
+    ]
+
+
+def _times_ms(wanted: Wanted, cells: Sequence[SizingCell]) -> tuple[float, float]:
+    """Return the processor time of sender and receiver for a frame."""
+    sender_ms = math.exp(log_at(cells, wanted, lambda cell: math.log(cell.sender_ms)))
+    receiver_ms = math.exp(log_at(cells, wanted, lambda cell: math.log(cell.receiver_ms)))
+    return sender_ms, receiver_ms
+
+
+def _estimate(
+    demand: Demand,
+    cells: Sequence[SizingCell],
+    assumptions: Assumptions,
+    left_ms: float | None,
+) -> Estimate:
+    wanted = demand.wanted
+    frame_bytes = math.exp(log_at(cells, wanted, lambda cell: cell.log_bytes(wanted.psnr_db)))
+    nearest = _nearest(cells, wanted)
+    low, high = (
+        math.exp(nearest.log_bytes(wanted.psnr_db, column) - nearest.log_bytes(wanted.psnr_db))
+        for column in ("low_bytes", "high_bytes")
+    )
+    pictures_per_s = demand.cameras * demand.hz
+    mbps_of = 8e-6 * pictures_per_s * (1 + assumptions.overhead_percent / 100)
+    sender_ms, receiver_ms = _times_ms(wanted, cells)
+    mbps, link_mbps = mbps_of * frame_bytes, None
+    if left_ms is not None and left_ms > 0:
+        sizes = [frame_bytes * ratio for ratio in nearest.frame_ratios]
+        frames_bps = needed_bps(sizes, demand.cameras, demand.hz, left_ms / 1e3, demand.share)
+        link_mbps = frames_bps / 1e6 * (1 + assumptions.overhead_percent / 100)
+    is_late = left_ms is not None and left_ms <= 0
+    vehicles = 0 if is_late else math.floor(assumptions.cell_mbps / (link_mbps or mbps))
+    return Estimate(
+        codec=cells[0].codec,
+        mbps=mbps,
+        low_mbps=mbps * low,
+        high_mbps=mbps * high,
+        vehicle_cores=pictures_per_s * sender_ms / 1e3,
+        server_cores=pictures_per_s * receiver_ms / 1e3,
+        vehicles_per_cell=vehicles,
+        vehicles_per_km2=vehicles * assumptions.cells_per_km2,
+        link_mbps=link_mbps,
+    )
+
+
+def _nearest(cells: Sequence[SizingCell], wanted: Wanted) -> SizingCell:
+    def distance(cell: SizingCell) -> float:
+        return abs(math.log(cell.hz / wanted.hz)) + abs(math.log(cell.pixels / wanted.pixels))
+
+    return min(cells, key=distance)

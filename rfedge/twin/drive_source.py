@@ -1,0 +1,131 @@
+"""One field without a server: its splats and, where a drive is given, the camera's own pictures.
+
+The field may be a file that is written again and again, by a training that is looked at.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+from rfcore.field import RadianceField, load_field
+from rfcore.image import jpeg_bytes
+from rfcore.views import PosedPicture
+from rfedge.twin.scene import PlacedField, SeenPicture, TwinScene
+
+__all__ = ["DriveSource", "FieldVersions", "FollowedFile", "OneField"]
+
+LOOK_EVERY_S = 0.5
+TILE = "field"
+
+
+class FieldVersions(Protocol):
+    """A field that may change."""
+
+    def newer(self) -> RadianceField | None:
+        """Return the field where it is not the one that was returned before; may take long."""
+
+
+class OneField:
+    """A field that does not change."""
+
+    def __init__(self, field: RadianceField) -> None:
+        self._field: RadianceField | None = field
+
+    def newer(self) -> RadianceField | None:
+        """Return the field, once."""
+        field, self._field = self._field, None
+        return field
+
+
+class FollowedFile:
+    """The field archive at ``path``, each time that another takes its place; it may yet be missing.
+
+    ``threads`` render it. An archive is replaced whole (``save_field``), so that none is read that
+    is half written.
+    """
+
+    def __init__(self, path: Path, threads: int = 1) -> None:
+        self._path = path
+        self._threads = threads
+        self._seen: tuple[int, int] | None = None
+
+    def newer(self) -> RadianceField | None:
+        """Return the field of a file that is new; raise ``FieldError`` for one that is none."""
+        try:
+            status = self._path.stat()
+        except FileNotFoundError:
+            return None
+        seen = (status.st_ino, status.st_mtime_ns)
+        if seen == self._seen:
+            return None
+        self._seen = seen
+        return load_field(self._path, threads=self._threads)
+
+
+class DriveSource:
+    """Shows the newest of ``versions``, and ``pictures`` again and again at ``rate_hz``.
+
+    ``name`` is what the page calls the field.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        versions: FieldVersions,
+        pictures: Sequence[PosedPicture],
+        rate_hz: float,
+        scene: TwinScene,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._name = name
+        self._versions = versions
+        self._pictures = pictures
+        self._interval_s = 1.0 / rate_hz
+        self._scene = scene
+        self._clock = clock
+        self._field_id = ""
+
+    async def run(self) -> None:
+        """Show until cancelled; raises ``DatasetError`` for a picture that cannot be read."""
+        self._scene.connection("waiting", f"{self._name} is being read", self._clock())
+        await asyncio.gather(self._show_fields(), self._show_pictures())
+
+    async def _show_fields(self) -> None:
+        count = 0
+        while True:
+            field = await asyncio.to_thread(self._versions.newer)
+            if field is not None:
+                placed = await asyncio.to_thread(PlacedField.of, field, TILE)
+                self._field_id, count = field.field_id, count + 1
+                self._scene.place(placed, self._clock())
+                said = self._name if count == 1 else f"{self._name}, version {count}"
+                self._scene.connection("offline", said, self._clock())
+            await asyncio.sleep(LOOK_EVERY_S)
+
+    async def _show_pictures(self) -> None:
+        if not self._pictures:
+            return
+        due_s, sequence = self._clock(), 0
+        while True:
+            picture = self._pictures[sequence % len(self._pictures)]
+            seen = await asyncio.to_thread(self._seen, picture, sequence)
+            self._scene.show(seen, self._clock())
+            sequence, due_s = sequence + 1, max(due_s + self._interval_s, self._clock())
+            await asyncio.sleep(due_s - self._clock())
+
+    def _seen(self, picture: PosedPicture, sequence: int) -> SeenPicture:
+        return SeenPicture(
+            key=("drive", "camera"),
+            sequence=sequence,
+            pose=picture.camera.world_from_cam,
+            intrinsics=picture.camera.intrinsics,
+            field_id=self._field_id,
+            jpeg=jpeg_bytes(picture.read()),
+            age_ms=0.0,
+            truth=True,
+            name=picture.name,
+        )

@@ -1,0 +1,109 @@
+// The page's state and its socket. Messages: see Message.encode in rfedge/twin/board.py.
+import { Street } from "/page/street.js";
+import { Wall } from "/page/wall.js";
+import { Inspector } from "/page/inspect.js";
+import { Plots } from "/page/plots.js";
+
+const RECONNECT_MS = 500;
+const AGES_KEPT = 20000;
+const element = (id) => document.getElementById(id);
+
+const select = (camera) => {
+  state.selected = camera;
+  wall.select(camera);
+  street.select(camera);
+  send();
+};
+const street = new Street(element("street"));
+const wall = new Wall(element("wall"), (camera) => { select(camera); inspector.open(camera); });
+const inspector = new Inspector(element("inspect"), () => select(null));
+const plots = new Plots(element("plots"));
+const state = { socket: null, selected: null, pictures: 0, ages: [] };
+
+function send() {
+  if (state.socket?.readyState === WebSocket.OPEN)
+    state.socket.send(JSON.stringify({ select: state.selected }));
+}
+
+function decode(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  let offset = 4 + length;
+  const parts = header.part_bytes.map((bytes) => {
+    offset += bytes;
+    return new Uint8Array(buffer, offset - bytes, bytes);
+  });
+  return [header, parts];
+}
+
+const picture = (bytes) => createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
+const key = (header) => `${header.vehicle}/${header.camera}`;
+
+const handlers = {
+  connection(header) { say(header.state, header.detail); },
+  fields(header) {
+    const names = header.fields.map((f) => `${f.tile}: ${f.primitives.toLocaleString()} ` +
+      (f.spz_bytes ? "splats" : `parameters (${f.kind}, not drawn)`));
+    const notes = header.notes.map((n) => `${n.tile}: ${n.text}`);
+    element("fields").textContent = [...names, ...notes].join("; ");
+    street.setFields(header.fields);
+  },
+  async picture(header, parts) {
+    const bitmap = await picture(parts[0]);
+    header.age_ms += header.held_ms;
+    state.pictures += 1;
+    if (!header.truth) {
+      element("plots").hidden = false;  // a drive has no uplink
+      state.ages.push(Date.now() - header.capture_time_ms);
+      if (state.ages.length > AGES_KEPT) state.ages.shift();
+    }
+    street.setPicture(key(header), header, bitmap);
+    wall.setPicture(key(header), header, bitmap);
+    plots.add(header);
+  },
+  async comparison(header, parts) {
+    const [shown, render, difference] = await Promise.all(parts.map(picture));
+    street.setMark(key(header), header);
+    wall.setQuality(key(header), header);
+    inspector.show(key(header), header, { shown, render, difference });
+  },
+  departure(header) {
+    street.remove(key(header));
+    wall.remove(key(header));
+  },
+};
+
+function say(status, detail) {
+  const shown = element("connection");
+  shown.dataset.state = status;
+  shown.textContent = `${status}: ${detail}`;
+}
+
+function connect() {
+  const socket = new WebSocket(`ws${location.protocol.slice(4)}//${location.host}/socket`);
+  socket.binaryType = "arraybuffer";
+  state.socket = socket;
+  socket.onopen = send;
+  socket.onmessage = ({ data }) => {
+    const [header, parts] = decode(data);
+    handlers[header.kind]?.(header, parts);  // kinds of a newer server are passed over
+  };
+  socket.onclose = () => {
+    say("closed", "rfedge twin does not answer; trying again");
+    setTimeout(connect, RECONNECT_MS);
+  };
+}
+
+setInterval(() => {
+  element("rate").textContent = `${state.pictures} pictures/s, ${street.framesPerSecond()} frames/s`;
+  state.pictures = 0;
+  wall.showAges();
+  plots.draw();
+}, 1000);
+element("overview").onclick = () => street.overview();
+element("follow").onchange = ({ target }) => { street.following = target.checked; };
+element("marks").onchange = ({ target }) => street.showMarks(target.checked);
+connect();
+
+// For tests and for the console: look from a pose, read the picture, read what was measured.
+window.twin = { state, street, select };

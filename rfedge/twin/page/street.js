@@ -1,0 +1,250 @@
+// The street in three dimensions: splats of every tile, cameras as frusta with their pictures, marks.
+// World axes are the field's: east, north, up, in metres. OpenCV cameras look along +z with y down,
+// three's along -z with y up: half a turn around x apart.
+import * as THREE from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+
+const NEAR_M = 0.05, FAR_M = 5000, FRUSTUM_M = 1.5, MARK_S = 10;
+const PICTURES_EVERY_MS = 100;  // drawing splats costs far more than a picture is worth
+const HALF_TURN = new THREE.Quaternion(1, 0, 0, 0);
+THREE.Object3D.DEFAULT_UP.set(0, 0, 1);
+
+const vector = (m) => new THREE.Vector3(m[0], m[1], m[2]);
+const threeRotation = ([w, x, y, z]) => new THREE.Quaternion(x, y, z, w).multiply(HALF_TURN);
+
+export class Street {
+  constructor(parent) {
+    this.parent = parent;
+    this.following = false;
+    this.cameras = new Map();
+    this.tiles = new Map();
+    this.marks = new Map();
+    this.marksShown = true;
+    this.selected = null;
+    this.frames = 0;
+    this.drawn = 0;  // since the page was opened
+    this.renderer = new THREE.WebGLRenderer({ antialias: false, preserveDrawingBuffer: true });
+    parent.append(this.renderer.domElement);
+    this.scene = new THREE.Scene();
+    this.scene.background = new THREE.Color(0x0d1117);
+    this.scene.add(new SparkRenderer({ renderer: this.renderer, onDirty: () => this.touch() }));
+    this.view = new THREE.PerspectiveCamera(60, 1, NEAR_M, FAR_M);
+    this.view.position.set(-20, -20, 15);
+    this.controls = new OrbitControls(this.view, this.renderer.domElement);
+    this.controls.addEventListener("change", () => this.touch());
+    new ResizeObserver(() => this.resize()).observe(parent);
+    this.renderer.setAnimationLoop(() => this.draw());
+  }
+
+  resize() {
+    if (this.fixedSize) return;
+    const { clientWidth, clientHeight } = this.parent;
+    this.renderer.setSize(clientWidth, clientHeight, false);
+    this.view.aspect = clientWidth / Math.max(1, clientHeight);
+    this.view.updateProjectionMatrix();
+    this.touch();
+  }
+
+  // The next frame shows something new: at once, or no sooner than PICTURES_EVERY_MS.
+  touch() { this.changed = true; }
+  touchLater() { this.pictureChanged = true; }
+
+  draw() {
+    const now = performance.now();
+    for (const [key, mark] of this.marks)
+      if (now - mark.seen > 1000 * MARK_S) this.removeMark(key);
+    const camera = this.following && this.cameras.get(this.selected);
+    if (camera) this.lookAlong(camera);
+    else if (!this.fixedSize) this.controls.update();
+    const isDue = this.pictureChanged && now - (this.drawnAt ?? 0) >= PICTURES_EVERY_MS;
+    if (!this.changed && !isDue) return;
+    this.changed = this.pictureChanged = false;
+    this.drawnAt = now;
+    this.renderer.render(this.scene, this.view);
+    this.frames += 1;
+    this.drawn += 1;
+  }
+
+  framesPerSecond() {
+    const frames = this.frames;
+    this.frames = 0;
+    return frames;
+  }
+
+  setFields(fields) {
+    const wanted = new Set(fields.map((field) => field.field));
+    const gone = [...this.tiles].filter(([id]) => !wanted.has(id));
+    for (const [id] of gone) this.tiles.delete(id);
+    const stale = new Map(gone.map(([, tile]) => [tile.field.tile, tile]));
+    for (const field of fields) {
+      if (this.tiles.has(field.field) || !field.spz_bytes) continue;
+      const mesh = new SplatMesh({ url: `/splats/${field.field}.spz` });
+      mesh.position.copy(vector(field.origin_m));
+      const tile = { mesh, field, loaded: false, before: stale.get(field.tile) };
+      stale.delete(field.tile);
+      mesh.initialized.then(() => {
+        tile.loaded = true;
+        this.discard(tile.before);  // shown until now, so that nothing flickers
+        tile.before = null;
+      });
+      this.tiles.set(field.field, tile);
+      this.scene.add(mesh);
+      if (!this.seenField) this.overview();
+      this.seenField = true;
+    }
+    for (const tile of stale.values()) this.discard(tile);
+  }
+
+  discard(tile) {
+    for (let one = tile; one; one = one.before) {
+      this.scene.remove(one.mesh);
+      one.mesh.dispose?.();
+    }
+    this.touch();
+  }
+
+  overview() {
+    const box = new THREE.Box3();
+    for (const { field } of this.tiles.values()) {
+      const origin = vector(field.origin_m);
+      box.expandByPoint(vector(field.low_m).add(origin));
+      box.expandByPoint(vector(field.high_m).add(origin));
+    }
+    for (const { group } of this.cameras.values()) box.expandByPoint(group.position);
+    if (box.isEmpty()) return;
+    this.following = false;
+    const cameras = [...this.cameras.values()];
+    const middle = cameras.length ? cameras[0].group.position : box.getCenter(new THREE.Vector3());
+    this.controls.target.copy(middle);
+    this.view.position.copy(middle).add(new THREE.Vector3(-18, -6, 12));
+    this.touch();
+  }
+
+  setPicture(key, header, bitmap) {
+    let camera = this.cameras.get(key);
+    if (camera && camera.size !== `${bitmap.width}x${bitmap.height}`) {
+      this.remove(key);
+      camera = null;
+    }
+    const isFirst = !camera && !this.cameras.size;
+    if (!camera) this.cameras.set(key, (camera = this.newCamera(header.intrinsics, bitmap)));
+    if (camera.texture.image !== bitmap) camera.texture.image.close();
+    camera.texture.image = bitmap;
+    camera.texture.needsUpdate = true;
+    camera.group.visible = header.translation_m !== null;  // a lost vehicle has a picture, no place
+    if (camera.group.visible) {
+      camera.group.position.copy(vector(header.translation_m)).add(vector(header.origin_m));
+      camera.group.quaternion.copy(threeRotation(header.rotation_wxyz));
+    }
+    camera.intrinsics = header.intrinsics;
+    if (isFirst) this.overview();
+    this.touchLater();
+  }
+
+  newCamera(k, bitmap) {
+    const [w, h] = [(k.width_px / k.fx_px) * FRUSTUM_M, (k.height_px / k.fy_px) * FRUSTUM_M];
+    const x = (k.width_px / 2 - k.cx_px) / k.fx_px * FRUSTUM_M;
+    const y = -(k.height_px / 2 - k.cy_px) / k.fy_px * FRUSTUM_M;
+    const corners = [[-1, 1], [1, 1], [1, -1], [-1, -1]].map(([a, b]) =>
+      new THREE.Vector3(x + (a * w) / 2, y + (b * h) / 2, -FRUSTUM_M));
+    const lines = corners.flatMap((c, i) => [new THREE.Vector3(), c, c, corners[(i + 1) % 4]]);
+    const texture = new THREE.Texture(bitmap);
+    texture.colorSpace = THREE.SRGBColorSpace;
+    texture.flipY = false;  // an ImageBitmap cannot be flipped when it is uploaded
+    texture.repeat.set(1, -1);
+    texture.offset.set(0, 1);
+    const picture = new THREE.Mesh(new THREE.PlaneGeometry(w, h),
+      new THREE.MeshBasicMaterial({ map: texture, side: THREE.DoubleSide, toneMapped: false }));
+    picture.position.set(x, y, -FRUSTUM_M);
+    const material = new THREE.LineBasicMaterial({ color: 0x58a6ff });
+    const group = new THREE.Group();
+    group.add(picture, new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(lines), material));
+    this.scene.add(group);
+    return { group, texture, material, intrinsics: k, size: `${bitmap.width}x${bitmap.height}` };
+  }
+
+  remove(key) {
+    const camera = this.cameras.get(key);
+    if (camera) {
+      this.scene.remove(camera.group);
+      camera.texture.dispose();
+      camera.group.traverse((part) => { part.geometry?.dispose(); part.material?.dispose(); });
+      this.cameras.delete(key);
+    }
+    this.removeMark(key);
+    this.touch();
+  }
+
+  select(key) {
+    this.selected = key && key.join("/");
+    for (const [name, camera] of this.cameras)
+      camera.material.color.set(name === this.selected ? 0xf0883e : 0x58a6ff);
+    this.touch();
+  }
+
+  setMark(key, header) {
+    this.removeMark(key);
+    if (!header.mark) return;
+    const radius = Math.max(0.2, header.mark.width_m / 2);
+    const ring = new THREE.Mesh(new THREE.TorusGeometry(radius, 0.05, 8, 48),
+      new THREE.MeshBasicMaterial({ color: 0xf85149 }));
+    ring.position.copy(vector(header.mark.position_m)).add(vector(header.origin_m));
+    ring.visible = this.marksShown;
+    this.marks.set(key, { ring, seen: performance.now() });
+    this.scene.add(ring);
+    this.touchLater();
+  }
+
+  removeMark(key) {
+    const mark = this.marks.get(key);
+    if (!mark) return;
+    this.scene.remove(mark.ring);
+    mark.ring.geometry.dispose();
+    mark.ring.material.dispose();
+    this.marks.delete(key);
+    this.touchLater();
+  }
+
+  showMarks(shown) {
+    this.marksShown = shown;
+    for (const { ring } of this.marks.values()) ring.visible = shown;
+    this.touch();
+  }
+
+  lookAlong({ group, intrinsics }) {
+    if (!this.view.position.equals(group.position)) this.touch();
+    this.view.position.copy(group.position);
+    this.view.quaternion.copy(group.quaternion);
+    this.controls.target.copy(new THREE.Vector3(0, 0, -5).applyQuaternion(group.quaternion)
+      .add(group.position));
+    this.setFieldOfView(intrinsics);
+  }
+
+  setFieldOfView(k) {
+    this.view.fov = (360 / Math.PI) * Math.atan(k.height_px / 2 / k.fy_px);
+    this.view.updateProjectionMatrix();
+  }
+
+  // Draw splats alone, exactly from a camera's pose at its size, until released with null.
+  fix(pose) {
+    this.fixedSize = pose !== null;
+    for (const { group } of this.cameras.values()) group.visible = !this.fixedSize;
+    this.showMarks(!this.fixedSize);
+    if (!pose) { this.resize(); return; }
+    const { translation_m, rotation_wxyz, intrinsics: k } = pose;
+    this.renderer.setSize(k.width_px, k.height_px, false);
+    this.view.aspect = k.width_px / k.height_px;
+    this.view.position.copy(vector(translation_m));
+    this.view.quaternion.copy(threeRotation(rotation_wxyz));
+    this.setFieldOfView(k);
+    this.touch();
+  }
+
+  loaded() {
+    const tiles = [...this.tiles.values()];
+    return tiles.length > 0 && tiles.every((tile) => tile.loaded);
+  }
+
+  png() { return this.renderer.domElement.toDataURL("image/png"); }
+}

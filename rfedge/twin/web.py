@@ -1,0 +1,235 @@
+"""The page over HTTP and one WebSocket a browser (aiohttp).
+
+A browser says what its user looks at; everything else flows one way. Access: from this machine
+alone, unless a token is set. Whatever the token, a WebSocket is opened only by the page itself, so
+that no other site in the same browser can read the street (cross-site WebSocket hijacking).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import structlog
+
+from rfcore.errors import InvalidInput
+from rfcore.extras import needs
+from rfcore.wire.address import Address
+from rfedge.twin.board import Board, Reader
+from rfedge.twin.comparing import Comparer
+from rfedge.twin.scene import CameraKey, TwinScene
+
+with needs("twin"):
+    from aiohttp import WSCloseCode, WSMsgType, web
+
+__all__ = ["TwinWeb", "WebSettings"]
+
+log = structlog.get_logger()
+
+PAGE: Final = Path(__file__).parent / "page"
+MAX_BROWSERS: Final = 16
+LONGEST_REQUEST_BYTES: Final = 4096
+HEARTBEAT_S: Final = 10.0
+STALLED_S: Final = 10.0
+"""A browser that takes nothing for so long is let go; it connects again by itself."""
+HEALTH: Final = "/healthy"
+"""Answers without a token, to whoever restarts a service that does not; tells nothing else."""
+COOKIE: Final = "rfedge-twin"
+SHORTEST_TOKEN: Final = 16
+POLICY: Final = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob: data:; "
+    "worker-src 'self' blob: data:; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; "
+    "connect-src 'self' blob: data:; frame-ancestors 'none'"
+)
+"""The splat library starts workers from blobs and WebAssembly from a data URL."""
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+@dataclass(frozen=True)
+class WebSettings:
+    """Where to listen, and the token a browser must know (``None``: none, loopback alone)."""
+
+    address: Address
+    token: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.token is None and not self.address.is_loopback:
+            raise InvalidInput(
+                "http", f"{self.address} can be reached from other machines; give a token"
+            )
+        if self.token is not None and len(self.token) < SHORTEST_TOKEN:
+            raise InvalidInput(
+                "token", f"has {len(self.token)} characters, fewer than {SHORTEST_TOKEN}"
+            )
+
+
+class TwinWeb:
+    """Serves the page, its splats, and the board's messages."""
+
+    def __init__(
+        self,
+        settings: WebSettings,
+        board: Board,
+        scene: TwinScene,
+        comparer: Comparer,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._settings = settings
+        self._board = board
+        self._scene = scene
+        self._comparer = comparer
+        self._clock = clock
+        self._browsers: set[web.WebSocketResponse] = set()
+        self._runner: web.AppRunner | None = None
+
+    async def start(self) -> str:
+        """Listen; return the page's address. Raises ``RfedgeError`` where the port is taken."""
+        address = self._settings.address
+        address.check_free("--http")
+        app = web.Application(middlewares=[self._guarded])
+        app.router.add_get("/", self._page)
+        app.router.add_get(HEALTH, self._healthy)
+        app.router.add_get("/socket", self._socket)
+        app.router.add_get("/splats/{field}.spz", self._splats)
+        app.router.add_static("/page", PAGE)
+        self._runner = web.AppRunner(app, access_log=None)
+        await self._runner.setup()
+        site = web.TCPSite(self._runner, address.host, address.port)
+        await site.start()
+        port = self._runner.addresses[0][1]
+        query = f"?token={self._settings.token}" if self._settings.token else ""
+        return f"http://{Address(address.host, port)}/{query}"
+
+    async def stop(self) -> None:
+        """Close every browser's socket and the port."""
+        for socket in tuple(self._browsers):
+            await socket.close(code=WSCloseCode.GOING_AWAY, message=b"rfedge twin ends")
+        if self._runner is not None:
+            await self._runner.cleanup()
+
+    @web.middleware
+    async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Refuse strangers; tell browsers what the page may do."""
+        if request.path != HEALTH and not self._is_known(request):
+            raise web.HTTPForbidden(text="this page needs its token: /?token=...\n")
+        response = await handler(request)
+        if not response.prepared:
+            response.headers["Content-Security-Policy"] = POLICY
+            response.headers["Referrer-Policy"] = "no-referrer"
+            response.headers["X-Content-Type-Options"] = "nosniff"
+            if request.query.get("token"):
+                response.set_cookie(
+                    COOKIE, request.query["token"], httponly=True, samesite="Strict"
+                )
+        return response
+
+    def _is_known(self, request: web.Request) -> bool:
+        token = self._settings.token
+        if token is None:  # a name that resolves to this machine is no proof (DNS rebinding)
+            return _host(request.host).is_loopback
+        given = request.query.get("token") or request.cookies.get(COOKIE) or ""
+        return hmac.compare_digest(given.encode(), token.encode())
+
+    async def _healthy(self, _: web.Request) -> web.StreamResponse:
+        return web.Response(text="ok\n")
+
+    async def _page(self, _: web.Request) -> web.StreamResponse:
+        return web.FileResponse(PAGE / "index.html")
+
+    async def _splats(self, request: web.Request) -> web.StreamResponse:
+        placed = self._scene.field(request.match_info["field"])
+        if placed is None or not placed.spz:
+            raise web.HTTPNotFound(text="no splats of this field\n")
+        headers = {"Cache-Control": "private, max-age=86400, immutable"}
+        return web.Response(
+            body=placed.spz, content_type="application/octet-stream", headers=headers
+        )
+
+    async def _socket(self, request: web.Request) -> web.StreamResponse:
+        origin = request.headers.get("Origin", "")
+        if origin.partition("://")[2] != request.host:
+            raise web.HTTPForbidden(text="a socket is opened by the page alone\n")
+        if len(self._browsers) >= MAX_BROWSERS:
+            raise web.HTTPServiceUnavailable(text=f"{MAX_BROWSERS} browsers look already\n")
+        socket = web.WebSocketResponse(
+            heartbeat=HEARTBEAT_S, max_msg_size=LONGEST_REQUEST_BYTES, compress=False
+        )
+        await socket.prepare(request)
+        self._browsers.add(socket)
+        try:
+            await self._serve(socket)
+        finally:
+            self._browsers.discard(socket)
+        return socket
+
+    async def _serve(self, socket: web.WebSocketResponse) -> None:
+        arrived = asyncio.Event()
+        reader = self._board.read(arrived.set)
+        writing = asyncio.create_task(self._write(socket, reader, arrived))
+        try:
+            await self._listen(socket)
+        finally:
+            writing.cancel()
+            self._board.leave(reader)
+
+    async def _write(
+        self, socket: web.WebSocketResponse, reader: Reader, arrived: asyncio.Event
+    ) -> None:
+        while True:
+            message = reader.take()
+            if message is None:
+                arrived.clear()
+                await arrived.wait()
+                continue
+            data = message.encode(self._clock())
+            try:
+                await asyncio.wait_for(socket.send_bytes(data), STALLED_S)
+            except (TimeoutError, ConnectionError):
+                log.info("browser let go", missed=reader.missed)
+                await socket.close(code=WSCloseCode.TRY_AGAIN_LATER)
+                return
+
+    async def _listen(self, socket: web.WebSocketResponse) -> None:
+        """Follow what the browser's user looks at, until it leaves."""
+        looked_at: CameraKey | None = None
+        try:
+            async for message in socket:
+                if message.type is not WSMsgType.TEXT:
+                    continue
+                chosen = selection(message.data)
+                if looked_at is not None:
+                    self._comparer.release(looked_at)
+                looked_at = chosen
+                if looked_at is not None:
+                    self._comparer.select(looked_at)
+        except ValueError as error:
+            log.info("browser sent what the page does not", problem=str(error))
+            await socket.close(code=WSCloseCode.POLICY_VIOLATION)
+        finally:
+            if looked_at is not None:
+                self._comparer.release(looked_at)
+
+
+def selection(text: str) -> CameraKey | None:
+    """Return the camera that a browser's message selects, None for none; raise ``ValueError``."""
+    value: Any = json.loads(text)
+    if not isinstance(value, dict) or value.keys() != {"select"}:
+        raise ValueError("a message has one member, select")
+    match value["select"]:
+        case None:
+            return None
+        case [str(vehicle), str(camera)]:
+            return (vehicle, camera)
+    raise ValueError("select is null or [vehicle, camera]")
+
+
+def _host(host_and_port: str) -> Address:
+    """Return the host of an HTTP header, with or without a port, brackets taken off."""
+    bare = host_and_port if host_and_port.endswith("]") else host_and_port.rpartition(":")[0]
+    return Address((bare or host_and_port).strip("[]"), 0)

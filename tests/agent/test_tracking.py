@@ -1,0 +1,106 @@
+"""The agent finds its pose while frames go on: searches run beside, OpenCV comes when asked for."""
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cav_agent.frames import Capture
+from cav_agent.tracking import CameraTracking, DatasetPoses
+from cav_agent.vehicle import SEARCH_NICENESS, yield_to_frames
+from rfcore.codec.sender.ladder import FULL_RUNG
+from rfcore.dataset import read_dataset
+from rfcore.field import RadianceField, load_field
+from rfcore.localise.fix import Fix, State
+from rfcore.native.yuv import i420_from_rgb
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+RATE_HZ = 10
+
+
+@pytest.fixture(scope="module")
+def field() -> RadianceField:
+    return load_field(SAMPLES / "fields/street.rff", threads=2)
+
+
+@pytest.fixture(scope="module")
+def captures() -> list[Capture]:
+    pictures = read_dataset(SAMPLES / "street/transforms_drive_empty.json").pictures
+    step_ns = 1_000_000_000 // RATE_HZ
+    return [Capture(n, p, n / RATE_HZ, 10**18 + n * step_ns) for n, p in enumerate(pictures)]
+
+
+class HeldExecutor(Executor):
+    """Runs nothing until told to."""
+
+    def __init__(self) -> None:
+        self.held: list[tuple[Future[Any], Callable[[], Any]]] = []
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        self.held.append((future, lambda: fn(*args, **kwargs)))
+        return future
+
+    def run(self) -> None:
+        for future, call in self.held:
+            future.set_result(call())
+        self.held.clear()
+
+
+def located(tracking: CameraTracking, capture: Capture) -> Fix:
+    return tracking.locate(capture, i420_from_rgb(capture.picture.read()), FULL_RUNG)
+
+
+@pytest.mark.sample
+def test_frames_go_on_while_a_search_runs_and_use_the_field_once_it_has_ended(
+    field: RadianceField, captures: list[Capture]
+) -> None:
+    """The search begun with frame 0 ends before frame 3; a second one may be needed to learn the
+    motion, and ends within a frame."""
+    held = HeldExecutor()
+    intrinsics = captures[0].picture.camera.intrinsics
+    tracking = CameraTracking(field, intrinsics, DatasetPoses(), held)
+    states = []
+    for number, capture in enumerate(captures[:8]):
+        if number >= 3:
+            held.run()
+        states.append(located(tracking, capture).state)
+    assert states[:3] == [State.LOCALISING] * 3
+    assert states[5:] == [State.TRACKING] * 3
+
+
+@pytest.mark.sample
+def test_where_no_clock_runs_a_search_is_waited_for(
+    field: RadianceField, captures: list[Capture]
+) -> None:
+    intrinsics = captures[0].picture.camera.intrinsics
+    with ThreadPoolExecutor(1) as searcher:
+        tracking = CameraTracking(field, intrinsics, DatasetPoses(), searcher, patient=True)
+        assert [located(tracking, capture).state for capture in captures[:3]] == [
+            State.TRACKING
+        ] * 3
+
+
+def test_an_agent_that_was_not_asked_to_localise_does_not_load_opencv() -> None:
+    program = "import sys, cav_agent.__main__, cav_agent.vehicle; print('cv2' in sys.modules)"
+    ran = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert ran.stdout.strip() == "False"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have no niceness of their own")
+def test_the_searching_thread_lets_the_others_go_first() -> None:
+    def niceness() -> int:
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    before = niceness()
+    with ThreadPoolExecutor(1, initializer=yield_to_frames) as searcher:
+        assert searcher.submit(niceness).result() == min(before + SEARCH_NICENESS, 19)
+    assert niceness() == before

@@ -1,0 +1,103 @@
+"""Attacks by packets that are nearly right: a real picture of the street, and harm done to it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+import time
+from collections.abc import AsyncIterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from attack.target import ROOT, SEED, VEHICLE, Target, all_of, for_ever, stream_of
+from cav_agent.frames import Capture, EncodeJob
+from cav_agent.pipeline import Pipeline
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.dataset import read_dataset
+from rfcore.field import load_field
+from rfcore.wire.conventions import RENDERER_CONTRACT
+from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
+
+
+def picture(target: Target, cameras: int = 1) -> tuple[Hello, Frame]:
+    """Return a Hello, and a frame of its first camera that needs its render alone."""
+    shown = read_dataset(ROOT / "samples/street/transforms_drive_vehicles.json").pictures[0]
+    k = shown.camera.intrinsics
+    rounded = type(shown.camera)(k, shown.camera.world_from_cam.rounded())
+    shown = type(shown)(shown.name, rounded, shown.read)
+    field = load_field(ROOT / "samples/fields/street.rff")
+    pipeline = Pipeline(field, CodecConfig(k.width, k.height, "fast"), time.perf_counter_ns)
+    packet = pipeline.encode(EncodeJob(Capture(0, shown, 0.0, 0), 0, 1)).packet
+    named = tuple(CameraDescription(f"c{i}", k, pipeline.header) for i in range(cameras))
+    contract = RendererContract(RENDERER_CONTRACT, exact=True)
+    prefix = bytes.fromhex(target.field_id)[:8]
+    greeting = Hello(VEHICLE, named, (target.field_id,), contract)
+    return greeting, Frame("c0", 0, rounded.world_from_cam, prefix, packet)
+
+
+async def flipped_slices(target: Target) -> None:
+    """Pictures of the street with one bit of the slice flipped and the CRC made right again."""
+    greeting, good = picture(target)
+    rng = random.Random(SEED)
+
+    async def messages() -> AsyncIterator[bytes]:
+        yield client_message_to_bytes(greeting)
+        for sequence in range(100_000):
+            data = bytearray(good.packet.payload)
+            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+            packet = replace(good.packet, epoch=1, sequence=sequence, payload=bytes(data)).sealed()
+            captured_ns = time.time_ns()
+            yield client_message_to_bytes(replace(good, packet=packet, capture_time_ns=captured_ns))
+            await asyncio.sleep(0.02)
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            await stream_of(channel, messages())
+
+    await for_ever(stream, 0.05)
+
+
+async def hung_decoders(target: Target) -> None:
+    """Pictures of the street for 4 cameras, whose decoder processes are stopped (SIGSTOP)."""
+    greeting, good = picture(target, 4)
+    spared = decoders(target.pid)
+
+    async def messages() -> AsyncIterator[bytes]:
+        yield client_message_to_bytes(greeting)
+        for sequence in range(100_000):
+            packet = replace(good.packet, epoch=1, sequence=sequence).sealed()
+            for camera in greeting.cameras:
+                shown = replace(good, camera_id=camera.camera_id, capture_time_ns=time.time_ns())
+                yield client_message_to_bytes(replace(shown, packet=packet))
+            await asyncio.sleep(0.1)
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            await stream_of(channel, messages())
+
+    async def stop() -> None:
+        while True:
+            for pid in decoders(target.pid) - spared:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGSTOP)
+            await asyncio.sleep(0.2)
+
+    await all_of(for_ever(stream, 0.05), stop())
+
+
+def decoders(pid: int) -> set[int]:
+    """Return the decoder processes of a server."""
+    found, left = set(), [pid]
+    while left:
+        of = left.pop()
+        for children in Path(f"/proc/{of}/task").glob("*/children"):
+            with suppress(OSError):
+                left += [int(child) for child in children.read_text().split()]
+        with suppress(OSError):
+            if b"mec_server.decoding.child" in Path(f"/proc/{of}/cmdline").read_bytes():
+                found.add(of)
+    return found - {pid}

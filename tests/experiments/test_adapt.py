@@ -1,0 +1,109 @@
+"""The adaptation table: shares of a loss, cases as text, and a run that goes on from its cells."""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from rfcore.errors import InvalidInput
+from rfedge.experiments.adapt.measure import AdaptCase, AdaptJob, recovered_percent, run_adapt
+from rfedge.experiments.adapt.report import AdaptRow, adapt_section
+from rfedge.results import Provenance, make_result
+
+
+def test_what_is_recovered_is_a_share_of_the_loss() -> None:
+    assert recovered_percent(75.0, 25.0, 75.0) == 0.0
+    assert recovered_percent(75.0, 25.0, 50.0) == 50.0
+    assert recovered_percent(75.0, 25.0, 20.0) == pytest.approx(110.0)
+    assert recovered_percent(75.0, 25.0, 80.0) == pytest.approx(-10.0)
+
+
+def test_without_a_loss_nothing_is_recovered() -> None:
+    assert recovered_percent(75.0, None, 50.0) is None
+    assert recovered_percent(25.0, 25.0, 20.0) is None
+
+
+def test_a_case_names_its_drive_fields_and_variants() -> None:
+    case = AdaptCase.parse("dusk@10=d.json,field=f.rff,noon=n.json,learnt=g.rff,layer=l.rff")
+    assert (case.drive.scene, case.drive.rate_hz, case.drive.dataset) == (
+        "dusk",
+        10,
+        Path("d.json"),
+    )
+    assert (case.field, case.noon) == (Path("f.rff"), Path("n.json"))
+    assert case.variants == {"learnt": Path("g.rff"), "layer": Path("l.rff")}
+    assert AdaptCase.parse("a@5=d,field=f").noon is None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("dusk@10=d.json", "names no field="),
+        ("dusk=d.json,field=f.rff", "is not NAME@HZ=DATASET"),
+        ("dusk@10=d.json,field", "'field' is not KEY=PATH"),
+        ("dusk@10=d.json,field=f,noon=", "'noon=' is not KEY=PATH"),
+        ("dusk@10=d.json,field=f,field=g", "'field=g' is not KEY=PATH"),
+        ("dusk@10=d.json,field=f,off=g", "'off=g' is not KEY=PATH"),
+    ],
+)
+def test_a_case_of_another_form_is_refused(text: str, said: str) -> None:
+    with pytest.raises(InvalidInput, match=said):
+        AdaptCase.parse(text)
+
+
+def test_a_job_without_cases_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="cases"):
+        AdaptJob((), "fast", "ultrafast", Path("o.json"), Path("cells"))
+
+
+def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(
+    thumbnail: Any, tmp_path: Path
+) -> None:
+    """Another name for the same field changes no bit; at noon a tool that is not used neither."""
+    text = f"{thumbnail.drive},field={thumbnail.field},again={thumbnail.field}"
+    text += f",noon={thumbnail.drive.partition('=')[2]}"
+    job = AdaptJob(
+        (AdaptCase.parse(text),), "fast", "ultrafast", tmp_path / "a.json", tmp_path / "cells", True
+    )
+    result = run_adapt(job, Console(file=io.StringIO(), width=200))
+    rows = {row["variant"]: row for row in result["rows"]}
+    assert list(rows) == ["off", "matrix", "again"]
+    assert rows["again"]["kbit_33db"] == rows["off"]["kbit_33db"]
+    assert rows["again"]["side_bytes"] == thumbnail.field.stat().st_size
+    assert rows["again"]["noon_bits_percent"] is None
+    assert rows["off"]["side_bytes"] == rows["off"]["extra_ms"] == 0
+    assert rows["off"]["recovered_percent"] is None, "noon itself has nothing to win back"
+    assert rows["off"]["noon_bits_percent"] == 0.0
+    assert rows["matrix"]["noon_bits_percent"] == 0.0
+    assert json.loads(job.out.read_text())["rows"] == result["rows"]
+    cells = {path: path.read_bytes() for path in job.cells.iterdir()}
+    assert run_adapt(job, Console(quiet=True))["rows"] == result["rows"]
+    assert {path: path.read_bytes() for path in job.cells.iterdir()} == cells
+
+
+ROW = AdaptRow(
+    case="dusk",
+    drive="transforms_drive_dusk@10",
+    frames=24,
+    variant="matrix",
+    kbit_33db=71.7,
+    x264_kbit_33db=100.0,
+    recovered_percent=None,
+    noon_bits_percent=0.0,
+    second_vehicle_percent=None,
+    side_bytes=0,
+    extra_ms=1.26,
+)
+
+
+HOST = {"cpu": "A CPU", "cores": 2, "isa": "avx2"}
+MADE = Provenance("rfedge eval adapt", "abc123", False, HOST, {})
+
+
+def test_what_does_not_apply_is_said_so() -> None:
+    section = adapt_section(Path("adapt.json"), make_result("adapt", MADE, {"rows": [ROW]}))
+    line = "| matrix | 71.7 | 100.0 | -28.3 | n/a | +0.0 | n/a | 0 | +1.3 |"
+    assert line in section

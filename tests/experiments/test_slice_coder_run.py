@@ -1,0 +1,96 @@
+"""The slice coder experiment: every coder gets the same work, and its rows can be read back."""
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rfcore.codec.h264.bitstream import split_nals
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.ffmpeg import PictureKind, encode_pictures
+from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, nal_type
+from rfcore.codec.h264.slice_coder import Effort, SliceCoder
+from rfcore.codec.h264.slices import CodedSlice, encode_slice, slice_options
+from rfcore.errors import InvalidInput
+from rfcore.image import I420
+from rfedge.experiments.slice_coder.report import BdRow, TimeRow, slice_coder_section
+from rfedge.experiments.slice_coder.run import DriveOfField, SliceCoderJob, run_slice_coder
+from rfedge.experiments.slice_coder.tasks import header_of, slice_qp
+from rfedge.results import read_result, rows_of
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+DRIVE = f"vehicles@10={SAMPLES / 'street/transforms_drive_vehicles.json'}"
+FIELD = SAMPLES / "fields/street.rff"
+CONFIG = CodecConfig(64, 48, "x264-medium")
+
+
+def picture(seed: int) -> I420:
+    rng = np.random.default_rng(seed)
+    shapes = ((48, 64), (24, 32), (24, 32))
+    return I420(*(rng.integers(0, 256, shape).astype(np.uint8) for shape in shapes))
+
+
+@pytest.mark.parametrize("references", range(4))
+@pytest.mark.parametrize("qp", [3, 26, 40])
+def test_the_quantiser_is_read_from_slices_of_our_own(references: int, qp: int) -> None:
+    header = header_of(CONFIG)
+    pictures = [picture(k) for k in range(references)]
+    payload = SliceCoder(header).encode(picture(9), pictures, qp).payload
+    assert slice_qp(CodedSlice(header, payload)) == qp
+
+
+@pytest.mark.parametrize("weights", ["1", "2"])
+def test_the_quantiser_is_read_from_x264_slices_with_weights(weights: str) -> None:
+    """The quantiser is set, not chosen: a zone of the sent picture says it."""
+    first = picture(0)
+    darker = I420(*((plane // 2).astype(np.uint8) for plane in first.planes))
+    options = slice_options(CONFIG)
+    params = {**options.params, "weightp": weights, "zones": "1,1,q=31"}
+    kinds = [(first, PictureKind.I), (darker, PictureKind.P)]
+    unit = encode_pictures(replace(options, params=params), kinds, ())[-1]
+    (payload,) = [nal for nal in split_nals(unit) if nal_type(nal) in (NAL_P, NAL_IDR)]
+    header = encode_slice(CONFIG, [first], first).header
+    assert slice_qp(CodedSlice(header, payload)) == 31
+
+
+def test_a_drive_may_name_its_own_field() -> None:
+    own = DriveOfField.parse("city@5=out/city.json,out/city.rff", FIELD)
+    assert (own.name.dataset, own.field) == (Path("out/city.json"), Path("out/city.rff"))
+    assert DriveOfField.parse(DRIVE, FIELD).field == FIELD
+
+
+def job(tmp_path: Path, *sizes: str) -> SliceCoderJob:
+    return SliceCoderJob(
+        field=FIELD,
+        drives=(DRIVE,),
+        noisy=(DRIVE,),
+        timed=DRIVE,
+        sizes=sizes,
+        out=tmp_path / "slice-coder.json",
+        quick=True,
+    )
+
+
+def test_a_size_of_another_form_is_refused_before_anything_is_coded(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="'720p' is not WIDTHxHEIGHT"):
+        run_slice_coder(job(tmp_path, "720p"), Console(file=io.StringIO()))
+
+
+@pytest.mark.slow
+def test_every_effort_is_compared_with_every_rival_and_timed(tmp_path: Path) -> None:
+    run_slice_coder(job(tmp_path, "320x180"), Console(file=io.StringIO()))
+    path = tmp_path / "slice-coder.json"
+    result = read_result(path, "slice-coder")
+    rows, times = rows_of(BdRow, result["rows"]), rows_of(TimeRow, result["times"])
+    assert {row.drive for row in rows} == {"vehicles", "vehicles noise 3"}
+    assert len(rows) == 2 * len(Effort) * 2
+    assert all(abs(row.bd_rate_percent) < 15 for row in rows)
+    assert [row.effort for row in times] == [effort.name.lower() for effort in Effort]
+    assert all(0 < row.encode_ms < row.x264_encode_ms for row in times)
+    assert times[0].references == 3
+    section = slice_coder_section(path, json.loads(path.read_text()))
+    assert "| vehicles noise 3 | 10 | 640x360 | fast | medium |" in section

@@ -1,0 +1,167 @@
+"""Packet loss x RTT x rate at street size: what a vehicle's pictures look like behind such a link.
+
+The shipped field and drive, 640x360 at 5 Hz, TCP as the kernel has it. Three vehicles at a time,
+one for each rate, to one server. A freeze is a gap between pictures of at least
+max(3 d, d + 150 ms), d their mean distance (W3C webrtc-stats, ``freezeCount``).
+"""
+
+import asyncio
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import pytest
+
+from attack.conftest import ENVIRONMENT, ROOT
+from rfcore.dataset import read_dataset
+from rfcore.field import FieldStore
+from rfcore.image import read_rgb
+from rfcore.metrics.psnr import psnr
+
+RATES_MBPS = (0.5, 2.0, 8.0)
+HZ = 5.0
+SETTLE_S, MEASURED_S = 3.0, 15.0
+OLDEST_S = 5.0
+"""``AgentLimits.answer_s``: a stream whose frames take longer is given up."""
+DRIVE = ROOT / "samples/street/transforms_drive_vehicles.json"
+PICTURES = 12
+
+
+@contextmanager
+def namespace(name: str) -> Iterator[str]:
+    subprocess.run(["ip", "netns", "add", name], check=True)
+    try:
+        subprocess.run(["ip", "-n", name, "link", "set", "lo", "up"], check=True)
+        yield name
+    finally:
+        subprocess.run(["ip", "netns", "del", name], check=True)
+
+
+@contextmanager
+def lossy_wire(near: str, far: str, subnet: str, *numbers: float) -> Iterator[None]:
+    """Connect two namespaces; ``numbers`` are loss in percent, RTT in ms and Mbit/s."""
+    words = [sys.executable, "-m", "fault.lossy_wire", near, far, subnet, *map(str, numbers)]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, env=ENVIRONMENT)
+    assert process.stdout is not None
+    with process:
+        try:
+            assert process.stdout.readline() == b"ready\n"
+            yield
+        finally:
+            process.kill()
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What came of the pictures that were captured in ``length_s``."""
+
+    lines: Sequence[dict[str, Any]]
+    length_s: float
+    qualities_db: Sequence[float]
+
+    @property
+    def acked(self) -> list[dict[str, Any]]:
+        return [x for x in self.lines if x["result"] == "acked"]
+
+    @property
+    def freezes_s(self) -> list[float]:
+        """Return the gaps between pictures that are freezes."""
+        shown = sorted(x["capture_time_ns"] / 1e9 + x["latency_ms"] / 1e3 for x in self.acked)
+        gaps = np.diff(shown)
+        mean_s = float(gaps.mean()) if len(gaps) else self.length_s
+        return [float(gap) for gap in gaps if gap >= max(3 * mean_s, mean_s + 0.15)]
+
+    def told(self) -> str:
+        """Return the figures in words."""
+        ages = np.percentile([x["latency_ms"] for x in self.acked] or [0.0], (50, 99))
+        frozen_s = sum(self.freezes_s)
+        bits = sum(8 * x["packet_bytes"] for x in self.acked)
+        return (
+            f"{len(self.acked) / self.length_s:.1f} Hz, {bits / self.length_s / 1e6:.2f} Mbit/s, "
+            f"frozen {frozen_s:.1f} s of {self.length_s:.0f} s, "
+            f"age {ages[0]:.0f} / {ages[1]:.0f} ms, "
+            f"{fmean(self.qualities_db or [0.0]):.1f} dB"
+        )
+
+
+def qualities_db(folder: Path, report: Sequence[dict[str, Any]]) -> list[float]:
+    """Return the PSNR of some pictures at the server against the camera's."""
+    truth = {picture.name: picture for picture in read_dataset(DRIVE).pictures}
+    saved = [(folder / f"{x['sequence']:06}.png", x["name"]) for x in report if x["epoch"] == 0] + [
+        (folder / f"e{x['epoch']:04}-{x['sequence']:06}.png", x["name"])
+        for x in report
+        if x["epoch"]
+    ]
+    there = [(path, name) for path, name in saved if path.exists()]
+    some = there[:: max(1, len(there) // PICTURES)]
+    return [psnr(read_rgb(path), truth[name].read()) for path, name in some]
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.usefixtures("as_root")
+@pytest.mark.parametrize("rtt_ms", [20, 100, 300])
+@pytest.mark.parametrize("loss_percent", [0, 1, 5])
+async def test_a_lossy_link(
+    loss_percent: int, rtt_ms: int, site: Any, case: Any, tmp_path: Path
+) -> None:
+    case.about(
+        f"{loss_percent} % loss, RTT {rtt_ms} ms",
+        f"IP packets lost and delayed between namespaces, {HZ:g} Hz of 640x360, quality free to "
+        "fall for --max-delay-ms 1000. Freezes by W3C webrtc-stats; ages median / 99th",
+        "F6",
+    )
+    number = os.getpid()
+    options = ("--allow-insecure", "--decoder", "in-process", "--save", str(tmp_path / "saved"))
+    field_id = FieldStore(tmp_path / "fields").add(ROOT / "samples/fields/street.rff")
+    fields = ("--fields", str(tmp_path / "fields"))
+    with ExitStack() as stack:
+        far = stack.enter_context(namespace(f"rff{number}"))
+        near = {
+            rate: stack.enter_context(namespace(f"rfn{number}-{i}"))
+            for i, rate in enumerate(RATES_MBPS)
+        }
+        for i, rate in enumerate(RATES_MBPS):
+            numbers = (loss_percent, rtt_ms, rate)
+            stack.enter_context(lossy_wire(near[rate], far, f"10.215.{i}", *numbers))
+        within = ("ip", "netns", "exec", far)
+        server = await site.server(*options, *fields, listen="0.0.0.0:0", within=within)
+        port = server.address.rpartition(":")[2]
+        agents = await asyncio.gather(
+            *(
+                site.vehicle(
+                    f"10.215.{i}.2:{port}",
+                    f"cav-{i}",
+                    *("--drive", str(DRIVE), *fields, "--field", field_id),
+                    *("--rate", str(HZ), "--max-delay-ms", "1000", "--allow-insecure"),
+                    within=("ip", "netns", "exec", near[rate]),
+                )
+                for i, rate in enumerate(RATES_MBPS)
+            )
+        )
+        await asyncio.sleep(SETTLE_S)
+        began_s = time.time()
+        await asyncio.sleep(MEASURED_S)
+        ended_s = time.time()
+        await asyncio.sleep(2 * rtt_ms / 1e3 + 1.0)
+    for i, (rate, agent) in enumerate(zip(RATES_MBPS, agents, strict=True)):
+        lines = [x for x in agent.lines() if began_s <= x["capture_time_ns"] / 1e9 <= ended_s]
+        folder = tmp_path / "saved" / f"cav-{i}" / "front"
+        acked = [x for x in lines if x["result"] == "acked"]
+        cell = Cell(lines, ended_s - began_s, qualities_db(folder, acked))
+        case.tells(f"{rate:g} Mbit/s: pictures, bits, freezes, ages, quality", cell.told())
+        case.holds(
+            f"{rate:g} Mbit/s: pictures go on, all exact",
+            acked and all(x["server_digest"] == x["reconstruction_digest"] for x in agent.acked()),
+        )
+        oldest_s = max((x["latency_ms"] for x in acked), default=0.0) / 1e3
+        case.at_most(f"{rate:g} Mbit/s: oldest", oldest_s, OLDEST_S)
+        case.holds(f"{rate:g} Mbit/s: quality measured", cell.qualities_db)
+    case.finish()

@@ -1,0 +1,202 @@
+"""What ``.spz`` keeps of splats; the writer against a decoder written from the format's text.
+
+The reader is held against the writer."""
+
+import gzip
+import io
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rfcore.camera import TileOrigin
+from rfcore.errors import FieldFormatError, InvalidInput
+from rfcore.field.spz import encode_spz, read_open_spz
+from rfcore.raster.gaussians import Gaussians
+
+HEADER = struct.Struct("<IIIBBBB")
+
+
+def random_gaussians(seed: int, n: int, degree: int, reach_m: float) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        rng.uniform(-reach_m, reach_m, (n, 3)).astype(np.float32),
+        rng.normal(size=(n, 4)).astype(np.float32),
+        rng.uniform(-9, 3, (n, 3)).astype(np.float32),
+        rng.uniform(-6, 6, n).astype(np.float32),
+        rng.uniform(-0.9, 0.9, (n, (degree + 1) ** 2, 3)).astype(np.float32),
+    )
+
+
+def rotation(packed: int) -> np.ndarray:
+    """x, y, z, w of the smallest-three code."""
+    largest, xyzw, rest = packed >> 30, np.zeros(4), packed
+    for axis in (3, 2, 1, 0):
+        if axis != largest:
+            xyzw[axis] = (rest & 511) / 511 / np.sqrt(2) * (-1 if rest >> 9 & 1 else 1)
+            rest >>= 10
+    xyzw[largest] = np.sqrt(max(0.0, 1 - (xyzw**2).sum()))
+    return xyzw
+
+
+@given(st.integers(0, 2**31), st.integers(0, 3), st.sampled_from([0.5, 40.0, 3000.0, 2e5]))
+def test_each_attribute_keeps_its_precision(seed: int, degree: int, reach_m: float) -> None:
+    given_ = random_gaussians(seed, 17, degree, reach_m)
+    data = gzip.decompress(encode_spz(given_, antialiased=True))
+    magic, version, n, sh_degree, fraction_bits, flags, _ = HEADER.unpack_from(data)
+    assert (magic, version, n, sh_degree, flags) == (0x5053474E, 3, 17, degree, 1)
+    raw = np.frombuffer(data, np.uint8, offset=HEADER.size)
+    sizes = [9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)]
+    means, alpha, colour, scales, turns, sh = (
+        block.reshape(n, size)
+        for block, size in zip(
+            np.split(raw, np.cumsum([n * s for s in sizes])[:-1]), sizes, strict=True
+        )
+    )
+    wide = np.zeros((n, 3, 4), np.uint8)
+    wide[..., 1:] = means.reshape(n, 3, 3)
+    metres = wide.view("<i4")[..., 0] / 256 / 2.0**fraction_bits
+    assert np.abs(metres - given_.means).max() <= 0.5001 / 2**fraction_bits
+    assert 2.0**-fraction_bits <= max(2**-12, reach_m / 2**21)
+    opacity = 1 / (1 + np.exp(-given_.opacity_logits.astype(np.float64)))
+    assert np.abs(alpha[:, 0] / 255 - opacity).max() <= 0.51 / 255
+    assert np.abs((colour / 255 - 0.5) / 0.15 - given_.sh[:, 0]).max() <= 0.51 / 255 / 0.15
+    assert np.abs(scales / 16 - 10 - given_.log_scales).max() <= 0.51 / 16
+    for code, q in zip(turns.copy().view("<u4")[:, 0], given_.quaternions, strict=True):
+        xyzw = np.roll(q / np.linalg.norm(q), -1)
+        assert abs(rotation(int(code)) @ xyzw) > 0.99999
+    if degree:
+        bands = given_.sh[:, 1:].reshape(n, -1)
+        steps = np.repeat(np.where(np.arange(bands.shape[1] // 3) < 3, 8, 16), 3)
+        assert (np.abs((sh.astype(int) - 128) - bands * 128) <= steps / 2 + 1).all()
+
+
+def test_no_splats_are_a_file_too() -> None:
+    data = gzip.decompress(encode_spz(random_gaussians(1, 0, 0, 1.0), antialiased=False))
+    assert HEADER.unpack(data)[2:6] == (0, 0, 12, 0)
+
+
+def test_the_same_splats_give_the_same_bytes() -> None:
+    one, other = (encode_spz(random_gaussians(3, 50, 3, 9.0), antialiased=True) for _ in range(2))
+    assert one == other
+
+
+def test_a_splat_beyond_24_bits_of_metres_is_refused() -> None:
+    with pytest.raises(InvalidInput, match=r"means: .* reaches 8388607 m"):
+        encode_spz(random_gaussians(3, 9, 0, 3e7), antialiased=False)
+
+
+# --- reading
+
+NAME = Path("a.spz")
+SIZES = (9, 1, 3, 3, 4, 45)
+
+
+def decoded(data: bytes, max_bytes: int = 1 << 20) -> tuple[Gaussians, bool]:
+    return read_open_spz(NAME, io.BytesIO(data), None, max_bytes)
+
+
+def as_version_4(data: bytes) -> bytes:
+    """The same blocks, each a Zstandard stream, behind the header and the table of version 4."""
+    plain = gzip.decompress(data)
+    magic, _, n, degree, fraction_bits, flags, _ = HEADER.unpack_from(plain)
+    sizes = [n * size for size in (*SIZES[:5], 3 * ((degree + 1) ** 2 - 1))]
+    blocks = np.split(np.frombuffer(plain, np.uint8, offset=16), np.cumsum(sizes)[:-1])
+    coded = [zstandard.compress(block.tobytes()) for block in blocks]
+    lengths = [n for pair in zip(map(len, coded), sizes, strict=True) for n in pair]
+    header = HEADER.pack(magic, 4, n, degree, fraction_bits, flags, 6) + struct.pack("<I12x", 32)
+    return header + struct.pack("<12Q", *lengths) + b"".join(coded)
+
+
+def assert_same(one: Gaussians, other: Gaussians) -> None:
+    for name, array in vars(one).items():
+        np.testing.assert_array_equal(array, getattr(other, name))
+
+
+@given(st.integers(0, 2**31), st.integers(0, 3), st.sampled_from([0.5, 40.0, 3000.0]))
+def test_what_is_written_is_read_within_its_steps(seed: int, degree: int, reach_m: float) -> None:
+    given_ = random_gaussians(seed, 17, degree, reach_m)
+    read, antialiased = decoded(encode_spz(given_, antialiased=seed % 2 == 0))
+    assert antialiased == (seed % 2 == 0)
+    assert np.abs(read.means - given_.means).max() <= max(2**-12, reach_m / 2**20)
+    assert np.abs(read.log_scales - given_.log_scales).max() <= 0.51 / 16
+    assert np.abs(read.sh[:, 0] - given_.sh[:, 0]).max() <= 0.51 / 255 / 0.15
+    assert np.abs(read.sh - given_.sh).max() <= 9.0 / 128
+    opacities = [1 / (1 + np.exp(-g.opacity_logits.astype(np.float64))) for g in (read, given_)]
+    assert np.abs(opacities[0] - opacities[1]).max() <= 0.51 / 255
+    turns = given_.quaternions / np.linalg.norm(given_.quaternions, axis=1, keepdims=True)
+    assert (np.abs((read.quaternions * turns).sum(axis=1)) > 0.99999).all()
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_reading_is_exact_once_the_splats_are_in_steps(degree: int) -> None:
+    once, antialiased = decoded(encode_spz(random_gaussians(5, 40, degree, 9.0), antialiased=True))
+    twice, _ = decoded(encode_spz(once, antialiased=antialiased))
+    np.testing.assert_allclose(twice.means, once.means, atol=0)
+    np.testing.assert_allclose(twice.sh, once.sh, atol=1e-6)
+    np.testing.assert_allclose(twice.opacity_logits, once.opacity_logits, atol=1e-5)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_version_4_holds_the_same_splats(degree: int) -> None:
+    data = encode_spz(random_gaussians(6, 40, degree, 9.0), antialiased=True)
+    assert_same(decoded(as_version_4(data))[0], decoded(data)[0])
+
+
+def test_version_2_has_rotations_of_three_bytes() -> None:
+    given_ = random_gaussians(7, 30, 1, 9.0)
+    plain = bytearray(gzip.decompress(encode_spz(given_, antialiased=False)))
+    plain[4] = 2
+    turns = given_.quaternions / np.linalg.norm(given_.quaternions, axis=1, keepdims=True)
+    turns *= np.where(turns[:, :1] < 0, -1, 1)
+    start = 16 + 30 * (9 + 1 + 3 + 3)
+    plain[start : start + 30 * 4] = np.round((turns[:, 1:] + 1) * 127.5).astype(np.uint8).tobytes()
+    read, _ = decoded(gzip.compress(bytes(plain)))
+    assert (np.abs((read.quaternions * turns).sum(axis=1)) > 0.999).all()
+
+
+def test_the_tiles_origin_is_taken_off_before_float32() -> None:
+    data = encode_spz(random_gaussians(8, 20, 0, 4000.0), antialiased=False)
+    moved, _ = read_open_spz(NAME, io.BytesIO(data), TileOrigin(100.0, 200.0, 3.0), 1 << 20)
+    here, _ = decoded(data)
+    np.testing.assert_allclose(moved.means, here.means - np.float32([100, 200, 3]), atol=5e-4)
+
+
+def edited(at: int, value: int) -> Callable[[bytes], bytes]:
+    def edit(data: bytes) -> bytes:
+        plain = bytearray(gzip.decompress(data))
+        plain[at] = value
+        return gzip.compress(bytes(plain))
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("edit", "named"),
+    [
+        (lambda _: b"", "does not begin with NGSP"),
+        (lambda _: b"ply\n" * 20, "does not begin with NGSP"),
+        (lambda data: data[: len(data) // 2], "ended before|end-of-stream|ends"),
+        (lambda data: gzip.compress(gzip.decompress(data)[:-1]), "ends 1 bytes before"),
+        (lambda data: gzip.compress(gzip.decompress(data) + b"."), "goes on after its 20 splats"),
+        (edited(4, 1), r"version 1; 2 to 4 are read: convert .* a\.spz a\.ply$"),
+        (edited(4, 9), "version 9"),
+        (edited(12, 4), "SH degree 4"),
+        (edited(13, 24), "24 fraction bits"),
+        (edited(14, 2), "extensions of a vendor"),
+        (edited(11, 255), "take .* GB of memory, over the limit"),
+        (lambda data: as_version_4(data)[:-1], "ends 1 bytes before"),
+        (lambda data: as_version_4(data)[:40], "before the last splat"),
+        (lambda data: as_version_4(data).replace(b"\x28\xb5\x2f\xfd", b"none"), "a.spz: "),
+        (lambda data: as_version_4(data)[:32] + b"\xff" * 200, "stream of"),
+    ],
+)
+def test_what_is_no_whole_spz_is_refused_by_name(edit, named: str) -> None:
+    data = encode_spz(random_gaussians(9, 20, 1, 9.0), antialiased=False)
+    with pytest.raises(FieldFormatError, match=named):
+        decoded(edit(data))

@@ -1,0 +1,122 @@
+"""Writes the first inputs of every target to ``corpus``: ``python tests/fuzz/seeds.py``."""
+
+import struct
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.codec.h264.bitstream import join_nals
+from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.references import RENDER_ONLY
+from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
+from rfcore.field import FieldMetadata, SplatField, render_field_view, write_ply
+from rfcore.field.archive import PREFIX, encode_archive
+from rfcore.native.yuv import i420_from_rgb
+from rfcore.raster.gaussians import Gaussians
+from rfcore.wire.conventions import RENDERER_CONTRACT
+from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert_answers import server_messages_to_bytes
+from rfcore.wire.drive_file import CodedDrive, write_drive
+from rfcore.wire.messages import (
+    Ack,
+    CameraDescription,
+    Frame,
+    FrameAddress,
+    Hello,
+    RendererContract,
+    StageTimes,
+)
+
+CORPUS = Path(__file__).parent / "corpus"
+FIELD_ID = "ab" * 32
+
+
+def put(target: str, name: str, data: bytes) -> None:
+    (CORPUS / target).mkdir(parents=True, exist_ok=True)
+    (CORPUS / target / name).write_bytes(data)
+
+
+def field(sh_degree: int) -> SplatField:
+    rng = np.random.default_rng(1)
+    n, k = 4, (sh_degree + 1) ** 2
+    shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, k, 3))
+    splats = Gaussians(*(rng.uniform(-1, 1, shape).astype(np.float32) for shape in shapes))
+    return SplatField(splats, FieldMetadata("fuzz"))
+
+
+def coded() -> tuple[Hello, list[Frame]]:
+    camera = Intrinsics(16, 16, 16.0, 16.0, 8.0, 8.0)
+    pose = Pose((0.0, 0.0, -4.0), (1.0, 0.0, 0.0, 0.0))
+    encoder = DeltaEncoder(CodecConfig(16, 16))
+    state, frames = encoder.start(1), []
+    for number in range(2):
+        view = render_field_view(field(0), Camera(camera, pose).rounded())
+        picture = i420_from_rgb(np.full((16, 16, 3), 90 + 40 * number, np.uint8))
+        encoded = encoder.encode(state, picture, view, choice=FrameChoice(RENDER_ONLY))
+        state = encoded.state
+        frames.append(Frame("front", 10**9 + number, pose, bytes.fromhex(FIELD_ID), encoded.packet))
+    described = CameraDescription("front", camera, encoder.header)
+    return Hello(
+        "cav-1", (described,), (FIELD_ID,), RendererContract(RENDERER_CONTRACT, True)
+    ), frames
+
+
+def put_wire() -> None:
+    hello, frames = coded()
+    messages = [client_message_to_bytes(message) for message in (hello, *frames)]
+    for name, data in zip(("hello", "frame-0", "frame-1"), messages, strict=True):
+        put("message", name, data)
+    ack = Ack(FrameAddress("front", 1, 0), StageTimes(1, 2, 3), bytes(16))
+    put("message", "answers", server_messages_to_bytes([ack])[0])
+    put("session", "drive", b"".join(struct.pack("<H", len(data)) + data for data in messages))
+    header = hello.cameras[0].codec
+    payloads = [frame.packet.payload for frame in frames]
+    put("bitstream", "stream", join_nals([header.sps, header.pps, *payloads]))
+    with tempfile.TemporaryDirectory() as folder:
+        write_drive(Path(folder) / "a.rfv", CodedDrive(hello, tuple(frames)))
+        put("drive", "drive", (Path(folder) / "a.rfv").read_bytes())
+
+
+def put_files() -> None:
+    for name, one in {"raw": field(0), "compressed": field(1).compressed()}.items():
+        data = encode_archive(one.archive())
+        put("archive", name, data)
+        length = PREFIX.unpack(data[: PREFIX.size])[2]
+        text = data[PREFIX.size : PREFIX.size + length]
+        put(
+            "archive",
+            f"{name}-unsealed",
+            text + b"\0" + data[-(-(PREFIX.size + length) // 64) * 64 :],
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        write_ply(Path(folder) / "a.ply", field(1).gaussians, antialiased=True)
+        data = (Path(folder) / "a.ply").read_bytes()
+        put("ply", "binary", data)
+    names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+    properties = "".join(f"property double {name}\n" for name in names.split())
+    row = " ".join(["0.5"] * 14)
+    put(
+        "ply",
+        "text",
+        f"ply\nformat ascii 1.0\nelement vertex 1\n{properties}end_header\n{row}\n".encode(),
+    )
+    put(
+        "transforms",
+        "nerfstudio",
+        b'{"w": 8, "h": 8, "fl_x": 8, "fl_y": 8, "cx": 4, "cy": 4, "k1": 0.1, "applied_transform": '
+        b'[[1,0,0,0],[0,1,0,0],[0,0,1,0]], "frames": [{"file_path": "a.png", "transform_matrix": '
+        b"[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}",
+    )
+    put(
+        "transforms",
+        "instant-ngp",
+        b'{"camera_angle_x": 0.7, "frames": [{"file_path": "b", "time": 1, "transform_matrix": '
+        b"[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}",
+    )
+
+
+if __name__ == "__main__":
+    put_wire()
+    put_files()

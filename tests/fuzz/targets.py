@@ -1,0 +1,151 @@
+"""Readers of bytes that others wrote: each gets any bytes and may raise ``RfedgeError``, no other.
+
+``TARGETS`` maps a target's name to a function of bytes. Where a digest or a checksum would refuse
+everything a fuzzer makes, it is repaired first, so that what lies behind it is reached.
+"""
+
+import hashlib
+import io
+import json
+import math
+import struct
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from mec_server.decode_jobs import OpenJob
+from mec_server.session import ServerSession
+from rfcore.codec.h264.bitstream import split_nals
+from rfcore.codec.h264.parameter_sets import parse_pps, parse_slice_start, parse_sps
+from rfcore.dataset.transforms import read_transforms_source
+from rfcore.errors import (
+    FieldFormatError,
+    InvalidInput,
+    PacketRejected,
+    RejectReason,
+    RfedgeError,
+)
+from rfcore.field.archive import ALIGN_BYTES, PREFIX, decode_archive
+from rfcore.field.ply import read_open_ply
+from rfcore.field.store import decode_field
+from rfcore.wire.convert import (
+    client_message_from_bytes,
+    client_message_to_bytes,
+)
+from rfcore.wire.convert_answers import server_messages_from_bytes
+from rfcore.wire.drive_file import read_drive
+
+__all__ = ["TARGETS"]
+
+FEW_BYTES = 1 << 24
+"""Memory that a field of a fuzzer may take."""
+FOLDER = Path(tempfile.mkdtemp())
+
+
+def message(data: bytes) -> None:
+    """A message of a vehicle, then of a server: what is read is written back as it was."""
+    with suppress(RfedgeError):
+        read = client_message_from_bytes(data)
+        again = client_message_from_bytes(client_message_to_bytes(read))
+        assert repr(again) == repr(read)
+    with suppress(RfedgeError):
+        server_messages_from_bytes(data)
+
+
+def session(data: bytes) -> None:
+    """A conversation with the server, message after message (two bytes of length each)."""
+    machine = ServerSession("session", ["ab" * 32], 0.0)
+    for now, part in enumerate(_parts(data)):
+        if machine.closed is not None:
+            return
+        try:
+            machine.receive(client_message_from_bytes(part), float(now))
+        except InvalidInput as error:
+            machine.refuse(error, float(now))
+        for job in machine.jobs_to_start(float(now)):
+            if isinstance(job, OpenJob):
+                machine.opened(job, float(now))
+            else:
+                machine.rejected(job, DAMAGED, float(now))
+        machine.messages_to_send(float(now))
+
+
+DAMAGED = PacketRejected(RejectReason.DECODER_FAILED, "no decoder here")
+
+
+def _parts(data: bytes) -> Iterator[bytes]:
+    while len(data) > 2:
+        (length,) = struct.unpack_from("<H", data)
+        yield data[2 : 2 + length]
+        data = data[2 + length :]
+
+
+def bitstream(data: bytes) -> None:
+    """NAL units, parameter sets, the start of a slice."""
+    with suppress(RfedgeError):
+        for nal in split_nals(data):
+            for parse in (parse_sps, parse_pps):
+                with suppress(RfedgeError):
+                    parse(nal)
+            with suppress(RfedgeError):
+                parse_slice_start(nal, 4)
+
+
+def archive(data: bytes) -> None:
+    """A field file as it is, then with its digests made right."""
+    with suppress(FieldFormatError):
+        decode_archive(data)
+    with suppress(FieldFormatError):
+        decode_field(repaired(data), max_bytes=FEW_BYTES)
+
+
+def repaired(data: bytes) -> bytes:
+    """Return an archive of JSON and, after a zero byte, the arrays' bytes; all digests hold."""
+    text, _, blobs = data.partition(b"\0")
+    try:
+        header = json.loads(text)
+        for entry in header["arrays"]:
+            start, size = entry["offset"], math.prod(entry["shape"]) * int(entry["dtype"][2])
+            entry["sha256"] = hashlib.sha256(blobs[start : start + size]).hexdigest()
+        blobs += bytes(-len(blobs) % ALIGN_BYTES)
+        header["data_bytes"] = len(blobs)
+        text = json.dumps(header).encode()
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError, OverflowError):
+        pass  # as it is, then
+    prefix = PREFIX.pack(b"RFFIELD\0", 1, len(text), hashlib.sha256(text).digest())
+    return prefix + text + bytes(-(len(prefix) + len(text)) % ALIGN_BYTES) + blobs
+
+
+def ply(data: bytes) -> None:
+    """Splats of other programs."""
+    with suppress(FieldFormatError):
+        read_open_ply(Path("fuzz.ply"), io.BytesIO(data), None, FEW_BYTES)
+
+
+def transforms(data: bytes) -> None:
+    """Posed pictures by nerfstudio's transforms.json."""
+    _as_file("transforms.json", data, read_transforms_source)
+
+
+def drive(data: bytes) -> None:
+    """A coded drive."""
+    _as_file("drive.rfv", data, read_drive)
+
+
+def _as_file(name: str, data: bytes, read: Callable[[Path], Any]) -> None:
+    (FOLDER / name).write_bytes(data)
+    with suppress(RfedgeError):
+        read(FOLDER / name)
+
+
+TARGETS: dict[str, Callable[[bytes], None]] = {
+    "message": message,
+    "session": session,
+    "bitstream": bitstream,
+    "archive": archive,
+    "ply": ply,
+    "transforms": transforms,
+    "drive": drive,
+}

@@ -1,0 +1,192 @@
+"""Certificates on a live server: revoked, expired, granted less; connections of a great age."""
+
+import asyncio
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+
+import mec_server.server
+from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
+from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.convert_answers import server_messages_from_bytes
+from rfcore.wire.messages import Welcome
+from rfcore.wire.tls import TlsFiles
+from rfcore.wire.twin import Subscription, subscription_to_wire, twin_message_from_wire
+from rfcore.wire.v1 import field_pb2, field_pb2_grpc, twin_pb2_grpc
+from rfedge.certs.authority import Members, certify, write_certificates
+
+Files = Callable[[str], TlsFiles]
+MEMBERS = Members(("cav-raw", "cav-1", "cav-2"), ("desk", "other"), operators=("op",))
+
+
+@pytest.fixture
+def certs(tmp_path: Path) -> Files:
+    write_certificates(tmp_path / "certs", certify(MEMBERS, datetime.now(UTC), days=30))
+
+    def files(name: str) -> TlsFiles:
+        root = tmp_path / "certs"
+        return TlsFiles(root / f"{name}.pem", root / f"{name}.key", root / "ca.pem")
+
+    return files
+
+
+@pytest.fixture
+def swift(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mec_server.server, "SWEEP_EVERY_S", 0.02)
+
+
+def channel_to(address: object, tls: TlsFiles) -> grpc.aio.Channel:
+    return grpc.aio.secure_channel(str(address), tls.channel_credentials(), CHANNEL_OPTIONS)
+
+
+async def status_of_watch(address: object, tls: TlsFiles, *names: str) -> grpc.StatusCode:
+    """Watch until the server ends the stream; return how."""
+    async with channel_to(address, tls) as channel:
+        subscription = Subscription(frozenset(names))
+        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(subscription_to_wire(subscription))
+        return await call.code()
+
+
+async def open_stream(channel: grpc.aio.Channel, hello: Any) -> Any:
+    stream = channel.stream_stream(STREAM_METHOD)()
+    await stream.write(client_message_to_bytes(hello))
+    (welcome, *_) = server_messages_from_bytes(await stream.read())
+    assert isinstance(welcome, Welcome)
+    return stream
+
+
+@pytest.mark.usefixtures("swift")
+async def test_a_revoked_vehicle_loses_its_open_stream_and_another_does_not(
+    certs: Files, serve: Any, coded: Any, tmp_path: Path
+) -> None:
+    access = tmp_path / "access.toml"
+    access.write_text("")
+    async with (
+        serve(tls=certs("server"), access=access) as server,
+        channel_to(server.address, certs("vehicle-cav-raw")) as channel,
+        channel_to(server.address, certs("operator-op")) as other,
+    ):
+        stream = await open_stream(channel, coded.hello)
+        watching = twin_pb2_grpc.TwinServiceStub(other).Watch(subscription_to_wire(Subscription()))
+        await watching.initial_metadata()
+        access.write_text('revoked = ["spiffe://rfedge/vehicle/cav-raw"]')
+        assert await stream.code() is grpc.StatusCode.UNAUTHENTICATED
+        assert "revoked" in await stream.details()
+        assert not watching.done()
+        again = channel.stream_stream(STREAM_METHOD)()
+        assert await again.code() is grpc.StatusCode.UNAUTHENTICATED
+        refused = server.registry.get_sample_value("rfedge_server_refused_certificates_total")
+        assert refused == 2
+        while server.registry.get_sample_value("rfedge_server_sessions"):
+            await asyncio.sleep(0.01)
+        access.write_text("")
+        while True:  # the list is read again within a moment
+            try:
+                await open_stream(channel, coded.hello)
+                break
+            except (AssertionError, grpc.aio.AioRpcError, asyncio.InvalidStateError, TypeError):
+                await asyncio.sleep(0.02)
+
+
+@pytest.mark.usefixtures("swift")
+async def test_a_certificate_that_expires_ends_the_stream_that_it_opened(
+    certs: Files, serve: Any, coded: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with (
+        serve(tls=certs("server")) as server,
+        channel_to(server.address, certs("vehicle-cav-raw")) as channel,
+    ):
+        stream = await open_stream(channel, coded.hello)
+        later = datetime.now(UTC) + timedelta(days=31)
+        monkeypatch.setattr(server._guard, "_utc_now", lambda: later)
+        assert await stream.code() is grpc.StatusCode.UNAUTHENTICATED
+        assert "expired at" in await stream.details()
+
+
+async def first_picture(address: object, tls: TlsFiles) -> str:
+    async with channel_to(address, tls) as channel:
+        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(subscription_to_wire(Subscription()))
+        async for response in call:
+            return twin_message_from_wire(response).vehicle_id
+    raise AssertionError("the stream ended")
+
+
+async def test_consumers_see_what_they_are_granted(
+    certs: Files, serve: Any, coded: Any, street: Any, tmp_path: Path
+) -> None:
+    access = tmp_path / "access.toml"
+    access.write_text('[consumers.desk]\nvehicles = ["cav-raw"]')
+    async with (
+        serve(tls=certs("server"), access=access) as server,
+        channel_to(server.address, certs("vehicle-cav-raw")) as channel,
+    ):
+        stream = await open_stream(channel, coded.hello)
+        await stream.write(client_message_to_bytes(coded.frames[0]))
+        await stream.read()
+        address = server.address
+        assert await first_picture(address, certs("consumer-desk")) == "cav-raw"
+        assert await first_picture(address, certs("operator-op")) == "cav-raw"
+        assert await first_picture(address, certs("vehicle-cav-raw")) == "cav-raw"
+        denied = grpc.StatusCode.PERMISSION_DENIED
+        assert await status_of_watch(address, certs("consumer-other")) is denied
+        assert await status_of_watch(address, certs("consumer-desk"), "cav-2") is denied
+        assert await status_of_watch(address, certs("vehicle-cav-2"), "cav-raw") is denied
+        async with channel_to(address, certs("consumer-desk")) as desk:
+            stub = field_pb2_grpc.FieldServiceStub(desk)
+            assert not (await stub.ListFields(field_pb2.ListFieldsRequest())).field_ids
+            request = field_pb2.GetManifestRequest(field_id=street.field_id)
+            with pytest.raises(grpc.aio.AioRpcError) as told:
+                await stub.GetManifest(request)
+            assert told.value.code() is denied
+
+
+@pytest.mark.usefixtures("swift")
+async def test_a_grant_that_changes_ends_the_stream_that_had_the_old_one(
+    certs: Files, serve: Any, tmp_path: Path
+) -> None:
+    access = tmp_path / "access.toml"
+    access.write_text("[consumers.desk]\nall = true")
+    async with (
+        serve(tls=certs("server"), access=access) as server,
+        channel_to(server.address, certs("consumer-desk")) as channel,
+    ):
+        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(subscription_to_wire(Subscription()))
+        await call.initial_metadata()
+        access.write_text('[consumers.desk]\nvehicles = ["cav-1"]')
+        assert await call.code() is grpc.StatusCode.UNAUTHENTICATED
+        assert "has changed; connect again" in await call.details()
+
+
+async def test_a_connection_of_a_great_age_is_renewed(
+    serve: Any, travel: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mec_server.server, "CONNECTION_GRACE_MS", 100)
+    async with serve(max_connection_age_s=1.0) as server:
+        async with grpc.aio.insecure_channel(str(server.address)) as channel:
+            call = twin_pb2_grpc.TwinServiceStub(channel).Watch(
+                subscription_to_wire(Subscription())
+            )
+            await call.initial_metadata()
+            async with asyncio.timeout(30):
+                assert await call.code() is not grpc.StatusCode.OK
+        assert (await travel(server.address)).counts["acked"] == 6
+
+
+@pytest.mark.parametrize("claimed_ns", [0, 2**63 - 1])
+async def test_a_capture_time_that_cannot_be_makes_no_age(
+    serve: Any, coded: Any, raw_vehicle: Any, claimed_ns: int
+) -> None:
+    from dataclasses import replace
+
+    async with serve() as server, raw_vehicle(server.address) as vehicle:
+        await vehicle.greet(coded.hello)
+        frame = replace(coded.frames[0], capture_time_ns=claimed_ns)
+        assert await vehicle.told(frame) == ("ack", 0)
+        value = server.registry.get_sample_value
+        assert value("rfedge_server_implausible_captures_total") == 1
+        assert value("rfedge_twin_age_seconds") < 60
+        assert value("rfedge_server_capture_to_picture_seconds_sum") == 0

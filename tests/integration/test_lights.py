@@ -1,0 +1,86 @@
+"""A vehicle drives in another light than the tile's: it fetches the light and codes against it."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rfcore.field import FieldStore, SplatField, load_field, save_field
+from rfcore.field.layer import VOXELS_M, ColourLayer, layer_archive, layered_field, voxels_of
+from rfcore.wire.publish import Ground, publish
+from rfcore.wire.tile_manifest import VersionLabel
+
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
+DUSK = VersionLabel("dusk", passes=2, time_of_day_h=18.5)
+
+
+def darker(field: SplatField) -> SplatField:
+    """The street at night: colours of a fifth."""
+    sh = field.gaussians.sh * np.float32(0.2)
+    sh[:, 0] -= np.float32(0.4 / 0.28209479)
+    return SplatField(replace(field.gaussians, sh=sh))
+
+
+@pytest.fixture
+def folder(street: Any, tmp_path: Path) -> Path:
+    """A tile whose own field is of the night, while the drive is by day."""
+    path = tmp_path / "published"
+    path.mkdir()
+    night = tmp_path / "night.rff"
+    day = load_field(street.store / "street.rff")
+    assert isinstance(day, SplatField)
+    save_field(darker(day), night)
+    publish(path, "street", night, Ground(), NOW)
+    return path
+
+
+async def test_the_light_is_fetched_while_driving_and_used_without_a_new_stream(
+    street: Any, folder: Path, serve: Any, vehicle: Any, tmp_path: Path
+) -> None:
+    tile = publish(folder, "street", street.store / "street.rff", Ground(), NOW, DUSK)
+    async with (
+        serve(fields=folder) as server,
+        vehicle(server.address, fields=tmp_path / "mine", loop=True) as driving,
+    ):
+        await driving.until(lambda: driving.lines()[-1:] != [] and lit(driving) == street.field_id)
+        seen = driving.acked()
+        await driving.until(lambda: driving.acked() >= seen + 6)
+    lines = driving.lines()
+    assert {line["result"] for line in lines} == {"acked"}
+    assert lines[0]["light_field"] is None
+    assert {line["epoch"] for line in lines} == {0}
+    assert driving.fields() >= {f"{field_id}.rff" for field_id in tile.renderable_ids}
+    first, last = lines[0]["payload_bytes"], lines[-1]["payload_bytes"]
+    assert last < first
+
+
+async def test_a_layer_is_fetched_with_its_base(
+    street: Any, folder: Path, serve: Any, vehicle: Any, tmp_path: Path
+) -> None:
+    day = load_field(street.store / "street.rff")
+    assert isinstance(day, SplatField)
+    voxels = [np.zeros((voxels_of(day.gaussians.means, m)[1], 6), np.int32) for m in VOXELS_M]
+    voxels[-1][:, 0] = 1
+    layer = ColourLayer(tuple(voxels), np.zeros((day.primitives, 3), np.int32))
+    made = layered_field(layer_archive(layer, day, day.metadata), day, day.metadata)
+    save_field(made, tmp_path / "layer.rff")
+    FieldStore(folder).add(street.store / "street.rff")
+    publish(folder, "street", tmp_path / "layer.rff", Ground(), NOW, DUSK)
+    mine = {"fields": tmp_path / "mine", "loop": True}
+    async with serve(fields=folder) as server, vehicle(server.address, **mine) as driving:
+        await driving.until(lambda: lit(driving) == made.field_id)
+        seen = driving.acked()
+        await driving.until(lambda: driving.acked() >= seen + 3)
+    assert {line["result"] for line in driving.lines()} == {"acked"}
+    assert {f"{day.field_id}.rff", f"{made.field_id}.rff"} <= driving.fields()
+    sizes = [path.stat().st_size for path in (tmp_path / "mine").glob("*.rff")]
+    assert driving.value("rfedge_agent_field_bytes_total") == sum(sizes)
+
+
+def lit(driving: Any) -> str | None:
+    """Return the field of another light that the last picture was coded against."""
+    lines = driving.lines()
+    return lines[-1]["light_field"] if lines else None

@@ -1,0 +1,128 @@
+"""What one stream is charged for, and what it gives back, on a clock the test turns."""
+
+from dataclasses import replace
+
+import pytest
+
+from mec_server.config import AdmissionLimits, IdentityBudget, ServerBudget
+from mec_server.ledger.budgets import HELD, Resource, budgets_of
+from mec_server.ledger.entry import (
+    LEAST_BURST_FRAMES,
+    RATE_MARGIN,
+    RAW_BYTES_PER_PIXEL,
+    CameraMeter,
+    EntryControl,
+)
+from mec_server.ledger.peer_log import LINE_BURST, LINES_PER_S, LogLimiter
+from rfcore.errors import LimitExceeded
+from rfcore.wire.messages import Hello
+
+GIB = 1 << 30
+
+
+class Sender:
+    """A stream of an agent of its own."""
+
+    agent = "a"
+
+    def silent_s(self, now: float) -> float:
+        return now - now
+
+    def displace(self, error: LimitExceeded) -> None:
+        raise AssertionError(error)
+
+
+def entry_control(**limits: float) -> EntryControl:
+    budgets = budgets_of(IdentityBudget(), ServerBudget(), 2, GIB)
+    return EntryControl(budgets, AdmissionLimits(**limits), 2, 0.5, 0.0)
+
+
+def sent_in(seconds: float, meter: CameraMeter, hz: float, message_bytes: int = 10) -> int:
+    """Return how many of ``hz`` frames a second the meter lets through."""
+    passed = 0
+    for number in range(round(seconds * hz)):
+        try:
+            meter.spend(message_bytes, number / hz)
+        except LimitExceeded:
+            continue
+        passed += 1
+    return passed
+
+
+def test_a_camera_at_its_granted_rate_is_never_refused() -> None:
+    assert sent_in(60.0, CameraMeter(640 * 360, 10.0, 0.0), 10.0) == 600
+    assert sent_in(60.0, CameraMeter(640 * 360, 0.0, 0.0), 1000.0) == 60_000, "no limit was set"
+
+
+def test_a_camera_beyond_its_granted_rate_gets_that_and_a_quarter() -> None:
+    passed = sent_in(60.0, CameraMeter(640 * 360, 10.0, 0.0), 100.0)
+    assert passed == pytest.approx(60 * 10 * RATE_MARGIN + 10 * RATE_MARGIN, abs=2)
+
+
+def test_a_camera_that_sends_more_bytes_than_uncoded_pictures_have_is_refused() -> None:
+    pixels = 100
+    meter = CameraMeter(pixels, 1.0, 0.0)
+    raw = round(RAW_BYTES_PER_PIXEL * pixels)
+    for _ in range(LEAST_BURST_FRAMES // 2):
+        meter.spend(2 * raw, 0.0)
+    with pytest.raises(LimitExceeded, match=r"^camera_bytes: "):
+        meter.spend(raw, 0.0)
+
+
+def test_a_stream_gives_everything_back(hello: Hello) -> None:
+    entry = entry_control()
+    account = entry.open("s-1", "ipv4:peer", named=False, now=0.0)
+    account.enter(hello, Sender(), 0.0)
+    assert entry.ledger.held(Resource.STREAMS, hello.vehicle_id) == 1
+    assert entry.ledger.held(Resource.STREAMS, "ipv4:peer") == 0
+    assert entry.ledger.held(Resource.DECODERS) == len(hello.cameras)
+    account.leave()
+    assert entry.ledger.held(Resource.DECODERS) == 0
+    assert entry.promises.promised_share == 0.0
+    account.close()
+    account.close()
+    assert all(entry.ledger.held(resource) == 0 for resource in HELD)
+
+
+def test_a_hello_that_is_refused_holds_nothing_but_its_stream(hello: Hello) -> None:
+    entry = entry_control()
+    other = entry.open("s-1", "cav-1", named=True, now=0.0)
+    other.enter(hello, Sender(), 0.0)
+    second = entry.open("s-2", "cav-2", named=True, now=0.0)
+    another_agent = Sender()
+    another_agent.agent = "b"
+    with pytest.raises(LimitExceeded, match="camera_taken"):
+        second.enter(hello, another_agent, 0.0)
+    assert entry.ledger.held(Resource.DECODERS, "cav-2") == 0
+    assert entry.promises.promised_to("cav-2") == 0.0
+    second.close()
+    assert entry.ledger.held(Resource.STREAMS) == 1
+
+
+def test_worker_time_binds_only_while_others_stream(hello: Hello, make_frame: object) -> None:
+    frame = make_frame(0)  # type: ignore[operator]
+    entry = entry_control()
+    account = entry.open("s-1", "greedy", named=True, now=0.0)
+    account.enter(hello, Sender(), 0.0)
+    account.worked(hello.field_ids[0], 60.0, 0.0)
+    account.spend_frame(frame, 10, 0.0)
+    other = entry.open("s-2", "modest", named=True, now=0.0)
+    other.enter(replace(hello, vehicle_id="modest"), Sender(), 0.0)
+    with pytest.raises(LimitExceeded, match="identity_worker_seconds"):
+        account.spend_frame(frame, 10, 0.0)
+    other.spend_frame(frame, 10, 0.0)
+    other.leave()
+    account.spend_frame(frame, 10, 0.0)
+
+
+def test_lines_beyond_the_burst_are_suppressed_counted_and_told_once() -> None:
+    limiter = LogLimiter()
+    answers = [limiter.admit("mallory", 0.0) for _ in range(150)]
+    assert answers == [0] * round(LINE_BURST) + [None] * (150 - round(LINE_BURST))
+    assert limiter.suppressed == 50
+    assert limiter.admit("cav-1", 0.0) == 0
+    later = 1.0 / LINES_PER_S + 1e-6
+    assert limiter.admit("mallory", later) == 50
+    for number in range(5000):
+        limiter.admit(f"name-{number}", later)
+    assert len(limiter._buckets) <= 1024, "names cost no memory"

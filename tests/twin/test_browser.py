@@ -1,0 +1,169 @@
+"""The page in a real browser: a server, two vehicles, headless Chromium (software WebGL)."""
+
+import base64
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service as Driver
+
+from rfcore.dataset import read_dataset
+from rfcore.field import load_field
+from rfcore.image import rgb_from_bytes
+from rfcore.metrics.ssim import ssim
+from rfedge.demo.processes import command_of, service
+from rfedge.samples import sample_path
+
+pytestmark = [pytest.mark.slow, pytest.mark.sample]
+
+DRIVE = sample_path("street/transforms_drive_empty.json")
+LOADED_S = 120.0
+"""Software WebGL on a busy machine: the sample's splats take 10 s on an idle one."""
+OPTIONS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-dev-shm-usage",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--window-size=1100,700",
+)
+
+
+@contextmanager
+def browser() -> Iterator[webdriver.Chrome]:
+    options = webdriver.ChromeOptions()
+    options.page_load_strategy = "none"
+    options.binary_location = program("chromium")
+    for option in OPTIONS:
+        options.add_argument(option)
+    driver = webdriver.Chrome(service=Driver(program("chromedriver")), options=options)
+    driver.set_script_timeout(120)
+    try:
+        yield driver
+    finally:
+        driver.quit()
+
+
+def program(name: str) -> str:
+    found = shutil.which(name)
+    assert found is not None, f"{name} is missing; make test-system-packages installs it"
+    return found
+
+
+def until(holds: Callable[[], Any], timeout_s: float = 60.0) -> Any:
+    deadline_s = time.monotonic() + timeout_s
+    while not (value := holds()):
+        assert time.monotonic() < deadline_s, "did not come in time"
+        time.sleep(0.1)
+    return value
+
+
+@contextmanager
+def vehicle(name: str, address: str, folder: Path) -> Iterator[None]:
+    """An agent that drives the sample again and again at 2 Hz."""
+    command = [*command_of("cav-agent"), "--server", address, "--vehicle", name, "--loop"]
+    command += ["--drive", str(DRIVE), "--fields", str(sample_path("fields")), "--rate", "2"]
+    with (folder / f"{name}.log").open("wb") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(20)
+
+
+@contextmanager
+def server(folder: Path, listen: str) -> Iterator[str]:
+    command = [*command_of("mec-server"), "--fields", str(sample_path("fields"))]
+    with service("mec-server", [*command, "--listen", listen], folder) as running:
+        yield running.address
+
+
+def sequences(page: webdriver.Chrome) -> dict[str, int]:
+    script = (
+        "return [...document.querySelectorAll('#wall figure')].map("
+        "f => [f.dataset.camera, Number(f.querySelector('canvas').dataset.sequence)])"
+    )
+    return dict(page.execute_script(script))
+
+
+@pytest.mark.timeout(600)
+def test_two_vehicles_are_seen_and_seen_again_after_the_server_restarts(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        first = stack.enter_context(ExitStack())
+        address = first.enter_context(server(tmp_path, "127.0.0.1:0"))
+        twin = [*command_of("rfedge"), "twin", address, "--http", "127.0.0.1:0"]
+        twin += ["--fields", str(tmp_path / "fields")]
+        page_address = stack.enter_context(service("twin", twin, tmp_path)).address
+        for name in ("cav-1", "cav-2"):
+            stack.enter_context(vehicle(name, address, tmp_path))
+        page = stack.enter_context(browser())
+        page.get(page_address)
+
+        until(lambda: page.execute_script("return !!window.twin?.street.loaded()"), LOADED_S)
+        seen = until(lambda: len(found := sequences(page)) == 2 and found)
+        assert seen.keys() == {"cav-1/front", "cav-2/front"}
+        until(lambda: all(sequences(page)[name] > number for name, number in seen.items()))
+        assert splats_look_like_the_field(page) >= 0.7
+
+        wall_and_slider_work(page)
+        first.close()
+        until(lambda: state(page) == "waiting")
+        stack.enter_context(server(tmp_path, address))
+        until(lambda: state(page) == "connected")
+        until(lambda: len(sequences(page)) == 2)
+
+
+def state(page: webdriver.Chrome) -> str:
+    script = "return document.getElementById('connection').dataset.state"
+    return str(page.execute_script(script))
+
+
+def splats_look_like_the_field(page: webdriver.Chrome) -> float:
+    """Return the SSIM of what the page draws and our own render, from the drive's first camera."""
+    camera = read_dataset(DRIVE).pictures[0].camera
+    k, pose = camera.intrinsics, camera.world_from_cam
+    page.execute_script(
+        "window.twin.street.fix({translation_m: arguments[0], rotation_wxyz: arguments[1],"
+        "intrinsics: arguments[2]})",
+        pose.translation_m,
+        pose.rotation,
+        {"width_px": k.width_px, "height_px": k.height_px, "fx_px": k.fx_px, "fy_px": k.fy_px},
+    )
+    field = load_field(sample_path("fields/street.rff"))
+    own = (field.render_colour(camera).clip(0, 1) * 255).round().astype("uint8")
+
+    def similarity() -> float:
+        url = page.execute_script("return window.twin.street.png()")
+        drawn = rgb_from_bytes(base64.b64decode(url.partition(",")[2]), "page")
+        return ssim(drawn, own) if drawn.shape == own.shape else 0.0
+
+    best = 0.0
+    deadline_s = time.monotonic() + 60
+    while best < 0.7 and time.monotonic() < deadline_s:  # splats are sorted beside the drawing
+        best = max(best, similarity())
+        time.sleep(0.2)
+    page.execute_script("window.twin.street.fix(null)")
+    return best
+
+
+def wall_and_slider_work(page: webdriver.Chrome) -> None:
+    """Open a camera from the wall; both ends of the slider show different pictures."""
+    page.execute_script("document.querySelector('#wall figure').click()")
+    quality = "return document.getElementById('inspect-quality').textContent"
+    until(lambda: "dB" in page.execute_script(quality))
+    show = (
+        "const s = document.getElementById('inspect-slider'); s.value = arguments[0]; s.oninput();"
+        "return document.getElementById('inspect-canvas').toDataURL()"
+    )
+    page.execute_script("document.querySelector('input[value=difference]').click()")
+    reconstruction, difference = (page.execute_script(show, value) for value in (1, 0))
+    assert reconstruction != difference
+    page.execute_script("document.getElementById('inspect-close').click()")

@@ -1,0 +1,170 @@
+"""Who may open the page, what a browser is sent, and that a slow one delays nobody."""
+
+import asyncio
+import json
+import struct
+from collections.abc import AsyncIterator
+from concurrent.futures import Executor
+from contextlib import asynccontextmanager
+from typing import Any
+from unittest.mock import Mock
+
+import aiohttp
+import pytest
+
+from rfcore.errors import InvalidInput
+from rfcore.field import SplatField
+from rfcore.wire.address import Address
+from rfedge.twin.board import Board, Message
+from rfedge.twin.comparing import Comparer
+from rfedge.twin.scene import PlacedField, TwinScene
+from rfedge.twin.web import TwinWeb, WebSettings, selection
+from wall_scene import seen
+
+TOKEN = "correct-horse-battery"
+
+
+class Site:
+    """A page that is served, and a browser's session with it."""
+
+    def __init__(self, url: str, session: aiohttp.ClientSession, board: Board) -> None:
+        self.url = url.partition("?")[0]
+        self.session = session
+        self.board = board
+        self.scene = TwinScene(board)
+        self.comparer = Comparer(self.scene, Mock(Executor))
+
+    def socket(self, **headers: str) -> Any:
+        origin = {"Origin": self.url.rstrip("/"), **headers}
+        return self.session.ws_connect(f"{self.url}socket", headers=origin, max_msg_size=0)
+
+
+@asynccontextmanager
+async def site(token: str | None = None) -> AsyncIterator[Site]:
+    board = Board()
+    made = Site("", Mock(aiohttp.ClientSession), board)
+    web = TwinWeb(
+        WebSettings(Address("127.0.0.1", 0), token), board, made.scene, made.comparer, lambda: 0.0
+    )
+    made.url = (await web.start()).partition("?")[0]
+    async with aiohttp.ClientSession() as session:
+        made.session = session
+        try:
+            yield made
+        finally:
+            await web.stop()
+
+
+def header_of(data: bytes) -> dict[str, Any]:
+    (length,) = struct.unpack_from("<I", data)
+    header: dict[str, Any] = json.loads(data[4 : 4 + length])
+    return header
+
+
+async def test_the_page_and_its_parts_are_there() -> None:
+    async with site() as made:
+        for path in ("", "page/app.js", "page/vendor/three.module.min.js"):
+            async with made.session.get(made.url + path) as response:
+                assert response.status == 200
+                assert "frame-ancestors 'none'" in response.headers["Content-Security-Policy"]
+        async with made.session.get(made.url + "page/../web.py") as response:
+            assert response.status == 404
+
+
+async def test_without_the_token_nothing_is_given() -> None:
+    async with site(TOKEN) as made:
+        for path in ("", "page/app.js", "socket", "?token=wrong-horse-battery"):
+            async with made.session.get(made.url + path) as response:
+                assert response.status == 403
+        async with made.session.get(f"{made.url}?token={TOKEN}") as response:
+            assert response.status == 200
+            assert "httponly" in response.headers["Set-Cookie"].lower()
+        cookies = {"rfedge-twin": TOKEN}
+        async with aiohttp.ClientSession(cookies=cookies) as session:
+            assert (await session.get(made.url + "page/app.js")).status == 200
+
+
+async def test_health_is_told_without_the_token_and_nothing_else() -> None:
+    async with site(TOKEN) as made, made.session.get(made.url + "healthy") as response:
+        assert (response.status, await response.text()) == (200, "ok\n")
+
+
+async def test_a_foreign_name_for_this_machine_is_refused() -> None:
+    async with site() as made:
+        headers = {"Host": "evil.example"}
+        async with made.session.get(made.url, headers=headers) as response:
+            assert response.status == 403
+
+
+async def test_another_sites_script_gets_no_socket() -> None:
+    async with site() as made:
+        with pytest.raises(aiohttp.WSServerHandshakeError, match="403"):
+            async with made.socket(Origin="http://evil.example"):
+                pass
+
+
+async def test_a_browser_is_sent_what_is_shown_and_what_comes(wall: SplatField) -> None:
+    async with site() as made:
+        made.scene.place(PlacedField(wall, "tile", b"splats"), 0.0)
+        async with made.socket() as socket:
+            assert header_of(await socket.receive_bytes(timeout=5))["kind"] == "fields"
+            made.scene.show(seen(wall), 0.0)
+            data = await socket.receive_bytes(timeout=5)
+            assert header_of(data)["vehicle"] == "cav-1"
+            assert data.endswith(seen(wall).jpeg)
+        async with made.session.get(f"{made.url}splats/{wall.field_id}.spz") as response:
+            assert await response.read() == b"splats"
+        async with made.session.get(f"{made.url}splats/{'0' * 64}.spz") as response:
+            assert response.status == 404
+
+
+async def test_what_a_user_looks_at_is_compared_until_the_browser_goes(wall: SplatField) -> None:
+    async with site() as made:
+        made.scene.place(PlacedField(wall, "tile", b""), 0.0)
+        made.scene.show(seen(wall), 0.0)
+        made.comparer.began(seen(wall), 0.0)
+        made.scene.show(seen(wall, sequence=1), 0.0)
+
+        async def until(is_due: bool) -> None:
+            async with asyncio.timeout(5):
+                while (made.comparer.due(0.0) is not None) != is_due:
+                    await asyncio.sleep(0.01)
+
+        async with made.socket() as socket:
+            await socket.send_str(json.dumps({"select": ["cav-1", "front"]}))
+            await until(True)
+            await socket.send_str(json.dumps({"select": None}))
+            await until(False)
+            await socket.send_str(json.dumps({"select": ["cav-1", "front"]}))
+            await until(True)
+        await until(False)
+
+
+async def test_a_browser_that_reads_nothing_delays_nobody() -> None:
+    async with site() as made, made.socket() as slow, made.socket() as quick:
+        assert not slow.closed
+        part = bytes(1 << 20)
+        for number in range(64):  # far more than the sockets of both ends hold
+            made.board.post("a", Message({"number": number}, 0.0, (part,)))
+            async with asyncio.timeout(5):
+                while header_of(await quick.receive_bytes())["number"] != number:
+                    pass
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"select": 1}', '{"other": null}', '{"select": [1, 2]}']
+)
+def test_what_the_page_never_says_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"."):
+        selection(text)
+
+
+@pytest.mark.parametrize(
+    ("host", "token", "problem"),
+    [("0.0.0.0", None, "give a token"), ("127.0.0.1", "short", "5 characters, fewer than 16")],
+)
+def test_a_page_for_everybody_needs_a_token_worth_the_name(
+    host: str, token: str | None, problem: str
+) -> None:
+    with pytest.raises(InvalidInput, match=problem):
+        WebSettings(Address(host, 8080), token)

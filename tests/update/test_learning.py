@@ -1,0 +1,138 @@
+"""What is learnt of another light and of change, and what is not written."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rfcore.errors import InvalidInput
+from rfcore.field import SplatField
+from rfcore.field.store import decode_field, encode_field
+from rfcore.image import Rgb
+from rfcore.update.agreement import trusted_pixels
+from rfcore.update.colours import ColourFit, colour_layer
+from rfcore.update.passes import Pass, split_frames
+from rfcore.update.run import LearnAs, UpdateSettings, learn
+from rfcore.update.splats import FineTuning, fine_tuned
+from rfcore.update.trial import Trial, saved_percent, try_field
+
+MakePass = Callable[..., Pass]
+QUICK = UpdateSettings(fine_tuning=FineTuning(120, growth=0.0))
+
+
+def with_vehicle(number: int, rgb: Rgb) -> Rgb:
+    """A white block that drives by, a place further in every frame."""
+    out = rgb.copy()
+    out[24:48, 4 * number + 8 : 4 * number + 32] = 255
+    return out
+
+
+def luma_error(field: SplatField, drive: Pass) -> float:
+    shown = [np.clip(field.render_colour(p.camera), 0, 1) * 255 for p in drive.pictures]
+    pairs = zip(shown, drive.pictures, strict=True)
+    return float(np.mean([np.abs(colour - p.read()).mean() for colour, p in pairs]))
+
+
+def test_another_light_is_learnt_and_pays(
+    noon: SplatField, dusk: SplatField, make_pass: MakePass
+) -> None:
+    passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
+    update = learn(noon, passes, QUICK)
+    assert not update.refused
+    assert update.mean_saved_percent > 10
+    third = make_pass(dusk, "c", -0.1)
+    assert luma_error(update.learnt, third) < 0.2 * luma_error(noon, third)
+
+
+def test_a_layer_learns_the_light_on_the_shape_that_is_there(
+    noon: SplatField, dusk: SplatField, make_pass: MakePass
+) -> None:
+    passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
+    update = learn(noon, passes, replace(QUICK, learn_as=LearnAs.COLOURS))
+    assert not update.refused
+    third = make_pass(dusk, "c", -0.1)
+    assert luma_error(update.learnt, third) < 0.3 * luma_error(noon, third)
+    data = encode_field(update.learnt)
+    again = decode_field(data, open_base=lambda _: noon)
+    assert (again.gaussians.sh == update.learnt.gaussians.sh).all()  # type: ignore[attr-defined]
+    assert (again.gaussians.means == noon.gaussians.means).all()  # type: ignore[attr-defined]
+
+
+def test_what_is_known_already_is_not_written(noon: SplatField, make_pass: MakePass) -> None:
+    update = learn(noon, [make_pass(noon, "a"), make_pass(noon, "b", 0.1)], QUICK)
+    assert "less than 2 %" in update.refused or "rise by" in update.refused
+
+
+def test_a_pass_that_gets_dearer_withholds_the_update(
+    noon: SplatField, dusk: SplatField, make_pass: MakePass
+) -> None:
+    """Two at dusk outvote one at noon, whose bits would rise."""
+    passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.1), make_pass(noon, "c", 0.05)]
+    assert learn(noon, passes, QUICK).refused.startswith("bits rise by")
+
+
+def test_the_same_passes_give_the_same_field(
+    noon: SplatField, dusk: SplatField, make_pass: MakePass
+) -> None:
+    frames, _ = split_frames([make_pass(dusk, "a"), make_pass(dusk, "b", 0.1)], 24)
+    config = FineTuning(30)
+    first = fine_tuned(noon, frames, config)
+    second = fine_tuned(noon, frames, replace(config, threads=2))
+    assert first.field_id == second.field_id
+    fit = ColourFit(2, 2)
+    layers = [colour_layer(noon, frames, replace(fit, threads=t)) for t in (1, 2)]
+    assert layers[0].field_id == layers[1].field_id
+
+
+def test_what_drives_by_in_one_pass_is_not_trusted(noon: SplatField, make_pass: MakePass) -> None:
+    passes = [make_pass(noon, "a", paint=with_vehicle), make_pass(noon, "b", 0.03)]
+    frames, _ = split_frames(passes, 24)
+    trusted = trusted_pixels(noon, frames)
+    first = trusted[0]
+    assert first is not None
+    assert not first[28:44, 16:24].any()
+    assert first[:, 72:].all()
+    assert all(mask is None for mask in trusted[len(frames) // 2 :])
+
+
+def test_what_all_passes_see_is_trusted(noon: SplatField, make_pass: MakePass) -> None:
+    def parked(_: int, rgb: Rgb) -> Rgb:
+        return with_vehicle(5, rgb)
+
+    passes = [make_pass(noon, "a", paint=parked), make_pass(noon, "b", 0.01, paint=parked)]
+    frames, _ = split_frames(passes, 24)
+    masks = trusted_pixels(noon, frames)
+    assert all(mask is None or mask[28:44, 32:44].all() for mask in masks)
+
+
+def test_a_vehicle_in_one_of_two_passes_is_not_baked_in(
+    noon: SplatField, make_pass: MakePass
+) -> None:
+    """A wall in white before the first vehicle; against the same update without votes."""
+
+    def walled(_: int, rgb: Rgb) -> Rgb:
+        out = rgb.copy()
+        out[16:] = 255
+        return out
+
+    passes = [make_pass(noon, "a", paint=walled), make_pass(noon, "b", 0.03)]
+    frames, _ = split_frames(passes, 24)
+    empty = make_pass(noon, "c", 0.06)
+    believed = [replace(frame, pass_number=0) for frame in frames]
+    config = FineTuning(80, sh_dc=2e-2, growth=0.0)
+    voted = luma_error(fine_tuned(noon, frames, config), empty)
+    assert voted < 0.5 * luma_error(fine_tuned(noon, believed, config), empty)
+
+
+def test_bits_are_compared_at_equal_quality() -> None:
+    """Two lines of equal slope in log(rate), a factor of two apart."""
+    before = Trial({0: ((30.0, 100.0), (33.0, 200.0), (36.0, 400.0))})
+    after = Trial({0: ((31.0, 100 * 2 ** (1 / 3) / 2), (37.0, 100 * 2 ** (7 / 3) / 2))})
+    assert saved_percent(before, after)[0] == pytest.approx(50.0)
+    assert saved_percent(after, before)[0] == pytest.approx(-100.0)
+
+
+def test_a_trial_without_frames_is_refused(noon: SplatField) -> None:
+    with pytest.raises(InvalidInput, match="no frames are held back"):
+        try_field(noon, [])

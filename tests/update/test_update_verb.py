@@ -1,0 +1,88 @@
+"""``rfedge field update`` and ``disagree`` on recordings of two vehicles."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfcore.dataset.source import SourceCamera
+from rfcore.dataset.write import WrittenPicture, write_transforms
+from rfcore.errors import InvalidInput
+from rfcore.field import SplatField, load_field, save_field
+from rfcore.image import read_rgb, write_png
+from rfcore.update.passes import Pass
+from rfedge.cli.field_update import FieldDisagree, FieldUpdate
+from rfedge.fields.disagree import disagreement_picture
+
+MakePass = Callable[..., Pass]
+
+
+def recorded(folder: Path, drive: Pass) -> Path:
+    """Write a pass as a dataset."""
+    folder.mkdir()
+    written = []
+    for picture in drive.pictures:
+        write_png(folder / picture.name, picture.read())
+        camera = SourceCamera(picture.camera.intrinsics)
+        written.append(WrittenPicture(picture.name, camera, picture.camera.world_from_cam))
+    write_transforms(folder, written, None)
+    return folder
+
+
+@pytest.mark.parametrize("learn_as", ["all", "colours"])
+def test_what_pays_is_written(
+    noon: SplatField,
+    dusk: SplatField,
+    make_pass: MakePass,
+    tmp_path: Path,
+    learn_as: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    save_field(noon, tmp_path / "noon.rff")
+    passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
+    folders = tuple(recorded(tmp_path / drive.identity, drive) for drive in passes)
+    out = tmp_path / "dusk.rff"
+    FieldUpdate(
+        tmp_path / "noon.rff",
+        folders,
+        out,
+        learn_as,  # type: ignore[arg-type]
+        iterations=120,
+    ).run()
+    assert "% fewer bits" in capsys.readouterr().out
+    assert load_field(out).field_id != noon.field_id
+
+
+def test_what_does_not_pay_is_not(noon: SplatField, make_pass: MakePass, tmp_path: Path) -> None:
+    save_field(noon, tmp_path / "noon.rff")
+    folders = [recorded(tmp_path / name, make_pass(noon, name)) for name in "ab"]
+    out = tmp_path / "again.rff"
+    with pytest.raises(InvalidInput, match="nothing is written"):
+        FieldUpdate(tmp_path / "noon.rff", tuple(folders), out, iterations=20).run()
+    assert not out.exists()
+
+
+def test_disagreement_is_red_where_something_stands(
+    noon: SplatField, make_pass: MakePass, tmp_path: Path
+) -> None:
+    """A dark block in a picture that is darker as a whole: the block alone is marked."""
+
+    def block(_: int, rgb: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+        out = (0.6 * rgb).astype(np.uint8)
+        out[16:40, 24:48] = 255
+        return out
+
+    drive = make_pass(noon, "a", paint=block)
+    save_field(noon, tmp_path / "noon.rff")
+    out = tmp_path / "out" / "red.png"
+    FieldDisagree(tmp_path / "noon.rff", (recorded(tmp_path / "a", drive),), out).run()
+    shown = read_rgb(out)
+    assert shown.shape == (4 * 64, 3 * 96, 3)
+    redness = shown[:64, 192:, 0].astype(int) - shown[:64, 192:, 1]
+    assert redness[20:36, 28:44].mean() > 3 * redness[:, 64:].mean()
+
+
+def test_disagreement_without_pictures_is_refused(noon: SplatField) -> None:
+    with pytest.raises(InvalidInput, match="no pictures"):
+        disagreement_picture(noon, [])
