@@ -38,7 +38,7 @@ def test_what_grows_is_named(samples: list[Sample], said: str) -> None:
 
 
 def test_a_thing_that_comes_and_goes_is_no_growth() -> None:
-    """A connection at the start and one at the end, of a scrape or a check of health."""
-    samples = looks(descriptors=41)
-    samples[1] = Sample(60.0, 0.0, 0.0, 200.0, 41, 9, 2)
+    """A connection that lives for a moment, of a scrape or a check of health."""
+    samples = looks()
+    samples[9] = Sample(540.0, 0.0, 0.0, 200.0, 41, 9, 2)
     assert what_grew(samples) == []
