@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field import FULL, Quality, Renderer, render_field_view
-from rfcore.localise.agreement import agreement, eight_bits, near_on_the_spot
+from rfcore.localise.agreement import agreement, eight_bits
 from rfcore.localise.matching import Features, Solution, features, grey, lifted, matched, solved
 from rfcore.localise.prior import PosePrior, hypotheses
 from rfcore.localise.structure import Pyramid
-from rfcore.localise.track import HALF, Track, TrackSettings, begun
+from rfcore.localise.track import Track, TrackSettings, begun
 from rfcore.views import FieldView, View
 
 __all__ = [
@@ -196,15 +196,11 @@ class Localiser:
 
     def _agreement(self, luma: U8, solution: Solution) -> tuple[Solution, float] | None:
         """Return the solution aligned photometrically, and its agreement; None if refuted."""
-        levels, least = Pyramid(luma), self._settings
-        track = self._settled(levels, solution.world_from_cam)
+        track = self._settled(Pyramid(luma), solution.world_from_cam)
         if track is None:
             return None
-        drawn = track.template.structures[HALF]
-        if near_on_the_spot(levels[HALF], drawn, track.view) < least.least_on_the_spot:
-            return None
         alike = agreement(luma, self._render(track.world_from_cam))
-        if alike < least.least_agreement:
+        if alike < self._settings.least_agreement:
             return None
         return replace(solution, world_from_cam=track.world_from_cam), alike
 
@@ -216,15 +212,8 @@ class Localiser:
                 self._renderer, Camera(self._intrinsics, pose).rounded(), self._quality
             )
 
-        settings, track = TrackSettings(), None
-        for _ in range(MOST_ALIGNMENTS):
-            track = begun(0, near, None, levels, render_at, settings)
-            if track is None:
-                return None
-            near = track.world_from_cam
-            if track.correction_px <= settings.redraw_px:
-                break
-        return track
+        settings = TrackSettings(least_on_the_spot=self._settings.least_on_the_spot)
+        return begun(0, near, None, levels, render_at, settings, MOST_ALIGNMENTS)
 
     def _render(self, world_from_cam: Pose) -> View:
         return self._renderer.render(Camera(self._intrinsics, world_from_cam), self._quality)

@@ -60,6 +60,8 @@ LEAST_BETWEEN_S = 0.01
 """Poses nearer in time show no motion."""
 CARRY_OF_MOTION = 0.3
 """Share of the motion since a search's picture that carrying its pose forward may be wrong by."""
+CARRY_ALIGNMENTS = 2
+"""Alignments of a pose carried forward: it is further off than a prediction, and frames wait."""
 RECENT_S = 3.0
 """A pose known so long ago still tells where to search."""
 RECENT_M, RECENT_DEG, RECENT_DEG_PER_S = 0.5, 1.5, 4.0
@@ -223,7 +225,7 @@ class PoseTracker:
         off_m = CARRY_OF_MOTION * seconds * (speed_m_s if self._motion else UNKNOWN_SPEED_M_S)
         expected = Expected(RECENT_M / 2 + off_m, math.radians(RECENT_DEG))
         near = found.world_from_cam.compose(moved)
-        return begun(time_ns, near, expected, levels, render_at, settings)
+        return begun(time_ns, near, expected, levels, render_at, settings, CARRY_ALIGNMENTS)
 
     def _tracking(self, track: Track) -> Fix:
         self.counts[Event.TRACKED] += 1

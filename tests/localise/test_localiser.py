@@ -13,6 +13,7 @@ from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import FULL, Quality, RadianceField, load_field, render_field_view
 from rfcore.localise.agreement import agreement, near_on_the_spot
+from rfcore.localise.alignment import Expected
 from rfcore.localise.localiser import (
     Localised,
     Localiser,
@@ -23,9 +24,11 @@ from rfcore.localise.localiser import (
 )
 from rfcore.localise.matching import grey
 from rfcore.localise.prior import PosePrior, moved
-from rfcore.localise.structure import halved, structure
+from rfcore.localise.structure import Pyramid, halved, structure
+from rfcore.localise.track import Track, TrackSettings, begun
+from rfcore.localise.tracker import CARRY_ALIGNMENTS, full_range
 from rfcore.motion import rotation_vector
-from rfcore.views import PosedPicture, View
+from rfcore.views import FieldView, PosedPicture, View
 
 pytestmark = pytest.mark.sample
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -134,6 +137,40 @@ def test_near_things_tell_a_pose_from_one_decimetres_away_that_far_things_cannot
         assert on_the_spot(taken, (0.0, 0.0, 0.0)) > 1.4 * limit
         for by_m in ((0.0, 0.0, 0.5), (0.0, 0.0, -0.5), (0.4, 0.0, 0.0)):
             assert on_the_spot(taken, by_m) < 0.7 * limit
+
+
+CARRIED_OFF_M: tuple[Vec3, ...] = (
+    *((0.0, 0.0, z) for z in (-1.0, -0.5, 0.5, 1.0, 1.5, 2.5)),
+    *((x, 0.0, 0.0) for x in (-0.5, 0.5, 1.0)),
+    *((x, 0.0, x) for x in (-0.7, 0.7)),
+)
+"""What is left when a pose was carried over half a second by a motion that is not known well."""
+
+
+def carried(taken: PosedPicture, off_m: Vec3) -> Track | None:
+    """Begin a track where a picture was not taken, as with a pose found in an earlier picture."""
+
+    def render_at(pose: Pose) -> FieldView:
+        return render_field_view(field(), Camera(taken.camera.intrinsics, pose).rounded())
+
+    near = moved(taken.camera.world_from_cam, off_m, (0.0, math.radians(0.7), 0.0))
+    expected, levels = Expected(0.4, math.radians(1.5)), Pyramid(full_range(grey(taken.read())))
+    return begun(0, near, expected, levels, render_at, TrackSettings(), CARRY_ALIGNMENTS)
+
+
+@pytest.mark.parametrize(("number", "drive"), [(9, "empty"), (21, "vehicles")])
+def test_a_track_that_begins_metres_off_is_right_or_does_not_begin(number: int, drive: str) -> None:
+    """By alignment and agreement alone, half of what begins here would be up to 2 m wrong."""
+    taken = picture(number, drive)
+    tracks = [carried(taken, off_m) for off_m in CARRIED_OFF_M]
+    truth = taken.camera.world_from_cam
+    off_m = [
+        math.dist(truth.translation_m, track.view.camera.world_from_cam.translation_m)
+        for track in tracks
+        if track is not None
+    ]
+    assert max(off_m) < 0.1
+    assert len(off_m) >= 3
 
 
 class Emptiness:
