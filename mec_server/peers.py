@@ -1,7 +1,8 @@
 """Peers of gRPC calls: whom a call is charged to, and how it is told that it is refused.
 
 ``ChargeRpcs`` charges every call of the server, whatever its service, for as long as it lasts: also
-health checks, and calls whose peer does not read its status.
+health checks, and calls whose peer does not read its status. What fails unexpectedly in a call is
+told to the log; the peer learns no more than that it failed.
 """
 
 from __future__ import annotations
@@ -9,9 +10,11 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import grpc
+import structlog
 
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Hold, Ledger
@@ -21,6 +24,10 @@ from rfcore.wire.identity import peer_identity
 from rfcore.wire.status import status_of
 
 __all__ = ["ChargeRpcs", "Slots", "abort", "peer_account"]
+
+log = structlog.get_logger()
+
+FAILED = "the server failed in this call, and has logged why"
 
 Context = grpc.aio.ServicerContext[Any, Any]
 if TYPE_CHECKING:
@@ -98,15 +105,27 @@ class ChargeRpcs(grpc.aio.ServerInterceptor):
 
     def _wrapped(self, behaviour: Callable[..., Any]) -> Callable[..., Any]:
         async def call(request: Any, context: Context) -> Any:
-            with await self._hold(context):
+            async with self._held(context):
                 return await behaviour(request, context)
 
         async def generate(request: Any, context: Context) -> AsyncIterator[Any]:
-            with await self._hold(context):
+            async with self._held(context):
                 async for response in behaviour(request, context):
                     yield response
 
         return generate if inspect.isasyncgenfunction(behaviour) else call
+
+    @asynccontextmanager
+    async def _held(self, context: Context) -> AsyncIterator[None]:
+        """Hold what the call takes while it lasts; an unexpected failure ends it with INTERNAL."""
+        with await self._hold(context):
+            try:
+                yield
+            except grpc.aio.AbortError:
+                raise
+            except Exception:
+                log.exception("call failed", peer=context.peer())
+                await context.abort(grpc.StatusCode.INTERNAL, FAILED)
 
     async def _hold(self, context: Context) -> Hold:
         identity, _ = peer_account(context)

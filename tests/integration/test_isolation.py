@@ -17,6 +17,7 @@ from mec_server.config import AdmissionLimits, DecoderKind
 from mec_server.connection_cap import ConnectionCap
 from mec_server.decode_jobs import DecodeJob, OpenJob
 from mec_server.metrics import BackgroundTask
+from mec_server.peers import FAILED
 from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.wire.conventions import AGENT_PROCESS
@@ -336,7 +337,7 @@ async def opening_fails(scene: Scene) -> Any:
     async with scene.serve(opened) as server:
         async with scene.raw_vehicle(server.address) as bad:
             await bad.say(replace(scene.coded.hello, vehicle_id="cav-bad"))
-            assert await bad.end() is grpc.StatusCode.UNKNOWN, "the stream that met it ends"
+            assert await bad.end() is grpc.StatusCode.INTERNAL, "the stream that met it ends"
         await drive_on(scene, server)
     return server
 
@@ -348,7 +349,7 @@ async def stream_fails(scene: Scene) -> Any:
     async with scene.serve(watched(broken)) as server, scene.raw_vehicle(server.address) as vehicle:
         await vehicle.greet(scene.coded.hello)
         await vehicle.say(scene.coded.frames[0])
-        assert await vehicle.end() is grpc.StatusCode.UNKNOWN
+        assert await vehicle.end() is grpc.StatusCode.INTERNAL
     return server
 
 
@@ -362,7 +363,8 @@ async def consumer_fails(scene: Scene) -> Any:
         await drive_on(scene, server)
         with pytest.raises(grpc.aio.AioRpcError) as raised:
             await watching.read()
-        assert raised.value.code() is grpc.StatusCode.UNKNOWN
+        assert raised.value.code() is grpc.StatusCode.INTERNAL
+        assert raised.value.details() == FAILED  # and nothing of the exception
         await drive_on(scene, server)
     return server
 
