@@ -11,6 +11,9 @@ from concurrent.futures import Executor, Future
 from dataclasses import replace
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cav_agent.frames import Capture
 from rfcore.camera import Intrinsics, Vec3
 from rfcore.codec.sender.ladder import Rung
@@ -21,10 +24,13 @@ from rfcore.localise.localiser import Localised, Localiser, Lost
 from rfcore.localise.matching import use_one_thread
 from rfcore.localise.measurement import PoseMeasurement
 from rfcore.localise.track import Effort
-from rfcore.localise.tracker import PoseTracker, SearchJob
+from rfcore.localise.tracker import PoseTracker, SearchJob, Seen, full_range
 
 __all__ = ["CameraTracking", "DatasetPoses", "Measurements"]
 
+U8 = NDArray[np.uint8]
+_Found = tuple[Localised | Lost, Seen | None]
+"""What a search ended with, and where a later picture was taken, if that was looked for."""
 DATASET_STD_M, DATASET_STD_DEG = 0.5, 1.0
 """Poses of a dataset stand in for a sensor's as good as that."""
 
@@ -92,7 +98,8 @@ class CameraTracking:
         self._localiser: Localiser = self._tracker.localiser()
         self._poses, self._searcher = poses, searcher
         self._patient = patient
-        self._running: tuple[SearchJob, Future[Localised | Lost]] | None = None
+        self._running: tuple[SearchJob, Future[_Found]] | None = None
+        self._newest: tuple[int, U8] | None = None
 
     def locate(self, capture: Capture, frame: I420, rung: Rung) -> Fix:
         """Return what is known of a picture's pose, looked for as hard as ``rung`` says."""
@@ -102,6 +109,7 @@ class CameraTracking:
         for measured in self._poses.measurements(capture):
             self._tracker.measure(measured)
         self._collect()
+        self._newest = None if self._running is None else (time_ns, full_range(frame.y))
         fix = self._tracker.locate(frame, time_ns, quality=rung.quality, effort=effort)
         self._begin_search()
         if self._patient and self._running is not None:
@@ -122,12 +130,19 @@ class CameraTracking:
             return
         job = self._tracker.search()
         if job is not None:
-            future = self._searcher.submit(self._localiser.localise_luma, job.luma, job.prior)
-            self._running = (job, future)
+            self._running = (job, self._searcher.submit(self._search, job))
+
+    def _search(self, job: SearchJob) -> _Found:
+        """Run a search, on its own thread, and look for the picture that is the newest by then."""
+        answer = self._localiser.localise_luma(job.luma, job.prior)
+        newest = self._newest
+        if isinstance(answer, Lost) or newest is None:
+            return answer, None
+        return answer, job.later(answer.world_from_cam, *newest, self._localiser)
 
     def _collect(self) -> None:
         """Bring a search that has ended to the tracker; raise what it raised."""
         if self._running is None or not self._running[1].done():
             return
         (job, future), self._running = self._running, None
-        self._tracker.searched(job, future.result())
+        self._tracker.searched(job, *future.result())

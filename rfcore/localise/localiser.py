@@ -10,6 +10,9 @@ pose found, which resembles the picture more. A pose is accepted if it passes fo
 * agreement: the render at the pose resembles the picture, pixel on pixel, far better than chance;
 * nearness: what is near lies where the picture has it, or far matches alone made the pose.
 
+The first hypothesis is tried with pictures of half the resolution first, whose features take a
+quarter of the time: where that passes every check, as it mostly does, nothing else is looked at.
+
 Otherwise the next hypothesis is tried, and after the last one the camera is lost: no pose is given.
 No clock and no chance: the same picture, field and prior give the same answer.
 """
@@ -19,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +53,8 @@ MOST_ALIGNMENTS = 3
 """A pose that alignment still moves is aligned again, so often at most: of few matches, all far
 away, features make poses that are decimetres off, and one alignment goes half the way.
 """
+LEAST_HALVED_PX = 90
+"""Shorter side of a halved picture that is looked at for features."""
 
 
 @dataclass(frozen=True)
@@ -153,23 +158,58 @@ class Localiser:
 
     def localise_luma(self, luma: U8, prior: PosePrior) -> Localised | Lost:
         """Return the pose of the camera that took a picture of full-range luma, uint8 [H, W]."""
-        seen = features(luma, self._settings.features)
-        if len(seen.uv_px) < self._settings.least_inliers:
+        starts: Iterator[tuple[Pose, View]]
+        starts = islice(self._starts(prior), self._settings.most_hypotheses)
+        coarse = self._features(luma, 1)
+        if coarse is not None:
+            first = next(starts)
+            answer = self._tried(luma, prior, coarse, *first)
+            if not isinstance(answer, Obstacle):
+                return Localised(*answer, 1)
+            starts = chain([first], starts)
+        seen = self._features(luma, 0)
+        if seen is None:
             return Lost(Obstacle.FEW_FEATURES, 0)
         furthest, tried = Obstacle.FEW_INLIERS, 0
-        for start, view in islice(self._starts(prior), self._settings.most_hypotheses):
-            tried += 1
-            solution = self._solution(seen, start, view)
-            if solution is None:
-                continue
-            if not prior.allows(solution.world_from_cam):
-                furthest = max(furthest, Obstacle.IMPLAUSIBLE)
-                continue
-            alike = self._agreement(luma, solution)
-            if alike is not None:
-                return Localised(*alike, tried)
-            furthest = Obstacle.UNLIKE
+        for tried, start in enumerate(starts, 1):
+            answer = self._tried(luma, prior, seen, *start)
+            if not isinstance(answer, Obstacle):
+                return Localised(*answer, tried)
+            furthest = max(furthest, answer)
         return Lost(furthest, tried)
+
+    def again(self, luma: U8, prior: PosePrior) -> Pose | None:
+        """Return where a picture was taken shortly after one whose pose, the prior's, was found.
+
+        By the features of half the resolution and one render, a quarter of a search's time. Only
+        inliers and the prior speak for it: it says where to begin a track, which checks it.
+        """
+        seen = self._features(luma, 1) or self._features(luma, 0)
+        if seen is None:
+            return None
+        view = self._render(prior.world_from_cam)
+        solution = self._solution(seen, prior.world_from_cam, view, 1)
+        if solution is None or solution.inliers < self._settings.least_inliers:
+            return None
+        return solution.world_from_cam if prior.allows(solution.world_from_cam) else None
+
+    def _features(self, luma: U8, halvings: int) -> Features | None:
+        """Return a picture's features; None where they, or the halved picture, are too few."""
+        if halvings and min(luma.shape) < 2 * LEAST_HALVED_PX:
+            return None
+        seen = features(luma, self._settings.features, halvings)
+        return seen if len(seen.uv_px) >= self._settings.least_inliers else None
+
+    def _tried(
+        self, luma: U8, prior: PosePrior, seen: Features, start: Pose, view: View
+    ) -> tuple[Solution, float] | Obstacle:
+        """Return the pose that a hypothesis leads to and its agreement, or what kept it from it."""
+        solution = self._solution(seen, start, view, self._settings.rounds)
+        if solution is None:
+            return Obstacle.FEW_INLIERS
+        if not prior.allows(solution.world_from_cam):
+            return Obstacle.IMPLAUSIBLE
+        return self._agreement(luma, solution) or Obstacle.UNLIKE
 
     def _starts(self, prior: PosePrior) -> Iterator[tuple[Pose, View]]:
         """Yield hypotheses with their renders; the first one tells how far apart the others are."""
@@ -179,14 +219,14 @@ class Localiser:
         for pose in poses:
             yield pose, self._render(pose)
 
-    def _solution(self, seen: Features, start: Pose, view: View) -> Solution | None:
-        """Return the pose that enough matches agree with, after all rounds, or None."""
+    def _solution(self, seen: Features, start: Pose, view: View, rounds: int) -> Solution | None:
+        """Return the pose that enough matches agree with, after so many rounds, or None."""
         s, k = self._settings, self._intrinsics
         solution = None
-        for number in range(s.rounds):
+        for number in range(rounds):
             if solution is not None:
                 start, view = solution.world_from_cam, self._render(solution.world_from_cam)
-            drawn = features(grey(eight_bits(view.colour)), s.features)
+            drawn = features(grey(eight_bits(view.colour)), s.features, seen.halvings)
             found = lifted(matched(seen, drawn, s.ratio), view, k, s.least_confidence)
             solution = solved(found, k, start, s.inlier_px if number else s.first_inlier_px)
             least = s.least_inliers if number else s.least_first_inliers

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Intrinsics, Pose
 from rfcore.extras import needs
+from rfcore.localise.structure import halved
 from rfcore.views import View
 
 with needs("localise"):
@@ -46,10 +47,14 @@ FEWEST_FOR_PNP = 6
 
 @dataclass(frozen=True)
 class Features:
-    """Where something is, ``uv_px`` float64 [N, 2], and what: ``descriptors`` float32 [N, 128]."""
+    """Where something is, ``uv_px`` float64 [N, 2], and what: ``descriptors`` float32 [N, 128].
+
+    Places are those of the whole picture, which was halved so many times before it was looked at.
+    """
 
     uv_px: F64
     descriptors: F32
+    halvings: int = 0
 
 
 @dataclass(frozen=True)
@@ -79,13 +84,19 @@ def grey(rgb: U8) -> U8:
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def features(luma: U8, most: int) -> Features:
-    """Return at most ``most`` features of a picture uint8 [H, W], the strongest."""
+def features(luma: U8, most: int, halvings: int = 0) -> Features:
+    """Return at most ``most`` features of a picture uint8 [H, W], the strongest.
+
+    ``halvings``: of the picture's resolution before; each takes three quarters of the time away.
+    """
+    for _ in range(halvings):
+        luma = halved(luma)
     places, descriptors = cv2.SIFT.create(most).detectAndCompute(luma, None)
     if descriptors is None:
-        return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
-    uv_px = np.array([place.pt for place in places], np.float64)
-    return Features(uv_px, np.asarray(descriptors, np.float32))
+        return Features(np.empty((0, 2)), np.empty((0, 128), np.float32), halvings)
+    step = 2**halvings
+    uv_px = step * np.array([place.pt for place in places], np.float64) + (step - 1) / 2
+    return Features(uv_px, np.asarray(descriptors, np.float32), halvings)
 
 
 def matched(seen: Features, drawn: Features, ratio: float) -> tuple[F64, F64]:

@@ -8,7 +8,8 @@ rendered at the pose to send, or that the camera is not known to be anywhere.
 * *Localising*: a search (``rfcore.localise.localiser``) is to be run or is running. The machine
   hands out a ``SearchJob``; whoever drives it runs the job when and where it likes and brings the
   answer back (``searched``). By then newer pictures have come: the pose found is carried forward by
-  what is known of the motion and aligned with the next picture.
+  what is known of the motion and aligned with the next picture. Where no motion is known, the one
+  who ran the job looks for the newest picture, too, from the pose found, which is soon done.
 * *Tracking*: each picture is predicted, aligned and checked (``rfcore.localise.track``). The check
   is of the render at the very pose to be sent; a pose that does not pass is never sent.
 
@@ -47,7 +48,7 @@ from rfcore.localise.track import (
 )
 from rfcore.views import FieldView
 
-__all__ = ["PoseTracker", "SearchJob", "TrackerSettings", "full_range"]
+__all__ = ["PoseTracker", "SearchJob", "Seen", "TrackerSettings", "full_range"]
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -80,22 +81,38 @@ DEFAULTS = TrackerSettings()
 ONE_MORE_RENDER = Effort(1)
 
 
+@dataclass(frozen=True)
+class Seen:
+    """Where the camera was at a time."""
+
+    time_ns: int
+    world_from_cam: Pose
+
+
 @dataclass(frozen=True, eq=False)
 class SearchJob:
-    """A search to be run: ``Localiser.localise_luma(luma, prior)``, anywhere, then ``searched``."""
+    """A search to be run: ``Localiser.localise_luma(luma, prior)``, anywhere, then ``searched``.
+
+    ``motion``: of the camera, where known. Where it is not, a pose that was found says little about
+    the pictures taken meanwhile, and whoever runs the job looks where a later one was taken.
+    """
 
     number: int
     time_ns: int
     luma: U8
     prior: PosePrior
+    motion: Motion | None = None
 
+    def later(self, found: Pose, time_ns: int, luma: U8, localiser: Localiser) -> Seen | None:
+        """Return where a picture was taken later than the job's, in which the camera was found.
 
-@dataclass(frozen=True)
-class _Seen:
-    """Where the camera was at a time."""
-
-    time_ns: int
-    world_from_cam: Pose
+        None where the motion is known already, or it was not found.
+        """
+        if self.motion is not None or time_ns <= self.time_ns:
+            return None
+        prior = _expected_since(Seen(self.time_ns, found), None, time_ns)
+        pose = localiser.again(luma, prior)
+        return None if pose is None else Seen(time_ns, pose)
 
 
 class PoseTracker:
@@ -117,8 +134,8 @@ class PoseTracker:
         self.feed = MeasuredPoses(self.counts, bounds)
         self._time_ns: int | None = None
         self._track: Track | None = None
-        self._found: _Seen | None = None
-        self._seen: _Seen | None = None
+        self._found: Seen | None = None
+        self._seen: Seen | None = None
         self._motion: Motion | None = None
         self._inliers: int | None = None
         self._job: SearchJob | None = None
@@ -174,8 +191,11 @@ class PoseTracker:
         self.counts[Event.SEARCHED] += 1
         return self._job
 
-    def searched(self, job: SearchJob, answer: Localised | Lost) -> None:
-        """Take in what a search found. An answer to a job that was given up is left out."""
+    def searched(self, job: SearchJob, answer: Localised | Lost, later: Seen | None = None) -> None:
+        """Take in what a search found, and where the camera was ``later``, if that was looked for.
+
+        An answer to a job that was given up is left out.
+        """
         if self._job is None or job.number != self._job.number:
             return
         self._job, self._handed_out = None, False
@@ -185,8 +205,11 @@ class PoseTracker:
             return
         self.counts[Event.FOUND] += 1
         self._failures, self._inliers = 0, answer.solution.inliers
-        self._found = _Seen(job.time_ns, answer.world_from_cam)
+        self._found = Seen(job.time_ns, answer.world_from_cam)
         self._note(self._found)
+        if later is not None:
+            self._found = later
+            self._note(later)
 
     def _render_at(self, quality: Quality, pose: Pose) -> FieldView:
         camera = Camera(self._intrinsics, pose).rounded()
@@ -225,14 +248,17 @@ class PoseTracker:
         off_m = CARRY_OF_MOTION * seconds * (speed_m_s if self._motion else UNKNOWN_SPEED_M_S)
         expected = Expected(RECENT_M / 2 + off_m, math.radians(RECENT_DEG))
         near = found.world_from_cam.compose(moved)
-        return begun(time_ns, near, expected, levels, render_at, settings, CARRY_ALIGNMENTS)
+        track = begun(time_ns, near, expected, levels, render_at, settings, CARRY_ALIGNMENTS)
+        if track is None:
+            self._motion = None  # it led elsewhere: the next search learns it anew
+        return track
 
     def _tracking(self, track: Track) -> Fix:
         self.counts[Event.TRACKED] += 1
         self.counts[Event.REDRAWN] += track.renders > 1
         self._job, self._handed_out, self._found = None, False, None
         self._failures, self._pause_until_ns = 0, 0
-        self._note(_Seen(track.time_ns, track.world_from_cam))
+        self._note(Seen(track.time_ns, track.world_from_cam))
         self._motion = track.motion or self._motion
         self._track = track if track.motion else replace(track, motion=self._motion)
         self.state = State.TRACKING
@@ -265,7 +291,7 @@ class PoseTracker:
         self._job = None
         if prior is not None:
             self._searches += 1
-            self._job = SearchJob(self._searches, time_ns, full_range(frame.y), prior)
+            self._job = SearchJob(self._searches, time_ns, full_range(frame.y), prior, self._motion)
 
     def _prior(self, time_ns: int) -> PosePrior | None:
         """Return where to search: where the camera was just seen, unless the feed contradicts."""
@@ -283,21 +309,20 @@ class PoseTracker:
         seen = self._seen
         if seen is None or not 0 <= time_ns - seen.time_ns <= 1e9 * RECENT_S:
             return None
-        seconds = (time_ns - seen.time_ns) / 1e9
-        moved = (self._motion or Motion()).over(seconds)
-        off_m = RECENT_M + CARRY_OF_MOTION * math.hypot(*moved.translation_m)
-        if self._motion is None:
-            off_m += UNKNOWN_SPEED_M_S * seconds
-        off_deg = RECENT_DEG + RECENT_DEG_PER_S * seconds
-        return PosePrior(seen.world_from_cam.compose(moved), off_m, off_deg)
+        return _expected_since(seen, self._motion, time_ns)
 
-    def _note(self, seen: _Seen) -> None:
-        """Remember where the camera was, and learn its motion from two poses of near times."""
+    def _note(self, seen: Seen) -> None:
+        """Remember where the camera was, and learn its motion from two poses of near times.
+
+        A camera that is where it cannot have driven to was not seen between: its motion is kept.
+        """
         last, self._seen = self._seen, seen
         if last is None:
             return
         seconds = (seen.time_ns - last.time_ns) / 1e9
-        if LEAST_BETWEEN_S < seconds <= RECENT_S:
+        if not LEAST_BETWEEN_S < seconds <= RECENT_S:
+            return
+        if _expected_since(last, self._motion, seen.time_ns).allows(seen.world_from_cam):
             self._motion = Motion.between(last.world_from_cam, seen.world_from_cam, seconds)
 
     def _forget(self) -> None:
@@ -305,6 +330,17 @@ class PoseTracker:
         self._track = self._found = self._motion = self._seen = self._job = None
         self._handed_out, self._failures, self._pause_until_ns = False, 0, 0
         self.feed.forget()
+
+
+def _expected_since(seen: Seen, motion: Motion | None, time_ns: int) -> PosePrior:
+    """Return where a camera is expected that was seen a moment before."""
+    seconds = (time_ns - seen.time_ns) / 1e9
+    moved = (motion or Motion()).over(seconds)
+    off_m = RECENT_M + CARRY_OF_MOTION * math.hypot(*moved.translation_m)
+    if motion is None:
+        off_m += UNKNOWN_SPEED_M_S * seconds
+    off_deg = RECENT_DEG + RECENT_DEG_PER_S * seconds
+    return PosePrior(seen.world_from_cam.compose(moved), off_m, off_deg)
 
 
 def full_range(luma: U8) -> U8:

@@ -72,7 +72,7 @@ def test_a_start_2_m_and_3_degrees_off_finds_the_pose(number: int, drive: str) -
     depth_m = median_depth(field().render(truth, FULL))
     assert math.hypot(*error.translation_m) < 0.003 * depth_m
     assert math.degrees(math.hypot(*rotation_vector(error.rotation))) < 0.1
-    assert answer.solution.inliers > 100
+    assert answer.solution.inliers > 50
 
 
 def test_the_same_search_gives_the_same_bits() -> None:
