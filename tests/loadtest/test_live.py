@@ -26,7 +26,7 @@ JOB = LiveJob(
     work=Path("work"),
     out=Path("live.json"),
 )
-AGES = [AgeRow(1, 2.0, 10.0, 20, 51.25, 98.5, 7.25), AgeRow(4, 2.0, 10.0, 0, None, None, 3.0)]
+AGES = [AgeRow(1, 2.0, 10.0, 20, 51.25, 98.5, 7250.0), AgeRow(4, 2.0, 10.0, 0, None, None, 3000.0)]
 INGEST = [IngestRow(4, 2.0, 3, 10, 240, 239, 41.0, 80.0, 42.0, 83.0)]
 SOURCES = [
     SourceRow(
@@ -78,8 +78,8 @@ def section(tmp_path: Path, **parts: Any) -> str:
 
 def test_the_page_shows_every_figure(tmp_path: Path) -> None:
     page = section(tmp_path, ages=AGES, ingest=INGEST, sources=SOURCES)
-    assert "| 1 | 2 | 20 | 51 | 98 | 7.25 |" in page
-    assert "| 4 | 2 | 0 | none | none | 3.00 |" in page
+    assert "| 1 | 2 | 20 | 51 | 98 | 7250 |" in page
+    assert "| 4 | 2 | 0 | none | none | 3000 |" in page
     assert "| 4 | 2 | 10 | 240 / 239 | 41 | 80 | 42 | 83 |" in page
     assert "| rtsp | 300 | 4 | 2805 of 2900 | 99 | 201 | 402 | 203 | 404 | 386 | +0.25 |" in page
 

@@ -37,17 +37,17 @@ LOW_PRIORITY = 10
 LOADED_S = 300.0
 POLL_S = 0.2
 LOADED = (
-    "return !!window.twin?.street.loaded()"
+    "return !!window.twin?.street.settled()"
     " && document.querySelectorAll('#wall figure').length >= arguments[0]"
 )
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What a page showed: ages of pictures at their showing, and frames a second of its street."""
+    """What a page showed: ages of pictures at their showing, and its street's last drawing."""
 
     ages_ms: tuple[float, ...]
-    frames_per_s: float
+    drawing_ms: float
 
 
 class Page:
@@ -68,14 +68,10 @@ class Page:
         """Return what is seen in the next ``seconds``."""
         take = "const t = window.twin; const a = t.state.ages; t.state.ages = [];"
         self._driver.execute_script(take)
-        before, began_s = self._drawn(), time.monotonic()
         time.sleep(seconds)
         ages_ms = self._driver.execute_script(take + " return a")
-        frames = self._drawn() - before
-        return Seen(tuple(map(float, ages_ms)), frames / (time.monotonic() - began_s))
-
-    def _drawn(self) -> int:
-        return int(self._driver.execute_script("return window.twin.street.drawn"))
+        drawing_ms = self._driver.execute_script("return window.twin.street.drawingMs")
+        return Seen(tuple(map(float, ages_ms)), float(drawing_ms))
 
 
 @contextmanager

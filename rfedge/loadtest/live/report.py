@@ -19,8 +19,8 @@ __all__ = ["AgeRow", "IngestRow", "SourceRow", "live_section", "print_live"]
 class AgeRow:
     """Pictures in a browser. Ages: from capture until it has the decoded picture; None: none came.
 
-    ``frames_per_s``: of the street, in software WebGL; pictures are drawn on it at most 10 times a
-    second, and nothing where nothing changes.
+    ``drawing_ms``: what the last drawing of the street took, in software WebGL; where that is over
+    1000 the street is drawn for a new view alone.
     """
 
     cameras: int
@@ -29,7 +29,7 @@ class AgeRow:
     pictures: int
     median_ms: float | None
     p99_ms: float | None
-    frames_per_s: float
+    drawing_ms: float
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class SourceRow:
     threads_last: int
 
 
-AGE_COLUMNS = ("cameras", "Hz", "pictures", "age: median ms", "p99 ms", "WebGL frames/s")
+AGE_COLUMNS = ("cameras", "Hz", "pictures", "age: median ms", "p99 ms", "drawing ms")
 INGEST_COLUMNS = (
     "vehicles",
     "Hz",
@@ -135,7 +135,7 @@ def cells(row: AgeRow | IngestRow | SourceRow) -> list[str]:
         case AgeRow():
             values: tuple[Any, ...] = (
                 *(row.cameras, f"{row.hz:g}", row.pictures, _ms(row.median_ms), _ms(row.p99_ms)),
-                row.frames_per_s,
+                f"{row.drawing_ms:.0f}",
             )
         case IngestRow():
             values = (

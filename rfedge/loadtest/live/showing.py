@@ -77,7 +77,7 @@ def measure_age(bed: TwinBed, cameras: int) -> AgeRow:
         seen = page.watch(bed.seconds)
     median_ms, p99_ms = percentiles(seen.ages_ms)
     return AgeRow(
-        cameras, bed.hz, bed.seconds, len(seen.ages_ms), median_ms, p99_ms, seen.frames_per_s
+        cameras, bed.hz, bed.seconds, len(seen.ages_ms), median_ms, p99_ms, seen.drawing_ms
     )
 
 

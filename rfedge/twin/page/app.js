@@ -95,7 +95,9 @@ function connect() {
 }
 
 setInterval(() => {
-  element("rate").textContent = `${state.pictures} pictures/s, ${street.framesPerSecond()} frames/s`;
+  const frames = `${street.framesPerSecond()} frames/s`;
+  const slow = `street drawn in ${(street.drawingMs / 1000).toFixed(1)} s, so for a new view only (no GPU?)`;
+  element("rate").textContent = `${state.pictures} pictures/s, ${street.isTooSlow ? slow : frames}`;
   state.pictures = 0;
   wall.showAges();
   plots.draw();

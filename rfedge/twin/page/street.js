@@ -7,6 +7,9 @@ import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
 const NEAR_M = 0.05, FAR_M = 5000, FRUSTUM_M = 1.5, MARK_S = 10;
 const PICTURES_EVERY_MS = 100;  // drawing splats costs far more than a picture is worth
+const DRAWING_SHARE = 0.2;  // of the time at most, for pictures alone
+const SLOW_MS = 400, QUICK_MS = 40, COARSEST = 0.25;  // fewer pixels while a drawing takes longer
+const TOO_SLOW_MS = 1000;  // without a GPU a drawing takes seconds, in which the whole page stands still
 const HALF_TURN = new THREE.Quaternion(1, 0, 0, 0);
 THREE.Object3D.DEFAULT_UP.set(0, 0, 1);
 
@@ -24,6 +27,8 @@ export class Street {
     this.selected = null;
     this.frames = 0;
     this.drawn = 0;  // since the page was opened
+    this.drawingMs = 0;  // what the last drawing took, until the GPU was done
+    this.resolution = 1;  // pixels drawn for one of the page, in each direction
     this.renderer = new THREE.WebGLRenderer({ antialias: false, preserveDrawingBuffer: true });
     parent.append(this.renderer.domElement);
     this.scene = new THREE.Scene();
@@ -40,13 +45,14 @@ export class Street {
   resize() {
     if (this.fixedSize) return;
     const { clientWidth, clientHeight } = this.parent;
+    this.renderer.setPixelRatio(this.resolution);
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.view.aspect = clientWidth / Math.max(1, clientHeight);
     this.view.updateProjectionMatrix();
     this.touch();
   }
 
-  // The next frame shows something new: at once, or no sooner than PICTURES_EVERY_MS.
+  // The next frame shows something new: at once, or when a picture is worth a drawing.
   touch() { this.changed = true; }
   touchLater() { this.pictureChanged = true; }
 
@@ -57,14 +63,41 @@ export class Street {
     const camera = this.following && this.cameras.get(this.selected);
     if (camera) this.lookAlong(camera);
     else if (!this.fixedSize) this.controls.update();
-    const isDue = this.pictureChanged && now - (this.drawnAt ?? 0) >= PICTURES_EVERY_MS;
+    if (this.isDrawing(now)) return;
+    const everyMs = Math.max(PICTURES_EVERY_MS, this.drawingMs / DRAWING_SHARE);
+    const isDue = this.pictureChanged && !this.isTooSlow && now - (this.drawnAt ?? -everyMs) >= everyMs;
     if (!this.changed && !isDue) return;
     this.changed = this.pictureChanged = false;
     this.drawnAt = now;
     this.renderer.render(this.scene, this.view);
+    const gl = this.renderer.getContext();
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
     this.frames += 1;
     this.drawn += 1;
   }
+
+  // Whether the GPU is still at the last drawing; when it is done, its time sets the next one's pixels.
+  isDrawing(now) {
+    if (!this.fence) return false;
+    const gl = this.renderer.getContext();
+    if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED) return true;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    this.drawingMs = now - this.drawnAt;
+    if (this.fixedSize) return false;
+    if (this.drawingMs > SLOW_MS && this.resolution > COARSEST) this.setResolution(this.resolution / 2);
+    else if (this.drawingMs < QUICK_MS && this.resolution < 1) this.setResolution(2 * this.resolution);
+    return false;
+  }
+
+  setResolution(resolution) {
+    this.resolution = resolution;
+    this.resize();
+  }
+
+  // Then it is drawn for a new view alone, and pictures show on the wall.
+  get isTooSlow() { return this.drawingMs > TOO_SLOW_MS; }
 
   framesPerSecond() {
     const frames = this.frames;
@@ -233,6 +266,7 @@ export class Street {
     this.showMarks(!this.fixedSize);
     if (!pose) { this.resize(); return; }
     const { translation_m, rotation_wxyz, intrinsics: k } = pose;
+    this.renderer.setPixelRatio(1);
     this.renderer.setSize(k.width_px, k.height_px, false);
     this.view.aspect = k.width_px / k.height_px;
     this.view.position.copy(vector(translation_m));
@@ -245,6 +279,8 @@ export class Street {
     const tiles = [...this.tiles.values()];
     return tiles.length > 0 && tiles.every((tile) => tile.loaded);
   }
+
+  settled() { return this.loaded() && !this.changed && !this.fence; }
 
   png() { return this.renderer.domElement.toDataURL("image/png"); }
 }
