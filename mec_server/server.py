@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any
@@ -36,6 +37,7 @@ from mec_server.recorder import Recorder
 from mec_server.recording_room import KeepLimits
 from mec_server.server_context import ServerContext
 from mec_server.twin.metrics import TwinMetrics
+from mec_server.twin.rendering import TwinViews
 from mec_server.twin.service import Sight, TwinService
 from mec_server.twin.state import Twin
 from rfcore.errors import RfedgeError
@@ -64,6 +66,9 @@ longer good."""
 
 CONNECTIONS_EVERY_S = 0.25
 """How often connections are counted by address."""
+
+MAX_VIEWED_FIELDS = 2
+"""Fields kept open for views of the twin, beside those that frames are decoded against."""
 
 CONNECTION_GRACE_MS = 30_000
 """How long streams of a connection that is renewed may go on before they are ended."""
@@ -115,6 +120,7 @@ class EdgeServer:
         self._edge = EdgeService(self._context(twin, open_decoders))
         consumer_failed = self._failed(BackgroundTask.CONSUMER)
         ledger, limited = self._entry.ledger, self._metrics.count_limited
+        self._views = self._twin_views(twin)
         self._twin_service = TwinService(
             twin,
             self._twin_metrics(twin),
@@ -122,6 +128,7 @@ class EdgeServer:
             config.limits.stalled_s,
             consumer_failed,
             self._sight,
+            self._views,
         )
         self._server = grpc.aio.server(
             interceptors=(self._guard, ChargeRpcs(ledger, limited)),
@@ -168,6 +175,18 @@ class EdgeServer:
         entry = EntryControl(budgets, config.admission, config.workers, share, time.monotonic())
         self._metrics.observe_ledger(entry, self._log_limiter)
         return entry
+
+    def _twin_views(self, twin: Twin) -> TwinViews:
+        """Return what composes views: with one thread, and fields that nobody else renders."""
+        render = replace(self._config.render, threads=1)
+        load = field_loader(self._index, render, opened=lambda _: None)
+        return TwinViews(
+            twin,
+            FieldShelf(self._index, load, MAX_VIEWED_FIELDS).open,
+            lambda: self._published.tiles,
+            self._entry.ledger,
+            self._failed(BackgroundTask.OUTCOME),
+        )
 
     def _twin_metrics(self, twin: Twin) -> TwinMetrics:
         return TwinMetrics(
@@ -239,6 +258,7 @@ class EdgeServer:
         await asyncio.to_thread(self._workers.close)
         await asyncio.to_thread(self._decoders.close)
         self._twin_service.close()
+        await asyncio.to_thread(self._views.close)
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
         if self._metrics_endpoint is not None:
@@ -281,7 +301,11 @@ class EdgeServer:
             here = (tile.name for tile in self._published.tiles if field_id in tile.archive_ids)
             return grant.covers(vehicle_id, frozenset(here))
 
-        return Sight(covers, grant.check_vehicles)
+        def may_draw(field_id: str) -> bool:
+            here = (tile.name for tile in self._published.tiles if field_id in tile.archive_ids)
+            return self._guard.may_fetch(context, frozenset(here))
+
+        return Sight(covers, grant.check_vehicles, may_draw)
 
     def _follow(
         self, work: Callable[[], Awaitable[object]], every_s: float, task: BackgroundTask

@@ -20,8 +20,7 @@ from cav_agent.live.process import ReaderProcess
 from cav_agent.live.settings import LiveSettings, ReaderSettings
 from cav_agent.live.source import LiveFrame, LiveSource, SourceObserver, SourceThread
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin, Vec3
-from rfcore.dataset.recorded_poses import RecordedPoses
-from rfcore.dataset.recording import RecordingCamera, read_recording_camera
+from rfcore.dataset.recording import RecordedPoses, RecordingCamera, read_recording_camera
 from rfcore.dataset.undistort import pinhole_of, undistorted
 from rfcore.errors import DatasetError, InvalidInput, RfedgeError
 from rfcore.image import Rgb

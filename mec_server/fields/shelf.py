@@ -34,10 +34,14 @@ class Store(Protocol):
 
 
 class FieldShelf:
-    """A cache of opened fields of ``store``: ``load`` opens one, the least recently used leaves."""
+    """A cache of ``most`` opened fields of ``store``: ``load`` opens one, the least recently used
+    leaves."""
 
-    def __init__(self, store: Store, load: Callable[[str], RadianceField]) -> None:
+    def __init__(
+        self, store: Store, load: Callable[[str], RadianceField], most: int = MAX_OPEN_FIELDS
+    ) -> None:
         self._store = store
+        self._most = most
         self._load = load
         self._open: OrderedDict[str, RadianceField] = OrderedDict()
         self._lock = threading.Lock()
@@ -47,7 +51,7 @@ class FieldShelf:
         with self._lock:
             if field_id not in self._open:
                 self._open[field_id] = self._load(field_id)
-                if len(self._open) > MAX_OPEN_FIELDS:
+                if len(self._open) > self._most:
                     self._open.popitem(last=False)
             self._open.move_to_end(field_id)
             return self._open[field_id]

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import grpc
 import structlog
 
-from mec_server.peers import Slots, abort
+from mec_server.peers import Slots, abort, peer_account
 from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
+from mec_server.twin.rendering import TwinViews
 from mec_server.twin.state import Covers, Mailbox, Twin, TwinView
-from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded
+from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded, RfedgeError
 from rfcore.image import I420, jpeg_bytes, png_bytes
 from rfcore.native.yuv import rgb_from_i420
 from rfcore.wire.status import status_of
@@ -31,10 +33,11 @@ from rfcore.wire.twin import (
     subscription_from_wire,
     twin_message_to_wire,
 )
+from rfcore.wire.twin_render import RenderedView, rendered_view_to_wire, view_request_from_wire
 from rfcore.wire.v1 import twin_pb2 as pb
 from rfcore.wire.v1 import twin_pb2_grpc
 
-__all__ = ["Sight", "TwinPictures", "TwinService", "encoded"]
+__all__ = ["RenderCalls", "Sight", "TwinPictures", "TwinService", "encoded"]
 
 log = structlog.get_logger()
 
@@ -75,15 +78,18 @@ def encoded(picture: I420, encoding: PictureEncoding) -> bytes:
 
 
 Context = grpc.aio.ServicerContext[pb.WatchRequest, pb.WatchResponse]
+AnyContext = grpc.aio.ServicerContext[Any, Any]
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What one consumer may see: ``covers`` says it of a picture, and ``check_vehicles`` raises
-    ``AccessDenied`` for vehicles asked for by name that it can never see."""
+    """What one consumer may see: ``covers`` says it of a picture, ``may_draw`` of a field's id, and
+    ``check_vehicles`` raises ``AccessDenied`` for vehicles asked for by name that it can never
+    see."""
 
     covers: Covers
     check_vehicles: Callable[[frozenset[str]], None]
+    may_draw: Callable[[str], bool]
 
 
 class TwinService(twin_pb2_grpc.TwinServiceServicer):
@@ -91,7 +97,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
 
     ``slots`` says how many may watch; one that took nothing for ``stalled_s`` is too slow.
     ``failed`` is called with an unexpected exception, which ends the stream that met it. ``sight``
-    says what the peer of a call may see.
+    says what the peer of a call may see, ``views`` composes views for it.
     """
 
     def __init__(
@@ -102,6 +108,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         stalled_s: float,
         failed: Callable[[Exception], None],
         sight: Callable[[Context], Sight],
+        views: TwinViews,
     ) -> None:
         self._twin = twin
         self._sight = sight
@@ -111,6 +118,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         self._failed = failed
         self._pictures = TwinPictures()
         self._draining = asyncio.Event()
+        self._renders = RenderCalls(views, metrics, slots, stalled_s, failed, sight, self._draining)
 
     def register(self, server: grpc.aio.Server) -> None:
         """Add the service to a server that has not started."""
@@ -121,8 +129,20 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         self._draining.set()
 
     def close(self) -> None:
-        """Stop encoding."""
+        """Stop encoding; ``views`` are their owner's."""
         self._pictures.close()
+
+    async def Render(  # noqa: N802
+        self, request: pb.RenderRequest, context: Context
+    ) -> pb.RenderResponse:
+        """Return the street as it is now from one viewpoint."""
+        return await self._renders.render(request, context)
+
+    async def RenderStream(  # type: ignore[override]  # noqa: N802
+        self, requests: AsyncIterator[pb.RenderRequest], context: Context
+    ) -> None:
+        """Return it from a viewpoint that moves, until the consumer has no more requests."""
+        await self._renders.render_stream(requests, context)
 
     async def Watch(  # type: ignore[override]  # noqa: N802 (a coroutine that writes will do)
         self, request: pb.WatchRequest, context: Context
@@ -256,3 +276,144 @@ def _message(view: TwinView, age_s: float, mailbox: Mailbox, data: bytes) -> Twi
         localisation=view.frame.localisation,
         instant=view.frame.instant,
     )
+
+
+class RenderCalls:
+    """Answers calls with views. The arguments are those of ``TwinService``; every call, and every
+    stream for as long as it lasts, holds one of ``slots``."""
+
+    def __init__(
+        self,
+        views: TwinViews,
+        metrics: TwinMetrics,
+        slots: Slots,
+        stalled_s: float,
+        failed: Callable[[Exception], None],
+        sight: Callable[[AnyContext], Sight],
+        draining: asyncio.Event,
+    ) -> None:
+        self._views = views
+        self._metrics = metrics
+        self._slots = slots
+        self._stalled_s = stalled_s
+        self._failed = failed
+        self._sight = sight
+        self._draining = draining
+
+    async def render(self, request: pb.RenderRequest, context: AnyContext) -> pb.RenderResponse:
+        """Return one view, or end the call with the status of what is wrong."""
+        with await self._hold(context):
+            return rendered_view_to_wire(await self._view(request, context))
+
+    async def render_stream(
+        self, requests: AsyncIterator[pb.RenderRequest], context: AnyContext
+    ) -> None:
+        """Answer requests until the peer has no more, reads too slowly, or the server drains."""
+        with await self._hold(context):
+            self._metrics.consumers.inc()
+            end = ConsumerEnd.LEFT
+            identity, _ = peer_account(context)
+            moving = _MovingCamera(requests, lambda: self._views.spend_message(identity))
+            drained = asyncio.create_task(self._draining.wait())
+            try:
+                end = await self._follow(moving, drained, context)
+            finally:
+                drained.cancel()
+                moving.close()
+                self._metrics.consumers.dec()
+                self._metrics.ended.labels(end).inc()
+                log.info("consumer ended", peer=context.peer(), reason=str(end))
+        if moving.unread is not None:
+            await moving.unread  # gRPC sends no status before what is being written
+            await context.abort(
+                grpc.StatusCode.RESOURCE_EXHAUSTED,
+                f"nothing was taken for {self._stalled_s:g} s; read faster",
+            )
+
+    async def _hold(self, context: AnyContext) -> Any:
+        try:
+            return self._slots.hold(context)
+        except RfedgeError as error:
+            self._metrics.ended.labels(ConsumerEnd.REFUSED).inc()
+            await abort(context, error)
+
+    async def _view(self, request: pb.RenderRequest, context: AnyContext) -> RenderedView:
+        try:
+            sight = self._sight(context)
+            asked = view_request_from_wire(request)
+            identity, _ = peer_account(context)
+            return await self._views.view(asked, identity, sight.covers, sight.may_draw)
+        except RfedgeError as error:
+            await abort(context, error)
+        except Exception as error:
+            self._failed(error)
+            raise
+
+    async def _follow(
+        self, moving: _MovingCamera, drained: asyncio.Task[bool], context: AnyContext
+    ) -> ConsumerEnd:
+        while (request := await moving.next(drained)) is not None:
+            skipped = moving.skipped
+            view = replace(await self._view(request, context), skipped=skipped)
+            writing = asyncio.create_task(context.write(rendered_view_to_wire(view)))
+            await asyncio.wait(
+                {writing, drained}, timeout=self._stalled_s, return_when=asyncio.FIRST_COMPLETED
+            )
+            if not writing.done() and drained.done():
+                writing.cancel()
+                return ConsumerEnd.DRAINED
+            if not writing.done():
+                moving.unread = writing
+                return ConsumerEnd.SLOW
+            writing.result()
+        if moving.error is not None:
+            await abort(context, moving.error)
+        return ConsumerEnd.DRAINED if drained.done() else ConsumerEnd.LEFT
+
+
+class _MovingCamera:
+    """Reads the requests of one stream, of which it keeps the newest.
+
+    ``spend`` is called for each and may raise ``LimitExceeded``, which ends the reading. ``error``:
+    what ended it, None for the peer. ``skipped``: requests that got no answer. ``unread``: an
+    answer that the peer does not take.
+    """
+
+    def __init__(
+        self, requests: AsyncIterator[pb.RenderRequest], spend: Callable[[], None]
+    ) -> None:
+        self.skipped = 0
+        self.error: RfedgeError | None = None
+        self.unread: asyncio.Task[None] | None = None
+        self._newest: pb.RenderRequest | None = None
+        self._spend = spend
+        self._arrived = asyncio.Event()
+        self._reading = asyncio.create_task(self._read(requests))
+        self._reading.add_done_callback(lambda _: self._arrived.set())
+
+    def close(self) -> None:
+        """Read no more."""
+        self._reading.cancel()
+
+    async def next(self, drained: asyncio.Task[bool]) -> pb.RenderRequest | None:
+        """Return the newest request once there is one, None when there will be none."""
+        while self._newest is None and not self._reading.done() and not drained.done():
+            arrived = asyncio.create_task(self._arrived.wait())
+            await asyncio.wait({arrived, drained}, return_when=asyncio.FIRST_COMPLETED)
+            arrived.cancel()
+            self._arrived.clear()
+        if drained.done() or self.error is not None:
+            return None
+        request, self._newest = self._newest, None
+        return request
+
+    async def _read(self, requests: AsyncIterator[pb.RenderRequest]) -> None:
+        async for request in requests:
+            try:
+                self._spend()
+            except RfedgeError as error:
+                self.error = error
+                return
+            self.skipped += self._newest is not None
+            self._newest = request
+            self._arrived.set()

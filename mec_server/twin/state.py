@@ -16,8 +16,12 @@ from rfcore.camera import Intrinsics
 from rfcore.image import I420
 from rfcore.wire.messages import Frame
 from rfcore.wire.twin import Departure, Subscription
+from rfcore.wire.twin_render import MAX_AGE_S
 
 __all__ = ["CameraKey", "Covers", "Mailbox", "Twin", "TwinView"]
+
+MAX_DEPARTED = 32
+"""Last pictures kept of cameras that left."""
 
 CameraKey = tuple[str, str]
 """(vehicle id, camera id)"""
@@ -113,6 +117,7 @@ class Twin:
 
     def __init__(self) -> None:
         self._views: dict[CameraKey, TwinView] = {}
+        self._departed: OrderedDict[CameraKey, TwinView] = OrderedDict()
         self._mailboxes: list[Mailbox] = []
         self.missed = 0
 
@@ -126,6 +131,7 @@ class Twin:
         ):
             return
         self._views[view.key] = view
+        self._departed.pop(view.key, None)
         self._tell(view.key, view)
 
     def leave(self, session_id: str) -> None:
@@ -133,7 +139,19 @@ class Twin:
         for key, view in tuple(self._views.items()):
             if view.session_id == session_id:
                 del self._views[key]
+                self._departed[key] = view
+                if len(self._departed) > MAX_DEPARTED:
+                    self._departed.popitem(last=False)
                 self._tell(key, Departure(*key))
+
+    def recent(self, now: float, max_age_s: float) -> list[TwinView]:
+        """Return the newest picture of every camera that is no older than ``max_age_s``, also of
+        cameras that left; those of them that are older than ``MAX_AGE_S`` are forgotten."""
+        for key, view in tuple(self._departed.items()):
+            if view.age_s(now) > MAX_AGE_S:
+                del self._departed[key]
+        views = (*self._views.values(), *self._departed.values())
+        return [view for view in views if view.age_s(now) <= max_age_s]
 
     def watch(
         self,

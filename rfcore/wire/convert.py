@@ -56,6 +56,8 @@ __all__ = [
     "client_message_from_wire",
     "client_message_to_bytes",
     "client_message_to_wire",
+    "quality_of",
+    "quality_to_wire",
 ]
 
 
@@ -223,15 +225,19 @@ def _frame_from_wire(frame: pb.Frame) -> Frame:
     )
 
 
-def _quality_from_wire(quality: pb.Quality) -> Quality:
+def quality_of(quality: pb.Quality) -> Quality:
     """Return a checked quality; ``Quality`` itself refuses what is not on the ladder."""
+    return Quality(
+        (quality.detail_percent or 100) / 100,
+        quality.sh_degree if quality.HasField("sh_degree") else None,
+        quality.samples_per_ray or None,
+        (quality.scale_percent or 100) / 100,
+    )
+
+
+def _quality_from_wire(quality: pb.Quality) -> Quality:
     try:
-        return Quality(
-            (quality.detail_percent or 100) / 100,
-            quality.sh_degree if quality.HasField("sh_degree") else None,
-            quality.samples_per_ray or None,
-            (quality.scale_percent or 100) / 100,
-        )
+        return quality_of(quality)
     except InvalidInput as error:
         raise InvalidInput(f"frame.{error.field}", error.problem) from error
 
@@ -307,11 +313,12 @@ def _frame_to_wire(frame: Frame) -> pb.Frame:
     )
     _add_pose(message, frame.pose)
     if frame.quality != FULL:
-        message.quality.CopyFrom(_quality_to_wire(frame.quality))
+        message.quality.CopyFrom(quality_to_wire(frame.quality))
     return message
 
 
-def _quality_to_wire(quality: Quality) -> pb.Quality:
+def quality_to_wire(quality: Quality) -> pb.Quality:
+    """Return a quality as protobuf."""
     return pb.Quality(
         detail_percent=0 if quality.detail == 1 else round(100 * quality.detail),
         sh_degree=quality.sh_degree,

@@ -31,6 +31,11 @@ __all__ = [
     "PictureEncoding",
     "Subscription",
     "TwinPicture",
+    "encoding_from_wire",
+    "encoding_to_wire",
+    "intrinsics_to_wire",
+    "pose_from_wire",
+    "pose_to_wire",
     "subscription_from_wire",
     "subscription_to_wire",
     "twin_message_from_wire",
@@ -104,7 +109,7 @@ def subscription_to_wire(subscription: Subscription) -> twin_pb2.WatchRequest:
     """Return a consumer's request as protobuf."""
     return twin_pb2.WatchRequest(
         vehicle_ids=sorted(subscription.vehicle_ids),
-        encoding=_encoding_to_wire(subscription.encoding),
+        encoding=encoding_to_wire(subscription.encoding),
     )
 
 
@@ -114,7 +119,7 @@ def subscription_from_wire(request: twin_pb2.WatchRequest) -> Subscription:
     names = (check_name(f"vehicle_ids[{i}]", name) for i, name in enumerate(request.vehicle_ids))
     if request.encoding == twin_pb2.PICTURE_ENCODING_UNSPECIFIED:
         return Subscription(frozenset(names))
-    return Subscription(frozenset(names), _encoding_from_wire(request.encoding))
+    return Subscription(frozenset(names), encoding_from_wire(request.encoding))
 
 
 def twin_message_to_wire(message: TwinPicture | Departure) -> twin_pb2.WatchResponse:
@@ -143,7 +148,6 @@ def twin_message_from_wire(response: twin_pb2.WatchResponse) -> TwinPicture | De
 
 
 def _picture_to_wire(message: TwinPicture) -> twin_pb2.TwinPicture:
-    k = message.intrinsics
     return twin_pb2.TwinPicture(
         vehicle_id=message.vehicle_id,
         camera_id=message.camera_id,
@@ -152,18 +156,11 @@ def _picture_to_wire(message: TwinPicture) -> twin_pb2.TwinPicture:
         sequence=message.sequence,
         capture_time_ns=message.capture_time_ns,
         age_ns=message.age_ns,
-        pose=None if message.pose is None else _pose_to_wire(message.pose),
-        intrinsics=edge_pb2.Intrinsics(
-            width_px=k.width_px,
-            height_px=k.height_px,
-            fx_px=k.fx_px,
-            fy_px=k.fy_px,
-            cx_px=k.cx_px,
-            cy_px=k.cy_px,
-        ),
+        pose=None if message.pose is None else pose_to_wire(message.pose),
+        intrinsics=intrinsics_to_wire(message.intrinsics),
         field_id=message.field_id,
         reconstruction_digest=message.reconstruction_digest,
-        encoding=_encoding_to_wire(message.encoding),
+        encoding=encoding_to_wire(message.encoding),
         picture=message.picture,
         skipped=message.skipped,
         payload_bytes=message.payload_bytes,
@@ -174,7 +171,20 @@ def _picture_to_wire(message: TwinPicture) -> twin_pb2.TwinPicture:
     )
 
 
-def _pose_to_wire(pose: Pose) -> edge_pb2.Pose:
+def intrinsics_to_wire(k: Intrinsics) -> edge_pb2.Intrinsics:
+    """Return intrinsics as protobuf."""
+    return edge_pb2.Intrinsics(
+        width_px=k.width_px,
+        height_px=k.height_px,
+        fx_px=k.fx_px,
+        fy_px=k.fy_px,
+        cx_px=k.cx_px,
+        cy_px=k.cy_px,
+    )
+
+
+def pose_to_wire(pose: Pose) -> edge_pb2.Pose:
+    """Return a pose as protobuf."""
     x_m, y_m, z_m = pose.translation_m
     w, x, y, z = pose.rotation
     return edge_pb2.Pose(
@@ -182,7 +192,8 @@ def _pose_to_wire(pose: Pose) -> edge_pb2.Pose:
     )
 
 
-def _pose_from_wire(pose: edge_pb2.Pose) -> Pose:
+def pose_from_wire(pose: edge_pb2.Pose) -> Pose:
+    """Return a pose; raise ``InvalidInput`` for one that is none."""
     rotation = (pose.rotation_w, pose.rotation_x, pose.rotation_y, pose.rotation_z)
     return Pose((pose.x_m, pose.y_m, pose.z_m), rotation)
 
@@ -197,11 +208,11 @@ def _picture_from_wire(picture: twin_pb2.TwinPicture) -> TwinPicture:
         sequence=picture.sequence,
         capture_time_ns=picture.capture_time_ns,
         age_ns=picture.age_ns,
-        pose=_pose_from_wire(pose) if picture.HasField("pose") else None,
+        pose=pose_from_wire(pose) if picture.HasField("pose") else None,
         intrinsics=Intrinsics(k.width_px, k.height_px, k.fx_px, k.fy_px, k.cx_px, k.cy_px),
         field_id=picture.field_id,
         reconstruction_digest=picture.reconstruction_digest,
-        encoding=_encoding_from_wire(picture.encoding),
+        encoding=encoding_from_wire(picture.encoding),
         picture=picture.picture,
         skipped=picture.skipped,
         payload_bytes=picture.payload_bytes,
@@ -219,12 +230,14 @@ def _references_from_wire(numbers: Iterable[int]) -> References:
         raise InvalidInput("picture.references", f"{error}; update this end") from error
 
 
-def _encoding_to_wire(encoding: PictureEncoding) -> twin_pb2.PictureEncoding.ValueType:
+def encoding_to_wire(encoding: PictureEncoding) -> twin_pb2.PictureEncoding.ValueType:
+    """Return an encoding as protobuf."""
     return twin_pb2.PictureEncoding.Value(f"PICTURE_ENCODING_{encoding.name}")
 
 
-def _encoding_from_wire(number: int) -> PictureEncoding:
+def encoding_from_wire(number: int) -> PictureEncoding:
+    """Return an encoding; raise ``InvalidInput`` for a number that is none."""
     for encoding in PictureEncoding:
-        if _encoding_to_wire(encoding) == number:
+        if encoding_to_wire(encoding) == number:
             return encoding
     raise InvalidInput("encoding", f"{number} is no picture encoding this program knows")

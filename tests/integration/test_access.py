@@ -10,12 +10,14 @@ import grpc
 import pytest
 
 import mec_server.server
+from rfcore.camera import Camera
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import Welcome
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import Subscription, subscription_to_wire, twin_message_from_wire
+from rfcore.wire.twin_render import ViewRequest, view_request_to_wire
 from rfcore.wire.v1 import field_pb2, field_pb2_grpc, twin_pb2_grpc
 from rfedge.certs.authority import Members, certify, write_certificates
 
@@ -190,3 +192,34 @@ async def test_a_capture_time_that_cannot_be_makes_no_age(
         assert value("rfedge_server_implausible_captures_total") == 1
         assert value("rfedge_twin_age_seconds") < 60
         assert value("rfedge_server_capture_to_picture_seconds_sum") == 0
+
+
+async def test_views_show_what_their_consumer_is_granted(
+    certs: Files, serve: Any, coded: Any, street: Any, tmp_path: Path
+) -> None:
+    access = tmp_path / "access.toml"
+    access.write_text('[consumers.desk]\nvehicles = ["cav-raw"]')
+    pose = coded.frames[0].pose
+    camera = Camera(coded.hello.cameras[0].intrinsics, pose)
+    request = view_request_to_wire(ViewRequest(camera, field_id=street.field_id, max_age_s=10.0))
+
+    async def seen_by(name: str) -> list[str]:
+        async with channel_to(server.address, certs(name)) as peer:
+            response = await twin_pb2_grpc.TwinServiceStub(peer).Render(request)
+            return [camera.vehicle_id for camera in response.cameras]
+
+    async with (
+        serve(tls=certs("server"), access=access) as server,
+        channel_to(server.address, certs("vehicle-cav-raw")) as channel,
+    ):
+        stream = await open_stream(channel, coded.hello)
+        await stream.write(client_message_to_bytes(coded.frames[0]))
+        await stream.read()
+        assert await seen_by("operator-op") == ["cav-raw"]
+        assert await seen_by("vehicle-cav-raw") == ["cav-raw"]
+        assert await seen_by("vehicle-cav-2") == []
+        for name in ("consumer-desk", "consumer-other"):
+            with pytest.raises(grpc.aio.AioRpcError) as caught:
+                await seen_by(name)
+            assert caught.value.code() is grpc.StatusCode.PERMISSION_DENIED
+            assert "may not see that tile" in caught.value.details()

@@ -173,3 +173,25 @@ def test_who_is_back_has_not_departed(view: MakeView) -> None:
     twin.leave("s-1")
     twin.show(view(session="s-2", sequence=7))
     assert taken(mailbox) == [("cav-1", 7)]
+
+
+def test_a_vehicle_that_left_is_recent_until_it_has_aged(view: MakeView) -> None:
+    twin = Twin()
+    for name in ("cav-1", "cav-2"):
+        twin.show(view(name, session=name))
+    twin.leave("cav-1")
+    assert {seen.vehicle_id for seen in twin.recent(10.5, 2.0)} == {"cav-1", "cav-2"}
+    assert twin.recent(12.0, 2.0) == []
+    assert {seen.vehicle_id for seen in twin.recent(19.8, 11.0)} == {"cav-2"}, "10 s are the most"
+    twin.show(view("cav-1", session="again", sequence=4))
+    assert [s.frame.packet.sequence for s in twin.recent(10.5, 2.0) if s.vehicle_id == "cav-1"] == [
+        4
+    ]
+
+
+def test_cameras_that_come_and_go_cost_no_memory(view: MakeView) -> None:
+    twin = Twin()
+    for number in range(200):
+        twin.show(view(f"cav-{number}", session=f"s-{number}"))
+        twin.leave(f"s-{number}")
+    assert len(twin.recent(10.0, 2.0)) == 32

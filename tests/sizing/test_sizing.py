@@ -13,10 +13,16 @@ from hypothesis import strategies as st
 from rfcore.errors import InvalidInput
 from rfcore.link.shaper import ConstantRate
 from rfedge.cli import parse
-from rfedge.sizing.estimate import Assumptions, Demand, estimate
+from rfedge.sizing.estimate import (
+    INSTANTS,
+    Assumptions,
+    Demand,
+    estimate,
+    needed_bps,
+    share_in_time,
+)
 from rfedge.sizing.interpolate import MAX_BEYOND_DB, Wanted, check_reach, log_at
 from rfedge.sizing.tables import CODECS, SizingCell, SizingTables, read_tables, shipped_tables
-from rfedge.sizing.uplink import INSTANTS, needed_bps, share_in_time
 
 SIZES = ((320, 180), (640, 360), (1920, 1080))
 RATES = (2.0, 10.0, 30.0)

@@ -1,12 +1,14 @@
 """What consumers and servers say to each other survives the wire, and what is wrong is named."""
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfcore.camera import Intrinsics, Pose
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.references import Reference
 from rfcore.errors import InvalidInput, ProtocolError
+from rfcore.field.quality import FULL, Quality
 from rfcore.localise.fix import State
 from rfcore.wire.sensing import ClockKind
 from rfcore.wire.twin import (
@@ -18,6 +20,15 @@ from rfcore.wire.twin import (
     subscription_to_wire,
     twin_message_from_wire,
     twin_message_to_wire,
+)
+from rfcore.wire.twin_render import (
+    LiveCamera,
+    RenderedView,
+    ViewRequest,
+    rendered_view_from_wire,
+    rendered_view_to_wire,
+    view_request_from_wire,
+    view_request_to_wire,
 )
 from rfcore.wire.v1 import twin_pb2
 
@@ -67,3 +78,41 @@ def test_an_impossible_picture_is_the_servers_fault() -> None:
         twin_message_from_wire(bad)
     with pytest.raises(ProtocolError, match="update it"):
         twin_message_from_wire(twin_pb2.WatchResponse())
+
+
+VIEW = RenderedView(
+    7, 10**18, "ab" * 32, PictureEncoding.NONE, b"", np.full((16, 32), 2.5, np.float32),
+    np.full((16, 32), 120, np.uint16), (LiveCamera("cav-1", "front", 0.12, 0.5, False),), 3,
+)  # fmt: skip
+LENS = Intrinsics(32, 16, 20.0, 20.0, 16.0, 8.0)
+
+
+@pytest.mark.parametrize("place", [{"tile": "west"}, {"field_id": "ab" * 32}])
+@pytest.mark.parametrize("quality", [FULL, Quality(0.5, 1, None, 0.5)])
+def test_a_request_for_a_view_survives_the_wire(place: dict[str, str], quality: Quality) -> None:
+    camera = Camera(LENS, Pose((1.0, 2.0, 3.0), (0.0, 1.0, 0.0, 0.0)))
+    asked = ViewRequest(
+        camera, **place, quality=quality, encoding=PictureEncoding.PNG, max_age_s=0.5, number=9
+    )
+    sent = view_request_to_wire(asked).SerializeToString()
+    assert view_request_from_wire(twin_pb2.RenderRequest.FromString(sent)) == asked
+
+
+def test_a_view_survives_the_wire() -> None:
+    sent = rendered_view_to_wire(VIEW).SerializeToString()
+    got = rendered_view_from_wire(twin_pb2.RenderResponse.FromString(sent), LENS)
+    assert np.array_equal(got.depth, VIEW.depth)
+    assert np.array_equal(got.age_ms, VIEW.age_ms)
+    assert got.rgb is None
+    assert got.live.all()
+    for name in ("number", "time_ns", "field_id", "encoding", "cameras"):
+        assert getattr(got, name) == getattr(VIEW, name)
+
+
+@pytest.mark.parametrize("change", [{"depth_m": b"1234"}, {"age_ms": b""}, {"field_id": "x"}])
+def test_an_impossible_view_is_the_servers_fault(change: dict[str, object]) -> None:
+    bad = rendered_view_to_wire(VIEW)
+    for name, value in change.items():
+        setattr(bad, name, value)
+    with pytest.raises(ProtocolError, match="impossible view"):
+        rendered_view_from_wire(bad, LENS)

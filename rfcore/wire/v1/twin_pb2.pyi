@@ -215,3 +215,140 @@ class Departure(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___Departure: _TypeAlias = Departure  # noqa: Y015
+
+@_typing.final
+class RenderRequest(_message.Message):
+    """One viewpoint."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    TILE_FIELD_NUMBER: _builtins.int
+    FIELD_ID_FIELD_NUMBER: _builtins.int
+    POSE_FIELD_NUMBER: _builtins.int
+    INTRINSICS_FIELD_NUMBER: _builtins.int
+    QUALITY_FIELD_NUMBER: _builtins.int
+    ENCODING_FIELD_NUMBER: _builtins.int
+    MAX_AGE_MS_FIELD_NUMBER: _builtins.int
+    NUMBER_FIELD_NUMBER: _builtins.int
+    tile: _builtins.str
+    """A tile that the server publishes. Empty: `field_id` says which field."""
+    field_id: _builtins.str
+    """Lower-case hexadecimal sha256 of a field that the server holds; empty beside a tile."""
+    encoding: Global___PictureEncoding.ValueType
+    max_age_ms: _builtins.int
+    """Pictures that were captured longer ago vouch for nothing. 0: 2000; at most 10000."""
+    number: _builtins.int
+    """The answer has the same number."""
+    @_builtins.property
+    def pose(self) -> _edge_pb2.Pose: ...
+    @_builtins.property
+    def intrinsics(self) -> _edge_pb2.Intrinsics:
+        """At most 1920 x 1088 pixels."""
+
+    @_builtins.property
+    def quality(self) -> _edge_pb2.Quality: ...
+    def __init__(
+        self,
+        *,
+        tile: _builtins.str = ...,
+        field_id: _builtins.str = ...,
+        pose: _edge_pb2.Pose | None = ...,
+        intrinsics: _edge_pb2.Intrinsics | None = ...,
+        quality: _edge_pb2.Quality | None = ...,
+        encoding: Global___PictureEncoding.ValueType = ...,
+        max_age_ms: _builtins.int = ...,
+        number: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["intrinsics", b"intrinsics", "pose", b"pose", "quality", b"quality"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["encoding", b"encoding", "field_id", b"field_id", "intrinsics", b"intrinsics", "max_age_ms", b"max_age_ms", "number", b"number", "pose", b"pose", "quality", b"quality", "tile", b"tile"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___RenderRequest: _TypeAlias = RenderRequest  # noqa: Y015
+
+@_typing.final
+class RenderResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NUMBER_FIELD_NUMBER: _builtins.int
+    SKIPPED_FIELD_NUMBER: _builtins.int
+    TIME_NS_FIELD_NUMBER: _builtins.int
+    FIELD_ID_FIELD_NUMBER: _builtins.int
+    ENCODING_FIELD_NUMBER: _builtins.int
+    PICTURE_FIELD_NUMBER: _builtins.int
+    DEPTH_M_FIELD_NUMBER: _builtins.int
+    AGE_MS_FIELD_NUMBER: _builtins.int
+    CAMERAS_FIELD_NUMBER: _builtins.int
+    number: _builtins.int
+    skipped: _builtins.int
+    """Requests before this one that got no answer of their own, so far; of a stream."""
+    time_ns: _builtins.int
+    """When the view was composed, by the server's clock."""
+    field_id: _builtins.str
+    """Lower-case hexadecimal sha256 of the field that was drawn."""
+    encoding: Global___PictureEncoding.ValueType
+    picture: _builtins.bytes
+    depth_m: _builtins.bytes
+    """Of the field: float32 metres along the optical axis, little-endian, row by row; 0: nothing hit."""
+    age_ms: _builtins.bytes
+    """Since the capture of the picture that vouches for a pixel: uint16, little-endian, row by row;
+    65535: no live picture vouches for it, the pixel is the field's.
+    """
+    @_builtins.property
+    def cameras(self) -> _containers.RepeatedCompositeFieldContainer[Global___LiveCamera]: ...
+    def __init__(
+        self,
+        *,
+        number: _builtins.int = ...,
+        skipped: _builtins.int = ...,
+        time_ns: _builtins.int = ...,
+        field_id: _builtins.str = ...,
+        encoding: Global___PictureEncoding.ValueType = ...,
+        picture: _builtins.bytes = ...,
+        depth_m: _builtins.bytes = ...,
+        age_ms: _builtins.bytes = ...,
+        cameras: _abc.Iterable[Global___LiveCamera] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ms", b"age_ms", "cameras", b"cameras", "depth_m", b"depth_m", "encoding", b"encoding", "field_id", b"field_id", "number", b"number", "picture", b"picture", "skipped", b"skipped", "time_ns", b"time_ns"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___RenderResponse: _TypeAlias = RenderResponse  # noqa: Y015
+
+@_typing.final
+class LiveCamera(_message.Message):
+    """A camera whose newest picture was looked at for a view."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    VEHICLE_ID_FIELD_NUMBER: _builtins.int
+    CAMERA_ID_FIELD_NUMBER: _builtins.int
+    AGE_MS_FIELD_NUMBER: _builtins.int
+    SHARE_FIELD_NUMBER: _builtins.int
+    OUTVOTED_FIELD_NUMBER: _builtins.int
+    vehicle_id: _builtins.str
+    camera_id: _builtins.str
+    age_ms: _builtins.int
+    share: _builtins.float
+    """Share of the view's pixels that it vouches for."""
+    outvoted: _builtins.bool
+    """It disagrees with the field nearly everywhere, as with a wrong pose, and was left out."""
+    def __init__(
+        self,
+        *,
+        vehicle_id: _builtins.str = ...,
+        camera_id: _builtins.str = ...,
+        age_ms: _builtins.int = ...,
+        share: _builtins.float = ...,
+        outvoted: _builtins.bool = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ms", b"age_ms", "camera_id", b"camera_id", "outvoted", b"outvoted", "share", b"share", "vehicle_id", b"vehicle_id"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___LiveCamera: _TypeAlias = LiveCamera  # noqa: Y015

@@ -39,6 +39,16 @@ class TwinServiceStub:
                 request_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.WatchRequest.SerializeToString,
                 response_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.WatchResponse.FromString,
                 _registered_method=True)
+        self.Render = channel.unary_unary(
+                '/rfcore.wire.v1.TwinService/Render',
+                request_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.SerializeToString,
+                response_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.FromString,
+                _registered_method=True)
+        self.RenderStream = channel.stream_stream(
+                '/rfcore.wire.v1.TwinService/RenderStream',
+                request_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.SerializeToString,
+                response_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.FromString,
+                _registered_method=True)
 
 
 class TwinServiceServicer:
@@ -52,6 +62,22 @@ class TwinServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def Render(self, request, context):
+        """The street as it is now from any viewpoint: the field, with the newest pictures of the vehicles
+        carried to that view.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def RenderStream(self, request_iterator, context):
+        """The same for a camera that moves. Requests that wait when a view is done are answered by one
+        view, of the newest; `skipped` counts the others.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_TwinServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -59,6 +85,16 @@ def add_TwinServiceServicer_to_server(servicer, server):
                     servicer.Watch,
                     request_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.WatchRequest.FromString,
                     response_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.WatchResponse.SerializeToString,
+            ),
+            'Render': grpc.unary_unary_rpc_method_handler(
+                    servicer.Render,
+                    request_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.FromString,
+                    response_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.SerializeToString,
+            ),
+            'RenderStream': grpc.stream_stream_rpc_method_handler(
+                    servicer.RenderStream,
+                    request_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.FromString,
+                    response_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -88,6 +124,60 @@ class TwinService:
             '/rfcore.wire.v1.TwinService/Watch',
             rfcore_dot_wire_dot_v1_dot_twin__pb2.WatchRequest.SerializeToString,
             rfcore_dot_wire_dot_v1_dot_twin__pb2.WatchResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Render(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/rfcore.wire.v1.TwinService/Render',
+            rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.SerializeToString,
+            rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def RenderStream(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_stream(
+            request_iterator,
+            target,
+            '/rfcore.wire.v1.TwinService/RenderStream',
+            rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.SerializeToString,
+            rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.FromString,
             options,
             channel_credentials,
             insecure,

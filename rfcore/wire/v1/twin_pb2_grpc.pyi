@@ -38,6 +38,14 @@ class TwinServiceStub:
     """The newest picture of each camera, again and again. Whoever reads slowly misses pictures, and
     delays nobody; whoever reads nothing for long is let go.
     """
+    Render: _grpc.UnaryUnaryMultiCallable[_twin_pb2.RenderRequest, _twin_pb2.RenderResponse]
+    """The street as it is now from any viewpoint: the field, with the newest pictures of the vehicles
+    carried to that view.
+    """
+    RenderStream: _grpc.StreamStreamMultiCallable[_twin_pb2.RenderRequest, _twin_pb2.RenderResponse]
+    """The same for a camera that moves. Requests that wait when a view is done are answered by one
+    view, of the newest; `skipped` counts the others.
+    """
 
 @_typing.type_check_only
 class TwinServiceAsyncStub(TwinServiceStub):
@@ -45,6 +53,14 @@ class TwinServiceAsyncStub(TwinServiceStub):
     Watch: _aio.UnaryStreamMultiCallable[_twin_pb2.WatchRequest, _twin_pb2.WatchResponse]  # type: ignore[assignment]
     """The newest picture of each camera, again and again. Whoever reads slowly misses pictures, and
     delays nobody; whoever reads nothing for long is let go.
+    """
+    Render: _aio.UnaryUnaryMultiCallable[_twin_pb2.RenderRequest, _twin_pb2.RenderResponse]  # type: ignore[assignment]
+    """The street as it is now from any viewpoint: the field, with the newest pictures of the vehicles
+    carried to that view.
+    """
+    RenderStream: _aio.StreamStreamMultiCallable[_twin_pb2.RenderRequest, _twin_pb2.RenderResponse]  # type: ignore[assignment]
+    """The same for a camera that moves. Requests that wait when a view is done are answered by one
+    view, of the newest; `skipped` counts the others.
     """
 
 class TwinServiceServicer(metaclass=_abc_1.ABCMeta):
@@ -56,6 +72,26 @@ class TwinServiceServicer(metaclass=_abc_1.ABCMeta):
     ) -> _typing.Union[_abc.Iterator[_twin_pb2.WatchResponse], _abc.AsyncIterator[_twin_pb2.WatchResponse]]:
         """The newest picture of each camera, again and again. Whoever reads slowly misses pictures, and
         delays nobody; whoever reads nothing for long is let go.
+        """
+
+    @_abc_1.abstractmethod
+    def Render(
+        self,
+        request: _twin_pb2.RenderRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_twin_pb2.RenderResponse, _abc.Awaitable[_twin_pb2.RenderResponse]]:
+        """The street as it is now from any viewpoint: the field, with the newest pictures of the vehicles
+        carried to that view.
+        """
+
+    @_abc_1.abstractmethod
+    def RenderStream(
+        self,
+        request_iterator: _MaybeAsyncIterator[_twin_pb2.RenderRequest],
+        context: _ServicerContext,
+    ) -> _typing.Union[_abc.Iterator[_twin_pb2.RenderResponse], _abc.AsyncIterator[_twin_pb2.RenderResponse]]:
+        """The same for a camera that moves. Requests that wait when a view is done are answered by one
+        view, of the newest; `skipped` counts the others.
         """
 
 def add_TwinServiceServicer_to_server(servicer: TwinServiceServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

@@ -12,9 +12,8 @@ import numpy as np
 from rfcore.field import load_field
 from rfedge.demo.processes import Service, command_of, service
 from rfedge.loadtest.drive import drive_prerecorded
-from rfedge.loadtest.live.agents import agent
 from rfedge.loadtest.live.chromium import opened
-from rfedge.loadtest.live.consumers import watching
+from rfedge.loadtest.live.peers import agent, watching
 from rfedge.loadtest.live.report import AgeRow, IngestRow
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.prerecorded import prerecorded_drive

@@ -19,8 +19,7 @@ from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable, InvalidInput, RfedgeError
 from rfcore.image import jpeg_bytes
 from rfedge.demo.processes import command_of, service
-from rfedge.loadtest.live.agents import agent
-from rfedge.loadtest.live.consumers import watching
+from rfedge.loadtest.live.peers import agent, watching
 from rfedge.loadtest.live.report import SourceRow
 from rfedge.loadtest.usage import Usage, Watcher, slope_per_minute
 from rfedge.results import CHECKOUT

@@ -1,20 +1,49 @@
-"""Consumers of the twin, each on a thread and a channel of its own."""
+"""Who talks to the server: agents as processes of their own, consumers of the twin as threads."""
 
 from __future__ import annotations
 
+import subprocess
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 
 import grpc
 
+from rfcore.errors import RfedgeError
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.v1 import twin_pb2, twin_pb2_grpc
+from rfedge.demo.processes import command_of
 
-__all__ = ["Consumer", "watching"]
+__all__ = ["Consumer", "agent", "watching"]
 
+STOP_S = 20.0
 END_S = 10.0
+
+
+@contextmanager
+def agent(name: str, arguments: Sequence[str], work: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Run ``cav-agent`` until the block ends; its log is NAME.log.
+
+    Raises ``RfedgeError`` if it has ended by then, or does not end within 20 s of SIGTERM.
+    """
+    log_path = work / f"{name}.log"
+    with log_path.open("wb") as log:
+        command = [*command_of("cav-agent"), *arguments, "--vehicle", name]
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+    try:
+        yield process
+        if process.poll() is not None:
+            raise RfedgeError(f"{name} ended early; see {log_path}")
+    finally:
+        process.terminate()
+        try:
+            process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            raise RfedgeError(f"{name} did not end; see {log_path}") from None
 
 
 class Consumer:

@@ -1,0 +1,276 @@
+"""Views of the twin for consumers: which pictures may enter them, where they are computed, and what
+that is charged.
+
+Views are computed on one thread of the lowest priority, with fields of its own: neither event loop
+nor the workers that decode, nor the renderers these share, wait for it. Identities take turns, and
+pay with worker time, the same as vehicles.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from mec_server.event_loop import Workers
+from mec_server.ledger.budgets import Resource
+from mec_server.ledger.ledger import Ledger
+from mec_server.twin.composition import (
+    MOST_DISTANCE_M,
+    ComposedView,
+    LivePicture,
+    compose,
+    live_picture,
+    shrunk,
+)
+from mec_server.twin.state import CameraKey, Covers, Twin, TwinView
+from rfcore.camera import Camera
+from rfcore.errors import AccessDenied, InvalidInput
+from rfcore.field import RadianceField
+from rfcore.field.quality import FULL
+from rfcore.image import Rgb, jpeg_bytes, png_bytes
+from rfcore.native.yuv import i420_from_rgb
+from rfcore.views import View
+from rfcore.wire.checks import shown
+from rfcore.wire.tiles import Tile
+from rfcore.wire.twin import PictureEncoding
+from rfcore.wire.twin_render import NO_AGE, LiveCamera, RenderedView, ViewRequest
+
+__all__ = ["Place", "TwinViews", "place_of"]
+
+MOST_CAMERAS = 4
+"""Live pictures carried to one view: those nearest to it."""
+MOST_KEPT = 16
+"""Live pictures whose difference from the field is kept for the next view."""
+
+BEYOND_BOUNDS_M = 5.0
+"""How far outside of a field's box a view may be."""
+INSIDE_M, INSIDE_SHARE = 0.3, 0.9
+"""A view of which so much is nearer than this is inside of something."""
+
+LOWEST_PRIORITY = 19
+
+
+@dataclass(frozen=True)
+class Place:
+    """A field to draw, and every field that pictures of the same ground may be coded against."""
+
+    field_id: str
+    field_ids: frozenset[str]
+
+
+def place_of(request: ViewRequest, tiles: Sequence[Tile]) -> Place:
+    """Return what ``request`` names; raise ``InvalidInput`` for a tile that is not published."""
+    for tile in tiles:
+        if request.tile == tile.name or request.field_id in tile.archive_ids:
+            return Place(request.field_id or tile.field_id, tile.archive_ids)
+    if request.field_id:
+        return Place(request.field_id, frozenset((request.field_id,)))
+    here = ", ".join(tile.name for tile in tiles) or "none; name a field_id"
+    raise InvalidInput("tile", f"{shown(request.tile)} is not published here; published: {here}")
+
+
+class TwinViews:
+    """Composes views of ``twin``.
+
+    ``open_field`` opens a field that only these views use; ``tiles`` are those published now.
+    ``failed`` is called with what a callback of the thread raised.
+    """
+
+    def __init__(
+        self,
+        twin: Twin,
+        open_field: Callable[[str], RadianceField],
+        tiles: Callable[[], tuple[Tile, ...]],
+        ledger: Ledger,
+        failed: Callable[[Exception], None],
+    ) -> None:
+        self._twin = twin
+        self._open_field = open_field
+        self._tiles = tiles
+        self._ledger = ledger
+        self._worker = Workers(1, failed, "views")
+        self._kept: OrderedDict[tuple[CameraKey, str], tuple[TwinView, LivePicture]] = OrderedDict()
+        self._lowered = False
+
+    def close(self) -> None:
+        """Stop the thread."""
+        self._worker.close()
+
+    def spend_message(self, identity: str) -> None:
+        """Charge a message of a stream; raise ``LimitExceeded``."""
+        self._ledger.spend(identity, Resource.MESSAGES, 1, time.monotonic())
+
+    async def view(
+        self,
+        request: ViewRequest,
+        identity: str,
+        covers: Covers,
+        may_draw: Callable[[str], bool],
+    ) -> RenderedView:
+        """Return a view of the pictures that ``covers`` lets the consumer see.
+
+        Raises ``LimitExceeded`` while ``identity`` has spent its worker time, ``AccessDenied`` for
+        a field that it may not have (``may_draw``), ``UnknownField``, and ``InvalidInput`` for a
+        viewpoint outside of the field or inside of a wall. A caller that is cancelled costs at most
+        the view that has begun.
+        """
+        place = place_of(request, self._tiles())
+        if not may_draw(place.field_id):
+            raise AccessDenied("this certificate may not see that tile; ask the operator")
+        now = time.monotonic()
+        self._ledger.check(identity, Resource.WORKER_SECONDS, now)
+        recent = [
+            seen
+            for seen in self._twin.recent(now, request.max_age_s)
+            if seen.field_id in place.field_ids and covers(seen.vehicle_id, seen.field_id)
+        ]
+        answer: asyncio.Future[RenderedView] = asyncio.get_running_loop().create_future()
+        work = partial(self._timed, request, place, recent, answer)
+        self._worker.submit(identity, work, partial(self._finish, identity, answer))
+        return await answer
+
+    def _finish(
+        self,
+        identity: str,
+        answer: asyncio.Future[RenderedView],
+        outcome: tuple[float, RenderedView | Exception] | Exception,
+    ) -> None:
+        if isinstance(outcome, Exception):
+            raise outcome
+        worked_s, result = outcome
+        self._ledger.charge(identity, Resource.WORKER_SECONDS, worked_s, time.monotonic())
+        if answer.done():
+            return
+        if isinstance(result, Exception):
+            answer.set_exception(result)
+        else:
+            answer.set_result(result)
+
+    # --- on the thread
+
+    def _timed(
+        self,
+        request: ViewRequest,
+        place: Place,
+        recent: list[TwinView],
+        answer: asyncio.Future[RenderedView],
+    ) -> tuple[float, RenderedView | Exception]:
+        """Return for how long the thread was busy, and the view, or why there is none."""
+        if answer.cancelled():
+            return 0.0, asyncio.InvalidStateError("nobody waits for this view")
+        self._lower_priority()
+        started = time.monotonic()
+        try:
+            result: RenderedView | Exception = self._composed(request, place, recent)
+        except Exception as error:
+            result = error
+        return time.monotonic() - started, result
+
+    def _lower_priority(self) -> None:
+        if not self._lowered:
+            self._lowered = True
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST_PRIORITY)
+
+    def _composed(self, request: ViewRequest, place: Place, recent: list[TwinView]) -> RenderedView:
+        field = self._open_field(place.field_id)
+        camera = request.camera
+        check_inside(camera, field)
+        view = field.render(camera, request.quality)
+        check_outside_of_walls(view)
+        seen = _nearest(recent, camera)
+        now = time.monotonic()
+        live = [(self._live(each, field), each.age_s(now)) for each in seen]
+        composed = compose(camera, view, live, request.max_age_s)
+        cameras = tuple(
+            LiveCamera(each.vehicle_id, each.frame.camera_id, age_s, share, picture.trust == 0)
+            for each, (picture, age_s), share in zip(seen, live, composed.shares, strict=True)
+        )
+        return RenderedView(
+            number=request.number,
+            time_ns=time.time_ns(),
+            field_id=place.field_id,
+            encoding=request.encoding,
+            picture=_encoded(composed.rgb, request.encoding),
+            depth=composed.depth,
+            age_ms=_milliseconds(composed),
+            cameras=cameras,
+        )
+
+    def _live(self, seen: TwinView, field: RadianceField) -> LivePicture:
+        """Return what a picture changes in ``field``; made once for each picture."""
+        key = (seen.key, field.field_id)
+        kept = self._kept.get(key)
+        if kept is None or kept[0] is not seen:
+            assert seen.frame.pose is not None
+            rgb, intrinsics = shrunk(seen.picture, seen.intrinsics)
+            camera = Camera(intrinsics, seen.frame.pose)
+            kept = (seen, live_picture(camera, rgb, field.render(camera, FULL)))
+            self._kept[key] = kept
+            if len(self._kept) > MOST_KEPT:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return kept[1]
+
+
+def check_inside(camera: Camera, field: RadianceField) -> None:
+    """Raise ``InvalidInput`` for a camera further than ``BEYOND_BOUNDS_M`` outside of the field."""
+    low_m, high_m = field.bounds.low_m, field.bounds.high_m
+    for axis, at_m, low, high in zip(
+        "xyz", camera.world_from_cam.translation_m, low_m, high_m, strict=True
+    ):
+        if not low - BEYOND_BOUNDS_M <= at_m <= high + BEYOND_BOUNDS_M:
+            raise InvalidInput(
+                f"pose.{axis}_m",
+                f"{at_m:.6g} is more than {BEYOND_BOUNDS_M:g} m outside of the field, which is "
+                f"from {low:.6g} to {high:.6g}; choose a viewpoint in the tile",
+            )
+
+
+def check_outside_of_walls(view: View) -> None:
+    """Raise ``InvalidInput`` for a view that something fills at arm's length."""
+    near = (view.opacity > 0.5) & (view.depth < INSIDE_M)
+    share = float(near.mean())
+    if share >= INSIDE_SHARE:
+        raise InvalidInput(
+            "pose",
+            f"{share:.0%} of the view is nearer than {INSIDE_M:g} m: the viewpoint is inside of "
+            "something; move it into the open",
+        )
+
+
+def _nearest(recent: list[TwinView], camera: Camera) -> list[TwinView]:
+    """Return the pictures of known pose that were taken nearest to ``camera``, within reach."""
+
+    def distance_m(seen: TwinView) -> float:
+        if seen.frame.pose is None:
+            return math.inf
+        return math.dist(seen.frame.pose.translation_m, camera.world_from_cam.translation_m)
+
+    near = [seen for seen in recent if distance_m(seen) < 2 * MOST_DISTANCE_M]
+    return sorted(near, key=lambda seen: (distance_m(seen), seen.key))[:MOST_CAMERAS]
+
+
+def _encoded(rgb: Rgb, encoding: PictureEncoding) -> bytes:
+    match encoding:
+        case PictureEncoding.NONE:
+            return b""
+        case PictureEncoding.I420:
+            return i420_from_rgb(rgb).packed()
+        case PictureEncoding.JPEG:
+            return jpeg_bytes(rgb)
+        case PictureEncoding.PNG:
+            return png_bytes(rgb)
+
+
+def _milliseconds(composed: ComposedView) -> np.ndarray[tuple[int, ...], np.dtype[np.uint16]]:
+    ages_ms = np.minimum(np.rint(composed.age_s * 1e3), NO_AGE - 1)
+    return np.where(np.isfinite(composed.age_s), ages_ms, NO_AGE).astype(np.uint16)

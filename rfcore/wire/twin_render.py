@@ -1,0 +1,246 @@
+"""Views of the street from any viewpoint: messages of ``TwinService.Render``, and how to ask.
+
+What comes from a peer is checked here, as in ``rfcore.wire.twin``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import grpc
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera, Intrinsics
+from rfcore.errors import InvalidInput, ProtocolError
+from rfcore.field.quality import FULL, Quality
+from rfcore.image import I420, Rgb, rgb_from_bytes
+from rfcore.native.yuv import rgb_from_i420
+from rfcore.wire.checks import check_bytes, check_field_id, check_name, check_range
+from rfcore.wire.convert import quality_of, quality_to_wire
+from rfcore.wire.twin import (
+    PictureEncoding,
+    encoding_from_wire,
+    encoding_to_wire,
+    intrinsics_to_wire,
+    pose_from_wire,
+    pose_to_wire,
+)
+from rfcore.wire.v1 import twin_pb2 as pb
+from rfcore.wire.v1 import twin_pb2_grpc
+
+__all__ = [
+    "DEFAULT_AGE_S",
+    "MAX_AGE_S",
+    "MAX_VIEW_PX",
+    "NO_AGE",
+    "LiveCamera",
+    "RenderedView",
+    "ViewRequest",
+    "render_view",
+    "rendered_view_from_wire",
+    "rendered_view_to_wire",
+    "view_request_from_wire",
+    "view_request_to_wire",
+]
+
+MAX_VIEW_PX: Final = 1920 * 1088
+LEAST_SIDE_PX: Final = 16
+LEAST_FOCAL, MOST_FOCAL = 0.1, 20.0
+"""Focal lengths in widths and heights of the picture: 157 degrees to 2.9 degrees."""
+DEFAULT_AGE_S: Final = 2.0
+MAX_AGE_S: Final = 10.0
+"""How old a picture may be that still vouches for pixels."""
+NO_AGE: Final = 65535
+"""Where no live picture vouches, in ``RenderResponse.age_ms``."""
+RENDER_TIMEOUT_S: Final = 30.0
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """One viewpoint of a published ``tile``, or of a field by its id; exactly one is given.
+
+    ``camera`` is relative to the origin of the tile. Pictures older than ``max_age_s`` vouch for
+    nothing. Raises ``InvalidInput`` for a camera no one could look through.
+    """
+
+    camera: Camera
+    tile: str = ""
+    field_id: str = ""
+    quality: Quality = FULL
+    encoding: PictureEncoding = PictureEncoding.JPEG
+    max_age_s: float = DEFAULT_AGE_S
+    number: int = 0
+
+    def __post_init__(self) -> None:
+        if bool(self.tile) == bool(self.field_id):
+            raise InvalidInput("tile", "name either a published tile or a field_id")
+        if self.tile:
+            check_name("tile", self.tile)
+        else:
+            check_field_id("field_id", self.field_id)
+        check_range("max_age_ms", 1e3 * self.max_age_s, 1, 1e3 * MAX_AGE_S)
+        _check_camera(self.camera.intrinsics)
+
+
+@dataclass(frozen=True)
+class LiveCamera:
+    """A camera that was looked at for a view. ``share``: of the view's pixels, that it vouches
+    for; ``outvoted``: it disagrees with the field nearly everywhere."""
+
+    vehicle_id: str
+    camera_id: str
+    age_s: float
+    share: float
+    outvoted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedView:
+    """A view as it was composed.
+
+    ``rgb`` uint8 [H, W, 3], None where the picture was not asked for; ``depth`` of the field,
+    float32 [H, W], metres, 0: nothing hit; ``age_ms`` uint16 [H, W], ``NO_AGE`` where no live
+    picture vouches. ``picture`` is ``rgb`` in ``encoding``.
+    """
+
+    number: int
+    time_ns: int
+    field_id: str
+    encoding: PictureEncoding
+    picture: bytes
+    depth: NDArray[np.float32]
+    age_ms: NDArray[np.uint16]
+    cameras: tuple[LiveCamera, ...]
+    skipped: int = 0
+
+    @property
+    def rgb(self) -> Rgb | None:
+        """The picture."""
+        height, width = self.depth.shape
+        if self.encoding is PictureEncoding.NONE:
+            return None
+        if self.encoding is PictureEncoding.I420:
+            return rgb_from_i420(I420.unpacked((width, height), self.picture))
+        return rgb_from_bytes(self.picture, "the server's view")
+
+    @property
+    def live(self) -> NDArray[np.bool_]:
+        """Where a live picture vouches, [H, W]."""
+        return np.asarray(self.age_ms != NO_AGE)
+
+
+def render_view(
+    channel: grpc.Channel, request: ViewRequest, timeout_s: float = RENDER_TIMEOUT_S
+) -> RenderedView:
+    """Ask a server for one view; raises ``grpc.RpcError``, or ``ProtocolError`` for an answer that
+    is none to ``request``."""
+    stub = twin_pb2_grpc.TwinServiceStub(channel)
+    return rendered_view_from_wire(
+        stub.Render(view_request_to_wire(request), timeout=timeout_s), request.camera.intrinsics
+    )
+
+
+def view_request_to_wire(request: ViewRequest) -> pb.RenderRequest:
+    """Return a request as protobuf."""
+    return pb.RenderRequest(
+        tile=request.tile,
+        field_id=request.field_id,
+        pose=pose_to_wire(request.camera.world_from_cam),
+        intrinsics=intrinsics_to_wire(request.camera.intrinsics),
+        quality=quality_to_wire(request.quality),
+        encoding=encoding_to_wire(request.encoding),
+        max_age_ms=round(1e3 * request.max_age_s),
+        number=request.number,
+    )
+
+
+def view_request_from_wire(request: pb.RenderRequest) -> ViewRequest:
+    """Return what a consumer asks for; raise ``InvalidInput`` for a value outside its limits."""
+    if not (request.HasField("pose") and request.HasField("intrinsics")):
+        raise InvalidInput("pose", "a view needs a pose and intrinsics")
+    k = request.intrinsics
+    intrinsics = Intrinsics(k.width_px, k.height_px, k.fx_px, k.fy_px, k.cx_px, k.cy_px)
+    jpeg = request.encoding == pb.PICTURE_ENCODING_UNSPECIFIED
+    return ViewRequest(
+        Camera(intrinsics, pose_from_wire(request.pose)),
+        request.tile,
+        request.field_id,
+        quality_of(request.quality) if request.HasField("quality") else FULL,
+        PictureEncoding.JPEG if jpeg else encoding_from_wire(request.encoding),
+        (request.max_age_ms / 1e3) or DEFAULT_AGE_S,
+        request.number,
+    )
+
+
+def rendered_view_to_wire(view: RenderedView) -> pb.RenderResponse:
+    """Return an answer as protobuf."""
+    return pb.RenderResponse(
+        number=view.number,
+        skipped=view.skipped,
+        time_ns=view.time_ns,
+        field_id=view.field_id,
+        encoding=encoding_to_wire(view.encoding),
+        picture=view.picture,
+        depth_m=view.depth.astype("<f4").tobytes(),
+        age_ms=view.age_ms.astype("<u2").tobytes(),
+        cameras=[
+            pb.LiveCamera(
+                vehicle_id=camera.vehicle_id,
+                camera_id=camera.camera_id,
+                age_ms=round(1e3 * camera.age_s),
+                share=camera.share,
+                outvoted=camera.outvoted,
+            )
+            for camera in view.cameras
+        ],
+    )
+
+
+def rendered_view_from_wire(response: pb.RenderResponse, intrinsics: Intrinsics) -> RenderedView:
+    """Return a server's answer to a request for a view of ``intrinsics``; raise ``ProtocolError``
+    for one no server of ours would send."""
+    shape = (intrinsics.height_px, intrinsics.width_px)
+    pixels = intrinsics.height_px * intrinsics.width_px
+    try:
+        depth_m = check_bytes("depth_m", response.depth_m, 4 * pixels, 4 * pixels)
+        age_ms = check_bytes("age_ms", response.age_ms, 2 * pixels, 2 * pixels)
+        return RenderedView(
+            response.number,
+            response.time_ns,
+            check_field_id("field_id", response.field_id),
+            encoding_from_wire(response.encoding),
+            response.picture,
+            np.frombuffer(depth_m, "<f4").reshape(shape),
+            np.frombuffer(age_ms, "<u2").reshape(shape),
+            tuple(_live_camera(camera) for camera in response.cameras),
+            response.skipped,
+        )
+    except InvalidInput as error:
+        raise ProtocolError(f"the server sent an impossible view: {error}") from error
+
+
+def _live_camera(camera: pb.LiveCamera) -> LiveCamera:
+    return LiveCamera(
+        check_name("camera.vehicle_id", camera.vehicle_id),
+        check_name("camera.camera_id", camera.camera_id),
+        camera.age_ms / 1e3,
+        check_range("camera.share", camera.share, 0.0, 1.0),
+        camera.outvoted,
+    )
+
+
+def _check_camera(k: Intrinsics) -> None:
+    for name, side in (("width_px", k.width_px), ("height_px", k.height_px)):
+        if side < LEAST_SIDE_PX:
+            raise InvalidInput(f"intrinsics.{name}", f"{side} px is below {LEAST_SIDE_PX} px")
+    if k.width_px * k.height_px > MAX_VIEW_PX:
+        raise InvalidInput(
+            "intrinsics",
+            f"{k.width_px} x {k.height_px} are more than {MAX_VIEW_PX} pixels; ask for fewer",
+        )
+    for name, focal_px, side in (("fx_px", k.fx_px, k.width_px), ("fy_px", k.fy_px, k.height_px)):
+        check_range(f"intrinsics.{name}", focal_px, LEAST_FOCAL * side, MOST_FOCAL * side)
+    for name, centre_px, side in (("cx_px", k.cx_px, k.width_px), ("cy_px", k.cy_px, k.height_px)):
+        check_range(f"intrinsics.{name}", centre_px, -1.0 * side, 2.0 * side)

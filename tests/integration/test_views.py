@@ -1,0 +1,247 @@
+"""Views of the street from any viewpoint, by real consumers from a real server."""
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+
+from mec_server.config import ServerBudget, SessionLimits
+from mec_server.twin import rendering
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.wire.conventions import CONSUMER_OPTIONS
+from rfcore.wire.twin import PictureEncoding
+from rfcore.wire.twin_render import (
+    NO_AGE,
+    ViewRequest,
+    render_view,
+    rendered_view_from_wire,
+    view_request_to_wire,
+)
+from rfcore.wire.v1 import twin_pb2_grpc
+
+INTRINSICS = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
+ORIGIN = Camera(INTRINSICS, Pose.identity())
+
+
+def asked(street: Any, camera: Camera = ORIGIN, **changes: Any) -> ViewRequest:
+    changes = {"encoding": PictureEncoding.PNG, "max_age_s": 10.0, **changes}
+    return ViewRequest(camera, field_id=street.field_id, **changes)
+
+
+def field_picture(street: Any, camera: Camera) -> np.ndarray:
+    colour = street.field.render(camera).colour.clip(0, 1)
+    return np.rint(colour * np.float32(255)).astype(np.uint8)
+
+
+@asynccontextmanager
+async def stub_of(server: Any) -> AsyncIterator[Any]:
+    async with grpc.aio.insecure_channel(str(server.address), options=CONSUMER_OPTIONS) as channel:
+        yield twin_pb2_grpc.TwinServiceStub(channel)
+
+
+async def refusal(call: Any) -> tuple[grpc.StatusCode, str]:
+    with pytest.raises(grpc.aio.AioRpcError) as caught:
+        await call
+    return caught.value.code(), caught.value.details()
+
+
+async def test_a_view_is_the_field_with_what_a_vehicle_sees_now(
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    """The vehicle sees a red box that the field does not have; a neighbour's view shows it."""
+    aside = Camera(INTRINSICS, Pose((0.05, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
+
+    def look() -> Any:
+        with grpc.insecure_channel(str(server.address), options=CONSUMER_OPTIONS) as channel:
+            return render_view(channel, asked(street, aside, number=7))
+
+    async with serve() as server:
+        empty = await asyncio.to_thread(look)
+        async with raw_vehicle(server.address) as vehicle:
+            await vehicle.greet(coded.hello)
+            await vehicle.told(coded.frames[0])
+            view = await asyncio.to_thread(look)
+        gone = await asyncio.to_thread(look)
+    field = field_picture(street, aside)
+    assert np.array_equal(empty.rgb, field)
+    assert not empty.live.any()
+    assert (view.number, view.field_id) == (7, street.field_id)
+    assert np.array_equal(view.depth, street.field.render(aside).depth)
+    red = np.array([200, 40, 30])
+    box, live = (slice(24, 32), slice(14, 21)), view.live[24:32, 14:21]
+    assert live.mean() > 0.5
+    before, after = (np.abs(rgb[box][live].astype(int) - red).mean() for rgb in (field, view.rgb))
+    assert after < before / 2
+    assert np.array_equal(view.rgb[~view.live], field[~view.live])
+    (camera,) = view.cameras
+    assert (camera.vehicle_id, camera.camera_id, camera.outvoted) == ("cav-raw", "front", False)
+    assert camera.share == pytest.approx(view.live.mean())
+    assert set(np.unique(view.age_ms)) == {round(1e3 * camera.age_s), NO_AGE}
+    assert gone.live.any(), "a vehicle that left fades, it does not vanish"
+    assert gone.cameras[0].age_s > camera.age_s
+
+
+def turned_away(**changes: Any) -> Camera:
+    return replace(ORIGIN, intrinsics=replace(INTRINSICS, **changes))
+
+
+FAR = Camera(INTRINSICS, Pose((0.0, 0.0, -40.0), (1.0, 0.0, 0.0, 0.0)))
+
+
+async def test_a_viewpoint_outside_of_the_field_is_refused(street: Any, serve: Any) -> None:
+    async with serve() as server, stub_of(server) as stub:
+        code, details = await refusal(stub.Render(view_request_to_wire(asked(street, FAR))))
+    assert code is grpc.StatusCode.INVALID_ARGUMENT
+    assert "pose.z_m: -40 is more than 5 m outside of the field" in details
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"width_px": 4000, "height_px": 3000}, "intrinsics: 4000 x 3000 are more than 2088960"),
+        ({"width_px": 8}, "intrinsics.width_px: 8 px is below 16 px"),
+        ({"width_px": 0}, "intrinsics.width_px: 0 px is outside 1..8192 px"),
+        ({"fx_px": 1.0}, "intrinsics.fx_px: 1.0 is outside 7.6..1520"),
+        ({"fy_px": float("nan")}, "intrinsics.fy_px: nan"),
+        ({"cx_px": 1e9}, "intrinsics.cx_px: 1000000000.0 is outside -76..152"),
+    ],
+)
+async def test_absurd_intrinsics_are_refused(
+    street: Any, serve: Any, change: dict[str, Any], problem: str
+) -> None:
+    request = view_request_to_wire(asked(street))
+    for name, value in change.items():
+        setattr(request.intrinsics, name, value)
+    async with serve() as server, stub_of(server) as stub:
+        code, details = await refusal(stub.Render(request))
+    assert code is grpc.StatusCode.INVALID_ARGUMENT
+    assert problem in details
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "problem"),
+    [
+        ({"field_id": ""}, "INVALID_ARGUMENT", "tile: name either"),
+        ({"field_id": "", "tile": "west"}, "INVALID_ARGUMENT", "'west' is not published here"),
+        ({"field_id": "ab" * 32}, "NOT_FOUND", "is not on this server"),
+        ({"max_age_ms": 10_001}, "INVALID_ARGUMENT", "max_age_ms: 10001.0 is outside 1..10000"),
+        ({"encoding": 99}, "INVALID_ARGUMENT", "encoding: 99"),
+        ({"pose": None}, "INVALID_ARGUMENT", "a view needs a pose"),
+    ],
+)
+async def test_what_nobody_can_be_shown_is_refused(
+    street: Any, serve: Any, change: dict[str, Any], code: str, problem: str
+) -> None:
+    request = view_request_to_wire(asked(street))
+    for name, value in change.items():
+        request.ClearField(name)  # type: ignore[arg-type]
+        if value is not None:
+            setattr(request, name, value)
+    async with serve() as server, stub_of(server) as stub:
+        refused, details = await refusal(stub.Render(request))
+    assert refused is grpc.StatusCode[code]
+    assert problem in details
+
+
+async def test_views_are_charged_and_limited(street: Any, serve: Any) -> None:
+    async with serve(server_budget=ServerBudget(watches=1)) as server, stub_of(server) as stub:
+        value = server.registry.get_sample_value
+        moving = stub.RenderStream()
+        await moving.write(view_request_to_wire(asked(street)))
+        await moving.read()
+        code, details = await refusal(stub.Render(view_request_to_wire(asked(street))))
+        await moving.done_writing()
+        assert await moving.code() is grpc.StatusCode.OK
+        spent = value("rfedge_server_spent_total", {"resource": "worker_seconds"})
+    assert code is grpc.StatusCode.RESOURCE_EXHAUSTED
+    assert "1 watches" in details
+    assert spent > 0
+
+
+async def test_a_camera_that_moves_is_answered_in_order_with_the_newest(
+    street: Any, serve: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the first view is held back, four more requests come: one answer, of the last."""
+    gate, begun, compose = threading.Event(), threading.Event(), rendering.compose
+
+    def held_back(*args: Any) -> Any:
+        begun.set()
+        assert gate.wait(30)
+        return compose(*args)
+
+    monkeypatch.setattr(rendering, "compose", held_back)
+    cameras = [
+        replace(ORIGIN, world_from_cam=Pose((0.1 * i, 0, 0), (1, 0, 0, 0))) for i in range(5)
+    ]
+    async with serve() as server, stub_of(server) as stub:
+        moving = stub.RenderStream()
+        await moving.write(view_request_to_wire(asked(street, cameras[0], number=0)))
+        assert await asyncio.to_thread(begun.wait, 30)
+        for number in range(1, 5):
+            await moving.write(view_request_to_wire(asked(street, cameras[number], number=number)))
+        spent = ("rfedge_server_spent_total", {"resource": "messages"})
+        async with asyncio.timeout(30):
+            while server.registry.get_sample_value(*spent) < 5:
+                await asyncio.sleep(0.001)
+        gate.set()
+        views = [rendered_view_from_wire(await moving.read(), INTRINSICS) for _ in range(2)]
+        await moving.done_writing()
+        assert await moving.read() is grpc.aio.EOF
+    assert [(view.number, view.skipped) for view in views] == [(0, 0), (4, 3)]
+    for view in views:
+        assert np.array_equal(view.rgb, field_picture(street, cameras[view.number]))
+
+
+async def test_a_stream_ends_with_what_is_wrong_and_with_its_server(
+    street: Any, serve: Any
+) -> None:
+    async with stub_of_stopping(serve) as (stub, server):
+        wrong, good = stub.RenderStream(), stub.RenderStream()
+        await wrong.write(view_request_to_wire(asked(street, FAR)))
+        assert await wrong.code() is grpc.StatusCode.INVALID_ARGUMENT
+        await good.write(view_request_to_wire(asked(street)))
+        await good.read()
+        await server.stop()
+        assert await good.code() is grpc.StatusCode.OK
+
+
+@asynccontextmanager
+async def stub_of_stopping(serve: Any) -> AsyncIterator[tuple[Any, Any]]:
+    async with serve() as server, stub_of(server) as stub:
+        yield stub, server
+
+
+async def test_a_view_that_nobody_waits_for_any_more_is_not_drawn(
+    street: Any, serve: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate, drawn, compose = threading.Event(), [], rendering.compose
+
+    def held_back(*args: Any) -> Any:
+        drawn.append(1)
+        assert gate.wait(30)
+        return compose(*args)
+
+    monkeypatch.setattr(rendering, "compose", held_back)
+    request = view_request_to_wire(asked(street))
+    async with serve(limits=SessionLimits()) as server, stub_of(server) as stub:
+        held = lambda: server._entry.ledger.held("watches")  # noqa: E731
+        first = stub.Render(request)
+        async with asyncio.timeout(30):
+            while not drawn:
+                await asyncio.sleep(0.001)
+            second = stub.Render(request)
+            while held() < 2:
+                await asyncio.sleep(0.001)
+            second.cancel()
+            while held() > 1:
+                await asyncio.sleep(0.001)
+        gate.set()
+        await first
+        await stub.Render(request)
+    assert len(drawn) == 2
