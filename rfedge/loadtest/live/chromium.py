@@ -36,6 +36,8 @@ LOW_PRIORITY = 10
 """A tenth of the time of what competes with it: at 19 it starves on a busy machine."""
 LOADED_S = 300.0
 POLL_S = 0.2
+SETTLED_S = 5.0
+"""Splats are sorted once more, and drawn, after they were drawn first."""
 LOADED = (
     "return !!window.twin?.street.settled()"
     " && document.querySelectorAll('#wall figure').length >= arguments[0]"
@@ -57,11 +59,14 @@ class Page:
         self._driver = driver
 
     def await_shown(self, cameras: int) -> None:
-        """Wait until the splats are drawn and so many cameras are on the wall."""
+        """Wait until the splats are drawn, and stay so, and so many cameras are on the wall."""
         end_s = time.monotonic() + LOADED_S
-        while not self._driver.execute_script(LOADED, cameras):
-            if time.monotonic() > end_s:
+        drawing_s = time.monotonic()
+        while (now_s := time.monotonic()) - drawing_s < SETTLED_S:
+            if now_s > end_s:
                 raise RfedgeError(f"the page did not show {cameras} cameras in {LOADED_S:g} s")
+            if not self._driver.execute_script(LOADED, cameras):
+                drawing_s = time.monotonic()
             time.sleep(POLL_S)
 
     def watch(self, seconds: float) -> Seen:
