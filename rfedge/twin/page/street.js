@@ -206,7 +206,7 @@ export class Street {
       this.cameras.delete(key);
     }
     this.removeMark(key);
-    this.touch();
+    this.touchLater();
   }
 
   select(key) {
