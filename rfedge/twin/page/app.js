@@ -95,9 +95,10 @@ function connect() {
 }
 
 setInterval(() => {
-  const frames = `${street.framesPerSecond()} frames/s`;
-  const slow = `street drawn in ${(street.drawingMs / 1000).toFixed(1)} s, so for a new view only (no GPU?)`;
-  element("rate").textContent = `${state.pictures} pictures/s, ${street.isTooSlow ? slow : frames}`;
+  const drawing = street.isTooSlow ? `${(street.drawingMs / 1000).toFixed(0)} s a drawing`
+    : `${street.framesPerSecond()} frames/s`;
+  element("rate").textContent = `${state.pictures} pictures/s, ${drawing}`;
+  element("slow").hidden = !street.isTooSlow;
   state.pictures = 0;
   wall.showAges();
   plots.draw();

@@ -45,6 +45,9 @@ export class Street {
   resize() {
     if (this.fixedSize) return;
     const { clientWidth, clientHeight } = this.parent;
+    const size = [clientWidth, clientHeight, this.resolution].join();
+    if (size === this.size) return;
+    this.size = size;
     this.renderer.setPixelRatio(this.resolution);
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.view.aspect = clientWidth / Math.max(1, clientHeight);
@@ -266,6 +269,7 @@ export class Street {
     this.showMarks(!this.fixedSize);
     if (!pose) { this.resize(); return; }
     const { translation_m, rotation_wxyz, intrinsics: k } = pose;
+    this.size = null;
     this.renderer.setPixelRatio(1);
     this.renderer.setSize(k.width_px, k.height_px, false);
     this.view.aspect = k.width_px / k.height_px;
