@@ -36,8 +36,8 @@ LOW_PRIORITY = 10
 """A tenth of the time of what competes with it: at 19 it starves on a busy machine."""
 LOADED_S = 300.0
 POLL_S = 0.2
-SETTLED_S = 5.0
-"""Splats are sorted once more, and drawn, after they were drawn first."""
+SETTLED_S = 15.0
+"""Splats are sorted before they are drawn, and once more with fewer pixels if that took long."""
 LOADED = (
     "return !!window.twin?.street.settled()"
     " && document.querySelectorAll('#wall figure').length >= arguments[0]"
