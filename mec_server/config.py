@@ -10,6 +10,7 @@ from typing import Annotated
 from tyro.conf import Suppress, arg
 
 from rfcore.errors import InvalidInput
+from rfcore.update.run import LearnAs
 from rfcore.wire.checks import MAX_RATE_HZ
 from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
 
@@ -17,6 +18,7 @@ __all__ = [
     "AdmissionLimits",
     "DecoderKind",
     "IdentityBudget",
+    "LearnSettings",
     "RecordSettings",
     "ServerBudget",
     "ServerConfig",
@@ -173,6 +175,37 @@ class RecordSettings:
 
 
 @dataclass(frozen=True)
+class LearnSettings:
+    """What is learnt of recordings: other lights of the tiles, and what changed on the street."""
+
+    on: Annotated[bool, arg(name="learn")] = False
+    """Learn from what is recorded (--record), in a process of its own at the lowest priority, and
+    publish what makes bits fall into the folder of fields (docs/fields.md)."""
+    learn_as: Annotated[LearnAs, arg(name="learn-as")] = LearnAs.COLOURS
+    """Another light as colours (a layer on the tile's field) or as all (a field of its own)."""
+    min_identities: Annotated[int, arg(name="learn-min-identities")] = 2
+    """From fewer vehicles nothing is learnt."""
+    cpu_s_per_h: Annotated[float, arg(name="learn-cpu-s-per-h")] = 900.0
+    """Seconds of one core that learning about one tile may take in an hour."""
+    max_gb: Annotated[float, arg(name="learn-max-gb")] = 1.0
+    """What all learnt archives may take, in 10^9 bytes; the oldest that are not current go."""
+    max_age_h: Annotated[float, arg(name="learn-max-age-h")] = 24.0
+    """Recordings older than so many hours are not learnt from."""
+    quiet_s: Annotated[float, Suppress] = 20.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.min_identities <= 1000:
+            raise InvalidInput("learn-min-identities", f"{self.min_identities} is outside 1..1000")
+        for name, value, low, high in (
+            ("cpu-s-per-h", self.cpu_s_per_h, 1.0, 3600.0),
+            ("max-gb", self.max_gb, 0.001, 1e6),
+            ("max-age-h", self.max_age_h, 0.01, 1e6),
+        ):
+            if not low <= value <= high:
+                raise InvalidInput(f"learn-{name}", f"{value:g} is outside {low:g}..{high:g}")
+
+
+@dataclass(frozen=True)
 class ServerConfig:
     """Reconstruct what vehicles see, against the radiance fields held here."""
 
@@ -181,6 +214,7 @@ class ServerConfig:
     listen: str = "127.0.0.1:50051"
     """HOST:PORT to accept vehicles on; port 0 takes a free one."""
     record: RecordSettings = RecordSettings()
+    learn: LearnSettings = LearnSettings()
     workers: int = 2
     """Frames reconstructed at once."""
     decoder: DecoderKind = DecoderKind.AUTO
@@ -223,6 +257,8 @@ class ServerConfig:
             raise InvalidInput(
                 "max_connection_age_s", f"{self.max_connection_age_s:g} is neither 0 nor 1..1e6"
             )
+        if self.learn.on and self.record.folder is None:
+            raise InvalidInput("learn", "there is nothing to learn from; give --record FOLDER, too")
         if not self.fields.is_dir():
             raise InvalidInput("fields", f"{self.fields} is not a directory")
         if not self.drain_s >= 0:

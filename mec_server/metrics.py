@@ -59,6 +59,8 @@ class BackgroundTask(StrEnum):
     """Serves one consumer of the twin, whose stream ends."""
     RECORDING = "recording"
     """Writes pictures to disk; recording ends for good, streaming goes on."""
+    LEARNING = "learning"
+    """Keeps the learning process running and reads what it learnt; goes on with its next look."""
 
 
 class OpeningResult(StrEnum):

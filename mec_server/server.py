@@ -22,20 +22,20 @@ from mec_server.connection_cap import ConnectionCap
 from mec_server.decoding.decoders import Decoders, DecoderSettings
 from mec_server.edge_service import EdgeService
 from mec_server.event_loop import Workers, repeat_forever
-from mec_server.fields.index import FieldIndex, field_loader
-from mec_server.fields.published import PublishedFields
+from mec_server.fields.index import FieldIndex, PublishedFields, field_loader
 from mec_server.fields.service import FieldService
 from mec_server.fields.shelf import FieldShelf
 from mec_server.guard import Guard
+from mec_server.learner import Learner
 from mec_server.ledger.budgets import Limit, Resource, budgets_of, memory_limit_bytes
 from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.peer_log import LogLimiter, PeerLog
 from mec_server.metrics import BackgroundTask, ServerMetrics
 from mec_server.peers import ChargeRpcs, Slots
 from mec_server.reconstruction import OpenCameras, Tools, open_cameras
-from mec_server.recorder import Recorder
-from mec_server.recording_room import KeepLimits
+from mec_server.recorder import KeepLimits, Recorder
 from mec_server.server_context import ServerContext
+from mec_server.tile_learning import LearningJob
 from mec_server.twin.metrics import TwinMetrics
 from mec_server.twin.rendering import TwinViews
 from mec_server.twin.service import Sight, TwinService
@@ -53,6 +53,9 @@ log = structlog.get_logger()
 
 PUBLICATIONS_EVERY_S = 1.0
 """How often the manifest in the folder of fields is checked for a change: one stat()."""
+
+LEARNING_EVERY_S = 1.0
+"""How often it is looked whether the learning process runs, and what it has learnt."""
 
 FIELDS_EVERY_S = 1.0
 """How often the folder of fields is listed: one stat() an archive, and its digest if it is new."""
@@ -109,6 +112,7 @@ class EdgeServer:
         load = field_loader(self._index, config.render, opened=self._metrics.field_opened)
         self._shelf = FieldShelf(self._index, load)
         self._recorder = self._open_recorder(config.record)
+        self._learner = self._open_learner(config)
         self._published = PublishedFields(config.fields, self._shelf.open)
         self._following: list[asyncio.Task[None]] = []
         self._access = AccessFile(config.access)
@@ -219,6 +223,9 @@ class EdgeServer:
         await self._server.start()
         self._follow(self.take_up_fields, PUBLICATIONS_EVERY_S, BackgroundTask.PUBLICATIONS)
         self._follow(self._sweep_calls, SWEEP_EVERY_S, BackgroundTask.ACCESS)
+        if self._learner is not None:
+            self._learner.start()
+            self._follow(self._look_at_learning, LEARNING_EVERY_S, BackgroundTask.LEARNING)
         self._follow(self.index_fields, FIELDS_EVERY_S, BackgroundTask.FIELDS)
         self._cap_connections()
         await self._set_health(health_pb2.HealthCheckResponse.SERVING)
@@ -259,6 +266,8 @@ class EdgeServer:
         await asyncio.to_thread(self._decoders.close)
         self._twin_service.close()
         await asyncio.to_thread(self._views.close)
+        if self._learner is not None:
+            await asyncio.to_thread(self._learner.close)
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
         if self._metrics_endpoint is not None:
@@ -274,6 +283,10 @@ class EdgeServer:
     async def index_fields(self) -> None:
         """Look for archives that were put into the folder, or taken out of it."""
         await asyncio.to_thread(self._index.refresh)
+
+    async def _look_at_learning(self) -> None:
+        if self._learner is not None:
+            await asyncio.to_thread(self._learner.look)
 
     async def _sweep_calls(self) -> None:
         self._guard.sweep()
@@ -335,6 +348,23 @@ class EdgeServer:
             lambda: time.time_ns() // 1_000_000,
             self._recording_failed,
         )
+
+    def _open_learner(self, config: ServerConfig) -> Learner | None:
+        settings, recordings = config.learn, config.record.folder
+        if not settings.on or recordings is None:
+            return None
+        job = LearningJob(
+            config.fields,
+            recordings,
+            settings.learn_as,
+            settings.min_identities,
+            cpu_s_per_h=settings.cpu_s_per_h,
+            max_bytes=round(settings.max_gb * 1e9),
+            max_age_s=settings.max_age_h * 3600,
+            quiet_s=settings.quiet_s,
+            max_field_bytes=config.render.max_field_bytes,
+        )
+        return Learner(job, config.log, lambda _: None)
 
     def _recording_failed(self, error: Exception) -> None:
         self._metrics.recording.set(0)

@@ -3,6 +3,10 @@
 Reading a folder and hashing archives takes as long as the disk likes, so it never happens on the
 event loop: ``refresh`` runs on a thread, and ``ids`` and ``path`` only look at what it found. A new
 file is listed by the second look that finds it unchanged.
+
+Which tiles the folder publishes is kept up to date likewise: a manifest that cannot be read, or
+that names a field which cannot be opened, changes nothing: the tiles that were current stay, and
+the problem is logged once for each manifest.
 """
 
 from __future__ import annotations
@@ -14,15 +18,18 @@ from types import MappingProxyType
 
 import structlog
 
-from rfcore.errors import UnknownField
+from rfcore.errors import RfedgeError, UnknownField
 from rfcore.field import RadianceField
 from rfcore.field.folder import FIELD_ID, SUFFIX, FieldFolder, FolderListing
 from rfcore.field.store import load_checked
 from rfcore.wire.settings import RenderSettings
+from rfcore.wire.tile_manifest import MANIFEST, read_publication
+from rfcore.wire.tiles import Tile
 
-__all__ = ["FieldIndex", "field_loader"]
+__all__ = ["FieldIndex", "PublishedFields", "field_loader"]
 
 log = structlog.get_logger()
+Stamp = tuple[int, int, int] | None
 
 
 class FieldIndex:
@@ -124,3 +131,53 @@ def field_loader(
         return field
 
     return load
+
+
+class PublishedFields:
+    """The current tiles of ``folder``; ``open_field`` makes a field ready before it is current."""
+
+    def __init__(self, folder: Path, open_field: Callable[[str], object]) -> None:
+        self.tiles: tuple[Tile, ...] = ()
+        self._folder = folder
+        self._open_field = open_field
+        self._seen: Stamp = None
+
+    def start(self) -> None:
+        """Take what is published; raise ``FieldFormatError`` or ``UnknownField``."""
+        self._seen = self._stamp()
+        self._take(read_publication(self._folder).current())
+
+    def refresh(self) -> bool:
+        """Follow the manifest if it was replaced; return whether other tiles are current now."""
+        stamp, before = self._stamp(), self.tiles
+        if stamp == self._seen:
+            return False
+        self._seen = stamp
+        try:
+            self._take(read_publication(self._folder).current())
+        except (RfedgeError, OSError) as error:
+            log.error("publication not taken up", problem=str(error), kept=_named(before))
+            return False
+        log.info("publication taken up", tiles=_named(self.tiles))
+        return self.tiles != before
+
+    def _take(self, tiles: tuple[Tile, ...]) -> None:
+        ready = {field_id for tile in self.tiles for field_id in tile.renderable_ids}
+        for field_id in (field_id for tile in tiles for field_id in tile.renderable_ids):
+            if field_id not in ready:
+                self._open_field(field_id)
+        self.tiles = tiles
+
+    def _stamp(self) -> Stamp:
+        try:
+            stat = (self._folder / MANIFEST).stat()
+        except OSError:
+            return None
+        return stat.st_mtime_ns, stat.st_ino, stat.st_size
+
+
+def _named(tiles: tuple[Tile, ...]) -> list[str]:
+    return [
+        " ".join([tile.name, str(tile.version), *(f"{x.name}:{x.version}" for x in tile.lights)])
+        for tile in tiles
+    ]

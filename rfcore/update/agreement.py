@@ -4,6 +4,9 @@ A block of 8x8 pixels counts as passing through when its frame is far from the f
 passes, at the same place of the street, are not: most of them, where the field's depth carries
 their blocks to. What persists over the passes (a parked car, another light) is far in all of them.
 Passes that nobody else saw have no one to contradict them; of one pass alone everything is learnt.
+
+A whole frame is an outlier (a wrong pose, a pasted picture) if its edges lie neither where the
+field's do nor where another vehicle saw some: edges stay in another light, colours do not.
 """
 
 from __future__ import annotations
@@ -19,10 +22,10 @@ from rfcore.field.interface import render_field_view
 from rfcore.image import I420
 from rfcore.native.warp import BLOCK_PX, warp_i420
 from rfcore.native.yuv import i420_from_rgb
-from rfcore.update.passes import SeenFrame
+from rfcore.update.passes import FEWEST_FRAMES, Pass, SeenFrame
 from rfcore.views import FieldView
 
-__all__ = ["both", "trusted_pixels"]
+__all__ = ["both", "edge_correlation", "trusted_pixels", "without_outliers"]
 
 FAR_LEVELS = 20
 """Mean absolute difference of a block's luma above which it does not show what the field does."""
@@ -34,6 +37,12 @@ SAME_WAY = 0.8
 UNKNOWN = 255
 """Carried differences are below ``CLIPPED``; what the depth does not carry reads as this."""
 CLIPPED = 120
+EDGES_AGREE = 0.3
+"""Correlation of edges from which on two pictures show the same place. The sample street's pictures
+against its field: 0.70 to 0.98, in a third of the light, too, 0.16 to 0.38 if the pose is 0.5 m
+off, at most 0.21 for another picture of the same street."""
+EDGE_CELL_PX = 4
+"""Edges are those between means of so many pixels each way: noise and small pose errors go."""
 
 Mask = NDArray[np.bool_]
 F32 = NDArray[np.float32]
@@ -141,3 +150,63 @@ def _most_around(plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
         shifted = [np.roll(most, step, axis) for step in (-BLOCK_PX, 0, BLOCK_PX)]
         most = np.maximum.reduce(shifted)
     return np.where(plane == UNKNOWN, np.uint8(UNKNOWN), most).astype(np.uint8)
+
+
+def without_outliers(field: RadianceField, passes: Sequence[Pass]) -> list[Pass]:
+    """Return the passes without frames that agree with neither the field nor another identity.
+
+    A pass of which fewer than half the frames, or fewer than an update needs, agree is left out.
+    Raises ``DatasetError`` for a picture that cannot be read.
+    """
+    identities = sorted({drive.identity for drive in passes})
+    frames = [
+        SeenFrame(picture.camera, picture.read(), identities.index(drive.identity))
+        for drive in passes
+        for picture in drive.pictures
+    ]
+    agree = iter(_agreeing(field, frames))
+    kept = []
+    for drive in passes:
+        pictures = tuple(picture for picture in drive.pictures if next(agree))
+        if len(pictures) >= max(FEWEST_FRAMES, len(drive.pictures) / 2):
+            kept.append(Pass(drive.identity, pictures))
+    return kept
+
+
+def edge_correlation(first: F32, second: F32) -> float:
+    """Return how alike the edges of two luma planes [H, W] lie: -1..1, 0 if one has no edges."""
+    a, b = _edges(first), _edges(second)
+    norm = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum()) / norm if norm > 0 else 0.0
+
+
+def _edges(plane: F32) -> NDArray[np.float64]:
+    cell = EDGE_CELL_PX
+    height, width = (side // cell * cell for side in plane.shape)
+    cells = plane[:height, :width].reshape(height // cell, cell, width // cell, cell)
+    means = cells.mean(axis=(1, 3), dtype=np.float64)
+    return np.concatenate([np.diff(means, axis=0).ravel(), np.diff(means, axis=1).ravel()])
+
+
+def _agreeing(field: RadianceField, frames: Sequence[SeenFrame]) -> list[bool]:
+    """Tell of each frame, its ``pass_number`` that of its identity, whether it is no outlier."""
+    views = [render_field_view(field, frame.camera) for frame in frames]
+    pictures = [i420_from_rgb(frame.rgb) for frame in frames]
+    agree = [
+        edge_correlation(_luma(picture), _luma(view.render)) >= EDGES_AGREE
+        for picture, view in zip(pictures, views, strict=True)
+    ]
+    for index in [index for index, agrees in enumerate(agree) if not agrees]:
+        agree[index] = any(
+            edge_correlation(
+                _luma(warp_i420(pictures[other], views[other], views[index])),
+                _luma(pictures[index]),
+            )
+            >= EDGES_AGREE
+            for other in _neighbours(index, frames).values()
+        )
+    return agree
+
+
+def _luma(picture: I420) -> F32:
+    return picture.y.astype(np.float32)

@@ -16,7 +16,15 @@ from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
 from rfcore.views import PosedPicture
 
-__all__ = ["HOLD_BACK_EVERY", "Pass", "SeenFrame", "check_passes", "split_frames"]
+__all__ = [
+    "FEWEST_FRAMES",
+    "HOLD_BACK_EVERY",
+    "Pass",
+    "SeenFrame",
+    "check_passes",
+    "split_frames",
+    "spread",
+]
 
 HOLD_BACK_EVERY = 4
 FEWEST_FRAMES = 8
@@ -68,7 +76,7 @@ def split_frames(passes: Sequence[Pass], most: int) -> tuple[list[SeenFrame], li
     learnt: list[SeenFrame] = []
     held_back: list[SeenFrame] = []
     for number, drive in enumerate(passes):
-        for place, picture in enumerate(_spread(drive.pictures, max(2, most // len(passes)))):
+        for place, picture in enumerate(spread(drive.pictures, max(2, most // len(passes)))):
             camera = replace(picture.camera, world_from_cam=picture.camera.world_from_cam.rounded())
             frame = SeenFrame(camera, picture.read(), number)
             is_held_back = place % HOLD_BACK_EVERY == HOLD_BACK_EVERY // 2
@@ -76,7 +84,8 @@ def split_frames(passes: Sequence[Pass], most: int) -> tuple[list[SeenFrame], li
     return learnt, held_back
 
 
-def _spread(pictures: Sequence[PosedPicture], most: int) -> list[PosedPicture]:
+def spread(pictures: Sequence[PosedPicture], most: int) -> list[PosedPicture]:
+    """Return at most ``most`` of the pictures, evenly over all of them."""
     if len(pictures) <= most:
         return list(pictures)
     return [pictures[i] for i in np.linspace(0, len(pictures) - 1, most).round().astype(int)]

@@ -47,13 +47,16 @@ def publish(
     ground: Ground,
     now: datetime,
     label: VersionLabel = OWN_LIGHT,
+    *,
+    only_after: Tile | None = None,
 ) -> Tile:
     """Make ``archive`` the current version of tile ``name`` of ``folder``; return the tile.
 
     ``label`` says of which light it is; its base is read from a layer. The field that is current
     already stays the same version. Raises ``FieldFormatError`` for a damaged archive,
     ``UnknownField`` for a layer whose base is not in the folder, ``InvalidInput``, also for a light
-    of a tile without a field of its own; the folder then publishes what it did.
+    of a tile without a field of its own, or if ``only_after`` is given and is not the tile that is
+    current: somebody else has published meanwhile. The folder then publishes what it did.
     """
     store = FieldStore(folder)
     with _locked(folder):
@@ -61,6 +64,8 @@ def publish(
         before = publication.tiles.get(name)
         if before is None and label.light:
             raise InvalidInput("light", f"publish a field of tile {name!r} itself first")
+        if only_after is not None and (before is None or before.tile(name) != only_after):
+            raise InvalidInput("tile", f"{name!r} was published by somebody else meanwhile")
         field_id = store.add(archive)
         base = base_of_layer(decode_archive(read_file(archive), str(archive))) or ""
         label = replace(label, base_field_id=base)

@@ -13,7 +13,7 @@ import grpc
 import pytest
 from structlog.testing import capture_logs
 
-from mec_server.config import AdmissionLimits, DecoderKind
+from mec_server.config import AdmissionLimits, DecoderKind, LearnSettings
 from mec_server.connection_cap import ConnectionCap
 from mec_server.decode_jobs import DecodeJob, OpenJob
 from mec_server.metrics import BackgroundTask
@@ -410,6 +410,16 @@ async def recording_fails(scene: Scene) -> Any:
     return server
 
 
+async def learning_fails(scene: Scene) -> Any:
+    scene.patch.setattr("mec_server.server.LEARNING_EVERY_S", 0.001)
+    scene.patch.setattr("mec_server.server.Learner.look", surprise)
+    learn = LearnSettings(on=True)
+    async with scene.serve(record=scene.folder, learn=learn) as server:
+        await until(lambda: failed(server, BackgroundTask.LEARNING))
+        await drive_on(scene, server)
+    return server
+
+
 async def drive_on(scene: Scene, server: Any) -> None:
     """Expect that a vehicle is served."""
     async with scene.raw_vehicle(server.address) as vehicle:
@@ -447,6 +457,7 @@ SABOTAGE: dict[BackgroundTask, Callable[[Scene], Awaitable[Any]]] = {
     BackgroundTask.STREAM: stream_fails,
     BackgroundTask.CONSUMER: consumer_fails,
     BackgroundTask.RECORDING: recording_fails,
+    BackgroundTask.LEARNING: learning_fails,
 }
 ENDS_WITH_IT = {BackgroundTask.OPENING: BackgroundTask.STREAM}
 """A task that ends through the failure of another is counted, too."""

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from mec_server import recorder as module
-from mec_server.recorder import Recorder, SessionRecording, picture_name
-from mec_server.recording_room import KeepLimits
+from mec_server.recorder import KeepLimits, Recorder, SessionRecording, picture_name
 from recorded import recorded, recorded_parts
 from rfcore.camera import TileOrigin
 from rfcore.dataset import read_dataset

@@ -1,0 +1,577 @@
+"""What the learning process does with recordings: one round over the published tiles at a time.
+
+Files: the recordings of ``mec_server.recorder``, the folder of fields, and RECORDINGS/.learning/:
+``tiles.json``, what was learnt, tried and withdrawn of each tile (``TileHistory``), and a lock that
+one process holds. A round first checks what was published (``withdraw_worse``): the newest frames
+that vehicles coded against a learnt field are coded again against it and against what it replaced.
+Then it learns (``learn_tile``): passes that are over and were not used before, sorted by light,
+without outliers; tried on frames held back; published as ``rfedge field publish --light`` does.
+What is published is one rename of the manifest, so a round may end anywhere. An identity is the id
+of a vehicle, which a certificate ties to it where the server asks for one.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera
+from rfcore.codec.block_means import median_block_mean_difference
+from rfcore.dataset.picture_file import read_picture
+from rfcore.dataset.recorded_session import RecordedPart, read_recorded_part, recordings_under
+from rfcore.errors import DatasetError, InvalidInput, RfedgeError
+from rfcore.field import RadianceField, save_field
+from rfcore.field.interface import render_field_view
+from rfcore.field.store import load_checked
+from rfcore.files import write_whole
+from rfcore.native.yuv import i420_from_rgb
+from rfcore.update.agreement import without_outliers
+from rfcore.update.passes import FEWEST_FRAMES, Pass, SeenFrame, split_frames, spread
+from rfcore.update.run import LearnAs, Update, UpdateSettings, learn
+from rfcore.update.splats import FineTuning
+from rfcore.update.trial import saved_percent, try_field
+from rfcore.views import PosedPicture
+from rfcore.wire.publish import Ground, publish, roll_back
+from rfcore.wire.tile_manifest import TileVersions, VersionLabel, read_publication
+from rfcore.wire.tiles import Tile
+
+__all__ = ["LEARNING", "LearningJob", "LearningRounds", "TileHistory", "read_histories"]
+
+log = structlog.get_logger()
+
+LEARNING = ".learning"
+HISTORIES = "tiles.json"
+FITS_LEVELS = 6.0
+"""Median difference of block means up to which a pass is in a field's light, as for vehicles."""
+SAME_LIGHT = 0.25
+"""Two passes are in one light if the logarithms of their colours' gains differ by no more."""
+LOOKED_AT = 5
+"""Frames of a pass by which its light is told."""
+MOST_PASSES = 6
+CHECK_FRAMES = 8
+"""Frames in a row that are tried to see whether a published field makes bits worse."""
+CHECK_EVERY = 24
+"""Frames of one camera between two checks: twice that, at most, until a harm is seen."""
+HOUR_MS = 3_600_000
+WATCH_EVERY_MS = 2_000
+"""How often published fields are checked while another is learnt."""
+AGAIN_MS = 600_000
+"""What could not be learnt from is looked at again after this time, or when there is more."""
+FRESH_S = 120.0
+"""A recording to which nothing was added for so long is not looked at for withdrawals."""
+
+
+@dataclass(frozen=True)
+class LearningJob:
+    """What the learning process is told; ``mec_server.config.LearnSettings`` says what is meant."""
+
+    fields: Path
+    recordings: Path
+    learn_as: LearnAs = LearnAs.COLOURS
+    min_identities: int = 2
+    frames: int = 48
+    iterations: int = 600
+    cpu_s_per_h: float = 900.0
+    max_bytes: int = 10**9
+    max_age_s: float = 86_400.0
+    quiet_s: float = 20.0
+    """A pass is over when nothing was added to its recording for so long."""
+    max_field_bytes: int = 2 << 30
+
+    def settings(self) -> UpdateSettings:
+        """Return how an update is made and judged."""
+        fine_tuning = FineTuning(self.iterations)
+        return UpdateSettings(
+            self.learn_as, self.frames, self.min_identities, fine_tuning=fine_tuning
+        )
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """One field that was learnt; written before it is published, so that none goes unwatched.
+
+    ``replaced_id``: what vehicles took before, and take again if it is withdrawn.
+    """
+
+    field_id: str
+    light: str
+    replaced_id: str
+    passes: int
+    saved_percent: float
+    time_ms: int
+    withdrawn: bool = False
+
+
+@dataclass(frozen=True)
+class TileHistory:
+    """What was learnt of one tile. ``tried``: recordings that were used, as paths below the folder;
+    ``checked``: frames of each recording and learnt field that were looked at for a withdrawal."""
+
+    learnt: tuple[Learnt, ...] = ()
+    tried: tuple[str, ...] = ()
+    checked: Mapping[str, int] = field(default_factory=dict)
+    cpu: tuple[tuple[int, float], ...] = ()
+    """When CPU time was spent on learning, and seconds of it, of the last hour."""
+
+    @property
+    def withdrawals(self) -> int:
+        """How many updates made bits worse."""
+        return sum(one.withdrawn for one in self.learnt)
+
+
+class BudgetSpent(Exception):
+    """The CPU time of this hour is spent; the round goes on when there is more."""
+
+
+@dataclass(frozen=True)
+class _SeenPass:
+    """A recording that is over: its name, its pass, and what tells its light."""
+
+    name: str
+    drive: Pass
+    first_ns: int
+    gains: tuple[float, float, float]
+    nearest_light: str | None
+
+
+def read_histories(recordings: Path) -> dict[str, TileHistory]:
+    """Return what was learnt, by tile; raise ``InvalidInput`` for a file that is damaged."""
+    path = recordings / LEARNING / HISTORIES
+    if not path.exists():
+        return {}
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        return {name: _history(one) for name, one in stored.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InvalidInput("learning", f"{path} is damaged ({error}); remove it") from error
+
+
+def _history(stored: Mapping[str, Any]) -> TileHistory:
+    return TileHistory(
+        learnt=tuple(Learnt(**one) for one in stored["learnt"]),
+        tried=tuple(stored["tried"]),
+        checked=dict(stored["checked"]),
+        cpu=tuple((int(at_ms), float(spent_s)) for at_ms, spent_s in stored["cpu"]),
+    )
+
+
+class LearningRounds:
+    """Runs one round after the other; ``now_ms`` is the time of the Unix epoch."""
+
+    def __init__(self, job: LearningJob, now_ms: Callable[[], int]) -> None:
+        self._job, self._now_ms = job, now_ms
+        self._learners: dict[str, TileLearner] = {}
+
+    def run(self) -> None:
+        """Withdraw what made bits worse, then learn what there is to learn.
+
+        A tile or a disk that refuses is logged, and tried again later. Raises ``InvalidInput`` for
+        a damaged history, ``FieldFormatError`` for a damaged manifest, ``OSError``.
+        """
+        (self._job.recordings / LEARNING).mkdir(parents=True, exist_ok=True)
+        histories = read_histories(self._job.recordings)
+        for name in read_publication(self._job.fields).tiles:
+            if name not in self._learners:
+                self._learners[name] = TileLearner(self._job, name, self._now_ms)
+        for learner in self._learners.values():
+            learner.histories = histories
+        self._watch()
+        for learner in self._learners.values():
+            _attempt(learner, partial(learner.learn, self._watch))
+
+    def _watch(self) -> None:
+        for learner in self._learners.values():
+            _attempt(learner, learner.withdraw_worse)
+
+
+def _attempt(learner: TileLearner, work: Callable[[], None]) -> None:
+    try:
+        work()
+    except BudgetSpent as error:
+        log.info("learning postponed", tile=learner.name, reason=str(error))
+    except (RfedgeError, OSError) as error:
+        log.error("learning failed", tile=learner.name, problem=str(error))
+
+
+class TileLearner:
+    """Learns about one tile; what it did is in ``histories``, which are written at each change."""
+
+    def __init__(self, job: LearningJob, name: str, now_ms: Callable[[], int]) -> None:
+        self.name = name
+        self.histories: dict[str, TileHistory] = {}
+        self._job, self._now_ms = job, now_ms
+        self._watched_ms = now_ms()
+        self._fields: dict[str, RadianceField] = {}
+        self._looked_at: object = None
+
+    @property
+    def history(self) -> TileHistory:
+        """What was done until now."""
+        return self.histories.get(self.name, TileHistory())
+
+    def _keep(self, **changes: Any) -> None:
+        self.histories[self.name] = replace(self.history, **changes)
+        stored = {name: asdict(one) for name, one in self.histories.items()}
+        write_whole(self._job.recordings / LEARNING / HISTORIES, json.dumps(stored))
+
+    # --- what was published
+
+    def withdraw_worse(self) -> None:
+        """Withdraw each current field that was learnt and costs somebody bits; count it."""
+        versions = self._versions()
+        for light in ("", *versions.lights):
+            number = versions.lights[light] if light else versions.current
+            for one in self.history.learnt:
+                if one.field_id == versions.field_ids[number - 1] and not one.withdrawn:
+                    self._check(one)
+
+    def _check(self, one: Learnt) -> None:
+        for part in _readable(self._files(FRESH_S)):
+            pictures = [p for p in part.pictures if p.field_id == one.field_id]
+            key = f"{self._name_of(part.file)} {one.field_id}"
+            new = len(pictures) - self.history.checked.get(key, 0)
+            if new < CHECK_EVERY:
+                continue
+            self._keep(checked={**self.history.checked, key: len(pictures)})
+            drive = self._pass_of(part, {one.field_id}, one.replaced_id)
+            worse = self._percent_worse(one, drive)
+            if worse > self._job.settings().max_loss_percent:
+                self._withdraw(one, drive.identity, worse)
+                return
+
+    def _percent_worse(self, one: Learnt, drive: Pass) -> float:
+        before, after = self._open(one.replaced_id), self._open(one.field_id)
+        newest = Pass(drive.identity, drive.pictures[-CHECK_FRAMES:])
+        if len(newest.pictures) < CHECK_FRAMES or not without_outliers(after, [newest]):
+            return 0.0
+        frames = [
+            SeenFrame(_as_sent(picture.camera), picture.read(), 0) for picture in newest.pictures
+        ]
+        return -saved_percent(try_field(before, frames), try_field(after, frames))[0]
+
+    def _withdraw(self, one: Learnt, identity: str, worse_percent: float) -> None:
+        versions = self._versions()
+        before = [n for n in versions.of_light(one.light) if _id(versions, n) == one.replaced_id]
+        to = before[-1] if before else None
+        tile = roll_back(self._job.fields, self.name, to, one.light)
+        learnt = (replace(x, withdrawn=x.withdrawn or x == one) for x in self.history.learnt)
+        self._keep(learnt=tuple(learnt))
+        log.warning(
+            "update withdrawn",
+            tile=tile.name,
+            light=one.light,
+            field=one.field_id,
+            vehicle=identity,
+            bits_worse_percent=round(worse_percent, 1),
+        )
+
+    # --- what is to be learnt
+
+    def learn(self, watch: Callable[[], None]) -> None:
+        """Learn from each light's passes that were not used, and publish what pays.
+
+        ``watch`` is called every few seconds. Raises ``BudgetSpent``, ``RfedgeError``, ``OSError``.
+        """
+        versions = self._versions()
+        files = self._new_files()
+        looked_at = (files, versions, self._now_ms() // AGAIN_MS)
+        if looked_at == self._looked_at:
+            return
+        self._looked_at = looked_at
+        self._fields.clear()
+        seen = list(self._seen_passes(files, versions))
+        for light, group in _by_light(seen, versions):
+            of_light = group[-MOST_PASSES:]
+            if len({one.drive.identity for one in of_light}) >= self._job.min_identities:
+                self._learn_light(versions.tile(self.name), light, of_light, watch)
+
+    def _learn_light(
+        self, tile: Tile, light: str, group: Sequence[_SeenPass], watch: Callable[[], None]
+    ) -> None:
+        current = {"": tile.field_id, **{one.name: one.field_id for one in tile.lights}}
+        replaced_id = current.get(light, tile.field_id)
+        judged_by = self._open(replaced_id)
+        honest = without_outliers(judged_by, [one.drive for one in group])
+        dropped = len(group) - len(honest)
+        lines = log.bind(tile=tile.name, light=light, passes=len(honest), dropped=dropped)
+        if len({drive.identity for drive in honest}) < self._job.min_identities:
+            self._tried([one for one in group if one.drive.identity not in _identities(honest)])
+            lines.info("not learnt", reason="passes of too few vehicles agree with each other")
+            return
+        learn_as = self._job.learn_as if light else LearnAs.ALL
+        base = self._open(tile.field_id) if learn_as is LearnAs.COLOURS else judged_by
+        update = self._within_budget(base, honest, learn_as, watch)
+        refused = update.refused or self._refused_beside(update, judged_by, base, honest)
+        if refused:
+            lines.info("update not kept", reason=refused)
+        else:
+            self._publish(tile, light, replaced_id, update, group, len(honest))
+        self._tried(group)
+
+    def _refused_beside(
+        self, update: Update, current: RadianceField, base: RadianceField, passes: Sequence[Pass]
+    ) -> str:
+        """Say why an update that beats the tile's own field is no better than the light's."""
+        if current is base:
+            return ""
+        _, held_back = split_frames(passes, self._job.frames)
+        saved = saved_percent(try_field(current, held_back), try_field(update.learnt, held_back))
+        settings = self._job.settings()
+        if min(saved.values()) < -settings.max_loss_percent:
+            return "bits rise against the light's field"
+        mean = float(np.mean(list(saved.values())))
+        return "" if mean >= settings.min_saved_percent else "no better than the light's field"
+
+    def _within_budget(
+        self,
+        base: RadianceField,
+        passes: Sequence[Pass],
+        learn_as: LearnAs,
+        watch: Callable[[], None],
+    ) -> Update:
+        left_s, began_s = self._cpu_left_s(), time.process_time()
+
+        def told(doing: str, done: int, total: int) -> None:
+            if time.process_time() - began_s > left_s:
+                limit = f"{self._job.cpu_s_per_h:g} s of this hour are spent"
+                raise BudgetSpent(f"{limit}, {doing}: {done} of {total}")
+            if self._now_ms() - self._watched_ms > WATCH_EVERY_MS:
+                self._watched_ms = self._now_ms()
+                watch()
+
+        told("learning", 0, 1)
+        try:
+            return learn(base, passes, replace(self._job.settings(), learn_as=learn_as), told)
+        finally:
+            spent = (self._now_ms(), time.process_time() - began_s)
+            self._keep(cpu=(*self._cpu_of_the_hour(), spent))
+
+    def _cpu_of_the_hour(self) -> tuple[tuple[int, float], ...]:
+        since_ms = self._now_ms() - HOUR_MS
+        return tuple((at, spent) for at, spent in self.history.cpu if at > since_ms)
+
+    def _cpu_left_s(self) -> float:
+        return self._job.cpu_s_per_h - sum(spent for _, spent in self._cpu_of_the_hour())
+
+    def _publish(
+        self,
+        tile: Tile,
+        light: str,
+        replaced_id: str,
+        update: Update,
+        group: Sequence[_SeenPass],
+        passes: int,
+    ) -> None:
+        hour = float(np.mean([_hour(one.first_ns) for one in group]))
+        archive = self._job.recordings / LEARNING / f"{tile.name}.rff"
+        field_id = save_field(update.learnt, archive)
+        self._check_room(archive.stat().st_size)
+        now_ms = self._now_ms()
+        saved = Learnt(field_id, light, replaced_id, passes, update.mean_saved_percent, now_ms)
+        self._keep(learnt=(*self.history.learnt, saved))
+        label = VersionLabel(light, "", passes, hour if light else None)
+        now = datetime.fromtimestamp(now_ms / 1e3, UTC)
+        try:
+            publish(self._job.fields, tile.name, archive, Ground(), now, label, only_after=tile)
+        finally:
+            archive.unlink()
+        log.info(
+            "update published",
+            tile=tile.name,
+            light=light,
+            field=field_id,
+            passes=passes,
+            saved_percent=round(update.mean_saved_percent, 1),
+        )
+
+    def _check_room(self, wanted_bytes: int) -> None:
+        """Remove the oldest learnt archives that nobody is sent to any more until one more fits."""
+        tile = self._versions().tile(self.name)
+        paths = {
+            one.field_id: self._job.fields / f"{one.field_id}.rff"
+            for history in self.histories.values()
+            for one in history.learnt
+        }
+        sizes = {name: path.stat().st_size for name, path in paths.items() if path.exists()}
+        for one in self.history.learnt:
+            if sum(sizes.values()) + wanted_bytes <= self._job.max_bytes:
+                return
+            if one.field_id in sizes and one.field_id not in tile.archive_ids:
+                paths[one.field_id].unlink()
+                del sizes[one.field_id]
+        if sum(sizes.values()) + wanted_bytes > self._job.max_bytes:
+            raise InvalidInput(
+                "learn-max-gb",
+                f"{self._job.max_bytes / 1e9:g} do not hold {wanted_bytes} bytes more; give more, "
+                "or withdraw lights that are not needed",
+            )
+
+    # --- recordings
+
+    def _tried(self, group: Sequence[_SeenPass]) -> None:
+        there = {self._name_of(file) for file in self._files(self._job.max_age_s)}
+        tried = there & {*self.history.tried, *(one.name for one in group)}
+        checked = {key: n for key, n in self.history.checked.items() if key.split()[0] in there}
+        self._keep(tried=tuple(sorted(tried)), checked=checked)
+
+    def _new_files(self) -> list[Path]:
+        """Return the recordings that are over and were not used, oldest first."""
+        return [
+            file
+            for file in self._files(self._job.max_age_s)
+            if self._name_of(file) not in self.history.tried
+            and _age_s(file, self._now_ms()) >= self._job.quiet_s
+        ]
+
+    def _seen_passes(self, files: Sequence[Path], versions: TileVersions) -> Iterator[_SeenPass]:
+        tile = versions.tile(self.name)
+        own = self._open(tile.field_id)
+        fields = {"": own, **{one.name: self._open(one.field_id) for one in tile.lights}}
+        for part in _readable(files):
+            drive = self._pass_of(part, frozenset(versions.field_ids), tile.field_id)
+            if len(drive.pictures) >= FEWEST_FRAMES:
+                few = replace(drive, pictures=tuple(spread(drive.pictures, self._job.frames)))
+                first_ns = part.pictures[0].capture_time_ns
+                yield _SeenPass(self._name_of(part.file), few, first_ns, *_light_of(few, fields))
+
+    def _files(self, max_age_s: float) -> list[Path]:
+        """Return the recordings that were added to lately, oldest first."""
+        files = sorted(recordings_under(self._job.recordings), key=lambda file: file.parent.name)
+        return [file for file in files if _age_s(file, self._now_ms()) <= max_age_s]
+
+    def _name_of(self, file: Path) -> str:
+        return str(file.parent.relative_to(self._job.recordings))
+
+    def _pass_of(self, part: RecordedPart, field_ids: Set[str], origin_id: str) -> Pass:
+        """Return the pictures coded against one of ``field_ids``, in the tile of ``origin_id``."""
+        origin = self._open(origin_id).metadata.tile_origin
+        intrinsics = part.camera.intrinsics
+        pictures = tuple(
+            PosedPicture(
+                picture.file,
+                Camera(intrinsics, origin.localise(picture.world_from_cam)),
+                partial(read_picture, part.file.parent / picture.file, intrinsics),
+            )
+            for picture in part.pictures
+            if picture.world_from_cam is not None and picture.field_id in field_ids
+        )
+        return Pass(part.camera.vehicle_id, pictures)
+
+    # --- fields
+
+    def _versions(self) -> TileVersions:
+        return read_publication(self._job.fields).tiles[self.name]
+
+    def _open(self, field_id: str) -> RadianceField:
+        if field_id not in self._fields:
+            path = self._job.fields / f"{field_id}.rff"
+            self._fields[field_id] = load_checked(
+                path, field_id, max_bytes=self._job.max_field_bytes, open_base=self._open
+            )
+        return self._fields[field_id]
+
+
+def _id(versions: TileVersions, number: int) -> str:
+    return versions.field_ids[number - 1]
+
+
+def _identities(passes: Sequence[Pass]) -> frozenset[str]:
+    return frozenset(drive.identity for drive in passes)
+
+
+def _readable(files: Sequence[Path]) -> Iterator[RecordedPart]:
+    """Yield recordings; one that is deleted meanwhile is left out."""
+    for file in files:
+        try:
+            yield read_recorded_part(file)
+        except (DatasetError, FileNotFoundError) as error:
+            log.info("recording left out", problem=str(error))
+
+
+def _age_s(file: Path, now_ms: int) -> float:
+    """Return the seconds since a file was written; any number for one that is gone."""
+    try:
+        return now_ms / 1e3 - file.stat().st_mtime
+    except FileNotFoundError:
+        return math.inf
+
+
+def _hour(time_ns: int) -> float:
+    """Return the time of day, UTC, of a capture time."""
+    return time_ns / 1e9 % 86_400 / 3600
+
+
+def _light_of(
+    drive: Pass, fields: Mapping[str, RadianceField]
+) -> tuple[tuple[float, float, float], str | None]:
+    """Return the log gains of a pass's colours over the tile's own field, and the light it fits."""
+    looked_at = spread(drive.pictures, LOOKED_AT)
+    frames = [SeenFrame(_as_sent(picture.camera), picture.read(), 0) for picture in looked_at]
+    differences = {
+        name: float(np.median([_difference(field, frame) for frame in frames]))
+        for name, field in fields.items()
+    }
+    nearest = min(differences, key=lambda name: differences[name])
+    means = [_colour_gains(fields[""], frame) for frame in frames]
+    red, green, blue = (float(gain) for gain in np.median(means, axis=0))
+    return (red, green, blue), nearest if differences[nearest] <= FITS_LEVELS else None
+
+
+def _difference(field: RadianceField, frame: SeenFrame) -> float:
+    view = render_field_view(field, frame.camera)
+    return median_block_mean_difference(i420_from_rgb(frame.rgb), view.render)
+
+
+def _colour_gains(field: RadianceField, frame: SeenFrame) -> NDArray[np.float64]:
+    shown = np.clip(field.render_colour(frame.camera), 0, 1).mean(axis=(0, 1))
+    seen = frame.colour().mean(axis=(0, 1))
+    gains: NDArray[np.float64] = np.log(np.maximum(seen, 1 / 255) / np.maximum(shown, 1 / 255))
+    return gains
+
+
+def _by_light(
+    passes: Sequence[_SeenPass], versions: TileVersions
+) -> Iterator[tuple[str, list[_SeenPass]]]:
+    """Yield the passes of each light, oldest first; a light that is new gets a name of its hour."""
+    known: dict[str, list[_SeenPass]] = {}
+    new: list[list[_SeenPass]] = []
+    for one in passes:
+        if one.nearest_light is not None:
+            known.setdefault(one.nearest_light, []).append(one)
+            continue
+        alike = [group for group in new if _same_light(group[0], one)]
+        if alike:
+            alike[0].append(one)
+        else:
+            new.append([one])
+    yield from known.items()
+    taken = {versions.label(n + 1).light for n in range(len(versions.field_ids))}
+    for group in new:
+        name = _unused(f"h{int(_hour(group[0].first_ns)):02}", taken)
+        taken.add(name)
+        yield name, group
+
+
+def _same_light(first: _SeenPass, second: _SeenPass) -> bool:
+    return max(abs(a - b) for a, b in zip(first.gains, second.gains, strict=True)) <= SAME_LIGHT
+
+
+def _unused(name: str, taken: Set[str]) -> str:
+    names = (name if number == 1 else f"{name}-{number}" for number in count(1))
+    return next(each for each in names if each not in taken)
+
+
+def _as_sent(camera: Camera) -> Camera:
+    return replace(camera, world_from_cam=camera.world_from_cam.rounded())

@@ -1,0 +1,317 @@
+"""What the learning process publishes, what it does not, and what it takes back."""
+
+import errno
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from structlog.testing import capture_logs
+
+from mec_server import tile_learning as module
+from mec_server.learner import RESTART_S, Learner
+from mec_server.tile_learning import LEARNING, LearningJob, LearningRounds, Learnt, read_histories
+from rfcore.dataset.recorded_session import RECORDING_NAME, RecordedCamera, RecordedPicture
+from rfcore.errors import InvalidInput
+from rfcore.field import FieldStore, SplatField, save_field
+from rfcore.image import Rgb, write_png
+from rfcore.update.agreement import without_outliers
+from rfcore.update.passes import Pass
+from rfcore.update.run import LearnAs, Update, UpdateSettings, learn
+from rfcore.wire.publish import Ground, publish
+from rfcore.wire.settings import LogForm
+from rfcore.wire.tile_manifest import MANIFEST, TileVersions, VersionLabel, read_publication
+
+MakePass = Callable[..., Pass]
+NOW_MS = 1_767_290_400_000
+"""18:00 UTC."""
+NOW = datetime.fromtimestamp(NOW_MS / 1e3, UTC)
+
+
+class Street:
+    """A folder of fields with tile west at noon, and a folder of recordings."""
+
+    def __init__(self, folder: Path, noon: SplatField) -> None:
+        self.fields, self.recordings = folder / "fields", folder / "recordings"
+        self.fields.mkdir()
+        self.recordings.mkdir()
+        self.noon_id = save_field(noon, folder / "noon.rff")
+        publish(self.fields, "west", folder / "noon.rff", Ground(), NOW)
+        self.job = LearningJob(self.fields, self.recordings, frames=16)
+        self.parts = 0
+
+    def record(self, drive: Pass, field_id: str = "", times: int = 1) -> None:
+        """Record a pass, its pictures so many times over, that ended a minute ago."""
+        self.parts += 1
+        part = self.recordings / drive.identity / "front" / f"{NOW_MS - 60_000 + self.parts}-s"
+        part.mkdir(parents=True)
+        camera = drive.pictures[0].camera
+        lines = [RecordedCamera(drive.identity, "front", "s", camera.intrinsics).line()]
+        for number, picture in enumerate(drive.pictures * times):
+            name, pose = f"{number:06}.png", picture.camera.world_from_cam
+            write_png(part / name, picture.read())
+            time_ns = (NOW_MS - 60_000 + 100 * number) * 1_000_000
+            line = RecordedPicture(name, time_ns, 0, number, field_id or self.noon_id, pose, "00")
+            lines.append(line.line())
+        (part / RECORDING_NAME).write_text("".join(lines))
+        os.utime(part / RECORDING_NAME, (NOW_MS / 1e3 - 60, NOW_MS / 1e3 - 60))
+
+    def rounds(self, **changes: Any) -> LearningRounds:
+        return LearningRounds(replace(self.job, **changes), lambda: NOW_MS)
+
+    def west(self) -> TileVersions:
+        return read_publication(self.fields).tiles["west"]
+
+
+@pytest.fixture
+def street(tmp_path: Path, noon: SplatField) -> Street:
+    return Street(tmp_path, noon)
+
+
+@pytest.fixture
+def at_dusk(street: Street, dusk: SplatField, make_pass: MakePass) -> Street:
+    """Two vehicles were recorded at dusk."""
+    street.record(make_pass(dusk, "a"))
+    street.record(make_pass(dusk, "b", 0.15))
+    return street
+
+
+@pytest.fixture(scope="module")
+def update(noon: SplatField, dusk: SplatField, make_pass: MakePass) -> Update:
+    """What the passes of ``at_dusk`` teach; learnt once."""
+    settings = UpdateSettings(LearnAs.COLOURS, frames=16)
+    made = learn(noon, [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)], settings)
+    assert not made.refused
+    return made
+
+
+@pytest.fixture
+def learnt_before(update: Update, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the worker take what was learnt once: what it does around learning is tested."""
+    monkeypatch.setattr(module, "learn", lambda *_: update)
+
+
+def elsewhere(drive: Pass) -> Pass:
+    """The same pictures with poses 2 m off."""
+
+    def moved(number: int) -> Any:
+        picture = drive.pictures[number]
+        pose = picture.camera.world_from_cam
+        x, y, z = pose.translation_m
+        wrong = replace(pose, translation_m=(x + 2.0, y, z))
+        return replace(picture, camera=replace(picture.camera, world_from_cam=wrong))
+
+    return Pass(drive.identity, tuple(moved(number) for number in range(len(drive.pictures))))
+
+
+def pasted(number: int, _: Rgb) -> Rgb:
+    rng = np.random.default_rng(number)
+    return np.kron(rng.integers(0, 255, (8, 12, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+
+
+def test_two_vehicles_teach_a_light_once(at_dusk: Street) -> None:
+    rounds = at_dusk.rounds()
+    rounds.run()
+    west = at_dusk.west()
+    (light,) = west.tile("west").lights
+    assert (light.name, light.passes, light.base_field_id) == ("h17", 2, at_dusk.noon_id)
+    assert light.time_of_day_h == pytest.approx(17.98, abs=0.01)
+    (learnt,) = read_histories(at_dusk.recordings)["west"].learnt
+    assert learnt.field_id == light.field_id
+    assert learnt.saved_percent > 10
+    rounds.run()
+    at_dusk.rounds().run()
+    assert at_dusk.west() == west
+
+
+def test_fewer_vehicles_than_asked_for_teach_nothing(
+    street: Street, dusk: SplatField, make_pass: MakePass
+) -> None:
+    for shift_m in (0.0, 0.15, 0.3):
+        street.record(make_pass(dusk, "a", shift_m))
+    street.rounds().run()
+    assert len(street.west().field_ids) == 1
+    assert "west" not in read_histories(street.recordings)
+
+
+@pytest.mark.usefixtures("learnt_before")
+@pytest.mark.parametrize("poison", ["poses", "pictures"])
+def test_poisoned_passes_are_dropped_and_make_no_identity(
+    street: Street, dusk: SplatField, make_pass: MakePass, poison: str
+) -> None:
+    """With one honest vehicle nothing is learnt; with two, what the two saw."""
+    street.record(make_pass(dusk, "a"))
+    if poison == "poses":
+        street.record(elsewhere(make_pass(dusk, "liar")))
+    else:
+        street.record(make_pass(dusk, "liar", paint=pasted))
+    street.rounds().run()
+    assert len(street.west().field_ids) == 1
+    street.record(make_pass(dusk, "b", 0.15))
+    street.rounds().run()
+    (light,) = street.west().tile("west").lights
+    assert light.passes == 2
+
+
+def test_single_frames_that_nobody_confirms_are_dropped(
+    noon: SplatField, make_pass: MakePass
+) -> None:
+    def sometimes(number: int, rgb: Rgb) -> Rgb:
+        return pasted(number, rgb) if number in (3, 7) else rgb
+
+    drives = [make_pass(noon, "a", paint=sometimes), make_pass(noon, "b", 0.05)]
+    kept = without_outliers(noon, drives)
+    assert [len(drive.pictures) for drive in kept] == [10, 12]
+    assert {p.name for p in kept[0].pictures}.isdisjoint({"3.png", "7.png"})
+
+
+def test_what_another_vehicle_saw_too_is_no_outlier(noon: SplatField, make_pass: MakePass) -> None:
+    """A new front on the wall, nothing like the field, seen by two; then by one alone."""
+    front = pasted(0, np.zeros((64, 96, 3), np.uint8))
+    drives = [make_pass(noon, name, paint=lambda _, __: front) for name in "ab"]
+    assert len(without_outliers(noon, drives)) == 2
+    assert without_outliers(noon, drives[:1]) == []
+
+
+def test_an_update_that_makes_bits_worse_is_withdrawn_within_50_frames(
+    street: Street, noon: SplatField, dusk: SplatField, make_pass: MakePass, tmp_path: Path
+) -> None:
+    street.rounds().run()
+    bad_id = save_field(dusk, tmp_path / "bad.rff")
+    published = Learnt(bad_id, "h17", street.noon_id, 2, 20.0, NOW_MS)
+    (street.recordings / LEARNING / "tiles.json").write_text(
+        module.json.dumps({"west": module.asdict(module.TileHistory((published,)))})
+    )
+    label = VersionLabel("h17", "", 2, 17.0)
+    publish(street.fields, "west", tmp_path / "bad.rff", Ground(), NOW, label)
+    street.record(make_pass(noon, "c"), bad_id, times=4)
+    with capture_logs() as lines:
+        street.rounds().run()
+    assert [line["event"] for line in lines] == ["update withdrawn"]
+    assert lines[0]["vehicle"] == "c"
+    assert street.west().tile("west").lights == ()
+    history = read_histories(street.recordings)["west"]
+    assert history.withdrawals == 1
+    street.rounds().run()
+    assert read_histories(street.recordings)["west"] == history
+
+
+@pytest.mark.usefixtures("learnt_before")
+def test_an_update_that_helps_stays(at_dusk: Street, dusk: SplatField, make_pass: MakePass) -> None:
+    at_dusk.rounds().run()
+    west = at_dusk.west()
+    at_dusk.record(make_pass(dusk, "c", 0.05), west.tile("west").lights[0].field_id, times=4)
+    at_dusk.rounds().run()
+    assert at_dusk.west() == west
+    assert read_histories(at_dusk.recordings)["west"].checked
+
+
+class Killed(BaseException):
+    """Ends a round at once, as SIGKILL would."""
+
+
+@pytest.mark.usefixtures("learnt_before")
+@pytest.mark.parametrize("step", ["learn", "save_field", "publish", "store", "manifest"])
+def test_a_killed_round_publishes_nothing_half_and_the_next_does_the_work(
+    at_dusk: Street, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    target = {
+        "store": "rfcore.wire.publish.FieldStore.add",
+        "manifest": "rfcore.wire.publish.write_publication",
+    }.get(step, f"mec_server.tile_learning.{step}")
+
+    def killed(*_: object, **__: object) -> None:
+        raise Killed
+
+    before = (at_dusk.fields / MANIFEST).read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(target, killed)
+        with pytest.raises(Killed):
+            at_dusk.rounds().run()
+    assert (at_dusk.fields / MANIFEST).read_bytes() == before
+    assert all(FieldStore(at_dusk.fields).path(name) for name in FieldStore(at_dusk.fields).ids())
+    at_dusk.rounds().run()
+    assert len(at_dusk.west().tile("west").lights) == 1
+
+
+@pytest.mark.usefixtures("learnt_before")
+def test_a_full_disk_publishes_nothing_and_is_reported(
+    at_dusk: Street, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = (at_dusk.fields / MANIFEST).read_bytes()
+    monkeypatch.setattr("rfcore.field.store.write_whole", full)
+    with capture_logs() as lines:
+        at_dusk.rounds().run()
+    assert "No space left" in lines[-1]["problem"]
+    assert (at_dusk.fields / MANIFEST).read_bytes() == before
+
+
+@pytest.mark.usefixtures("learnt_before")
+def test_learnt_fields_stay_within_their_bytes(at_dusk: Street) -> None:
+    with capture_logs() as lines:
+        at_dusk.rounds(max_bytes=100).run()
+    assert "learn-max-gb" in lines[-1]["problem"]
+    assert len(at_dusk.west().field_ids) == 1
+
+
+def test_spent_time_postpones_learning(at_dusk: Street) -> None:
+    with capture_logs() as lines:
+        at_dusk.rounds(cpu_s_per_h=0.001).run()
+    assert lines[-1]["event"] == "learning postponed"
+    assert len(at_dusk.west().field_ids) == 1
+
+
+def test_of_two_updates_at_once_one_is_published(
+    at_dusk: Street,
+    monkeypatch: pytest.MonkeyPatch,
+    dusk: SplatField,
+    update: Update,
+    tmp_path: Path,
+) -> None:
+    """Somebody publishes while this process learns: what was learnt was for another state."""
+    other_id = save_field(dusk, tmp_path / "other.rff")
+
+    def slowly(*_: Any) -> Update:
+        label = VersionLabel("dusk", "", 2)
+        publish(at_dusk.fields, "west", tmp_path / "other.rff", Ground(), NOW, label)
+        return update
+
+    monkeypatch.setattr(module, "learn", slowly)
+    with capture_logs() as lines:
+        at_dusk.rounds().run()
+    assert "published by somebody else" in lines[-1]["problem"]
+    assert [light.field_id for light in at_dusk.west().tile("west").lights] == [other_id]
+
+
+def test_a_damaged_history_is_named(street: Street) -> None:
+    street.rounds().run()
+    (street.recordings / LEARNING / "tiles.json").write_text("{")
+    with pytest.raises(InvalidInput, match=r"tiles\.json is damaged"):
+        street.rounds().run()
+
+
+def test_a_killed_process_is_started_again_and_ends_with_its_server(street: Street) -> None:
+    now_s = [0.0]
+    learner = Learner(street.job, LogForm.JSON, lambda _: None, lambda: now_s[0])
+    learner.start()
+    first = learner.pid
+    assert first is not None
+    os.kill(first, 9)
+    os.waitid(os.P_PID, first, os.WEXITED | os.WNOWAIT)
+    learner.look()
+    assert learner.pid == first
+    now_s[0] = RESTART_S
+    learner.look()
+    second = learner.pid
+    assert second is not None
+    assert (second != first, learner.restarts) == (True, 1)
+    learner.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(second, 0)
