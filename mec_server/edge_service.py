@@ -15,8 +15,8 @@ import grpc
 from mec_server.ledger.entry import StreamAccount
 from mec_server.metrics import BackgroundTask
 from mec_server.peers import abort, peer_account
-from mec_server.server_context import ServerContext
 from mec_server.stream import Context, Stream
+from mec_server.stream_decoders import ServerContext
 from rfcore.errors import LimitExceeded
 from rfcore.wire.conventions import STREAM_METHOD
 

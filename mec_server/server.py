@@ -34,7 +34,7 @@ from mec_server.metrics import BackgroundTask, ServerMetrics
 from mec_server.peers import ChargeRpcs, Slots
 from mec_server.reconstruction import OpenCameras, Tools, open_cameras
 from mec_server.recorder import KeepLimits, Recorder
-from mec_server.server_context import ServerContext
+from mec_server.stream_decoders import ServerContext
 from mec_server.tile_learning import LearningJob
 from mec_server.twin.metrics import TwinMetrics
 from mec_server.twin.rendering import TwinViews

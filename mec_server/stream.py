@@ -22,9 +22,8 @@ from mec_server.ledger.budgets import Limit
 from mec_server.ledger.entry import StreamAccount
 from mec_server.ledger.peer_log import PeerLog
 from mec_server.reconstruction import Reconstruction
-from mec_server.server_context import ServerContext
 from mec_server.session import ServerSession, SessionState
-from mec_server.stream_decoders import FrameResult, StreamDecoders
+from mec_server.stream_decoders import FrameResult, ServerContext, StreamDecoders
 from mec_server.twin.state import TwinView
 from rfcore.camera import Intrinsics
 from rfcore.errors import InvalidInput, LimitExceeded, PacketRejected, RfedgeError

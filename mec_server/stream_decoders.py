@@ -8,16 +8,41 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
+from mec_server.config import SessionLimits
 from mec_server.decode_jobs import DecodeJob, OpenJob, RenderTooLate
+from mec_server.event_loop import Workers
+from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.ledger import Hold
-from mec_server.metrics import BackgroundTask, OpeningResult
-from mec_server.reconstruction import Decoder, Reconstruction
-from mec_server.recorder import SessionRecording
-from mec_server.server_context import ServerContext
+from mec_server.ledger.peer_log import LogLimiter
+from mec_server.metrics import BackgroundTask, OpeningResult, ServerMetrics
+from mec_server.reconstruction import Decoder, FieldSource, OpenCameras, Reconstruction, Tools
+from mec_server.recorder import Recorder, SessionRecording
+from mec_server.twin.state import Twin
 from rfcore.codec.h264.splice import PictureDecoder
 from rfcore.errors import PacketRejected, RfedgeError
 
-__all__ = ["FrameResult", "StreamDecoders"]
+__all__ = ["FrameResult", "ServerContext", "StreamDecoders"]
+
+
+@dataclass(frozen=True)
+class ServerContext:
+    """The parts of one server that its streams share."""
+
+    fields: FieldSource
+    held_field_ids: Callable[[], tuple[str, ...]]
+    workers: Workers
+    """Threads that decode frames."""
+    opener: Workers
+    """One thread that opens fields and decoders for new vehicles: a crowd of them, or a decoder
+    process that is slow to start, must not delay the frames of others."""
+    tools: Tools
+    metrics: ServerMetrics
+    limits: SessionLimits
+    entry: EntryControl
+    log_limiter: LogLimiter
+    twin: Twin
+    open_cameras: OpenCameras
+    recorder: Recorder | None = None
 
 
 class OpeningCancelled(RfedgeError):

@@ -75,13 +75,15 @@ class LivePicture:
     """What one camera's picture changes in the field.
 
     ``difference``: float32 [H, W, 3], levels in the light of the field, 0 where there is only
-    noise. ``depth``: the field's, float32 [H, W]. ``trust``: 0 (outvoted) to 1.
+    noise. ``depth``: the field's, float32 [H, W]. ``trust``: 0 (outvoted) to 1. ``changed``: bool
+    [H, W], where it is more likely a change than noise.
     """
 
     camera: Camera
     difference: F32
     depth: F32
     trust: float
+    changed: Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,8 @@ def live_picture(camera: Camera, rgb: Rgb, view: View) -> LivePicture:
     disagreement = float((part > 0.5).sum() / seen) if seen else 1.0
     trust = 0.0 if disagreement > MOST_DISAGREEMENT else 1.0 - disagreement
     depth = np.where(covered, view.depth, np.float32(0))
-    return LivePicture(camera, difference * part[:, :, None].astype(np.float32), depth, trust)
+    carried = difference * part[:, :, None].astype(np.float32)
+    return LivePicture(camera, carried, depth, trust, part > 0.5)
 
 
 def compose(

@@ -17,6 +17,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from mec_server.twin.composition import (
     live_picture,
     shrunk,
 )
+from mec_server.twin.objects import Detection, detect
 from mec_server.twin.state import CameraKey, Covers, Twin, TwinView
 from rfcore.camera import Camera
 from rfcore.errors import AccessDenied, InvalidInput
@@ -42,9 +44,17 @@ from rfcore.views import View
 from rfcore.wire.checks import shown
 from rfcore.wire.tiles import Tile
 from rfcore.wire.twin import PictureEncoding
-from rfcore.wire.twin_render import NO_AGE, LiveCamera, RenderedView, ViewRequest
+from rfcore.wire.twin_render import (
+    NO_AGE,
+    LiveCamera,
+    ObjectsRequest,
+    RenderedView,
+    ViewRequest,
+)
 
 __all__ = ["Place", "TwinViews", "place_of"]
+
+R = TypeVar("R")
 
 MOST_CAMERAS = 4
 """Live pictures carried to one view: those nearest to it."""
@@ -67,7 +77,7 @@ class Place:
     field_ids: frozenset[str]
 
 
-def place_of(request: ViewRequest, tiles: Sequence[Tile]) -> Place:
+def place_of(request: ViewRequest | ObjectsRequest, tiles: Sequence[Tile]) -> Place:
     """Return what ``request`` names; raise ``InvalidInput`` for a tile that is not published."""
     for tile in tiles:
         if request.tile == tile.name or request.field_id in tile.archive_ids:
@@ -123,26 +133,45 @@ class TwinViews:
         viewpoint outside of the field or inside of a wall. A caller that is cancelled costs at most
         the view that has begun.
         """
-        place = place_of(request, self._tiles())
-        if not may_draw(place.field_id):
-            raise AccessDenied("this certificate may not see that tile; ask the operator")
+        place = self.place(request, may_draw)
         now = time.monotonic()
-        self._ledger.check(identity, Resource.WORKER_SECONDS, now)
         recent = [
             seen
             for seen in self._twin.recent(now, request.max_age_s)
             if seen.field_id in place.field_ids and covers(seen.vehicle_id, seen.field_id)
         ]
-        answer: asyncio.Future[RenderedView] = asyncio.get_running_loop().create_future()
-        work = partial(self._timed, request, place, recent, answer)
+        return await self._on_thread(identity, partial(self._composed, request, place, recent))
+
+    async def detections(self, seen: TwinView, place: Place, identity: str) -> list[Detection]:
+        """Return what a picture shows that the field of ``place`` does not have.
+
+        Raises ``LimitExceeded`` while ``identity`` has spent its worker time.
+        """
+        if seen.frame.pose is None:
+            return []
+        return await self._on_thread(identity, partial(self._detected, seen, place))
+
+    def place(
+        self, request: ViewRequest | ObjectsRequest, may_draw: Callable[[str], bool]
+    ) -> Place:
+        """Return where to look; raise ``InvalidInput`` or ``AccessDenied``."""
+        place = place_of(request, self._tiles())
+        if not may_draw(place.field_id):
+            raise AccessDenied("this certificate may not see that tile; ask the operator")
+        return place
+
+    async def _on_thread(self, identity: str, compute: Callable[[], R]) -> R:
+        self._ledger.check(identity, Resource.WORKER_SECONDS, time.monotonic())
+        answer: asyncio.Future[R] = asyncio.get_running_loop().create_future()
+        work = partial(self._timed, compute, answer)
         self._worker.submit(identity, work, partial(self._finish, identity, answer))
         return await answer
 
     def _finish(
         self,
         identity: str,
-        answer: asyncio.Future[RenderedView],
-        outcome: tuple[float, RenderedView | Exception] | Exception,
+        answer: asyncio.Future[R],
+        outcome: tuple[float, R | Exception] | Exception,
     ) -> None:
         if isinstance(outcome, Exception):
             raise outcome
@@ -158,19 +187,15 @@ class TwinViews:
     # --- on the thread
 
     def _timed(
-        self,
-        request: ViewRequest,
-        place: Place,
-        recent: list[TwinView],
-        answer: asyncio.Future[RenderedView],
-    ) -> tuple[float, RenderedView | Exception]:
-        """Return for how long the thread was busy, and the view, or why there is none."""
+        self, compute: Callable[[], R], answer: asyncio.Future[R]
+    ) -> tuple[float, R | Exception]:
+        """Return for how long the thread was busy, and the result, or why there is none."""
         if answer.cancelled():
-            return 0.0, asyncio.InvalidStateError("nobody waits for this view")
+            return 0.0, asyncio.InvalidStateError("nobody waits for this")
         self._lower_priority()
         started = time.monotonic()
         try:
-            result: RenderedView | Exception = self._composed(request, place, recent)
+            result: R | Exception = compute()
         except Exception as error:
             result = error
         return time.monotonic() - started, result
@@ -204,6 +229,9 @@ class TwinViews:
             age_ms=_milliseconds(composed),
             cameras=cameras,
         )
+
+    def _detected(self, seen: TwinView, place: Place) -> list[Detection]:
+        return detect(self._live(seen, self._open_field(place.field_id)))
 
     def _live(self, seen: TwinView, field: RadianceField) -> LivePicture:
         """Return what a picture changes in ``field``; made once for each picture."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -19,7 +20,8 @@ import structlog
 
 from mec_server.peers import Slots, abort, peer_account
 from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
-from mec_server.twin.rendering import TwinViews
+from mec_server.twin.objects import ObjectTracker
+from mec_server.twin.rendering import Place, TwinViews
 from mec_server.twin.state import Covers, Mailbox, Twin, TwinView
 from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded, RfedgeError
 from rfcore.image import I420, jpeg_bytes, png_bytes
@@ -33,7 +35,15 @@ from rfcore.wire.twin import (
     subscription_from_wire,
     twin_message_to_wire,
 )
-from rfcore.wire.twin_render import RenderedView, rendered_view_to_wire, view_request_from_wire
+from rfcore.wire.twin_render import (
+    ObjectsSeen,
+    RenderedView,
+    StreetObject,
+    objects_request_from_wire,
+    objects_to_wire,
+    rendered_view_to_wire,
+    view_request_from_wire,
+)
 from rfcore.wire.v1 import twin_pb2 as pb
 from rfcore.wire.v1 import twin_pb2_grpc
 
@@ -118,6 +128,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         self._failed = failed
         self._pictures = TwinPictures()
         self._draining = asyncio.Event()
+        self._views = views
         self._renders = RenderCalls(views, metrics, slots, stalled_s, failed, sight, self._draining)
 
     def register(self, server: grpc.aio.Server) -> None:
@@ -159,13 +170,33 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         except LimitExceeded as error:
             self._metrics.ended.labels(ConsumerEnd.REFUSED).inc()
             await abort(context, error)
+        consumer = _Consumer(self._twin, self._pictures, self._metrics, context)
         with held:
-            await self._watch(subscription, sight.covers, context)
+            await self._watch(subscription, sight.covers, context, consumer)
 
-    async def _watch(self, subscription: Subscription, covers: Covers, context: Context) -> None:
+    async def Objects(  # type: ignore[override]  # noqa: N802
+        self, request: pb.ObjectsRequest, context: AnyContext
+    ) -> None:
+        """Send the objects of a place with each picture, until the consumer leaves."""
+        try:
+            sight = self._sight(context)
+            place = self._views.place(objects_request_from_wire(request), sight.may_draw)
+            held = self._slots.hold(context)
+        except RfedgeError as error:
+            await abort(context, error)
+
+        def covers(vehicle_id: str, field_id: str) -> bool:
+            return field_id in place.field_ids and sight.covers(vehicle_id, field_id)
+
+        consumer = _ObjectsConsumer(self._twin, self._views, self._metrics, context, place)
+        with held:
+            await self._watch(Subscription(), covers, context, consumer)
+
+    async def _watch(
+        self, subscription: Subscription, covers: Covers, context: AnyContext, consumer: _Mailed
+    ) -> None:
         self._metrics.consumers.inc()
         end = ConsumerEnd.LEFT
-        consumer = _Consumer(self._twin, self._pictures, self._metrics, context)
         try:
             end = await consumer.serve(subscription, covers, self._stalled_s, self._draining)
         except Exception as error:
@@ -183,15 +214,11 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
             )
 
 
-class _Consumer:
+class _Mailed(ABC):
     """Writes what arrives in one mailbox. ``unread``: what a slow consumer has not taken."""
 
-    def __init__(
-        self, twin: Twin, pictures: TwinPictures, metrics: TwinMetrics, context: Context
-    ) -> None:
+    def __init__(self, twin: Twin, context: AnyContext) -> None:
         self._twin = twin
-        self._pictures = pictures
-        self._metrics = metrics
         self._context = context
         self._arrived = asyncio.Event()
         self.unread: asyncio.Task[None] | None = None
@@ -239,6 +266,21 @@ class _Consumer:
         arrived.cancel()
         self._arrived.clear()
 
+    @abstractmethod
+    async def _write(self, mailbox: Mailbox, entry: TwinView | Departure) -> None:
+        """Write what the consumer is to have of one entry."""
+
+
+class _Consumer(_Mailed):
+    """Writes the pictures themselves."""
+
+    def __init__(
+        self, twin: Twin, pictures: TwinPictures, metrics: TwinMetrics, context: Context
+    ) -> None:
+        super().__init__(twin, context)
+        self._pictures = pictures
+        self._metrics = metrics
+
     async def _write(self, mailbox: Mailbox, entry: TwinView | Departure) -> None:
         if isinstance(entry, Departure):
             await self._context.write(twin_message_to_wire(entry))
@@ -251,6 +293,55 @@ class _Consumer:
         self._metrics.sent.labels(encoding).inc()
         self._metrics.bytes.inc(message.ByteSize())
         self._metrics.sent_age.observe(age_s)
+
+
+class _ObjectsConsumer(_Mailed):
+    """Writes what the pictures show that the field does not have."""
+
+    def __init__(
+        self,
+        twin: Twin,
+        views: TwinViews,
+        metrics: TwinMetrics,
+        context: AnyContext,
+        place: Place,
+    ) -> None:
+        super().__init__(twin, context)
+        self._views = views
+        self._metrics = metrics
+        self._place = place
+        self._tracker = ObjectTracker()
+        self._identity, _ = peer_account(context)
+
+    async def _write(self, mailbox: Mailbox, entry: TwinView | Departure) -> None:
+        if isinstance(entry, Departure):
+            return
+        try:
+            found = await self._views.detections(entry, self._place, self._identity)
+        except LimitExceeded:  # out of worker time: this picture is missed, as by a slow consumer
+            mailbox.skipped[entry.key] += 1
+            return
+        self._tracker.take(found, entry.key, entry.captured_s)
+        message = objects_to_wire(self._seen(entry.captured_s))
+        await self._context.write(message)
+        self._metrics.bytes.inc(message.ByteSize())
+
+    def _seen(self, now: float) -> ObjectsSeen:
+        objects = (
+            StreetObject(
+                object_id=each.object_id,
+                at_m=each.at(now),
+                velocity_mps=each.velocity_mps,
+                width_m=each.width_m,
+                height_m=each.height_m,
+                confidence=each.confidence(now),
+                age_s=max(0.0, now - each.first_s),
+                unseen_s=max(0.0, now - each.last_s),
+                seen_by=tuple(each.seen_by(now)),
+            )
+            for each in self._tracker.confirmed(now)
+        )
+        return ObjectsSeen(time.time_ns(), self._place.field_id, tuple(objects))
 
 
 def _message(view: TwinView, age_s: float, mailbox: Mailbox, data: bytes) -> TwinPicture:

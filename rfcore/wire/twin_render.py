@@ -1,4 +1,4 @@
-"""Views of the street from any viewpoint: messages of ``TwinService.Render``, and how to ask.
+"""The street as it is now: messages of ``TwinService.Render`` and ``Objects``, and how to ask.
 
 What comes from a peer is checked here, as in ``rfcore.wire.twin``.
 """
@@ -36,8 +36,15 @@ __all__ = [
     "MAX_VIEW_PX",
     "NO_AGE",
     "LiveCamera",
+    "ObjectsRequest",
+    "ObjectsSeen",
     "RenderedView",
+    "StreetObject",
     "ViewRequest",
+    "objects_from_wire",
+    "objects_request_from_wire",
+    "objects_request_to_wire",
+    "objects_to_wire",
     "render_view",
     "rendered_view_from_wire",
     "rendered_view_to_wire",
@@ -55,6 +62,8 @@ MAX_AGE_S: Final = 10.0
 NO_AGE: Final = 65535
 """Where no live picture vouches, in ``RenderResponse.age_ms``."""
 RENDER_TIMEOUT_S: Final = 30.0
+
+Vec3 = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -74,12 +83,7 @@ class ViewRequest:
     number: int = 0
 
     def __post_init__(self) -> None:
-        if bool(self.tile) == bool(self.field_id):
-            raise InvalidInput("tile", "name either a published tile or a field_id")
-        if self.tile:
-            check_name("tile", self.tile)
-        else:
-            check_field_id("field_id", self.field_id)
+        _check_place(self.tile, self.field_id)
         check_range("max_age_ms", 1e3 * self.max_age_s, 1, 1e3 * MAX_AGE_S)
         _check_camera(self.camera.intrinsics)
 
@@ -129,6 +133,42 @@ class RenderedView:
     def live(self) -> NDArray[np.bool_]:
         """Where a live picture vouches, [H, W]."""
         return np.asarray(self.age_ms != NO_AGE)
+
+
+@dataclass(frozen=True)
+class ObjectsRequest:
+    """Where to look for objects: a published ``tile``, or a field by its id; exactly one."""
+
+    tile: str = ""
+    field_id: str = ""
+
+    def __post_init__(self) -> None:
+        _check_place(self.tile, self.field_id)
+
+
+@dataclass(frozen=True)
+class StreetObject:
+    """A thing that the field does not have: see twin.proto. ``at_m`` is the foot of the side that
+    is seen, relative to the tile's origin; ``seen_by``: (vehicle id, camera id)."""
+
+    object_id: int
+    at_m: Vec3
+    velocity_mps: Vec3
+    width_m: float
+    height_m: float
+    confidence: float
+    age_s: float
+    unseen_s: float
+    seen_by: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class ObjectsSeen:
+    """The objects of one moment."""
+
+    time_ns: int
+    field_id: str
+    objects: tuple[StreetObject, ...]
 
 
 def render_view(
@@ -229,6 +269,89 @@ def _live_camera(camera: pb.LiveCamera) -> LiveCamera:
         check_range("camera.share", camera.share, 0.0, 1.0),
         camera.outvoted,
     )
+
+
+def objects_request_to_wire(request: ObjectsRequest) -> pb.ObjectsRequest:
+    """Return a request as protobuf."""
+    return pb.ObjectsRequest(tile=request.tile, field_id=request.field_id)
+
+
+def objects_request_from_wire(request: pb.ObjectsRequest) -> ObjectsRequest:
+    """Return what a consumer asks for; raise ``InvalidInput``."""
+    return ObjectsRequest(request.tile, request.field_id)
+
+
+def objects_to_wire(seen: ObjectsSeen) -> pb.ObjectsResponse:
+    """Return the objects of one moment as protobuf."""
+    return pb.ObjectsResponse(
+        time_ns=seen.time_ns,
+        field_id=seen.field_id,
+        objects=[_object_to_wire(each) for each in seen.objects],
+    )
+
+
+def objects_from_wire(response: pb.ObjectsResponse) -> ObjectsSeen:
+    """Return a server's answer; raise ``ProtocolError`` for one no server of ours would send."""
+    try:
+        return ObjectsSeen(
+            response.time_ns,
+            check_field_id("field_id", response.field_id),
+            tuple(_object_from_wire(each) for each in response.objects),
+        )
+    except InvalidInput as error:
+        raise ProtocolError(f"the server sent an impossible object: {error}") from error
+
+
+def _object_to_wire(each: StreetObject) -> pb.StreetObject:
+    (x_m, y_m, z_m), (vx, vy, vz) = each.at_m, each.velocity_mps
+    return pb.StreetObject(
+        object_id=each.object_id,
+        x_m=x_m,
+        y_m=y_m,
+        z_m=z_m,
+        velocity_x_mps=vx,
+        velocity_y_mps=vy,
+        velocity_z_mps=vz,
+        width_m=each.width_m,
+        height_m=each.height_m,
+        confidence=each.confidence,
+        age_ms=round(1e3 * each.age_s),
+        unseen_ms=round(1e3 * each.unseen_s),
+        seen_by=[pb.Sighting(vehicle_id=v, camera_id=c) for v, c in each.seen_by],
+    )
+
+
+def _object_from_wire(each: pb.StreetObject) -> StreetObject:
+    at_m = (each.x_m, each.y_m, each.z_m)
+    velocity_mps = (each.velocity_x_mps, each.velocity_y_mps, each.velocity_z_mps)
+    for value in (*at_m, *velocity_mps, each.width_m, each.height_m):
+        check_range("object", value, -1e9, 1e9)
+    return StreetObject(
+        each.object_id,
+        at_m,
+        velocity_mps,
+        each.width_m,
+        each.height_m,
+        check_range("object.confidence", each.confidence, 0.0, 1.0),
+        each.age_ms / 1e3,
+        each.unseen_ms / 1e3,
+        tuple(
+            (
+                check_name("seen_by.vehicle_id", s.vehicle_id),
+                check_name("seen_by.camera_id", s.camera_id),
+            )
+            for s in each.seen_by
+        ),
+    )
+
+
+def _check_place(tile: str, field_id: str) -> None:
+    if bool(tile) == bool(field_id):
+        raise InvalidInput("tile", "name either a published tile or a field_id")
+    if tile:
+        check_name("tile", tile)
+    else:
+        check_field_id("field_id", field_id)
 
 
 def _check_camera(k: Intrinsics) -> None:

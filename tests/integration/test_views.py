@@ -12,18 +12,21 @@ import numpy as np
 import pytest
 
 from mec_server.config import ServerBudget, SessionLimits
-from mec_server.twin import rendering
+from mec_server.twin import objects, rendering
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.twin import PictureEncoding
 from rfcore.wire.twin_render import (
     NO_AGE,
+    ObjectsRequest,
     ViewRequest,
+    objects_from_wire,
+    objects_request_to_wire,
     render_view,
     rendered_view_from_wire,
     view_request_to_wire,
 )
-from rfcore.wire.v1 import twin_pb2_grpc
+from rfcore.wire.v1 import twin_pb2, twin_pb2_grpc
 
 INTRINSICS = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
 ORIGIN = Camera(INTRINSICS, Pose.identity())
@@ -245,3 +248,51 @@ async def test_a_view_that_nobody_waits_for_any_more_is_not_drawn(
         await first
         await stub.Render(request)
     assert len(drawn) == 2
+
+
+async def test_objects_are_what_the_vehicle_sees_and_the_field_does_not_have(
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The red box of the drive, once three pictures have shown it."""
+    monkeypatch.setattr(objects, "LEAST_BLOCKS", 1)  # of a picture of 76x52
+    monkeypatch.setattr(objects, "MOST_SLOPE", 1.0)  # the field is a cloud, without ground
+    async with serve() as server, stub_of(server) as stub:
+        call = stub.Objects(objects_request_to_wire(ObjectsRequest(field_id=street.field_id)))
+        await call.initial_metadata()
+        async with raw_vehicle(server.address) as vehicle:
+            await vehicle.greet(coded.hello)
+            told = []
+            for frame in coded.frames[:4]:
+                await vehicle.told(frame)
+                told.append(objects_from_wire(await call.read()))
+    assert told[0].objects == told[1].objects == ()
+    assert {each.field_id for each in told} == {street.field_id}
+    assert told[0].time_ns < told[1].time_ns < told[2].time_ns
+    thing = told[3].objects[0]
+    assert thing.seen_by == (("cav-raw", "front"),)
+    assert 0 < thing.confidence <= 1
+    assert 2 < thing.at_m[2] < 9, "on the surface behind the box: the field is a cloud at 2 to 8 m"
+
+
+@pytest.mark.parametrize(
+    ("request_", "code"),
+    [
+        (twin_pb2.ObjectsRequest(), grpc.StatusCode.INVALID_ARGUMENT),
+        (twin_pb2.ObjectsRequest(tile="west"), grpc.StatusCode.INVALID_ARGUMENT),
+        (twin_pb2.ObjectsRequest(field_id="../x"), grpc.StatusCode.INVALID_ARGUMENT),
+    ],
+)
+async def test_objects_of_no_place_are_refused(
+    serve: Any, request_: twin_pb2.ObjectsRequest, code: grpc.StatusCode
+) -> None:
+    async with serve() as server, stub_of(server) as stub:
+        assert await stub.Objects(request_).code() is code
+
+
+async def test_objects_end_with_their_server(street: Any, serve: Any) -> None:
+    request = objects_request_to_wire(ObjectsRequest(field_id=street.field_id))
+    async with stub_of_stopping(serve) as (stub, server):
+        call = stub.Objects(request)
+        await call.initial_metadata()
+        await server.stop()
+        assert await call.code() is grpc.StatusCode.OK

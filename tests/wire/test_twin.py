@@ -23,8 +23,15 @@ from rfcore.wire.twin import (
 )
 from rfcore.wire.twin_render import (
     LiveCamera,
+    ObjectsRequest,
+    ObjectsSeen,
     RenderedView,
+    StreetObject,
     ViewRequest,
+    objects_from_wire,
+    objects_request_from_wire,
+    objects_request_to_wire,
+    objects_to_wire,
     rendered_view_from_wire,
     rendered_view_to_wire,
     view_request_from_wire,
@@ -116,3 +123,18 @@ def test_an_impossible_view_is_the_servers_fault(change: dict[str, object]) -> N
         setattr(bad, name, value)
     with pytest.raises(ProtocolError, match="impossible view"):
         rendered_view_from_wire(bad, LENS)
+
+
+def test_objects_survive_the_wire() -> None:
+    thing = StreetObject(
+        7, (1.0, 2.0, 3.0), (0.5, 0.0, -0.25), 1.8, 1.5, 0.75, 2.5, 0.1, (("cav-1", "front"),)
+    )
+    seen = ObjectsSeen(10**18, "ab" * 32, (thing,))
+    sent = objects_to_wire(seen).SerializeToString()
+    assert objects_from_wire(twin_pb2.ObjectsResponse.FromString(sent)) == seen
+    for asked in (ObjectsRequest(tile="west"), ObjectsRequest(field_id="ab" * 32)):
+        assert objects_request_from_wire(objects_request_to_wire(asked)) == asked
+    bad = objects_to_wire(seen)
+    bad.objects[0].x_m = float("nan")
+    with pytest.raises(ProtocolError, match="impossible object"):
+        objects_from_wire(bad)

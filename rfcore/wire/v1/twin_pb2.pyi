@@ -352,3 +352,143 @@ class LiveCamera(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___LiveCamera: _TypeAlias = LiveCamera  # noqa: Y015
+
+@_typing.final
+class ObjectsRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    TILE_FIELD_NUMBER: _builtins.int
+    FIELD_ID_FIELD_NUMBER: _builtins.int
+    tile: _builtins.str
+    """As in RenderRequest: one of the two."""
+    field_id: _builtins.str
+    def __init__(
+        self,
+        *,
+        tile: _builtins.str = ...,
+        field_id: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["field_id", b"field_id", "tile", b"tile"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ObjectsRequest: _TypeAlias = ObjectsRequest  # noqa: Y015
+
+@_typing.final
+class ObjectsResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    TIME_NS_FIELD_NUMBER: _builtins.int
+    FIELD_ID_FIELD_NUMBER: _builtins.int
+    OBJECTS_FIELD_NUMBER: _builtins.int
+    time_ns: _builtins.int
+    """When it was put together, by the server's clock."""
+    field_id: _builtins.str
+    """Of the field that the pictures were compared with."""
+    @_builtins.property
+    def objects(self) -> _containers.RepeatedCompositeFieldContainer[Global___StreetObject]:
+        """Sorted by object_id; without those that fewer than three pictures showed."""
+
+    def __init__(
+        self,
+        *,
+        time_ns: _builtins.int = ...,
+        field_id: _builtins.str = ...,
+        objects: _abc.Iterable[Global___StreetObject] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["field_id", b"field_id", "objects", b"objects", "time_ns", b"time_ns"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ObjectsResponse: _TypeAlias = ObjectsResponse  # noqa: Y015
+
+@_typing.final
+class StreetObject(_message.Message):
+    """A thing, as one consumer's stream follows it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    OBJECT_ID_FIELD_NUMBER: _builtins.int
+    X_M_FIELD_NUMBER: _builtins.int
+    Y_M_FIELD_NUMBER: _builtins.int
+    Z_M_FIELD_NUMBER: _builtins.int
+    VELOCITY_X_MPS_FIELD_NUMBER: _builtins.int
+    VELOCITY_Y_MPS_FIELD_NUMBER: _builtins.int
+    VELOCITY_Z_MPS_FIELD_NUMBER: _builtins.int
+    WIDTH_M_FIELD_NUMBER: _builtins.int
+    HEIGHT_M_FIELD_NUMBER: _builtins.int
+    CONFIDENCE_FIELD_NUMBER: _builtins.int
+    AGE_MS_FIELD_NUMBER: _builtins.int
+    UNSEEN_MS_FIELD_NUMBER: _builtins.int
+    SEEN_BY_FIELD_NUMBER: _builtins.int
+    object_id: _builtins.int
+    """Within the stream."""
+    x_m: _builtins.float
+    """Where it stands, relative to the tile's origin: the side that the cameras see, at its foot."""
+    y_m: _builtins.float
+    z_m: _builtins.float
+    velocity_x_mps: _builtins.float
+    velocity_y_mps: _builtins.float
+    velocity_z_mps: _builtins.float
+    width_m: _builtins.float
+    """As seen by the camera that saw it last, which may see a part."""
+    height_m: _builtins.float
+    confidence: _builtins.float
+    """0 to 1: by how many pictures it was seen in, and how many missed it."""
+    age_ms: _builtins.int
+    """Since it was first seen, and since it was last."""
+    unseen_ms: _builtins.int
+    @_builtins.property
+    def seen_by(self) -> _containers.RepeatedCompositeFieldContainer[Global___Sighting]:
+        """Those that saw it within the last second."""
+
+    def __init__(
+        self,
+        *,
+        object_id: _builtins.int = ...,
+        x_m: _builtins.float = ...,
+        y_m: _builtins.float = ...,
+        z_m: _builtins.float = ...,
+        velocity_x_mps: _builtins.float = ...,
+        velocity_y_mps: _builtins.float = ...,
+        velocity_z_mps: _builtins.float = ...,
+        width_m: _builtins.float = ...,
+        height_m: _builtins.float = ...,
+        confidence: _builtins.float = ...,
+        age_ms: _builtins.int = ...,
+        unseen_ms: _builtins.int = ...,
+        seen_by: _abc.Iterable[Global___Sighting] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ms", b"age_ms", "confidence", b"confidence", "height_m", b"height_m", "object_id", b"object_id", "seen_by", b"seen_by", "unseen_ms", b"unseen_ms", "velocity_x_mps", b"velocity_x_mps", "velocity_y_mps", b"velocity_y_mps", "velocity_z_mps", b"velocity_z_mps", "width_m", b"width_m", "x_m", b"x_m", "y_m", b"y_m", "z_m", b"z_m"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___StreetObject: _TypeAlias = StreetObject  # noqa: Y015
+
+@_typing.final
+class Sighting(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    VEHICLE_ID_FIELD_NUMBER: _builtins.int
+    CAMERA_ID_FIELD_NUMBER: _builtins.int
+    vehicle_id: _builtins.str
+    camera_id: _builtins.str
+    def __init__(
+        self,
+        *,
+        vehicle_id: _builtins.str = ...,
+        camera_id: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera_id", b"camera_id", "vehicle_id", b"vehicle_id"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Sighting: _TypeAlias = Sighting  # noqa: Y015

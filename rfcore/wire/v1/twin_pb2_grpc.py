@@ -49,6 +49,11 @@ class TwinServiceStub:
                 request_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.SerializeToString,
                 response_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.FromString,
                 _registered_method=True)
+        self.Objects = channel.unary_stream(
+                '/rfcore.wire.v1.TwinService/Objects',
+                request_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.ObjectsRequest.SerializeToString,
+                response_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.ObjectsResponse.FromString,
+                _registered_method=True)
 
 
 class TwinServiceServicer:
@@ -78,6 +83,13 @@ class TwinServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def Objects(self, request, context):
+        """Things that the vehicles see and the field does not have, again and again while pictures come.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_TwinServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -95,6 +107,11 @@ def add_TwinServiceServicer_to_server(servicer, server):
                     servicer.RenderStream,
                     request_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.FromString,
                     response_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.SerializeToString,
+            ),
+            'Objects': grpc.unary_stream_rpc_method_handler(
+                    servicer.Objects,
+                    request_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.ObjectsRequest.FromString,
+                    response_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.ObjectsResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -178,6 +195,33 @@ class TwinService:
             '/rfcore.wire.v1.TwinService/RenderStream',
             rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.SerializeToString,
             rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Objects(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/rfcore.wire.v1.TwinService/Objects',
+            rfcore_dot_wire_dot_v1_dot_twin__pb2.ObjectsRequest.SerializeToString,
+            rfcore_dot_wire_dot_v1_dot_twin__pb2.ObjectsResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -46,6 +46,8 @@ class TwinServiceStub:
     """The same for a camera that moves. Requests that wait when a view is done are answered by one
     view, of the newest; `skipped` counts the others.
     """
+    Objects: _grpc.UnaryStreamMultiCallable[_twin_pb2.ObjectsRequest, _twin_pb2.ObjectsResponse]
+    """Things that the vehicles see and the field does not have, again and again while pictures come."""
 
 @_typing.type_check_only
 class TwinServiceAsyncStub(TwinServiceStub):
@@ -62,6 +64,8 @@ class TwinServiceAsyncStub(TwinServiceStub):
     """The same for a camera that moves. Requests that wait when a view is done are answered by one
     view, of the newest; `skipped` counts the others.
     """
+    Objects: _aio.UnaryStreamMultiCallable[_twin_pb2.ObjectsRequest, _twin_pb2.ObjectsResponse]  # type: ignore[assignment]
+    """Things that the vehicles see and the field does not have, again and again while pictures come."""
 
 class TwinServiceServicer(metaclass=_abc_1.ABCMeta):
     @_abc_1.abstractmethod
@@ -93,5 +97,13 @@ class TwinServiceServicer(metaclass=_abc_1.ABCMeta):
         """The same for a camera that moves. Requests that wait when a view is done are answered by one
         view, of the newest; `skipped` counts the others.
         """
+
+    @_abc_1.abstractmethod
+    def Objects(
+        self,
+        request: _twin_pb2.ObjectsRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_abc.Iterator[_twin_pb2.ObjectsResponse], _abc.AsyncIterator[_twin_pb2.ObjectsResponse]]:
+        """Things that the vehicles see and the field does not have, again and again while pictures come."""
 
 def add_TwinServiceServicer_to_server(servicer: TwinServiceServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

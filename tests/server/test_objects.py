@@ -1,0 +1,171 @@
+"""Things that are not in the field are found where they stand, and followed."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mec_server.twin.composition import live_picture
+from mec_server.twin.objects import Detection, ObjectTracker, detect
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.field import SplatField
+from rfcore.raster.gaussians import Gaussians
+
+INTRINSICS = Intrinsics(320, 180, 260.0, 260.0, 160.0, 80.0)
+CAMERA_M = 1.5
+FRONT = ("cav-1", "front")
+
+
+def surface(points: np.ndarray, level: float, thin: int, seed: int = 0) -> Gaussians:
+    """Opaque flat Gaussians at ``points`` [N, 3], thin along axis ``thin``; grey, a bit uneven."""
+    n = len(points)
+    points = points[:, [0, 2, 1]] * [1, 1, -1]  # z is up in a tile
+    thin = (0, 2, 1)[thin]
+    levels = level + np.random.default_rng(seed).uniform(-0.05, 0.05, n)
+    sh = np.repeat((levels[:, None, None] - 0.5) / 0.28209479, 3, axis=2).astype(np.float32)
+    turns = np.tile(np.float32([1, 0, 0, 0]), (n, 1))
+    scales = np.full((n, 3), np.log(0.12), np.float32)
+    scales[:, thin] = np.log(0.005)
+    return Gaussians(
+        np.ascontiguousarray(points, np.float32), turns, scales, np.full(n, 8.0, np.float32), sh
+    )
+
+
+def grid(a: tuple[float, float], b: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    first, second = np.meshgrid(np.arange(*a, 0.15), np.arange(*b, 0.15))
+    return first.ravel(), second.ravel()
+
+
+def street() -> Gaussians:
+    """Ground (y down, CAMERA_M below the camera) up to a wall at 22 m."""
+    x, z = grid((-5, 5), (2, 22))
+    ground = np.stack([x, np.full_like(x, CAMERA_M), z], 1)
+    x, y = grid((-9, 9), (-4, CAMERA_M))
+    wall = np.stack([x, y, np.full_like(x, 22.0)], 1)
+    return joined(surface(ground, 0.45, 1), surface(wall, 0.5, 2)).gaussians
+
+
+def joined(a: Gaussians, b: Gaussians) -> SplatField:
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    return SplatField(
+        Gaussians(**{n: np.concatenate([getattr(a, n), getattr(b, n)]) for n in names})
+    )
+
+
+def car(x_m: float, z_m: float) -> Gaussians:
+    """A box 1.8 m wide and 1.4 m high whose near side is at ``z_m``."""
+    x, y = grid((x_m - 0.9, x_m + 0.9), (CAMERA_M - 1.4, CAMERA_M))
+    near = [np.stack([x, y, np.full_like(x, z)], 1) for z in (z_m, z_m + 1)]
+    return surface(np.concatenate(near), 0.9, 2, 1)
+
+
+STREET = street()
+FIELD = SplatField(STREET)
+
+
+def camera_at(x_m: float = 0.0, yaw_rad: float = 0.0) -> Camera:
+    yaw = Pose((0.0, 0.0, 0.0), (math.cos(yaw_rad / 2), 0.0, math.sin(yaw_rad / 2), 0.0))
+    level = Pose((x_m, 0.0, 0.0), (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0))
+    return Camera(INTRINSICS, level.compose(yaw))
+
+
+def seen(
+    field: SplatField, camera: Camera, sigma: float = 0.0, gain: float = 1.0
+) -> list[Detection]:
+    colour = field.render(camera).colour.clip(0, 1) * 255 * gain
+    noise = np.random.default_rng(5).normal(scale=sigma, size=colour.shape)
+    rgb = np.clip(np.rint(colour + noise), 0, 255).astype(np.uint8)
+    return detect(live_picture(camera, rgb, FIELD.render(camera)))
+
+
+@pytest.mark.parametrize("z_m", [6.0, 10.0, 15.0])
+@pytest.mark.parametrize(("sigma", "gain"), [(0.0, 1.0), (3.0, 1.0), (3.0, 0.4)])
+def test_a_car_is_found_where_it_stands(z_m: float, sigma: float, gain: float) -> None:
+    """Also with a noisy camera, and at dusk beside a field of noon."""
+    (found,) = seen(joined(STREET, car(0.8, z_m)), camera_at(), sigma, gain)
+    assert math.dist(found.at_m, (0.8, z_m, -CAMERA_M)) < 0.5 + 0.03 * z_m
+    assert found.width_m == pytest.approx(1.8, rel=0.35)
+    assert found.height_m == pytest.approx(1.4, rel=0.35)
+
+
+def test_two_cameras_find_the_same_place() -> None:
+    field = joined(STREET, car(0.8, 10.0))
+    (a,), (b,) = seen(field, camera_at(-1.0)), seen(field, camera_at(1.5, 0.05))
+    assert math.dist(a.at_m, b.at_m) < 0.5
+
+
+@pytest.mark.parametrize(("sigma", "gain"), [(0.0, 1.0), (3.0, 1.0), (3.0, 0.4)])
+def test_an_empty_street_has_no_objects(sigma: float, gain: float) -> None:
+    assert seen(FIELD, camera_at(), sigma, gain) == []
+
+
+def test_what_hangs_on_a_wall_is_no_object() -> None:
+    x, y = grid((-1.0, 1.0), (-2.0, 0.0))
+    poster = surface(np.stack([x, y, np.full_like(x, 21.9)], 1), 0.95, 2, 1)
+    assert seen(joined(STREET, poster), camera_at()) == []
+
+
+def test_two_cars_are_two_and_one_without_a_foot_in_the_picture_is_none() -> None:
+    both = joined(car(-2.0, 9.0), car(2.0, 12.0))
+    left, right = seen(joined(STREET, both.gaussians), camera_at())
+    assert left.at_m[0] < 0 < right.at_m[0]
+    assert seen(joined(STREET, car(0.0, 3.0)), camera_at()) == []
+
+
+def at(x_m: float, z_m: float = 10.0) -> Detection:
+    return Detection((x_m, CAMERA_M, z_m), math.hypot(x_m, z_m), 1.8, 1.4)
+
+
+def test_a_thing_that_moves_is_followed_with_its_velocity() -> None:
+    tracker = ObjectTracker()
+    for step in range(20):
+        tracker.take([at(-5.0 + 0.5 * step)], FRONT, 0.1 * step)
+    (thing,) = tracker.confirmed(1.9)
+    assert thing.object_id == 1
+    assert thing.at(1.9)[0] == pytest.approx(4.5, abs=0.15)
+    assert thing.velocity_mps[0] == pytest.approx(5.0, abs=0.5)
+    assert thing.confidence(1.9) == 1.0
+    assert thing.seen_by(1.9) == [FRONT]
+
+
+def test_two_vehicles_that_see_one_thing_see_one_thing() -> None:
+    tracker = ObjectTracker()
+    for step in range(6):
+        camera = FRONT if step % 2 else ("cav-2", "front")
+        tracker.take([at(1.0 + 0.2 * (step % 2))], camera, 0.1 * step)
+    (thing,) = tracker.confirmed(0.5)
+    assert thing.seen_by(0.5) == [FRONT, ("cav-2", "front")]
+    assert math.hypot(*thing.velocity_mps) < 1.0
+
+
+def test_two_pictures_confirm_nothing_and_what_nobody_sees_is_forgotten() -> None:
+    tracker = ObjectTracker()
+    for time_s in (0.0, 0.05):
+        tracker.take([at(0.0)], FRONT, time_s)
+        assert tracker.confirmed(time_s) == []
+    tracker.take([at(0.0)], FRONT, 0.1)
+    assert len(tracker.confirmed(0.1)) == 1
+    assert tracker.confirmed(0.6)[0].confidence(0.6) < tracker.confirmed(0.1)[0].confidence(0.1)
+    assert tracker.confirmed(1.2) == []
+    for time_s in (2.0, 2.05, 2.1):
+        tracker.take([at(0.0)], FRONT, time_s)
+    assert [thing.object_id for thing in tracker.confirmed(2.1)] == [2], "an id is never used again"
+
+
+def test_things_side_by_side_keep_their_identity_in_any_order() -> None:
+    tracker = ObjectTracker()
+    for step in range(8):
+        things = [at(-2.0 + 0.1 * step), at(2.0)]
+        tracker.take(things[:: 1 if step % 2 else -1], FRONT, 0.1 * step)
+    by_id = {thing.object_id: thing.at(0.7)[0] for thing in tracker.confirmed(0.7)}
+    assert sorted(by_id.values()) == pytest.approx([-1.3, 2.0], abs=0.15)
+    assert sorted(by_id) == [1, 2]
+
+
+def test_a_picture_that_comes_late_moves_nothing_wildly() -> None:
+    tracker = ObjectTracker()
+    for time_s in (0.0, 0.1, 0.2, 0.15, 0.2, 0.3):
+        tracker.take([at(10.0 * time_s)], FRONT, time_s)
+    (thing,) = tracker.confirmed(0.3)
+    assert thing.last_s == 0.3
+    assert abs(thing.velocity_mps[0]) < 20
