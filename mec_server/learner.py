@@ -49,8 +49,7 @@ Command = tuple[str, ...]
 class Learner:
     """Keeps the learning process running: ``start``, then ``look`` now and then, then ``close``.
 
-    ``show`` is given what was learnt, by tile, and what is published, when it changes;
-    ``now_s`` is a monotonic clock.
+    ``show`` is given what was learnt, by tile, with each look; ``now_s`` is a monotonic clock.
     """
 
     def __init__(

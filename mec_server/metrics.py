@@ -23,11 +23,13 @@ from mec_server.decoding.process import LossCause
 from mec_server.ledger.budgets import HELD, SPENT, Limit
 from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.peer_log import LogLimiter
+from mec_server.tile_learning import TileHistory
 from rfcore.codec.references import References, references_name
 from rfcore.errors import RejectReason
 from rfcore.field import RadianceField
 from rfcore.wire.instruments import DurationSeries, Family, Instruments
 from rfcore.wire.messages import Ack, Frame, Nack, ServerMessage, StageTimes
+from rfcore.wire.tiles import Tile
 
 __all__ = ["BackgroundTask", "OpeningResult", "ServerMetrics", "VehicleMetrics"]
 
@@ -82,6 +84,13 @@ SUPPRESSED = Family(
     "rfedge_server_log_lines_suppressed_total",
     "counter",
     "Log lines about peers that were not written, since their identity caused too many.",
+)
+
+WITHDRAWALS = Family(
+    "rfedge_server_tile_withdrawals_total",
+    "counter",
+    "Learnt fields of a tile that were withdrawn, since they made somebody's bits more.",
+    ("tile",),
 )
 
 STAGES = tuple(f.name.removesuffix("_ns") for f in fields(StageTimes) if f.name != "total_ns")
@@ -200,6 +209,26 @@ class ServerMetrics:
             "rfedge_server_recording",
             "1 while pictures are recorded, 0 when none are asked for or the disk refused.",
         )
+        self._lights = make.gauge(
+            "rfedge_server_tile_lights", "Fields of other lights that a tile publishes.", ("tile",)
+        )
+        self._passes = make.gauge(
+            "rfedge_server_tile_passes",
+            "Passes that the current lights of a tile were learnt from.",
+            ("tile",),
+        )
+        self._learnt = make.gauge(
+            "rfedge_server_tile_learnt_timestamp_seconds",
+            "When the learning process last published a field of a tile: Unix time.",
+            ("tile",),
+        )
+        self._saved = make.gauge(
+            "rfedge_server_tile_saved_ratio",
+            "Share of bits that the last learnt field saved on frames held back; 0 if withdrawn.",
+            ("tile",),
+        )
+        self._withdrawals: dict[str, Callable[[], float]] = {}
+        make.collector(WITHDRAWALS, _Counts(WITHDRAWALS, self._withdrawals))
         self._fields = make.gauge(
             "rfedge_server_field_info",
             "1 for each open radiance field: the first 16 digits of its id, and its kind.",
@@ -246,6 +275,21 @@ class ServerMetrics:
     def field_opened(self, field: RadianceField) -> None:
         """Publish which field was opened."""
         self._fields.labels(field.field_id[:16], field.metadata.kind).set(1)
+
+    def show_tiles(self, tiles: Iterable[Tile]) -> None:
+        """Publish which lights the tiles have."""
+        for tile in tiles:
+            self._lights.labels(tile.name).set(len(tile.lights))
+            self._passes.labels(tile.name).set(sum(light.passes for light in tile.lights))
+
+    def show_learnt(self, histories: Mapping[str, TileHistory]) -> None:
+        """Publish what was learnt of each tile."""
+        for name, history in histories.items():
+            self._withdrawals[name] = partial(float, history.withdrawals)
+            if history.learnt:
+                last = history.learnt[-1]
+                self._learnt.labels(name).set(last.time_ms / 1e3)
+                self._saved.labels(name).set(0 if last.withdrawn else last.saved_percent / 100)
 
     def count_limited(self, limit: str, count: int = 1) -> None:
         """Count what was refused or ended because of ``limit``."""

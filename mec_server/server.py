@@ -216,6 +216,7 @@ class EdgeServer:
         self._serve_metrics()
         await asyncio.to_thread(self._index.start)
         await asyncio.to_thread(self._published.start)
+        self._metrics.show_tiles(self._published.tiles)
         opened = await asyncio.to_thread(self._shelf.warm_up)
         await asyncio.to_thread(self._decoders.start)
         self._metrics.decoder_started(self._decoders.kind)
@@ -277,6 +278,7 @@ class EdgeServer:
         """Serve what is published now, and tell the vehicles if it is something else."""
         if await asyncio.to_thread(self._published.refresh):
             tiles = self._published.tiles
+            self._metrics.show_tiles(tiles)
             every = dict.fromkeys(name for tile in tiles for name in tile.renderable_ids)
             self._edge.fields_changed(tuple(every)[:MAX_FIELDS])
 
@@ -364,7 +366,7 @@ class EdgeServer:
             quiet_s=settings.quiet_s,
             max_field_bytes=config.render.max_field_bytes,
         )
-        return Learner(job, config.log, lambda _: None)
+        return Learner(job, config.log, self._metrics.show_learnt)
 
     def _recording_failed(self, error: Exception) -> None:
         self._metrics.recording.set(0)

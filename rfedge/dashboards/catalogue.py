@@ -413,6 +413,38 @@ CAPACITY = Dashboard(
             (Query(f"rfedge_server_recording{{{SERVER}}}"),),
             PanelKind.NUMBER,
         ),
+        Panel(
+            "Lights of the tiles",
+            "Fields of other lights that each tile publishes, and the passes they come from.",
+            Unit.COUNT,
+            (
+                Query(f"rfedge_server_tile_lights{{{SERVER}}}", "{{instance}} {{tile}}"),
+                Query(f"rfedge_server_tile_passes{{{SERVER}}}", "{{instance}} {{tile}} passes"),
+            ),
+        ),
+        Panel(
+            "Saved by learning",
+            "Share of bits that each tile's last learnt field saved on frames held back.",
+            Unit.SHARE,
+            (Query(f"rfedge_server_tile_saved_ratio{{{SERVER}}}", "{{instance}} {{tile}}"),),
+        ),
+        Panel(
+            "Since the last update",
+            "How long ago the learning process published a field of each tile.",
+            Unit.SECONDS,
+            (
+                Query(
+                    f"time() - rfedge_server_tile_learnt_timestamp_seconds{{{SERVER}}}",
+                    "{{instance}} {{tile}}",
+                ),
+            ),
+        ),
+        Panel(
+            "Updates withdrawn",
+            "Learnt fields that made somebody's bits more and were rolled back.",
+            Unit.COUNT,
+            (Query(f"rfedge_server_tile_withdrawals_total{{{SERVER}}}", "{{instance}} {{tile}}"),),
+        ),
     ),
 )
 

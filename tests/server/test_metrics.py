@@ -86,7 +86,7 @@ CLOSED = {
 }
 """The values that each label can have."""
 
-OWN = {"field", "version", "renderer_contract", "python", "device", "driver", "build"}
+OWN = {"field", "tile", "version", "renderer_contract", "python", "device", "driver", "build"}
 """Labels whose values the operator decides on, with what is installed and served."""
 
 

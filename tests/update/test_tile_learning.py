@@ -10,11 +10,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from prometheus_client import CollectorRegistry
 from structlog.testing import capture_logs
 
 from mec_server import tile_learning as module
 from mec_server.learner import RESTART_S, Learner
-from mec_server.tile_learning import LEARNING, LearningJob, LearningRounds, Learnt, read_histories
+from mec_server.metrics import ServerMetrics
+from mec_server.tile_learning import (
+    LEARNING,
+    LearningJob,
+    LearningRounds,
+    Learnt,
+    TileHistory,
+    read_histories,
+)
 from rfcore.dataset.recorded_session import RECORDING_NAME, RecordedCamera, RecordedPicture
 from rfcore.errors import InvalidInput
 from rfcore.field import FieldStore, SplatField, save_field
@@ -25,6 +34,7 @@ from rfcore.update.run import LearnAs, Update, UpdateSettings, learn
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.settings import LogForm
 from rfcore.wire.tile_manifest import MANIFEST, TileVersions, VersionLabel, read_publication
+from rfcore.wire.tiles import Tile, TileLight
 
 MakePass = Callable[..., Pass]
 NOW_MS = 1_767_290_400_000
@@ -184,7 +194,7 @@ def test_an_update_that_makes_bits_worse_is_withdrawn_within_50_frames(
     bad_id = save_field(dusk, tmp_path / "bad.rff")
     published = Learnt(bad_id, "h17", street.noon_id, 2, 20.0, NOW_MS)
     (street.recordings / LEARNING / "tiles.json").write_text(
-        module.json.dumps({"west": module.asdict(module.TileHistory((published,)))})
+        module.json.dumps({"west": module.asdict(TileHistory((published,)))})
     )
     label = VersionLabel("h17", "", 2, 17.0)
     publish(street.fields, "west", tmp_path / "bad.rff", Ground(), NOW, label)
@@ -315,3 +325,22 @@ def test_a_killed_process_is_started_again_and_ends_with_its_server(street: Stre
     learner.close()
     with pytest.raises(ProcessLookupError):
         os.kill(second, 0)
+
+
+def test_what_was_learnt_is_shown(street: Street) -> None:
+    """Of the tile's lights, and of the last update, which was withdrawn at last."""
+    registry = CollectorRegistry()
+    metrics = ServerMetrics(registry)
+
+    def shown(name: str) -> float | None:
+        return registry.get_sample_value(f"rfedge_server_tile_{name}", {"tile": "west"})
+
+    light = TileLight("h17", "ab" * 32, 2, street.noon_id, 3)
+    metrics.show_tiles([Tile("west", street.noon_id, lights=(light,))])
+    assert (shown("lights"), shown("passes")) == (1, 3)
+    learnt = Learnt("ab" * 32, "h17", street.noon_id, 3, 20.0, NOW_MS)
+    metrics.show_learnt({"west": TileHistory((learnt,))})
+    assert shown("learnt_timestamp_seconds") == NOW_MS / 1e3
+    assert (shown("saved_ratio"), shown("withdrawals_total")) == (0.2, 0)
+    metrics.show_learnt({"west": TileHistory((replace(learnt, withdrawn=True),))})
+    assert (shown("saved_ratio"), shown("withdrawals_total")) == (0, 1)
