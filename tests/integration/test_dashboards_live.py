@@ -6,16 +6,21 @@ configuration that is deployed, only more often. The clock is looked at only to 
 
 import asyncio
 import json
+import shutil
 import subprocess
 import urllib.parse
 import urllib.request
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from mec_server.tile_learning import LEARNING, Learnt, TileHistory
+from rfcore.wire.publish import Ground, publish
 from rfedge.dashboards.catalogue import DASHBOARDS
 from rfedge.demo.processes import command_of
 
@@ -115,6 +120,18 @@ async def written(path: Path) -> str:
     return path.read_text().strip()
 
 
+def tile_that_learnt(street: Any, folder: Path) -> Path:
+    """Return a folder that publishes the street; its server has learnt of it before."""
+    shutil.copytree(street.store, folder / "fields")
+    archive = street.store / "street.rff"
+    publish(folder / "fields", "west", archive, Ground(), datetime(2026, 1, 1, tzinfo=UTC))
+    learnt = Learnt(street.field_id, "h17", street.field_id, 2, 20.0, 1_767_290_400_000, True)
+    history = folder / "saved" / LEARNING / "tiles.json"
+    history.parent.mkdir(parents=True)
+    history.write_text(json.dumps({"west": asdict(TileHistory((learnt,)))}))
+    return folder / "fields"
+
+
 @asynccontextmanager
 async def street_in_motion(street: Any, folder: Path) -> AsyncIterator[dict[str, int]]:
     """A server, a link, a vehicle and a consumer; yields the port of the metrics by job."""
@@ -122,8 +139,9 @@ async def street_in_motion(street: Any, folder: Path) -> AsyncIterator[dict[str,
         start = lambda *words: stack.enter_async_context(command(*words))  # noqa: E731
         ports = {}
         server = await start(
-            *command_of("mec-server"), "--fields", street.store, "--listen", "127.0.0.1:0",
-            "--metrics-port", 0, "--ready-file", folder / "server", "--record", folder / "saved",
+            *command_of("mec-server"), "--fields", tile_that_learnt(street, folder),
+            "--listen", "127.0.0.1:0", "--metrics-port", 0, "--ready-file", folder / "server",
+            "--record", folder / "saved", "--learn",
         )  # fmt: skip
         ports["mec-server"] = await server.says(metrics_port)
         address = await written(folder / "server")
