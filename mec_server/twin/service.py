@@ -150,7 +150,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         return await self._renders.render(request, context)
 
     async def RenderStream(  # type: ignore[override]  # noqa: N802
-        self, requests: AsyncIterator[pb.RenderRequest], context: Context
+        self, requests: AsyncIterator[pb.RenderStreamRequest], context: Context
     ) -> None:
         """Return it from a viewpoint that moves, until the consumer has no more requests."""
         await self._renders.render_stream(requests, context)
@@ -397,7 +397,7 @@ class RenderCalls:
             return rendered_view_to_wire(await self._view(request, context))
 
     async def render_stream(
-        self, requests: AsyncIterator[pb.RenderRequest], context: AnyContext
+        self, requests: AsyncIterator[pb.RenderStreamRequest], context: AnyContext
     ) -> None:
         """Answer requests until the peer has no more, reads too slowly, or the server drains."""
         with await self._hold(context):
@@ -446,7 +446,8 @@ class RenderCalls:
         while (request := await moving.next(drained)) is not None:
             skipped = moving.skipped
             view = replace(await self._view(request, context), skipped=skipped)
-            writing = asyncio.create_task(context.write(rendered_view_to_wire(view)))
+            answer = pb.RenderStreamResponse(view=rendered_view_to_wire(view))
+            writing = asyncio.create_task(context.write(answer))
             await asyncio.wait(
                 {writing, drained}, timeout=self._stalled_s, return_when=asyncio.FIRST_COMPLETED
             )
@@ -471,7 +472,7 @@ class _MovingCamera:
     """
 
     def __init__(
-        self, requests: AsyncIterator[pb.RenderRequest], spend: Callable[[], None]
+        self, requests: AsyncIterator[pb.RenderStreamRequest], spend: Callable[[], None]
     ) -> None:
         self.skipped = 0
         self.error: RfedgeError | None = None
@@ -498,7 +499,7 @@ class _MovingCamera:
         request, self._newest = self._newest, None
         return request
 
-    async def _read(self, requests: AsyncIterator[pb.RenderRequest]) -> None:
+    async def _read(self, requests: AsyncIterator[pb.RenderStreamRequest]) -> None:
         async for request in requests:
             try:
                 self._spend()
@@ -506,5 +507,5 @@ class _MovingCamera:
                 self.error = error
                 return
             self.skipped += self._newest is not None
-            self._newest = request
+            self._newest = request.view
             self._arrived.set()

@@ -37,6 +37,10 @@ def asked(street: Any, camera: Camera = ORIGIN, **changes: Any) -> ViewRequest:
     return ViewRequest(camera, field_id=street.field_id, **changes)
 
 
+def stream_request(request: ViewRequest) -> twin_pb2.RenderStreamRequest:
+    return twin_pb2.RenderStreamRequest(view=view_request_to_wire(request))
+
+
 def field_picture(street: Any, camera: Camera) -> np.ndarray:
     colour = street.field.render(camera).colour.clip(0, 1)
     return np.rint(colour * np.float32(255)).astype(np.uint8)
@@ -156,7 +160,7 @@ async def test_views_are_charged_and_limited(street: Any, serve: Any) -> None:
     async with serve(server_budget=ServerBudget(watches=1)) as server, stub_of(server) as stub:
         value = server.registry.get_sample_value
         moving = stub.RenderStream()
-        await moving.write(view_request_to_wire(asked(street)))
+        await moving.write(stream_request(asked(street)))
         await moving.read()
         code, details = await refusal(stub.Render(view_request_to_wire(asked(street))))
         await moving.done_writing()
@@ -184,16 +188,16 @@ async def test_a_camera_that_moves_is_answered_in_order_with_the_newest(
     ]
     async with serve() as server, stub_of(server) as stub:
         moving = stub.RenderStream()
-        await moving.write(view_request_to_wire(asked(street, cameras[0], number=0)))
+        await moving.write(stream_request(asked(street, cameras[0], number=0)))
         assert await asyncio.to_thread(begun.wait, 30)
         for number in range(1, 5):
-            await moving.write(view_request_to_wire(asked(street, cameras[number], number=number)))
+            await moving.write(stream_request(asked(street, cameras[number], number=number)))
         spent = ("rfedge_server_spent_total", {"resource": "messages"})
         async with asyncio.timeout(30):
             while server.registry.get_sample_value(*spent) < 5:
                 await asyncio.sleep(0.001)
         gate.set()
-        views = [rendered_view_from_wire(await moving.read(), INTRINSICS) for _ in range(2)]
+        views = [rendered_view_from_wire((await moving.read()).view, INTRINSICS) for _ in range(2)]
         await moving.done_writing()
         assert await moving.read() is grpc.aio.EOF
     assert [(view.number, view.skipped) for view in views] == [(0, 0), (4, 3)]
@@ -206,9 +210,9 @@ async def test_a_stream_ends_with_what_is_wrong_and_with_its_server(
 ) -> None:
     async with stub_of_stopping(serve) as (stub, server):
         wrong, good = stub.RenderStream(), stub.RenderStream()
-        await wrong.write(view_request_to_wire(asked(street, FAR)))
+        await wrong.write(stream_request(asked(street, FAR)))
         assert await wrong.code() is grpc.StatusCode.INVALID_ARGUMENT
-        await good.write(view_request_to_wire(asked(street)))
+        await good.write(stream_request(asked(street)))
         await good.read()
         await server.stop()
         assert await good.code() is grpc.StatusCode.OK

@@ -354,6 +354,46 @@ class LiveCamera(_message.Message):
 Global___LiveCamera: _TypeAlias = LiveCamera  # noqa: Y015
 
 @_typing.final
+class RenderStreamRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    VIEW_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def view(self) -> Global___RenderRequest: ...
+    def __init__(
+        self,
+        *,
+        view: Global___RenderRequest | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["view", b"view"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["view", b"view"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___RenderStreamRequest: _TypeAlias = RenderStreamRequest  # noqa: Y015
+
+@_typing.final
+class RenderStreamResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    VIEW_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def view(self) -> Global___RenderResponse: ...
+    def __init__(
+        self,
+        *,
+        view: Global___RenderResponse | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["view", b"view"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["view", b"view"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___RenderStreamResponse: _TypeAlias = RenderStreamResponse  # noqa: Y015
+
+@_typing.final
 class ObjectsRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 

@@ -46,8 +46,8 @@ class TwinServiceStub:
                 _registered_method=True)
         self.RenderStream = channel.stream_stream(
                 '/rfcore.wire.v1.TwinService/RenderStream',
-                request_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.SerializeToString,
-                response_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.FromString,
+                request_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderStreamRequest.SerializeToString,
+                response_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderStreamResponse.FromString,
                 _registered_method=True)
         self.Objects = channel.unary_stream(
                 '/rfcore.wire.v1.TwinService/Objects',
@@ -105,8 +105,8 @@ def add_TwinServiceServicer_to_server(servicer, server):
             ),
             'RenderStream': grpc.stream_stream_rpc_method_handler(
                     servicer.RenderStream,
-                    request_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.FromString,
-                    response_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.SerializeToString,
+                    request_deserializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderStreamRequest.FromString,
+                    response_serializer=rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderStreamResponse.SerializeToString,
             ),
             'Objects': grpc.unary_stream_rpc_method_handler(
                     servicer.Objects,
@@ -193,8 +193,8 @@ class TwinService:
             request_iterator,
             target,
             '/rfcore.wire.v1.TwinService/RenderStream',
-            rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderRequest.SerializeToString,
-            rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderResponse.FromString,
+            rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderStreamRequest.SerializeToString,
+            rfcore_dot_wire_dot_v1_dot_twin__pb2.RenderStreamResponse.FromString,
             options,
             channel_credentials,
             insecure,

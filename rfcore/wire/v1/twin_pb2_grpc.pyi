@@ -42,7 +42,7 @@ class TwinServiceStub:
     """The street as it is now from any viewpoint: the field, with the newest pictures of the vehicles
     carried to that view.
     """
-    RenderStream: _grpc.StreamStreamMultiCallable[_twin_pb2.RenderRequest, _twin_pb2.RenderResponse]
+    RenderStream: _grpc.StreamStreamMultiCallable[_twin_pb2.RenderStreamRequest, _twin_pb2.RenderStreamResponse]
     """The same for a camera that moves. Requests that wait when a view is done are answered by one
     view, of the newest; `skipped` counts the others.
     """
@@ -60,7 +60,7 @@ class TwinServiceAsyncStub(TwinServiceStub):
     """The street as it is now from any viewpoint: the field, with the newest pictures of the vehicles
     carried to that view.
     """
-    RenderStream: _aio.StreamStreamMultiCallable[_twin_pb2.RenderRequest, _twin_pb2.RenderResponse]  # type: ignore[assignment]
+    RenderStream: _aio.StreamStreamMultiCallable[_twin_pb2.RenderStreamRequest, _twin_pb2.RenderStreamResponse]  # type: ignore[assignment]
     """The same for a camera that moves. Requests that wait when a view is done are answered by one
     view, of the newest; `skipped` counts the others.
     """
@@ -91,9 +91,9 @@ class TwinServiceServicer(metaclass=_abc_1.ABCMeta):
     @_abc_1.abstractmethod
     def RenderStream(
         self,
-        request_iterator: _MaybeAsyncIterator[_twin_pb2.RenderRequest],
+        request_iterator: _MaybeAsyncIterator[_twin_pb2.RenderStreamRequest],
         context: _ServicerContext,
-    ) -> _typing.Union[_abc.Iterator[_twin_pb2.RenderResponse], _abc.AsyncIterator[_twin_pb2.RenderResponse]]:
+    ) -> _typing.Union[_abc.Iterator[_twin_pb2.RenderStreamResponse], _abc.AsyncIterator[_twin_pb2.RenderStreamResponse]]:
         """The same for a camera that moves. Requests that wait when a view is done are answered by one
         view, of the newest; `skipped` counts the others.
         """
