@@ -123,6 +123,7 @@ def _fields(clip: CodedClip) -> dict[str, Any]:
         "ssim": clip.ssim.tolist(),
         "cpu_ms": clip.cpu_ms,
         "notes": {name: list(values) for name, values in clip.notes.items()},
+        "receiver_cpu_ms": clip.receiver_cpu_ms,
     }
 
 
@@ -145,6 +146,7 @@ def _clip_of(path: Path, clip: Any) -> CodedClip:
             np.array(clip["ssim"], np.float64),
             clip["cpu_ms"],
             {name: tuple(values) for name, values in clip["notes"].items()},
+            clip.get("receiver_cpu_ms"),
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise _damaged(path, error) from error

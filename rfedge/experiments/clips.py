@@ -61,6 +61,8 @@ class CodedClip:
     cpu_ms: float
     notes: Mapping[str, tuple[float | str, ...]] = field(default_factory=dict)
     """What the method wants to tell of each frame, by name: references chosen, bits by kind..."""
+    receiver_cpu_ms: float | None = None
+    """Processor time of the receiver over the whole clip; None if the method does not tell."""
 
     def __post_init__(self) -> None:
         shapes = {self.frame_bytes.shape, self.luma_mse.shape, self.ssim.shape}

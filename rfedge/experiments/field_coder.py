@@ -22,7 +22,7 @@ from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.photometric import Photometric
-from rfcore.codec.references import References, is_temporal, references_name
+from rfcore.codec.references import INTRA, Reference, References, is_temporal, references_name
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.errors import InvalidInput
 from rfcore.field import FULL, Quality, RadianceField, render_field_view
@@ -34,11 +34,13 @@ from rfedge.experiments.clips import CodedClip, luma_mse, luma_sse
 from rfedge.experiments.picture_quality import luma_ssim
 from rfedge.offline import Arrival, FrameInput, decode_promised, encode_frames
 
-__all__ = ["FieldCoder", "RenderedClip", "message_bytes", "render_clip"]
+__all__ = ["WITHOUT_FIELD", "FieldCoder", "RenderedClip", "message_bytes", "render_clip"]
 
 LIMITS = (1.0, 51.0)
 CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0, 35.0, 38.0)
 COVERED = 0.5
+WITHOUT_FIELD: References = (Reference.PREVIOUS,)
+"""As a coder that has no field: each frame from the one before, the first by itself."""
 MESSAGE_CAMERA = "front"
 MESSAGE_TIME_NS = 1_700_000_000_000_000_000
 
@@ -121,10 +123,14 @@ class FieldCoder:
         self._rendered = rendered
         self._effort = effort
         self._foregrounds = foregrounds
+        if references == WITHOUT_FIELD:
+            photometric = ()
         self._choice = FrameChoice(references=references, photometric=photometric)
-        # Temporal references exist from the second frame on.
-        temporal = references is not None and is_temporal(references)
-        self._first_choice = FrameChoice(photometric=photometric) if temporal else self._choice
+        first = references
+        if references is not None and is_temporal(references):  # from the second frame on
+            first = INTRA if references == WITHOUT_FIELD else None
+        self._first_choice = FrameChoice(references=first, photometric=photometric)
+        self._renders = references != WITHOUT_FIELD
 
     @cached_property
     def version(self) -> str:
@@ -157,8 +163,10 @@ class FieldCoder:
         encoder = DeltaEncoder(config)
         coded = list(encode_frames(encoder, self._inputs(frames)))
         cpu_ms = (process_time_ns() - began_ns) / 1e6
-        cpu_ms += self._rendered.render_cpu_ms * len(frames) / count
-        decoded = decode_promised(DeltaDecoder(encoder.header), coded)
+        render_cpu_ms = self._renders * self._rendered.render_cpu_ms * len(frames) / count
+        began_ns = process_time_ns()
+        decoded = list(decode_promised(DeltaDecoder(encoder.header), coded))
+        receiver_cpu_ms = (process_time_ns() - began_ns) / 1e6
         pairs = [(picture, coded_frame.given.frame) for coded_frame, picture in decoded]
         packets = [coded_frame.encoded.packet for coded_frame in coded]
         notes: dict[str, tuple[float | str, ...]] = {
@@ -173,8 +181,9 @@ class FieldCoder:
             np.array([message_bytes(frame.arrival) for frame in coded]),
             np.array([luma_mse(*pair) for pair in pairs]),
             np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
-            cpu_ms,
+            cpu_ms + render_cpu_ms,
             notes,
+            receiver_cpu_ms + render_cpu_ms,
         )
 
     def _inputs(self, frames: Sequence[I420]) -> Iterator[FrameInput]:

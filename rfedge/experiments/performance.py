@@ -5,7 +5,7 @@ Everything is taken from a ``CellStore`` where it is there already.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Protocol, runtime_checkable
@@ -14,22 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
-from rfedge.experiments.cells import CellStore, Rows, clip_key
+from rfedge.experiments.cells import CellKey, CellStore, Rows, clip_key
 from rfedge.experiments.clips import STEADY, Clip, ClipCoder, CodedClip, psnr_of_mse
 from rfedge.experiments.rate_curve import RateCurve, Window, rate_curve
 
 __all__ = [
     "HEADLINE_DB",
+    "CpuTime",
     "Performance",
     "perform",
     "seconds_left",
     "spanning_points",
+    "time_in_turns",
 ]
 
 HEADLINE_DB: Window = (32.0, 35.0)
 """Luma PSNR over which BD-rates are quoted, unless a window is asked for."""
 PROBE_FRAMES = 2
-TIMED_FRAMES, TIMED_REPEATS = 12, 3
+TIMED_FRAMES, TIMED_REPEATS, ROUNDS = 12, 3, 5
 
 
 @runtime_checkable
@@ -42,21 +44,44 @@ class BoundedCoder(Protocol):
 
 
 @dataclass(frozen=True)
+class CpuTime:
+    """Processor time a frame: medians of several rounds, and the least and most that both ends
+    took together in one. ``receiver_ms`` is None for a method that does not tell."""
+
+    sender_ms: float
+    receiver_ms: float | None
+    least_ms: float
+    most_ms: float
+
+    @property
+    def both_ms(self) -> float:
+        """Of both ends, as far as they are known."""
+        return self.sender_ms + (self.receiver_ms or 0.0)
+
+
+@dataclass(frozen=True)
 class Performance:
     """A method's clips at all its operating points, and its sender's processor time a frame.
 
     The time is that near the middle of the window asked about: it falls with the rate, and a mean
-    over all points would depend on how many of them are outside the window.
+    over all points would depend on how many of them are outside the window. ``cpu`` has more of it
+    where the method took turns with others (``time_in_turns``).
     """
 
     name: str
     clips: tuple[CodedClip, ...]
     cpu_ms_per_frame: float
+    cpu: CpuTime | None = None
 
     @property
     def steady(self) -> RateCurve:
         """The curve without the first frame."""
         return rate_curve(self.clips, STEADY)
+
+    @property
+    def both_ends_ms(self) -> float:
+        """Processor time a frame of both ends where that was taken, else the sender's."""
+        return self.cpu_ms_per_frame if self.cpu is None else self.cpu.both_ms
 
     def nearest(self, psnr_db: float) -> CodedClip:
         """Return the clip whose quality is nearest to ``psnr_db``, its first frame included."""
@@ -84,17 +109,21 @@ def perform(
     *,
     window_db: Window | None = None,
     retime: bool = False,
+    timed: bool = True,
 ) -> Performance:
     """Code ``clip`` at every point of ``coder``, taking from ``store`` what is there.
 
     With a window, points are added until the curve spans it, as ``spanning_points`` does, and
-    processor time is that near its middle. ``retime`` takes it anew, and nothing else.
+    processor time is that near its middle. ``retime`` takes it anew, and nothing else; where it is
+    not ``timed``, it is not known: infinite.
     """
     points = coder.points
     if window_db is not None:
         points = spanning_points(clip, coder, store, window_db)
     clips = tuple(_coded(clip, coder, point, store) for point in points)
     performance = Performance(coder.name, clips, float("inf"))
+    if not timed:
+        return performance
     point = performance.nearest(sum(window_db or HEADLINE_DB) / 2).point
     key = {**clip_key(clip, coder, point), "timed": TIMED_REPEATS}
     if retime:
@@ -163,3 +192,53 @@ def _timed(clip: Clip, coder: ClipCoder, point: float) -> Rows:
     frames = clip.frames[:TIMED_FRAMES]
     runs = [coder.code(frames, clip.rate_hz, point) for _ in range(TIMED_REPEATS)]
     return [{"cpu_ms_per_frame": min(run.cpu_ms for run in runs) / len(frames)}]
+
+
+def time_in_turns(
+    clip: Clip,
+    coded: Sequence[tuple[ClipCoder, Performance]],
+    store: CellStore,
+    window_db: Window,
+    *,
+    retime: bool = False,
+) -> list[Performance]:
+    """Return the performances with processor times for which all coders took turns.
+
+    In each of five rounds each coder codes and decodes the beginning of the clip once, near the
+    middle of the window: what else the machine does falls on all alike.
+    """
+    middle_db = sum(window_db) / 2
+    tasks = {p.name: (coder, p.nearest(middle_db).point) for coder, p in coded}
+    key: CellKey = {
+        "turns": ROUNDS,
+        "frames": clip.frames_digest,
+        "hz": clip.rate_hz,
+        "coders": "; ".join(f"{n} {c.version} at {p:g}" for n, (c, p) in tasks.items()),
+    }
+    if retime:
+        store.forget(key)
+    rows = store.rows(key, lambda: _rounds(clip, tasks))
+    times = {str(row.pop("name")): CpuTime(**row) for row in rows}
+    return [
+        replace(p, cpu=times[p.name], cpu_ms_per_frame=times[p.name].sender_ms) for _, p in coded
+    ]
+
+
+def _rounds(clip: Clip, tasks: Mapping[str, tuple[ClipCoder, float]]) -> Rows:
+    frames = clip.frames[:TIMED_FRAMES]
+    runs: dict[str, list[CodedClip]] = {name: [] for name in tasks}
+    for _ in range(ROUNDS):
+        for name, (coder, point) in tasks.items():
+            runs[name].append(coder.code(frames, clip.rate_hz, point))
+    return [{"name": name} | _cpu_time(those, len(frames)) for name, those in runs.items()]
+
+
+def _cpu_time(runs: Sequence[CodedClip], frames: int) -> dict[str, float | None]:
+    receivers = [run.receiver_cpu_ms for run in runs if run.receiver_cpu_ms is not None]
+    both = [run.cpu_ms + (run.receiver_cpu_ms or 0.0) for run in runs]
+    return {
+        "sender_ms": float(np.median([run.cpu_ms for run in runs])) / frames,
+        "receiver_ms": float(np.median(receivers)) / frames if receivers else None,
+        "least_ms": min(both) / frames,
+        "most_ms": max(both) / frames,
+    }

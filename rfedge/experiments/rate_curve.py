@@ -3,13 +3,14 @@
 The distortion of a clip is the PSNR of the mean squared error over its frames (not the mean of
 PSNRs, which lets one easy frame outweigh a hard one). Between points, log(rate) is interpolated
 over decibels by a monotone cubic (PCHIP; Bjontegaard, VCEG-M33, with the interpolation of
-JVET-M0166). There is no extrapolation: a window that a curve does not span is an error.
+JVET-M0166). There is no extrapolation: a window that a curve does not span is an error. A curve
+over SSIM has -10 log10(1 - SSIM) for decibels.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,15 @@ from rfedge.experiments.clips import CodedClip
 with needs("eval"):
     from scipy.interpolate import PchipInterpolator
 
-__all__ = ["RateCurve", "Window", "bd_rate_interval", "bd_rate_percent", "rate_curve"]
+__all__ = [
+    "RateCurve",
+    "Window",
+    "bd_rate_interval",
+    "bd_rate_percent",
+    "rate_curve",
+    "ssim_curve",
+    "ssim_db",
+]
 
 MIN_POINTS = 6
 PEAK = 255.0
@@ -32,7 +41,10 @@ Window = tuple[float, float]
 
 @dataclass(frozen=True)
 class RateCurve:
-    """Points of a rate-distortion curve, ascending: ``bytes_per_frame`` over ``psnr_db``, [N]."""
+    """Points of a rate-distortion curve, ascending: ``bytes_per_frame`` over ``psnr_db``, [N].
+
+    ``psnr_db`` is SSIM in decibels where a curve is over SSIM.
+    """
 
     psnr_db: NDArray[np.float64]
     bytes_per_frame: NDArray[np.float64]
@@ -83,11 +95,28 @@ def rate_curve(clips: Sequence[CodedClip], frames: NDArray[np.intp] | slice) -> 
     fewest bytes. Raises ``InvalidInput`` when there are too few points.
     """
     mse = np.array([clip.luma_mse[frames].mean() for clip in clips])
-    rates = np.array([clip.frame_bytes[frames].mean() for clip in clips])
     with np.errstate(divide="ignore"):
         psnr_db = 10 * np.log10(PEAK * PEAK / mse)
-    order = np.lexsort((rates, psnr_db))
-    qualities, first = np.unique(psnr_db[order], return_index=True)
+    return _curve(psnr_db, clips, frames)
+
+
+def ssim_db(ssim: float) -> float:
+    """Return an SSIM below 1 in decibels: 0.9 is 10 dB."""
+    return -10 * math.log10(1 - ssim)
+
+
+def ssim_curve(clips: Sequence[CodedClip], frames: NDArray[np.intp] | slice) -> RateCurve:
+    """Return the same over the mean SSIM of the frames, in decibels."""
+    qualities = [ssim_db(float(clip.ssim[frames].mean())) for clip in clips]
+    return _curve(np.array(qualities), clips, frames)
+
+
+def _curve(
+    quality_db: NDArray[np.float64], clips: Sequence[CodedClip], frames: NDArray[np.intp] | slice
+) -> RateCurve:
+    rates = np.array([clip.frame_bytes[frames].mean() for clip in clips])
+    order = np.lexsort((rates, quality_db))
+    qualities, first = np.unique(quality_db[order], return_index=True)
     return RateCurve(qualities, rates[order][first])
 
 
@@ -108,20 +137,22 @@ def bd_rate_interval(
     *,
     first: int = 1,
     repetitions: int = 400,
+    curve: Callable[[Sequence[CodedClip], NDArray[np.intp]], RateCurve] = rate_curve,
 ) -> tuple[float, float]:
-    """Return the 95 % interval of the BD-rate from resampled frames (percentile bootstrap).
+    """Return the 95 % interval of the BD-rate from resampled blocks of frames.
 
-    The same frames are drawn for both, from frame ``first`` on. It says how far the figure hangs
-    on which frames the clip happens to have; neighbours resemble each other, so it is a lower bound
-    of what another street would show. Draws whose curves leave the window count as no figure; if
-    they are more than 5 %, ``InvalidInput`` is raised.
+    The moving-block bootstrap of Kuensch (1989), percentiles: neighbouring frames resemble each
+    other, so blocks of sqrt(N) consecutive frames are drawn, the same for both, from frame
+    ``first`` on. It says how far the figure hangs on which part of the street the clip happens to
+    show; another street may lie outside. Draws whose curves leave the window count as no figure;
+    if they are more than 5 %, ``InvalidInput`` is raised.
     """
     count = len(anchor[0].frame_bytes)
     figures = []
     for _ in range(repetitions):
-        frames = rng.integers(first, count, count - first)
+        frames = _drawn_blocks(first, count, rng)
         try:
-            curves = rate_curve(anchor, frames), rate_curve(test, frames)
+            curves = curve(anchor, frames), curve(test, frames)
             figures.append(bd_rate_percent(*curves, window_db))
         except InvalidInput:
             continue
@@ -132,3 +163,11 @@ def bd_rate_interval(
         )
     low, high = np.percentile(figures, (2.5, 97.5))
     return float(low), float(high)
+
+
+def _drawn_blocks(first: int, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Return as many frames as there are from ``first`` on, drawn in blocks of their root."""
+    wanted = count - first
+    length = max(1, round(math.sqrt(wanted)))
+    starts = rng.integers(first, count - length + 1, -(-wanted // length))
+    return (starts[:, None] + np.arange(length)).ravel()[:wanted]

@@ -36,8 +36,11 @@ __all__ = [
     "svtav1_lowdelay",
     "video_frame",
     "x264_for_psnr",
+    "x264_for_ssim",
     "x264_lowdelay",
+    "x264_with_our_tools",
     "x265_for_psnr",
+    "x265_for_ssim",
     "x265_lowdelay",
 ]
 
@@ -125,6 +128,7 @@ class Rival:
             np.array([luma_mse(*pair) for pair in pairs]),
             np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
             made.cpu_ms,
+            receiver_cpu_ms=made.decoder_cpu_ms,
         )
 
     def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
@@ -198,6 +202,30 @@ def x264_for_psnr(preset: str) -> Rival:
     return replace(plain, options={**plain.options, "tune": "zerolatency,psnr"})
 
 
+def x264_for_ssim(preset: str) -> Rival:
+    """Return the same with ``tune=ssim``, for a comparison by SSIM."""
+    plain = x264_lowdelay(preset, f"x264-lowdelay-ssim-{preset}")
+    return replace(plain, options={**plain.options, "tune": "zerolatency,ssim"})
+
+
+OUR_TOOLS = {"mixed-refs": "1", "ref": "3", "trellis": "2", "aq-mode": "0", "psy": "0"}
+"""What our slices have at every effort: blocks that choose among three references,
+rate-distortion optimised coefficients; and what they have not."""
+MORE_REFERENCES = ("slow", "slower", "veryslow", "placebo")
+
+
+def x264_with_our_tools(preset: str) -> Rival:
+    """Return x264 tuned for PSNR with every tool that our slices have, whatever the preset.
+
+    Presets that search more references than three keep theirs: nothing is taken from a rival.
+    """
+    tools = dict(OUR_TOOLS)
+    if preset in MORE_REFERENCES:
+        del tools["ref"]
+    plain = x264_lowdelay(preset, f"x264-our-tools-{preset}", **tools)
+    return replace(plain, options={**plain.options, "tune": "zerolatency,psnr"})
+
+
 def x265_lowdelay(preset: str) -> Rival:
     """Return x265 with ``tune=zerolatency``, one key frame."""
     return _x265(f"x265-lowdelay-{preset}", preset, {})
@@ -207,6 +235,12 @@ def x265_for_psnr(preset: str) -> Rival:
     """Return the same as ``tune=psnr`` would have it; x265 takes one tune only."""
     tuned = {"aq-mode": "0", "psy-rd": "0", "psy-rdoq": "0"}
     return _x265(f"x265-lowdelay-psnr-{preset}", preset, tuned)
+
+
+def x265_for_ssim(preset: str) -> Rival:
+    """Return the same as ``tune=ssim`` would have it: adaptive quantisation, nothing for looks."""
+    tuned = {"aq-mode": "2", "psy-rd": "0", "psy-rdoq": "0"}
+    return _x265(f"x265-lowdelay-ssim-{preset}", preset, tuned)
 
 
 def _x265(name: str, preset: str, params: Mapping[str, str]) -> Rival:

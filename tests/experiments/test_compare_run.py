@@ -149,7 +149,7 @@ def compared(thumbnail, tmp_path_factory):
 def test_a_comparison_says_what_it_will_do_before_it_starts(compared):
     _, _, said = compared
     first = said.splitlines()[0]
-    assert first.startswith("BD-rates over 33..36 dB: 49 clips to code, about ")
+    assert first.startswith("BD-rates over 33..36 dB: 75 clips to code, about ")
     assert "Points are added where a curve does not span the window" in said
     assert re.search(r"rfedge-fast-\w+ also at 41", said)
 
@@ -172,6 +172,7 @@ def test_every_row_of_a_comparison_has_its_interval_around_its_figure(compared):
     assert {row["method"].rsplit("-", 2)[0] for row in result["rows"]} == {
         "rfedge",
         "rfedge-render-only",
+        "rfedge-without-field",
     }
 
 

@@ -12,7 +12,7 @@ from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_colour
 from rfcore.raster.gaussians import Gaussians
 from rfedge.experiments import field_coder
-from rfedge.experiments.field_coder import FieldCoder, render_clip
+from rfedge.experiments.field_coder import WITHOUT_FIELD, FieldCoder, render_clip
 
 INTRINSICS = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
 
@@ -66,12 +66,24 @@ def test_processor_time_holds_the_render():
 
 
 def test_processor_time_is_coding_and_the_frames_share_of_rendering(monkeypatch):
-    """7 ms of coding by a stopped clock, and 2 of 4 frames that took 40 ms to render."""
-    clock = iter((1_000_000, 8_000_000))
+    """7 ms of coding and 3 of decoding by a stopped clock, and 2 of 4 frames that took 40 ms to
+    render, at either end."""
+    clock = iter((1_000_000, 8_000_000, 9_000_000, 12_000_000))
     seen = replace(render_clip(street(2), CAMERAS), render_cpu_ms=40.0)
     monkeypatch.setattr(field_coder, "process_time_ns", lambda: next(clock))
     clip = FieldCoder(seen, "ours", "test", effort="fast").code(FRAMES[:2], 10, 30.0)
     assert clip.cpu_ms == pytest.approx(7 + 20)
+    assert clip.receiver_cpu_ms == pytest.approx(3 + 20)
+
+
+def test_without_the_field_nothing_is_rendered_and_nothing_of_it_is_referred_to(monkeypatch):
+    clock = iter((1_000_000, 8_000_000, 9_000_000, 12_000_000))
+    seen = replace(render_clip(street(2), CAMERAS), render_cpu_ms=40.0)
+    monkeypatch.setattr(field_coder, "process_time_ns", lambda: next(clock))
+    coder = FieldCoder(seen, "ours", "test", effort="fast", references=WITHOUT_FIELD)
+    clip = coder.code(FRAMES, 10, 30.0)
+    assert clip.notes["references"] == ("intra", "previous", "previous", "previous")
+    assert (clip.cpu_ms, clip.receiver_cpu_ms) == (7, 3)
 
 
 def test_without_rendering_there_is_still_coding_to_be_timed():

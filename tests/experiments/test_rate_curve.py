@@ -1,5 +1,6 @@
 """Curves whose BD-rate is known by algebra, and the published implementation as an oracle."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import bjontegaard
@@ -10,7 +11,14 @@ from hypothesis import strategies as st
 
 from rfcore.errors import InvalidInput
 from rfedge.experiments.clips import CodedClip
-from rfedge.experiments.rate_curve import RateCurve, bd_rate_interval, bd_rate_percent, rate_curve
+from rfedge.experiments.rate_curve import (
+    RateCurve,
+    bd_rate_interval,
+    bd_rate_percent,
+    rate_curve,
+    ssim_curve,
+    ssim_db,
+)
 
 DECIBELS = np.array([28.0, 29.5, 31.0, 33.0, 35.0, 37.0])
 BYTES = np.exp(np.array([7.0, 7.4, 7.9, 8.6, 9.2, 9.9]))
@@ -151,6 +159,34 @@ def test_an_interval_that_most_draws_leave_is_refused():
     window = (float(rate_curve(uneven, slice(1, None)).psnr_db[0]) + 0.01, 35.0)
     with pytest.raises(InvalidInput, match=r"only \d+ of 400 resampled clips span"):
         bd_rate_interval(uneven, uneven, window, np.random.default_rng(1))
+
+
+def test_frames_that_resemble_their_neighbours_widen_the_interval():
+    """The same frames in order of their ratio and shuffled: blocks of the first differ more."""
+    anchor, ratios = clips(1, 49), np.linspace(0.4, 0.9, 49)
+    shuffled = np.random.default_rng(2).permutation(ratios)
+
+    def width(factors):
+        test = [replace(c, frame_bytes=(c.frame_bytes * factors).astype(np.int64)) for c in anchor]
+        low, high = bd_rate_interval(anchor, test, (30, 36), np.random.default_rng(1))
+        return high - low
+
+    assert width(ratios) > 1.5 * width(shuffled)
+
+
+def test_ssim_in_decibels_counts_what_lacks_to_one():
+    assert [ssim_db(s) for s in (0.9, 0.99)] == pytest.approx([10, 20])
+
+
+def test_a_curve_over_ssim_is_of_the_mean_over_frames():
+    ssim = np.array([0.1, 0.90, 0.94])
+    points = [
+        CodedClip(k, np.array([9, 8, 8]) * (9 - k), np.ones(3), ssim - 0.01 * k, 0.0)
+        for k in range(6)
+    ]
+    curve = ssim_curve(points, slice(1, None))
+    assert curve.psnr_db[-1] == pytest.approx(ssim_db(0.92))
+    assert curve.bytes_per_frame[-1] == 72
 
 
 increments = st.lists(st.floats(0.3, 4.0), min_size=7, max_size=7)

@@ -21,6 +21,7 @@ from rfedge.experiments.compare.report import (
     CompareRow,
     CurveRow,
     ForegroundRow,
+    SsimRow,
     compare_section,
     print_compared,
 )
@@ -100,6 +101,8 @@ COMPARED = CompareRow(
     rival_psnr_deviation_db=0.2,
     cpu_ms=90.4,
     rival_cpu_ms=19.6,
+    both_ends_ms=(151.2, 140.1, 170.0),
+    rival_both_ends_ms=(24.4, 24.0, 25.6),
     field_psnr_db=28.123,
 )
 PAID = BreakEvenRow(
@@ -120,12 +123,19 @@ CURVE = CurveRow(
     family="x264-lowdelay",
     setting="x264-lowdelay-veryfast",
     cpu_ms=19.6,
+    both_ends_ms=24.4,
     point=[41.0, 17.0],
     psnr_db=[30.0, 37.0],
     bytes_per_frame=[1000.0, 9000.0],
     ssim=[0.8, 0.95],
 )
-OURS = replace(CURVE, family="", setting="rfedge-veryfast-0123", bytes_per_frame=[500.0, 8000.0])
+OURS = replace(
+    CURVE,
+    family="",
+    setting="rfedge-veryfast-0123",
+    both_ends_ms=151.2,
+    bytes_per_frame=[500.0, 8000.0],
+)
 FOREGROUND = ForegroundRow(
     scene="s",
     hz=10.0,
@@ -143,7 +153,7 @@ def test_a_comparison_names_field_quality_and_interval_beside_its_figure() -> No
     assert (
         "| yardstick-empty | 10 | rfedge-veryfast | x264-lowdelay (x264-lowdelay-veryfast) "
         "| 32..35 | -57.3 | -60.0..-54.0 | 80 / 55 / 40 | 0.910 | 0.902 | 0.12 | 0.20 "
-        "| 12.3 | 40.0 | 90 | 20 | 28.12 |"
+        "| 12.3 | 40.0 | 90 | 151 (140..170) | 20 | 24 (24..26) | 28.12 |"
     ) in compare_section(Path("compare.json"), result_of(rows=[COMPARED]))
 
 
@@ -177,11 +187,18 @@ def test_break_even_bits_and_foreground_stand_below_the_comparison() -> None:
     assert "they share no window of a decibel" in section
 
 
+def test_a_comparison_by_ssim_names_the_rivals_setting_and_the_window() -> None:
+    row = SsimRow("s", 10.0, "rfedge-fast-01", "x264-ssim", "x264-x", (0.88, 0.92), -50.04)
+    section = compare_section(Path("compare.json"), result_of(rows=[COMPARED], ssim=[row]))
+    assert "| s | 10 | rfedge-fast | x264-x | 0.88..0.92 | -50.0 |" in section
+
+
 def test_every_point_of_every_curve_is_beside_its_figure(tmp_path: Path) -> None:
     result = result_of(rows=[COMPARED], curves=[CURVE, OURS])
     written = write_compare_figures(result, tmp_path)
     assert [path.name for path in written] == [
         *("rd_yardstick-empty_10.svg", "rd_yardstick-empty_10.csv"),
+        *("cpu_yardstick-empty_10.svg", "cpu_yardstick-empty_10.csv"),
         *("bd_rate_bars.svg", "bd_rate_bars.csv"),
     ]
     assert lines_of(written[1])[1:] == [
@@ -190,9 +207,15 @@ def test_every_point_of_every_curve_is_beside_its_figure(tmp_path: Path) -> None
         ["rfedge-veryfast-0123", "41", "30.000", "500.0", "0.8000"],
         ["rfedge-veryfast-0123", "17", "37.000", "8000.0", "0.9500"],
     ]
-    assert lines_of(written[3])[1][-3:] == ["-57.31", "-60.04", "-54.00"]
+    assert lines_of(written[3])[1:] == [
+        ["x264-lowdelay-veryfast", "24.40", "100.00"],
+        ["rfedge-veryfast-0123", "151.20", lines_of(written[3])[2][2]],
+    ]
+    assert 50 < float(lines_of(written[3])[2][2]) < 100 * 8 / 9
+    assert lines_of(written[5])[1][-3:] == ["-57.31", "-60.04", "-54.00"]
     assert "rfedge-veryfast" in shown_in(written[0])
-    assert "x264-lowdelay" in shown_in(written[2])
+    assert "rfedge-veryfast" in shown_in(written[2])
+    assert "x264-lowdelay" in shown_in(written[4])
 
 
 def test_bars_are_of_the_headline_window_alone(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
-from rfedge.experiments.compare.drives import rival_families
+from rfedge.experiments.compare.drives import rival_families, ssim_rivals
 from rfedge.experiments.rivals import (
     Rival,
     svtav1_lowdelay,
@@ -117,12 +117,20 @@ X265 = {"bframes": "0", "scenecut": "0", "rc": "crf", "rc-lookahead": "0", "debl
 X265_VERYFAST = X265 | {"ref": "2", "rd": "2", "subme": "1", "max-merge": "2", "signhide": "yes"}
 X265_MEDIUM = X265 | {"ref": "3", "rd": "3", "subme": "2", "max-merge": "3", "signhide": "yes"}
 X265_PLAIN = {"psy-rd": "2.00", "aq-mode": "2", "aq-strength": "1.00"}
+X265_FOR_SSIM = {"psy-rd": "0.00", "psy-rdoq": "0.00", "aq-mode": "2"}
 X265_FOR_PSNR = {"psy-rd": "0.00", "psy-rdoq": "0.00", "aq-mode": "0"}
+OUR_TOOLS = {"trellis": "2", "mixed_ref": "1"}
 PINNED = {
     "x264-lowdelay-veryfast": PLAIN,
     "x264-lowdelay-psnr-veryfast": VERYFAST | FOR_PSNR,
     "x264-lowdelay-psnr-medium": MEDIUM | FOR_PSNR,
     "x264-lowdelay-psnr-veryslow": VERYSLOW | FOR_PSNR,
+    "x264-our-tools-veryfast": VERYFAST | FOR_PSNR | OUR_TOOLS | {"ref": "3"},
+    "x264-our-tools-medium": MEDIUM | FOR_PSNR | OUR_TOOLS,
+    "x264-our-tools-veryslow": VERYSLOW | FOR_PSNR | OUR_TOOLS,
+    "x264-lowdelay-ssim-veryfast": VERYFAST | {"psy": "0", "aq": "2:1.00"},
+    "x264-lowdelay-ssim-medium": MEDIUM | {"psy": "0", "aq": "2:1.00"},
+    "x265-lowdelay-ssim-medium": X265_MEDIUM | X265_FOR_SSIM,
     "x264-keyint-10-veryfast": PLAIN | {"keyint": "10"},
     "x264-keyint-30-veryfast": PLAIN | {"keyint": "30"},
     "x264-keyint-250-veryfast": PLAIN | {"keyint": "250"},
@@ -133,7 +141,8 @@ PINNED = {
 }
 BY_NAME = {
     rival.name: rival
-    for family in rival_families("veryfast", quick=False).values()
+    for families in (rival_families("veryfast", quick=False), ssim_rivals(quick=False))
+    for family in families.values()
     for rival in family
 }
 
@@ -151,7 +160,9 @@ def test_every_rival_whose_options_can_be_read_is_pinned():
 
 def test_av1_rivals_run_with_low_delay_at_their_presets():
     av1 = {name: rival for name, rival in BY_NAME.items() if rival.encoder == "libsvtav1"}
-    assert [rival.options["preset"] for rival in av1.values()] == ["10", "8", "6", "4"]
+    assert {name: rival.options["preset"] for name, rival in av1.items()} == {
+        f"svtav1-lowdelay-p{preset}": str(preset) for preset in (6, 10, 8, 4)
+    }
     for rival in av1.values():
         assert rival.options["svtav1-params"] == "pred-struct=1:keyint=-1:lp=1:rc=0"
 
@@ -164,6 +175,10 @@ def test_the_families_are_the_anchors_and_what_is_stronger():
     assert names["x264-stronger"] == ["x264-lowdelay-psnr-medium", "x264-lowdelay-psnr-veryslow"]
     assert len(names["x265-lowdelay"]) == 3
     assert len(names["svtav1-lowdelay"]) == 4
+    for preset in ("veryfast", "medium", "veryslow"):
+        assert names[f"x264-our-tools-{preset}"] == [f"x264-our-tools-{preset}"]
+    assert names["x265-medium"] == ["x265-lowdelay-psnr-medium"]
+    assert names["svtav1-p6"] == ["svtav1-lowdelay-p6"]
     assert rival_families("veryfast", quick=True).keys() <= families.keys()
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.codec.h264.config import check_effort
-from rfcore.codec.references import RENDER_ONLY
+from rfcore.codec.references import RENDER_ONLY, References
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
 from rfcore.train import mean_psnr_db
@@ -26,14 +26,17 @@ from rfedge.experiments.cells import program_version
 from rfedge.experiments.clips import DECIMATION, Clip, ClipCoder, Drive, DriveName, read_drive
 from rfedge.experiments.compare.foreground import ForegroundCoder, foreground_mask
 from rfedge.experiments.compare.measure import WINDOWS_DB
-from rfedge.experiments.field_coder import FieldCoder, RenderedClip, render_clip
+from rfedge.experiments.field_coder import WITHOUT_FIELD, FieldCoder, RenderedClip, render_clip
 from rfedge.experiments.rate_curve import Window
 from rfedge.experiments.rivals import (
     Rival,
     svtav1_lowdelay,
     x264_for_psnr,
+    x264_for_ssim,
     x264_lowdelay,
+    x264_with_our_tools,
     x265_for_psnr,
+    x265_for_ssim,
     x265_lowdelay,
 )
 from rfedge.results import check_result_path
@@ -44,10 +47,12 @@ __all__ = [
     "foreign_coder",
     "read_drive_comparisons",
     "rival_families",
+    "ssim_rivals",
 ]
 
 
 KEYINTS = (10, 30, 250)
+OUR_TOOLS_PRESETS = ("veryfast", "medium", "veryslow")
 
 
 def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
@@ -55,16 +60,23 @@ def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
 
     The first anchor is x264 as it comes, which is what a user has. It spends bits on looks that a
     PSNR does not see, and our encoder does not; the second is tuned for PSNR as ours is, and so are
-    the stronger presets.
+    the stronger presets. `x264-our-tools` has every tool of our slices besides, so that only the
+    field is left between the two.
     """
     anchors: dict[str, list[ClipCoder]] = {
         "x264-lowdelay": [x264_lowdelay(preset)],
         "x264-lowdelay-psnr": [x264_for_psnr(preset)],
     }
     if quick:
-        return {**anchors, "svtav1-lowdelay": [svtav1_lowdelay(8)]}
+        tools: dict[str, list[ClipCoder]] = {
+            f"x264-our-tools-{preset}": [x264_with_our_tools(preset)]
+        }
+        return {**anchors, **tools, "svtav1-lowdelay": [svtav1_lowdelay(8)]}
     return {
         **anchors,
+        **{f"x264-our-tools-{p}": [x264_with_our_tools(p)] for p in OUR_TOOLS_PRESETS},
+        "x265-medium": [x265_for_psnr("medium")],
+        "svtav1-p6": [svtav1_lowdelay(6)],
         "x264-stronger": [x264_for_psnr(p) for p in ("medium", "veryslow")],
         **{f"x264-keyint-{n}": [_with_key_frames(preset, n)] for n in KEYINTS},
         "x264-intra-refresh": [_with_intra_refresh(preset)],
@@ -73,6 +85,18 @@ def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
             *(x265_for_psnr(p) for p in ("veryfast", "medium")),
         ],
         "svtav1-lowdelay": [svtav1_lowdelay(p) for p in (10, 8, 6, 4)],
+    }
+
+
+def ssim_rivals(*, quick: bool) -> dict[str, list[ClipCoder]]:
+    """Return the rivals of a comparison by SSIM, tuned for it; SVT-AV1 cannot be at low delay."""
+    if quick:
+        return {"x264-ssim": [x264_for_ssim("veryfast")]}
+    return {
+        "x264-ssim": [x264_for_ssim("veryfast")],
+        "x264-ssim-medium": [x264_for_ssim("medium")],
+        "x265-ssim-medium": [x265_for_ssim("medium")],
+        "svtav1-p6": [svtav1_lowdelay(6)],
     }
 
 
@@ -136,6 +160,12 @@ def _working_folder_on_path() -> Iterator[None]:
 
 
 QUICK_FRAMES = 8
+METHODS: dict[str, References | None] = {
+    "rfedge": None,
+    "rfedge-render-only": RENDER_ONLY,
+    "rfedge-without-field": WITHOUT_FIELD,
+}
+"""Ours first, then what is left of it without a past, and without a field: what each is worth."""
 
 
 @dataclass(frozen=True)
@@ -184,19 +214,20 @@ class DriveComparison:
     background: str | None
     methods: Sequence[FieldCoder]
     families: Mapping[str, Sequence[ClipCoder]]
+    for_ssim: Mapping[str, Sequence[ClipCoder]]
     foreground_only: ForegroundCoder | None
 
     @property
     def compared(self) -> list[ClipCoder]:
         """Everybody who takes part in the BD-rates, ours first."""
-        rivals = (coder for family in self.families.values() for coder in family)
-        return [*self.methods, *rivals]
+        rivals = [coder for family in self.families.values() for coder in family]
+        return [*self.methods, *{rival.name: rival for rival in rivals}.values()]
 
     @property
     def coders(self) -> list[ClipCoder]:
         """All of them, ours first."""
         last = [] if self.foreground_only is None else [self.foreground_only]
-        return [*self.compared, *last]
+        return [*self.compared, *(c for family in self.for_ssim.values() for c in family), *last]
 
 
 def read_drive_comparisons(job: CompareJob, field: RadianceField) -> list[DriveComparison]:
@@ -244,13 +275,14 @@ def _drive_comparison(
             references=references,
             foregrounds=() if behind is None else foregrounds,
         )
-        for name, references in (("rfedge", None), ("rfedge-render-only", RENDER_ONLY))
+        for name, references in METHODS.items()
     ]
     rival = None
     if behind is not None:
         rival_stamp = f"{stamp}, field {rendered.field_id}"
         rival = ForegroundCoder.of(job.preset, foregrounds, rendered.renders, rival_stamp)
-    return DriveComparison(clip, rendered, foregrounds, behind, coders, families, rival)
+    by_ssim = ssim_rivals(quick=job.quick)
+    return DriveComparison(clip, rendered, foregrounds, behind, coders, families, by_ssim, rival)
 
 
 def _foregrounds(drive: Drive, background: Drive | None) -> list[NDArray[np.bool_]]:

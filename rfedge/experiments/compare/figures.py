@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ SHOWN = {
     "": ("#2563eb", "o"),
     "x264-lowdelay": ("#1c2733", "s"),
     "x264-lowdelay-psnr": ("#6b7785", "D"),
+    "x264-our-tools-medium": ("#9aa5b1", "x"),
     "x265-lowdelay": ("#0f766e", "^"),
     "svtav1-lowdelay": ("#d97706", "v"),
 }
@@ -33,7 +35,8 @@ LOW_DB, MIDDLE_DB, HIGH_DB = 29.0, 33.5, 38.0
 
 
 def write_compare_figures(result: Result, folder: Path) -> list[Path]:
-    """Write ``rd_<scene>_<hz>`` for every drive and ``bd_rate_bars`` into ``folder``.
+    """Write ``rd_<scene>_<hz>`` and ``cpu_<scene>_<hz>`` for every drive and ``bd_rate_bars`` into
+    ``folder``.
 
     Raises ``InvalidInput`` for a result without rows.
     """
@@ -46,6 +49,7 @@ def write_compare_figures(result: Result, folder: Path) -> list[Path]:
     for scene, hz in dict.fromkeys((row.scene, row.hz) for row in everybody):
         curves = [row for row in everybody if (row.scene, row.hz) == (scene, hz)]
         written += write_figure(folder / f"rd_{scene}_{hz:g}", *_curves(curves))
+        written += write_figure(folder / f"cpu_{scene}_{hz:g}", *_frontier(curves))
     rows = [row for row in compared if row.window_db == compared[0].window_db]
     return written + write_figure(folder / "bd_rate_bars", *_bars(rows))
 
@@ -67,6 +71,35 @@ def _curves(curves: Sequence[CurveRow]) -> tuple[Figure, Lines]:
                 )
         axes.set(xlabel="kB a frame", ylabel="Y-PSNR, dB", ylim=(LOW_DB, HIGH_DB), xscale="log")
         axes.legend(frameon=False, loc="upper left", fontsize=9)
+    return figure, lines
+
+
+def _frontier(curves: Sequence[CurveRow]) -> tuple[Figure, Lines]:
+    """Return bytes over processor time of both ends, of every setting; low and left is good."""
+    everybody = {curve.setting: curve for curve in curves}.values()
+    anchor = next(curve for curve in everybody if curve.family.startswith("x264-lowdelay"))
+    lines: Lines = [["setting", "both_ends_ms", "bytes_percent"]]
+    with mpl.rc_context({**STYLE, "axes.grid.axis": "both"}):
+        figure, axes = plt.subplots(figsize=(7.2, 3.6))
+        for curve in everybody:
+            percent = 100 * math.exp(_middle_bytes(curve) - _middle_bytes(anchor))
+            lines.append([curve.setting, f"{curve.both_ends_ms:.2f}", f"{percent:.2f}"])
+            name = curve.setting if curve.family else without_field(curve.setting)
+            colour = SHOWN.get(curve.family, ("#9aa5b1", "."))[0]
+            axes.plot(curve.both_ends_ms, percent, "o", color=colour, markersize=5)
+            axes.annotate(
+                name,
+                (curve.both_ends_ms, percent),
+                fontsize=6,
+                xytext=(4, 2),
+                textcoords="offset points",
+            )
+        axes.set(
+            xlabel="processor time of both ends, ms a frame",
+            xscale="log",
+            ylabel=f"bytes at {MIDDLE_DB:g} dB, % of {anchor.setting}",
+            ylim=(0, None),
+        )
     return figure, lines
 
 

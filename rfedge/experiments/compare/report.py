@@ -17,23 +17,30 @@ from rfedge.results import Result, rows_of
 
 __all__ = [
     "BEST",
+    "BEST_OF_ANY_CPU",
     "BitShareRow",
     "BreakEvenRow",
     "CompareRow",
     "CurveRow",
     "ForegroundRow",
+    "SsimRow",
     "compare_section",
     "print_compared",
     "without_field",
 ]
 
 BEST = "best-comparable"
-"""Named as a family: the strongest rival whose sender takes no more processor time than ours."""
+"""Named as a family: the strongest rival that takes no more processor time than ours, of sender
+and receiver together."""
+BEST_OF_ANY_CPU = "best-of-any-cpu"
+"""Named as a family: the strongest of all rivals."""
+BESTS = {BEST: " (best comparable)", BEST_OF_ANY_CPU: " (best of any CPU)"}
 
 
 @dataclass(frozen=True)
 class CompareRow:
-    """One method against one rival over one window of quality. CPU is the sender's, a frame."""
+    """One method against one rival over one window of quality. ``cpu_ms`` is the sender's, a frame;
+    ``both_ends_ms`` of sender and receiver: median, least and most of interleaved rounds."""
 
     scene: str
     hz: float
@@ -47,7 +54,7 @@ class CompareRow:
     bd_rate_percent: float
     """Negative where the method needs fewer bytes."""
     ci95: Sequence[float]
-    """Interval of the BD-rate from frames drawn with replacement."""
+    """Interval of the BD-rate from blocks of frames drawn with replacement."""
     points: int
     saving_percent_at_db: Mapping[str, float]
     """A quality that a curve does not reach has no saving."""
@@ -59,8 +66,23 @@ class CompareRow:
     rival_psnr_deviation_db: float
     cpu_ms: float
     rival_cpu_ms: float
+    both_ends_ms: Sequence[float]
+    rival_both_ends_ms: Sequence[float]
     field_psnr_db: float | None
     """Of the field's own renders against the camera."""
+
+
+@dataclass(frozen=True)
+class SsimRow:
+    """One method against one rival that is tuned for SSIM, over a window of mean SSIM."""
+
+    scene: str
+    hz: float
+    method: str
+    rival: str
+    rival_setting: str
+    window_ssim: Sequence[float]
+    bd_rate_percent: float
 
 
 @dataclass(frozen=True)
@@ -121,6 +143,7 @@ class CurveRow:
     """Empty for ours."""
     setting: str
     cpu_ms: float
+    both_ends_ms: float
     point: Sequence[float]
     psnr_db: Sequence[float]
     bytes_per_frame: Sequence[float]
@@ -142,11 +165,21 @@ COMPARE_COLUMNS = (
     "rival's",
     "first frame kB",
     "rival's",
-    "CPU ms",
+    "CPU ms: sender",
+    "both ends",
     "rival's",
+    "both ends",
     "field dB",
 )
 PRINTED = ("scene", "Hz", "method", "rival", "window dB", "BD-rate %", "95 %", "CPU ms")
+SSIM_COLUMNS = (
+    "scene",
+    "Hz",
+    "method",
+    "rival, tuned for SSIM where it can be",
+    "SSIM",
+    "BD-rate %",
+)
 SAVING_AT_DB = ("31", "33", "35")
 BREAK_EVEN_COLUMNS = (
     "scene",
@@ -168,6 +201,9 @@ def compare_section(path: Path, result: Result) -> str:
     """Return the tables of a comparison; those that it did not measure are left out."""
     compared = [_compare_cells(row) for row in rows_of(CompareRow, result["rows"])]
     parts = [heading(path, result), table(COMPARE_COLUMNS, compared)]
+    by_ssim = rows_of(SsimRow, result.get("ssim", ()))
+    if by_ssim:
+        parts += ["By SSIM:", table(SSIM_COLUMNS, map(_ssim_cells, by_ssim))]
     break_even = rows_of(BreakEvenRow, result.get("break_even", ()))
     if break_even:
         parts += ["What the field's own bytes leave:"]
@@ -191,11 +227,29 @@ def _printed_cells(row: CompareRow) -> list[str]:
         row.scene,
         f"{row.hz:g}",
         without_field(row.method),
-        row.rival_setting + (" (best)" if row.rival == BEST else ""),
+        row.rival_setting + BESTS.get(row.rival, ""),
         "{:g}..{:g}".format(*row.window_db),
         f"{row.bd_rate_percent:.1f}",
         f"{low:.1f}..{high:.1f}",
-        f"{row.cpu_ms:.0f} / {row.rival_cpu_ms:.0f}",
+        f"{row.both_ends_ms[0]:.0f} / {row.rival_both_ends_ms[0]:.0f}",
+    ]
+
+
+def _spread(both_ends_ms: Sequence[float]) -> str:
+    return "{:.0f} ({:.0f}..{:.0f})".format(*both_ends_ms)
+
+
+def _ssim_cells(row: SsimRow) -> list[str]:
+    low, high = row.window_ssim
+    method = without_field(row.method)
+    window = f"{low:g}..{high:g}"
+    return [
+        row.scene,
+        f"{row.hz:g}",
+        method,
+        row.rival_setting,
+        window,
+        f"{row.bd_rate_percent:.1f}",
     ]
 
 
@@ -219,7 +273,9 @@ def _compare_cells(row: CompareRow) -> list[str]:
         f"{row.first_frame_bytes / 1000:.1f}",
         f"{row.rival_first_frame_bytes / 1000:.1f}",
         f"{row.cpu_ms:.0f}",
+        _spread(row.both_ends_ms),
         f"{row.rival_cpu_ms:.0f}",
+        _spread(row.rival_both_ends_ms),
         "-" if row.field_psnr_db is None else f"{row.field_psnr_db:.2f}",
     ]
 

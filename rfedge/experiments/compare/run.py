@@ -17,9 +17,20 @@ from rfedge.experiments.clips import ClipCoder, DriveName
 from rfedge.experiments.compare.bit_split import SplitClip, split_rows
 from rfedge.experiments.compare.drives import CompareJob, DriveComparison, read_drive_comparisons
 from rfedge.experiments.compare.foreground import foreground_row
-from rfedge.experiments.compare.measure import break_even_row, compare_rows, curve_rows
+from rfedge.experiments.compare.measure import (
+    break_even_row,
+    compare_rows,
+    curve_rows,
+    ssim_rows,
+)
 from rfedge.experiments.compare.report import BitShareRow, print_compared
-from rfedge.experiments.performance import Performance, perform, seconds_left, spanning_points
+from rfedge.experiments.performance import (
+    Performance,
+    perform,
+    seconds_left,
+    spanning_points,
+    time_in_turns,
+)
 from rfedge.experiments.rate_curve import Window
 from rfedge.results import make_result, provenance, rows_of, write_result
 
@@ -101,24 +112,30 @@ def _tables(
 ) -> dict[str, list[Any]]:
     clip, window = comparison.clip, job.windows_db[0]
 
-    def performed(coder: ClipCoder) -> Performance:
+    def performed(coder: ClipCoder, window: Window | None) -> Performance:
         console.print(f"  {clip.scene} {clip.rate_hz:g} Hz: {coder.name}")
-        return perform(clip, coder, store, window_db=window, retime=job.retime)
+        return perform(clip, coder, store, window_db=window, timed=False)
 
-    families = {n: [performed(c) for c in family] for n, family in comparison.families.items()}
-    methods = [performed(coder) for coder in comparison.methods]
+    coded = [(coder, performed(coder, window)) for coder in comparison.compared]
+    timed = time_in_turns(clip, coded, store, window, retime=job.retime)
+    by_name = {each.name: each for each in timed}
+    families = {n: [by_name[c.name] for c in f] for n, f in comparison.families.items()}
+    methods = [by_name[coder.name] for coder in comparison.methods]
+    for_ssim = {n: [performed(c, None) for c in f] for n, f in comparison.for_ssim.items()}
     anchor, field_bytes = families[ANCHOR][0], job.field.stat().st_size
     foreground = []
     if comparison.foreground_only is not None:
         # Its whole picture has a ceiling below any window: it is not asked to span one.
-        theirs = perform(clip, comparison.foreground_only, store, retime=job.retime).clips
+        theirs = performed(comparison.foreground_only, None).clips
         foreground = [foreground_row(clip, methods[0].clips, theirs, comparison.foregrounds)]
+    windows = [job.windows_db, *[job.windows_db[:1]] * (len(methods) - 1)]
     return {
         "rows": [
             row
-            for method in methods
-            for row in compare_rows(clip, method, families, job.windows_db)
+            for method, asked in zip(methods, windows, strict=True)
+            for row in compare_rows(clip, method, families, asked)
         ],
+        "ssim": ssim_rows(clip, methods[0], for_ssim),
         "break_even": [break_even_row(clip, m, anchor, field_bytes) for m in methods],
         "bits": _bits(job, comparison, methods[0], store),
         "foreground": foreground,
