@@ -10,6 +10,7 @@ from rfcore.camera import Pose
 from rfcore.errors import InvalidInput
 from rfcore.motion import quaternion_from_vector
 from rfedge.experiments.localisation.given import GivenDrive, aligned_poses, read_pose_lines
+from rfedge.experiments.localisation.starts import StartError
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 
@@ -23,6 +24,7 @@ def test_every_key_is_taken() -> None:
     assert (given.name, given.drive, given.field) == ("a", Path("d.json"), Path("f.rff"))
     assert (given.units, given.hz, given.frames, given.noise) == (2.0, 5.0, 9, 3.0)
     assert given.rows == "bits"
+    assert GivenDrive.parse("a=d.json,f.rff,rows=2m:3deg").rows == StartError(2, 3)
     fed = GivenDrive.parse("a=d.json,f.rff,feed=p.txt,feed_map=m.txt,map=m.json")
     assert (fed.feed, fed.feed_map, fed.map) == (Path("p.txt"), Path("m.txt"), Path("m.json"))
 
@@ -35,12 +37,12 @@ def test_every_key_is_taken() -> None:
         "a=d.json,f.rff,speed=3",
         "a=d.json,f.rff,units=0",
         "a=d.json,f.rff,units=x",
-        "a=d.json,f.rff,rows=all",
+        "a=d.json,f.rff,rows=2m",
         "a=d.json,f.rff,feed=p.txt",
     ],
 )
 def test_other_text_is_refused(text: str) -> None:
-    with pytest.raises(InvalidInput, match="drives"):
+    with pytest.raises(InvalidInput, match=r"drives|start_error: '2m' is not"):
         GivenDrive.parse(text)
 
 

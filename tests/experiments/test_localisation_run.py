@@ -91,6 +91,12 @@ def test_pictures_of_other_places_of_any_size_are_every_second_false_start() -> 
     assert len(reads) == 1
 
 
+def test_a_drive_may_ask_for_searches_from_one_start_error_alone() -> None:
+    asked = EvalLocalise(drives=("a=d.json,f.rff",), starts=("2m:3deg", "4m:8deg"))
+    (piece,) = pieces(asked, [GivenDrive.parse("a=d.json,f.rff,rows=1m:2deg")])
+    assert (piece.start, piece.sensor) == (StartError(1, 2), None)
+
+
 def test_a_drive_without_a_field_is_refused() -> None:
     with pytest.raises(InvalidInput, match="NAME=DRIVE,FIELD"):
         EvalLocalise(drives=("sample=here",)).run()

@@ -28,8 +28,8 @@ class EvalLocalise:
     """Measure searches, tracking, and the bits that errors of measured poses cost."""
 
     drives: Annotated[tuple[str, ...], Positional, arg(metavar="NAME=DRIVE,FIELD[,KEY=VALUE...]")]
-    """A name, posed pictures, a field; then units=, hz=, frames=, noise=, rows=starts|bits, and
-    feed=, feed_map=, map= (docs/localise.md)."""
+    """A name, posed pictures, a field; then units=, hz=, frames=, noise=, rows=starts|bits|2m:3deg,
+    and feed=, feed_map=, map= (docs/localise.md)."""
     tries: int = 100
     """Searches of each start error."""
     false_starts: int = 50

@@ -6,7 +6,8 @@
 * ``hz``: rate of pictures without times, 10 where it is left out;
 * ``frames``: how many are coded, where that is not what the command says for all;
 * ``noise``: standard deviation of noise added to the pictures, in 8-bit steps;
-* ``rows``: ``starts`` or ``bits``, where not both are wanted;
+* ``rows``: ``starts`` or ``bits``, where not both are wanted; a start error as ``2m:3deg`` where
+  only searches from that one are;
 * ``feed``, ``feed_map``, ``map``: poses as lines of 12 numbers (KITTI odometry's form) of the drive
   and of the pictures that the field was made of, and the dataset that holds the latter. The feed is
   put into the field's axes by the pictures of the map, so its drift between the two passes stays.
@@ -28,6 +29,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
 from rfcore.views import PosedPicture
 from rfedge.arguments import open_field
+from rfedge.experiments.localisation.starts import StartError, parse_start_error
 
 __all__ = ["GivenDrive", "aligned_poses", "read_pose_lines"]
 
@@ -48,7 +50,7 @@ class GivenDrive:
     hz: float = 10.0
     frames: int | None = None
     noise: float = 0.0
-    rows: Literal["starts", "bits", "both"] = "both"
+    rows: Literal["starts", "bits", "both"] | StartError = "both"
     feed: Path | None = None
     feed_map: Path | None = None
     map: Path | None = None
@@ -130,8 +132,8 @@ def _value(text: str, key: str, value: str) -> dict[str, Any]:
     """Return one key of a drive with its value as it is stored."""
     if key in PATHS and value:
         return {key: Path(value)}
-    if key == "rows" and value in ("starts", "bits"):
-        return {key: value}
+    if key == "rows":
+        return {key: value if value in ("starts", "bits") else parse_start_error(value)}
     if key in NUMBERS:
         try:
             return {key: int(value) if key == "frames" else float(value)}

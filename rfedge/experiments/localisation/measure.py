@@ -85,9 +85,11 @@ def pieces(asked: EvalLocalise, given: Sequence[GivenDrive]) -> list[Piece]:
     found = []
     for drive in given:
         wanted: list[tuple[StartError | None, str | None]] = []
-        if drive.rows != "bits":
+        if isinstance(drive.rows, StartError):
+            wanted += [(drive.rows, None)]
+        elif drive.rows != "bits":
             wanted += [(start, None) for start in starts]
-        if drive.rows != "starts":
+        if drive.rows in ("bits", "both"):
             wanted += [(None, sensor) for sensor in sensors_of(drive, asked.errors)]
         found += [_piece(asked, drive, *what) for what in wanted]
     return found
