@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import PosedPicture
@@ -33,6 +34,7 @@ __all__ = [
     "CodedClip",
     "Drive",
     "DriveName",
+    "DriveOfField",
     "luma_mse",
     "luma_sse",
     "psnr_of_mse",
@@ -140,6 +142,26 @@ class DriveName:
         if not found or float(found[2]) <= 0:
             raise InvalidInput("drives", f"{text!r} is not NAME@HZ=DATASET, as empty@10=drive.json")
         return DriveName(found[1], float(found[2]), Path(found[3]))
+
+
+@dataclass(frozen=True)
+class DriveOfField:
+    """A drive and the field that it is rendered with: ``NAME@HZ=DATASET[,FIELD.rff]``."""
+
+    name: DriveName
+    field: Path
+
+    @staticmethod
+    def parse(text: str, field: Path) -> DriveOfField:
+        """Take ``field`` where the text names none; raises as ``DriveName.parse``."""
+        drive, comma, own = text.rpartition(",")
+        if not comma or not own.endswith(".rff"):
+            return DriveOfField(DriveName.parse(text), field)
+        return DriveOfField(DriveName.parse(drive), Path(own))
+
+    def read(self, limit: int | None) -> tuple[Drive, RadianceField]:
+        """Read the frames and the field."""
+        return read_drive(self.name, limit), load_field(self.field)
 
 
 @dataclass(frozen=True)

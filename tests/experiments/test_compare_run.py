@@ -231,14 +231,24 @@ def test_a_decimated_drive_is_every_fifth_frame_at_a_fifth_of_the_rate(tmp_path)
         out=tmp_path / "compare.json",
         cells=tmp_path / "cells",
     )
-    field = load_field(job.field)
-    (comparison,) = read_drive_comparisons(job, field)
+    (comparison,) = read_drive_comparisons(job)
     assert comparison.clip.rate_hz == 2.0
     whole = read_drive(job.decimated[0])
     assert [f.digest() for f in comparison.clip.frames] == [f.digest() for f in whole.frames[::5]]
     assert [c.world_from_cam for c in comparison.rendered.cameras] == [
         c.world_from_cam.rounded() for c in whole.cameras[::5]
     ]
+
+
+@pytest.mark.sample
+def test_a_drive_may_name_a_field_of_its_own(thumbnail, tmp_path):
+    """The street's field at the wall's poses; the wall's is the command's."""
+    own = SAMPLES / "fields" / "street.rff"
+    drives = (thumbnail.drive, f"{thumbnail.drive.replace('wall', 'other')},{own}")
+    walls, other = read_drive_comparisons(job_of(thumbnail, tmp_path, drives=drives))
+    assert walls.rendered.field_id == load_field(thumbnail.field).field_id
+    assert other.rendered.field_id == load_field(own).field_id
+    assert other.field_bytes == own.stat().st_size
 
 
 def test_a_comparison_of_nothing_is_refused(tmp_path):

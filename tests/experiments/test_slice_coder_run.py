@@ -17,8 +17,9 @@ from rfcore.codec.h264.slice_coder import Effort, SliceCoder
 from rfcore.codec.h264.slices import CodedSlice, encode_slice, slice_options
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfedge.experiments.clips import DriveOfField
 from rfedge.experiments.slice_coder.report import BdRow, TimeRow, slice_coder_section
-from rfedge.experiments.slice_coder.run import DriveOfField, SliceCoderJob, run_slice_coder
+from rfedge.experiments.slice_coder.run import SliceCoderJob, run_slice_coder
 from rfedge.experiments.slice_coder.tasks import header_of, slice_qp
 from rfedge.results import read_result, rows_of
 

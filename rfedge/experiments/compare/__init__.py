@@ -23,9 +23,10 @@ class EvalCompare:
     """
 
     field: Annotated[Path, Positional]
-    """The field archive (.rff) both ends hold."""
+    """The field archive (.rff) both ends hold, for the drives that name none."""
     drives: Annotated[tuple[str, ...], Positional] = ()
-    """NAME@HZ=DATASET for each drive, such as `yardstick-empty@10=street/transforms_drive.json`."""
+    """NAME@HZ=DATASET for each drive, such as `yardstick-empty@10=street/transforms_drive.json`;
+    NAME@HZ=DATASET,FIELD.rff for one of another field."""
     decimated: tuple[str, ...] = ()
     """The same for drives of which every fifth frame is taken, at a fifth of the rate."""
     background: tuple[str, ...] = ()

@@ -23,7 +23,15 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
 from rfcore.train import mean_psnr_db
 from rfedge.experiments.cells import program_version
-from rfedge.experiments.clips import DECIMATION, Clip, ClipCoder, Drive, DriveName, read_drive
+from rfedge.experiments.clips import (
+    DECIMATION,
+    Clip,
+    ClipCoder,
+    Drive,
+    DriveName,
+    DriveOfField,
+    read_drive,
+)
 from rfedge.experiments.compare.foreground import ForegroundCoder, foreground_mask
 from rfedge.experiments.compare.measure import WINDOWS_DB
 from rfedge.experiments.field_coder import WITHOUT_FIELD, FieldCoder, RenderedClip, render_clip
@@ -204,12 +212,14 @@ class CompareJob:
 class DriveComparison:
     """One drive with everybody who codes it, ours (``methods``) from what the field shows.
 
+    ``field_bytes``: size of the field's archive.
     ``foregrounds``: bool [H, W] a frame, what differs from the empty street, if a ``background``
     drive shows that; else nothing. ``background``: its digest.
     """
 
     clip: Clip
     rendered: RenderedClip
+    field_bytes: int
     foregrounds: Sequence[NDArray[np.bool_]]
     background: str | None
     methods: Sequence[FieldCoder]
@@ -230,32 +240,42 @@ class DriveComparison:
         return [*self.compared, *(c for family in self.for_ssim.values() for c in family), *last]
 
 
-def read_drive_comparisons(job: CompareJob, field: RadianceField) -> list[DriveComparison]:
+def read_drive_comparisons(job: CompareJob) -> list[DriveComparison]:
     """Return a comparison per drive.
 
     Raises ``InvalidInput`` for a background that does not fit its drive, and as ``read_drive``.
     """
     limit = QUICK_FRAMES if job.quick else None
-    backgrounds = {_name(text): text for text in job.backgrounds}
-    unknown = backgrounds.keys() - {_name(text) for text in job.drives}
+    drives, slow = (
+        [DriveOfField.parse(text, job.field) for text in texts]
+        for texts in (job.drives, job.decimated)
+    )
+    behind = {_name(name): name for name in map(DriveName.parse, job.backgrounds)}
+    unknown = behind.keys() - {_name(drive.name) for drive in drives}
     if unknown:
         raise InvalidInput("background", f"there is no drive {sorted(unknown)} to stand behind")
-    slow = [read_drive(text).every(DECIMATION) for text in job.decimated]
-    comparisons = [_drive_comparison(job, drive, None, field) for drive in slow]
-    for text in job.drives:
-        behind = backgrounds.get(_name(text))
-        background = None if behind is None else read_drive(behind, limit)
-        comparisons.append(_drive_comparison(job, read_drive(text, limit), background, field))
+    comparisons = []
+    for given in slow:
+        drive, field = given.read(None)
+        comparisons.append(_drive_comparison(job, drive.every(DECIMATION), None, field, given))
+    for given in drives:
+        drive, field = given.read(limit)
+        name = behind.get(_name(given.name))
+        background = None if name is None else read_drive(name, limit)
+        comparisons.append(_drive_comparison(job, drive, background, field, given))
     return comparisons
 
 
-def _name(text: str) -> tuple[str, float]:
-    name = DriveName.parse(text)
+def _name(name: DriveName) -> tuple[str, float]:
     return name.scene, name.rate_hz
 
 
 def _drive_comparison(
-    job: CompareJob, drive: Drive, background: Drive | None, field: RadianceField
+    job: CompareJob,
+    drive: Drive,
+    background: Drive | None,
+    field: RadianceField,
+    given: DriveOfField,
 ) -> DriveComparison:
     clip = drive.clip(field_psnr_db=mean_psnr_db(field, drive.pictures))
     families = rival_families(job.preset, quick=job.quick)
@@ -282,7 +302,17 @@ def _drive_comparison(
         rival_stamp = f"{stamp}, field {rendered.field_id}"
         rival = ForegroundCoder.of(job.preset, foregrounds, rendered.renders, rival_stamp)
     by_ssim = ssim_rivals(quick=job.quick)
-    return DriveComparison(clip, rendered, foregrounds, behind, coders, families, by_ssim, rival)
+    return DriveComparison(
+        clip,
+        rendered,
+        given.field.stat().st_size,
+        foregrounds,
+        behind,
+        coders,
+        families,
+        by_ssim,
+        rival,
+    )
 
 
 def _foregrounds(drive: Drive, background: Drive | None) -> list[NDArray[np.bool_]]:

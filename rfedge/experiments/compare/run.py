@@ -11,9 +11,8 @@ from typing import Any
 
 from rich.console import Console
 
-from rfcore.field import load_field
 from rfedge.experiments.cells import CellStore, clip_key
-from rfedge.experiments.clips import ClipCoder, DriveName
+from rfedge.experiments.clips import ClipCoder, DriveName, DriveOfField
 from rfedge.experiments.compare.bit_split import SplitClip, split_rows
 from rfedge.experiments.compare.drives import CompareJob, DriveComparison, read_drive_comparisons
 from rfedge.experiments.compare.foreground import foreground_row
@@ -36,7 +35,8 @@ from rfedge.results import make_result, provenance, rows_of, write_result
 
 __all__ = ["run_compare"]
 
-ANCHOR = "x264-lowdelay"
+PAID_AGAINST = "x264-lowdelay-psnr"
+"""Whose bytes must be saved before a field is paid for."""
 
 
 def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
@@ -45,11 +45,12 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
     Raises ``InvalidInput`` or ``DatasetError`` before anything is coded if an input is wrong, and
     ``InvalidInput`` after the ends of the curves if one cannot span the window.
     """
-    for text in (*job.drives, *job.decimated, *job.backgrounds):
+    given = [DriveOfField.parse(text, job.field) for text in (*job.drives, *job.decimated)]
+    for text in job.backgrounds:
         DriveName.parse(text)
-    field = load_field(job.field)
-    comparisons = read_drive_comparisons(job, field)
-    store, made = CellStore(job.cells), provenance([job.field])
+    comparisons = read_drive_comparisons(job)
+    fields = list(dict.fromkeys(drive.field for drive in given))
+    store, made = CellStore(job.cells), provenance(fields)
     _announce(job, comparisons, store, console)
     for comparison in comparisons:
         _check_window(job, comparison, store, console)
@@ -59,8 +60,6 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
             tables.setdefault(name, []).extend(rows)
     content = {
         "quick": job.quick,
-        "field_id": field.field_id,
-        "field_bytes": job.field.stat().st_size,
         "frames": {f"{b.clip.scene}@{b.clip.rate_hz:g}": _frames(b) for b in comparisons},
         **tables,
     }
@@ -122,7 +121,7 @@ def _tables(
     families = {n: [by_name[c.name] for c in f] for n, f in comparison.families.items()}
     methods = [by_name[coder.name] for coder in comparison.methods]
     for_ssim = {n: [performed(c, None) for c in f] for n, f in comparison.for_ssim.items()}
-    anchor, field_bytes = families[ANCHOR][0], job.field.stat().st_size
+    anchor, field_bytes = families[PAID_AGAINST][0], comparison.field_bytes
     foreground = []
     if comparison.foreground_only is not None:
         # Its whole picture has a ceiling below any window: it is not asked to span one.
@@ -160,4 +159,10 @@ def _bits(
 
 
 def _frames(comparison: DriveComparison) -> dict[str, Any]:
-    return {"count": len(comparison.clip.frames), "sha256": comparison.clip.frames_digest}
+    clip = comparison.clip
+    return {
+        "count": len(clip.frames),
+        "sha256": clip.frames_digest,
+        "field_id": comparison.rendered.field_id,
+        "field_bytes": comparison.field_bytes,
+    }

@@ -11,38 +11,17 @@ from typing import Any
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
-from rfcore.field import RadianceField, load_field
-from rfedge.experiments.clips import Drive, DriveName, read_drive
+from rfedge.experiments.clips import DriveOfField
 from rfedge.experiments.slice_coder.measure import bd_rows, time_rows
 from rfedge.experiments.slice_coder.report import BdRow, TimeRow, print_slice_coder
 from rfedge.experiments.slice_coder.tasks import Footage, noisy, resized
 from rfedge.results import check_result_path, make_result, provenance, write_result
 
-__all__ = ["NOISE_SIGMA", "DriveOfField", "SliceCoderJob", "run_slice_coder"]
+__all__ = ["NOISE_SIGMA", "SliceCoderJob", "run_slice_coder"]
 
 NOISE_SIGMA, NOISE_SEED = 3.0, 1
 QUICK_FRAMES = 4
 TIMED_FRAMES = 6
-
-
-@dataclass(frozen=True)
-class DriveOfField:
-    """A drive and the field that it is rendered with: ``NAME@HZ=DATASET[,FIELD.rff]``."""
-
-    name: DriveName
-    field: Path
-
-    @staticmethod
-    def parse(text: str, field: Path) -> DriveOfField:
-        """Take ``field`` where the text names none; raises as ``DriveName.parse``."""
-        drive, comma, own = text.rpartition(",")
-        if not comma or not own.endswith(".rff"):
-            return DriveOfField(DriveName.parse(text), field)
-        return DriveOfField(DriveName.parse(drive), Path(own))
-
-    def read(self, limit: int | None) -> tuple[Drive, RadianceField]:
-        """Read the frames and the field."""
-        return read_drive(self.name, limit), load_field(self.field)
 
 
 @dataclass(frozen=True)
