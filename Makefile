@@ -194,7 +194,7 @@ results-%: build-full  ## record `rfedge eval NAME` in results/NAME.json; option
 	$(BIN)/rfedge eval $* $(ARGS) --out results/$*.json
 
 figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.md, metrics.md, dashboards
-	$(BIN)/python -m rfedge.pages.results results docs
+	$(BIN)/python -m rfedge.pages.results results docs README.md
 	$(BIN)/python -m rfedge.experiments.ladder.page results docs
 	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
 	mv docs/reliability.md.part docs/reliability.md

@@ -1,7 +1,7 @@
 """``docs/results.md`` and the figures of the experiments, from the result files: never typed.
 
-``python -m rfedge.pages.results results docs`` (``make figures``). A test holds the committed page
-to the committed files.
+``python -m rfedge.pages.results results docs README.md`` (``make figures``). Tests hold the
+committed pages to the committed files.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rfedge.bench import bench_section
 from rfedge.demo.report import demo_section
 from rfedge.experiments.adapt.report import adapt_section
 from rfedge.experiments.compare.figures import write_compare_figures
-from rfedge.experiments.compare.report import compare_section
+from rfedge.experiments.compare.report import compare_section, headline_table
 from rfedge.experiments.ladder.page import write_ladder_figure
 from rfedge.experiments.latency.report import latency_section, write_latency_figures
 from rfedge.experiments.localisation.rows import localise_section
@@ -32,7 +32,7 @@ from rfedge.report.tables import heading
 from rfedge.results import Result, read_result, rows_of
 from rfedge.training.report import training_section
 
-__all__ = ["results_page", "write_figures"]
+__all__ = ["results_page", "with_headline", "write_figures"]
 
 INTRODUCTION = """# Measured figures
 
@@ -40,6 +40,9 @@ Generated from `results/*.json` by `make figures`; each table names its command,
 Machines are shared and noisy: compare within a table, not across hosts.
 """
 
+
+HEADLINE_BEGINS = "<!-- made from results/compare.json by `make figures` -->"
+HEADLINE_ENDS = "<!-- end -->"
 
 SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
     "adapt": adapt_section,
@@ -108,11 +111,30 @@ def _reference(path: Path, result: Result, noun: str, page: str) -> str:
     return f"{heading(path, result)}\n\n{len(rows)} {noun}: `docs/{page}.md`.\n"
 
 
+def with_headline(page: str, compared: Result) -> str:
+    """Return a page with the headline of a comparison between its two marks.
+
+    Raises ``InvalidInput`` for a page without them.
+    """
+    before, mark, rest = page.partition(HEADLINE_BEGINS)
+    _, end, after = rest.partition(HEADLINE_ENDS)
+    if not (mark and end):
+        raise InvalidInput("page", f"it lacks {HEADLINE_BEGINS!r} ... {HEADLINE_ENDS!r}")
+    return f"{before}{mark}\n\n{headline_table(compared)}\n\n{end}{after}"
+
+
 def main(results: Path, docs: Path) -> None:
     """Write page and figures."""
     write_whole(docs / "results.md", results_page(results))
     write_figures(results, docs / "figures")
 
 
+def write_headline(results: Path, readme: Path) -> None:
+    """Write the headline of ``results/compare.json`` into the README."""
+    compared = read_result(results / "compare.json", "compare")
+    write_whole(readme, with_headline(readme.read_text(), compared))
+
+
 if __name__ == "__main__":
     main(Path(sys.argv[1]), Path(sys.argv[2]))
+    write_headline(Path(sys.argv[1]), Path(sys.argv[3]))

@@ -23,6 +23,7 @@ from rfedge.experiments.compare.report import (
     ForegroundRow,
     SsimRow,
     compare_section,
+    headline_table,
     print_compared,
 )
 from rfedge.experiments.ladder.page import (
@@ -191,6 +192,22 @@ def test_a_comparison_by_ssim_names_the_rivals_setting_and_the_window() -> None:
     row = SsimRow("s", 10.0, "rfedge-fast-01", "x264-ssim", "x264-x", (0.88, 0.92), -50.04)
     section = compare_section(Path("compare.json"), result_of(rows=[COMPARED], ssim=[row]))
     assert "| s | 10 | rfedge-fast | x264-x | 0.88..0.92 | -50.0 |" in section
+
+
+def test_the_headline_has_the_fair_anchor_the_best_rival_and_ours_without_the_field() -> None:
+    fair = replace(COMPARED, rival="x264-our-tools-medium")
+    best = replace(
+        COMPARED, rival="best-of-any-cpu", rival_setting="svtav1-lowdelay-p4", bd_rate_percent=-41.2
+    )
+    bare = replace(fair, method="rfedge-without-field-veryfast-0123", bd_rate_percent=1.24)
+    wider = replace(fair, window_db=(30.0, 33.0), bd_rate_percent=-99.0)
+    line = headline_table(result_of(rows=[fair, best, bare, wider])).splitlines()[-1]
+    assert line == (
+        "| yardstick-empty, 10 Hz | -57.3 % (-60.0..-54.0) | -41.2 % (svtav1-lowdelay-p4) "
+        "| +1.2 % | 151 / 24 |"
+    )
+    with pytest.raises(InvalidInput, match="yardstick-empty@10 lacks rfedge-without-field"):
+        headline_table(result_of(rows=[fair, best]))
 
 
 def test_every_point_of_every_curve_is_beside_its_figure(tmp_path: Path) -> None:

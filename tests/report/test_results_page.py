@@ -9,7 +9,15 @@ from matplotlib.figure import Figure
 
 from rfcore.errors import InvalidInput
 from rfedge.experiments.ladder.page import ladder_page
-from rfedge.pages.results import SECTIONS, main, results_page, write_figures
+from rfedge.pages.results import (
+    HEADLINE_BEGINS,
+    HEADLINE_ENDS,
+    SECTIONS,
+    main,
+    results_page,
+    with_headline,
+    write_figures,
+)
 from rfedge.results import Provenance, make_result, read_result, write_result
 
 ROOT = Path(__file__).parents[2]
@@ -42,6 +50,20 @@ def page_of(folder: Path, kind: str, **content: Any) -> str:
 def test_the_page_is_generated_from_the_result_files() -> None:
     page = (ROOT / "docs" / "results.md").read_text()
     assert page == results_page(ROOT / "results"), "run `make figures`"
+
+
+def test_the_readmes_headline_is_generated_from_the_result_file() -> None:
+    readme = (ROOT / "README.md").read_text()
+    compared = read_result(ROOT / "results" / "compare.json", "compare")
+    assert readme == with_headline(readme, compared), "run `make figures`"
+    table = readme.partition(HEADLINE_BEGINS)[2].partition(HEADLINE_ENDS)[0]
+    assert "kitti-loop, 10 Hz" in table
+    assert "best of all rivals" in table
+
+
+def test_a_page_without_a_place_for_the_headline_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="it lacks"):
+        with_headline("# A page\n", {"rows": []})
 
 
 def test_the_ladders_page_is_generated_from_the_result_files() -> None:

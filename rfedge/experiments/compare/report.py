@@ -12,6 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from rfcore.errors import InvalidInput
 from rfedge.report.tables import heading, print_table, table
 from rfedge.results import Result, rows_of
 
@@ -25,6 +26,7 @@ __all__ = [
     "ForegroundRow",
     "SsimRow",
     "compare_section",
+    "headline_table",
     "print_compared",
     "without_field",
 ]
@@ -171,6 +173,14 @@ COMPARE_COLUMNS = (
     "both ends",
     "field dB",
 )
+HEADLINE_ANCHOR = "x264-our-tools-medium"
+HEADLINE_COLUMNS = (
+    "drive",
+    "against x264 medium with our tools (95 %)",
+    "against the best of all rivals",
+    "our coder without the field",
+    "ms a frame at both ends: ours / that x264",
+)
 PRINTED = ("scene", "Hz", "method", "rival", "window dB", "BD-rate %", "95 %", "CPU ms")
 SSIM_COLUMNS = (
     "scene",
@@ -214,6 +224,39 @@ def compare_section(path: Path, result: Result) -> str:
         parts += [_bits_table(bits)]
     parts += map(_foreground_line, rows_of(ForegroundRow, result.get("foreground", ())))
     return "\n\n".join([*parts, ""])
+
+
+def headline_table(result: Result) -> str:
+    """Return a line per drive over the first window: ours against x264 with the same tools at
+    preset medium and against the strongest rival of all; our coder without the field; times.
+
+    Raises ``InvalidInput`` for a comparison that lacks one of them.
+    """
+    compared = rows_of(CompareRow, result["rows"])
+    window = compared[0].window_db if compared else ()
+    first = [row for row in compared if row.window_db == window]
+    drives = dict.fromkeys((row.scene, row.hz) for row in first)
+    return table(HEADLINE_COLUMNS, [_headline_cells(first, *drive) for drive in drives])
+
+
+def _headline_cells(rows: Sequence[CompareRow], scene: str, hz: float) -> list[str]:
+    def row(method: str, rival: str) -> CompareRow:
+        for each in rows:
+            named = without_field(each.method).rsplit("-", 1)[0]
+            if (each.scene, each.hz, named, each.rival) == (scene, hz, method, rival):
+                return each
+        raise InvalidInput("rows", f"{scene}@{hz:g} lacks {method} against {rival}")
+
+    fair, best = row("rfedge", HEADLINE_ANCHOR), row("rfedge", BEST_OF_ANY_CPU)
+    ablated = row("rfedge-without-field", HEADLINE_ANCHOR)
+    low, high = fair.ci95
+    return [
+        f"{scene}, {hz:g} Hz",
+        f"{fair.bd_rate_percent:+.1f} % ({low:.1f}..{high:.1f})",
+        f"{best.bd_rate_percent:+.1f} % ({best.rival_setting})",
+        f"{ablated.bd_rate_percent:+.1f} %",
+        f"{fair.both_ends_ms[0]:.0f} / {fair.rival_both_ends_ms[0]:.0f}",
+    ]
 
 
 def print_compared(console: Console, rows: Sequence[CompareRow]) -> None:
