@@ -21,13 +21,8 @@ from pathlib import Path
 
 import structlog
 
-from mec_server.tile_learning import (
-    LEARNING,
-    LearningJob,
-    LearningRounds,
-    TileHistory,
-    read_histories,
-)
+from mec_server.tile_history import LEARNING, TileHistory, read_histories
+from mec_server.tile_learning import LearningJob, LearningRounds
 from rfcore.errors import RfedgeError
 from rfcore.update.run import LearnAs
 from rfcore.wire.settings import LogForm, configure_logs

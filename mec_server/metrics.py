@@ -23,7 +23,7 @@ from mec_server.decoding.process import LossCause
 from mec_server.ledger.budgets import HELD, SPENT, Limit
 from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.peer_log import LogLimiter
-from mec_server.tile_learning import TileHistory
+from mec_server.tile_history import TileHistory
 from rfcore.codec.references import References, references_name
 from rfcore.errors import RejectReason
 from rfcore.field import RadianceField

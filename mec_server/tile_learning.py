@@ -12,53 +12,45 @@ of a vehicle, which a certificate ties to it where the server asks for one.
 
 from __future__ import annotations
 
-import json
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence, Set
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import structlog
-from numpy.typing import NDArray
 
-from rfcore.camera import Camera
-from rfcore.codec.block_means import median_block_mean_difference
-from rfcore.dataset.picture_file import read_picture
-from rfcore.dataset.recorded_session import RecordedPart, read_recorded_part, recordings_under
-from rfcore.errors import DatasetError, InvalidInput, RfedgeError
+from mec_server.recorded_passes import (
+    Recordings,
+    SeenPass,
+    as_sent,
+    by_light,
+    hour_of,
+    light_of,
+    pass_of,
+    readable,
+)
+from mec_server.tile_history import LEARNING, Learnt, TileHistory, read_histories, write_histories
+from rfcore.dataset.recorded_session import RecordedPart
+from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField, save_field
-from rfcore.field.interface import render_field_view
 from rfcore.field.store import load_checked
-from rfcore.files import write_whole
-from rfcore.native.yuv import i420_from_rgb
 from rfcore.update.agreement import without_outliers
 from rfcore.update.passes import FEWEST_FRAMES, Pass, SeenFrame, split_frames, spread
 from rfcore.update.run import LearnAs, Update, UpdateSettings, learn
 from rfcore.update.splats import FineTuning
 from rfcore.update.trial import saved_percent, try_field
-from rfcore.views import PosedPicture
 from rfcore.wire.publish import Ground, publish, roll_back
 from rfcore.wire.tile_manifest import TileVersions, VersionLabel, read_publication
 from rfcore.wire.tiles import Tile
 
-__all__ = ["LEARNING", "LearningJob", "LearningRounds", "TileHistory", "read_histories"]
+__all__ = ["LearningJob", "LearningRounds"]
 
 log = structlog.get_logger()
 
-LEARNING = ".learning"
-HISTORIES = "tiles.json"
-FITS_LEVELS = 6.0
-"""Median difference of block means up to which a pass is in a field's light, as for vehicles."""
-SAME_LIGHT = 0.25
-"""Two passes are in one light if the logarithms of their colours' gains differ by no more."""
-LOOKED_AT = 5
-"""Frames of a pass by which its light is told."""
 MOST_PASSES = 6
 CHECK_FRAMES = 8
 """Frames in a row that are tried to see whether a published field makes bits worse."""
@@ -98,73 +90,8 @@ class LearningJob:
         )
 
 
-@dataclass(frozen=True)
-class Learnt:
-    """One field that was learnt; written before it is published, so that none goes unwatched.
-
-    ``replaced_id``: what vehicles took before, and take again if it is withdrawn.
-    """
-
-    field_id: str
-    light: str
-    replaced_id: str
-    passes: int
-    saved_percent: float
-    time_ms: int
-    withdrawn: bool = False
-
-
-@dataclass(frozen=True)
-class TileHistory:
-    """What was learnt of one tile. ``tried``: recordings that were used, as paths below the folder;
-    ``checked``: frames of each recording and learnt field that were looked at for a withdrawal."""
-
-    learnt: tuple[Learnt, ...] = ()
-    tried: tuple[str, ...] = ()
-    checked: Mapping[str, int] = field(default_factory=dict)
-    cpu: tuple[tuple[int, float], ...] = ()
-    """When CPU time was spent on learning, and seconds of it, of the last hour."""
-
-    @property
-    def withdrawals(self) -> int:
-        """How many updates made bits worse."""
-        return sum(one.withdrawn for one in self.learnt)
-
-
 class BudgetSpent(Exception):
     """The CPU time of this hour is spent; the round goes on when there is more."""
-
-
-@dataclass(frozen=True)
-class _SeenPass:
-    """A recording that is over: its name, its pass, and what tells its light."""
-
-    name: str
-    drive: Pass
-    first_ns: int
-    gains: tuple[float, float, float]
-    nearest_light: str | None
-
-
-def read_histories(recordings: Path) -> dict[str, TileHistory]:
-    """Return what was learnt, by tile; raise ``InvalidInput`` for a file that is damaged."""
-    path = recordings / LEARNING / HISTORIES
-    if not path.exists():
-        return {}
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        return {name: _history(one) for name, one in stored.items()}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InvalidInput("learning", f"{path} is damaged ({error}); remove it") from error
-
-
-def _history(stored: Mapping[str, Any]) -> TileHistory:
-    return TileHistory(
-        learnt=tuple(Learnt(**one) for one in stored["learnt"]),
-        tried=tuple(stored["tried"]),
-        checked=dict(stored["checked"]),
-        cpu=tuple((int(at_ms), float(spent_s)) for at_ms, spent_s in stored["cpu"]),
-    )
 
 
 class LearningRounds:
@@ -212,6 +139,7 @@ class TileLearner:
         self.name = name
         self.histories: dict[str, TileHistory] = {}
         self._job, self._now_ms = job, now_ms
+        self._recordings = Recordings(job.recordings, now_ms)
         self._watched_ms = now_ms()
         self._fields: dict[str, RadianceField] = {}
         self._looked_at: object = None
@@ -223,8 +151,7 @@ class TileLearner:
 
     def _keep(self, **changes: Any) -> None:
         self.histories[self.name] = replace(self.history, **changes)
-        stored = {name: asdict(one) for name, one in self.histories.items()}
-        write_whole(self._job.recordings / LEARNING / HISTORIES, json.dumps(stored))
+        write_histories(self._job.recordings, self.histories)
 
     # --- what was published
 
@@ -238,14 +165,14 @@ class TileLearner:
                     self._check(one)
 
     def _check(self, one: Learnt) -> None:
-        for part in _readable(self._files(FRESH_S)):
+        for part in readable(self._recordings.files(FRESH_S)):
             pictures = [p for p in part.pictures if p.field_id == one.field_id]
-            key = f"{self._name_of(part.file)} {one.field_id}"
+            key = f"{self._recordings.name_of(part.file)} {one.field_id}"
             new = len(pictures) - self.history.checked.get(key, 0)
             if new < CHECK_EVERY:
                 continue
             self._keep(checked={**self.history.checked, key: len(pictures)})
-            drive = self._pass_of(part, {one.field_id}, one.replaced_id)
+            drive = self._pass_of(part, {one.field_id}, self._open(one.replaced_id))
             worse = self._percent_worse(one, drive)
             if worse > self._job.settings().max_loss_percent:
                 self._withdraw(one, drive.identity, worse)
@@ -257,7 +184,7 @@ class TileLearner:
         if len(newest.pictures) < CHECK_FRAMES or not without_outliers(after, [newest]):
             return 0.0
         frames = [
-            SeenFrame(_as_sent(picture.camera), picture.read(), 0) for picture in newest.pictures
+            SeenFrame(as_sent(picture.camera), picture.read(), 0) for picture in newest.pictures
         ]
         return -saved_percent(try_field(before, frames), try_field(after, frames))[0]
 
@@ -292,13 +219,13 @@ class TileLearner:
         self._looked_at = looked_at
         self._fields.clear()
         seen = list(self._seen_passes(files, versions))
-        for light, group in _by_light(seen, versions):
+        for light, group in by_light(seen, versions):
             of_light = group[-MOST_PASSES:]
             if len({one.drive.identity for one in of_light}) >= self._job.min_identities:
                 self._learn_light(versions.tile(self.name), light, of_light, watch)
 
     def _learn_light(
-        self, tile: Tile, light: str, group: Sequence[_SeenPass], watch: Callable[[], None]
+        self, tile: Tile, light: str, group: Sequence[SeenPass], watch: Callable[[], None]
     ) -> None:
         current = {"": tile.field_id, **{one.name: one.field_id for one in tile.lights}}
         replaced_id = current.get(light, tile.field_id)
@@ -356,14 +283,14 @@ class TileLearner:
             return learn(base, passes, replace(self._job.settings(), learn_as=learn_as), told)
         finally:
             spent = (self._now_ms(), time.process_time() - began_s)
-            self._keep(cpu=(*self._cpu_of_the_hour(), spent))
+            self._keep(cpu=(*self._cpu_of_thehour_of(), spent))
 
-    def _cpu_of_the_hour(self) -> tuple[tuple[int, float], ...]:
+    def _cpu_of_thehour_of(self) -> tuple[tuple[int, float], ...]:
         since_ms = self._now_ms() - HOUR_MS
         return tuple((at, spent) for at, spent in self.history.cpu if at > since_ms)
 
     def _cpu_left_s(self) -> float:
-        return self._job.cpu_s_per_h - sum(spent for _, spent in self._cpu_of_the_hour())
+        return self._job.cpu_s_per_h - sum(spent for _, spent in self._cpu_of_thehour_of())
 
     def _publish(
         self,
@@ -371,10 +298,10 @@ class TileLearner:
         light: str,
         replaced_id: str,
         update: Update,
-        group: Sequence[_SeenPass],
+        group: Sequence[SeenPass],
         passes: int,
     ) -> None:
-        hour = float(np.mean([_hour(one.first_ns) for one in group]))
+        hour = float(np.mean([hour_of(one.first_ns) for one in group]))
         archive = self._job.recordings / LEARNING / f"{tile.name}.rff"
         field_id = save_field(update.learnt, archive)
         self._check_room(archive.stat().st_size)
@@ -420,8 +347,10 @@ class TileLearner:
 
     # --- recordings
 
-    def _tried(self, group: Sequence[_SeenPass]) -> None:
-        there = {self._name_of(file) for file in self._files(self._job.max_age_s)}
+    def _tried(self, group: Sequence[SeenPass]) -> None:
+        there = {
+            self._recordings.name_of(file) for file in self._recordings.files(self._job.max_age_s)
+        }
         tried = there & {*self.history.tried, *(one.name for one in group)}
         checked = {key: n for key, n in self.history.checked.items() if key.split()[0] in there}
         self._keep(tried=tuple(sorted(tried)), checked=checked)
@@ -430,44 +359,27 @@ class TileLearner:
         """Return the recordings that are over and were not used, oldest first."""
         return [
             file
-            for file in self._files(self._job.max_age_s)
-            if self._name_of(file) not in self.history.tried
-            and _age_s(file, self._now_ms()) >= self._job.quiet_s
+            for file in self._recordings.files(self._job.max_age_s)
+            if self._recordings.name_of(file) not in self.history.tried
+            and self._recordings.age_s(file) >= self._job.quiet_s
         ]
 
-    def _seen_passes(self, files: Sequence[Path], versions: TileVersions) -> Iterator[_SeenPass]:
+    def _seen_passes(self, files: Sequence[Path], versions: TileVersions) -> Iterator[SeenPass]:
         tile = versions.tile(self.name)
         own = self._open(tile.field_id)
         fields = {"": own, **{one.name: self._open(one.field_id) for one in tile.lights}}
-        for part in _readable(files):
-            drive = self._pass_of(part, frozenset(versions.field_ids), tile.field_id)
+        for part in readable(files):
+            drive = self._pass_of(part, frozenset(versions.field_ids), own)
             if len(drive.pictures) >= FEWEST_FRAMES:
                 few = replace(drive, pictures=tuple(spread(drive.pictures, self._job.frames)))
                 first_ns = part.pictures[0].capture_time_ns
-                yield _SeenPass(self._name_of(part.file), few, first_ns, *_light_of(few, fields))
+                yield SeenPass(
+                    self._recordings.name_of(part.file), few, first_ns, *light_of(few, fields)
+                )
 
-    def _files(self, max_age_s: float) -> list[Path]:
-        """Return the recordings that were added to lately, oldest first."""
-        files = sorted(recordings_under(self._job.recordings), key=lambda file: file.parent.name)
-        return [file for file in files if _age_s(file, self._now_ms()) <= max_age_s]
-
-    def _name_of(self, file: Path) -> str:
-        return str(file.parent.relative_to(self._job.recordings))
-
-    def _pass_of(self, part: RecordedPart, field_ids: Set[str], origin_id: str) -> Pass:
-        """Return the pictures coded against one of ``field_ids``, in the tile of ``origin_id``."""
-        origin = self._open(origin_id).metadata.tile_origin
-        intrinsics = part.camera.intrinsics
-        pictures = tuple(
-            PosedPicture(
-                picture.file,
-                Camera(intrinsics, origin.localise(picture.world_from_cam)),
-                partial(read_picture, part.file.parent / picture.file, intrinsics),
-            )
-            for picture in part.pictures
-            if picture.world_from_cam is not None and picture.field_id in field_ids
-        )
-        return Pass(part.camera.vehicle_id, pictures)
+    @staticmethod
+    def _pass_of(part: RecordedPart, field_ids: Set[str], in_tile_of: RadianceField) -> Pass:
+        return pass_of(part, field_ids, in_tile_of.metadata.tile_origin)
 
     # --- fields
 
@@ -489,89 +401,3 @@ def _id(versions: TileVersions, number: int) -> str:
 
 def _identities(passes: Sequence[Pass]) -> frozenset[str]:
     return frozenset(drive.identity for drive in passes)
-
-
-def _readable(files: Sequence[Path]) -> Iterator[RecordedPart]:
-    """Yield recordings; one that is deleted meanwhile is left out."""
-    for file in files:
-        try:
-            yield read_recorded_part(file)
-        except (DatasetError, FileNotFoundError) as error:
-            log.info("recording left out", problem=str(error))
-
-
-def _age_s(file: Path, now_ms: int) -> float:
-    """Return the seconds since a file was written; any number for one that is gone."""
-    try:
-        return now_ms / 1e3 - file.stat().st_mtime
-    except FileNotFoundError:
-        return math.inf
-
-
-def _hour(time_ns: int) -> float:
-    """Return the time of day, UTC, of a capture time."""
-    return time_ns / 1e9 % 86_400 / 3600
-
-
-def _light_of(
-    drive: Pass, fields: Mapping[str, RadianceField]
-) -> tuple[tuple[float, float, float], str | None]:
-    """Return the log gains of a pass's colours over the tile's own field, and the light it fits."""
-    looked_at = spread(drive.pictures, LOOKED_AT)
-    frames = [SeenFrame(_as_sent(picture.camera), picture.read(), 0) for picture in looked_at]
-    differences = {
-        name: float(np.median([_difference(field, frame) for frame in frames]))
-        for name, field in fields.items()
-    }
-    nearest = min(differences, key=lambda name: differences[name])
-    means = [_colour_gains(fields[""], frame) for frame in frames]
-    red, green, blue = (float(gain) for gain in np.median(means, axis=0))
-    return (red, green, blue), nearest if differences[nearest] <= FITS_LEVELS else None
-
-
-def _difference(field: RadianceField, frame: SeenFrame) -> float:
-    view = render_field_view(field, frame.camera)
-    return median_block_mean_difference(i420_from_rgb(frame.rgb), view.render)
-
-
-def _colour_gains(field: RadianceField, frame: SeenFrame) -> NDArray[np.float64]:
-    shown = np.clip(field.render_colour(frame.camera), 0, 1).mean(axis=(0, 1))
-    seen = frame.colour().mean(axis=(0, 1))
-    gains: NDArray[np.float64] = np.log(np.maximum(seen, 1 / 255) / np.maximum(shown, 1 / 255))
-    return gains
-
-
-def _by_light(
-    passes: Sequence[_SeenPass], versions: TileVersions
-) -> Iterator[tuple[str, list[_SeenPass]]]:
-    """Yield the passes of each light, oldest first; a light that is new gets a name of its hour."""
-    known: dict[str, list[_SeenPass]] = {}
-    new: list[list[_SeenPass]] = []
-    for one in passes:
-        if one.nearest_light is not None:
-            known.setdefault(one.nearest_light, []).append(one)
-            continue
-        alike = [group for group in new if _same_light(group[0], one)]
-        if alike:
-            alike[0].append(one)
-        else:
-            new.append([one])
-    yield from known.items()
-    taken = {versions.label(n + 1).light for n in range(len(versions.field_ids))}
-    for group in new:
-        name = _unused(f"h{int(_hour(group[0].first_ns)):02}", taken)
-        taken.add(name)
-        yield name, group
-
-
-def _same_light(first: _SeenPass, second: _SeenPass) -> bool:
-    return max(abs(a - b) for a, b in zip(first.gains, second.gains, strict=True)) <= SAME_LIGHT
-
-
-def _unused(name: str, taken: Set[str]) -> str:
-    names = (name if number == 1 else f"{name}-{number}" for number in count(1))
-    return next(each for each in names if each not in taken)
-
-
-def _as_sent(camera: Camera) -> Camera:
-    return replace(camera, world_from_cam=camera.world_from_cam.rounded())

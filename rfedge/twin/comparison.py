@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera, Pose
 from rfcore.field import RadianceField
 from rfcore.image import Rgb, jpeg_bytes, rgb_from_bytes
-from rfcore.metrics.psnr import psnr
+from rfcore.metrics import psnr
 from rfedge.twin.scene import SeenPicture
 
 __all__ = ["Comparison", "compared", "largest_disagreement"]

@@ -24,7 +24,7 @@ from attack.conftest import ENVIRONMENT, ROOT
 from rfcore.dataset import read_dataset
 from rfcore.field import FieldStore
 from rfcore.image import read_rgb
-from rfcore.metrics.psnr import psnr
+from rfcore.metrics import psnr
 
 RATES_MBPS = (0.5, 2.0, 8.0)
 HZ = 5.0

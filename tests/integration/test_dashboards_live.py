@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from mec_server.tile_learning import LEARNING, Learnt, TileHistory
+from mec_server.tile_history import LEARNING, Learnt, TileHistory
 from rfcore.wire.publish import Ground, publish
 from rfedge.dashboards.catalogue import DASHBOARDS
 from rfedge.demo.processes import command_of

@@ -16,7 +16,7 @@ from selenium.webdriver.chrome.service import Service as Driver
 from rfcore.dataset import read_dataset
 from rfcore.field import load_field
 from rfcore.image import rgb_from_bytes
-from rfcore.metrics.ssim import ssim
+from rfcore.metrics import ssim
 from rfedge.demo.processes import command_of, service
 from rfedge.samples import sample_path
 

@@ -13,17 +13,16 @@ import pytest
 from prometheus_client import CollectorRegistry
 from structlog.testing import capture_logs
 
-from mec_server import tile_learning as module
 from mec_server.learner import RESTART_S, Learner
 from mec_server.metrics import ServerMetrics
-from mec_server.tile_learning import (
+from mec_server.tile_history import (
     LEARNING,
-    LearningJob,
-    LearningRounds,
     Learnt,
     TileHistory,
     read_histories,
+    write_histories,
 )
+from mec_server.tile_learning import LearningJob, LearningRounds
 from rfcore.dataset.recorded_session import RECORDING_NAME, RecordedCamera, RecordedPicture
 from rfcore.errors import InvalidInput
 from rfcore.field import FieldStore, SplatField, save_field
@@ -102,7 +101,7 @@ def update(noon: SplatField, dusk: SplatField, make_pass: MakePass) -> Update:
 @pytest.fixture
 def learnt_before(update: Update, monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the worker take what was learnt once: what it does around learning is tested."""
-    monkeypatch.setattr(module, "learn", lambda *_: update)
+    monkeypatch.setattr("mec_server.tile_learning.learn", lambda *_: update)
 
 
 def elsewhere(drive: Pass) -> Pass:
@@ -193,9 +192,7 @@ def test_an_update_that_makes_bits_worse_is_withdrawn_within_50_frames(
     street.rounds().run()
     bad_id = save_field(dusk, tmp_path / "bad.rff")
     published = Learnt(bad_id, "h17", street.noon_id, 2, 20.0, NOW_MS)
-    (street.recordings / LEARNING / "tiles.json").write_text(
-        module.json.dumps({"west": module.asdict(TileHistory((published,)))})
-    )
+    write_histories(street.recordings, {"west": TileHistory((published,))})
     label = VersionLabel("h17", "", 2, 17.0)
     publish(street.fields, "west", tmp_path / "bad.rff", Ground(), NOW, label)
     street.record(make_pass(noon, "c"), bad_id, times=4)
@@ -293,7 +290,7 @@ def test_of_two_updates_at_once_one_is_published(
         publish(at_dusk.fields, "west", tmp_path / "other.rff", Ground(), NOW, label)
         return update
 
-    monkeypatch.setattr(module, "learn", slowly)
+    monkeypatch.setattr("mec_server.tile_learning.learn", slowly)
     with capture_logs() as lines:
         at_dusk.rounds().run()
     assert "published by somebody else" in lines[-1]["problem"]

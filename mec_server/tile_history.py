@@ -1,0 +1,82 @@
+"""What the server has learnt of each tile, as it is kept beside the recordings.
+
+RECORDINGS/.learning/tiles.json holds a ``TileHistory`` by the tile's name: what was learnt, tried
+and withdrawn. The learning process writes it (``mec_server.tile_learning``); the server reads it
+for its metrics.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rfcore.errors import InvalidInput
+from rfcore.files import write_whole
+
+__all__ = ["LEARNING", "Learnt", "TileHistory", "read_histories", "write_histories"]
+
+LEARNING = ".learning"
+HISTORIES = "tiles.json"
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """One field that was learnt; written before it is published, so that none goes unwatched.
+
+    ``replaced_id``: what vehicles took before, and take again if it is withdrawn.
+    """
+
+    field_id: str
+    light: str
+    replaced_id: str
+    passes: int
+    saved_percent: float
+    time_ms: int
+    withdrawn: bool = False
+
+
+@dataclass(frozen=True)
+class TileHistory:
+    """What was learnt of one tile. ``tried``: recordings that were used, as paths below the folder;
+    ``checked``: frames of each recording and learnt field that were looked at for a withdrawal."""
+
+    learnt: tuple[Learnt, ...] = ()
+    tried: tuple[str, ...] = ()
+    checked: Mapping[str, int] = field(default_factory=dict)
+    cpu: tuple[tuple[int, float], ...] = ()
+    """When CPU time was spent on learning, and seconds of it, of the last hour."""
+
+    @property
+    def withdrawals(self) -> int:
+        """How many updates made bits worse."""
+        return sum(one.withdrawn for one in self.learnt)
+
+
+def read_histories(recordings: Path) -> dict[str, TileHistory]:
+    """Return what was learnt, by tile; raise ``InvalidInput`` for a file that is damaged."""
+    path = recordings / LEARNING / HISTORIES
+    if not path.exists():
+        return {}
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        return {name: _history(one) for name, one in stored.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InvalidInput("learning", f"{path} is damaged ({error}); remove it") from error
+
+
+def _history(stored: Mapping[str, Any]) -> TileHistory:
+    return TileHistory(
+        learnt=tuple(Learnt(**one) for one in stored["learnt"]),
+        tried=tuple(stored["tried"]),
+        checked=dict(stored["checked"]),
+        cpu=tuple((int(at_ms), float(spent_s)) for at_ms, spent_s in stored["cpu"]),
+    )
+
+
+def write_histories(recordings: Path, histories: Mapping[str, TileHistory]) -> None:
+    """Write what was learnt, by tile, in one piece."""
+    stored = {name: asdict(one) for name, one in histories.items()}
+    write_whole(recordings / LEARNING / HISTORIES, json.dumps(stored))
