@@ -33,7 +33,7 @@ from cav_agent.frames import (
 from cav_agent.server_connection import ServerConnection, retry_after_s
 from cav_agent.session import AgentSession, LinkState
 from rfcore.errors import ProtocolError, RfedgeError
-from rfcore.wire.conventions import AGENT_PROCESS, STREAM_METHOD
+from rfcore.wire.conventions import AGENT_PROCESS, STREAM_METHOD, TILE, VEHICLE
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import FieldNotice, Welcome
 
@@ -42,7 +42,7 @@ __all__ = ["CameraSource", "CameraTaken", "FieldNotServed", "StreamClient", "Str
 log = structlog.get_logger()
 Stream = grpc.aio.StreamStreamCall[bytes, bytes]
 
-IDENTIFICATION = ((AGENT_PROCESS, uuid.uuid4().hex),)
+PROCESS = uuid.uuid4().hex
 """Tells a server which streams are of one process, so that no other sends the same camera."""
 
 FINAL = frozenset(
@@ -102,7 +102,7 @@ class CameraSource:
 
 
 class StreamClient:
-    """Streams what ``capture`` takes to one server, until ``finish``."""
+    """Streams what ``capture`` takes to one server, until ``finish``; ``tile`` names the place."""
 
     def __init__(
         self,
@@ -111,7 +111,11 @@ class StreamClient:
         source: CameraSource,
         observer: StreamObserver,
         limits: AgentLimits,
+        *,
+        tile: str,
     ) -> None:
+        names = {AGENT_PROCESS: PROCESS, VEHICLE: session.vehicle_id, TILE: tile}
+        self._metadata = tuple(names.items())
         self._server = server
         self._session = session
         self._source = source
@@ -131,6 +135,11 @@ class StreamClient:
     def is_streaming(self) -> bool:
         """Whether the server has welcomed the vehicle and pictures can go on being captured."""
         return not self._is_finishing and self._session.state is LinkState.STREAMING
+
+    @property
+    def is_sent_away(self) -> bool:
+        """Whether the server is about to stop, and takes pictures until another one does."""
+        return self._session.is_sent_away
 
     @property
     def rate_limit_hz(self) -> float:
@@ -273,7 +282,7 @@ class StreamClient:
     async def _one_stream(self) -> StreamEnd:
         """Open a stream and serve it to its end; return why it ended."""
         self._retry_after_s = 0.0
-        stream: Stream = self._server.channel.stream_stream(STREAM_METHOD)(metadata=IDENTIFICATION)
+        stream: Stream = self._server.channel.stream_stream(STREAM_METHOD)(metadata=self._metadata)
         self._stream = stream
         self._session.connected(time.monotonic())
         self._changed.set()

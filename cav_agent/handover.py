@@ -97,6 +97,8 @@ class Handover:
         self.route = route
         self.current: ServedTile | None = None
         """The tile that took the last picture."""
+        self.draining: frozenset[ServedTile] = frozenset()
+        """The tiles whose servers ask to be left; they take pictures until others do."""
         self._near = near
         self._absent_since_s: float | None = None
 
@@ -112,7 +114,7 @@ class Handover:
         wanted = self.route.ahead(index, self._near)
         assigned, current = wanted[0], self.current
         self._watch(assigned, streaming, now)
-        if self._is_lost(now):
+        if self._is_lost(now) or assigned in self.draining:
             wanted += [served for served in self.route.in_range(index) if served not in wanted]
         is_needed = assigned not in streaming and current in streaming
         if is_needed and current is not None and current not in wanted:
@@ -123,7 +125,7 @@ class Handover:
         """Return the tile that would take picture ``index``."""
         assigned = self.route.assigned[index % len(self.route)]
         self._watch(assigned, streaming, now)
-        if assigned in streaming:
+        if assigned in streaming and assigned not in self.draining:
             return assigned
         return self._substitute(index, streaming, now) or assigned
 
@@ -141,12 +143,16 @@ class Handover:
     def _substitute(
         self, index: int, streaming: Collection[ServedTile], now: float
     ) -> ServedTile | None:
-        current = self.current
-        if current is not None and current in streaming and self.route.covers(current, index):
+        current, assigned = self.current, self.route.assigned[index % len(self.route)]
+        is_here = current in streaming and current is not None and self.route.covers(current, index)
+        if is_here and current not in self.draining:
             return current
-        if not self._is_lost(now):
-            return None
-        return next((tile for tile in self.route.in_range(index) if tile in streaming), None)
+        if self._is_lost(now) or assigned in self.draining:
+            staying = set(streaming) - self.draining
+            substitute = next((t for t in self.route.in_range(index) if t in staying), None)
+            if substitute is not None:
+                return substitute
+        return current if is_here else None
 
     def _watch(self, assigned: ServedTile, streaming: Collection[ServedTile], now: float) -> None:
         if assigned in streaming or self.current is None:  # what has not begun is not lost

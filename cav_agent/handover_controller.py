@@ -174,6 +174,8 @@ class HandoverController:
 
     def _hold_streams(self, handover: Handover, now: float) -> None:
         """Open what is wanted, prepare what lies ahead, and close the rest."""
+        streams = self._streams.items()
+        handover.draining = frozenset(tile for tile, stream in streams if stream.is_sent_away)
         wanted = handover.wanted(self._next, self._streaming(), now)
         ahead = handover.route.ahead(self._next, self._pictures(AHEAD_S, AHEAD_PICTURES))
         for served in wanted:

@@ -44,6 +44,7 @@ from rfcore.wire.messages import (
     Ack,
     ClientMessage,
     Credit,
+    DrainNotice,
     FieldNotice,
     Frame,
     FrameAddress,
@@ -97,7 +98,7 @@ class AgentSession:
     ``rate_control`` says how many bytes each instant may take, and ``bit_division`` how its
     cameras share them; without the former all have the configured CRF. ``failed`` is set when the
     server refused the vehicle's Hello, ``broken`` when it did not answer in time; either ends the
-    stream.
+    stream. ``is_sent_away``: the server is about to stop, and goes on taking frames for a while.
     """
 
     def __init__(
@@ -112,6 +113,7 @@ class AgentSession:
         self.state = LinkState.DISCONNECTED
         self.session_id = ""
         self.exact: bool | None = None
+        self.is_sent_away = False
         self.rate_limit_hz = 0.0
         self.failed: RfedgeError | None = None
         self.broken: StreamEnd | None = None
@@ -134,6 +136,11 @@ class AgentSession:
         self._greeting_until_s = 0.0
 
     @property
+    def vehicle_id(self) -> str:
+        """Whose stream it is."""
+        return self._hello.vehicle_id
+
+    @property
     def epoch(self) -> int:
         """The highest epoch of the cameras' next packets."""
         return max(camera.chain.epoch for camera in self._cameras.values())
@@ -152,6 +159,7 @@ class AgentSession:
         """A stream is open: greet the server."""
         self.state = LinkState.GREETING
         self.broken = None
+        self.is_sent_away = False
         self._connection += 1
         for camera in self._cameras.values():
             camera.granted = camera.used = 0
@@ -194,6 +202,8 @@ class AgentSession:
                 self._acked(message, now)
             case Nack():
                 self._nacked(message, now)
+            case DrainNotice():
+                self.is_sent_away = True
             case FieldNotice() | Credit():
                 pass  # the refusal that follows a notice names both ids
 

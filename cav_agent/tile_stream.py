@@ -1,13 +1,16 @@
 """One tile on the vehicle's way: its field prepared, and a stream to its server while wanted.
 
 ``cav_agent.handover_controller`` holds one per tile and gives it the pictures that the tile takes.
-A stream that is closed first finishes what it has taken.
+A stream that is closed first finishes what it has taken. Where the server asks to be left, a second
+stream to the same address is opened beside the first: a proxy places it on another server, which
+takes over as soon as it has welcomed the vehicle.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 
 from cav_agent.backoff import Backoff
 from cav_agent.client import StreamClient, StreamObserver
@@ -25,6 +28,20 @@ FIRST_RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
 """Until a stream that failed is opened again: longer with every failure in a row."""
 
 
+@dataclass(frozen=True)
+class RunningClient:
+    """A client and the task in which it runs."""
+
+    client: StreamClient
+    task: asyncio.Task[None]
+
+    def ended(self) -> bool:
+        """Whether it has; then no picture of its stream is left without an end."""
+        if self.task.done():
+            self.client.abandon("its stream was given up")
+        return self.task.done()
+
+
 class TileStream:
     """A tile's stream: prepared, open, or closed; ``retry_at_s`` holds both back after an error."""
 
@@ -33,13 +50,19 @@ class TileStream:
     ) -> None:
         self.served = served
         self.retry_at_s = 0.0
-        self.client: StreamClient | None = None
         self._prepare = prepare
         self._observer = observer
         self._open: OpenStream | None = None
         self._preparing: asyncio.Task[OpenStream] | None = None
-        self._running: asyncio.Task[None] | None = None
+        self._current: RunningClient | None = None
+        self._successor: RunningClient | None = None
+        self._left: RunningClient | None = None
         self._backoff = Backoff(FIRST_RETRY_S, LONGEST_RETRY_S)
+
+    @property
+    def client(self) -> StreamClient | None:
+        """The client that takes the pictures."""
+        return None if self._current is None else self._current.client
 
     @property
     def is_streaming(self) -> bool:
@@ -47,9 +70,15 @@ class TileStream:
         return self.client is not None and self.client.is_streaming
 
     @property
+    def is_sent_away(self) -> bool:
+        """Whether the server is about to stop, and takes pictures until another one does."""
+        return self.client is not None and self.client.is_sent_away
+
+    @property
     def tasks(self) -> list[asyncio.Task[OpenStream] | asyncio.Task[None]]:
         """The tasks that have not been collected."""
-        return [task for task in (self._preparing, self._running) if task is not None]
+        preparing = [] if self._preparing is None else [self._preparing]
+        return [*preparing, *(running.task for running in self._running())]
 
     def prepare(self, now: float) -> None:
         """Begin to fetch and open the field, unless that is done or going on."""
@@ -59,20 +88,22 @@ class TileStream:
     def open(self, now: float) -> None:
         """Hold a stream to the server, as soon as the field is prepared."""
         self.prepare(now)
-        if self._open is None or self._running is not None or now < self.retry_at_s:
+        if self._open is None or now < self.retry_at_s:
             return
-        self.client = self._open(self._observer)
-        self._running = asyncio.create_task(self.client.run())
+        if self._current is None:
+            self._current = self._run(self._open)
+        elif self.is_sent_away and self._successor is None and self._left is None:
+            self._successor = self._run(self._open)
 
     def close(self) -> None:
         """Finish what was taken, then close the stream."""
-        if self.client is not None:
-            self.client.finish()
+        for running in self._running():
+            running.client.finish()
 
     def stop(self) -> None:
         """Finish the frame in flight, drop what waits, then close the stream."""
-        if self.client is not None:
-            self.client.stop()
+        for running in self._running():
+            running.client.stop()
 
     def capture(self, index: int) -> None:
         """Take picture ``index`` of the drive now."""
@@ -86,8 +117,8 @@ class TileStream:
 
     async def wait_closed(self) -> None:
         """Wait until the stream has ended; raise the error with which it did."""
-        if self._running is not None:
-            await self._running
+        for running in self._running():
+            await running.task
 
     def hold_back(self, now: float) -> float:
         """Try nothing for a while, since something failed; return for how many seconds."""
@@ -97,18 +128,45 @@ class TileStream:
 
     def collect(self) -> BaseException | None:
         """Take note of tasks that ended; return the error with which one did."""
-        error = None
         if self.is_streaming:
             self._backoff.reset()
+        ended: list[asyncio.Task[OpenStream] | asyncio.Task[None]] = []
         if self._preparing is not None and self._preparing.done():
-            error = self._preparing.exception()
+            ended.append(self._preparing)
             self._preparing = None
-        if self._running is not None and self._running.done():
-            error = error or self._running.exception()
-            client, self._running, self.client = self.client, None, None
-            if client is not None:
-                client.abandon("its stream was given up")
-        return error
+        for running in self._running():
+            if running.ended():
+                ended.append(running.task)
+                self._forget(running)
+        self._take_over()
+        errors = (task.exception() for task in ended)
+        return next((error for error in errors if error is not None), None)
+
+    def _take_over(self) -> None:
+        """Give the pictures to the successor once its server has welcomed the vehicle, or once the
+        first stream has ended."""
+        current, successor = self._current, self._successor
+        if successor is None or not (successor.client.is_streaming or current is None):
+            return
+        if current is not None:
+            current.client.finish()
+        self._current, self._successor, self._left = successor, None, current
+
+    def _running(self) -> list[RunningClient]:
+        every = (self._current, self._successor, self._left)
+        return [running for running in every if running is not None]
+
+    def _forget(self, ended: RunningClient) -> None:
+        if ended is self._current:
+            self._current = None
+        elif ended is self._successor:
+            self._successor = None
+        else:
+            self._left = None
+
+    def _run(self, open_stream: OpenStream) -> RunningClient:
+        client = open_stream(self._observer)
+        return RunningClient(client, asyncio.create_task(client.run()))
 
     async def _run_prepare(self) -> OpenStream:
         self._open = await self._prepare(self.served)

@@ -261,10 +261,10 @@ class StreamFactory:
     async def prepare(self, served: ServedTile) -> OpenStream:
         """Prepare the tile's field; return how to open a stream with it."""
         prepared = await self._fields.prepared(served)
-        return partial(self._client, self._servers[served.server], prepared)
+        return partial(self._client, served, prepared)
 
     def _client(
-        self, server: ServerConnection, prepared: PreparedField, observer: StreamObserver
+        self, served: ServedTile, prepared: PreparedField, observer: StreamObserver
     ) -> StreamClient:
         places = self._places_on_rig(prepared)
         pipelines = {
@@ -277,7 +277,8 @@ class StreamFactory:
 
         session = self._session(self._hello(prepared, pipelines), prepared)
         source = CameraSource(prepared.pictures.take, encode, self._encoder)
-        return StreamClient(server, session, source, observer, self._config.limits)
+        server, limits = self._servers[served.server], self._config.limits
+        return StreamClient(server, session, source, observer, limits, tile=served.tile.name)
 
     def _pipeline(
         self, prepared: PreparedField, camera: PreparedCamera, on_rig: OnRig | None

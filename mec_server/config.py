@@ -205,6 +205,9 @@ class LearnSettings:
                 raise InvalidInput(f"learn-{name}", f"{value:g} is outside {low:g}..{high:g}")
 
 
+MAX_DRAIN_HOLD_S = 600.0
+
+
 @dataclass(frozen=True)
 class ServerConfig:
     """Reconstruct what vehicles see, against the radiance fields held here."""
@@ -240,6 +243,10 @@ class ServerConfig:
     max_connection_age_s: float = 86_400.0
     """After how many seconds a connection is renewed, open streams in it after half a minute more;
     0: never."""
+    drain_hold_s: float = 0.0
+    """When told to stop: seconds for which health checks say NOT_SERVING before vehicles are asked
+    to go to another server, long enough for a proxy to notice (docs/scale.md). 0: nobody is asked,
+    and streams end with the frames that were taken."""
     server_budget: ServerBudget = ServerBudget()
     identity_budget: IdentityBudget = IdentityBudget()
     admission: AdmissionLimits = AdmissionLimits()
@@ -261,5 +268,9 @@ class ServerConfig:
             raise InvalidInput("learn", "there is nothing to learn from; give --record FOLDER, too")
         if not self.fields.is_dir():
             raise InvalidInput("fields", f"{self.fields} is not a directory")
+        if not 0 <= self.drain_hold_s <= MAX_DRAIN_HOLD_S:
+            raise InvalidInput(
+                "drain_hold_s", f"{self.drain_hold_s:g} is outside 0..{MAX_DRAIN_HOLD_S:g}"
+            )
         if not self.drain_s >= 0:
             raise InvalidInput("drain_s", f"{self.drain_s} must not be negative")

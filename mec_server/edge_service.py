@@ -6,9 +6,11 @@ cannot be parsed is answered with a Nack like any other, instead of ending the s
 
 from __future__ import annotations
 
+import asyncio
 import time
 import uuid
 from collections.abc import AsyncIterator
+from contextlib import suppress
 
 import grpc
 
@@ -29,6 +31,8 @@ class EdgeService:
     def __init__(self, server: ServerContext) -> None:
         self._server = server
         self._streams: set[Stream] = set()
+        self._is_leaving = False
+        self._stream_closed = asyncio.Event()
 
     def register(self, server: grpc.aio.Server) -> None:
         """Add the service to a server that has not started."""
@@ -39,6 +43,19 @@ class EdgeService:
         server.add_generic_rpc_handlers(
             (grpc.method_handlers_generic_handler(service, {method: handler}),)
         )
+
+    async def send_away(self, within_s: float) -> int:
+        """Refuse new streams, ask the vehicles of open ones to go elsewhere, and wait until they
+        have; return how many are left after ``within_s``."""
+        self._is_leaving = True
+        for stream in self._streams:
+            stream.announce_drain()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while self._streams:
+                    self._stream_closed.clear()
+                    await self._stream_closed.wait()
+        return len(self._streams)
 
     def drain(self) -> None:
         """Let every stream finish what it has taken, then end it."""
@@ -59,6 +76,8 @@ class EdgeService:
 
     async def _handle(self, requests: AsyncIterator[bytes], context: Context) -> None:
         """Serve one stream; it is charged for until its status was sent, or its peer is gone."""
+        if self._is_leaving:
+            await context.abort(grpc.StatusCode.UNAVAILABLE, "this server is shutting down")
         session_id = uuid.uuid4().hex[:12]
         identity, named = peer_account(context)
         entry = self._server.entry
@@ -89,6 +108,7 @@ class EdgeService:
             raise
         finally:
             self._streams.discard(stream)
+            self._stream_closed.set()
             self._server.metrics.sessions.dec()
             stream.close()
         if end.error is not None:

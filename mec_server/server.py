@@ -249,11 +249,20 @@ class EdgeServer:
         return self.address
 
     async def stop(self) -> None:
-        """Take no more frames, finish those taken within ``drain_s``, then close."""
-        log.info("draining", within_s=self._config.drain_s)
+        """Let vehicles move if there is ``drain_hold_s``; then take no more frames,
+        finish those taken within ``drain_s``, and close."""
+        log.info("draining", hold_s=self._config.drain_hold_s, within_s=self._config.drain_s)
         await self._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
+        if self._config.drain_hold_s:
+            await self._send_away()
         await self._release(self._config.drain_s)
         log.info("stopped")
+
+    async def _send_away(self) -> None:
+        """Let health checks notice, then let vehicles move while their frames are still taken."""
+        await asyncio.sleep(self._config.drain_hold_s)
+        left = await self._edge.send_away(self._config.drain_s)
+        log.info("vehicles sent away", streams_left=left)
 
     async def _release(self, drain_s: float) -> None:
         """Give back everything that ``__init__`` and ``start`` took, as far as they came."""

@@ -37,6 +37,7 @@ from rfcore.wire.identity import PeerIdentity
 from rfcore.wire.messages import (
     Ack,
     ClientMessage,
+    DrainNotice,
     FieldNotice,
     Frame,
     FrameAddress,
@@ -98,6 +99,7 @@ class ServerSession:
         self._damaged: deque[tuple[Frame, PacketRejected]] = deque(maxlen=MAX_UNUSABLE)
         self._exact = False
         self._rate_hz = 0.0
+        self._is_to_drain = False
 
     # --- messages of the vehicle
 
@@ -223,6 +225,8 @@ class ServerSession:
         self._say(Welcome(self.session_id, job.exact, self._rate_hz))
         for credit in self._cameras.credits():
             self._say(credit)
+        if self._is_to_drain:
+            self._say(DrainNotice())
         self._restart_deadline(now)
 
     def grant(self, rate_hz: float) -> None:
@@ -286,6 +290,12 @@ class ServerSession:
         self._outbox.clear()
         answered = {m.address.camera_id for m in messages if isinstance(m, (Ack, Nack))}
         return [*messages, *self._cameras.credits(answered)]
+
+    def announce_drain(self) -> None:
+        """Tell the vehicle to go elsewhere, now or after its Welcome; frames are still taken."""
+        if not self._is_to_drain and self.state is SessionState.OPEN:
+            self._say(DrainNotice())
+        self._is_to_drain = True
 
     def drain(self) -> None:
         """Take no more frames, finish those taken, then close."""

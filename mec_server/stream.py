@@ -89,6 +89,11 @@ class Stream:
             self._identity,
         )
 
+    def announce_drain(self) -> None:
+        """Ask the vehicle to go elsewhere; its frames are still taken."""
+        self._session.announce_drain()
+        self._wake.set()
+
     def drain(self) -> None:
         """Take no more frames and end when those taken are answered."""
         self._session.drain()

@@ -17,6 +17,8 @@ __all__ = [
     "RETRY_AFTER",
     "SERVER_OPTIONS",
     "STREAM_METHOD",
+    "TILE",
+    "VEHICLE",
 ]
 
 MAX_MESSAGE_BYTES: Final = 1 << 20
@@ -28,6 +30,13 @@ RETRY_AFTER: Final = "retry-after-ms"
 AGENT_PROCESS: Final = "agent-process"
 """Metadata of a stream: a name of the agent process that opened it, different for each process. A
 server lets two processes never send the same camera; without it the connection stands for it."""
+
+VEHICLE: Final = "rfedge-vehicle"
+"""Metadata of a stream: the vehicle's id, as in its Hello."""
+
+TILE: Final = "rfedge-tile"
+"""Metadata of a stream: the name of the tile it is for. A proxy places streams by this and by
+``VEHICLE`` before it has seen a message (docs/scale.md); a server believes neither."""
 
 STREAM_METHOD: Final = "/rfcore.wire.v1.EdgeService/Stream"
 

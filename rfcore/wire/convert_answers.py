@@ -14,6 +14,7 @@ from rfcore.wire.checks import MAX_RATE_HZ
 from rfcore.wire.messages import (
     Ack,
     Credit,
+    DrainNotice,
     FieldNotice,
     FrameAddress,
     Nack,
@@ -50,6 +51,8 @@ def server_messages_from_bytes(data: bytes) -> list[ServerMessage]:
             messages.append(_nack_from_wire(response.nack))
         case "field_notice":
             messages.append(FieldNotice(tuple(response.field_notice.field_ids)))
+        case "drain_notice":
+            messages.append(DrainNotice())
     if response.HasField("credit"):
         messages.append(Credit(response.credit.camera_id, response.credit.frames))
     return messages
@@ -69,7 +72,7 @@ def server_messages_to_bytes(messages: Iterable[ServerMessage]) -> list[bytes]:
     return [response.SerializeToString() for response in responses]
 
 
-def _response(message: Welcome | Ack | Nack | FieldNotice) -> pb.StreamResponse:
+def _response(message: Welcome | Ack | Nack | FieldNotice | DrainNotice) -> pb.StreamResponse:
     match message:
         case Welcome(session_id, exact, rate_hz):
             welcome = pb.Welcome(session_id=session_id, exact=exact, rate_hz=rate_hz)
@@ -82,6 +85,8 @@ def _response(message: Welcome | Ack | Nack | FieldNotice) -> pb.StreamResponse:
             return pb.StreamResponse(nack=_nack_to_wire(message))
         case FieldNotice(field_ids):
             return pb.StreamResponse(field_notice=pb.FieldNotice(field_ids=field_ids))
+        case DrainNotice():
+            return pb.StreamResponse(drain_notice=pb.DrainNotice())
 
 
 def _welcome_from_wire(welcome: pb.Welcome) -> Welcome:

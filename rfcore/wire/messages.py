@@ -22,6 +22,7 @@ __all__ = [
     "CameraDescription",
     "ClientMessage",
     "Credit",
+    "DrainNotice",
     "FieldNotice",
     "Frame",
     "FrameAddress",
@@ -183,6 +184,11 @@ class FieldNotice:
 
 
 @dataclass(frozen=True)
+class DrainNotice:
+    """The server is about to stop, and refuses new streams: open one elsewhere, then close this."""
+
+
+@dataclass(frozen=True)
 class Credit:
     """Since Hello, this camera may send ``frames`` frames in all; the number never falls."""
 
@@ -191,4 +197,4 @@ class Credit:
 
 
 ClientMessage = Hello | Frame
-ServerMessage = Welcome | Ack | Nack | FieldNotice | Credit
+ServerMessage = Welcome | Ack | Nack | FieldNotice | DrainNotice | Credit

@@ -25,6 +25,7 @@ from cav_agent.frames import (
 from cav_agent.session import AgentSession
 from rfcore.codec.sender.steering import SteeringSettings
 from rfcore.errors import CodecError, ProtocolError, RejectReason, RfedgeError
+from rfcore.wire.conventions import TILE, VEHICLE
 from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
 from rfcore.wire.messages import (
@@ -97,6 +98,7 @@ class MemoryServer:
     def __init__(self, *answers: Answer) -> None:
         self.fields_changed = asyncio.Event()
         self.streams: list[MemoryStream] = []
+        self.metadata: list[tuple[tuple[str, str], ...]] = []
         self._answers = deque(answers)
 
     @property
@@ -110,7 +112,8 @@ class MemoryServer:
     def stream_stream(self, method: str) -> Callable[..., MemoryStream]:
         assert method == "/rfcore.wire.v1.EdgeService/Stream"
 
-        def call(**_: object) -> MemoryStream:
+        def call(metadata: tuple[tuple[str, str], ...]) -> MemoryStream:
+            self.metadata.append(metadata)
             answer = self._answers.popleft() if len(self._answers) > 1 else self._answers[0]
             self.streams.append(MemoryStream(answer))
             return self.streams[-1]
@@ -177,7 +180,7 @@ def open_client(
         session = AgentSession(hello, limits)
         drive = OneCamera("front", RecordedPictures(pictures), SteeringSettings())
         source = CameraSource(drive.take, coder, executor)
-        return StreamClient(server, session, source, heard, limits)  # type: ignore[arg-type]
+        return StreamClient(server, session, source, heard, limits, tile="street")  # type: ignore[arg-type]
 
     return make
 
@@ -195,6 +198,8 @@ async def test_a_picture_is_encoded_sent_and_reported_once(open_client: OpenClie
     assert len(server.frames) == 1
     assert heard.connections == [True]
     assert client.rate_limit_hz == 5.0
+    names = dict(server.metadata[0])
+    assert (names[VEHICLE], names[TILE]) == ("cav-1", "street"), "by which a proxy places it"
 
 
 async def test_a_client_streams_from_its_welcome_until_it_is_to_finish(

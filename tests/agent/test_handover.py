@@ -81,3 +81,21 @@ def test_another_version_takes_over_when_it_is_ready_and_not_before() -> None:
     assert set(vehicle.wanted(1, {A}, 9.0)) == {A, newer}
     assert vehicle.choose(2, {A, newer}, 9.1) == (newer, HandoverCause.TILE)
     assert vehicle.wanted(3, {A, newer}, 9.1) == [newer]
+
+
+def test_a_server_that_drains_takes_pictures_until_a_neighbour_in_range_streams() -> None:
+    vehicle = handover()
+    vehicle.choose(2, {A}, 0.0)
+    vehicle.draining = frozenset({A})
+    assert vehicle.wanted(3, {A}, 0.1) == [A, B], "at once, not after a pause"
+    assert vehicle.choose(3, {A}, 0.1) == (A, None)
+    assert vehicle.choose(3, {A, B}, 0.2) == (B, HandoverCause.SERVER_LOST)
+    vehicle.draining = frozenset({A, B})
+    assert vehicle.choose(3, {A, B}, 0.3) == (B, None), "where all drain, nothing is gained"
+
+
+def test_a_server_that_drains_is_not_left_for_one_out_of_range() -> None:
+    vehicle = handover()
+    vehicle.choose(0, {A}, 0.0)
+    vehicle.draining = frozenset({A})
+    assert vehicle.choose(1, {A, B}, 0.1) == (A, None)

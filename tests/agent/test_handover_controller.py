@@ -37,6 +37,7 @@ class MemoryClient:
     """Stands for ``StreamClient``: acknowledges every picture as soon as it is captured."""
 
     rate_limit_hz = 0.0
+    is_sent_away = False
 
     def __init__(
         self,
@@ -104,6 +105,8 @@ class Site:
     """Who had a stream when a picture was captured."""
     breaks_at: int | None = None
     """The picture at which the stream that takes it is refused, once it was answered."""
+    sends_away_at: int | None = None
+    """The picture at which the server of the stream that takes it asks to be left."""
     failing: int = 0
     """How many streams after a tile's first one are refused at once."""
 
@@ -127,6 +130,9 @@ class Site:
             self.breaks_at = None
             (client,) = (c for clients in self.clients.values() for c in clients)
             client.break_off(REFUSED)
+        if index == self.sends_away_at:
+            (client,) = (c for clients in self.clients.values() for c in clients)
+            client.is_sent_away = True
         self.streaming[index] = {
             served
             for served, clients in self.clients.items()
@@ -215,6 +221,18 @@ async def test_a_server_that_welcomed_the_vehicle_once_is_tried_again_for_ever(
     assert len(site.clients[WEST]) == 5, "one that broke, three that were refused, one that went on"
     retried = registry.get_sample_value("rfedge_agent_retries_total", {"reason": "refused"})
     assert retried == 4
+
+
+async def test_a_second_stream_to_the_same_tile_takes_over_where_its_server_asks_to_be_left(
+    drive: Drive, site: Site
+) -> None:
+    """As behind a proxy, which places the second stream on another server."""
+    site.sends_away_at = 1
+    await drive(WEST).run()
+    first, second = site.clients[WEST]
+    assert first.captured + second.captured == [0, 1, 2, 3]
+    assert second.captured, "the rest of the drive"
+    assert not first.is_streaming, "the vehicle is shown once"
 
 
 async def test_no_server_for_as_long_as_may_be_ends_the_drive(

@@ -24,6 +24,7 @@ from rfcore.wire.identity import PeerIdentity, Role, identity_uri
 from rfcore.wire.messages import (
     Ack,
     Credit,
+    DrainNotice,
     FieldNotice,
     Frame,
     FrameAddress,
@@ -439,6 +440,30 @@ def test_draining_finishes_what_was_taken_and_takes_no_more(
     assert told == [("overloaded", 2), ("ack", 0), ("ack", 1)]
     assert session.closed is not None
     assert session.closed.error is None
+
+
+def test_a_vehicle_that_is_sent_away_is_told_once_and_goes_on_being_served(
+    session: ServerSession, make_frame: MakeFrame
+) -> None:
+    session.announce_drain()
+    session.announce_drain()
+    assert session.messages_to_send(1.0) == [DrainNotice()]
+    session.receive(make_frame(0), 1.0)
+    ReferenceDecoder().run(session, 1.0)
+    assert answers(session.messages_to_send(1.0)) == [("ack", 0)]
+
+
+def test_who_is_being_welcomed_is_sent_away_after_its_welcome(hello: Hello) -> None:
+    session = ServerSession("s-1", [FIELD], now=0.0)
+    session.receive(hello, 0.0)
+    (job,) = session.jobs_to_start(0.0)
+    session.announce_drain()
+    assert session.messages_to_send(0.0) == []
+    assert isinstance(job, OpenJob)
+    session.opened(job, 0.0)
+    told = [type(message) for message in session.messages_to_send(0.0)]
+    assert told[0] is Welcome
+    assert told.count(DrainNotice) == 1
 
 
 def test_draining_an_idle_session_closes_it_at_once(session: ServerSession) -> None:

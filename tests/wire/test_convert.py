@@ -22,6 +22,7 @@ from rfcore.wire.convert_answers import server_messages_from_bytes, server_messa
 from rfcore.wire.messages import (
     Ack,
     Credit,
+    DrainNotice,
     FieldNotice,
     Frame,
     FrameAddress,
@@ -107,6 +108,7 @@ ADDRESS = FrameAddress("front", 2, 7)
         *[Nack(ADDRESS, reason, "why", count=2) for reason in RejectReason],
         Nack(ADDRESS, RejectReason.CRC_MISMATCH, "why", last_good_sequence=0, current_epoch=9),
         FieldNotice(("ab" * 32, "cd" * 32)),
+        DrainNotice(),
         Credit("front", 12),
     ],
     ids=str,

@@ -172,6 +172,7 @@ class StreamResponse(_message.Message):
     ACK_FIELD_NUMBER: _builtins.int
     NACK_FIELD_NUMBER: _builtins.int
     FIELD_NOTICE_FIELD_NUMBER: _builtins.int
+    DRAIN_NOTICE_FIELD_NUMBER: _builtins.int
     CREDIT_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def welcome(self) -> Global___Welcome: ...
@@ -181,6 +182,8 @@ class StreamResponse(_message.Message):
     def nack(self) -> Global___Nack: ...
     @_builtins.property
     def field_notice(self) -> Global___FieldNotice: ...
+    @_builtins.property
+    def drain_notice(self) -> Global___DrainNotice: ...
     @_builtins.property
     def credit(self) -> Global___Credit:
         """Alone, or in the message of the answer that changed it, which saves a message a frame."""
@@ -192,13 +195,14 @@ class StreamResponse(_message.Message):
         ack: Global___Ack | None = ...,
         nack: Global___Nack | None = ...,
         field_notice: Global___FieldNotice | None = ...,
+        drain_notice: Global___DrainNotice | None = ...,
         credit: Global___Credit | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "credit", b"credit", "field_notice", b"field_notice", "message", b"message", "nack", b"nack", "welcome", b"welcome"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "credit", b"credit", "drain_notice", b"drain_notice", "field_notice", b"field_notice", "message", b"message", "nack", b"nack", "welcome", b"welcome"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "credit", b"credit", "field_notice", b"field_notice", "message", b"message", "nack", b"nack", "welcome", b"welcome"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "credit", b"credit", "drain_notice", b"drain_notice", "field_notice", b"field_notice", "message", b"message", "nack", b"nack", "welcome", b"welcome"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["welcome", "ack", "nack", "field_notice"]  # noqa: Y015
+    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["welcome", "ack", "nack", "field_notice", "drain_notice"]  # noqa: Y015
     _WhichOneofArgType_message: _TypeAlias = _typing.Literal["message", b"message"]  # noqa: Y015
     def WhichOneof(self, oneof_group: _WhichOneofArgType_message) -> _WhichOneofReturnType_message | None: ...
 
@@ -738,6 +742,25 @@ class FieldNotice(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___FieldNotice: _TypeAlias = FieldNotice  # noqa: Y015
+
+@_typing.final
+class DrainNotice(_message.Message):
+    """This server is about to stop. It refuses new streams, and goes on taking frames of this one for
+    some seconds: time to open a stream elsewhere, then to close this one.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___DrainNotice: _TypeAlias = DrainNotice  # noqa: Y015
 
 @_typing.final
 class Credit(_message.Message):
