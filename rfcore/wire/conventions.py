@@ -36,7 +36,7 @@ VEHICLE: Final = "rfedge-vehicle"
 
 TILE: Final = "rfedge-tile"
 """Metadata of a stream: the name of the tile it is for. A proxy places streams by this and by
-``VEHICLE`` before it has seen a message (docs/scale.md); a server believes neither."""
+``VEHICLE`` before it has seen a message (docs/operations.md); a server believes neither."""
 
 STREAM_METHOD: Final = "/rfcore.wire.v1.EdgeService/Stream"
 
