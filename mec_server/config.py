@@ -245,8 +245,8 @@ class ServerConfig:
     0: never."""
     drain_hold_s: float = 0.0
     """When told to stop: seconds for which health checks say NOT_SERVING before vehicles are asked
-    to go to another server, long enough for a proxy to notice (docs/operations.md). 0: nobody is asked,
-    and streams end with the frames that were taken."""
+    to go to another server, long enough for a proxy to notice (docs/operations.md). 0: nobody is
+    asked, and streams end with the frames that were taken."""
     server_budget: ServerBudget = ServerBudget()
     identity_budget: IdentityBudget = IdentityBudget()
     admission: AdmissionLimits = AdmissionLimits()

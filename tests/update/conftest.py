@@ -1,18 +1,28 @@
-"""A wall of splats, and passes of vehicles along it in the light of the field or in another."""
+"""A wall of splats, passes of vehicles along it in the light of the field or in another, and what
+a server has recorded of them."""
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from mec_server.tile_learning import LearningJob, LearningRounds
 from rfcore.camera import Camera, Intrinsics, Pose
-from rfcore.field import SplatField
+from rfcore.dataset.recorded_session import RECORDING_NAME, RecordedCamera, RecordedPicture
+from rfcore.field import SplatField, save_field
 from rfcore.field.layer import SH_DC
-from rfcore.image import Rgb
+from rfcore.image import Rgb, write_png
 from rfcore.raster.gaussians import Gaussians
 from rfcore.update.passes import Pass
+from rfcore.update.run import LearnAs, Update, UpdateSettings, learn
 from rfcore.views import PosedPicture
+from rfcore.wire.publish import Ground, publish
+from rfcore.wire.tile_manifest import TileVersions, read_publication
 
 K = Intrinsics(96, 64, 70.0, 70.0, 48.0, 32.0)
 Paint = Callable[[int, Rgb], Rgb]
@@ -35,7 +45,7 @@ def wall() -> Gaussians:
     )
 
 
-def at_dusk(gaussians: Gaussians) -> Gaussians:
+def darkened(gaussians: Gaussians) -> Gaussians:
     """A third of the light, bluer, and darker to one side: no matrix of colours says it."""
     shade = 1.0 / (1.0 + np.exp(-2 * gaussians.means[:, 0]))
     colours = gaussians.sh[:, 0] * SH_DC + 0.5
@@ -50,7 +60,7 @@ def noon() -> SplatField:
 
 @pytest.fixture(scope="session")
 def dusk() -> SplatField:
-    return SplatField(at_dusk(wall()))
+    return SplatField(darkened(wall()))
 
 
 @pytest.fixture(scope="session")
@@ -70,3 +80,71 @@ def make_pass() -> MakePass:
         return Pass(identity, tuple(pictures))
 
     return make
+
+
+NOW_MS = 1_767_290_400_000
+"""18:00 UTC."""
+NOW = datetime.fromtimestamp(NOW_MS / 1e3, UTC)
+
+
+class Street:
+    """A folder of fields with tile west at noon, and a folder of recordings."""
+
+    def __init__(self, folder: Path, noon: SplatField) -> None:
+        self.fields, self.recordings = folder / "fields", folder / "recordings"
+        self.fields.mkdir()
+        self.recordings.mkdir()
+        self.noon_id = save_field(noon, folder / "noon.rff")
+        publish(self.fields, "west", folder / "noon.rff", Ground(), NOW)
+        self.job = LearningJob(self.fields, self.recordings, frames=16)
+        self.parts = 0
+
+    def record(self, drive: Pass, field_id: str = "", times: int = 1) -> None:
+        """Record a pass, its pictures so many times over, that ended a minute ago."""
+        self.parts += 1
+        part = self.recordings / drive.identity / "front" / f"{NOW_MS - 60_000 + self.parts}-s"
+        part.mkdir(parents=True)
+        camera = drive.pictures[0].camera
+        lines = [RecordedCamera(drive.identity, "front", "s", camera.intrinsics).line()]
+        for number, picture in enumerate(drive.pictures * times):
+            name, pose = f"{number:06}.png", picture.camera.world_from_cam
+            write_png(part / name, picture.read())
+            time_ns = (NOW_MS - 60_000 + 100 * number) * 1_000_000
+            line = RecordedPicture(name, time_ns, 0, number, field_id or self.noon_id, pose, "00")
+            lines.append(line.line())
+        (part / RECORDING_NAME).write_text("".join(lines))
+        os.utime(part / RECORDING_NAME, (NOW_MS / 1e3 - 60, NOW_MS / 1e3 - 60))
+
+    def rounds(self, **changes: Any) -> LearningRounds:
+        return LearningRounds(replace(self.job, **changes), lambda: NOW_MS)
+
+    def west(self) -> TileVersions:
+        return read_publication(self.fields).tiles["west"]
+
+
+@pytest.fixture
+def street(tmp_path: Path, noon: SplatField) -> Street:
+    return Street(tmp_path, noon)
+
+
+@pytest.fixture
+def at_dusk(street: Street, dusk: SplatField, make_pass: MakePass) -> Street:
+    """Two vehicles were recorded at dusk."""
+    street.record(make_pass(dusk, "a"))
+    street.record(make_pass(dusk, "b", 0.15))
+    return street
+
+
+@pytest.fixture(scope="session")
+def update(noon: SplatField, dusk: SplatField, make_pass: MakePass) -> Update:
+    """What the passes of ``at_dusk`` teach; learnt once."""
+    settings = UpdateSettings(LearnAs.COLOURS, frames=16)
+    made = learn(noon, [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)], settings)
+    assert not made.refused
+    return made
+
+
+@pytest.fixture
+def learnt_before(update: Update, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the worker take what was learnt once: what it does around learning is tested."""
+    monkeypatch.setattr("mec_server.tile_learning.learn", lambda *_: update)

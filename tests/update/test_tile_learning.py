@@ -22,86 +22,21 @@ from mec_server.tile_history import (
     read_histories,
     write_histories,
 )
-from mec_server.tile_learning import LearningJob, LearningRounds
-from rfcore.dataset.recorded_session import RECORDING_NAME, RecordedCamera, RecordedPicture
 from rfcore.errors import InvalidInput
 from rfcore.field import FieldStore, SplatField, save_field
-from rfcore.image import Rgb, write_png
+from rfcore.image import Rgb
 from rfcore.update.agreement import without_outliers
 from rfcore.update.passes import Pass
-from rfcore.update.run import LearnAs, Update, UpdateSettings, learn
+from rfcore.update.run import Update
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.settings import LogForm
-from rfcore.wire.tile_manifest import MANIFEST, TileVersions, VersionLabel, read_publication
+from rfcore.wire.tile_manifest import MANIFEST, VersionLabel
 from rfcore.wire.tiles import Tile, TileLight
 
 MakePass = Callable[..., Pass]
 NOW_MS = 1_767_290_400_000
-"""18:00 UTC."""
+"""18:00 UTC, as in conftest."""
 NOW = datetime.fromtimestamp(NOW_MS / 1e3, UTC)
-
-
-class Street:
-    """A folder of fields with tile west at noon, and a folder of recordings."""
-
-    def __init__(self, folder: Path, noon: SplatField) -> None:
-        self.fields, self.recordings = folder / "fields", folder / "recordings"
-        self.fields.mkdir()
-        self.recordings.mkdir()
-        self.noon_id = save_field(noon, folder / "noon.rff")
-        publish(self.fields, "west", folder / "noon.rff", Ground(), NOW)
-        self.job = LearningJob(self.fields, self.recordings, frames=16)
-        self.parts = 0
-
-    def record(self, drive: Pass, field_id: str = "", times: int = 1) -> None:
-        """Record a pass, its pictures so many times over, that ended a minute ago."""
-        self.parts += 1
-        part = self.recordings / drive.identity / "front" / f"{NOW_MS - 60_000 + self.parts}-s"
-        part.mkdir(parents=True)
-        camera = drive.pictures[0].camera
-        lines = [RecordedCamera(drive.identity, "front", "s", camera.intrinsics).line()]
-        for number, picture in enumerate(drive.pictures * times):
-            name, pose = f"{number:06}.png", picture.camera.world_from_cam
-            write_png(part / name, picture.read())
-            time_ns = (NOW_MS - 60_000 + 100 * number) * 1_000_000
-            line = RecordedPicture(name, time_ns, 0, number, field_id or self.noon_id, pose, "00")
-            lines.append(line.line())
-        (part / RECORDING_NAME).write_text("".join(lines))
-        os.utime(part / RECORDING_NAME, (NOW_MS / 1e3 - 60, NOW_MS / 1e3 - 60))
-
-    def rounds(self, **changes: Any) -> LearningRounds:
-        return LearningRounds(replace(self.job, **changes), lambda: NOW_MS)
-
-    def west(self) -> TileVersions:
-        return read_publication(self.fields).tiles["west"]
-
-
-@pytest.fixture
-def street(tmp_path: Path, noon: SplatField) -> Street:
-    return Street(tmp_path, noon)
-
-
-@pytest.fixture
-def at_dusk(street: Street, dusk: SplatField, make_pass: MakePass) -> Street:
-    """Two vehicles were recorded at dusk."""
-    street.record(make_pass(dusk, "a"))
-    street.record(make_pass(dusk, "b", 0.15))
-    return street
-
-
-@pytest.fixture(scope="module")
-def update(noon: SplatField, dusk: SplatField, make_pass: MakePass) -> Update:
-    """What the passes of ``at_dusk`` teach; learnt once."""
-    settings = UpdateSettings(LearnAs.COLOURS, frames=16)
-    made = learn(noon, [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)], settings)
-    assert not made.refused
-    return made
-
-
-@pytest.fixture
-def learnt_before(update: Update, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have the worker take what was learnt once: what it does around learning is tested."""
-    monkeypatch.setattr("mec_server.tile_learning.learn", lambda *_: update)
 
 
 def elsewhere(drive: Pass) -> Pass:
@@ -122,7 +57,7 @@ def pasted(number: int, _: Rgb) -> Rgb:
     return np.kron(rng.integers(0, 255, (8, 12, 3)), np.ones((8, 8, 1))).astype(np.uint8)
 
 
-def test_two_vehicles_teach_a_light_once(at_dusk: Street) -> None:
+def test_two_vehicles_teach_a_light_once(at_dusk: Any) -> None:
     rounds = at_dusk.rounds()
     rounds.run()
     west = at_dusk.west()
@@ -138,7 +73,7 @@ def test_two_vehicles_teach_a_light_once(at_dusk: Street) -> None:
 
 
 def test_fewer_vehicles_than_asked_for_teach_nothing(
-    street: Street, dusk: SplatField, make_pass: MakePass
+    street: Any, dusk: SplatField, make_pass: MakePass
 ) -> None:
     for shift_m in (0.0, 0.15, 0.3):
         street.record(make_pass(dusk, "a", shift_m))
@@ -150,7 +85,7 @@ def test_fewer_vehicles_than_asked_for_teach_nothing(
 @pytest.mark.usefixtures("learnt_before")
 @pytest.mark.parametrize("poison", ["poses", "pictures"])
 def test_poisoned_passes_are_dropped_and_make_no_identity(
-    street: Street, dusk: SplatField, make_pass: MakePass, poison: str
+    street: Any, dusk: SplatField, make_pass: MakePass, poison: str
 ) -> None:
     """With one honest vehicle nothing is learnt; with two, what the two saw."""
     street.record(make_pass(dusk, "a"))
@@ -187,7 +122,7 @@ def test_what_another_vehicle_saw_too_is_no_outlier(noon: SplatField, make_pass:
 
 
 def test_an_update_that_makes_bits_worse_is_withdrawn_within_50_frames(
-    street: Street, noon: SplatField, dusk: SplatField, make_pass: MakePass, tmp_path: Path
+    street: Any, noon: SplatField, dusk: SplatField, make_pass: MakePass, tmp_path: Path
 ) -> None:
     street.rounds().run()
     bad_id = save_field(dusk, tmp_path / "bad.rff")
@@ -208,7 +143,7 @@ def test_an_update_that_makes_bits_worse_is_withdrawn_within_50_frames(
 
 
 @pytest.mark.usefixtures("learnt_before")
-def test_an_update_that_helps_stays(at_dusk: Street, dusk: SplatField, make_pass: MakePass) -> None:
+def test_an_update_that_helps_stays(at_dusk: Any, dusk: SplatField, make_pass: MakePass) -> None:
     at_dusk.rounds().run()
     west = at_dusk.west()
     at_dusk.record(make_pass(dusk, "c", 0.05), west.tile("west").lights[0].field_id, times=4)
@@ -224,7 +159,7 @@ class Killed(BaseException):
 @pytest.mark.usefixtures("learnt_before")
 @pytest.mark.parametrize("step", ["learn", "save_field", "publish", "store", "manifest"])
 def test_a_killed_round_publishes_nothing_half_and_the_next_does_the_work(
-    at_dusk: Street, monkeypatch: pytest.MonkeyPatch, step: str
+    at_dusk: Any, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     target = {
         "store": "rfcore.wire.publish.FieldStore.add",
@@ -247,7 +182,7 @@ def test_a_killed_round_publishes_nothing_half_and_the_next_does_the_work(
 
 @pytest.mark.usefixtures("learnt_before")
 def test_a_full_disk_publishes_nothing_and_is_reported(
-    at_dusk: Street, monkeypatch: pytest.MonkeyPatch
+    at_dusk: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -261,14 +196,14 @@ def test_a_full_disk_publishes_nothing_and_is_reported(
 
 
 @pytest.mark.usefixtures("learnt_before")
-def test_learnt_fields_stay_within_their_bytes(at_dusk: Street) -> None:
+def test_learnt_fields_stay_within_their_bytes(at_dusk: Any) -> None:
     with capture_logs() as lines:
         at_dusk.rounds(max_bytes=100).run()
     assert "learn-max-gb" in lines[-1]["problem"]
     assert len(at_dusk.west().field_ids) == 1
 
 
-def test_spent_time_postpones_learning(at_dusk: Street) -> None:
+def test_spent_time_postpones_learning(at_dusk: Any) -> None:
     with capture_logs() as lines:
         at_dusk.rounds(cpu_s_per_h=0.001).run()
     assert lines[-1]["event"] == "learning postponed"
@@ -276,7 +211,7 @@ def test_spent_time_postpones_learning(at_dusk: Street) -> None:
 
 
 def test_of_two_updates_at_once_one_is_published(
-    at_dusk: Street,
+    at_dusk: Any,
     monkeypatch: pytest.MonkeyPatch,
     dusk: SplatField,
     update: Update,
@@ -297,14 +232,14 @@ def test_of_two_updates_at_once_one_is_published(
     assert [light.field_id for light in at_dusk.west().tile("west").lights] == [other_id]
 
 
-def test_a_damaged_history_is_named(street: Street) -> None:
+def test_a_damaged_history_is_named(street: Any) -> None:
     street.rounds().run()
     (street.recordings / LEARNING / "tiles.json").write_text("{")
     with pytest.raises(InvalidInput, match=r"tiles\.json is damaged"):
         street.rounds().run()
 
 
-def test_a_killed_process_is_started_again_and_ends_with_its_server(street: Street) -> None:
+def test_a_killed_process_is_started_again_and_ends_with_its_server(street: Any) -> None:
     now_s = [0.0]
     learner = Learner(street.job, LogForm.JSON, lambda _: None, lambda: now_s[0])
     learner.start()
@@ -324,7 +259,7 @@ def test_a_killed_process_is_started_again_and_ends_with_its_server(street: Stre
         os.kill(second, 0)
 
 
-def test_what_was_learnt_is_shown(street: Street) -> None:
+def test_what_was_learnt_is_shown(street: Any) -> None:
     """Of the tile's lights, and of the last update, which was withdrawn at last."""
     registry = CollectorRegistry()
     metrics = ServerMetrics(registry)
