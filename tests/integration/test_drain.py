@@ -8,11 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import grpc
+import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
+from cav_agent.config import AgentLimits
 from rfcore.wire.messages import Ack, DrainNotice
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tiles import Area
+
+PATIENT = AgentLimits(answer_s=60.0)
+"""A busy machine is not a server that is lost."""
 
 EVERYWHERE = Ground(Area((-5.0, -5.0), (5.0, 5.0)), 0.0)
 
@@ -25,7 +30,7 @@ async def two_servers(street: Any, serve: Any, folder: Path) -> AsyncIterator[An
     now = datetime(2026, 1, 1, tzinfo=UTC)
     publish(store, "street", street.store / "street.rff", EVERYWHERE, now)
     async with AsyncExitStack() as first, serve(fields=store) as b:
-        a = await first.enter_async_context(serve(fields=store, drain_hold_s=0.2))
+        a = await first.enter_async_context(serve(fields=store, drain_hold_s=0.2, drain_s=60.0))
         yield a, b, first.aclose
 
 
@@ -36,13 +41,18 @@ async def health(address: object) -> health_pb2.HealthCheckResponse.ServingStatu
 
 
 async def test_a_server_that_drains_hands_its_vehicle_over_without_a_lost_frame_or_a_keyframe(
-    street: Any, serve: Any, vehicle: Any, tmp_path: Path
+    street: Any, serve: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
     async with (
         two_servers(street, serve, tmp_path) as (a, b, drained),
         vehicle(
-            a.address, neighbours=(str(b.address),), fields=tmp_path / "mine", loop=True
-        ) as driving,
+            a.address,
+            neighbours=(str(b.address),),
+            fields=tmp_path / "mine",
+            loop=True,
+            limits=PATIENT,
+        ) as driving,  # fmt: skip
     ):
         await driving.until(lambda: driving.acked() >= 4)
         draining = asyncio.create_task(drained())
