@@ -75,31 +75,29 @@ def _curves(curves: Sequence[CurveRow]) -> tuple[Figure, Lines]:
 
 
 def _frontier(curves: Sequence[CurveRow]) -> tuple[Figure, Lines]:
-    """Return bytes over processor time of both ends, of every setting; low and left is good."""
+    """Return bytes over processor time of both ends, of every setting; low and left is good.
+
+    Named are ours, and those that nobody beats in both.
+    """
     everybody = {curve.setting: curve for curve in curves}.values()
     anchor = next(curve for curve in everybody if curve.family.startswith("x264-lowdelay"))
     lines: Lines = [["setting", "both_ends_ms", "bytes_percent"]]
+    least = math.inf
     with mpl.rc_context({**STYLE, "axes.grid.axis": "both"}):
         figure, axes = plt.subplots(figsize=(7.2, 3.6))
-        for curve in everybody:
+        for curve in sorted(everybody, key=lambda each: each.both_ends_ms):
             percent = 100 * math.exp(_middle_bytes(curve) - _middle_bytes(anchor))
             lines.append([curve.setting, f"{curve.both_ends_ms:.2f}", f"{percent:.2f}"])
-            name = curve.setting if curve.family else without_field(curve.setting)
-            colour = SHOWN.get(curve.family, ("#9aa5b1", "."))[0]
-            axes.plot(curve.both_ends_ms, percent, "o", color=colour, markersize=5)
-            axes.annotate(
-                name,
-                (curve.both_ends_ms, percent),
-                fontsize=6,
-                xytext=(4, 2),
-                textcoords="offset points",
-            )
-        axes.set(
-            xlabel="processor time of both ends, ms a frame",
-            xscale="log",
-            ylabel=f"bytes at {MIDDLE_DB:g} dB, % of {anchor.setting}",
-            ylim=(0, None),
-        )
+            at = (curve.both_ends_ms, percent)
+            axes.plot(*at, "o", color=SHOWN.get(curve.family, ("#9aa5b1", "."))[0], markersize=5)
+            if percent < least or not curve.family:
+                name = curve.setting if curve.family else without_field(curve.setting)
+                axes.annotate(
+                    name, at, (0, -11), textcoords="offset points", fontsize=7, ha="center"
+                )
+            least = min(least, percent)
+        axes.set(xlabel="processor time of both ends, ms a frame", xscale="log", ylim=(0, None))
+        axes.set_ylabel(f"bytes at {MIDDLE_DB:g} dB, % of\n{anchor.setting}")
     return figure, lines
 
 
