@@ -35,12 +35,6 @@ class RunningClient:
     client: StreamClient
     task: asyncio.Task[None]
 
-    def ended(self) -> bool:
-        """Whether it has; then no picture of its stream is left without an end."""
-        if self.task.done():
-            self.client.abandon("its stream was given up")
-        return self.task.done()
-
 
 class TileStream:
     """A tile's stream: prepared, open, or closed; ``retry_at_s`` holds both back after an error."""
@@ -135,7 +129,8 @@ class TileStream:
             ended.append(self._preparing)
             self._preparing = None
         for running in self._running():
-            if running.ended():
+            if running.task.done():
+                running.client.abandon("its stream was given up")
                 ended.append(running.task)
                 self._forget(running)
         self._take_over()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -33,7 +33,6 @@ from rfcore.wire.tile_manifest import TileVersions
 __all__ = [
     "Recordings",
     "SeenPass",
-    "as_sent",
     "by_light",
     "hour_of",
     "light_of",
@@ -123,7 +122,7 @@ def light_of(
 ) -> tuple[tuple[float, float, float], str | None]:
     """Return the log gains of a pass's colours over the tile's own field, and the light it fits."""
     looked_at = spread(drive.pictures, LOOKED_AT)
-    frames = [SeenFrame(as_sent(picture.camera), picture.read(), 0) for picture in looked_at]
+    frames = [SeenFrame(picture.camera.rounded(), picture.read(), 0) for picture in looked_at]
     differences = {
         name: float(np.median([_difference(field, frame) for frame in frames]))
         for name, field in fields.items()
@@ -176,7 +175,3 @@ def _same_light(first: SeenPass, second: SeenPass) -> bool:
 def _unused(name: str, taken: Set[str]) -> str:
     names = (name if number == 1 else f"{name}-{number}" for number in count(1))
     return next(each for each in names if each not in taken)
-
-
-def as_sent(camera: Camera) -> Camera:
-    return replace(camera, world_from_cam=camera.world_from_cam.rounded())

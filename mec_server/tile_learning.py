@@ -13,7 +13,7 @@ of a vehicle, which a certificate ties to it where the server asks for one.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -26,7 +26,6 @@ import structlog
 from mec_server.recorded_passes import (
     Recordings,
     SeenPass,
-    as_sent,
     by_light,
     hour_of,
     light_of,
@@ -34,7 +33,6 @@ from mec_server.recorded_passes import (
     readable,
 )
 from mec_server.tile_history import LEARNING, Learnt, TileHistory, read_histories, write_histories
-from rfcore.dataset.recorded_session import RecordedPart
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField, save_field
 from rfcore.field.store import load_checked
@@ -172,7 +170,8 @@ class TileLearner:
             if new < CHECK_EVERY:
                 continue
             self._keep(checked={**self.history.checked, key: len(pictures)})
-            drive = self._pass_of(part, {one.field_id}, self._open(one.replaced_id))
+            origin = self._open(one.replaced_id).metadata.tile_origin
+            drive = pass_of(part, {one.field_id}, origin)
             worse = self._percent_worse(one, drive)
             if worse > self._job.settings().max_loss_percent:
                 self._withdraw(one, drive.identity, worse)
@@ -184,7 +183,7 @@ class TileLearner:
         if len(newest.pictures) < CHECK_FRAMES or not without_outliers(after, [newest]):
             return 0.0
         frames = [
-            SeenFrame(as_sent(picture.camera), picture.read(), 0) for picture in newest.pictures
+            SeenFrame(picture.camera.rounded(), picture.read(), 0) for picture in newest.pictures
         ]
         return -saved_percent(try_field(before, frames), try_field(after, frames))[0]
 
@@ -283,14 +282,14 @@ class TileLearner:
             return learn(base, passes, replace(self._job.settings(), learn_as=learn_as), told)
         finally:
             spent = (self._now_ms(), time.process_time() - began_s)
-            self._keep(cpu=(*self._cpu_of_thehour_of(), spent))
+            self._keep(cpu=(*self._cpu_of_the_hour(), spent))
 
-    def _cpu_of_thehour_of(self) -> tuple[tuple[int, float], ...]:
+    def _cpu_of_the_hour(self) -> tuple[tuple[int, float], ...]:
         since_ms = self._now_ms() - HOUR_MS
         return tuple((at, spent) for at, spent in self.history.cpu if at > since_ms)
 
     def _cpu_left_s(self) -> float:
-        return self._job.cpu_s_per_h - sum(spent for _, spent in self._cpu_of_thehour_of())
+        return self._job.cpu_s_per_h - sum(spent for _, spent in self._cpu_of_the_hour())
 
     def _publish(
         self,
@@ -369,17 +368,13 @@ class TileLearner:
         own = self._open(tile.field_id)
         fields = {"": own, **{one.name: self._open(one.field_id) for one in tile.lights}}
         for part in readable(files):
-            drive = self._pass_of(part, frozenset(versions.field_ids), own)
+            drive = pass_of(part, frozenset(versions.field_ids), own.metadata.tile_origin)
             if len(drive.pictures) >= FEWEST_FRAMES:
                 few = replace(drive, pictures=tuple(spread(drive.pictures, self._job.frames)))
                 first_ns = part.pictures[0].capture_time_ns
                 yield SeenPass(
                     self._recordings.name_of(part.file), few, first_ns, *light_of(few, fields)
                 )
-
-    @staticmethod
-    def _pass_of(part: RecordedPart, field_ids: Set[str], in_tile_of: RadianceField) -> Pass:
-        return pass_of(part, field_ids, in_tile_of.metadata.tile_origin)
 
     # --- fields
 

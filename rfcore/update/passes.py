@@ -6,7 +6,7 @@ Every fourth frame of a pass is held back for the trial; poses are rounded as ve
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +77,7 @@ def split_frames(passes: Sequence[Pass], most: int) -> tuple[list[SeenFrame], li
     held_back: list[SeenFrame] = []
     for number, drive in enumerate(passes):
         for place, picture in enumerate(spread(drive.pictures, max(2, most // len(passes)))):
-            camera = replace(picture.camera, world_from_cam=picture.camera.world_from_cam.rounded())
+            camera = picture.camera.rounded()
             frame = SeenFrame(camera, picture.read(), number)
             is_held_back = place % HOLD_BACK_EVERY == HOLD_BACK_EVERY // 2
             (held_back if is_held_back else learnt).append(frame)

@@ -199,13 +199,13 @@ def x264_lowdelay(preset: str, name: str | None = None, **params: str) -> Rival:
 def x264_for_psnr(preset: str) -> Rival:
     """Return the same with ``tune=psnr``, as whoever compares PSNRs should have it."""
     plain = x264_lowdelay(preset, f"x264-lowdelay-psnr-{preset}")
-    return replace(plain, options={**plain.options, "tune": "zerolatency,psnr"})
+    return _tuned(plain, "psnr")
 
 
 def x264_for_ssim(preset: str) -> Rival:
     """Return the same with ``tune=ssim``, for a comparison by SSIM."""
     plain = x264_lowdelay(preset, f"x264-lowdelay-ssim-{preset}")
-    return replace(plain, options={**plain.options, "tune": "zerolatency,ssim"})
+    return _tuned(plain, "ssim")
 
 
 OUR_TOOLS = {"mixed-refs": "1", "ref": "3", "trellis": "2", "aq-mode": "0", "psy": "0"}
@@ -223,7 +223,12 @@ def x264_with_our_tools(preset: str) -> Rival:
     if preset in MORE_REFERENCES:
         del tools["ref"]
     plain = x264_lowdelay(preset, f"x264-our-tools-{preset}", **tools)
-    return replace(plain, options={**plain.options, "tune": "zerolatency,psnr"})
+    return _tuned(plain, "psnr")
+
+
+def _tuned(plain: Rival, metric: str) -> Rival:
+    """Return an x264 of low delay tuned for a metric besides."""
+    return replace(plain, options={**plain.options, "tune": f"zerolatency,{metric}"})
 
 
 def x265_lowdelay(preset: str) -> Rival:

@@ -132,9 +132,9 @@ COUNTED: tuple[tuple[str, Callable[[Sample], int]], ...] = (
 
 
 def _least(samples: Sequence[Sample], count: Callable[[Sample], int]) -> list[int]:
-    """Return the least there was in each quarter; there must be four samples."""
+    """Return the least there was in each quarter; a short run has samples that count twice."""
     edges = [len(samples) * quarter // QUARTERS for quarter in range(QUARTERS + 1)]
-    return [min(map(count, samples[begin:end])) for begin, end in pairwise(edges)]
+    return [min(map(count, samples[begin : max(end, begin + 1)])) for begin, end in pairwise(edges)]
 
 
 def _lost(run: Run) -> list[str]:

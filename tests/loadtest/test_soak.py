@@ -55,3 +55,8 @@ def test_a_thing_that_comes_and_goes_is_no_growth() -> None:
     samples = looks()
     samples[9] = Sample(540.0, 0.0, 0.0, 200.0, 41, 9, 2)
     assert what_grew(samples) == []
+
+
+def test_a_run_too_short_for_quarters_is_judged_all_the_same() -> None:
+    assert what_grew(looks()[:2]) == []
+    assert what_grew(looks(descriptors=41)[5:8]) == ["descriptors grew from 40 to 41"]

@@ -4,7 +4,6 @@ import errno
 import os
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +31,9 @@ from rfcore.wire.publish import Ground, publish
 from rfcore.wire.settings import LogForm
 from rfcore.wire.tile_manifest import MANIFEST, VersionLabel
 from rfcore.wire.tiles import Tile, TileLight
+from tests.update.conftest import NOW, NOW_MS
 
 MakePass = Callable[..., Pass]
-NOW_MS = 1_767_290_400_000
-"""18:00 UTC, as in conftest."""
-NOW = datetime.fromtimestamp(NOW_MS / 1e3, UTC)
 
 
 def elsewhere(drive: Pass) -> Pass:

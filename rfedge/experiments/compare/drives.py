@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from rfcore.codec.h264.config import check_effort
 from rfcore.codec.references import RENDER_ONLY, References
 from rfcore.errors import InvalidInput
-from rfcore.field import RadianceField
+from rfcore.field import RadianceField, load_field
 from rfcore.train import mean_psnr_db
 from rfedge.experiments.cells import program_version
 from rfedge.experiments.clips import (
@@ -212,20 +213,25 @@ class CompareJob:
 class DriveComparison:
     """One drive with everybody who codes it, ours (``methods``) from what the field shows.
 
-    ``field_bytes``: size of the field's archive.
+    ``field``: the field's archive.
     ``foregrounds``: bool [H, W] a frame, what differs from the empty street, if a ``background``
     drive shows that; else nothing. ``background``: its digest.
     """
 
     clip: Clip
     rendered: RenderedClip
-    field_bytes: int
+    field: Path
     foregrounds: Sequence[NDArray[np.bool_]]
     background: str | None
     methods: Sequence[FieldCoder]
     families: Mapping[str, Sequence[ClipCoder]]
     for_ssim: Mapping[str, Sequence[ClipCoder]]
     foreground_only: ForegroundCoder | None
+
+    @property
+    def field_bytes(self) -> int:
+        """Size of the field's archive."""
+        return self.field.stat().st_size
 
     @property
     def compared(self) -> list[ClipCoder]:
@@ -254,15 +260,16 @@ def read_drive_comparisons(job: CompareJob) -> list[DriveComparison]:
     unknown = behind.keys() - {_name(drive.name) for drive in drives}
     if unknown:
         raise InvalidInput("background", f"there is no drive {sorted(unknown)} to stand behind")
+    open_field = cache(load_field)
     comparisons = []
     for given in slow:
-        drive, field = given.read(None)
-        comparisons.append(_drive_comparison(job, drive.every(DECIMATION), None, field, given))
+        drive = read_drive(given.name).every(DECIMATION)
+        comparisons.append(_drive_comparison(job, given, drive, None, open_field(given.field)))
     for given in drives:
-        drive, field = given.read(limit)
-        name = behind.get(_name(given.name))
+        drive, name = read_drive(given.name, limit), behind.get(_name(given.name))
         background = None if name is None else read_drive(name, limit)
-        comparisons.append(_drive_comparison(job, drive, background, field, given))
+        field = open_field(given.field)
+        comparisons.append(_drive_comparison(job, given, drive, background, field))
     return comparisons
 
 
@@ -272,10 +279,10 @@ def _name(name: DriveName) -> tuple[str, float]:
 
 def _drive_comparison(
     job: CompareJob,
+    given: DriveOfField,
     drive: Drive,
     background: Drive | None,
     field: RadianceField,
-    given: DriveOfField,
 ) -> DriveComparison:
     clip = drive.clip(field_psnr_db=mean_psnr_db(field, drive.pictures))
     families = rival_families(job.preset, quick=job.quick)
@@ -305,7 +312,7 @@ def _drive_comparison(
     return DriveComparison(
         clip,
         rendered,
-        given.field.stat().st_size,
+        given.field,
         foregrounds,
         behind,
         coders,

@@ -46,8 +46,8 @@ __all__ = [
 
 WINDOWS_DB: tuple[Window, ...] = (HEADLINE_DB, (30.0, 33.0), (30.0, 35.0), (35.0, 38.0))
 """The headline window first."""
-ANCHORS = ("x264-lowdelay", "x264-our-tools")
-"""How the names of families begin that are compared over the other windows, too."""
+ANCHORS_AND_BEST = ("x264-lowdelay", "x264-our-tools", BEST, BEST_OF_ANY_CPU)
+"""How the names begin of those that are compared over the other windows, too."""
 SSIM_WINDOW: Window = (0.88, 0.92)
 """Mean SSIM of the luma: about what 33 to 35 dB show on the streets at hand."""
 SAVING_AT_DB = (31.0, 33.0, 35.0)
@@ -71,20 +71,28 @@ def compare_rows(
     30 dB before a bit is sent. Raises ``InvalidInput`` when a curve does not span the first.
     """
     headline, *wider = windows_db
-    rows = [
-        _row(clip, method, name, rival, headline)
-        for name, rival in _chosen(method, families, headline).items()
-    ]
+    rows = _window_rows(clip, method, families, headline)
     everybody = [method, *chain.from_iterable(families.values())]
     for window in wider:
         if all(each.steady.spans(window) for each in everybody):
             with suppress(InvalidInput):  # resampled clips leave the window
-                rows += [
-                    _row(clip, method, name, rival, window)
-                    for name, rival in _chosen(method, families, window).items()
-                    if name.startswith((*ANCHORS, BEST, BEST_OF_ANY_CPU))
-                ]
+                rows += _window_rows(clip, method, families, window, ANCHORS_AND_BEST)
     return rows
+
+
+def _window_rows(
+    clip: Clip,
+    method: Performance,
+    families: Mapping[str, Sequence[Performance]],
+    window: Window,
+    begins: tuple[str, ...] = ("",),
+) -> list[CompareRow]:
+    """Return the rows of one window against those whose name begins as one of ``begins``."""
+    return [
+        _row(clip, method, name, rival, window)
+        for name, rival in _chosen(method, families, window).items()
+        if name.startswith(begins)
+    ]
 
 
 def _chosen(
@@ -165,23 +173,17 @@ def ssim_rows(
     low, high = SSIM_WINDOW
     window = (ssim_db(low), ssim_db(high))
     ours = ssim_curve(method.clips, STEADY)
-    rows = []
-    for family, rivals in families.items():
-        for rival in rivals:
-            theirs = ssim_curve(rival.clips, STEADY)
-            if ours.spans(window) and theirs.spans(window):
-                rows.append(
-                    SsimRow(
-                        clip.scene,
-                        clip.rate_hz,
-                        method.name,
-                        family,
-                        rival.name,
-                        SSIM_WINDOW,
-                        bd_rate_percent(theirs, ours, window),
-                    )
-                )
-    return rows
+    curves = [
+        (family, rival.name, ssim_curve(rival.clips, STEADY))
+        for family, rivals in families.items()
+        for rival in rivals
+    ]
+    drive = (clip.scene, clip.rate_hz, method.name)
+    return [
+        SsimRow(*drive, family, name, SSIM_WINDOW, bd_rate_percent(theirs, ours, window))
+        for family, name, theirs in curves
+        if ours.spans(window) and theirs.spans(window)
+    ]
 
 
 def _middle(performance: Performance, window: Window) -> CodedClip:

@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 
 from rfedge.experiments.cells import CellStore, clip_key
-from rfedge.experiments.clips import ClipCoder, DriveName, DriveOfField
+from rfedge.experiments.clips import ClipCoder
 from rfedge.experiments.compare.bit_split import SplitClip, split_rows
 from rfedge.experiments.compare.drives import CompareJob, DriveComparison, read_drive_comparisons
 from rfedge.experiments.compare.foreground import foreground_row
@@ -45,12 +45,9 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
     Raises ``InvalidInput`` or ``DatasetError`` before anything is coded if an input is wrong, and
     ``InvalidInput`` after the ends of the curves if one cannot span the window.
     """
-    given = [DriveOfField.parse(text, job.field) for text in (*job.drives, *job.decimated)]
-    for text in job.backgrounds:
-        DriveName.parse(text)
     comparisons = read_drive_comparisons(job)
-    fields = list(dict.fromkeys(drive.field for drive in given))
-    store, made = CellStore(job.cells), provenance(fields)
+    fields = dict.fromkeys(comparison.field for comparison in comparisons)
+    store, made = CellStore(job.cells), provenance(list(fields))
     _announce(job, comparisons, store, console)
     for comparison in comparisons:
         _check_window(job, comparison, store, console)
@@ -127,12 +124,13 @@ def _tables(
         # Its whole picture has a ceiling below any window: it is not asked to span one.
         theirs = performed(comparison.foreground_only, None).clips
         foreground = [foreground_row(clip, methods[0].clips, theirs, comparison.foregrounds)]
-    windows = [job.windows_db, *[job.windows_db[:1]] * (len(methods) - 1)]
     return {
         "rows": [
             row
-            for method, asked in zip(methods, windows, strict=True)
-            for row in compare_rows(clip, method, families, asked)
+            for method in methods
+            for row in compare_rows(
+                clip, method, families, job.windows_db if method is methods[0] else [window]
+            )
         ],
         "ssim": ssim_rows(clip, methods[0], for_ssim),
         "break_even": [break_even_row(clip, m, anchor, field_bytes) for m in methods],
