@@ -25,7 +25,6 @@ from mec_server.event_loop import Workers
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Ledger
 from mec_server.twin.composition import (
-    MOST_DISTANCE_M,
     ComposedView,
     LivePicture,
     compose,
@@ -39,6 +38,7 @@ from rfcore.errors import AccessDenied, InvalidInput
 from rfcore.field import RadianceField
 from rfcore.field.quality import FULL
 from rfcore.image import Rgb, jpeg_bytes, png_bytes
+from rfcore.native.live_view import MOST_DISTANCE_M
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import View
 from rfcore.wire.checks import shown

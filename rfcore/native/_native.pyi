@@ -170,6 +170,28 @@ def warp_i420(
     threads: int,
 ) -> int: ...
 
+# --- live_view --------------------------------------------------------------
+
+def live_difference(
+    picture: _U8,
+    colour: _F32,
+    opacity: _F32,
+    light: Sequence[float],
+    limits: Sequence[float],
+    difference: _F32,
+    share: _F32,
+) -> None: ...
+def carry_to_view(
+    colour: _F32,
+    opacity: _F32,
+    depth: _F32,
+    camera: Sequence[float],
+    sources: Sequence[tuple[_F32, _F32, Sequence[float]]],
+    limits: Sequence[float],
+    rgb: _U8,
+    chosen: _U8,
+) -> None: ...
+
 # --- h264 -------------------------------------------------------------------
 
 class SliceCoder:

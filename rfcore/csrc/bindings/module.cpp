@@ -6,6 +6,7 @@ namespace nb = nanobind;
 namespace rfcore {
 void bind_blake2b(nb::module_& m);
 void bind_h264(nb::module_& m);
+void bind_live_view(nb::module_& m);
 void bind_ngp(nb::module_& m);
 void bind_pcm(nb::module_& m);
 void bind_raster(nb::module_& m);
@@ -17,6 +18,7 @@ NB_MODULE(_native, m) {
     m.doc() = "Bit-exact kernels of rfcore; use the wrappers in rfcore.native.";
     rfcore::bind_blake2b(m);
     rfcore::bind_h264(m);
+    rfcore::bind_live_view(m);
     rfcore::bind_ngp(m);
     rfcore::bind_pcm(m);
     rfcore::bind_raster(m);

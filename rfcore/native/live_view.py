@@ -1,0 +1,167 @@
+"""What a live picture changes in a field, and several of those carried to another view of it.
+
+``csrc/picture/live_view.cpp`` computes exactly what is defined here, in float32 without fused
+operations: the same bytes on every machine.
+
+*Change* (``live_difference``). A picture is ``gain * colour + offset`` in the light of the day; its
+difference from the field's render, in the light of the field, is
+``(picture - offset) / gain - level(colour)`` for red, green and blue, where ``level`` is
+``round(clip(255 c, 0, 255))``, halves to even. The mean difference over 7x7 pixels (the edge
+repeated; rows summed from above, then columns from the left), of the channel where it is largest,
+below ``NOISE_LEVELS`` is noise, from ``CHANGE_LEVELS`` on a change; between, that share of the
+difference is kept. Without a surface of the field (opacity of at most ``COVERED``) none is.
+
+*Carrying* (``carry_to_view``). Pixel (x, y) of the view, of depth z, has the ray
+((x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy, 1). With R, t mapping points of the view's axes into
+those of a live camera, row terms first::
+
+    T = R[:, 0] * ray_x + (R[:, 1] * ray_y + R[:, 2]);   P = z * T + t
+    (u, v) = (Px / Pz * fx' + (cx' - 0.5), Py / Pz * fy' + (cy' - 0.5))
+
+The camera *vouches* for the pixel when the view's opacity is above ``COVERED``, Pz lies between
+``NEAREST_M`` and ``MOST_DISTANCE_M``, (u, v) inside its outer sample centres, the field has a
+surface there at depth d with ``|d - Pz| < 0.08 Pz + 0.1`` (else another one is in front), the angle
+between P and T has a cosine c > ``LEAST_COSINE``, and it sees the surface with at least a quarter
+of the view's resolution, ``r = fx' / fx * z / Pz``. Its weight is the source's times
+``c**4 * min(r, 1) * (1 - Pz / MOST_DISTANCE_M)``.
+
+Its change is taken at (u, v) bilinearly, times the source's ``fade``. Of several that vouch, the
+weighted median by the sum of the three channels counts: one that is alone with its opinion is
+outvoted by two. The picture is ``level(colour)`` plus that, rounded and clamped likewise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera
+from rfcore.errors import InvalidInput
+from rfcore.image import Rgb
+from rfcore.native import _native
+from rfcore.views import View
+
+__all__ = [
+    "COVERED",
+    "MOST_DISTANCE_M",
+    "MOST_SOURCES",
+    "NOBODY",
+    "OWN_LIGHT",
+    "Light",
+    "LiveSource",
+    "carry_to_view",
+    "live_difference",
+]
+
+COVERED = 0.5
+"""Opacity above which the field has a surface."""
+NOISE_LEVELS, CHANGE_LEVELS = 10.0, 20.0
+
+MOST_DISTANCE_M = 40.0
+"""How far from a camera its picture vouches."""
+NEAREST_M = 0.1
+RELATIVE_DEPTH, ABSOLUTE_DEPTH_M = 0.08, 0.1
+"""As in the codec's warp: what differs more is another surface."""
+LEAST_COSINE = 0.5
+LEAST_RESOLUTION = 0.25
+
+MOST_SOURCES = 16
+NOBODY = 255
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Light:
+    """A picture is ``gain`` times the field's colour plus ``offset`` levels, for each of RGB."""
+
+    gain: tuple[float, float, float]
+    offset: tuple[float, float, float]
+
+
+OWN_LIGHT = Light((1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class LiveSource:
+    """A live picture's ``difference`` (float32 [H, W, 3]) and the field's ``depth`` (float32
+    [H, W], metres) at its ``camera``; ``weight`` and ``fade`` are of the whole picture."""
+
+    camera: Camera
+    difference: F32
+    depth: F32
+    weight: float
+    fade: float
+
+
+def live_difference(rgb: Rgb, view: View, light: Light) -> tuple[F32, F32]:
+    """Return what ``rgb``, uint8 [H, W, 3], changes in the field that shows ``view`` there.
+
+    The first is the change in levels, float32 [H, W, 3]; the second, float32 [H, W], what share of
+    the difference it is. Raises ``InvalidInput`` for a picture of another size than the view.
+    """
+    if rgb.shape != view.colour.shape or rgb.dtype != np.uint8:
+        raise InvalidInput(
+            "picture", f"{rgb.dtype} {rgb.shape} beside a view {view.colour.shape}; uint8 is wanted"
+        )
+    difference, share = np.empty(rgb.shape, np.float32), np.empty(rgb.shape[:2], np.float32)
+    _native.live_difference(
+        np.ascontiguousarray(rgb),
+        np.ascontiguousarray(view.colour),
+        np.ascontiguousarray(view.opacity),
+        [*light.gain, *light.offset],
+        [NOISE_LEVELS, CHANGE_LEVELS, COVERED],
+        difference,
+        share,
+    )
+    return difference, share
+
+
+def carry_to_view(
+    camera: Camera, view: View, sources: Sequence[LiveSource]
+) -> tuple[Rgb, NDArray[np.uint8]]:
+    """Return ``view``, the field's render at ``camera``, with what ``sources`` change in it.
+
+    The first is the picture, uint8 [H, W, 3]; the second, uint8 [H, W], which source vouches for a
+    pixel, ``NOBODY`` where it is the field's. Raises ``InvalidInput`` for more than
+    ``MOST_SOURCES``.
+    """
+    if len(sources) > MOST_SOURCES:
+        raise InvalidInput("sources", f"{len(sources)} are more than {MOST_SOURCES}")
+    rgb = np.empty(view.colour.shape, np.uint8)
+    chosen = np.empty(rgb.shape[:2], np.uint8)
+    _native.carry_to_view(
+        np.ascontiguousarray(view.colour),
+        np.ascontiguousarray(view.opacity),
+        np.ascontiguousarray(view.depth),
+        _pinhole(camera),
+        [_numbers(source, camera) for source in sources],
+        [
+            NEAREST_M,
+            MOST_DISTANCE_M,
+            RELATIVE_DEPTH,
+            ABSOLUTE_DEPTH_M,
+            LEAST_COSINE**2,
+            LEAST_RESOLUTION,
+            COVERED,
+        ],
+        rgb,
+        chosen,
+    )
+    return rgb, chosen
+
+
+def _numbers(source: LiveSource, camera: Camera) -> tuple[F32, F32, list[float]]:
+    motion = source.camera.cam_from_world().compose(camera.world_from_cam)
+    numbers = [value for row in motion.rotation_matrix() for value in row]
+    numbers += [*motion.translation_m, *_pinhole(source.camera), source.weight, source.fade]
+    depth, difference = map(np.ascontiguousarray, (source.depth, source.difference))
+    return difference, depth, numbers
+
+
+def _pinhole(camera: Camera) -> list[float]:
+    k = camera.intrinsics
+    return [k.fx_px, k.fy_px, k.cx_px, k.cy_px]
