@@ -16,9 +16,8 @@ from pathlib import Path
 from cav_agent.capture_schedule import ROUNDING_S
 from cav_agent.frames import Capture, FrameResult
 from cav_agent.live.address import SourceKind
-from cav_agent.live.process import ReaderProcess
 from cav_agent.live.settings import LiveSettings, ReaderSettings
-from cav_agent.live.source import LiveFrame, LiveSource, SourceObserver, SourceThread
+from cav_agent.live.source import LiveFrame, LiveSource, ReaderProcess, SourceObserver, SourceThread
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin, Vec3
 from rfcore.dataset.recording import RecordedPoses, RecordingCamera, read_recording_camera
 from rfcore.dataset.undistort import pinhole_of, undistorted

@@ -4,10 +4,15 @@
 its clocks and its reader are arguments. ``SourceThread`` is the thread that steps it. A source that
 says nothing for ``timeout_s`` is closed, which kills its process, and opened again after a pause
 that grows up to ``LONGEST_PAUSE_S``. There is one process and one thread at any time.
+``ReaderProcess`` starts it, reads it with a time limit, and kills it.
 """
 
 from __future__ import annotations
 
+import os
+import select
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +22,8 @@ from typing import Protocol
 
 from cav_agent.backoff import Backoff
 from cav_agent.live.clock import CaptureClock
-from cav_agent.live.record import EndRecord, FrameRecord, Record
+from cav_agent.live.record import HEADER_BYTES, EndRecord, FrameRecord, Header, Record, record_of
+from cav_agent.live.settings import ReaderSettings
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.image import Rgb
 from rfcore.wire.sensing import ClockKind
@@ -27,10 +33,65 @@ __all__ = [
     "LiveFrame",
     "LiveSource",
     "Reader",
+    "ReaderProcess",
     "SourceObserver",
     "SourceProblem",
     "SourceThread",
 ]
+
+BODY_TIMEOUT_S = 5.0
+"""For the rest of a record that has begun: the pipe's other end has it in memory."""
+
+
+class ReaderProcess:
+    """``cav_agent.live.reader`` on one source; ``close`` kills it."""
+
+    def __init__(self, settings: ReaderSettings) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "cav_agent.live.reader", settings.to_json()],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+        )
+        if self._process.stdout is None:
+            raise RfedgeError("the camera's reader has no output")
+        self._output = self._process.stdout.fileno()
+
+    def read(self, timeout_s: float) -> Record | None:
+        """Return the next record, or None if none begins in time; raise ``RfedgeError``."""
+        if not self._is_readable(timeout_s):
+            return None
+        header_bytes = self._exactly(HEADER_BYTES)
+        if header_bytes is None:
+            return EndRecord("the camera's reader died")
+        header = Header.parsed(bytes(header_bytes))
+        body = self._exactly(header.length)
+        return EndRecord("the camera's reader died") if body is None else record_of(header, body)
+
+    def close(self) -> None:
+        """Kill it and wait for its end."""
+        self._process.kill()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
+        self._process.wait(10.0)
+
+    def _is_readable(self, timeout_s: float) -> bool:
+        return bool(select.select([self._output], [], [], timeout_s)[0])
+
+    def _exactly(self, count: int) -> bytearray | None:
+        """Read so many bytes; ``None`` if the output ends before."""
+        data = bytearray(count)
+        view, have = memoryview(data), 0
+        while have < count:
+            if not self._is_readable(BODY_TIMEOUT_S):
+                raise RfedgeError("the camera's reader stopped within a frame")
+            got = os.readv(self._output, [view[have:]])
+            if not got:
+                return None
+            have += got
+        return data
+
 
 NS = 1_000_000_000
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
@@ -68,7 +129,7 @@ class LiveFrame:
 
 
 class Reader(Protocol):
-    """What reads a source (``cav_agent.live.process``)."""
+    """What reads a source (``cav_agent.live.source``)."""
 
     def read(self, timeout_s: float) -> Record | None:
         """Return the next record, or None if none came in time; raise ``RfedgeError``."""

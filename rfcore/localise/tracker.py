@@ -14,7 +14,7 @@ rendered at the pose to send, or that the camera is not known to be anywhere.
   is of the render at the very pose to be sent; a pose that does not pass is never sent.
 
 Measured poses are priors of searches, never poses to send. While tracking, the sensor's bias is
-learnt (``rfcore.localise.sensor_bias``), so that a constant error is paid for once.
+learnt (``rfcore.localise.measured_poses``), so that a constant error is paid for once.
 """
 
 from __future__ import annotations

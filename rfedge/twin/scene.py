@@ -149,7 +149,7 @@ class TwinScene:
         parts: tuple[bytes, ...],
         now_s: float,
     ) -> None:
-        """Show how ``picture`` differs from its field's render; see ``rfedge.twin.comparison``."""
+        """Show how ``picture`` differs from its field's render; see ``rfedge.twin.comparing``."""
         header = {
             "kind": "comparison",
             **_name(picture.key),

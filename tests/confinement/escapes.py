@@ -17,8 +17,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from rfcore.confinement.confine import Confinement, ProcessLimits, confine
-from rfcore.confinement.landlock import restrict_files_and_ports
+from rfcore.confinement.confine import Confinement, ProcessLimits, confine, restrict_files_and_ports
 from rfcore.confinement.start import ConfinedProgram
 
 LIBC = ctypes.CDLL(None, use_errno=True)

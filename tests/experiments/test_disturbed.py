@@ -8,7 +8,7 @@ import pytest
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfedge.experiments.clips import CodedClip
-from rfedge.experiments.robust.disturbed import PoseNoise, kbit_at, noisy_cameras
+from rfedge.experiments.robust.run import PoseNoise, kbit_at, noisy_cameras
 
 K = Intrinsics(64, 36, 50.0, 50.0, 32.0, 18.0)
 CAMERAS = [Camera(K, Pose((1.0 * k, 2.0, 3.0), (0.8, 0.0, 0.6, 0.0))) for k in range(2000)]

@@ -124,7 +124,7 @@ async def test_streams_of_one_agent_process_may_share_a_camera(
 async def test_an_agent_that_fell_silent_is_replaced_by_another_and_told_why(
     coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mec_server.ledger.active_cameras.CAMERA_SILENT_S", 0.0)
+    monkeypatch.setattr("mec_server.ledger.entry.CAMERA_SILENT_S", 0.0)
     async with (
         serve() as server,
         raw_vehicle(server.address) as silent,

@@ -8,7 +8,7 @@ import pytest
 from rfcore.camera import Intrinsics, Pose
 from rfcore.wire.twin import PictureEncoding, TwinPicture
 from rfedge.loadtest.rig.report import CameraRow, SessionRow, rig_section
-from rfedge.loadtest.rig.shown import instants_apart, spreads_of
+from rfedge.loadtest.rig.run import instants_apart, spreads_of
 from rfedge.results import make_result, provenance
 
 

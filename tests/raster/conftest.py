@@ -9,7 +9,7 @@ from forward_isas import WORST_CASE, forward_isas
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.native.backend import available_isas
 from rfcore.raster.gaussians import Gaussians
-from rfcore.raster.opencl import Device, opening
+from rfcore.raster.opencl import Device, self_check
 from rfcore.raster.opencl.device import BUILDS, Build, build_device, find_device
 from rfcore.raster.opencl.self_check import check_device
 
@@ -70,9 +70,9 @@ def worst_case_device() -> Iterator[None]:
         check_device(device)
         return device
 
-    first_exact = opening._first_exact
+    first_exact = self_check._first_exact
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(opening, "_first_exact", open_first)
+        patch.setattr(self_check, "_first_exact", open_first)
         yield
 
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from mec_server.ledger.active_cameras import CAMERA_SILENT_S, ActiveCameras
 from mec_server.ledger.budgets import Limit
+from mec_server.ledger.entry import CAMERA_SILENT_S, ActiveCameras
 from rfcore.errors import LimitExceeded
 from rfcore.wire.messages import Hello
 

@@ -5,7 +5,7 @@ import pytest
 
 from rfcore.field import SplatField
 from rfcore.image import rgb_from_bytes
-from rfedge.twin.comparison import BLOCK_PX, Comparison, compared, largest_disagreement
+from rfedge.twin.comparing import BLOCK_PX, Comparison, compared, largest_disagreement
 from rfedge.twin.scene import SeenPicture
 from wall_scene import WALL_M, seen
 

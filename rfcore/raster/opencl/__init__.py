@@ -1,12 +1,12 @@
 """The forward renderer on OpenCL devices: the bytes of the native kernels, or no picture at all.
 
-``device`` finds and builds, ``renderer`` draws, ``self_check`` proves a device before it is used,
-``opening`` ties them together. Everything that decides a byte stands in the ``.cl`` files, which
-follow ``rfcore/csrc/raster`` operation by operation; the host only counts.
+``device`` finds and builds, ``renderer`` draws, ``self_check`` proves a device before it is opened.
+Everything that decides a byte stands in the ``.cl`` files, which follow ``rfcore/csrc/raster``
+operation by operation; the host only counts.
 """
 
 from rfcore.raster.opencl.device import Device, DeviceFull, DeviceLost
-from rfcore.raster.opencl.opening import open_device
 from rfcore.raster.opencl.renderer import DeviceRasterizer
+from rfcore.raster.opencl.self_check import open_device
 
 __all__ = ["Device", "DeviceFull", "DeviceLost", "DeviceRasterizer", "open_device"]

@@ -4,22 +4,74 @@ What a driver says of itself is no gate: one that reports neither fused multiply
 rounding may be exact, and another that reports both may contract. So its arithmetic is compared on
 bit patterns and whole pictures with the digests of the native kernels, which reach every path:
 all SH degrees, both modes, splats of all sizes, ties, several batches a tile, opaque pixels.
+
+``open_device`` opens one for the process, and only once it has passed.
 """
 
 from __future__ import annotations
 
 import hashlib
+from threading import Lock
+from time import perf_counter
 
 import numpy as np
+import structlog
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import BackendUnavailable
 from rfcore.extras import needs
 from rfcore.raster.gaussians import F32, Gaussians
-from rfcore.raster.opencl.device import Device, DeviceLost
+from rfcore.raster.opencl.device import BUILDS, Device, DeviceLost, build_device, find_device
 from rfcore.raster.opencl.renderer import SIDE, DeviceRasterizer
+from rfcore.raster.renderers import DEVICES
 from rfcore.views import View
+
+__all__ = ["open_device"]
+
+log = structlog.get_logger()
+_opened: dict[str, Device] = {}
+_lock = Lock()
+
+
+def open_device(wanted: str = "") -> Device:
+    """Return the device of a name (``find_device``), opened and checked once in a process.
+
+    The builds are tried in their order. Raises ``BackendUnavailable`` with what was wrong with
+    each when none is exact.
+    """
+    with _lock:
+        if wanted not in _opened:
+            _opened[wanted] = _first_exact(wanted)
+        return _opened[wanted]
+
+
+def _first_exact(wanted: str) -> Device:
+    found, problems = find_device(wanted), []
+    for build in BUILDS:
+        begin = perf_counter()
+        try:
+            device = build_device(found, build)
+            check_device(device)
+        except BackendUnavailable as error:
+            log.warning("opencl build refused", build=build.name, problem=str(error))
+            problems.append(str(error))
+            continue
+        DEVICES.add_opened(device.name, device.driver, build.name)
+        log.info(
+            "opencl device opened",
+            device=device.name,
+            driver=device.driver,
+            build=build.name,
+            self_check="exact",
+            seconds=round(perf_counter() - begin, 2),
+        )
+        return device
+    raise BackendUnavailable(
+        f"{'; '.join(problems)}: pictures of this device would not be those of the other end; "
+        "render with --renderer cpu"
+    )
+
 
 with needs("opencl"):
     import pyopencl as cl

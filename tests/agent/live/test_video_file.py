@@ -13,10 +13,9 @@ import pytest
 
 from cav_agent.frames import ClockKind
 from cav_agent.live.camera import open_camera
-from cav_agent.live.process import ReaderProcess
 from cav_agent.live.record import EndRecord, FrameRecord
 from cav_agent.live.settings import LiveSettings, ReaderSettings
-from cav_agent.live.source import SourceProblem
+from cav_agent.live.source import ReaderProcess, SourceProblem
 from rfcore.camera import TileOrigin
 from rfcore.errors import DatasetError, RfedgeError
 

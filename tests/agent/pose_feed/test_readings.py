@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cav_agent.pose_feed.feed import MAX_LINE_BYTES, FeedReader
 from cav_agent.pose_feed.fix import BadReading, FeedProblem
 from cav_agent.pose_feed.json_lines import JsonParser
 from cav_agent.pose_feed.nmea import NmeaParser
-from cav_agent.pose_feed.reader import MAX_LINE_BYTES, FeedReader
 from rfedge.datasets.pose_feed import sentence
 
 NOON_NS = 1_700_000_000 * 10**9
