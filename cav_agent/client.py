@@ -36,6 +36,7 @@ from rfcore.errors import ProtocolError, RfedgeError
 from rfcore.wire.conventions import AGENT_PROCESS, STREAM_METHOD, TILE, VEHICLE
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import FieldNotice, Welcome
+from rfcore.wire.notices import StreetNotice
 
 __all__ = ["CameraSource", "CameraTaken", "FieldNotServed", "StreamClient", "StreamObserver"]
 
@@ -86,6 +87,9 @@ class StreamObserver(Protocol):
 
     def retrying(self, reason: RetryReason) -> None:
         """Something failed and will be tried again."""
+
+    def noticed(self, notice: StreetNotice) -> None:
+        """The server told of the street."""
 
     def message_unknown(self) -> None:
         """The server sent a message that this agent does not know, and ignores."""
@@ -334,6 +338,8 @@ class StreamClient:
                     self._observer.connected(True)
                 elif isinstance(message, FieldNotice):
                     self._server.fields_changed.set()
+                elif isinstance(message, StreetNotice):
+                    self._observer.noticed(message)
             self._changed.set()
 
     async def _write(self, stream: Stream) -> None:

@@ -96,6 +96,9 @@ class AgentConfig:
     ladder: Path = Path("results/ladder.json")
     """Times and rates of the rungs, as `rfedge eval ladder` measured them."""
     steering: SteeringSettings = SteeringSettings()
+    notices: Path | None = None
+    """Ask servers what others see ahead and what changed about the map, and hand it on: a Unix
+    socket at this path that gives its readers a line of JSON for each notice (docs/twin.md)."""
     localise: bool = False
     """Find the camera's pose in the field, from what the feed or the dataset says of it, and code
     frames without the field while it is lost; needs the extra localise (docs/localise.md)."""

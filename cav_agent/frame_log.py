@@ -7,7 +7,7 @@ streams and fields. Frames are counted when they have ended, however they ended.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -23,6 +23,7 @@ from cav_agent.rate_control import QualitySteps
 from rfcore.field import RadianceField
 from rfcore.localise.fix import Fix, State
 from rfcore.wire.address import Address
+from rfcore.wire.notices import StreetNotice
 from rfcore.wire.sensing import ClockKind
 
 __all__ = ["DriveObserver", "FrameLog", "log_line"]
@@ -52,9 +53,14 @@ class DriveObserver:
     """Turns the events of a drive into metrics, log lines and, if given, the frame log."""
 
     def __init__(
-        self, metrics: AgentMetrics, servers: Sequence[Address], frame_log: FrameLog | None = None
+        self,
+        metrics: AgentMetrics,
+        servers: Sequence[Address],
+        frame_log: FrameLog | None = None,
+        notice_takers: Sequence[Callable[[StreetNotice], None]] = (),
     ) -> None:
         self._metrics = metrics
+        self._notice_takers = tuple(notice_takers)
         self._servers = tuple(servers)
         self._frame_log = frame_log
         self._quality_steps = QualitySteps()
@@ -64,7 +70,7 @@ class DriveObserver:
 
     def of_camera(self, camera_id: str) -> DriveObserver:
         """Return an observer of one source of a rig, which names its camera in the log."""
-        named = DriveObserver(self._metrics, self._servers, self._frame_log)
+        named = DriveObserver(self._metrics, self._servers, self._frame_log, self._notice_takers)
         named._log = log.bind(camera=camera_id)
         return named
 
@@ -84,6 +90,12 @@ class DriveObserver:
     def retrying(self, reason: RetryReason) -> None:
         """Something failed and will be tried again."""
         self._metrics.retrying(reason)
+
+    def noticed(self, notice: StreetNotice) -> None:
+        """A server told of the street."""
+        self._metrics.noticed(notice)
+        for take in self._notice_takers:
+            take(notice)
 
     def message_unknown(self) -> None:
         """A server sent a message that this agent does not know."""

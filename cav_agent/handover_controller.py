@@ -25,6 +25,7 @@ from cav_agent.frames import FrameResult, RetryReason
 from cav_agent.handover import LOST_AFTER_S, Handover, Position, ServedTile, TileRoute
 from cav_agent.tile_stream import PrepareStream, TileStream
 from rfcore.errors import ProtocolError, RfedgeError
+from rfcore.wire.notices import StreetNotice
 
 __all__ = ["HandoverController"]
 
@@ -138,6 +139,10 @@ class HandoverController:
     def retrying(self, reason: RetryReason) -> None:
         """Pass on that something is tried again."""
         self._observer.retrying(reason)
+
+    def noticed(self, notice: StreetNotice) -> None:
+        """Pass on what a server tells of the street."""
+        self._observer.noticed(notice)
 
     def message_unknown(self) -> None:
         """Pass on that a server sent something unknown."""

@@ -17,6 +17,7 @@ from cav_agent.pose_feed.fix import FeedProblem
 from rfcore.codec.references import references_name
 from rfcore.localise.fix import Fix, State
 from rfcore.wire.instruments import Instruments
+from rfcore.wire.notices import NOTICE_KINDS, StreetNotice
 from rfcore.wire.sensing import ClockKind
 
 __all__ = ["AgentMetrics"]
@@ -46,6 +47,13 @@ class AgentMetrics:
             "rfedge_agent_unknown_messages",
             "Messages of a newer server that this agent does not know, and ignores.",
         )
+        self._notices = make.counter(
+            "rfedge_agent_notices",
+            "Notices of the street that servers sent, by what they tell of: object, map, light.",
+            ("kind",),
+        )
+        for kind in NOTICE_KINDS:
+            self._notices.labels(kind)
         self._frames = make.counter(
             "rfedge_agent_frames",
             "Captured pictures by result (acked, nacked, dropped, lost) and reason.",
@@ -166,6 +174,10 @@ class AgentMetrics:
         )
         for problem in FeedProblem:
             self._feed_problems.labels(problem)
+
+    def noticed(self, notice: StreetNotice) -> None:
+        """Count a notice of the street."""
+        self._notices.labels(notice.kind).inc()
 
     def field_fetched(self, size_bytes: int) -> None:
         """Count the bytes of an archive that was fetched."""

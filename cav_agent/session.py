@@ -53,6 +53,7 @@ from rfcore.wire.messages import (
     ServerMessage,
     Welcome,
 )
+from rfcore.wire.notices import StreetNotice
 
 __all__ = ["AgentSession", "LinkState", "OutgoingMessage"]
 
@@ -204,7 +205,7 @@ class AgentSession:
                 self._nacked(message, now)
             case DrainNotice():
                 self.is_sent_away = True
-            case FieldNotice() | Credit():
+            case FieldNotice() | StreetNotice() | Credit():
                 pass  # the refusal that follows a notice names both ids
 
     def _acked(self, ack: Ack, now: float) -> None:

@@ -38,6 +38,7 @@ from cav_agent.handover_controller import HandoverController
 from cav_agent.live.camera import LiveCamera, TrajectoryPoses, open_camera
 from cav_agent.live.rig import LiveRig, open_rig
 from cav_agent.metrics import AgentMetrics
+from cav_agent.notices import NoticeSocket
 from cav_agent.pipeline import OnRig, Pipeline, PipelineOptions, Tracking
 from cav_agent.pose_feed.feed import FieldFeed, PoseFeed
 from cav_agent.pose_feed.following import FollowedFeed
@@ -57,6 +58,7 @@ from rfcore.wire.checks import check_name
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.instruments import MetricsEndpoint
 from rfcore.wire.messages import CameraDescription, Hello, RendererContract
+from rfcore.wire.notices import StreetNotice
 from rfcore.wire.settings import MetricsSettings
 from rfcore.wire.tiles import Tile
 
@@ -79,9 +81,15 @@ field was replaced, so it is asked for more often than a stream that was refused
 
 
 class Vehicle:
-    """Runs ``config`` from connecting to the end of the drive; ``stop`` ends it early."""
+    """Runs ``config`` from connecting to the end of the drive; ``stop`` ends it early.
 
-    def __init__(self, config: AgentConfig) -> None:
+    ``on_notice`` is called, on the event loop, with what servers tell of the street.
+    """
+
+    def __init__(
+        self, config: AgentConfig, on_notice: Callable[[StreetNotice], None] | None = None
+    ) -> None:
+        self._on_notice = on_notice
         self.registry = CollectorRegistry()
         self._servers = server_connections(config)
         self._config = config
@@ -116,7 +124,8 @@ class Vehicle:
             frame_log = FrameLog(config.report)
             stack.callback(frame_log.close)
         addresses = [server.address for server in self._servers]
-        observer = DriveObserver(self._metrics, addresses, frame_log)
+        takers = await self._notice_takers(stack)
+        observer = DriveObserver(self._metrics, addresses, frame_log, takers)
         live = self._live = await self._open_source(stack, observer)
         pictures: VehiclePictures | None = live if isinstance(live, LiveRig) else None
         if isinstance(live, LiveCamera):
@@ -127,7 +136,16 @@ class Vehicle:
         searcher = stack.enter_context(
             ThreadPoolExecutor(1, "localiser", initializer=yield_to_frames)
         )
-        streams = StreamFactory(config, self._servers, fields, encoder, searcher, feed, live)
+        streams = StreamFactory(
+            config,
+            self._servers,
+            fields,
+            encoder,
+            searcher,
+            feed,
+            live,
+            take_notices=bool(takers),
+        )
         if live is None:
             return HandoverController(
                 config, way.positions, streams.prepare, observer, way.schedule
@@ -137,6 +155,14 @@ class Vehicle:
         )
         self._picture_arrived = controller.picture_arrived
         return controller
+
+    async def _notice_takers(self, stack: AsyncExitStack) -> list[Callable[[StreetNotice], None]]:
+        """Return who takes notices; ``stack`` closes the socket, if there is one."""
+        takers = [] if self._on_notice is None else [self._on_notice]
+        if self._config.notices is not None:
+            notices = await stack.enter_async_context(NoticeSocket(self._config.notices))
+            takers.append(notices.tell)
+        return takers
 
     async def _open_source(
         self, stack: AsyncExitStack, observer: DriveObserver
@@ -248,7 +274,10 @@ class StreamFactory:
         searcher: Executor,
         feed: PoseFeed | None = None,
         live: LiveCamera | LiveRig | None = None,
+        *,
+        take_notices: bool = False,
     ) -> None:
+        self._take_notices = take_notices
         self._config = config
         self._servers = tuple(servers)
         self._fields = fields
@@ -362,7 +391,14 @@ class StreamFactory:
         )
         contract = RendererContract(RENDERER_CONTRACT, exact=True)
         fields = prepared.field_ids
-        return Hello(config.vehicle, cameras, fields, contract, config.allow_recording)
+        return Hello(
+            config.vehicle,
+            cameras,
+            fields,
+            contract,
+            config.allow_recording,
+            self._take_notices,
+        )
 
     def _session(self, hello: Hello, prepared: PreparedField) -> AgentSession:
         """Return a session whose epochs none of the last sessions has used: packets of one camera

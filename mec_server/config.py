@@ -234,6 +234,9 @@ class ServerConfig:
     render: RenderSettings = RenderSettings()
     metrics: MetricsSettings = MetricsSettings()
     transport: TransportSettings = TransportSettings()
+    notices: bool = True
+    """Tell vehicles that ask (`cav-agent --notices`) what others see ahead of them; costs nothing
+    while none does (docs/twin.md)."""
     access: Path | None = None
     """File that says what consumers may see and which certificates are revoked (TOML, see
     docs/operations.md); read again when it changes. Without it consumers see everything."""

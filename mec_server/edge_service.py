@@ -67,6 +67,10 @@ class EdgeService:
         for stream in self._streams:
             stream.fields_changed(current_field_ids)
 
+    def notice_takers(self) -> list[Stream]:
+        """Return the streams of vehicles that want to be told of the street."""
+        return [stream for stream in self._streams if stream.takes_notices]
+
     def end_stalled(self, now: float) -> None:
         """End the streams whose peers take no answers; counted."""
         for stream in tuple(self._streams):

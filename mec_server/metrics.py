@@ -59,6 +59,8 @@ class BackgroundTask(StrEnum):
     """Closes connections of addresses that hold too many; goes on with its next look."""
     CONSUMER = "consumer"
     """Serves one consumer of the twin, whose stream ends."""
+    NOTICES = "notices"
+    """Looks at pictures for vehicles that take notices; goes on with the next picture."""
     RECORDING = "recording"
     """Writes pictures to disk; recording ends for good, streaming goes on."""
     LEARNING = "learning"

@@ -37,6 +37,7 @@ from mec_server.recorder import KeepLimits, Recorder
 from mec_server.stream_decoders import ServerContext
 from mec_server.tile_learning import LearningJob
 from mec_server.twin.metrics import TwinMetrics
+from mec_server.twin.notices import StreetNotices
 from mec_server.twin.rendering import TwinViews
 from mec_server.twin.service import Sight, TwinService
 from mec_server.twin.state import Twin
@@ -66,6 +67,9 @@ about to refuse, by name."""
 SWEEP_EVERY_S = 1.0
 """How often the access file is checked for a change, and open calls for certificates that are no
 longer good."""
+
+NOTICES_EVERY_S = 0.25
+"""How soon it is noticed that a vehicle takes notices."""
 
 CONNECTIONS_EVERY_S = 0.25
 """How often connections are counted by address."""
@@ -125,11 +129,19 @@ class EdgeServer:
         consumer_failed = self._failed(BackgroundTask.CONSUMER)
         ledger, limited = self._entry.ledger, self._metrics.count_limited
         self._views = self._twin_views(twin)
+        twin_metrics = self._twin_metrics(twin)
+        self._notices = StreetNotices(
+            twin,
+            self._views,
+            self._edge.notice_takers,
+            lambda: self._published.tiles,
+            twin_metrics,
+        )
         self._twin_service = TwinService(
             twin,
-            self._twin_metrics(twin),
+            twin_metrics,
             Slots(ledger, Resource.WATCHES, limited),
-            config.limits.stalled_s,
+            config.limits,
             consumer_failed,
             self._sight,
             self._views,
@@ -228,6 +240,8 @@ class EdgeServer:
             self._learner.start()
             self._follow(self._look_at_learning, LEARNING_EVERY_S, BackgroundTask.LEARNING)
         self._follow(self.index_fields, FIELDS_EVERY_S, BackgroundTask.FIELDS)
+        if self._config.notices:
+            self._follow(self._notices.follow, NOTICES_EVERY_S, BackgroundTask.NOTICES)
         self._cap_connections()
         await self._set_health(health_pb2.HealthCheckResponse.SERVING)
         if self._config.ready_file is not None:
@@ -285,8 +299,11 @@ class EdgeServer:
 
     async def take_up_fields(self) -> None:
         """Serve what is published now, and tell the vehicles if it is something else."""
+        before = self._published.tiles
         if await asyncio.to_thread(self._published.refresh):
             tiles = self._published.tiles
+            if self._config.notices:
+                self._notices.fields_changed(before, tiles)
             self._metrics.show_tiles(tiles)
             every = dict.fromkeys(name for tile in tiles for name in tile.renderable_ids)
             self._edge.fields_changed(tuple(every)[:MAX_FIELDS])

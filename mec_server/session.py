@@ -47,6 +47,7 @@ from rfcore.wire.messages import (
     StageTimes,
     Welcome,
 )
+from rfcore.wire.notices import StreetNotice
 
 __all__ = ["ServerSession", "SessionState"]
 
@@ -309,6 +310,17 @@ class ServerSession:
         """Tell a vehicle that streams which fields are current now; its own goes on being good."""
         if self.state is SessionState.OPEN:
             self._say(FieldNotice(tuple(current_field_ids)))
+
+    @property
+    def takes_notices(self) -> bool:
+        """Whether the vehicle is welcome and wants to be told of the street."""
+        asked = self.hello is not None and self.hello.take_notices
+        return asked and self.state is SessionState.OPEN
+
+    def tell(self, notice: StreetNotice) -> None:
+        """Tell a vehicle that takes notices of the street; one that does not read misses it."""
+        if self.takes_notices and len(self._outbox) < MAX_UNREAD // 2:
+            self._say(notice)
 
     def get_timer(self) -> float | None:
         """Return when ``handle_timer`` has something to do, or None."""

@@ -32,6 +32,7 @@ from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.convert_answers import server_messages_to_bytes
 from rfcore.wire.identity import peer_identity
 from rfcore.wire.messages import Frame, Hello
+from rfcore.wire.notices import StreetNotice
 
 __all__ = ["Context", "Stream"]
 
@@ -50,7 +51,7 @@ class Stream:
     """Serves one session. ``reallocate_rates`` is called after each frame, when the time that
     frames take has changed. ``account`` is charged; who made it closes it.
 
-    It is a ``mec_server.ledger.active_cameras.CameraSender``.
+    It is a ``mec_server.ledger.entry.CameraSender``.
     """
 
     def __init__(
@@ -102,6 +103,32 @@ class Stream:
     def fields_changed(self, current_field_ids: tuple[str, ...]) -> None:
         """Pass on which fields are current now."""
         self._session.fields_changed(current_field_ids)
+        self._wake.set()
+
+    @property
+    def session_id(self) -> str:
+        """Which stream it is."""
+        return self._session.session_id
+
+    @property
+    def vehicle_id(self) -> str:
+        """Whose stream it is; empty before its Hello was accepted."""
+        hello = self._session.hello
+        return "" if hello is None else hello.vehicle_id
+
+    @property
+    def takes_notices(self) -> bool:
+        """Whether the vehicle wants to be told of the street."""
+        return self._session.takes_notices
+
+    def uses(self, field_ids: frozenset[str]) -> bool:
+        """Whether the vehicle codes against one of these fields."""
+        hello = self._session.hello
+        return hello is not None and not field_ids.isdisjoint(hello.field_ids)
+
+    def tell(self, notice: StreetNotice) -> None:
+        """Pass on what concerns the vehicle on its way."""
+        self._session.tell(notice)
         self._wake.set()
 
     def regrant(self, changed: Mapping[str, float]) -> None:

@@ -9,6 +9,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from rfcore.wire.instruments import Family, Instruments
+from rfcore.wire.notices import NOTICE_KINDS, ObjectAhead, StreetNotice
 from rfcore.wire.twin import PictureEncoding
 
 __all__ = ["ConsumerEnd", "TwinMetrics"]
@@ -30,6 +31,7 @@ class ConsumerEnd(StrEnum):
 
     LEFT = "left"
     SLOW = "slow"
+    IDLE = "idle"
     REFUSED = "refused"
     DRAINED = "drained"
 
@@ -52,7 +54,8 @@ class TwinMetrics:
         self.consumers = make.gauge("rfedge_twin_consumers", "Consumers that watch the twin.")
         self.ended = make.counter(
             "rfedge_twin_consumers_ended",
-            "Consumers by how they ended: left, slow (took nothing for long), refused, drained.",
+            "Consumers by how they ended: left, slow (took nothing for long), idle (asked for "
+            "nothing for long), refused, drained.",
             ("reason",),
         )
         self.sent = make.counter(
@@ -62,10 +65,27 @@ class TwinMetrics:
         self.sent_age = make.seconds(
             "rfedge_twin_sent_age_seconds", "Seconds from capture to handing over to a consumer."
         )
+        self.notices = make.counter(
+            "rfedge_twin_notices",
+            "Notices sent to vehicles, by what they tell of: object, map, light.",
+            ("kind",),
+        )
+        self.notice_age = make.seconds(
+            "rfedge_twin_notice_age_seconds",
+            "From the capture of the picture that shows an object to the notice of it.",
+        )
+        for kind in NOTICE_KINDS:
+            self.notices.labels(kind)
         for reason in ConsumerEnd:
             self.ended.labels(reason)
         for encoding in PictureEncoding:
             self.sent.labels(encoding)
+
+    def noticed(self, notice: StreetNotice) -> None:
+        """Count a notice that was handed to a vehicle's stream."""
+        self.notices.labels(notice.kind).inc()
+        if isinstance(notice.subject, ObjectAhead):
+            self.notice_age.observe(notice.subject.unseen_s)
 
 
 class _Ages(Collector):

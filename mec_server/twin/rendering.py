@@ -31,7 +31,7 @@ from mec_server.twin.composition import (
     live_picture,
     shrunk,
 )
-from mec_server.twin.objects import Detection, detect
+from mec_server.twin.contacts import Detection, detect
 from mec_server.twin.state import CameraKey, Covers, Twin, TwinView
 from rfcore.camera import Camera
 from rfcore.errors import AccessDenied, InvalidInput

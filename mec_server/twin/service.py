@@ -18,6 +18,7 @@ from weakref import WeakKeyDictionary
 import grpc
 import structlog
 
+from mec_server.config import SessionLimits
 from mec_server.peers import Slots, abort, peer_account
 from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
 from mec_server.twin.objects import ObjectTracker
@@ -105,8 +106,9 @@ class Sight:
 class TwinService(twin_pb2_grpc.TwinServiceServicer):
     """Streams the pictures of ``twin`` to consumers.
 
-    ``slots`` says how many may watch; one that took nothing for ``stalled_s`` is too slow.
-    ``failed`` is called with an unexpected exception, which ends the stream that met it. ``sight``
+    ``slots`` says how many may watch; one that took nothing for ``limits.stalled_s`` is too slow,
+    and one that asks for views and asked for none in ``limits.idle_s`` is let go. ``failed`` is
+    called with an unexpected exception, which ends the stream that met it. ``sight``
     says what the peer of a call may see, ``views`` composes views for it.
     """
 
@@ -115,7 +117,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         twin: Twin,
         metrics: TwinMetrics,
         slots: Slots,
-        stalled_s: float,
+        limits: SessionLimits,
         failed: Callable[[Exception], None],
         sight: Callable[[Context], Sight],
         views: TwinViews,
@@ -124,12 +126,12 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         self._sight = sight
         self._metrics = metrics
         self._slots = slots
-        self._stalled_s = stalled_s
+        self._stalled_s = limits.stalled_s
         self._failed = failed
         self._pictures = TwinPictures()
         self._draining = asyncio.Event()
         self._views = views
-        self._renders = RenderCalls(views, metrics, slots, stalled_s, failed, sight, self._draining)
+        self._renders = RenderCalls(views, metrics, slots, limits, failed, sight, self._draining)
 
     def register(self, server: grpc.aio.Server) -> None:
         """Add the service to a server that has not started."""
@@ -378,7 +380,7 @@ class RenderCalls:
         views: TwinViews,
         metrics: TwinMetrics,
         slots: Slots,
-        stalled_s: float,
+        limits: SessionLimits,
         failed: Callable[[Exception], None],
         sight: Callable[[AnyContext], Sight],
         draining: asyncio.Event,
@@ -386,7 +388,7 @@ class RenderCalls:
         self._views = views
         self._metrics = metrics
         self._slots = slots
-        self._stalled_s = stalled_s
+        self._stalled_s, self._idle_s = limits.stalled_s, limits.idle_s
         self._failed = failed
         self._sight = sight
         self._draining = draining
@@ -399,7 +401,8 @@ class RenderCalls:
     async def render_stream(
         self, requests: AsyncIterator[pb.RenderStreamRequest], context: AnyContext
     ) -> None:
-        """Answer requests until the peer has no more, reads too slowly, or the server drains."""
+        """Answer requests until the peer has no more, asks for nothing for long, reads too slowly,
+        or the server drains."""
         with await self._hold(context):
             self._metrics.consumers.inc()
             end = ConsumerEnd.LEFT
@@ -419,6 +422,11 @@ class RenderCalls:
             await context.abort(
                 grpc.StatusCode.RESOURCE_EXHAUSTED,
                 f"nothing was taken for {self._stalled_s:g} s; read faster",
+            )
+        if end is ConsumerEnd.IDLE:
+            await context.abort(
+                grpc.StatusCode.DEADLINE_EXCEEDED,
+                f"no view was asked for within {self._idle_s:g} s; open another stream when one is",
             )
 
     async def _hold(self, context: AnyContext) -> Any:
@@ -443,7 +451,7 @@ class RenderCalls:
     async def _follow(
         self, moving: _MovingCamera, drained: asyncio.Task[bool], context: AnyContext
     ) -> ConsumerEnd:
-        while (request := await moving.next(drained)) is not None:
+        while (request := await moving.next(drained, self._idle_s)) is not None:
             skipped = moving.skipped
             view = replace(await self._view(request, context), skipped=skipped)
             answer = pb.RenderStreamResponse(view=rendered_view_to_wire(view))
@@ -460,6 +468,8 @@ class RenderCalls:
             writing.result()
         if moving.error is not None:
             await abort(context, moving.error)
+        if moving.is_idle:
+            return ConsumerEnd.IDLE
         return ConsumerEnd.DRAINED if drained.done() else ConsumerEnd.LEFT
 
 
@@ -467,14 +477,15 @@ class _MovingCamera:
     """Reads the requests of one stream, of which it keeps the newest.
 
     ``spend`` is called for each and may raise ``LimitExceeded``, which ends the reading. ``error``:
-    what ended it, None for the peer. ``skipped``: requests that got no answer. ``unread``: an
-    answer that the peer does not take.
+    what ended it, None for the peer. ``is_idle``: no request came for too long. ``skipped``:
+    requests that got no answer. ``unread``: an answer that the peer does not take.
     """
 
     def __init__(
         self, requests: AsyncIterator[pb.RenderStreamRequest], spend: Callable[[], None]
     ) -> None:
         self.skipped = 0
+        self.is_idle = False
         self.error: RfedgeError | None = None
         self.unread: asyncio.Task[None] | None = None
         self._newest: pb.RenderRequest | None = None
@@ -487,14 +498,20 @@ class _MovingCamera:
         """Read no more."""
         self._reading.cancel()
 
-    async def next(self, drained: asyncio.Task[bool]) -> pb.RenderRequest | None:
-        """Return the newest request once there is one, None when there will be none."""
+    async def next(self, drained: asyncio.Task[bool], within_s: float) -> pb.RenderRequest | None:
+        """Return the newest request once there is one, None when there will be none, or none came
+        ``within_s``."""
         while self._newest is None and not self._reading.done() and not drained.done():
             arrived = asyncio.create_task(self._arrived.wait())
-            await asyncio.wait({arrived, drained}, return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait(
+                {arrived, drained}, timeout=within_s, return_when=asyncio.FIRST_COMPLETED
+            )
             arrived.cancel()
             self._arrived.clear()
-        if drained.done() or self.error is not None:
+            if not done:
+                self.is_idle = True
+                break
+        if drained.done() or self.is_idle or self.error is not None:
             return None
         request, self._newest = self._newest, None
         return request

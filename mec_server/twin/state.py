@@ -67,8 +67,11 @@ class Mailbox:
         subscription: Subscription,
         arrived: Callable[[], None],
         covers: Covers = lambda _vehicle_id, _field_id: True,
+        *,
+        counts_misses: bool = True,
     ) -> None:
         self.subscription = subscription
+        self.counts_misses = counts_misses
         self._covers = covers
         self._known: set[CameraKey] = set()
         self.skipped: Counter[CameraKey] = Counter()
@@ -144,6 +147,11 @@ class Twin:
                     self._departed.popitem(last=False)
                 self._tell(key, Departure(*key))
 
+    def newest_of(self, session_id: str) -> TwinView | None:
+        """Return the picture of a stream that was captured last, of all its cameras."""
+        views = (view for view in self._views.values() if view.session_id == session_id)
+        return max(views, key=lambda view: view.captured_s, default=None)
+
     def recent(self, now: float, max_age_s: float) -> list[TwinView]:
         """Return the newest picture of every camera that is no older than ``max_age_s``, also of
         cameras that left; those of them that are older than ``MAX_AGE_S`` are forgotten."""
@@ -158,10 +166,12 @@ class Twin:
         subscription: Subscription,
         arrived: Callable[[], None],
         covers: Covers = lambda _vehicle_id, _field_id: True,
+        *,
+        counts_misses: bool = True,
     ) -> Mailbox:
         """Return a new consumer's mailbox, filled with the newest picture of each camera that it
         asks for and ``covers``."""
-        mailbox = Mailbox(subscription, arrived, covers)
+        mailbox = Mailbox(subscription, arrived, covers, counts_misses=counts_misses)
         for key, view in self._views.items():
             mailbox.put(key, view)
         self._mailboxes.append(mailbox)
@@ -180,4 +190,4 @@ class Twin:
 
     def _tell(self, key: CameraKey, entry: TwinView | Departure) -> None:
         for mailbox in self._mailboxes:
-            self.missed += mailbox.put(key, entry)
+            self.missed += mailbox.put(key, entry) and mailbox.counts_misses

@@ -120,6 +120,7 @@ def _hello_from_wire(hello: pb.Hello) -> Hello:
             check_name("hello.renderer.name", hello.renderer.name), hello.renderer.exact
         ),
         hello.allow_recording,
+        hello.take_notices,
     )
 
 
@@ -173,6 +174,7 @@ def _hello_to_wire(hello: Hello) -> pb.Hello:
         field_ids=hello.field_ids,
         renderer=pb.RendererContract(name=hello.renderer.name, exact=hello.renderer.exact),
         allow_recording=hello.allow_recording,
+        take_notices=hello.take_notices,
     )
 
 

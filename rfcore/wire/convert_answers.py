@@ -22,6 +22,7 @@ from rfcore.wire.messages import (
     StageTimes,
     Welcome,
 )
+from rfcore.wire.notices import StreetNotice, notice_from_wire, notice_to_wire
 from rfcore.wire.v1 import edge_pb2 as pb
 
 __all__ = ["server_messages_from_bytes", "server_messages_to_bytes"]
@@ -53,6 +54,9 @@ def server_messages_from_bytes(data: bytes) -> list[ServerMessage]:
             messages.append(FieldNotice(tuple(response.field_notice.field_ids)))
         case "drain_notice":
             messages.append(DrainNotice())
+        case "street_notice":
+            notice = notice_from_wire(response.street_notice)
+            messages += [] if notice is None else [notice]
     if response.HasField("credit"):
         messages.append(Credit(response.credit.camera_id, response.credit.frames))
     return messages
@@ -72,7 +76,9 @@ def server_messages_to_bytes(messages: Iterable[ServerMessage]) -> list[bytes]:
     return [response.SerializeToString() for response in responses]
 
 
-def _response(message: Welcome | Ack | Nack | FieldNotice | DrainNotice) -> pb.StreamResponse:
+def _response(
+    message: Welcome | Ack | Nack | FieldNotice | DrainNotice | StreetNotice,
+) -> pb.StreamResponse:
     match message:
         case Welcome(session_id, exact, rate_hz):
             welcome = pb.Welcome(session_id=session_id, exact=exact, rate_hz=rate_hz)
@@ -87,6 +93,8 @@ def _response(message: Welcome | Ack | Nack | FieldNotice | DrainNotice) -> pb.S
             return pb.StreamResponse(field_notice=pb.FieldNotice(field_ids=field_ids))
         case DrainNotice():
             return pb.StreamResponse(drain_notice=pb.DrainNotice())
+        case StreetNotice():
+            return pb.StreamResponse(street_notice=notice_to_wire(message))
 
 
 def _welcome_from_wire(welcome: pb.Welcome) -> Welcome:

@@ -15,6 +15,7 @@ from rfcore.errors import RejectReason
 from rfcore.field import FULL, Quality, Renderer, render_field_view
 from rfcore.localise.fix import State
 from rfcore.views import FieldView
+from rfcore.wire.notices import StreetNotice
 from rfcore.wire.sensing import ClockKind
 
 __all__ = [
@@ -78,6 +79,7 @@ class Hello:
     """The first message of a stream.
 
     ``allow_recording``: whether the server may keep the pictures beyond the newest one.
+    ``take_notices``: whether it shall tell what it knows of the street.
     """
 
     vehicle_id: str
@@ -85,6 +87,7 @@ class Hello:
     field_ids: tuple[str, ...]
     renderer: RendererContract
     allow_recording: bool = False
+    take_notices: bool = False
 
 
 @dataclass(frozen=True)
@@ -197,4 +200,4 @@ class Credit:
 
 
 ClientMessage = Hello | Frame
-ServerMessage = Welcome | Ack | Nack | FieldNotice | DrainNotice | Credit
+ServerMessage = Welcome | Ack | Nack | FieldNotice | DrainNotice | StreetNotice | Credit

@@ -361,7 +361,7 @@ CAPACITY = Dashboard(
         ),
         Panel(
             "Consumers by end",
-            "left is normal; slow took nothing for long; refused came beyond the limit.",
+            "left is normal; slow took nothing for long, idle asked nothing; refused: too many.",
             Unit.COUNT,
             (
                 Query(
@@ -397,6 +397,18 @@ CAPACITY = Dashboard(
                     "histogram_quantile(0.99, sum by (le) (rate(rfedge_twin_sent_age_seconds_bucket"
                     f"{{{SERVER}}}[$__rate_interval])))",
                     "p99",
+                ),
+            ),
+        ),
+        Panel(
+            "Notices to vehicles",
+            "What vehicles that take notices are told: objects ahead, other maps, other lights.",
+            Unit.PER_S,
+            (
+                Query(
+                    f"sum by (kind) (rate(rfedge_twin_notices_total{{{SERVER}}}"
+                    "[$__rate_interval]))",
+                    "{{kind}}",
                 ),
             ),
         ),

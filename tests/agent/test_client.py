@@ -40,6 +40,7 @@ from rfcore.wire.messages import (
     StageTimes,
     Welcome,
 )
+from rfcore.wire.notices import StreetNotice
 
 Answer = Callable[[Hello | Frame], list[ServerMessage] | grpc.aio.AioRpcError | None]
 TAKEN = "camera_taken: another agent sends camera front of vehicle cav-1; stop it"
@@ -145,6 +146,9 @@ class Heard:
 
     def retrying(self, reason: RetryReason) -> None:
         self.retries.append(reason)
+
+    def noticed(self, notice: StreetNotice) -> None:
+        pass
 
     def message_unknown(self) -> None:
         self.unknown += 1

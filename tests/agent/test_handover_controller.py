@@ -18,6 +18,7 @@ from cav_agent.metrics import AgentMetrics
 from cav_agent.tile_stream import OpenStream, TileStream
 from rfcore.errors import FieldFormatError, ProtocolError, RfedgeError
 from rfcore.wire.address import Address
+from rfcore.wire.notices import StreetNotice
 from rfcore.wire.tiles import Area, Tile
 
 REFUSED = ProtocolError("hello.field_ids: none is here")
@@ -278,6 +279,9 @@ async def test_one_of_two_streams_that_fails_is_held_back_and_tried_again(
         def retrying(self, reason: RetryReason) -> None:
             """Not looked at."""
 
+        def noticed(self, notice: StreetNotice) -> None:
+            pass
+
         def message_unknown(self) -> None:
             """Not looked at."""
 
@@ -320,6 +324,9 @@ async def test_a_field_is_prepared_once_for_all_streams_of_its_tile(site: Site) 
 
         def retrying(self, reason: RetryReason) -> None:
             """Not looked at."""
+
+        def noticed(self, notice: StreetNotice) -> None:
+            pass
 
         def message_unknown(self) -> None:
             """Not looked at."""

@@ -420,6 +420,15 @@ async def learning_fails(scene: Scene) -> Any:
     return server
 
 
+async def notices_fail(scene: Scene) -> Any:
+    scene.patch.setattr("mec_server.server.NOTICES_EVERY_S", 0.001)
+    scene.patch.setattr("mec_server.server.StreetNotices.follow", surprise)
+    async with scene.serve() as server:
+        await until(lambda: failed(server, BackgroundTask.NOTICES))
+        await drive_on(scene, server)
+    return server
+
+
 async def drive_on(scene: Scene, server: Any) -> None:
     """Expect that a vehicle is served."""
     async with scene.raw_vehicle(server.address) as vehicle:
@@ -458,6 +467,7 @@ SABOTAGE: dict[BackgroundTask, Callable[[Scene], Awaitable[Any]]] = {
     BackgroundTask.CONSUMER: consumer_fails,
     BackgroundTask.RECORDING: recording_fails,
     BackgroundTask.LEARNING: learning_fails,
+    BackgroundTask.NOTICES: notices_fail,
 }
 ENDS_WITH_IT = {BackgroundTask.OPENING: BackgroundTask.STREAM}
 """A task that ends through the failure of another is counted, too."""

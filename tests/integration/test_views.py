@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mec_server.config import ServerBudget, SessionLimits
-from mec_server.twin import objects, rendering
+from mec_server.twin import contacts, rendering
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.twin import PictureEncoding
@@ -218,6 +218,20 @@ async def test_a_stream_ends_with_what_is_wrong_and_with_its_server(
         assert await good.code() is grpc.StatusCode.OK
 
 
+async def test_a_stream_that_asks_for_nothing_gives_its_place_back(street: Any, serve: Any) -> None:
+    limits = SessionLimits(idle_s=0.3)
+    budget = ServerBudget(watches=1)
+    async with serve(limits=limits, server_budget=budget) as server, stub_of(server) as stub:
+        moving = stub.RenderStream()
+        await moving.write(stream_request(asked(street)))
+        await moving.read()
+        assert await moving.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+        assert "no view was asked for within 0.3 s" in await moving.details()
+        await stub.Render(view_request_to_wire(asked(street)))
+        ended = ("rfedge_twin_consumers_ended_total", {"reason": "idle"})
+        assert server.registry.get_sample_value(*ended) == 1
+
+
 @asynccontextmanager
 async def stub_of_stopping(serve: Any) -> AsyncIterator[tuple[Any, Any]]:
     async with serve() as server, stub_of(server) as stub:
@@ -258,8 +272,9 @@ async def test_objects_are_what_the_vehicle_sees_and_the_field_does_not_have(
     street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The red box of the drive, once three pictures have shown it."""
-    monkeypatch.setattr(objects, "LEAST_BLOCKS", 1)  # of a picture of 76x52
-    monkeypatch.setattr(objects, "MOST_SLOPE", 1.0)  # the field is a cloud, without ground
+    for name in ("LEAST_PX", "LEAST_COLUMNS", "LEAST_WIDTH_M", "LEAST_MARKED_M"):
+        monkeypatch.setattr(contacts, name, 0)  # of a picture of 76x52
+    monkeypatch.setattr(contacts, "MOST_SLOPE", 1.0)  # the field is a cloud, without ground
     async with serve() as server, stub_of(server) as stub:
         call = stub.Objects(objects_request_to_wire(ObjectsRequest(field_id=street.field_id)))
         await call.initial_metadata()

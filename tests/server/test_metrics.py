@@ -19,6 +19,7 @@ from rfcore.codec.references import Reference, references_name
 from rfcore.errors import RejectReason
 from rfcore.field.interface import KINDS
 from rfcore.wire.messages import Ack, Frame, FrameAddress, Nack, StageTimes
+from rfcore.wire.notices import NOTICE_KINDS
 from rfcore.wire.twin import PictureEncoding
 
 ADDRESS = FrameAddress("front", 0, 0)
@@ -80,7 +81,7 @@ CLOSED = {
     "limit": set(Limit),
     "cause": set(LossCause),
     "encoding": set(PictureEncoding),
-    "kind": set(KINDS),
+    "kind": {*KINDS, *NOTICE_KINDS},
     "task": set(BackgroundTask),
     "resource": set(Resource),
 }

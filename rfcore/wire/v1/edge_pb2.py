@@ -24,55 +24,63 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19rfcore/wire/v1/edge.proto\x12\x0erfcore.wire.v1\"j\n\rStreamRequest\x12&\n\x05hello\x18\x01 \x01(\x0b\x32\x15.rfcore.wire.v1.HelloH\x00\x12&\n\x05\x66rame\x18\x02 \x01(\x0b\x32\x15.rfcore.wire.v1.FrameH\x00\x42\t\n\x07message\"\xa3\x02\n\x0eStreamResponse\x12*\n\x07welcome\x18\x01 \x01(\x0b\x32\x17.rfcore.wire.v1.WelcomeH\x00\x12\"\n\x03\x61\x63k\x18\x02 \x01(\x0b\x32\x13.rfcore.wire.v1.AckH\x00\x12$\n\x04nack\x18\x03 \x01(\x0b\x32\x14.rfcore.wire.v1.NackH\x00\x12\x33\n\x0c\x66ield_notice\x18\x04 \x01(\x0b\x32\x1b.rfcore.wire.v1.FieldNoticeH\x00\x12\x33\n\x0c\x64rain_notice\x18\x06 \x01(\x0b\x32\x1b.rfcore.wire.v1.DrainNoticeH\x00\x12&\n\x06\x63redit\x18\x05 \x01(\x0b\x32\x16.rfcore.wire.v1.CreditB\t\n\x07message\"\xaf\x01\n\x05Hello\x12\x12\n\nvehicle_id\x18\x01 \x01(\t\x12\x32\n\x07\x63\x61meras\x18\x02 \x03(\x0b\x32!.rfcore.wire.v1.CameraDescription\x12\x11\n\tfield_ids\x18\x03 \x03(\t\x12\x32\n\x08renderer\x18\x04 \x01(\x0b\x32 .rfcore.wire.v1.RendererContract\x12\x17\n\x0f\x61llow_recording\x18\x05 \x01(\x08\"\xc3\x01\n\x11\x43\x61meraDescription\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12.\n\nintrinsics\x18\x02 \x01(\x0b\x32\x1a.rfcore.wire.v1.Intrinsics\x12+\n\x05\x63odec\x18\x03 \x01(\x0b\x32\x1c.rfcore.wire.v1.StreamHeader\x12\x0f\n\x07rate_hz\x18\x04 \x01(\x01\x12-\n\x0f\x63\x61mera_from_rig\x18\x05 \x01(\x0b\x32\x14.rfcore.wire.v1.Pose\"m\n\nIntrinsics\x12\x10\n\x08width_px\x18\x01 \x01(\r\x12\x11\n\theight_px\x18\x02 \x01(\r\x12\r\n\x05\x66x_px\x18\x03 \x01(\x01\x12\r\n\x05\x66y_px\x18\x04 \x01(\x01\x12\r\n\x05\x63x_px\x18\x05 \x01(\x01\x12\r\n\x05\x63y_px\x18\x06 \x01(\x01\"z\n\x0cStreamHeader\x12\x10\n\x08width_px\x18\x01 \x01(\r\x12\x11\n\theight_px\x18\x02 \x01(\r\x12\x0e\n\x06preset\x18\x03 \x01(\t\x12\x0b\n\x03\x63rf\x18\x04 \x01(\x01\x12\x0b\n\x03sps\x18\x05 \x01(\x0c\x12\x0b\n\x03pps\x18\x06 \x01(\x0c\x12\x0e\n\x06\x65\x66\x66ort\x18\x07 \x01(\t\"/\n\x10RendererContract\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\r\n\x05\x65xact\x18\x02 \x01(\x08\"}\n\x04Pose\x12\x0b\n\x03x_m\x18\x01 \x01(\x01\x12\x0b\n\x03y_m\x18\x02 \x01(\x01\x12\x0b\n\x03z_m\x18\x03 \x01(\x01\x12\x12\n\nrotation_w\x18\x04 \x01(\x01\x12\x12\n\nrotation_x\x18\x05 \x01(\x01\x12\x12\n\nrotation_y\x18\x06 \x01(\x01\x12\x12\n\nrotation_z\x18\x07 \x01(\x01\"w\n\x07Quality\x12\x16\n\x0e\x64\x65tail_percent\x18\x01 \x01(\r\x12\x16\n\tsh_degree\x18\x02 \x01(\rH\x00\x88\x01\x01\x12\x17\n\x0fsamples_per_ray\x18\x03 \x01(\r\x12\x15\n\rscale_percent\x18\x04 \x01(\rB\x0c\n\n_sh_degree\"\x92\x04\n\x05\x46rame\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12\r\n\x05\x65poch\x18\x02 \x01(\r\x12\x10\n\x08sequence\x18\x03 \x01(\x04\x12\x17\n\x0f\x63\x61pture_time_ns\x18\x04 \x01(\x06\x12\"\n\x04pose\x18\x05 \x01(\x0b\x32\x14.rfcore.wire.v1.Pose\x12\x17\n\x0f\x66ield_id_prefix\x18\x06 \x01(\x0c\x12-\n\nreferences\x18\x07 \x03(\x0e\x32\x19.rfcore.wire.v1.Reference\x12\x15\n\rrender_digest\x18\x08 \x01(\x0c\x12\x1a\n\x12render_block_means\x18\t \x01(\x0c\x12\x1d\n\x15reconstruction_digest\x18\n \x01(\x0c\x12\x0f\n\x07payload\x18\x0b \x01(\x0c\x12\r\n\x05\x63rc32\x18\x0c \x01(\x07\x12\x13\n\x0b\x62\x61se_digest\x18\r \x01(\x0c\x12\x13\n\x0bphotometric\x18\x0e \x03(\x11\x12\x10\n\x08pose_f32\x18\x0f \x03(\x02\x12(\n\x07quality\x18\x10 \x01(\x0b\x32\x17.rfcore.wire.v1.Quality\x12\x0f\n\x07instant\x18\x11 \x01(\x04\x12\x33\n\rcapture_clock\x18\x12 \x01(\x0e\x32\x1c.rfcore.wire.v1.CaptureClock\x12\x32\n\x0clocalisation\x18\x13 \x01(\x0e\x32\x1c.rfcore.wire.v1.Localisation\"=\n\x07Welcome\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\r\n\x05\x65xact\x18\x02 \x01(\x08\x12\x0f\n\x07rate_hz\x18\x03 \x01(\x01\"\x83\x01\n\x03\x41\x63k\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12\r\n\x05\x65poch\x18\x02 \x01(\r\x12\x10\n\x08sequence\x18\x03 \x01(\x04\x12)\n\x05times\x18\x04 \x01(\x0b\x32\x1a.rfcore.wire.v1.StageTimes\x12\x1d\n\x15reconstruction_digest\x18\x05 \x01(\x0c\"i\n\nStageTimes\x12\x10\n\x08queue_ns\x18\x01 \x01(\x04\x12\x11\n\trender_ns\x18\x02 \x01(\x04\x12\x11\n\tsplice_ns\x18\x03 \x01(\x04\x12\x11\n\tdecode_ns\x18\x04 \x01(\x04\x12\x10\n\x08total_ns\x18\x05 \x01(\x04\"\xd7\x01\n\x04Nack\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12\r\n\x05\x65poch\x18\x02 \x01(\r\x12\x10\n\x08sequence\x18\x03 \x01(\x04\x12\r\n\x05\x63ount\x18\x04 \x01(\x04\x12,\n\x06reason\x18\x05 \x01(\x0e\x32\x1c.rfcore.wire.v1.RejectReason\x12\x0f\n\x07problem\x18\x06 \x01(\t\x12\x1f\n\x12last_good_sequence\x18\x07 \x01(\x04H\x00\x88\x01\x01\x12\x15\n\rcurrent_epoch\x18\x08 \x01(\rB\x15\n\x13_last_good_sequence\" \n\x0b\x46ieldNotice\x12\x11\n\tfield_ids\x18\x01 \x03(\t\"\r\n\x0b\x44rainNotice\"+\n\x06\x43redit\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12\x0e\n\x06\x66rames\x18\x02 \x01(\x04*\x82\x01\n\tReference\x12\x19\n\x15REFERENCE_UNSPECIFIED\x10\x00\x12\x14\n\x10REFERENCE_RENDER\x10\x01\x12\x16\n\x12REFERENCE_PREVIOUS\x10\x02\x12\x12\n\x0eREFERENCE_WARP\x10\x03\x12\x18\n\x14REFERENCE_CORRECTION\x10\x04*i\n\x0c\x43\x61ptureClock\x12\x1d\n\x19\x43\x41PTURE_CLOCK_UNSPECIFIED\x10\x00\x12\x1f\n\x1b\x43\x41PTURE_CLOCK_SENDER_REPORT\x10\x01\x12\x19\n\x15\x43\x41PTURE_CLOCK_ARRIVAL\x10\x02*{\n\x0cLocalisation\x12\x1c\n\x18LOCALISATION_UNSPECIFIED\x10\x00\x12\x15\n\x11LOCALISATION_LOST\x10\x01\x12\x1b\n\x17LOCALISATION_LOCALISING\x10\x02\x12\x19\n\x15LOCALISATION_TRACKING\x10\x03*\xa6\x03\n\x0cRejectReason\x12\x1d\n\x19REJECT_REASON_UNSPECIFIED\x10\x00\x12\x1d\n\x19REJECT_REASON_STALE_EPOCH\x10\x01\x12 \n\x1cREJECT_REASON_STALE_SEQUENCE\x10\x02\x12\x1e\n\x1aREJECT_REASON_SEQUENCE_GAP\x10\x03\x12\x1e\n\x1aREJECT_REASON_CRC_MISMATCH\x10\x04\x12!\n\x1dREJECT_REASON_RENDER_MISMATCH\x10\x05\x12#\n\x1fREJECT_REASON_MALFORMED_PAYLOAD\x10\x06\x12 \n\x1cREJECT_REASON_DECODER_FAILED\x10\x07\x12)\n%REJECT_REASON_RECONSTRUCTION_MISMATCH\x10\x08\x12\"\n\x1eREJECT_REASON_INVALID_ARGUMENT\x10\t\x12\x1c\n\x18REJECT_REASON_OVERLOADED\x10\n\x12\x1f\n\x1bREJECT_REASON_UNKNOWN_STATE\x10\x0b\x32Z\n\x0b\x45\x64geService\x12K\n\x06Stream\x12\x1d.rfcore.wire.v1.StreamRequest\x1a\x1e.rfcore.wire.v1.StreamResponse(\x01\x30\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19rfcore/wire/v1/edge.proto\x12\x0erfcore.wire.v1\"j\n\rStreamRequest\x12&\n\x05hello\x18\x01 \x01(\x0b\x32\x15.rfcore.wire.v1.HelloH\x00\x12&\n\x05\x66rame\x18\x02 \x01(\x0b\x32\x15.rfcore.wire.v1.FrameH\x00\x42\t\n\x07message\"\xda\x02\n\x0eStreamResponse\x12*\n\x07welcome\x18\x01 \x01(\x0b\x32\x17.rfcore.wire.v1.WelcomeH\x00\x12\"\n\x03\x61\x63k\x18\x02 \x01(\x0b\x32\x13.rfcore.wire.v1.AckH\x00\x12$\n\x04nack\x18\x03 \x01(\x0b\x32\x14.rfcore.wire.v1.NackH\x00\x12\x33\n\x0c\x66ield_notice\x18\x04 \x01(\x0b\x32\x1b.rfcore.wire.v1.FieldNoticeH\x00\x12\x33\n\x0c\x64rain_notice\x18\x06 \x01(\x0b\x32\x1b.rfcore.wire.v1.DrainNoticeH\x00\x12\x35\n\rstreet_notice\x18\x07 \x01(\x0b\x32\x1c.rfcore.wire.v1.StreetNoticeH\x00\x12&\n\x06\x63redit\x18\x05 \x01(\x0b\x32\x16.rfcore.wire.v1.CreditB\t\n\x07message\"\xc5\x01\n\x05Hello\x12\x12\n\nvehicle_id\x18\x01 \x01(\t\x12\x32\n\x07\x63\x61meras\x18\x02 \x03(\x0b\x32!.rfcore.wire.v1.CameraDescription\x12\x11\n\tfield_ids\x18\x03 \x03(\t\x12\x32\n\x08renderer\x18\x04 \x01(\x0b\x32 .rfcore.wire.v1.RendererContract\x12\x17\n\x0f\x61llow_recording\x18\x05 \x01(\x08\x12\x14\n\x0ctake_notices\x18\x06 \x01(\x08\"\xc3\x01\n\x11\x43\x61meraDescription\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12.\n\nintrinsics\x18\x02 \x01(\x0b\x32\x1a.rfcore.wire.v1.Intrinsics\x12+\n\x05\x63odec\x18\x03 \x01(\x0b\x32\x1c.rfcore.wire.v1.StreamHeader\x12\x0f\n\x07rate_hz\x18\x04 \x01(\x01\x12-\n\x0f\x63\x61mera_from_rig\x18\x05 \x01(\x0b\x32\x14.rfcore.wire.v1.Pose\"m\n\nIntrinsics\x12\x10\n\x08width_px\x18\x01 \x01(\r\x12\x11\n\theight_px\x18\x02 \x01(\r\x12\r\n\x05\x66x_px\x18\x03 \x01(\x01\x12\r\n\x05\x66y_px\x18\x04 \x01(\x01\x12\r\n\x05\x63x_px\x18\x05 \x01(\x01\x12\r\n\x05\x63y_px\x18\x06 \x01(\x01\"z\n\x0cStreamHeader\x12\x10\n\x08width_px\x18\x01 \x01(\r\x12\x11\n\theight_px\x18\x02 \x01(\r\x12\x0e\n\x06preset\x18\x03 \x01(\t\x12\x0b\n\x03\x63rf\x18\x04 \x01(\x01\x12\x0b\n\x03sps\x18\x05 \x01(\x0c\x12\x0b\n\x03pps\x18\x06 \x01(\x0c\x12\x0e\n\x06\x65\x66\x66ort\x18\x07 \x01(\t\"/\n\x10RendererContract\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\r\n\x05\x65xact\x18\x02 \x01(\x08\"}\n\x04Pose\x12\x0b\n\x03x_m\x18\x01 \x01(\x01\x12\x0b\n\x03y_m\x18\x02 \x01(\x01\x12\x0b\n\x03z_m\x18\x03 \x01(\x01\x12\x12\n\nrotation_w\x18\x04 \x01(\x01\x12\x12\n\nrotation_x\x18\x05 \x01(\x01\x12\x12\n\nrotation_y\x18\x06 \x01(\x01\x12\x12\n\nrotation_z\x18\x07 \x01(\x01\"w\n\x07Quality\x12\x16\n\x0e\x64\x65tail_percent\x18\x01 \x01(\r\x12\x16\n\tsh_degree\x18\x02 \x01(\rH\x00\x88\x01\x01\x12\x17\n\x0fsamples_per_ray\x18\x03 \x01(\r\x12\x15\n\rscale_percent\x18\x04 \x01(\rB\x0c\n\n_sh_degree\"\x92\x04\n\x05\x46rame\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12\r\n\x05\x65poch\x18\x02 \x01(\r\x12\x10\n\x08sequence\x18\x03 \x01(\x04\x12\x17\n\x0f\x63\x61pture_time_ns\x18\x04 \x01(\x06\x12\"\n\x04pose\x18\x05 \x01(\x0b\x32\x14.rfcore.wire.v1.Pose\x12\x17\n\x0f\x66ield_id_prefix\x18\x06 \x01(\x0c\x12-\n\nreferences\x18\x07 \x03(\x0e\x32\x19.rfcore.wire.v1.Reference\x12\x15\n\rrender_digest\x18\x08 \x01(\x0c\x12\x1a\n\x12render_block_means\x18\t \x01(\x0c\x12\x1d\n\x15reconstruction_digest\x18\n \x01(\x0c\x12\x0f\n\x07payload\x18\x0b \x01(\x0c\x12\r\n\x05\x63rc32\x18\x0c \x01(\x07\x12\x13\n\x0b\x62\x61se_digest\x18\r \x01(\x0c\x12\x13\n\x0bphotometric\x18\x0e \x03(\x11\x12\x10\n\x08pose_f32\x18\x0f \x03(\x02\x12(\n\x07quality\x18\x10 \x01(\x0b\x32\x17.rfcore.wire.v1.Quality\x12\x0f\n\x07instant\x18\x11 \x01(\x04\x12\x33\n\rcapture_clock\x18\x12 \x01(\x0e\x32\x1c.rfcore.wire.v1.CaptureClock\x12\x32\n\x0clocalisation\x18\x13 \x01(\x0e\x32\x1c.rfcore.wire.v1.Localisation\"=\n\x07Welcome\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\r\n\x05\x65xact\x18\x02 \x01(\x08\x12\x0f\n\x07rate_hz\x18\x03 \x01(\x01\"\x83\x01\n\x03\x41\x63k\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12\r\n\x05\x65poch\x18\x02 \x01(\r\x12\x10\n\x08sequence\x18\x03 \x01(\x04\x12)\n\x05times\x18\x04 \x01(\x0b\x32\x1a.rfcore.wire.v1.StageTimes\x12\x1d\n\x15reconstruction_digest\x18\x05 \x01(\x0c\"i\n\nStageTimes\x12\x10\n\x08queue_ns\x18\x01 \x01(\x04\x12\x11\n\trender_ns\x18\x02 \x01(\x04\x12\x11\n\tsplice_ns\x18\x03 \x01(\x04\x12\x11\n\tdecode_ns\x18\x04 \x01(\x04\x12\x10\n\x08total_ns\x18\x05 \x01(\x04\"\xd7\x01\n\x04Nack\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12\r\n\x05\x65poch\x18\x02 \x01(\r\x12\x10\n\x08sequence\x18\x03 \x01(\x04\x12\r\n\x05\x63ount\x18\x04 \x01(\x04\x12,\n\x06reason\x18\x05 \x01(\x0e\x32\x1c.rfcore.wire.v1.RejectReason\x12\x0f\n\x07problem\x18\x06 \x01(\t\x12\x1f\n\x12last_good_sequence\x18\x07 \x01(\x04H\x00\x88\x01\x01\x12\x15\n\rcurrent_epoch\x18\x08 \x01(\rB\x15\n\x13_last_good_sequence\" \n\x0b\x46ieldNotice\x12\x11\n\tfield_ids\x18\x01 \x03(\t\"\r\n\x0b\x44rainNotice\"\xa6\x01\n\x0cStreetNotice\x12\x11\n\tnotice_id\x18\x01 \x01(\x04\x12\x14\n\x0cvalid_for_ms\x18\x02 \x01(\r\x12-\n\x06object\x18\x03 \x01(\x0b\x32\x1b.rfcore.wire.v1.ObjectAheadH\x00\x12\x33\n\x0c\x66ield_change\x18\x04 \x01(\x0b\x32\x1b.rfcore.wire.v1.FieldChangeH\x00\x42\t\n\x07subject\"\x8e\x02\n\x0bObjectAhead\x12\x10\n\x08\x66ield_id\x18\x01 \x01(\t\x12\x0b\n\x03x_m\x18\x02 \x01(\x01\x12\x0b\n\x03y_m\x18\x03 \x01(\x01\x12\x0b\n\x03z_m\x18\x04 \x01(\x01\x12\x16\n\x0evelocity_x_mps\x18\x05 \x01(\x01\x12\x16\n\x0evelocity_y_mps\x18\x06 \x01(\x01\x12\x16\n\x0evelocity_z_mps\x18\x07 \x01(\x01\x12\x0f\n\x07width_m\x18\x08 \x01(\x01\x12\x10\n\x08height_m\x18\t \x01(\x01\x12\x12\n\ndistance_m\x18\n \x01(\x01\x12\x12\n\nconfidence\x18\x0b \x01(\x01\x12\x0e\n\x06\x61ge_ms\x18\x0c \x01(\r\x12\x11\n\tunseen_ms\x18\r \x01(\r\x12\x10\n\x08vehicles\x18\x0e \x01(\r\"|\n\x0b\x46ieldChange\x12-\n\x04kind\x18\x01 \x01(\x0e\x32\x1f.rfcore.wire.v1.FieldChangeKind\x12\x0c\n\x04tile\x18\x02 \x01(\t\x12\x10\n\x08\x66ield_id\x18\x03 \x01(\t\x12\x0f\n\x07version\x18\x04 \x01(\r\x12\r\n\x05light\x18\x05 \x01(\t\"+\n\x06\x43redit\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12\x0e\n\x06\x66rames\x18\x02 \x01(\x04*\x82\x01\n\tReference\x12\x19\n\x15REFERENCE_UNSPECIFIED\x10\x00\x12\x14\n\x10REFERENCE_RENDER\x10\x01\x12\x16\n\x12REFERENCE_PREVIOUS\x10\x02\x12\x12\n\x0eREFERENCE_WARP\x10\x03\x12\x18\n\x14REFERENCE_CORRECTION\x10\x04*i\n\x0c\x43\x61ptureClock\x12\x1d\n\x19\x43\x41PTURE_CLOCK_UNSPECIFIED\x10\x00\x12\x1f\n\x1b\x43\x41PTURE_CLOCK_SENDER_REPORT\x10\x01\x12\x19\n\x15\x43\x41PTURE_CLOCK_ARRIVAL\x10\x02*{\n\x0cLocalisation\x12\x1c\n\x18LOCALISATION_UNSPECIFIED\x10\x00\x12\x15\n\x11LOCALISATION_LOST\x10\x01\x12\x1b\n\x17LOCALISATION_LOCALISING\x10\x02\x12\x19\n\x15LOCALISATION_TRACKING\x10\x03*\xa6\x03\n\x0cRejectReason\x12\x1d\n\x19REJECT_REASON_UNSPECIFIED\x10\x00\x12\x1d\n\x19REJECT_REASON_STALE_EPOCH\x10\x01\x12 \n\x1cREJECT_REASON_STALE_SEQUENCE\x10\x02\x12\x1e\n\x1aREJECT_REASON_SEQUENCE_GAP\x10\x03\x12\x1e\n\x1aREJECT_REASON_CRC_MISMATCH\x10\x04\x12!\n\x1dREJECT_REASON_RENDER_MISMATCH\x10\x05\x12#\n\x1fREJECT_REASON_MALFORMED_PAYLOAD\x10\x06\x12 \n\x1cREJECT_REASON_DECODER_FAILED\x10\x07\x12)\n%REJECT_REASON_RECONSTRUCTION_MISMATCH\x10\x08\x12\"\n\x1eREJECT_REASON_INVALID_ARGUMENT\x10\t\x12\x1c\n\x18REJECT_REASON_OVERLOADED\x10\n\x12\x1f\n\x1bREJECT_REASON_UNKNOWN_STATE\x10\x0b*l\n\x0f\x46ieldChangeKind\x12!\n\x1d\x46IELD_CHANGE_KIND_UNSPECIFIED\x10\x00\x12\x19\n\x15\x46IELD_CHANGE_KIND_MAP\x10\x01\x12\x1b\n\x17\x46IELD_CHANGE_KIND_LIGHT\x10\x02\x32Z\n\x0b\x45\x64geService\x12K\n\x06Stream\x12\x1d.rfcore.wire.v1.StreamRequest\x1a\x1e.rfcore.wire.v1.StreamResponse(\x01\x30\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'rfcore.wire.v1.edge_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_REFERENCE']._serialized_start=2505
-  _globals['_REFERENCE']._serialized_end=2635
-  _globals['_CAPTURECLOCK']._serialized_start=2637
-  _globals['_CAPTURECLOCK']._serialized_end=2742
-  _globals['_LOCALISATION']._serialized_start=2744
-  _globals['_LOCALISATION']._serialized_end=2867
-  _globals['_REJECTREASON']._serialized_start=2870
-  _globals['_REJECTREASON']._serialized_end=3292
+  _globals['_REFERENCE']._serialized_start=3150
+  _globals['_REFERENCE']._serialized_end=3280
+  _globals['_CAPTURECLOCK']._serialized_start=3282
+  _globals['_CAPTURECLOCK']._serialized_end=3387
+  _globals['_LOCALISATION']._serialized_start=3389
+  _globals['_LOCALISATION']._serialized_end=3512
+  _globals['_REJECTREASON']._serialized_start=3515
+  _globals['_REJECTREASON']._serialized_end=3937
+  _globals['_FIELDCHANGEKIND']._serialized_start=3939
+  _globals['_FIELDCHANGEKIND']._serialized_end=4047
   _globals['_STREAMREQUEST']._serialized_start=45
   _globals['_STREAMREQUEST']._serialized_end=151
   _globals['_STREAMRESPONSE']._serialized_start=154
-  _globals['_STREAMRESPONSE']._serialized_end=445
-  _globals['_HELLO']._serialized_start=448
-  _globals['_HELLO']._serialized_end=623
-  _globals['_CAMERADESCRIPTION']._serialized_start=626
-  _globals['_CAMERADESCRIPTION']._serialized_end=821
-  _globals['_INTRINSICS']._serialized_start=823
-  _globals['_INTRINSICS']._serialized_end=932
-  _globals['_STREAMHEADER']._serialized_start=934
-  _globals['_STREAMHEADER']._serialized_end=1056
-  _globals['_RENDERERCONTRACT']._serialized_start=1058
-  _globals['_RENDERERCONTRACT']._serialized_end=1105
-  _globals['_POSE']._serialized_start=1107
-  _globals['_POSE']._serialized_end=1232
-  _globals['_QUALITY']._serialized_start=1234
-  _globals['_QUALITY']._serialized_end=1353
-  _globals['_FRAME']._serialized_start=1356
-  _globals['_FRAME']._serialized_end=1886
-  _globals['_WELCOME']._serialized_start=1888
-  _globals['_WELCOME']._serialized_end=1949
-  _globals['_ACK']._serialized_start=1952
-  _globals['_ACK']._serialized_end=2083
-  _globals['_STAGETIMES']._serialized_start=2085
-  _globals['_STAGETIMES']._serialized_end=2190
-  _globals['_NACK']._serialized_start=2193
-  _globals['_NACK']._serialized_end=2408
-  _globals['_FIELDNOTICE']._serialized_start=2410
-  _globals['_FIELDNOTICE']._serialized_end=2442
-  _globals['_DRAINNOTICE']._serialized_start=2444
-  _globals['_DRAINNOTICE']._serialized_end=2457
-  _globals['_CREDIT']._serialized_start=2459
-  _globals['_CREDIT']._serialized_end=2502
-  _globals['_EDGESERVICE']._serialized_start=3294
-  _globals['_EDGESERVICE']._serialized_end=3384
+  _globals['_STREAMRESPONSE']._serialized_end=500
+  _globals['_HELLO']._serialized_start=503
+  _globals['_HELLO']._serialized_end=700
+  _globals['_CAMERADESCRIPTION']._serialized_start=703
+  _globals['_CAMERADESCRIPTION']._serialized_end=898
+  _globals['_INTRINSICS']._serialized_start=900
+  _globals['_INTRINSICS']._serialized_end=1009
+  _globals['_STREAMHEADER']._serialized_start=1011
+  _globals['_STREAMHEADER']._serialized_end=1133
+  _globals['_RENDERERCONTRACT']._serialized_start=1135
+  _globals['_RENDERERCONTRACT']._serialized_end=1182
+  _globals['_POSE']._serialized_start=1184
+  _globals['_POSE']._serialized_end=1309
+  _globals['_QUALITY']._serialized_start=1311
+  _globals['_QUALITY']._serialized_end=1430
+  _globals['_FRAME']._serialized_start=1433
+  _globals['_FRAME']._serialized_end=1963
+  _globals['_WELCOME']._serialized_start=1965
+  _globals['_WELCOME']._serialized_end=2026
+  _globals['_ACK']._serialized_start=2029
+  _globals['_ACK']._serialized_end=2160
+  _globals['_STAGETIMES']._serialized_start=2162
+  _globals['_STAGETIMES']._serialized_end=2267
+  _globals['_NACK']._serialized_start=2270
+  _globals['_NACK']._serialized_end=2485
+  _globals['_FIELDNOTICE']._serialized_start=2487
+  _globals['_FIELDNOTICE']._serialized_end=2519
+  _globals['_DRAINNOTICE']._serialized_start=2521
+  _globals['_DRAINNOTICE']._serialized_end=2534
+  _globals['_STREETNOTICE']._serialized_start=2537
+  _globals['_STREETNOTICE']._serialized_end=2703
+  _globals['_OBJECTAHEAD']._serialized_start=2706
+  _globals['_OBJECTAHEAD']._serialized_end=2976
+  _globals['_FIELDCHANGE']._serialized_start=2978
+  _globals['_FIELDCHANGE']._serialized_end=3102
+  _globals['_CREDIT']._serialized_start=3104
+  _globals['_CREDIT']._serialized_end=3147
+  _globals['_EDGESERVICE']._serialized_start=4049
+  _globals['_EDGESERVICE']._serialized_end=4139
 # @@protoc_insertion_point(module_scope)

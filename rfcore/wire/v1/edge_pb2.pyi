@@ -138,6 +138,27 @@ REJECT_REASON_OVERLOADED: RejectReason.ValueType  # 10
 REJECT_REASON_UNKNOWN_STATE: RejectReason.ValueType  # 11
 Global___RejectReason: _TypeAlias = RejectReason  # noqa: Y015
 
+class _FieldChangeKind:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _FieldChangeKindEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_FieldChangeKind.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    FIELD_CHANGE_KIND_UNSPECIFIED: _FieldChangeKind.ValueType  # 0
+    FIELD_CHANGE_KIND_MAP: _FieldChangeKind.ValueType  # 1
+    """The tile has another field, since the street is not what it was."""
+    FIELD_CHANGE_KIND_LIGHT: _FieldChangeKind.ValueType  # 2
+    """The tile has a field of another light."""
+
+class FieldChangeKind(_FieldChangeKind, metaclass=_FieldChangeKindEnumTypeWrapper): ...
+
+FIELD_CHANGE_KIND_UNSPECIFIED: FieldChangeKind.ValueType  # 0
+FIELD_CHANGE_KIND_MAP: FieldChangeKind.ValueType  # 1
+"""The tile has another field, since the street is not what it was."""
+FIELD_CHANGE_KIND_LIGHT: FieldChangeKind.ValueType  # 2
+"""The tile has a field of another light."""
+Global___FieldChangeKind: _TypeAlias = FieldChangeKind  # noqa: Y015
+
 @_typing.final
 class StreamRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
@@ -173,6 +194,7 @@ class StreamResponse(_message.Message):
     NACK_FIELD_NUMBER: _builtins.int
     FIELD_NOTICE_FIELD_NUMBER: _builtins.int
     DRAIN_NOTICE_FIELD_NUMBER: _builtins.int
+    STREET_NOTICE_FIELD_NUMBER: _builtins.int
     CREDIT_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def welcome(self) -> Global___Welcome: ...
@@ -185,6 +207,8 @@ class StreamResponse(_message.Message):
     @_builtins.property
     def drain_notice(self) -> Global___DrainNotice: ...
     @_builtins.property
+    def street_notice(self) -> Global___StreetNotice: ...
+    @_builtins.property
     def credit(self) -> Global___Credit:
         """Alone, or in the message of the answer that changed it, which saves a message a frame."""
 
@@ -196,13 +220,14 @@ class StreamResponse(_message.Message):
         nack: Global___Nack | None = ...,
         field_notice: Global___FieldNotice | None = ...,
         drain_notice: Global___DrainNotice | None = ...,
+        street_notice: Global___StreetNotice | None = ...,
         credit: Global___Credit | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "credit", b"credit", "drain_notice", b"drain_notice", "field_notice", b"field_notice", "message", b"message", "nack", b"nack", "welcome", b"welcome"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "credit", b"credit", "drain_notice", b"drain_notice", "field_notice", b"field_notice", "message", b"message", "nack", b"nack", "street_notice", b"street_notice", "welcome", b"welcome"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "credit", b"credit", "drain_notice", b"drain_notice", "field_notice", b"field_notice", "message", b"message", "nack", b"nack", "welcome", b"welcome"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["ack", b"ack", "credit", b"credit", "drain_notice", b"drain_notice", "field_notice", b"field_notice", "message", b"message", "nack", b"nack", "street_notice", b"street_notice", "welcome", b"welcome"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["welcome", "ack", "nack", "field_notice", "drain_notice"]  # noqa: Y015
+    _WhichOneofReturnType_message: _TypeAlias = _typing.Literal["welcome", "ack", "nack", "field_notice", "drain_notice", "street_notice"]  # noqa: Y015
     _WhichOneofArgType_message: _TypeAlias = _typing.Literal["message", b"message"]  # noqa: Y015
     def WhichOneof(self, oneof_group: _WhichOneofArgType_message) -> _WhichOneofReturnType_message | None: ...
 
@@ -219,9 +244,12 @@ class Hello(_message.Message):
     FIELD_IDS_FIELD_NUMBER: _builtins.int
     RENDERER_FIELD_NUMBER: _builtins.int
     ALLOW_RECORDING_FIELD_NUMBER: _builtins.int
+    TAKE_NOTICES_FIELD_NUMBER: _builtins.int
     vehicle_id: _builtins.str
     allow_recording: _builtins.bool
     """Whether the server may keep the pictures beyond the newest one."""
+    take_notices: _builtins.bool
+    """Whether the server shall send StreetNotices."""
     @_builtins.property
     def cameras(self) -> _containers.RepeatedCompositeFieldContainer[Global___CameraDescription]: ...
     @_builtins.property
@@ -238,10 +266,11 @@ class Hello(_message.Message):
         field_ids: _abc.Iterable[_builtins.str] | None = ...,
         renderer: Global___RendererContract | None = ...,
         allow_recording: _builtins.bool = ...,
+        take_notices: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["renderer", b"renderer"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["allow_recording", b"allow_recording", "cameras", b"cameras", "field_ids", b"field_ids", "renderer", b"renderer", "vehicle_id", b"vehicle_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["allow_recording", b"allow_recording", "cameras", b"cameras", "field_ids", b"field_ids", "renderer", b"renderer", "take_notices", b"take_notices", "vehicle_id", b"vehicle_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -761,6 +790,147 @@ class DrainNotice(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___DrainNotice: _TypeAlias = DrainNotice  # noqa: Y015
+
+@_typing.final
+class StreetNotice(_message.Message):
+    """Something about the street that concerns a vehicle whose Hello takes notices. What is said of a
+    subject replaces what was said of it before, and expires `valid_for_ms` after it arrived.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NOTICE_ID_FIELD_NUMBER: _builtins.int
+    VALID_FOR_MS_FIELD_NUMBER: _builtins.int
+    OBJECT_FIELD_NUMBER: _builtins.int
+    FIELD_CHANGE_FIELD_NUMBER: _builtins.int
+    notice_id: _builtins.int
+    """The same as long as the stream tells of the same subject."""
+    valid_for_ms: _builtins.int
+    @_builtins.property
+    def object(self) -> Global___ObjectAhead: ...
+    @_builtins.property
+    def field_change(self) -> Global___FieldChange: ...
+    def __init__(
+        self,
+        *,
+        notice_id: _builtins.int = ...,
+        valid_for_ms: _builtins.int = ...,
+        object: Global___ObjectAhead | None = ...,
+        field_change: Global___FieldChange | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["field_change", b"field_change", "object", b"object", "subject", b"subject"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["field_change", b"field_change", "notice_id", b"notice_id", "object", b"object", "subject", b"subject", "valid_for_ms", b"valid_for_ms"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType_subject: _TypeAlias = _typing.Literal["object", "field_change"]  # noqa: Y015
+    _WhichOneofArgType_subject: _TypeAlias = _typing.Literal["subject", b"subject"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_subject) -> _WhichOneofReturnType_subject | None: ...
+
+Global___StreetNotice: _TypeAlias = StreetNotice  # noqa: Y015
+
+@_typing.final
+class ObjectAhead(_message.Message):
+    """A thing that other cameras see and the field does not have, within reach ahead of the vehicle, and
+    that no camera of the vehicle saw lately.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    FIELD_ID_FIELD_NUMBER: _builtins.int
+    X_M_FIELD_NUMBER: _builtins.int
+    Y_M_FIELD_NUMBER: _builtins.int
+    Z_M_FIELD_NUMBER: _builtins.int
+    VELOCITY_X_MPS_FIELD_NUMBER: _builtins.int
+    VELOCITY_Y_MPS_FIELD_NUMBER: _builtins.int
+    VELOCITY_Z_MPS_FIELD_NUMBER: _builtins.int
+    WIDTH_M_FIELD_NUMBER: _builtins.int
+    HEIGHT_M_FIELD_NUMBER: _builtins.int
+    DISTANCE_M_FIELD_NUMBER: _builtins.int
+    CONFIDENCE_FIELD_NUMBER: _builtins.int
+    AGE_MS_FIELD_NUMBER: _builtins.int
+    UNSEEN_MS_FIELD_NUMBER: _builtins.int
+    VEHICLES_FIELD_NUMBER: _builtins.int
+    field_id: _builtins.str
+    """The field whose tile's origin the position is relative to: its sha256 in hexadecimal."""
+    x_m: _builtins.float
+    """Where it stands, as in twin.proto's StreetObject."""
+    y_m: _builtins.float
+    z_m: _builtins.float
+    velocity_x_mps: _builtins.float
+    velocity_y_mps: _builtins.float
+    velocity_z_mps: _builtins.float
+    width_m: _builtins.float
+    height_m: _builtins.float
+    distance_m: _builtins.float
+    """From the camera of this vehicle's newest picture."""
+    confidence: _builtins.float
+    """0 to 1: less after few pictures, and while nobody sees it."""
+    age_ms: _builtins.int
+    """Since it was first seen, and since the capture of the picture that showed it last."""
+    unseen_ms: _builtins.int
+    vehicles: _builtins.int
+    """Of how many vehicles cameras saw it within the last second."""
+    def __init__(
+        self,
+        *,
+        field_id: _builtins.str = ...,
+        x_m: _builtins.float = ...,
+        y_m: _builtins.float = ...,
+        z_m: _builtins.float = ...,
+        velocity_x_mps: _builtins.float = ...,
+        velocity_y_mps: _builtins.float = ...,
+        velocity_z_mps: _builtins.float = ...,
+        width_m: _builtins.float = ...,
+        height_m: _builtins.float = ...,
+        distance_m: _builtins.float = ...,
+        confidence: _builtins.float = ...,
+        age_ms: _builtins.int = ...,
+        unseen_ms: _builtins.int = ...,
+        vehicles: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ms", b"age_ms", "confidence", b"confidence", "distance_m", b"distance_m", "field_id", b"field_id", "height_m", b"height_m", "unseen_ms", b"unseen_ms", "vehicles", b"vehicles", "velocity_x_mps", b"velocity_x_mps", "velocity_y_mps", b"velocity_y_mps", "velocity_z_mps", b"velocity_z_mps", "width_m", b"width_m", "x_m", b"x_m", "y_m", b"y_m", "z_m", b"z_m"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ObjectAhead: _TypeAlias = ObjectAhead  # noqa: Y015
+
+@_typing.final
+class FieldChange(_message.Message):
+    """A field that was published for the tile of this stream after its Hello; FieldService has its bytes."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    KIND_FIELD_NUMBER: _builtins.int
+    TILE_FIELD_NUMBER: _builtins.int
+    FIELD_ID_FIELD_NUMBER: _builtins.int
+    VERSION_FIELD_NUMBER: _builtins.int
+    LIGHT_FIELD_NUMBER: _builtins.int
+    kind: Global___FieldChangeKind.ValueType
+    tile: _builtins.str
+    field_id: _builtins.str
+    """Lower-case hexadecimal sha256."""
+    version: _builtins.int
+    """Of the tile."""
+    light: _builtins.str
+    """Name of the light; empty for a map."""
+    def __init__(
+        self,
+        *,
+        kind: Global___FieldChangeKind.ValueType = ...,
+        tile: _builtins.str = ...,
+        field_id: _builtins.str = ...,
+        version: _builtins.int = ...,
+        light: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["field_id", b"field_id", "kind", b"kind", "light", b"light", "tile", b"tile", "version", b"version"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___FieldChange: _TypeAlias = FieldChange  # noqa: Y015
 
 @_typing.final
 class Credit(_message.Message):

@@ -1,0 +1,272 @@
+"""Words back to vehicles: what others see ahead of one, and what changed about its tile's field.
+
+Whoever took notices in Hello is told of every confirmed object (``mec_server.twin.objects``) that
+
+* stands within ``REACH_M`` ahead of the camera of its newest picture, in the same tile,
+* is seen by somebody else's camera, and was not seen by its own within the last second,
+
+when it is confirmed and again every ``REPEAT_S`` while that holds, the nearest first, at most
+``MOST_PER_S`` notices a second. Where a vehicle is known from its pictures: one whose pictures
+have no pose is told nothing of objects.
+
+Pictures are looked at only while a vehicle takes notices, by the thread that composes views: at the
+lowest priority, newest picture first, and charged like a consumer to ``NOTICES_IDENTITY``, so that
+the time it may take is bounded; what it cannot look at is missed, and delays nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Protocol
+
+from mec_server.twin.metrics import TwinMetrics
+from mec_server.twin.objects import FollowedObject, ObjectTracker
+from mec_server.twin.rendering import Place, TwinViews, place_of
+from mec_server.twin.state import Twin, TwinView
+from rfcore.camera import Pose
+from rfcore.errors import LimitExceeded
+from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
+from rfcore.wire.tiles import Tile
+from rfcore.wire.twin import PictureEncoding, Subscription
+from rfcore.wire.twin_render import ObjectsRequest
+
+__all__ = ["NoticeTaker", "StreamNotices", "StreetNotices", "field_changes"]
+
+NOTICES_IDENTITY = "server: notices"
+"""Whom looking at pictures is charged to."""
+
+REACH_M = 100.0
+REPEAT_S = 0.5
+MOST_PER_S = 10
+VALID_S = 1.0
+"""Of an object: two repetitions may be lost. By then, who told of it has forgotten it as well."""
+FIELD_VALID_S = 600.0
+
+KNOWN_FOR_S = 2.0
+"""How old the picture may be that says where a vehicle is."""
+LOOK_AGAIN_S = 1.0
+"""How soon it is noticed that nobody takes notices any more, where no pictures come."""
+
+
+class NoticeTaker(Protocol):
+    """A stream whose vehicle takes notices."""
+
+    @property
+    def session_id(self) -> str:
+        """Which stream it is."""
+
+    @property
+    def vehicle_id(self) -> str:
+        """Whose stream it is."""
+
+    def uses(self, field_ids: frozenset[str]) -> bool:
+        """Whether the vehicle codes against one of these fields."""
+
+    def tell(self, notice: StreetNotice) -> None:
+        """Pass a notice on."""
+
+
+@dataclass
+class _Told:
+    notice_id: int
+    at_s: float
+
+
+class StreamNotices:
+    """What one vehicle is told of objects: which of them, when again, and by which number.
+
+    Without clock or sockets.
+    """
+
+    def __init__(self, vehicle_id: str) -> None:
+        self._vehicle_id = vehicle_id
+        self._told: dict[tuple[str, int], _Told] = {}
+        self._next_id = 1
+        self._recent_s: deque[float] = deque(maxlen=MOST_PER_S)
+
+    def about_objects(
+        self, field_id: str, pose: Pose, objects: Iterable[FollowedObject], now: float
+    ) -> list[StreetNotice]:
+        """Return what a vehicle whose camera is at ``pose`` (world_from_cam) is to be told now."""
+        ahead = []
+        for each in objects:
+            seen_by = {vehicle_id for vehicle_id, _ in each.seen_by(now)}
+            distance_m = _distance_ahead_m(pose, each, now)
+            if distance_m is not None and seen_by and self._vehicle_id not in seen_by:
+                ahead.append((distance_m, each, len(seen_by)))
+        self._forget(now)
+        notices = []
+        for distance_m, each, vehicles in sorted(ahead, key=lambda it: (it[0], it[1].object_id)):
+            if not self._may_tell(now):
+                break
+            told = self._told.get((field_id, each.object_id))
+            if told is None or now - told.at_s >= REPEAT_S:
+                notice_id = self._note((field_id, each.object_id), told, now)
+                subject = _object_ahead(field_id, each, distance_m, vehicles, now)
+                notices.append(StreetNotice(notice_id, VALID_S, subject))
+        return notices
+
+    def about_field(self, change: FieldChange) -> StreetNotice:
+        """Return the notice of a newly published field."""
+        return StreetNotice(self._new_id(), FIELD_VALID_S, change)
+
+    def _may_tell(self, now: float) -> bool:
+        return len(self._recent_s) < MOST_PER_S or now - self._recent_s[0] >= 1.0
+
+    def _note(self, key: tuple[str, int], told: _Told | None, now: float) -> int:
+        self._recent_s.append(now)
+        notice_id = self._new_id() if told is None else told.notice_id
+        self._told[key] = _Told(notice_id, now)
+        return notice_id
+
+    def _new_id(self) -> int:
+        self._next_id += 1
+        return self._next_id - 1
+
+    def _forget(self, now: float) -> None:
+        """Give what was not told of for so long that it has expired a new number."""
+        for key in [key for key, told in self._told.items() if now - told.at_s > VALID_S]:
+            del self._told[key]
+
+
+def _distance_ahead_m(pose: Pose, each: FollowedObject, now: float) -> float | None:
+    """Return how far an object is in front of a camera; ``None`` if behind it or out of reach."""
+    at_m = each.at(now)
+    distance_m = math.dist(at_m, pose.translation_m)
+    _, _, along_m = pose.inverse().apply(at_m)
+    return distance_m if along_m > 0 and distance_m <= REACH_M else None
+
+
+def _object_ahead(
+    field_id: str, each: FollowedObject, distance_m: float, vehicles: int, now: float
+) -> ObjectAhead:
+    return ObjectAhead(
+        field_id=field_id,
+        at_m=each.at(now),
+        velocity_mps=each.velocity_mps,
+        width_m=each.width_m,
+        height_m=each.height_m,
+        distance_m=distance_m,
+        confidence=each.confidence(now),
+        age_s=max(0.0, now - each.first_s),
+        unseen_s=max(0.0, now - each.last_s),
+        vehicles=vehicles,
+    )
+
+
+def field_changes(before: Sequence[Tile], after: Sequence[Tile]) -> list[tuple[Tile, FieldChange]]:
+    """Return what ``after`` publishes for tiles of ``before`` that these did not have."""
+    known = {tile.name: tile for tile in before}
+    changes = []
+    for tile in after:
+        old = known.get(tile.name)
+        if old is None:
+            continue
+        if tile.field_id != old.field_id:
+            change = FieldChange(FieldChangeKind.MAP, tile.name, tile.field_id, tile.version)
+            changes.append((old, change))
+        for light in tile.lights:
+            if light.field_id not in old.renderable_ids:
+                change = FieldChange(
+                    FieldChangeKind.LIGHT, tile.name, light.field_id, light.version, light.name
+                )
+                changes.append((old, change))
+    return changes
+
+
+class StreetNotices:
+    """Looks at the pictures of ``twin`` for the streams that ``takers`` returns, and tells them."""
+
+    def __init__(
+        self,
+        twin: Twin,
+        views: TwinViews,
+        takers: Callable[[], Sequence[NoticeTaker]],
+        tiles: Callable[[], tuple[Tile, ...]],
+        metrics: TwinMetrics,
+    ) -> None:
+        self._twin = twin
+        self._views = views
+        self._takers = takers
+        self._tiles = tiles
+        self._metrics = metrics
+        self._streams: dict[str, StreamNotices] = {}
+        self._trackers: dict[frozenset[str], ObjectTracker] = {}
+
+    async def follow(self) -> None:
+        """Look at pictures until nobody takes notices."""
+        if not self._takers():
+            return
+        arrived = asyncio.Event()
+        every = Subscription(encoding=PictureEncoding.NONE)
+        mailbox = self._twin.watch(every, arrived.set, counts_misses=False)
+        try:
+            while self._takers():
+                entry = mailbox.take()
+                if isinstance(entry, TwinView):
+                    await self._look_at(entry)
+                elif entry is None:
+                    arrived.clear()
+                    with suppress(TimeoutError):
+                        async with asyncio.timeout(LOOK_AGAIN_S):
+                            await arrived.wait()
+        finally:
+            self._twin.unwatch(mailbox)
+            self._streams.clear()
+            self._trackers.clear()
+
+    def fields_changed(self, before: Sequence[Tile], after: Sequence[Tile]) -> None:
+        """Tell the vehicles of a tile that it has a new field."""
+        for tile, change in field_changes(before, after):
+            for taker in self._takers():
+                if taker.uses(tile.archive_ids):
+                    self._tell(taker, self._stream(taker).about_field(change))
+
+    async def _look_at(self, seen: TwinView) -> None:
+        """Find what a picture shows, and tell those whom it concerns."""
+        place = place_of(ObjectsRequest(field_id=seen.field_id), self._tiles())
+        takers = [taker for taker in self._takers() if taker.uses(place.field_ids)]
+        if not takers:
+            self._trackers.pop(place.field_ids, None)
+            return
+        try:
+            found = await self._views.detections(seen, place, NOTICES_IDENTITY)
+        except LimitExceeded:
+            return
+        tracker = self._trackers.setdefault(place.field_ids, ObjectTracker())
+        tracker.take(found, seen.key, seen.captured_s)
+        now = time.monotonic()
+        objects = tracker.confirmed(now)
+        self._forget_streams()
+        for taker in takers:
+            self._tell_of(taker, place, objects, now)
+
+    def _tell_of(
+        self, taker: NoticeTaker, place: Place, objects: Sequence[FollowedObject], now: float
+    ) -> None:
+        own = self._twin.newest_of(taker.session_id)
+        if own is None or own.frame.pose is None or own.age_s(now) > KNOWN_FOR_S:
+            return
+        if own.field_id not in place.field_ids:
+            return
+        stream, pose = self._stream(taker), own.frame.pose
+        for notice in stream.about_objects(place.field_id, pose, objects, now):
+            self._tell(taker, notice)
+
+    def _tell(self, taker: NoticeTaker, notice: StreetNotice) -> None:
+        taker.tell(notice)
+        self._metrics.noticed(notice)
+
+    def _stream(self, taker: NoticeTaker) -> StreamNotices:
+        return self._streams.setdefault(taker.session_id, StreamNotices(taker.vehicle_id))
+
+    def _forget_streams(self) -> None:
+        open_now = {taker.session_id for taker in self._takers()}
+        for session_id in [each for each in self._streams if each not in open_now]:
+            del self._streams[session_id]

@@ -1,0 +1,191 @@
+"""What a server tells a vehicle about the street: values, and their form on the wire.
+
+See ``StreetNotice`` in ``edge.proto``. Times are durations, since the clocks of both ends may
+differ: a notice expires ``valid_for_s`` after it arrived.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from rfcore.errors import InvalidInput, ProtocolError
+from rfcore.wire.checks import check_field_id, check_name, check_range
+from rfcore.wire.v1 import edge_pb2 as pb
+
+__all__ = [
+    "NOTICE_KINDS",
+    "FieldChange",
+    "FieldChangeKind",
+    "ObjectAhead",
+    "StreetNotice",
+    "Subject",
+    "notice_from_wire",
+    "notice_to_wire",
+]
+
+OBJECT = "object"
+MAX_VALID_S = 3600.0
+MAX_AGE_MS = 2**32 - 1
+
+Vec3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ObjectAhead:
+    """A thing that other cameras see and the field does not have.
+
+    ``at_m``: its foot, ``velocity_mps``: both in the axes of the tile of field ``field_id``.
+    ``confidence``: 0 to 1. ``age_s``: since it was first seen; ``unseen_s``: since the capture of
+    the picture that showed it last. ``vehicles``: of how many vehicles cameras see it.
+    """
+
+    field_id: str
+    at_m: Vec3
+    velocity_mps: Vec3
+    width_m: float
+    height_m: float
+    distance_m: float
+    confidence: float
+    age_s: float
+    unseen_s: float
+    vehicles: int
+
+
+class FieldChangeKind(StrEnum):
+    """What a newly published field is to its tile."""
+
+    MAP = "map"
+    LIGHT = "light"
+
+
+NOTICE_KINDS = (OBJECT, *map(str, FieldChangeKind))
+
+
+@dataclass(frozen=True)
+class FieldChange:
+    """A field that was published for a tile; ``light``: its name, empty for a map."""
+
+    kind: FieldChangeKind
+    tile: str
+    field_id: str
+    version: int
+    light: str = ""
+
+
+Subject = ObjectAhead | FieldChange
+
+
+@dataclass(frozen=True)
+class StreetNotice:
+    """``notice_id`` is the same as long as a stream tells of the same subject."""
+
+    notice_id: int
+    valid_for_s: float
+    subject: Subject
+
+    @property
+    def kind(self) -> str:
+        """What it tells of: one of ``NOTICE_KINDS``."""
+        subject = self.subject
+        return str(subject.kind) if isinstance(subject, FieldChange) else OBJECT
+
+
+KINDS = {
+    kind: pb.FieldChangeKind.Value(f"FIELD_CHANGE_KIND_{kind.name}") for kind in FieldChangeKind
+}
+KINDS_BACK = {number: kind for kind, number in KINDS.items()}
+
+
+def notice_to_wire(notice: StreetNotice) -> pb.StreetNotice:
+    """Return a notice as protobuf."""
+    message = pb.StreetNotice(
+        notice_id=notice.notice_id, valid_for_ms=_milliseconds(notice.valid_for_s)
+    )
+    match notice.subject:
+        case ObjectAhead() as ahead:
+            message.object.CopyFrom(_object_to_wire(ahead))
+        case FieldChange(kind, tile, field_id, version, light):
+            change = pb.FieldChange(
+                kind=KINDS[kind], tile=tile, field_id=field_id, version=version, light=light
+            )
+            message.field_change.CopyFrom(change)
+    return message
+
+
+def notice_from_wire(message: pb.StreetNotice) -> StreetNotice | None:
+    """Return a notice, ``None`` for one of a subject or kind that only a newer server knows.
+
+    Raises ``ProtocolError`` for values that cannot be.
+    """
+    try:
+        subject = _subject_from_wire(message)
+        valid_for_s = check_range("valid_for_s", message.valid_for_ms / 1e3, 0.0, MAX_VALID_S)
+    except InvalidInput as error:
+        raise ProtocolError(f"the server sent an impossible notice: {error}") from error
+    return None if subject is None else StreetNotice(message.notice_id, valid_for_s, subject)
+
+
+def _subject_from_wire(message: pb.StreetNotice) -> Subject | None:
+    match message.WhichOneof("subject"):
+        case "object":
+            return _object_from_wire(message.object)
+        case "field_change":
+            change = message.field_change
+            kind = KINDS_BACK.get(change.kind)
+            if kind is None:
+                return None
+            light = check_name("light", change.light) if change.light else ""
+            return FieldChange(
+                kind,
+                check_name("tile", change.tile),
+                check_field_id("field_id", change.field_id),
+                change.version,
+                light,
+            )
+    return None
+
+
+def _object_to_wire(ahead: ObjectAhead) -> pb.ObjectAhead:
+    (x_m, y_m, z_m), (vx, vy, vz) = ahead.at_m, ahead.velocity_mps
+    return pb.ObjectAhead(
+        field_id=ahead.field_id,
+        x_m=x_m,
+        y_m=y_m,
+        z_m=z_m,
+        velocity_x_mps=vx,
+        velocity_y_mps=vy,
+        velocity_z_mps=vz,
+        width_m=ahead.width_m,
+        height_m=ahead.height_m,
+        distance_m=ahead.distance_m,
+        confidence=ahead.confidence,
+        age_ms=_milliseconds(ahead.age_s),
+        unseen_ms=_milliseconds(ahead.unseen_s),
+        vehicles=ahead.vehicles,
+    )
+
+
+def _object_from_wire(message: pb.ObjectAhead) -> ObjectAhead:
+    at_m = (message.x_m, message.y_m, message.z_m)
+    velocity_mps = (message.velocity_x_mps, message.velocity_y_mps, message.velocity_z_mps)
+    for value in (*at_m, *velocity_mps):
+        check_range("object", value, -1e9, 1e9)
+    for size_m in (message.width_m, message.height_m, message.distance_m):
+        check_range("object", size_m, 0.0, 1e9)
+    return ObjectAhead(
+        check_field_id("field_id", message.field_id),
+        at_m,
+        velocity_mps,
+        message.width_m,
+        message.height_m,
+        message.distance_m,
+        check_range("confidence", message.confidence, 0.0, 1.0),
+        message.age_ms / 1e3,
+        message.unseen_ms / 1e3,
+        message.vehicles,
+    )
+
+
+def _milliseconds(seconds: float) -> int:
+    return min(MAX_AGE_MS, max(0, round(1e3 * seconds)))
