@@ -1,17 +1,9 @@
-"""Things that cameras see and the field does not have: found in pictures, followed over time.
+"""Things that cameras see and the field does not have, followed over time and over cameras.
 
 Without clock, sockets or threads, and deterministic: the same pictures in the same order give the
 same objects.
 
-In one picture, blocks of 8x8 pixels of which more than half differ clearly from the field
-(``mec_server.twin.composition``) are grouped with their eight neighbours. A group stands where its
-lower edge touches the field: of each column, the field's surface just below the lowest pixel that
-differs; of these points the nearer ones count, for the rest belong to the far side or to a gap
-under the thing. Sideways it is where the middle of those is. Left out is a group whose lower edge
-is not in the picture, not on ground that is level (z is up), or further away than ``REACH_M``:
-mostly, that is the field's own error at the edges of facades, trees and roofs.
-
-Over time and over cameras, a detection belongs to the nearest object not further away than
+A detection (``mec_server.twin.contacts``) belongs to the nearest object not further away than
 ``GATE_M`` and a part of its distance from the camera, for that is how its error grows; greedy, the
 nearest pair first. Between pictures objects move at constant velocity (an alpha-beta filter). One
 is *confirmed* by a third picture and forgotten ``FORGOTTEN_S`` after its last.
@@ -20,38 +12,16 @@ is *confirmed* by a third picture and forgotten ``FORGOTTEN_S`` after its last.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mec_server.twin.composition import LivePicture
+from mec_server.twin.contacts import Detection
 from mec_server.twin.state import CameraKey
-from rfcore.camera import Intrinsics
 
-__all__ = ["Detection", "FollowedObject", "ObjectTracker", "detect"]
+__all__ = ["FollowedObject", "ObjectTracker"]
 
-BLOCK_PX = 8
-LEAST_BLOCKS = 5
-"""320 pixels: a thing of 400 is found."""
-THING_LEVELS = 35.0
-"""A pixel of a thing. On the sample's empty drive one picture of 12 has a group of 15 levels or
-more in seven cases, of 35 in one; with vehicles there are three to seven a picture either way."""
-BELOW_PX = 2
-GROUND_PX = 6
-"""How far below its foot the ground under a thing is looked at."""
-MOST_SLOPE = 0.4
-"""Sine of the steepest way from there to the foot."""
-REACH_M = 30.0
-NEARER_SHARE = 0.5
-"""Of the points of a foot; their median is taken to be the near side's distance."""
-SAME_FOOT = 1.1
-"""Points up to so many times further away belong to the near side, too."""
-
-GATE_M = 1.0
-GATE_PER_M = 0.08
+GATE_M = 1.5
+GATE_PER_M = 0.1
 POSITION_GAIN, VELOCITY_GAIN = 0.4, 0.15
 MOST_SPEED_MPS = 60.0
 SEEN_BY_S = 1.0
@@ -61,112 +31,6 @@ SURE_BY = 4
 """Pictures that saw an object until nothing is missing from its confidence."""
 
 Vec3 = tuple[float, float, float]
-Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Detection:
-    """A thing in one picture: its foot relative to the tile's origin, ``distance_m`` from the
-    camera, and its size as the camera sees it."""
-
-    at_m: Vec3
-    distance_m: float
-    width_m: float
-    height_m: float
-
-
-def detect(picture: LivePicture) -> list[Detection]:
-    """Return what ``picture`` shows that the field does not have, from left to right."""
-    if picture.trust == 0:
-        return []
-    found = []
-    strong = picture.changed & (np.abs(picture.difference).max(axis=2) > THING_LEVELS)
-    for blocks in _groups(_changed_blocks(strong)):
-        if len(blocks) >= LEAST_BLOCKS:
-            detection = _standing(picture, strong, blocks)
-            if detection is not None:
-                found.append(detection)
-    return found
-
-
-def _changed_blocks(changed: Mask) -> Mask:
-    rows, columns = (side // BLOCK_PX for side in changed.shape)
-    whole = changed[: rows * BLOCK_PX, : columns * BLOCK_PX]
-    share = whole.reshape(rows, BLOCK_PX, columns, BLOCK_PX).mean(axis=(1, 3))
-    return np.asarray(share > 0.5)
-
-
-def _groups(blocks: Mask) -> list[list[tuple[int, int]]]:
-    """Return the (row, column) of the blocks of each 8-connected group, by leftmost block."""
-    left = {(int(row), int(column)) for row, column in np.argwhere(blocks)}
-    groups = []
-    for first in sorted(left, key=lambda at: (at[1], at[0])):
-        if first not in left:
-            continue
-        left.discard(first)
-        group, waiting = [first], deque((first,))
-        while waiting:
-            row, column = waiting.popleft()
-            for near in ((row + i, column + j) for i in (-1, 0, 1) for j in (-1, 0, 1)):
-                if near in left:
-                    left.discard(near)
-                    group.append(near)
-                    waiting.append(near)
-        groups.append(group)
-    return groups
-
-
-def _standing(
-    picture: LivePicture, strong: Mask, blocks: Sequence[tuple[int, int]]
-) -> Detection | None:
-    """Return where the thing in ``blocks`` stands, None if its foot is not in the picture."""
-    height = len(strong)
-    own = np.zeros_like(strong)
-    for row, column in blocks:  # the lower edge may be in the next block, half of it or less
-        own[row * BLOCK_PX : (row + 2) * BLOCK_PX, column * BLOCK_PX : (column + 1) * BLOCK_PX] = 1
-    own &= strong
-    columns = np.flatnonzero(own.any(axis=0))
-    if not len(columns):
-        return None
-    lowest = height - 1 - own[::-1, columns].argmax(axis=0)
-    rows = lowest + BELOW_PX
-    if (rows >= height).mean() > 0.5:
-        return None
-    columns, rows = columns[rows < height], rows[rows < height]
-    z = picture.depth[rows, columns]
-    columns, rows, z = columns[z > 0], rows[z > 0], z[z > 0]
-    if not len(z):
-        return None
-    near = z <= SAME_FOOT * np.quantile(z, NEARER_SHARE / 2)
-    u = float(columns[near].min() + columns[near].max()) / 2
-    v, z_m = float(np.median(rows[near])), float(np.median(z[near]))
-    k = picture.camera.intrinsics
-    foot = _point(k, u, v, z_m)
-    below = np.minimum(rows[near] + GROUND_PX, height - 1)
-    before = _point(
-        k, u, float(np.median(below)), float(np.median(picture.depth[below, columns[near]]))
-    )
-    to_world = picture.camera.world_from_cam.apply
-    if z_m > REACH_M or _slope(to_world(before), to_world(foot)) > MOST_SLOPE:
-        return None
-    top = int(own.any(axis=1).argmax())
-    return Detection(
-        to_world(foot),
-        math.hypot(*foot),
-        float(np.ptp(columns) + 1) * z_m / k.fx_px,
-        (v - top) * z_m / k.fy_px,
-    )
-
-
-def _point(k: Intrinsics, u: float, v: float, z_m: float) -> Vec3:
-    """Return the point that the middle of pixel (u, v) shows, in camera axes."""
-    return ((u + 0.5 - k.cx_px) / k.fx_px * z_m, (v + 0.5 - k.cy_px) / k.fy_px * z_m, z_m)
-
-
-def _slope(a: Vec3, b: Vec3) -> float:
-    """Return the sine of the way from a to b; 1 where there is no way."""
-    length_m = math.dist(a, b)
-    return abs(b[2] - a[2]) / length_m if length_m > 1e-3 else 1.0
 
 
 @dataclass

@@ -20,6 +20,7 @@ from rfedge.experiments.robust import EvalRobust
 from rfedge.experiments.slice_coder import EvalSliceCoder
 from rfedge.loadtest.live import EvalLive
 from rfedge.loadtest.rig import EvalRig
+from rfedge.loadtest.world import EvalWorld
 from rfedge.samples import sample_path
 from rfedge.sizing import EvalSizing
 
@@ -155,7 +156,8 @@ class Eval:
         | Annotated[EvalRig, subcommand("rig")]
         | Annotated[EvalRobust, subcommand("robust")]
         | Annotated[EvalSizing, subcommand("sizing")]
-        | Annotated[EvalSliceCoder, subcommand("slice-coder")],
+        | Annotated[EvalSliceCoder, subcommand("slice-coder")]
+        | Annotated[EvalWorld, subcommand("world")],
         arg(name=""),
     ]
 

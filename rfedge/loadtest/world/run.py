@@ -1,0 +1,421 @@
+"""Runs ``rfedge eval world``: each row a case, its bound, what was measured, whether it held."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import grpc
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from cav_agent.config import AgentConfig
+from cav_agent.vehicle import Vehicle
+from mec_server.twin.composition import LivePicture, compose, live_picture
+from mec_server.twin.contacts import detect
+from mec_server.twin.objects import ObjectTracker
+from rfcore.camera import Camera
+from rfcore.codec.h264.config import CoderSettings
+from rfcore.dataset import read_dataset
+from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField, load_field
+from rfcore.metrics import psnr
+from rfcore.views import PosedPicture
+from rfcore.wire.conventions import CONSUMER_OPTIONS
+from rfcore.wire.notices import ObjectAhead, StreetNotice
+from rfcore.wire.twin import PictureEncoding
+from rfcore.wire.twin_render import ViewRequest, render_view
+from rfedge.loadtest.live.showing import TwinBed, ingest_latencies_ms
+from rfedge.loadtest.world import EvalWorld
+from rfedge.loadtest.world.truth import SceneTruth, aside
+from rfedge.results import as_json, make_result, provenance, read_result, write_result
+
+__all__ = ["Row", "run_world"]
+
+LEAST_PX, REACH_M, MATCH_M = 400, 30.0, 2.0
+"""A vehicle of so many pixels within reach is to be found; an object further from its outline is
+another thing."""
+CAMERA = ("eval", "front")
+MAX_AGE_S = 2.0
+LIVE_AGE_S = 0.1
+"""How old the picture is that a view is composed of."""
+CHANGED_LEVELS = 10.0
+NOISE_SIGMA = 3.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """A case; ``held`` says whether ``measured`` keeps ``bound``, None where there is no bound."""
+
+    case: str
+    bound: str
+    measured: str
+    held: bool | None
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive of a scene, and the scene's truth."""
+
+    pictures: Sequence[PosedPicture]
+    scene: str
+
+    @staticmethod
+    def given(text: str) -> Drive:
+        """Read SCENE.toml,DATASET; raise ``InvalidInput`` for anything else."""
+        scene, comma, dataset = text.partition(",")
+        if not comma:
+            raise InvalidInput("drive", f"{text!r} is not SCENE.toml,DATASET")
+        return Drive(read_dataset(Path(dataset)).pictures, scene)
+
+    def time_s(self, index: int) -> float:
+        """Return when a picture was taken."""
+        return (self.pictures[index].time_ns - self.pictures[0].time_ns) / 1e9
+
+
+def run_world(asked: EvalWorld) -> None:
+    """Measure what is asked for, write the rows, print them."""
+    field, console = load_field(asked.field), Console()
+    asked.work.mkdir(parents=True, exist_ok=True)
+    cases: dict[str, Callable[[], list[Row]]] = {
+        "objects": lambda: object_rows(asked, field),
+        "views": lambda: view_rows(asked, field),
+        "cost": lambda: cost_rows(asked, field),
+        "notices": lambda: notice_rows(asked),
+        "ingest": lambda: ingest_rows(asked),
+    }
+    unknown = set(asked.only) - set(cases)
+    if unknown:
+        raise InvalidInput("only", f"{sorted(unknown)[0]!r} is none of {', '.join(cases)}")
+    paths = [asked.field, *(Path(p) for d in (asked.empty, asked.vehicles) for p in d.split(","))]
+    source = provenance(paths)
+    parts = _finished(asked.out, source.revision)
+    for name in asked.only or tuple(cases):
+        parts[name] = [as_json(row) for row in cases[name]()]
+        for row in parts[name]:
+            held = {True: "held", False: "[bold]missed[/]", None: ""}[row["held"]]
+            console.print(f"{row['case']}: {row['measured']} ({row['bound'] or 'no bound'}) {held}")
+        rows = [{"part": part, **row} for part in cases for row in parts.get(part, [])]
+        write_result(str(asked.out), make_result("world", source, {"rows": rows}))
+
+
+def _finished(out: Path, revision: str) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows that are there of this revision, by part."""
+    parts: dict[str, list[dict[str, Any]]] = {}
+    if out.is_file():
+        result = read_result(out)
+        for row in result["rows"] if result["revision"] == revision else ():
+            parts.setdefault(row["part"], []).append({k: row[k] for k in row if k != "part"})
+    return parts
+
+
+# --- objects
+
+
+@dataclass
+class Found:
+    """How objects compare with the vehicles of a drive's pictures."""
+
+    to_find: int = 0
+    found: int = 0
+    errors_m: list[float] | None = None
+    false: set[int] | None = None
+
+    def __post_init__(self) -> None:
+        self.errors_m, self.false = [], set()
+
+
+def object_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
+    """Return what is found of vehicles, with and without noise, and what where there are none."""
+    vehicles, empty = Drive.given(asked.vehicles), Drive.given(asked.empty)
+    truth = SceneTruth(vehicles.scene)
+    rows = []
+    for name, sigma in (("", 0.0), (f", noise {NOISE_SIGMA:g}", NOISE_SIGMA)):
+        found = followed(vehicles, field, sigma, truth)
+        rows += _rows_of_found(f"vehicles{name}", found)
+        false = followed(empty, field, sigma, None).false or set()
+        minutes = (empty.time_s(len(empty.pictures) - 1) + 0.1) / 60
+        rows.append(
+            Row(
+                f"objects: false ones where nothing stands{name}",
+                "<= 1 a minute",
+                f"{len(false)} in {60 * minutes:.1f} s",
+                len(false) <= max(0.0, minutes),
+            )
+        )
+    return rows
+
+
+def _rows_of_found(name: str, found: Found) -> list[Row]:
+    errors_m = np.array(found.errors_m or [np.nan])
+    median_m, p95_m = (float(np.nanpercentile(errors_m, q)) for q in (50, 95))
+    share = found.found / max(1, found.to_find)
+    return [
+        Row(
+            f"objects: {name}, distance from the outline, median",
+            "<= 0.5 m",
+            f"{median_m:.2f} m",
+            median_m <= 0.5,
+        ),
+        Row(
+            f"objects: {name}, distance from the outline, p95",
+            "<= 1.0 m",
+            f"{p95_m:.2f} m",
+            p95_m <= 1.0,
+        ),
+        Row(
+            f"objects: {name}, found where >= {LEAST_PX} px are seen within {REACH_M:g} m",
+            ">= 90 %",
+            f"{100 * share:.0f} % of {found.to_find}",
+            share >= 0.9,
+        ),
+        Row(
+            f"objects: {name}, confirmed objects that are no vehicle",
+            "",
+            f"{len(found.false or ())}",
+            None,
+        ),
+    ]
+
+
+def followed(drive: Drive, field: RadianceField, sigma: float, truth: SceneTruth | None) -> Found:
+    """Return how what is followed through a drive compares with ``truth``, None: nothing there."""
+    tracker, found = ObjectTracker(), Found()
+    assert found.errors_m is not None
+    assert found.false is not None
+    rng = np.random.default_rng(3)
+    for index, picture in enumerate(drive.pictures):
+        time_s = drive.time_s(index)
+        rgb = noisy(picture.read(), sigma, rng)
+        live = live_picture(picture.camera, rgb, field.render(picture.camera))
+        tracker.take(detect(live), CAMERA, time_s)
+        objects = [each for each in tracker.confirmed(time_s) if time_s - each.last_s < 1e-6]
+        followed_ = tracker.confirmed(time_s)
+        seen = [] if truth is None else truth.vehicles(picture.camera, time_s)
+        for each in objects:
+            distances = [vehicle.footprint.distance_m(each.at(time_s)) for vehicle in seen]
+            if distances and min(distances) <= MATCH_M:
+                found.errors_m.append(min(distances))
+            else:
+                found.false.add(each.object_id)
+        for vehicle in seen:
+            if vehicle.pixels >= LEAST_PX and vehicle.nearest_m <= REACH_M:
+                near = (vehicle.footprint.distance_m(each.at(time_s)) for each in followed_)
+                found.to_find += 1
+                found.found += any(distance_m <= MATCH_M for distance_m in near)
+    return found
+
+
+def noisy(rgb: NDArray[np.uint8], sigma: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Return a picture with sensor noise of ``sigma`` levels."""
+    if not sigma:
+        return rgb
+    return np.clip(np.rint(rgb + rng.normal(scale=sigma, size=rgb.shape)), 0, 255).astype(np.uint8)
+
+
+# --- views
+
+
+def view_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
+    """Return how close views from beside the drives come to the generator's pictures."""
+    rows = []
+    for name, given in (("unchanged street", asked.empty), ("vehicles", asked.vehicles)):
+        drive = Drive.given(given)
+        truth, gains, changed_gains = SceneTruth(drive.scene), [], []
+        for index in range(0, len(drive.pictures), asked.every):
+            picture, time_s = drive.pictures[index], drive.time_s(index)
+            live = live_picture(picture.camera, picture.read(), field.render(picture.camera))
+            for left_m in asked.aside_m:
+                camera = aside(picture.camera, left_m)
+                gain_db, changed_db = _gains_db(field, camera, live, truth.picture(camera, time_s))
+                gains.append(gain_db)
+                changed_gains += [] if changed_db is None else [changed_db]
+        worst_db = min(gains)
+        rows.append(
+            Row(
+                f"views: {name}, PSNR of the view less that of the field alone, worst of "
+                f"{len(gains)}",
+                ">= -0.1 dB",
+                f"{worst_db:+.3f} dB (median {np.median(gains):+.3f})",
+                worst_db >= -0.1,
+            )
+        )
+        if name == "vehicles":
+            median_db = float(np.median(changed_gains))
+            rows.append(
+                Row(
+                    "views: vehicles, the same in the changed pixels, median",
+                    ">= +2 dB",
+                    f"{median_db:+.2f} dB",
+                    median_db >= 2,
+                )
+            )
+    return rows
+
+
+def _gains_db(
+    field: RadianceField, camera: Camera, live: LivePicture, true: NDArray[np.uint8]
+) -> tuple[float, float | None]:
+    """Return by how much a live picture betters a view: everywhere, and where the street is not as
+    the field has it and the live camera vouches."""
+    view = field.render(camera)
+    alone = compose(camera, view, [], MAX_AGE_S)
+    composed = compose(camera, view, [(live, LIVE_AGE_S)], MAX_AGE_S)
+    gain_db = psnr(composed.rgb, true) - psnr(alone.rgb, true)
+    changed = (alone.rgb != composed.rgb).any(axis=2)
+    if changed.mean() < 0.002:
+        return gain_db, None
+    before, after = (((v.rgb.astype(float) - true)[changed] ** 2).mean() for v in (alone, composed))
+    return gain_db, float(10 * np.log10(before / max(after, 1e-9)))
+
+
+# --- cost
+
+
+def cost_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
+    """Return what a view takes on one core, beside the field's own render, in turn."""
+    drive = Drive.given(asked.vehicles)
+    pictures = drive.pictures[-4:]
+    lives = [live_picture(p.camera, p.read(), field.render(p.camera)) for p in pictures]
+    camera = aside(pictures[-1].camera, 1.0)
+    rgb, own = pictures[-1].read(), field.render(pictures[-1].camera)
+    times: dict[str, list[float]] = {"render": [], "compose": [], "take up": [], "find": []}
+    for _ in range(20):
+        with _timed(times["render"]):
+            view = field.render(camera)
+        with _timed(times["compose"]):
+            compose(camera, view, [(live, LIVE_AGE_S) for live in lives], MAX_AGE_S)
+        with _timed(times["take up"]):
+            live = live_picture(pictures[-1].camera, rgb, own)
+        with _timed(times["find"]):
+            detect(live)
+    ms = {name: 1e3 * float(np.median(values)) for name, values in times.items()}
+    renders = (ms["render"] + ms["compose"]) / ms["render"]
+    k = camera.intrinsics
+    what = f"{k.width_px}x{k.height_px}, {len(lives)} live pictures, one core"
+    return [
+        Row(
+            f"cost: a view, {what}",
+            "<= 2 renders",
+            f"{renders:.2f} renders of {ms['render']:.1f} ms",
+            renders <= 2,
+        ),
+        Row(
+            "cost: a live picture, once for all views of it, beside its render",
+            "",
+            f"{ms['take up']:.1f} ms",
+            None,
+        ),
+        Row("cost: the things in it", "", f"{ms['find']:.1f} ms", None),
+    ]
+
+
+@contextmanager
+def _timed(seconds: list[float]) -> Iterator[None]:
+    begin = time.process_time()
+    yield
+    seconds.append(time.process_time() - begin)
+
+
+# --- processes
+
+
+def notice_rows(asked: EvalWorld) -> list[Row]:
+    """Return how old what a vehicle is told is: since the capture of the picture that shows it."""
+    vehicles, empty = (Path(d.split(",")[1]) for d in (asked.vehicles, asked.empty))
+    bed = TwinBed(asked.field, vehicles, asked.work, asked.notices_hz, asked.seconds)
+    with bed.server() as server, bed.vehicles(server.address, 1):
+        ages_ms = asyncio.run(_told(asked, server.address, empty))
+    p50, p99 = np.percentile(ages_ms, (50, 99)) if ages_ms else (np.nan, np.nan)
+    return [
+        Row(
+            f"notices: age at the other vehicle, {asked.notices_hz:g} Hz, p99",
+            "<= 200 ms",
+            f"{p99:.0f} ms (median {p50:.0f}) of {len(ages_ms)}",
+            bool(p99 <= 200),
+        ),
+    ]
+
+
+async def _told(asked: EvalWorld, address: str, drive: Path) -> list[float]:
+    """Drive the empty street for a while; return the ages of the objects told, in ms."""
+    ages_ms: list[float] = []
+
+    def take(notice: StreetNotice) -> None:
+        if isinstance(notice.subject, ObjectAhead):
+            ages_ms.append(1e3 * notice.subject.unseen_s)
+
+    config = AgentConfig(
+        address,
+        drive,
+        asked.field.parent,
+        loop=True,
+        rate=asked.notices_hz,
+        vehicle="told",
+        coding=CoderSettings(effort="fast"),
+    )
+    vehicle = Vehicle(config, take)
+    driving = asyncio.create_task(vehicle.run())
+    await asyncio.wait({driving}, timeout=asked.seconds)
+    vehicle.stop()
+    await driving
+    return ages_ms
+
+
+def ingest_rows(asked: EvalWorld) -> list[Row]:
+    """Return the p99 of ingest without and with a live view that is asked for again and again."""
+    drive = Drive.given(asked.vehicles)
+    path = Path(asked.vehicles.split(",")[1])
+    bed = TwinBed(asked.field, path, asked.work, asked.notices_hz, asked.seconds / 3)
+    request = ViewRequest(
+        aside(drive.pictures[len(drive.pictures) // 2].camera, 1.0),
+        field_id=load_field(asked.field).field_id,
+        encoding=PictureEncoding.JPEG,
+    )
+    alone_ms: list[float] = []
+    viewed_ms: list[float] = []
+    views = 0
+    with bed.server() as server:
+        for _ in range(asked.rounds):
+            alone_ms += ingest_latencies_ms(bed, server)
+            with _viewing(server.address, request) as seen:
+                viewed_ms += ingest_latencies_ms(bed, server)
+            views += len(seen)
+    alone, viewed = (float(np.percentile(values, 99)) for values in (alone_ms, viewed_ms))
+    bound_ms = max(1.1 * alone, alone + 5)
+    return [
+        Row(
+            "ingest: p99 with a live view asked for again and again",
+            f"<= {bound_ms:.0f} ms (+10 % or +5 ms)",
+            f"{alone:.0f} -> {viewed:.0f} ms, {views} views",
+            viewed <= bound_ms,
+        ),
+    ]
+
+
+@contextmanager
+def _viewing(address: str, request: ViewRequest) -> Iterator[list[int]]:
+    """Ask for views, one after the other, until the block ends; yield the numbers of those seen."""
+    seen: list[int] = []
+    over = Event()
+
+    def look() -> None:
+        with grpc.insecure_channel(address, options=CONSUMER_OPTIONS) as channel:
+            while not over.is_set():
+                view = render_view(channel, replace(request, number=len(seen)))
+                seen.append(view.number)
+
+    thread = Thread(target=look, name="viewer")
+    thread.start()
+    try:
+        yield seen
+    finally:
+        over.set()
+        thread.join()

@@ -1,0 +1,107 @@
+"""What ``rfedge eval world`` compares with the generator's truth, and how."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mec_server.twin.composition import live_picture
+from rfcore.camera import Camera, Intrinsics
+from rfcore.errors import InvalidInput
+from rfedge.loadtest.world import EvalWorld
+from rfedge.loadtest.world.run import Drive, _gains_db, noisy, run_world
+from rfedge.loadtest.world.truth import Footprint, SceneTruth, aside
+from rfedge.street.geometry.mesh import Label
+from server.test_objects import CAMERA_M, FIELD, STREET, camera_at, car, joined
+
+SQUARE = Footprint(np.float32([[0, 0], [2, 0], [2, 1], [0, 1]]))
+SMALL = Intrinsics(96, 54, 48.0, 48.0, 48.0, 27.0)
+
+
+@pytest.mark.parametrize(
+    ("point", "outside_m"), [((1, -0.5, 9.0), 0.5), ((3, 0.5, 0), 1.0), ((1, 0.25, 0), -0.25)]
+)
+def test_a_footprint_knows_how_far_a_point_is_from_its_outline(
+    point: tuple[float, float, float], outside_m: float
+) -> None:
+    assert SQUARE.outside_m(point) == pytest.approx(outside_m)
+    assert SQUARE.distance_m(point) == pytest.approx(abs(outside_m))
+
+
+def test_aside_is_to_the_left_of_the_way() -> None:
+    """The test's cameras look along y, with z up: their left is -x."""
+    moved = aside(camera_at(), 2.0)
+    assert moved.world_from_cam.translation_m == pytest.approx((-2.0, 0.0, 0.0))
+    assert moved.world_from_cam.rotation == camera_at().world_from_cam.rotation
+
+
+def test_noise_has_the_strength_that_is_asked_for() -> None:
+    grey = np.full((100, 100, 3), 128, np.uint8)
+    rng = np.random.default_rng(1)
+    assert noisy(grey, 0.0, rng) is grey
+    assert noisy(grey, 3.0, rng).astype(float).std() == pytest.approx(3.0, rel=0.05)
+
+
+def test_a_live_picture_betters_the_pixels_that_changed() -> None:
+    street = joined(STREET, car(0.8, 10.0))
+    here, beside = camera_at(), camera_at(-0.5)
+
+    def picture(camera: Camera) -> np.ndarray:
+        return np.rint(street.render(camera).colour.clip(0, 1) * 255).astype(np.uint8)
+
+    live = live_picture(here, picture(here), FIELD.render(here))
+    gain_db, changed_db = _gains_db(FIELD, beside, live, picture(beside))
+    assert gain_db > 0.5
+    assert changed_db is not None
+    assert changed_db > 2
+    view = FIELD.render(here)
+    bare = live_picture(here, np.rint(view.colour * 255).astype(np.uint8), view)
+    assert _gains_db(FIELD, beside, bare, picture(beside)) == (0.0, None)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_generator_knows_what_a_camera_sees_of_each_vehicle() -> None:
+    truth = SceneTruth("samples/street/vehicles.toml", threads=1)
+    drive = Drive.given(
+        "samples/street/vehicles.toml,samples/street/transforms_drive_vehicles.json"
+    )
+    camera = Camera(SMALL, drive.pictures[12].camera.world_from_cam)
+    time_s = drive.time_s(12)
+    _, labels = truth._renderer.cast(camera, time_s)
+    vehicles = truth.vehicles(camera, time_s)
+    seen = int((labels == Label.VEHICLE).sum())
+    assert 0.9 * seen < sum(vehicle.pixels for vehicle in vehicles) <= seen + 4
+    moving = [vehicle for vehicle in vehicles if vehicle.number >= len(truth._parked)]
+    assert moving, "traffic of the scene"
+    eye = camera.world_from_cam.translation_m
+    for vehicle in vehicles:
+        reach_m = vehicle.footprint.distance_m(eye)
+        assert vehicle.nearest_m < reach_m + 6
+        ahead = camera.cam_from_world().apply((*vehicle.footprint.outline_m[0].tolist(), CAMERA_M))
+        assert ahead[2] > -6
+
+
+def test_what_is_no_drive_or_case_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="'nothing' is not SCENE"):
+        Drive.given("nothing")
+    asked = EvalWorld(only=("weather",), work=tmp_path, out=tmp_path / "world.json")
+    with pytest.raises(InvalidInput, match="'weather' is none of objects, views, cost"):
+        run_world(asked)
+    assert not asked.out.exists()
+
+
+@pytest.mark.sample
+def test_a_case_can_be_measured_by_itself_and_others_are_kept(tmp_path: Path) -> None:
+    out = tmp_path / "world.json"
+    run_world(EvalWorld(only=("cost",), work=tmp_path, out=out))
+    result = json.loads(out.read_text())
+    assert result["kind"] == "world"
+    assert [row["part"] for row in result["rows"]] == ["cost"] * 3
+    assert {"case", "bound", "measured", "held"} <= set(result["rows"][0])
+    kept = dict(result["rows"][0], part="views", case="kept")
+    out.write_text(json.dumps({**result, "rows": [kept]}))
+    run_world(EvalWorld(only=("cost",), work=tmp_path, out=out))
+    again = json.loads(out.read_text())["rows"]
+    assert [row["part"] for row in again] == ["views", *["cost"] * 3]
