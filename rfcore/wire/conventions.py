@@ -35,8 +35,8 @@ VEHICLE: Final = "rfedge-vehicle"
 """Metadata of a stream: the vehicle's id, as in its Hello."""
 
 TILE: Final = "rfedge-tile"
-"""Metadata of a stream: the name of the tile it is for. A proxy places streams by this and by
-``VEHICLE`` before it has seen a message (docs/operations.md); a server believes neither."""
+"""Metadata of a stream: the name of the tile it is for. A proxy may place streams by this and by
+``VEHICLE`` before it has seen a message (docs/scale.md); a server believes neither."""
 
 STREAM_METHOD: Final = "/rfcore.wire.v1.EdgeService/Stream"
 

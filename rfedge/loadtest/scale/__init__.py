@@ -1,0 +1,1 @@
+"""Several servers behind Envoy: run as processes, and measured against bounds."""

