@@ -18,16 +18,19 @@ nothing standing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera, Intrinsics
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420, Rgb
 from rfcore.native.live_view import (
     COVERED,
+    MOST_DISTANCE_M,
     NOBODY,
     OWN_LIGHT,
     Light,
@@ -39,7 +42,12 @@ from rfcore.native.yuv import rgb_from_i420
 from rfcore.raster.gaussians import F32
 from rfcore.views import View
 
-__all__ = ["ComposedView", "LivePicture", "compose", "live_picture", "shrunk"]
+__all__ = ["ComposedView", "LivePicture", "compose", "live_picture", "nearest", "shrunk"]
+
+T = TypeVar("T")
+
+MOST_CAMERAS = 4
+"""Live pictures carried to one view: those nearest to it."""
 
 MOST_DISAGREEMENT = 0.5
 """Share of a picture; one that differs in more is taken to be somewhere else."""
@@ -137,6 +145,19 @@ def compose(
     age_of[: len(ages_s)] = ages_s
     shares = np.bincount(chosen.ravel(), minlength=NOBODY + 1) / chosen.size
     return ComposedView(rgb, view.depth, age_of[chosen], tuple(map(float, shares[: len(sources)])))
+
+
+def nearest(pictures: Sequence[T], camera: Camera, pose_of: Callable[[T], Pose | None]) -> list[T]:
+    """Return the pictures of known pose that were taken nearest to ``camera``, within reach."""
+
+    def distance_m(picture: T) -> float:
+        pose = pose_of(picture)
+        if pose is None:
+            return math.inf
+        return math.dist(pose.translation_m, camera.world_from_cam.translation_m)
+
+    near = [picture for picture in pictures if distance_m(picture) < 2 * MOST_DISTANCE_M]
+    return sorted(near, key=distance_m)[:MOST_CAMERAS]
 
 
 def _light_of(rgb: Rgb, view: View, covered: Mask) -> Light:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 
 from mec_server.twin.contacts import Detection
 from mec_server.twin.state import CameraKey
+from rfcore.wire.twin_render import StreetObject
 
 __all__ = ["FollowedObject", "ObjectTracker"]
 
@@ -68,6 +69,20 @@ class FollowedObject:
             at_m + elapsed_s * mps for at_m, mps in zip(self.at_m, self.velocity_mps, strict=True)
         )
         return x, y, z
+
+    def told(self, now: float) -> StreetObject:
+        """Return what is known of it, where it is now."""
+        return StreetObject(
+            object_id=self.object_id,
+            at_m=self.at(now),
+            velocity_mps=self.velocity_mps,
+            width_m=self.width_m,
+            height_m=self.height_m,
+            confidence=self.confidence(now),
+            age_s=max(0.0, now - self.first_s),
+            unseen_s=max(0.0, now - self.last_s),
+            seen_by=tuple(self.seen_by(now)),
+        )
 
     def take(self, detection: Detection, camera: CameraKey, time_s: float) -> None:
         """Move to what a picture of ``camera`` shows."""

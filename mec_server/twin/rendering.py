@@ -9,7 +9,6 @@ pay with worker time, the same as vehicles.
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 import threading
 import time
@@ -29,6 +28,7 @@ from mec_server.twin.composition import (
     LivePicture,
     compose,
     live_picture,
+    nearest,
     shrunk,
 )
 from mec_server.twin.contacts import Detection, detect
@@ -38,7 +38,6 @@ from rfcore.errors import AccessDenied, InvalidInput
 from rfcore.field import RadianceField
 from rfcore.field.quality import FULL
 from rfcore.image import Rgb, jpeg_bytes, png_bytes
-from rfcore.native.live_view import MOST_DISTANCE_M
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import View
 from rfcore.wire.checks import shown
@@ -52,12 +51,10 @@ from rfcore.wire.twin_render import (
     ViewRequest,
 )
 
-__all__ = ["Place", "TwinViews", "place_of"]
+__all__ = ["Place", "TwinViews", "check_inside", "place_of"]
 
 R = TypeVar("R")
 
-MOST_CAMERAS = 4
-"""Live pictures carried to one view: those nearest to it."""
 MOST_KEPT = 16
 """Live pictures whose difference from the field is kept for the next view."""
 
@@ -211,7 +208,7 @@ class TwinViews:
         check_inside(camera, field)
         view = field.render(camera, request.quality)
         check_outside_of_walls(view)
-        seen = _nearest(recent, camera)
+        seen = nearest(sorted(recent, key=lambda it: it.key), camera, lambda it: it.frame.pose)
         now = time.monotonic()
         live = [(self._live(each, field), each.age_s(now)) for each in seen]
         composed = compose(camera, view, live, request.max_age_s)
@@ -273,18 +270,6 @@ def check_outside_of_walls(view: View) -> None:
             f"{share:.0%} of the view is nearer than {INSIDE_M:g} m: the viewpoint is inside of "
             "something; move it into the open",
         )
-
-
-def _nearest(recent: list[TwinView], camera: Camera) -> list[TwinView]:
-    """Return the pictures of known pose that were taken nearest to ``camera``, within reach."""
-
-    def distance_m(seen: TwinView) -> float:
-        if seen.frame.pose is None:
-            return math.inf
-        return math.dist(seen.frame.pose.translation_m, camera.world_from_cam.translation_m)
-
-    near = [seen for seen in recent if distance_m(seen) < 2 * MOST_DISTANCE_M]
-    return sorted(near, key=lambda seen: (distance_m(seen), seen.key))[:MOST_CAMERAS]
 
 
 def _encoded(rgb: Rgb, encoding: PictureEncoding) -> bytes:

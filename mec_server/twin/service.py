@@ -39,7 +39,6 @@ from rfcore.wire.twin import (
 from rfcore.wire.twin_render import (
     ObjectsSeen,
     RenderedView,
-    StreetObject,
     objects_request_from_wire,
     objects_to_wire,
     rendered_view_to_wire,
@@ -329,21 +328,8 @@ class _ObjectsConsumer(_Mailed):
         self._metrics.bytes.inc(message.ByteSize())
 
     def _seen(self, now: float) -> ObjectsSeen:
-        objects = (
-            StreetObject(
-                object_id=each.object_id,
-                at_m=each.at(now),
-                velocity_mps=each.velocity_mps,
-                width_m=each.width_m,
-                height_m=each.height_m,
-                confidence=each.confidence(now),
-                age_s=max(0.0, now - each.first_s),
-                unseen_s=max(0.0, now - each.last_s),
-                seen_by=tuple(each.seen_by(now)),
-            )
-            for each in self._tracker.confirmed(now)
-        )
-        return ObjectsSeen(time.time_ns(), self._place.field_id, tuple(objects))
+        objects = tuple(each.told(now) for each in self._tracker.confirmed(now))
+        return ObjectsSeen(time.time_ns(), self._place.field_id, objects)
 
 
 def _message(view: TwinView, age_s: float, mailbox: Mailbox, data: bytes) -> TwinPicture:

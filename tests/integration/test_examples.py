@@ -5,6 +5,7 @@ import json
 import runpy
 import socket
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,13 @@ from cav_agent.pose_feed.settings import PoseFeedSettings
 from recorded import recorded
 from rfcore.camera import Pose
 from rfcore.dataset import read_dataset
+from rfcore.wire.publish import Ground, publish
 from rfedge.cli import parse
 from rfedge.samples import sample_path
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
 CAM_FROM_BODY = ((0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
@@ -43,7 +46,7 @@ def write_trajectory(drive: Path, out: Path) -> list[Pose]:
 def test_every_example_is_listed() -> None:
     page = (EXAMPLES / "README.md").read_text()
     names = {path.name for path in EXAMPLES.glob("*.py")}
-    assert len(names) == 4
+    assert len(names) == 5
     assert all(f"`{name}`" in page for name in names)
 
 
@@ -118,3 +121,43 @@ def test_a_codec_of_ones_own_is_compared(tmp_path: Path, monkeypatch: pytest.Mon
     result = json.loads(Path(out).read_text())
     assert "motion-jpeg" in Path(out).read_text()
     assert result["kind"] == "compare"
+
+
+def driven(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["drive_in_the_twin.py", *map(str, arguments)])
+    example("drive_in_the_twin.py")["main"]()
+
+
+@pytest.mark.sample
+def test_a_recording_is_driven_through(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    drive, field = sample_path("street/transforms_drive_vehicles.json"), "fields/street.rff"
+    out = tmp_path / "drive.mp4"
+    options = ("--seconds", 2, "--size", "160x90", "--out", out)
+    driven(monkeypatch, sample_path(field), drive, *options)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["1.0", "2.0"]
+    assert float(lines[-1].split()[2]) > 1
+    assert out.stat().st_size > 1000
+
+
+async def test_a_server_is_driven_through(
+    street: Any,
+    coded: Any,
+    serve: Any,
+    raw_vehicle: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "fields"
+    folder.mkdir()
+    publish(folder, "west", street.store / "street.rff", Ground(), NOW)
+    async with serve(fields=folder) as server, raw_vehicle(server.address) as vehicle:
+        await vehicle.greet(coded.hello)
+        assert await vehicle.told(coded.frames[0]) == ("ack", 0)
+        options = ("--tile", "west", "--start", "0,0,0,90", "--size", "76x52", "--seconds", 1)
+        await asyncio.to_thread(driven, monkeypatch, "--server", server.address, *options)
+    (line,) = (x for x in capsys.readouterr().out.splitlines() if x.strip().startswith("1.0 s"))
+    assert "% live" in line

@@ -1,0 +1,308 @@
+"""Drive a car of one's own through a street as vehicles see it, or saw it.
+
+``TwinDrive`` moves a camera by a kinematic bicycle model through a ``Street``: one that a server
+shows (``ServedStreet``), or one that was recorded (``RecordedStreet``, from what ``mec-server
+--record`` keeps or any posed pictures with times). Every step takes ``1 / RATE_HZ`` seconds of the
+street's time and returns picture, depth and objects. A recorded street has no clock: the same
+recording and the same actions give the same bytes. Nothing in the street reacts to the car, and
+nothing stops it but the end of the field.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from threading import Thread
+from typing import Protocol
+
+import grpc
+import numpy as np
+from numpy.typing import NDArray
+
+from mec_server.twin.composition import LivePicture, compose, live_picture, nearest
+from mec_server.twin.contacts import detect
+from mec_server.twin.objects import ObjectTracker
+from mec_server.twin.rendering import check_inside, check_outside_of_walls
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField
+from rfcore.image import Rgb
+from rfcore.views import PosedPicture
+from rfcore.wire.twin import PictureEncoding
+from rfcore.wire.twin_render import (
+    ObjectsRequest,
+    StreetObject,
+    ViewRequest,
+    objects_from_wire,
+    objects_request_to_wire,
+    render_view,
+)
+from rfcore.wire.v1 import twin_pb2_grpc
+
+__all__ = [
+    "RATE_HZ",
+    "Observation",
+    "Place",
+    "RecordedStreet",
+    "ServedStreet",
+    "Street",
+    "TwinDrive",
+    "place_of",
+]
+
+RATE_HZ = 10.0
+WHEELBASE_M = 2.7
+MOST_STEERING_RAD = 0.6
+ACCELERATION_MPS2, BRAKING_MPS2 = 3.0, 8.0
+MOST_SPEED_MPS = 15.0
+MAX_AGE_S = 2.0
+"""As a server's views: older pictures vouch for nothing."""
+
+SAME_TIME_S = 1e-6
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the car's camera is, above the middle of the rear axle: relative to the tile's origin,
+    heading from x towards y, and how fast the car goes."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    heading_rad: float
+    speed_mps: float = 0.0
+
+    def camera(self, intrinsics: Intrinsics) -> Camera:
+        """Return the level camera that looks ahead."""
+        cos, sin = math.cos(self.heading_rad), math.sin(self.heading_rad)
+        rows = [[sin, 0.0, cos, self.x_m], [-cos, 0.0, sin, self.y_m], [0.0, -1.0, 0.0, self.z_m]]
+        return Camera(intrinsics, Pose.from_matrix(rows))
+
+    def after(self, steer: float, throttle: float, seconds: float) -> Place:
+        """Return the place a moment later: the kinematic bicycle model, about the rear axle.
+
+        ``steer`` and ``throttle`` are -1 to 1, left and forward; a negative throttle brakes, and
+        the car does not reverse. (Rajamani, Vehicle Dynamics and Control, 2nd ed., section 2.2.)
+        """
+        pull = throttle * (ACCELERATION_MPS2 if throttle > 0 else BRAKING_MPS2)
+        speed = min(MOST_SPEED_MPS, max(0.0, self.speed_mps + pull * seconds))
+        driven_m = (self.speed_mps + speed) / 2 * seconds
+        turn_rad = driven_m / WHEELBASE_M * math.tan(steer * MOST_STEERING_RAD)
+        middle_rad = self.heading_rad + turn_rad / 2
+        return replace(
+            self,
+            x_m=self.x_m + driven_m * math.cos(middle_rad),
+            y_m=self.y_m + driven_m * math.sin(middle_rad),
+            heading_rad=math.remainder(self.heading_rad + turn_rad, math.tau),
+            speed_mps=speed,
+        )
+
+
+def place_of(pose: Pose) -> Place:
+    """Return the place of a camera, world_from_cam: as it stands and looks, but level."""
+    forward = np.array(pose.rotation_matrix())[:, 2]
+    return Place(*pose.translation_m, heading_rad=math.atan2(forward[1], forward[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """``picture`` uint8 [H, W, 3]; ``depth`` float32 [H, W], metres along the optical axis, 0 for
+    nothing; ``live`` bool [H, W]: where a vehicle's picture vouches, else the field; ``objects``:
+    what the field does not have; ``ended``: the car has left the field, and stays where it is."""
+
+    place: Place
+    picture: Rgb
+    depth: F32
+    live: NDArray[np.bool_]
+    objects: tuple[StreetObject, ...]
+    ended: bool = False
+
+
+class Street(Protocol):
+    """What can be driven through."""
+
+    def begin(self) -> None:
+        """Begin at the street's first moment."""
+
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass."""
+
+    def look(self, camera: Camera) -> tuple[Rgb, F32, NDArray[np.bool_], tuple[StreetObject, ...]]:
+        """Return picture, depth, where it is live, and objects; raise ``InvalidInput`` where there
+        is nothing to see."""
+
+
+class TwinDrive:
+    """A car in a street: ``reset``, then ``step`` again and again."""
+
+    def __init__(self, street: Street, intrinsics: Intrinsics, rate_hz: float = RATE_HZ) -> None:
+        if not 0.1 <= rate_hz <= 100:
+            raise InvalidInput("rate_hz", f"{rate_hz:g} is outside 0.1..100")
+        self._street = street
+        self._intrinsics = intrinsics
+        self._step_s = 1.0 / rate_hz
+        self._seen: Observation | None = None
+
+    def reset(self, place: Place) -> Observation:
+        """Begin anew at a place; raise ``InvalidInput`` for one outside of the field."""
+        self._street.begin()
+        self._seen = Observation(place, *self._street.look(place.camera(self._intrinsics)))
+        return self._seen
+
+    def step(self, steer: float, throttle: float) -> Observation:
+        """Drive on for one step; raise ``InvalidInput`` for actions outside of -1 to 1."""
+        for name, value in (("steer", steer), ("throttle", throttle)):
+            if not -1 <= value <= 1:
+                raise InvalidInput(name, f"{value:g} is outside -1..1")
+        seen = self._seen
+        if seen is None:
+            raise InvalidInput("step", "the drive has not begun; call reset(place) first")
+        if not seen.ended:
+            self._street.pass_time(self._step_s)
+            place = seen.place.after(steer, throttle, self._step_s)
+            try:
+                seen = Observation(place, *self._street.look(place.camera(self._intrinsics)))
+            except InvalidInput:
+                seen = replace(seen, ended=True)
+            self._seen = seen
+        return seen
+
+
+class RecordedStreet:
+    """A street as recorded cameras saw it; it begins again when its recording ends.
+
+    ``cameras``: each one's pictures in the order of time, on one clock (``time_ns``).
+    """
+
+    def __init__(self, field: RadianceField, cameras: Sequence[Sequence[PosedPicture]]) -> None:
+        pictures = [(p.time_ns, n, p) for n, camera in enumerate(cameras) for p in camera]
+        self._pictures = sorted(pictures, key=lambda it: it[:2])
+        if not pictures:
+            raise InvalidInput("recording", "it has no pictures")
+        if len(pictures) > 1 and self._pictures[0][0] == self._pictures[-1][0]:
+            raise InvalidInput("recording", "its pictures have no times, or all the same")
+        self._field = field
+        self._live: dict[int, tuple[float, LivePicture]] = {}
+        self.begin()
+
+    @property
+    def lasts_s(self) -> float:
+        """From the first picture to the last."""
+        return (self._pictures[-1][0] - self._pictures[0][0]) / 1e9
+
+    def begin(self) -> None:
+        """Go back to the first picture."""
+        self._now_s = 0.0
+        self._next = 0
+        self._live.clear()
+        self._tracker = ObjectTracker()
+        self._take_up()
+
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass; raise ``InvalidInput`` for none or less."""
+        if not seconds > 0:
+            raise InvalidInput("seconds", f"{seconds:g} is not above 0")
+        self._now_s += seconds
+        self._take_up()
+        if self._now_s > self.lasts_s + MAX_AGE_S + SAME_TIME_S:
+            self.begin()
+
+    def look(self, camera: Camera) -> tuple[Rgb, F32, NDArray[np.bool_], tuple[StreetObject, ...]]:
+        """Return what a camera would see now; raise ``InvalidInput`` outside of the field."""
+        check_inside(camera, self._field)
+        view = self._field.render(camera)
+        check_outside_of_walls(view)
+        live = [
+            (picture, self._now_s - taken_s)
+            for taken_s, picture in self._live.values()
+            if self._now_s - taken_s < MAX_AGE_S
+        ]
+        near = nearest(live, camera, lambda it: it[0].camera.world_from_cam)
+        seen = compose(camera, view, near, MAX_AGE_S)
+        return seen.rgb, seen.depth, np.isfinite(seen.age_s), self._objects()
+
+    def _take_up(self) -> None:
+        """Look at the pictures that were taken until now."""
+        first_ns = self._pictures[0][0]
+        while self._next < len(self._pictures):
+            time_ns, number, picture = self._pictures[self._next]
+            taken_s = (time_ns - first_ns) / 1e9
+            if taken_s > self._now_s + SAME_TIME_S:
+                return
+            self._next += 1
+            live = live_picture(picture.camera, picture.read(), self._field.render(picture.camera))
+            self._live[number] = (taken_s, live)
+            self._tracker.take(detect(live), _key(number), taken_s)
+
+    def _objects(self) -> tuple[StreetObject, ...]:
+        now_s = self._now_s
+        return tuple(each.told(now_s) for each in self._tracker.confirmed(now_s))
+
+
+def _key(number: int) -> tuple[str, str]:
+    return ("recorded", f"camera-{number}")
+
+
+class ServedStreet:
+    """The street as a server sees it now, while it is entered; ``tile`` or ``field_id`` says which.
+
+    Time passes by itself: ``pass_time`` waits for nothing, and a caller that wants to keep real
+    time has to wait. Objects are those of the newest picture of any vehicle.
+    """
+
+    def __init__(self, channel: grpc.Channel, tile: str = "", field_id: str = "") -> None:
+        self._channel = channel
+        self._place = ObjectsRequest(tile, field_id)
+        self._number = 0
+        self._objects: tuple[StreetObject, ...] = ()
+        self._call = twin_pb2_grpc.TwinServiceStub(channel).Objects(
+            objects_request_to_wire(self._place), wait_for_ready=True
+        )
+        self._reading = Thread(target=self._read, name="objects", daemon=True)
+
+    def __enter__(self) -> ServedStreet:
+        self._reading.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._call.cancel()
+        self._reading.join()
+
+    def begin(self) -> None:
+        """Nothing: the street is as it is."""
+
+    def pass_time(self, seconds: float) -> None:
+        """Nothing: time passes."""
+
+    def look(self, camera: Camera) -> tuple[Rgb, F32, NDArray[np.bool_], tuple[StreetObject, ...]]:
+        """Return what a camera would see now.
+
+        Raises ``InvalidInput`` outside of the field, ``grpc.RpcError`` for whatever else fails.
+        """
+        self._number += 1
+        request = ViewRequest(
+            camera,
+            tile=self._place.tile,
+            field_id=self._place.field_id,
+            encoding=PictureEncoding.PNG,
+            number=self._number,
+        )
+        try:
+            view = render_view(self._channel, request)
+        except grpc.RpcError as error:
+            if error.code() is not grpc.StatusCode.INVALID_ARGUMENT:
+                raise
+            raise InvalidInput("place", str(error.details())) from error
+        rgb = view.rgb
+        assert rgb is not None
+        return rgb, view.depth, view.live, self._objects
+
+    def _read(self) -> None:
+        """Keep the newest objects until the call ends; whoever looks hears why from ``look``."""
+        with suppress(grpc.RpcError):
+            for response in self._call:
+                self._objects = objects_from_wire(response).objects

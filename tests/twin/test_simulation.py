@@ -1,0 +1,177 @@
+"""A car of one's own in the twin: how it moves, what it sees, and that a recording repeats."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rfcore.camera import Camera, Intrinsics
+from rfcore.dataset import read_dataset
+from rfcore.errors import InvalidInput
+from rfcore.field import load_field
+from rfcore.views import PosedPicture
+from rfedge.samples import sample_path
+from rfedge.twin.simulation import (
+    MOST_SPEED_MPS,
+    WHEELBASE_M,
+    Observation,
+    Place,
+    RecordedStreet,
+    TwinDrive,
+    place_of,
+)
+from server.test_objects import FIELD, INTRINSICS, STREET, camera_at, car, joined
+
+START = place_of(camera_at().world_from_cam)
+actions = st.tuples(st.floats(-1, 1), st.floats(-1, 1))
+
+
+def picture(camera: Camera, field: Any, time_s: float) -> PosedPicture:
+    rgb = np.rint(field.render(camera).colour.clip(0, 1) * 255).astype(np.uint8)
+    return PosedPicture(f"{time_s}", camera, lambda: rgb, round(time_s * 1e9))
+
+
+def passing_car() -> list[PosedPicture]:
+    """One second at 10 Hz: a camera that stands, and a car that comes nearer by 0.3 m a picture."""
+    return [
+        picture(camera_at(), joined(STREET, car(0.8, 14.0 - 0.3 * i)), i / 10) for i in range(10)
+    ]
+
+
+@pytest.fixture(scope="module")
+def recording() -> list[PosedPicture]:
+    return passing_car()
+
+
+def digest(seen: Observation) -> tuple[bytes, bytes, Any]:
+    return seen.picture.tobytes(), seen.depth.tobytes(), seen.objects
+
+
+def test_a_place_is_where_its_camera_stands_and_looks() -> None:
+    assert START.heading_rad == pytest.approx(math.pi / 2)
+    again, before = START.camera(INTRINSICS).world_from_cam, camera_at().world_from_cam
+    assert again.apply((1.0, 2.0, 3.0)) == pytest.approx(before.apply((1.0, 2.0, 3.0)))
+
+
+@given(actions=st.lists(actions, max_size=30), heading=st.floats(-3, 3))
+def test_the_car_keeps_to_what_a_car_can_do(
+    actions: list[tuple[float, float]], heading: float
+) -> None:
+    place = Place(0.0, 0.0, 1.6, heading)
+    for steer, throttle in actions:
+        after = place.after(steer, throttle, 0.1)
+        assert 0 <= after.speed_mps <= MOST_SPEED_MPS
+        driven_m = math.dist((place.x_m, place.y_m), (after.x_m, after.y_m))
+        assert driven_m <= 0.1 * max(place.speed_mps, after.speed_mps) + 1e-9
+        assert after.z_m == place.z_m
+        place = after
+
+
+def test_a_car_that_keeps_its_wheel_drives_the_circle_of_its_wheelbase() -> None:
+    radius_m = WHEELBASE_M / math.tan(0.6 * 0.5)
+    place = Place(0.0, 0.0, 1.6, 0.0, speed_mps=4.0)
+    for _ in range(2000):
+        place = place.after(0.5, 0.0, 0.01)
+        assert math.dist((place.x_m, place.y_m), (0.0, radius_m)) == pytest.approx(radius_m, 1e-4)
+
+
+def test_a_recorded_car_is_seen_and_found_from_beside(recording: list[PosedPicture]) -> None:
+    drive = TwinDrive(RecordedStreet(FIELD, [recording]), INTRINSICS)
+    seen = drive.reset(replace(START, x_m=-0.5))
+    for _ in range(5):
+        seen = drive.step(0.0, 0.0)
+    assert seen.live.any()
+    (thing,) = seen.objects
+    assert math.dist(thing.at_m[:2], (0.8, 14.0 - 0.3 * 5)) < 1.0
+    assert thing.velocity_mps[1] < 0
+    bare = np.rint(FIELD.render(seen.place.camera(INTRINSICS)).colour * 255).astype(np.uint8)
+    changed = (seen.picture != bare).any(axis=2)
+    assert 0.01 < changed.mean() < 0.5
+    assert not seen.ended
+
+
+def test_the_same_recording_and_actions_give_the_same_bytes(
+    recording: list[PosedPicture],
+) -> None:
+    def driven() -> list[Any]:
+        drive = TwinDrive(RecordedStreet(FIELD, [recording]), INTRINSICS)
+        seen = [digest(drive.reset(START))]
+        return [*seen, *(digest(drive.step(0.3 * math.sin(i), 0.5)) for i in range(8))]
+
+    first, second = driven(), driven()
+    assert first == second
+    assert len({picture for picture, _, _ in first}) == len(first), "it moves"
+
+
+def test_a_recording_fades_and_begins_again(recording: list[PosedPicture]) -> None:
+    street = RecordedStreet(FIELD, [recording])
+    drive = TwinDrive(street, INTRINSICS)
+    first = drive.reset(START)
+    assert street.lasts_s == pytest.approx(0.9)
+    seen = [drive.step(0.0, 0.0) for _ in range(30)]
+    assert seen[-1].picture.tobytes() == first.picture.tobytes(), "after 2.9 s it is as at first"
+    assert [o.live.any() for o in seen[:29]] == [True] * 28 + [False]
+
+
+def test_the_end_of_the_field_ends_the_drive(recording: list[PosedPicture]) -> None:
+    drive = TwinDrive(RecordedStreet(FIELD, [recording]), INTRINSICS)
+    seen = drive.reset(replace(START, y_m=-2.0, heading_rad=-math.pi / 2, speed_mps=10.0))
+    for _ in range(10):
+        seen = drive.step(0.0, 0.0)
+    assert seen.ended
+    assert -3.0 <= seen.place.y_m < -2.0
+    assert drive.step(0.0, 1.0) is seen
+
+
+@pytest.mark.parametrize(
+    ("steer", "throttle", "name"),
+    [(1.1, 0.0, "steer"), (0.0, -2.0, "throttle"), (float("nan"), 0.0, "steer")],
+)
+def test_actions_no_car_can_take_are_refused(
+    recording: list[PosedPicture], steer: float, throttle: float, name: str
+) -> None:
+    drive = TwinDrive(RecordedStreet(FIELD, [recording]), INTRINSICS)
+    with pytest.raises(InvalidInput, match="call reset"):
+        drive.step(0.0, 0.0)
+    seen = drive.reset(START)
+    with pytest.raises(InvalidInput, match=f"{name}: .* is outside -1..1"):
+        drive.step(steer, throttle)
+    assert drive.step(0.0, 0.0).place == seen.place
+
+
+def test_what_cannot_be_driven_through_is_refused(recording: list[PosedPicture]) -> None:
+    with pytest.raises(InvalidInput, match="no pictures"):
+        RecordedStreet(FIELD, [[]])
+    timeless = [replace(each, time_ns=0) for each in recording]
+    with pytest.raises(InvalidInput, match="have no times"):
+        RecordedStreet(FIELD, [timeless])
+    drive = TwinDrive(RecordedStreet(FIELD, [recording]), INTRINSICS)
+    with pytest.raises(InvalidInput, match="outside of the field"):
+        drive.reset(replace(START, x_m=1e4))
+    with pytest.raises(InvalidInput, match="rate_hz: 0 is outside"):
+        TwinDrive(RecordedStreet(FIELD, [recording]), INTRINSICS, rate_hz=0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_minute_in_the_sample_street_repeats_to_the_byte() -> None:
+    field = load_field(sample_path("fields/street.rff"))
+    pictures = read_dataset(sample_path("street/transforms_drive_vehicles.json")).pictures[::3]
+    intrinsics = Intrinsics(160, 90, 80.0, 80.0, 80.0, 45.0)
+    place = place_of(pictures[0].camera.world_from_cam)
+
+    def driven() -> list[bytes]:
+        drive = TwinDrive(RecordedStreet(field, [pictures]), intrinsics)
+        seen, pictures_seen = drive.reset(place), []
+        for _ in range(600):
+            seen = drive.reset(place) if seen.ended else drive.step(0.0, 0.2)
+            pictures_seen.append(seen.picture.tobytes())
+        return pictures_seen
+
+    first = driven()
+    assert first == driven()
+    assert len(set(first)) > 100, "it begins anew where the field ends"
