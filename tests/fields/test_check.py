@@ -12,14 +12,16 @@ from rfcore.field.similarity import Similarity, moved
 from rfcore.raster.gaussians import Gaussians
 from rfcore.views import PosedPicture
 from rfedge.fields.check import (
+    AS_GIVEN,
+    AS_OPENGL,
     ModeFit,
     check_field,
     drawn_antialiased,
     in_drive_world,
+    known_conventions,
     pairs_picture,
     to_rgb,
 )
-from rfedge.fields.conventions import AS_GIVEN, AS_OPENGL, known_conventions
 
 HALF = np.sqrt(0.5)
 TURNED = (0.8, 0.6 * HALF, 0.0, 0.6 * HALF)
