@@ -92,7 +92,7 @@ class AccessList:
                 return Grant(vehicles=frozenset({name}))
             case Role.CONSUMER:
                 return EVERYTHING if self.consumers is None else self.consumers.get(name, Grant())
-            case Role.SERVER:
+            case Role.SERVER | Role.PROXY:
                 return Grant()
 
     def may_fetch(self, identity: PeerIdentity | None, tiles: frozenset[str]) -> bool:

@@ -11,7 +11,7 @@ from tyro.conf import Suppress, arg
 
 from rfcore.errors import InvalidInput
 from rfcore.update.run import LearnAs
-from rfcore.wire.checks import MAX_RATE_HZ
+from rfcore.wire.checks import MAX_RATE_HZ, check_name
 from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
 
 __all__ = [
@@ -240,6 +240,9 @@ class ServerConfig:
     access: Path | None = None
     """File that says what consumers may see and which certificates are revoked (TOML, see
     docs/operations.md); read again when it changes. Without it consumers see everything."""
+    proxy_identity: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
+    """Proxies (certificates of spiffe://rfedge/proxy/NAME) whose x-forwarded-client-cert says which
+    vehicle a call is of (docs/scale.md); from everybody else the header means nothing."""
     address_connections: int = 256
     """Connections that one address (of IPv6, one /64) may hold, whoever is behind them; newer ones
     are closed within a quarter of a second. 0: any number."""
@@ -269,6 +272,12 @@ class ServerConfig:
             )
         if self.learn.on and self.record.folder is None:
             raise InvalidInput("learn", "there is nothing to learn from; give --record FOLDER, too")
+        for name in self.proxy_identity:
+            check_name("proxy-identity", name)
+        if self.proxy_identity and self.transport.tls() is None:
+            raise InvalidInput(
+                "proxy-identity", "without certificates no proxy is known; give --tls-cert, too"
+            )
         if not self.fields.is_dir():
             raise InvalidInput("fields", f"{self.fields} is not a directory")
         if not 0 <= self.drain_hold_s <= MAX_DRAIN_HOLD_S:

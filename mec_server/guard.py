@@ -1,5 +1,8 @@
 """Checks every call's certificate: when it is made, and for as long as it is open.
 
+Of a call through a proxy, the client's and the proxy's (``mec_server.proxies``); services see the
+client's alone.
+
 An interceptor around all services. A call of a certificate that is revoked, or has expired, is
 refused; ``sweep`` ends open ones whose certificate is no longer good, or whose grants changed.
 """
@@ -18,6 +21,7 @@ import grpc
 import structlog
 
 from mec_server.access import AccessFile, Grant
+from mec_server.proxies import Proxies
 from rfcore.errors import AccessDenied, RfedgeError
 from rfcore.wire.identity import PeerIdentity, peer_identity
 
@@ -29,9 +33,10 @@ Handler = Any  # grpc's RpcMethodHandler: of any of four kinds
 
 @dataclass(eq=False)
 class OpenCall:
-    """A call that is open, and why it is to end."""
+    """A call that is open, and why it is to end; ``proxy``: whom it came through."""
 
     identity: PeerIdentity
+    proxy: PeerIdentity | None
     grant: Grant
     task: asyncio.Task[Any]
     ended: str = ""
@@ -50,8 +55,10 @@ class Guard(grpc.aio.ServerInterceptor):
         access: AccessFile,
         utc_now: Callable[[], datetime],
         refused: Callable[[], None],
+        proxies: Proxies,
     ) -> None:
         self._access = access
+        self._proxies = proxies
         self._utc_now = utc_now
         self._refused = refused
         self._open: set[OpenCall] = set()
@@ -74,6 +81,7 @@ class Guard(grpc.aio.ServerInterceptor):
         access, now = self._access.current, self._utc_now()
         for call in tuple(self._open):
             try:
+                access.check(call.proxy, now)
                 access.check(call.identity, now)
             except AccessDenied as error:
                 call.end(str(error))
@@ -100,27 +108,28 @@ class Guard(grpc.aio.ServerInterceptor):
         if inspect.isasyncgenfunction(behaviour):
 
             async def generate(request: Any, context: Any) -> AsyncIterator[Any]:
-                async with self._admitted(context):
-                    async for response in behaviour(request, context):
+                async with self._admitted(context) as seen:
+                    async for response in behaviour(request, seen):
                         yield response
 
             return generate
 
         async def call(request: Any, context: Any) -> Any:
-            async with self._admitted(context):
-                return await behaviour(request, context)
+            async with self._admitted(context) as seen:
+                return await behaviour(request, seen)
 
         return call
 
     @asynccontextmanager
-    async def _admitted(self, context: Any) -> AsyncIterator[None]:
-        call = await self._admit(context)
+    async def _admitted(self, context: Any) -> AsyncIterator[Any]:
+        """Hold the call open; yields its context, which names the client behind a proxy."""
+        seen, call = await self._admit(context)
         if call is None:
-            yield
+            yield seen
             return
         self._open.add(call)
         try:
-            yield
+            yield seen
         except asyncio.CancelledError:
             if not call.ended:
                 raise
@@ -131,12 +140,20 @@ class Guard(grpc.aio.ServerInterceptor):
         finally:
             self._open.discard(call)
 
-    async def _admit(self, context: Any) -> OpenCall | None:
-        """Return the call, or None in plaintext; abort it if its certificate is not good."""
+    async def _admit(self, context: Any) -> tuple[Any, OpenCall | None]:
+        """Return the context that services are to see, and the call (None in plaintext).
+
+        Aborts the call if its certificate, or its proxy's, is not good.
+        """
+        seen = context
         try:
-            identity = peer_identity(context.auth_context())
+            proxy = self._proxies.proxy_of(context)
+            if proxy is not None:
+                self._access.current.check(proxy, self._utc_now())
+                seen = self._proxies.client_context(context)
+            identity = peer_identity(seen.auth_context())
             if identity is None:
-                return None
+                return seen, None
             self._access.current.check(identity, self._utc_now())
             grant = self._access.current.grant(identity)
         except RfedgeError as error:
@@ -146,4 +163,4 @@ class Guard(grpc.aio.ServerInterceptor):
             raise AssertionError("abort raises") from error
         task = asyncio.current_task()
         assert task is not None
-        return OpenCall(identity, grant, task)
+        return seen, OpenCall(identity, proxy, grant, task)

@@ -32,6 +32,7 @@ from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.peer_log import LogLimiter, PeerLog
 from mec_server.metrics import BackgroundTask, ServerMetrics
 from mec_server.peers import ChargeRpcs, Slots
+from mec_server.proxies import Proxies
 from mec_server.reconstruction import OpenCameras, Tools, open_cameras
 from mec_server.recorder import KeepLimits, Recorder
 from mec_server.stream_decoders import ServerContext
@@ -122,7 +123,10 @@ class EdgeServer:
         self._access = AccessFile(config.access)
         self._access.start()
         self._guard = Guard(
-            self._access, lambda: datetime.now(UTC), self._metrics.refused_certificates.inc
+            self._access,
+            lambda: datetime.now(UTC),
+            self._metrics.refused_certificates.inc,
+            Proxies(config.proxy_identity),
         )
         twin = Twin()
         self._edge = EdgeService(self._context(twin, open_decoders))

@@ -1,8 +1,8 @@
 """Identities in certificates: one URI as the subject alternative name, in the form of a SPIFFE ID.
 
 ``spiffe://rfedge/vehicle/cav-1`` may send frames as ``cav-1`` and as nobody else; every other role
-(``server``, ``consumer``, ``operator``) may send none. What a role may see is for the server to say
-(``mec_server.access``). <https://spiffe.io/docs/latest/spiffe-specs/spiffe-id/>
+(``server``, ``proxy``, ``consumer``, ``operator``) may send none. What a role may see is for the
+server to say (``mec_server.access``). <https://spiffe.io/docs/latest/spiffe-specs/spiffe-id/>
 
 Serial number and end of validity are read from the certificate's DER (RFC 5280, section 4.1): gRPC
 has verified its signature, and what is read here is only compared.
@@ -31,6 +31,7 @@ class Role(StrEnum):
     VEHICLE = "vehicle"
     CONSUMER = "consumer"
     OPERATOR = "operator"
+    PROXY = "proxy"
 
 
 def identity_uri(role: Role, name: str) -> str:

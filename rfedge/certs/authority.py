@@ -53,6 +53,7 @@ class Members:
     consumers: tuple[str, ...] = ()
     hosts: tuple[str, ...] = ("localhost", "127.0.0.1", "::1")
     operators: tuple[str, ...] = ()
+    proxies: tuple[str, ...] = ()
 
     @property
     def clients(self) -> tuple[tuple[Role, tuple[str, ...]], ...]:
@@ -61,6 +62,7 @@ class Members:
             (Role.VEHICLE, self.vehicles),
             (Role.CONSUMER, self.consumers),
             (Role.OPERATOR, self.operators),
+            (Role.PROXY, self.proxies),
         )
 
     def __post_init__(self) -> None:
@@ -68,7 +70,8 @@ class Members:
             for name in names:
                 identity_uri(role, name)
             if len(set(names)) != len(names):
-                raise InvalidInput(f"{role}s", f"{', '.join(names)}: a name is there twice")
+                group = "proxies" if role is Role.PROXY else f"{role}s"
+                raise InvalidInput(group, f"{', '.join(names)}: a name is there twice")
         if not self.hosts:
             raise InvalidInput("hosts", "a server without a name cannot be reached")
         for host in self.hosts:
@@ -115,8 +118,8 @@ def _clients(authority: _Authority, members: Members) -> Iterator[Issued]:
 def add_certificates(
     folder: Path, members: Members, now: datetime, days: int
 ) -> tuple[Issued, ...]:
-    """Sign certificates for further vehicles, consumers and operators with the authority of
-    ``folder``, and write them into it; those that are there stay as they are.
+    """Sign certificates for further clients with the authority of ``folder``, and write them into
+    it; those that are there stay as they are.
 
     Raises ``InvalidInput`` for a name that has a certificate already, or a folder without the
     authority's key; ``InvalidData`` for a key that is not the authority's.
@@ -124,7 +127,7 @@ def add_certificates(
     _check_days(days)
     issued = tuple(_clients(_read_authority(folder, now, days), members))
     if not issued:
-        raise InvalidInput("certs", "name at least one vehicle, consumer or operator to add")
+        raise InvalidInput("certs", "name at least one vehicle, consumer, operator or proxy to add")
     there = [one.name for one in issued if (folder / f"{one.name}.pem").exists()]
     if there:
         raise InvalidInput("certs", f"{folder} has a certificate of {', '.join(there)} already")

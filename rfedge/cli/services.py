@@ -122,6 +122,8 @@ class CertsInit:
     """Who may watch the twin and ask for the server's health, without being a vehicle."""
     operators: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
     """Who may see everything, whatever consumers are granted."""
+    proxies: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
+    """Proxies before the servers, as in mec-server --proxy-identity."""
     hosts: Annotated[tuple[str, ...], arg(metavar="HOST ...")] = ("localhost", "127.0.0.1", "::1")
     """Names and addresses by which vehicles reach the server."""
     days: int = 365
@@ -135,7 +137,7 @@ class CertsInit:
 
         from rfedge.certs.authority import Members, certify, write_certificates
 
-        members = Members(self.vehicles, self.consumers, self.hosts, self.operators)
+        members = Members(self.vehicles, self.consumers, self.hosts, self.operators, self.proxies)
         issued = certify(members, datetime.now(UTC), self.days)
         write_certificates(self.out, issued, replace=self.replace)
         for certificate in issued:
@@ -155,6 +157,8 @@ class CertsAdd:
     """Consumers to add; what they may see stands in the server's --access file."""
     operators: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
     """Operators to add."""
+    proxies: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
+    """Proxies to add."""
     days: int = 90
     """How long the certificates are good."""
 
@@ -164,7 +168,9 @@ class CertsAdd:
 
         from rfedge.certs.authority import Members, add_certificates
 
-        members = Members(self.vehicles, self.consumers, operators=self.operators)
+        members = Members(
+            self.vehicles, self.consumers, operators=self.operators, proxies=self.proxies
+        )
         for one in add_certificates(self.folder, members, datetime.now(UTC), self.days):
             print(f"{self.folder / one.name}.pem  {one.identity}")
 

@@ -3,17 +3,25 @@
 import asyncio
 import signal
 from collections.abc import Callable, Mapping
-from contextlib import AsyncExitStack, ExitStack
+from contextlib import AsyncExitStack, ExitStack, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
+import grpc
 import pytest
 import yaml
 
 from cav_agent.config import AgentLimits, PaceKind
+from mec_server.proxies import FORWARDED
+from rfcore.wire.conventions import STREAM_METHOD
+from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.publish import Ground, publish
+from rfcore.wire.settings import TransportSettings
 from rfcore.wire.tiles import Area
+from rfcore.wire.tls import TlsFiles
+from rfedge.certs.authority import Members, certify, write_certificates
 from rfedge.demo.processes import Service, command_of, service
 from rfedge.loadtest.scale.envoy import Envoy, EnvoySetup, check_config, envoy_binary, run_envoy
 
@@ -34,20 +42,22 @@ PROXIED = (
 
 
 class Site:
-    """Servers as processes, and Envoy before them."""
+    """Servers as processes with ``options``, and Envoy with ``config`` before them."""
 
-    def __init__(self, store: Path, folder: Path) -> None:
+    def __init__(
+        self, folder: Path, options: tuple[str, ...] = PROXIED, config: str = "envoy.yaml"
+    ) -> None:
         self.servers: list[Service] = []
-        self.setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy.yaml", folder / "envoy")
+        self.setup = EnvoySetup(envoy_binary(), DEPLOY / config, folder / "envoy")
         self.setup.folder.mkdir()
-        self._store, self._folder = store, folder
+        self._folder, self._options = folder, options
         self._stack = ExitStack()
         self._started = 0
 
     def start_server(self) -> Service:
         self._started += 1
-        options = ("--fields", str(self._store), "--listen", "127.0.0.1:0", *PROXIED)
-        command = [*command_of("mec-server"), *options]
+        store = ("--fields", str(self._folder / "published"), "--listen", "127.0.0.1:0")
+        command = [*command_of("mec-server"), *store, *self._options]
         started = self._stack.enter_context(
             service(f"server{self._started}", command, self._folder)
         )
@@ -67,6 +77,13 @@ class Site:
 
     def close(self) -> None:
         self._stack.close()
+
+
+def publish_street(street: Any, folder: Path) -> None:
+    """Make the folder that the servers of a site publish."""
+    (folder / "published").mkdir()
+    archive, now = street.store / "street.rff", datetime(2026, 1, 1, tzinfo=UTC)
+    publish(folder / "published", "street", archive, EVERYWHERE, now)
 
 
 async def settled(envoy: Envoy, holds: Callable[[Mapping[str, int]], bool]) -> dict[str, int]:
@@ -94,11 +111,8 @@ async def test_envoy_places_streams_and_moves_them_when_a_server_dies_or_drains(
     street: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
-    store = tmp_path / "published"
-    store.mkdir()
-    archive, now = street.store / "street.rff", datetime(2026, 1, 1, tzinfo=UTC)
-    publish(store, "street", archive, EVERYWHERE, now)
-    site = Site(store, tmp_path)
+    publish_street(street, tmp_path)
+    site = Site(tmp_path)
     async with AsyncExitStack() as stack:
         stack.callback(site.close)
         for _ in range(SERVERS):
@@ -152,6 +166,70 @@ async def test_envoy_places_streams_and_moves_them_when_a_server_dies_or_drains(
         if line["result"] == "acked":
             assert line["server_digest"] == line["reconstruction_digest"], "the same bytes"
             assert "render" in line["references"], "never a keyframe"
+
+
+async def test_over_mutual_tls_envoy_says_who_a_vehicle_is_and_nobody_else_can(
+    street: Any, vehicle: Any, coded: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
+    publish_street(street, tmp_path)
+    members = Members(("cav-1", "cav-raw", "thief"), proxies=("edge-proxy",))
+    certs = tmp_path / "envoy" / "certs"
+    files = ("--tls-cert", "server.pem", "--tls-key", "server.key", "--tls-ca", "ca.pem")
+    tls = (word if word.startswith("--") else str(certs / word) for word in files)
+    site = Site(tmp_path, (*tls, "--proxy-identity", "edge-proxy"), "envoy-mtls.yaml")
+    write_certificates(certs, certify(members, datetime.now(UTC), days=30))
+    metadata = ((FORWARDED, forwarded_header(certs / "vehicle-cav-raw.pem")),)
+
+    async def status(name: str) -> grpc.StatusCode:
+        """Say Hello as cav-raw, with that certificate and the header of cav-raw's."""
+        own = TlsFiles(certs / f"{name}.pem", certs / f"{name}.key", certs / "ca.pem")
+        async with grpc.aio.secure_channel(address, own.channel_credentials()) as channel:
+            stream = channel.stream_stream(STREAM_METHOD)(metadata=metadata)
+            await stream.write(client_message_to_bytes(coded.hello))
+            await stream.done_writing()
+            with suppress(grpc.aio.AioRpcError):
+                while await stream.read() is not grpc.aio.EOF:
+                    pass
+            return await stream.code()
+
+    with ExitStack() as stack:
+        stack.callback(site.close)
+        site.start_server()
+        address = site.start_envoy().address
+        transport = TransportSettings(
+            certs / "vehicle-cav-1.pem", certs / "vehicle-cav-1.key", certs / "ca.pem"
+        )
+        mine = tmp_path / "mine"
+        async with vehicle(address, fields=mine, limits=PATIENT, transport=transport) as driving:
+            await driving.until(lambda: driving.acked() >= 4)
+        assert await status("vehicle-cav-raw") is grpc.StatusCode.OK
+        assert await status("vehicle-thief") is grpc.StatusCode.PERMISSION_DENIED
+        async with grpc.aio.insecure_channel(address) as nobody:
+            stream = nobody.stream_stream(STREAM_METHOD)()
+            assert await stream.code() is grpc.StatusCode.UNAVAILABLE
+
+
+def forwarded_header(certificate: Path) -> str:
+    role, _, name = certificate.stem.partition("-")
+    return f'Cert="{quote(certificate.read_bytes())}";URI=spiffe://rfedge/{role}/{name}'
+
+
+def test_with_mutual_tls_nothing_else_is_another() -> None:
+    plain, secret = (
+        yaml.safe_load((DEPLOY / name).read_text()) for name in ("envoy.yaml", "envoy-mtls.yaml")
+    )
+    (listener,) = secret["static_resources"]["listeners"]
+    (chain,) = listener["filter_chains"]
+    manager = chain["filters"][0]["typed_config"]
+    for part, name in (
+        (chain, "transport_socket"),
+        (secret["static_resources"]["clusters"][0], "transport_socket"),
+        (manager, "forward_client_cert_details"),
+        (manager, "set_current_client_cert_details"),
+    ):
+        assert part.pop(name)
+    assert secret == plain
 
 
 def test_envoy_accepts_the_configuration_and_the_list_of_servers_is_as_the_test_writes_it(

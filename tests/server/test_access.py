@@ -43,6 +43,7 @@ def access(tmp_path: Path) -> AccessList:
         (who(Role.OPERATOR, "op"), True, True, True, True),
         (who(Role.VEHICLE, "cav-1"), True, False, False, True),
         (who(Role.SERVER, "edge"), False, False, False, False),
+        (who(Role.PROXY, "edge"), False, False, False, False),
         (None, True, True, True, True),
     ],
 )
