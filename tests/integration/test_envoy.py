@@ -242,3 +242,12 @@ def test_envoy_accepts_the_configuration_and_the_list_of_servers_is_as_the_test_
         yaml.safe_load((folder / "servers.yaml").read_text()) for folder in (tmp_path, DEPLOY)
     )
     assert deployed["resources"] == written["resources"]
+
+
+@pytest.mark.parametrize("config", ["envoy/envoy-mtls.yaml", "kubernetes/envoy.yaml"])
+def test_envoy_accepts_what_needs_certificates(config: str, tmp_path: Path) -> None:
+    members = Members((), proxies=("edge-proxy",))
+    write_certificates(tmp_path / "certs", certify(members, datetime.now(UTC), days=30))
+    setup = EnvoySetup(envoy_binary(), DEPLOY.parent / config, tmp_path)
+    setup.list_servers(["127.0.0.1:50051"])
+    check_config(setup)
