@@ -191,7 +191,8 @@ class LearnSettings:
     """What all learnt archives may take, in 10^9 bytes; the oldest that are not current go."""
     max_age_h: Annotated[float, arg(name="learn-max-age-h")] = 24.0
     """Recordings older than so many hours are not learnt from."""
-    quiet_s: Annotated[float, Suppress] = 20.0
+    quiet_s: Annotated[float, arg(name="learn-quiet-s")] = 20.0
+    """A pass is over, and is learnt from, when nothing was recorded of it for so many seconds."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.min_identities <= 1000:
@@ -200,6 +201,7 @@ class LearnSettings:
             ("cpu-s-per-h", self.cpu_s_per_h, 1.0, 3600.0),
             ("max-gb", self.max_gb, 0.001, 1e6),
             ("max-age-h", self.max_age_h, 0.01, 1e6),
+            ("quiet-s", self.quiet_s, 0.1, 3600.0),
         ):
             if not low <= value <= high:
                 raise InvalidInput(f"learn-{name}", f"{value:g} is outside {low:g}..{high:g}")

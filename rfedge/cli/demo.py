@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
 from rfcore.codec.h264.config import DEFAULT_EFFORT
-from rfedge.arguments import FOLDER
+from rfedge.arguments import DATASET, FOLDER
 from rfedge.samples import sample_path
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from rfedge.demo import DemoSettings
 
 __all__ = ["Demo"]
 
@@ -21,8 +26,15 @@ class Demo:
 
     sample: Annotated[Path, FOLDER] = sample_path("street")
     """Dataset folder: training views, points, and the drives `empty` and `vehicles`."""
-    out: Annotated[Path, FOLDER] = Path("out/demo")
-    """Folder for report.html, reconstructed.mp4 and result.json; replaced on every run."""
+    evening: bool = False
+    """Instead: drive at dusk against the field of noon, let the server learn from what it decoded,
+    and let a second vehicle fetch and use what it published."""
+    dusk: Annotated[Path | None, DATASET] = None
+    """With --evening: a drive of the sample's street in another light, as `rfedge scene build
+    street-dusk --split drive` renders it; default: the drive `empty` under a declared light."""
+    out: Annotated[Path | None, FOLDER] = None
+    """Folder for report.html, result.json and reconstructed.mp4; replaced on every run. Default:
+    out/demo, with --evening out/demo-evening."""
     cache: Annotated[Path, FOLDER] = Path("out/cache")
     """Folder that keeps the trained field between runs."""
     train: bool = False
@@ -51,14 +63,17 @@ class Demo:
         """Run the demo, write its report and print its table."""
         from rich.console import Console
 
+        from rfcore.errors import InvalidInput
         from rfedge.demo import DemoSettings, run_demo
         from rfedge.demo.report import print_summary, write_report
         from rfedge.training.run import training_config
 
+        if self.dusk is not None and not self.evening:
+            raise InvalidInput("dusk", f"{self.dusk} is driven only with --evening; give it, too")
         console = Console()
         settings = DemoSettings(
             sample=self.sample,
-            out=self.out,
+            out=self._out,
             cache=self.cache,
             train_anew=self.train,
             training=training_config(self.gaussians, self.iterations, self.threads),
@@ -70,10 +85,26 @@ class Demo:
             crf=self.crf,
             threads=self.threads,
         )
+        if self.evening:
+            self._run_evening(settings, console)
+            return
         run = run_demo(settings, console)
-        video = self.out / "reconstructed.mp4"
-        write_report(self.out / "report.html", run.result, run.pictures, video)
-        print_summary(console, run.result, self.out)
+        video = settings.out / "reconstructed.mp4"
+        write_report(settings.out / "report.html", run.result, run.pictures, video)
+        print_summary(console, run.result, settings.out)
         # Not wrapped to the terminal's width: to be copied in one go.
-        print(f"in a browser: {run.twin_command(self.out)}")
+        print(f"in a browser: {run.twin_command(settings.out)}")
         run.require_complete()
+
+    def _run_evening(self, settings: DemoSettings, console: Console) -> None:
+        from rfedge.demo.evening import run_evening
+        from rfedge.demo.report import print_evening, write_evening_report
+
+        run = run_evening(settings, self.dusk, console)
+        write_evening_report(settings.out / "report.html", run.result, run.pictures)
+        print_evening(console, run.result, settings.out)
+
+    @property
+    def _out(self) -> Path:
+        """The folder of the demo that was asked for."""
+        return self.out or Path("out/demo-evening" if self.evening else "out/demo")

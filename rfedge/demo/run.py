@@ -34,7 +34,17 @@ from rfedge.demo.processes import command_of, run_to_end, service
 from rfedge.results import make_result, provenance, write_result
 from rfedge.video import write_mp4
 
-__all__ = ["DRIVES", "DemoRun", "DemoSettings", "run_demo"]
+__all__ = [
+    "CAMERA",
+    "DRIVES",
+    "DemoRun",
+    "DemoSettings",
+    "empty_folder",
+    "json_lines",
+    "refuse_foreign_folder",
+    "rendered",
+    "run_demo",
+]
 
 DRIVES = ("empty", "vehicles")
 VEHICLE = "demo"
@@ -100,10 +110,10 @@ def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
     """
     console.print(f"[bold]Sample[/] {settings.sample}: verifying")
     verify_manifest(settings.sample)
-    _refuse_foreign_folder(settings.out)
+    refuse_foreign_folder(settings.out)
     choice = FieldChoice(settings.sample, settings.cache, settings.training, settings.train_anew)
     field_path = choose_field(choice, console)
-    _empty_folder(settings.out)
+    empty_folder(settings.out)
     field = load_field(field_path, threads=settings.threads)
     wrong_street = _wrong_street(settings.sample, field)
     sequences: dict[str, DriveFigures] = {}
@@ -121,7 +131,7 @@ def run_demo(settings: DemoSettings, console: Console) -> DemoRun:
     return DemoRun(result, pictures, field_path)
 
 
-def _refuse_foreign_folder(folder: Path) -> None:
+def refuse_foreign_folder(folder: Path) -> None:
     """Raise ``InvalidInput`` for a folder whose content no demo made: it would be deleted."""
     content = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     if content - {"work"} and "result.json" not in content:
@@ -130,7 +140,8 @@ def _refuse_foreign_folder(folder: Path) -> None:
         )
 
 
-def _empty_folder(folder: Path) -> None:
+def empty_folder(folder: Path) -> None:
+    """Leave nothing in a demo's folder but an empty ``work``."""
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "work").mkdir(parents=True)
 
@@ -142,7 +153,7 @@ def _drive_outcome(
     work.mkdir(parents=True)
     drive_path = settings.sample / f"transforms_drive_{drive}.json"
     _run_processes(settings, drive_path, field_path, field.field_id, work)
-    agent_rows = _json_lines(work / "agent.jsonl")
+    agent_rows = json_lines(work / "agent.jsonl")
     parts = [read_recorded_part(file) for file in recordings_under(work / RECORDED)]
     recorded = {(r.epoch, r.sequence): (part, r) for part in parts for r in part.pictures}
     dataset = read_dataset(drive_path)
@@ -197,10 +208,12 @@ def _address(row: Mapping[str, Any]) -> FrameAddress:
     return (row["epoch"], row["sequence"])
 
 
-def _json_lines(path: Path) -> list[dict[str, Any]]:
+def json_lines(path: Path) -> list[dict[str, Any]]:
+    """Return a report's lines that are whole; raise ``RfedgeError`` if there is none."""
     if not path.exists():
         raise RfedgeError(f"{path} was not written: the processes reported nothing")
-    return [json.loads(line) for line in path.read_text().splitlines()]
+    *whole, _ = path.read_text().split("\n")
+    return [json.loads(line) for line in whole]
 
 
 def _pictures(
@@ -215,7 +228,7 @@ def _pictures(
         Pictures(
             row["name"],
             posed[row["name"]].read(),
-            _rendered(field, posed[row["name"]].camera),
+            rendered(field, posed[row["name"]].camera),
             read_rgb(recorded[_address(row)]),
         )
         for row in agent_rows
@@ -223,7 +236,7 @@ def _pictures(
     ]
 
 
-def _rendered(field: RadianceField, camera: Camera) -> Rgb:
+def rendered(field: RadianceField, camera: Camera) -> Rgb:
     """The render as the codec sees it: through YUV 4:2:0 and back."""
     return rgb_from_i420(render_field_view(field, camera).render)
 
@@ -240,7 +253,7 @@ def _wrong_street(sample: Path, field: RadianceField) -> Rgb:
             for a, b in zip(view.camera.world_from_cam.translation_m, start, strict=True)
         ),
     )
-    return _rendered(field, farthest.camera)
+    return rendered(field, farthest.camera)
 
 
 def _result(
