@@ -14,7 +14,7 @@ from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
 from rfedge.bench import bench_section
 from rfedge.demo.report import demo_section
-from rfedge.experiments.adapt.report import adapt_section
+from rfedge.experiments.adapt.measure import adapt_section
 from rfedge.experiments.compare.figures import write_compare_figures
 from rfedge.experiments.compare.report import compare_section, headline_table
 from rfedge.experiments.ladder.page import write_ladder_figure

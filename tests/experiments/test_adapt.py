@@ -9,8 +9,14 @@ import pytest
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
-from rfedge.experiments.adapt.measure import AdaptCase, AdaptJob, recovered_percent, run_adapt
-from rfedge.experiments.adapt.report import AdaptRow, adapt_section
+from rfedge.experiments.adapt.measure import (
+    AdaptCase,
+    AdaptJob,
+    AdaptRow,
+    adapt_section,
+    recovered_percent,
+    run_adapt,
+)
 from rfedge.results import Provenance, make_result
 
 

@@ -20,15 +20,30 @@ from rfcore.codec.h264.config import check_effort
 from rfcore.codec.photometric import Photometric
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field
-from rfedge.experiments.adapt.report import AdaptRow, print_adapt
 from rfedge.experiments.cells import CellStore, program_version
 from rfedge.experiments.clips import Drive, DriveName, read_drive
 from rfedge.experiments.field_coder import FieldCoder, render_clip
 from rfedge.experiments.performance import Performance, perform
 from rfedge.experiments.rivals import x264_for_psnr
-from rfedge.results import check_result_path, make_result, provenance, write_result
+from rfedge.report.tables import heading, print_table, table
+from rfedge.results import (
+    Result,
+    check_result_path,
+    make_result,
+    provenance,
+    rows_of,
+    write_result,
+)
 
-__all__ = ["AT_DB", "AdaptCase", "AdaptJob", "recovered_percent", "run_adapt"]
+__all__ = [
+    "AT_DB",
+    "AdaptCase",
+    "AdaptJob",
+    "AdaptRow",
+    "adapt_section",
+    "recovered_percent",
+    "run_adapt",
+]
 
 AT_DB = 33.0
 POINTS = (18.0, 22.0, 26.0, 30.0, 34.0, 38.0, 42.0)
@@ -36,6 +51,30 @@ QUICK_FRAMES = 6
 OFF, MATRIX = "off", "matrix"
 TOOLS: Mapping[str, Photometric | None] = {OFF: (), MATRIX: None}
 """Variants with the case's own field, and what the sender is told about the light."""
+
+
+@dataclass(frozen=True)
+class AdaptRow:
+    """One drive coded in one way; None where a figure does not apply."""
+
+    case: str
+    drive: str
+    frames: int
+    variant: str
+    kbit_33db: float
+    """Kilobits a frame at a luma PSNR of 33 dB, the first frame apart."""
+    x264_kbit_33db: float
+    """The same of x264 tuned for PSNR."""
+    recovered_percent: float | None
+    """Of what the drive costs more than in the field's own light, with the variant ``off``."""
+    noon_bits_percent: float | None
+    """Bits more than ``off`` takes in the field's own light; other fields are not taken there."""
+    second_vehicle_percent: float | None
+    """A second vehicle's bytes a frame over the first one's, above those of the empty street."""
+    side_bytes: int
+    """Of the field or layer that the variant needs besides."""
+    extra_ms: float
+    """Processor time a frame of the sender, more than ``off`` takes."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +143,7 @@ def run_adapt(job: AdaptJob, console: Console) -> dict[str, Any]:
             console.print(f"{row.case} {row.variant}: {row.kbit_33db:.1f} kbit a frame")
     result = make_result("adapt", made, {"quick": job.quick, "at_db": AT_DB, "rows": rows})
     write_result(job.out, result)
-    print_adapt(console, rows)
+    print_table(console, "Another light", COLUMNS, [_cells(row) for row in rows])
     return result
 
 
@@ -186,3 +225,47 @@ class _Measured:
         """
         curve = done.steady
         return 8e-3 * curve.bytes_at(max(AT_DB, float(curve.psnr_db[0])))
+
+
+COLUMNS = (
+    "case",
+    "drive",
+    "frames",
+    "variant",
+    "kbit at 33 dB",
+    "x264",
+    "against x264 %",
+    "recovered %",
+    "bits at noon %",
+    "second vehicle %",
+    "side bytes",
+    "extra ms",
+)
+
+
+def adapt_section(path: Path, result: Result) -> str:
+    """Return the table of the results page."""
+    rows = map(_cells, rows_of(AdaptRow, result["rows"]))
+    return "\n\n".join([heading(path, result), table(COLUMNS, rows), ""])
+
+
+def _cells(row: AdaptRow) -> list[str]:
+    against = 100 * (row.kbit_33db / row.x264_kbit_33db - 1)
+    return [
+        row.case,
+        row.drive,
+        str(row.frames),
+        row.variant,
+        f"{row.kbit_33db:.1f}",
+        f"{row.x264_kbit_33db:.1f}",
+        f"{against:+.1f}",
+        _percent(row.recovered_percent),
+        _percent(row.noon_bits_percent),
+        _percent(row.second_vehicle_percent),
+        str(row.side_bytes),
+        f"{row.extra_ms:+.1f}",
+    ]
+
+
+def _percent(value: float | None) -> str:
+    return "n/a" if value is None else f"{value:+.1f}"
