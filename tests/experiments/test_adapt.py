@@ -2,9 +2,11 @@
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -14,9 +16,13 @@ from rfedge.experiments.adapt.measure import (
     AdaptJob,
     AdaptRow,
     adapt_section,
+    kbit_at,
     recovered_percent,
     run_adapt,
+    second_vehicle_percent,
 )
+from rfedge.experiments.clips import CodedClip
+from rfedge.experiments.performance import Performance
 from rfedge.results import Provenance, make_result
 
 
@@ -29,7 +35,40 @@ def test_what_is_recovered_is_a_share_of_the_loss() -> None:
 
 def test_without_a_loss_nothing_is_recovered() -> None:
     assert recovered_percent(75.0, None, 50.0) is None
+    assert recovered_percent(75.0, 25.0, None) is None
+    assert recovered_percent(None, 25.0, 20.0) is None
     assert recovered_percent(25.0, 25.0, 20.0) is None
+
+
+def test_a_second_vehicle_pays_for_what_is_new_as_the_first_one_or_not_at_all() -> None:
+    assert second_vehicle_percent(60.0, 20.0, 60.0) == 100.0
+    assert second_vehicle_percent(60.0, 20.0, 40.0) == 50.0
+    assert second_vehicle_percent(60.0, 20.0, 20.0) == 0.0
+    assert second_vehicle_percent(60.0, None, 20.0) is None
+    assert second_vehicle_percent(60.0, 20.0, None) is None
+
+
+def coded_at(*points: tuple[float, int]) -> Performance:
+    """Two frames at so many luma decibels and bytes a frame."""
+    clips = tuple(
+        CodedClip(
+            float(point),
+            np.array([9999, size]),
+            np.full(2, 255.0**2 / 10 ** (db / 10)),
+            np.full(2, 0.9),
+            cpu_ms=2.0,
+        )
+        for point, (db, size) in enumerate(points)
+    )
+    return Performance("ours", clips, 1.0)
+
+
+def test_bits_at_a_quality_are_those_of_the_curve_and_none_are_made_up_outside_it() -> None:
+    done = coded_at(*((40.0 - 2 * n, 1000 - 100 * n) for n in range(6)))
+    assert kbit_at(36.0, done) == pytest.approx(8 * 0.8)
+    assert kbit_at(30.0, done) == pytest.approx(8 * 0.5)
+    assert kbit_at(29.9, done) is None
+    assert kbit_at(40.1, done) is None
 
 
 def test_a_case_names_its_drive_fields_and_variants() -> None:
@@ -42,6 +81,7 @@ def test_a_case_names_its_drive_fields_and_variants() -> None:
     assert (case.field, case.noon) == (Path("f.rff"), Path("n.json"))
     assert case.variants == {"learnt": Path("g.rff"), "layer": Path("l.rff")}
     assert AdaptCase.parse("a@5=d,field=f").noon is None
+    assert AdaptCase.parse("a@5=d,field=f,empty=e.json").empty == Path("e.json")
 
 
 @pytest.mark.parametrize(
@@ -82,6 +122,8 @@ def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(
     assert rows["again"]["noon_bits_percent"] is None
     assert rows["off"]["side_bytes"] == rows["off"]["extra_ms"] == 0
     assert rows["off"]["recovered_percent"] is None, "noon itself has nothing to win back"
+    assert rows["off"]["kbit_33db"] > 0
+    assert rows["off"]["lowest_psnr_db"] < 33
     assert rows["off"]["noon_bits_percent"] == 0.0
     assert rows["matrix"]["noon_bits_percent"] == 0.0
     assert json.loads(job.out.read_text())["rows"] == result["rows"]
@@ -90,12 +132,30 @@ def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(
     assert {path: path.read_bytes() for path in job.cells.iterdir()} == cells
 
 
+def test_where_a_field_shows_33_db_before_a_bit_is_sent_no_bits_are_stated(
+    thumbnail: Any, tmp_path: Path
+) -> None:
+    text = f"{thumbnail.empty},field={thumbnail.field},again={thumbnail.field}"
+    text += f",empty={thumbnail.empty.partition('=')[2]}"
+    job = AdaptJob(
+        (AdaptCase.parse(text),), "fast", "ultrafast", tmp_path / "a.json", tmp_path / "cells", True
+    )
+    said = io.StringIO()
+    off, _, again = run_adapt(job, Console(file=said, width=200))["rows"]
+    assert off["kbit_33db"] is None
+    assert off["lowest_psnr_db"] > 33
+    assert off["x264_kbit_33db"] > 0
+    assert again["recovered_percent"] is again["second_vehicle_percent"] is None
+    assert f"not at 33 dB, from {off['lowest_psnr_db']:.1f} dB on" in said.getvalue()
+
+
 ROW = AdaptRow(
     case="dusk",
     drive="transforms_drive_dusk@10",
     frames=24,
     variant="matrix",
     kbit_33db=71.7,
+    lowest_psnr_db=25.31,
     x264_kbit_33db=100.0,
     recovered_percent=None,
     noon_bits_percent=0.0,
@@ -111,5 +171,11 @@ MADE = Provenance("rfedge eval adapt", "abc123", False, HOST, {})
 
 def test_what_does_not_apply_is_said_so() -> None:
     section = adapt_section(Path("adapt.json"), make_result("adapt", MADE, {"rows": [ROW]}))
-    line = "| matrix | 71.7 | 100.0 | -28.3 | n/a | +0.0 | n/a | 0 | +1.3 |"
+    line = "| matrix | 71.7 | 25.3 | 100.0 | -28.3 | n/a | +0.0 | n/a | 0 | +1.3 |"
     assert line in section
+
+
+def test_a_curve_above_33_db_says_so_and_from_where_on_it_is() -> None:
+    row = replace(ROW, kbit_33db=None, lowest_psnr_db=34.62)
+    section = adapt_section(Path("adapt.json"), make_result("adapt", MADE, {"rows": [row]}))
+    assert "| matrix | n/a | 34.6 | 100.0 | n/a | n/a | +0.0 | n/a | 0 | +1.3 |" in section

@@ -41,8 +41,10 @@ __all__ = [
     "AdaptJob",
     "AdaptRow",
     "adapt_section",
+    "kbit_at",
     "recovered_percent",
     "run_adapt",
+    "second_vehicle_percent",
 ]
 
 AT_DB = 33.0
@@ -61,16 +63,19 @@ class AdaptRow:
     drive: str
     frames: int
     variant: str
-    kbit_33db: float
+    kbit_33db: float | None
     """Kilobits a frame at a luma PSNR of 33 dB, the first frame apart."""
-    x264_kbit_33db: float
-    """The same of x264 tuned for PSNR."""
+    lowest_psnr_db: float
+    """Luma PSNR at the fewest bits: above 33 dB, ``kbit_33db`` is None."""
+    x264_kbit_33db: float | None
+    """Kilobits of x264 tuned for PSNR at 33 dB."""
     recovered_percent: float | None
     """Of what the drive costs more than in the field's own light, with the variant ``off``."""
     noon_bits_percent: float | None
     """Bits more than ``off`` takes in the field's own light; other fields are not taken there."""
     second_vehicle_percent: float | None
-    """A second vehicle's bytes a frame over the first one's, above those of the empty street."""
+    """Bits above those of the street without what is new to the field, over those that ``off``
+    takes above them; of fields that were learnt since."""
     side_bytes: int
     """Of the field or layer that the variant needs besides."""
     extra_ms: float
@@ -79,11 +84,15 @@ class AdaptRow:
 
 @dataclass(frozen=True)
 class AdaptCase:
-    """A drive in some light, the field of another one, and variants by name."""
+    """A drive in some light, the field of another one, and variants by name.
+
+    ``noon``: the same drive in the field's light; ``empty``: without what the field has not seen.
+    """
 
     drive: DriveName
     field: Path
     noon: Path | None = None
+    empty: Path | None = None
     variants: Mapping[str, Path] = with_factory(default_factory=dict)
 
     @staticmethod
@@ -96,10 +105,10 @@ class AdaptCase:
             if not (key and found and path) or key in named or key in TOOLS:
                 raise InvalidInput("cases", f"{pair!r} is not KEY=PATH with a key of its own")
             named[key] = Path(path)
-        if "field" not in named:
+        own, noon, empty = (named.pop(key, None) for key in ("field", "noon", "empty"))
+        if own is None:
             raise InvalidInput("cases", f"{text!r} names no field=")
-        own, noon = named.pop("field"), named.pop("noon", None)
-        return AdaptCase(DriveName.parse(drive), own, noon, named)
+        return AdaptCase(DriveName.parse(drive), own, noon, empty, named)
 
     @property
     def files(self) -> list[Path]:
@@ -132,26 +141,35 @@ class AdaptJob:
 def run_adapt(job: AdaptJob, console: Console) -> dict[str, Any]:
     """Code what is not there yet, write ``job.out`` and print the rows.
 
-    Raises ``InvalidInput`` where no point of a coder reaches 33 dB, ``DatasetError`` or
-    ``FieldFormatError`` for inputs that cannot be read.
+    Raises ``DatasetError`` or ``FieldFormatError`` for inputs that cannot be read.
     """
     made = provenance([path for case in job.cases for path in case.files])
     store, rows = CellStore(job.cells), []
     for case in job.cases:
         for row in _Measured(job, case, store).rows():
             rows.append(row)
-            console.print(f"{row.case} {row.variant}: {row.kbit_33db:.1f} kbit a frame")
+            console.print(f"{row.case} {row.variant}: {_kbit_text(row)}")
     result = make_result("adapt", made, {"quick": job.quick, "at_db": AT_DB, "rows": rows})
     write_result(job.out, result)
     print_table(console, "Another light", COLUMNS, [_cells(row) for row in rows])
     return result
 
 
-def recovered_percent(off_kbit: float, noon_kbit: float | None, kbit: float) -> float | None:
-    """Return which share of the loss was won back; None without a noon or without a loss."""
-    if noon_kbit is None or noon_kbit >= off_kbit:
+def recovered_percent(
+    off_kbit: float | None, noon_kbit: float | None, kbit: float | None
+) -> float | None:
+    """Return which share of the loss was won back; None where bits are, or without a loss."""
+    if off_kbit is None or noon_kbit is None or kbit is None or noon_kbit >= off_kbit:
         return None
     return 100 * (off_kbit - kbit) / (off_kbit - noon_kbit)
+
+
+def second_vehicle_percent(
+    first_kbit: float | None, empty_kbit: float | None, kbit: float | None
+) -> float | None:
+    """Return which share of what is new a vehicle still pays for; None as above."""
+    recovered = recovered_percent(first_kbit, empty_kbit, kbit)
+    return None if recovered is None else 100 - recovered
 
 
 @dataclass(frozen=True)
@@ -162,35 +180,44 @@ class _Measured:
 
     def rows(self) -> Iterator[AdaptRow]:
         """Yield a row for each variant."""
-        case = self.case
-        drive = self.job.read(case.drive)
-        noon = self._noon()
+        case, drive = self.case, self.job.read(self.case.drive)
         x264 = self._performed(drive, x264_for_psnr(self.job.preset))
         plain = self._coded(drive, OFF, case.field)
-        noon_off = None if noon is None else self._kbit(self._coded(noon, OFF, case.field))
+        noon = self._other("noon", case.noon)
+        noon_off, empty_off = self._off_kbit(noon), self._off_kbit(self._other("empty", case.empty))
         for variant in (OFF, MATRIX, *case.variants):
+            is_other = variant in case.variants
             path = case.variants.get(variant, case.field)
             done = plain if variant == OFF else self._coded(drive, variant, path)
-            kbit = self._kbit(done)
+            off_kbit, kbit = kbit_at(AT_DB, plain), kbit_at(AT_DB, done)
+            second = second_vehicle_percent(off_kbit, empty_off, kbit) if is_other else None
             yield AdaptRow(
                 case=case.drive.scene,
                 drive=f"{case.drive.dataset.stem}@{case.drive.rate_hz:g}",
                 frames=len(drive.frames),
                 variant=variant,
                 kbit_33db=kbit,
-                x264_kbit_33db=self._kbit(x264),
-                recovered_percent=recovered_percent(self._kbit(plain), noon_off, kbit),
+                lowest_psnr_db=min(clip.psnr_db() for clip in done.clips),
+                x264_kbit_33db=kbit_at(AT_DB, x264),
+                recovered_percent=recovered_percent(off_kbit, noon_off, kbit),
                 noon_bits_percent=self._noon_percent(noon, noon_off, variant),
-                second_vehicle_percent=None,
-                side_bytes=path.stat().st_size if variant in case.variants else 0,
+                second_vehicle_percent=second,
+                side_bytes=path.stat().st_size if is_other else 0,
                 extra_ms=done.cpu_ms_per_frame - plain.cpu_ms_per_frame,
             )
 
-    def _noon(self) -> Drive | None:
-        if self.case.noon is None:
+    def _other(self, kind: str, dataset: Path | None) -> Drive | None:
+        """Return the same drive in other circumstances, if the case names it."""
+        if dataset is None:
             return None
-        name = DriveName(f"{self.case.drive.scene}-noon", self.case.drive.rate_hz, self.case.noon)
-        return self.job.read(name)
+        drive = self.case.drive
+        return self.job.read(DriveName(f"{drive.scene}-{kind}", drive.rate_hz, dataset))
+
+    def _off_kbit(self, drive: Drive | None) -> float | None:
+        """Return what a drive takes with the case's own field."""
+        if drive is None:
+            return None
+        return kbit_at(AT_DB, self._coded(drive, OFF, self.case.field))
 
     def _noon_percent(
         self, noon: Drive | None, off_kbit: float | None, variant: str
@@ -201,7 +228,8 @@ class _Measured:
         """
         if noon is None or off_kbit is None or variant not in TOOLS:
             return None
-        return 100 * (self._kbit(self._coded(noon, variant, self.case.field)) / off_kbit - 1)
+        kbit = kbit_at(AT_DB, self._coded(noon, variant, self.case.field))
+        return None if kbit is None else 100 * (kbit / off_kbit - 1)
 
     def _coded(self, drive: Drive, variant: str, path: Path) -> Performance:
         rendered = render_clip(load_field(path), drive.cameras)
@@ -218,13 +246,13 @@ class _Measured:
     def _performed(self, drive: Drive, coder: Any) -> Performance:
         return perform(drive.clip(), coder, self.store)
 
-    def _kbit(self, done: Performance) -> float:
-        """Return the kilobits a frame at 33 dB, the first frame apart.
 
-        A field that shows more before a bit is sent is taken at its lowest quality.
-        """
-        curve = done.steady
-        return 8e-3 * curve.bytes_at(max(AT_DB, float(curve.psnr_db[0])))
+def kbit_at(psnr_db: float, done: Performance) -> float | None:
+    """Return the kilobits a frame at a luma PSNR, the first frame apart; None outside the curve."""
+    reached_db = [clip.psnr_db() for clip in done.clips]
+    if not min(reached_db) <= psnr_db <= max(reached_db):
+        return None
+    return 8e-3 * done.steady.bytes_at(psnr_db)
 
 
 COLUMNS = (
@@ -233,6 +261,7 @@ COLUMNS = (
     "frames",
     "variant",
     "kbit at 33 dB",
+    "lowest dB",
     "x264",
     "against x264 %",
     "recovered %",
@@ -250,21 +279,34 @@ def adapt_section(path: Path, result: Result) -> str:
 
 
 def _cells(row: AdaptRow) -> list[str]:
-    against = 100 * (row.kbit_33db / row.x264_kbit_33db - 1)
+    against = None
+    if row.kbit_33db is not None and row.x264_kbit_33db is not None:
+        against = 100 * (row.kbit_33db / row.x264_kbit_33db - 1)
     return [
         row.case,
         row.drive,
         str(row.frames),
         row.variant,
-        f"{row.kbit_33db:.1f}",
-        f"{row.x264_kbit_33db:.1f}",
-        f"{against:+.1f}",
+        _kbit(row.kbit_33db),
+        f"{row.lowest_psnr_db:.1f}",
+        _kbit(row.x264_kbit_33db),
+        _percent(against),
         _percent(row.recovered_percent),
         _percent(row.noon_bits_percent),
         _percent(row.second_vehicle_percent),
         str(row.side_bytes),
         f"{row.extra_ms:+.1f}",
     ]
+
+
+def _kbit_text(row: AdaptRow) -> str:
+    if row.kbit_33db is None:
+        return f"not at {AT_DB:g} dB, from {row.lowest_psnr_db:.1f} dB on"
+    return f"{row.kbit_33db:.1f} kbit a frame"
+
+
+def _kbit(value: float | None) -> str:
+    return "n/a" if value is None else f"{value:.1f}"
 
 
 def _percent(value: float | None) -> str:
