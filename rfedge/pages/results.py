@@ -28,6 +28,7 @@ from rfedge.experiments.slice_coder.report import slice_coder_section
 from rfedge.loadtest.live.report import live_section
 from rfedge.loadtest.result import load_section
 from rfedge.loadtest.rig.report import rig_section
+from rfedge.loadtest.world.report import world_section
 from rfedge.report.tables import heading
 from rfedge.results import Result, read_result, rows_of
 from rfedge.training.report import training_section
@@ -61,6 +62,7 @@ SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
     "robust": robust_section,
     "slice-coder": slice_coder_section,
     "stability": lambda path, result: _reference(path, result, "cases", "stability"),
+    "world": world_section,
 }
 """How each kind of result is shown; some have a page of their own."""
 

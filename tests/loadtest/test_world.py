@@ -100,7 +100,7 @@ def test_a_case_can_be_measured_by_itself_and_others_are_kept(tmp_path: Path) ->
     assert result["kind"] == "world"
     assert [row["part"] for row in result["rows"]] == ["cost"] * 3
     assert {"case", "bound", "measured", "held"} <= set(result["rows"][0])
-    kept = dict(result["rows"][0], part="views", case="kept")
+    kept = {**result["rows"][0], "part": "views", "case": "kept"}
     out.write_text(json.dumps({**result, "rows": [kept]}))
     run_world(EvalWorld(only=("cost",), work=tmp_path, out=out))
     again = json.loads(out.read_text())["rows"]
