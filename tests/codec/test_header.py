@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.bitstream import BitWriter, nal_of_rbsp
 from rfcore.codec.h264.config import EFFORTS, PRESETS, CodecConfig, Coder, CoderSettings
-from rfcore.codec.h264.header import StreamHeader, check_header, own_header
-from rfcore.codec.h264.parameter_set_writer import pps_nal, sps_nal
+from rfcore.codec.h264.header import StreamHeader, check_header, own_header, pps_nal, sps_nal
 from rfcore.codec.h264.parameter_sets import (
     PictureParameters,
     SequenceParameters,
