@@ -59,6 +59,7 @@ TILE = "street"
 QUIET_S = 2.0
 DRIVE_TIMEOUT_S = 300.0
 LEARN_TIMEOUT_S = 900.0
+RECORD_TIMEOUT_S = 30.0
 LEARNING = ("--learn", "--learn-min-identities", "1", "--learn-quiet-s", f"{QUIET_S:g}")
 RECORDED = "recorded"
 SHOWN = 3
@@ -195,7 +196,7 @@ class _Street:
         vehicle = _Vehicle(self, name, dataset, light)
         with vehicle.link(server) as link:
             seconds = vehicle.drive(link.address)
-        return vehicle.figures(seconds)
+        return vehicle.figures(server, seconds)
 
     def learnt(self, server: Service) -> LearntLight:
         """Wait until the server has published a light and tells vehicles of it."""
@@ -212,12 +213,12 @@ class _Street:
                     )
             return None
 
-        def told() -> bool | None:
-            events = [event["event"] for event in _events(server.log_path)]
-            return True if "publication taken up" in events else None
+        def taken_up() -> bool | None:
+            tiles = [event.get("tiles", []) for event in _events(server.log_path)]
+            return True if any(event["light"] in named for named in map(str, tiles)) else None
 
         event = await_result(server, published, LEARN_TIMEOUT_S)
-        await_result(server, told, DRIVE_TIMEOUT_S)
+        await_result(server, taken_up, DRIVE_TIMEOUT_S)
         archive = self.published / f"{event['field']}.rff"
         return LearntLight(
             event["light"],
@@ -277,20 +278,18 @@ class _Vehicle:
         run_until("cav-agent", command, self.folder, self._is_done, DRIVE_TIMEOUT_S)
         return monotonic() - began_s
 
-    def figures(self, seconds: float) -> EveningDrive:
-        """Return the figures of the round; raise ``RfedgeError`` for a frame not recorded."""
+    def figures(self, server: Service, seconds: float) -> EveningDrive:
+        """Return the figures of the round, once the server has written what it saw of it."""
         acked, counted = self._acked(), self._counted_round()
-        pictures = self._recorded(self.street.work / RECORDED)
+        pictures = await_result(server, lambda: self._pictures_of(counted), RECORD_TIMEOUT_S)
         posed = {picture.name: picture for picture in self._frames}
         own = self.street.field
         field = own if self.light is None else self.street.opened(self.light.field_id)
         db, field_db = [], []
-        for row in counted:
-            address, picture = (row["epoch"], row["sequence"]), posed[row["name"]]
-            if address not in pictures:
-                raise RfedgeError(f"the server kept no picture of {self.name}'s frame {address}")
+        for row, path in zip(counted, pictures, strict=True):
+            picture = posed[row["name"]]
             camera = picture.read()
-            db.append(psnr(read_rgb(pictures[address]), camera))
+            db.append(psnr(read_rgb(path), camera))
             field_db.append(psnr(rendered(field, picture.camera), camera))
         archives = (self.folder / "fields").glob("*.rff")
         fetched = [path for path in archives if path.stem != own.field_id]
@@ -332,20 +331,24 @@ class _Vehicle:
                 return acked[end - frames : end]
         return []
 
-    def _recorded(self, folder: Path) -> dict[tuple[int, int], Path]:
-        parts = [read_recorded_part(file) for file in recordings_under(folder)]
-        return {
+    def _pictures_of(self, rows: Sequence[Mapping[str, Any]]) -> list[Path] | None:
+        """Return the server's pictures of frames; None while one is not written."""
+        parts = map(read_recorded_part, recordings_under(self.street.work / RECORDED))
+        written = {
             (picture.epoch, picture.sequence): part.path(picture)
             for part in parts
             for picture in part.pictures
             if part.camera.vehicle_id == self.name
         }
+        found = [written.get((row["epoch"], row["sequence"])) for row in rows]
+        there = [path for path in found if path is not None]
+        return there if len(there) == len(rows) else None
 
 
 def _events(log_path: Path) -> list[dict[str, Any]]:
-    """Return the lines of a log in JSON; other programs' lines are left out."""
-    lines = log_path.read_text(errors="replace").splitlines()
-    return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("}")]
+    """Return a log's whole lines in JSON; what other programs write into it is left out."""
+    *whole, _ = log_path.read_text(errors="replace").split("\n")
+    return [json.loads(line) for line in whole if line.startswith('{"')]
 
 
 def _shown(pictures: Sequence[PosedPicture]) -> list[PosedPicture]:

@@ -16,10 +16,12 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.dataset import read_dataset, write_manifest
 from rfcore.dataset.source import SourceCamera
 from rfcore.dataset.write import WrittenPicture, transforms_of
+from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.image import write_png
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
+from rfedge.cli.demo import Demo
 from rfedge.demo.dusk import SHADOW, TINT, at_dusk, write_dusk
 from rfedge.demo.evening import EveningDrive, EveningPictures, LearntLight
 from rfedge.demo.field import write_sample_field
@@ -169,10 +171,10 @@ def demo(*options: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_drive_at_dusk_without_an_evening_is_refused(tmp_path: Path) -> None:
-    done = demo("--dusk", "dusk.json", "--out", str(tmp_path / "demo"))
-    assert done.returncode == 2
-    assert "give it, too" in done.stderr
-    assert done.stderr.count("\n") == 1
+    verb = Demo(dusk=Path("dusk.json"), out=tmp_path / "demo")
+    with pytest.raises(InvalidInput, match="is driven only with --evening"):
+        verb.run()
+    assert not (tmp_path / "demo").exists()
 
 
 @pytest.mark.slow
