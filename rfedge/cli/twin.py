@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rfcore.camera import TileOrigin
     from rfcore.field import RadianceField
     from rfedge.twin.drive_source import FieldVersions
-    from rfedge.twin.run import Source
     from rfedge.twin.scene import TwinScene
+    from rfedge.twin.web import Source
 
 __all__ = ["Twin"]
 
@@ -62,8 +62,7 @@ class Twin:
     def run(self) -> None:
         """Serve the page until SIGINT or SIGTERM."""
         from rfcore.wire.address import Address
-        from rfedge.twin.run import TwinRun, run_twin
-        from rfedge.twin.web import WebSettings
+        from rfedge.twin.web import TwinRun, WebSettings, run_twin
 
         token = self.token or os.environ.get("RFEDGE_TWIN_TOKEN")
         web = WebSettings(Address.parse("http", self.http), token)

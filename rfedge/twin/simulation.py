@@ -147,6 +147,11 @@ class TwinDrive:
         self._step_s = 1.0 / rate_hz
         self._seen: Observation | None = None
 
+    @property
+    def seen(self) -> Observation | None:
+        """What ``reset`` or ``step`` returned last."""
+        return self._seen
+
     def reset(self, place: Place) -> Observation:
         """Begin anew at a place; raise ``InvalidInput`` for one outside of the field."""
         self._street.begin()

@@ -1,4 +1,4 @@
-"""The page over HTTP and one WebSocket a browser (aiohttp).
+"""``rfedge twin``: the page over HTTP and one WebSocket a browser (aiohttp).
 
 A browser says what its user looks at; everything else flows one way. Access: from this machine
 alone, unless a token is set. Whatever the token, a WebSocket is opened only by the page itself, so
@@ -10,16 +10,20 @@ from __future__ import annotations
 import asyncio
 import hmac
 import json
+import os
+import signal
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import structlog
 
 from rfcore.errors import InvalidInput
 from rfcore.extras import needs
+from rfcore.files import write_whole
 from rfcore.wire.address import Address
 from rfedge.twin.board import Board, Reader
 from rfedge.twin.comparing import Comparer
@@ -28,7 +32,7 @@ from rfedge.twin.scene import CameraKey, TwinScene
 with needs("twin"):
     from aiohttp import WSCloseCode, WSMsgType, web
 
-__all__ = ["TwinWeb", "WebSettings"]
+__all__ = ["Source", "TwinRun", "TwinWeb", "WebSettings", "run_twin"]
 
 log = structlog.get_logger()
 
@@ -36,6 +40,7 @@ PAGE: Final = Path(__file__).parent / "page"
 MAX_BROWSERS: Final = 16
 LONGEST_REQUEST_BYTES: Final = 4096
 HEARTBEAT_S: Final = 10.0
+EXIT_SEEN_S: Final = 1.0
 STALLED_S: Final = 10.0
 """A browser that takes nothing for so long is let go; it connects again by itself."""
 HEALTH: Final = "/healthy"
@@ -233,3 +238,73 @@ def _host(host_and_port: str) -> Address:
     """Return the host of an HTTP header, with or without a port, brackets taken off."""
     bare = host_and_port if host_and_port.endswith("]") else host_and_port.rpartition(":")[0]
     return Address((bare or host_and_port).strip("[]"), 0)
+
+
+class Source(Protocol):
+    """Where fields and pictures come from."""
+
+    def run(self) -> Coroutine[Any, Any, None]:
+        """Tell the scene, until cancelled."""
+
+
+@dataclass(frozen=True)
+class TwinRun:
+    """What ``rfedge twin`` was asked for; ``source`` is made for the scene it is to tell."""
+
+    web: WebSettings
+    source: Callable[[TwinScene], Source]
+    ready_file: Path | None = None
+    """Written with the page's address once it can be opened."""
+    until_exit_of: int | None = None
+    """A process at whose end this one ends, too."""
+
+
+def run_twin(run: TwinRun) -> None:
+    """Serve until SIGINT or SIGTERM; raises what the source raises."""
+    asyncio.run(_serve(run))
+
+
+async def _serve(run: TwinRun) -> None:
+    board = Board()
+    scene = TwinScene(board)
+    stopped = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stopped.set)
+    with ThreadPoolExecutor(1, "compare") as executor:
+        comparer = Comparer(scene, executor)
+        page = TwinWeb(run.web, board, scene, comparer)
+        address = await page.start()
+        print(f"open {address}", flush=True)
+        if run.ready_file is not None:
+            write_whole(run.ready_file, address.encode())
+        tasks = [
+            asyncio.create_task(run.source(scene).run()),
+            asyncio.create_task(comparer.run()),
+            asyncio.create_task(stopped.wait()),
+            *([asyncio.create_task(_exit_of(run.until_exit_of))] if run.until_exit_of else []),
+        ]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await page.stop()
+
+
+async def _exit_of(pid: int) -> None:
+    """Wait until a process has ended."""
+    while _runs(pid):
+        await asyncio.sleep(EXIT_SEEN_S)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # it runs as another user
+        return True
+    return True
