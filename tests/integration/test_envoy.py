@@ -3,7 +3,7 @@
 import asyncio
 import signal
 from collections.abc import Callable, Mapping
-from contextlib import AsyncExitStack, ExitStack, suppress
+from contextlib import AsyncExitStack, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,11 @@ from urllib.parse import quote
 import grpc
 import pytest
 import yaml
+from rich.console import Console
 
 from cav_agent.config import AgentLimits, PaceKind
 from mec_server.proxies import FORWARDED
+from rfcore.errors import RfedgeError
 from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.publish import Ground, publish
@@ -22,8 +24,15 @@ from rfcore.wire.settings import TransportSettings
 from rfcore.wire.tiles import Area
 from rfcore.wire.tls import TlsFiles
 from rfedge.certs.authority import Members, certify, write_certificates
-from rfedge.demo.processes import Service, command_of, service
-from rfedge.loadtest.scale.envoy import Envoy, EnvoySetup, check_config, envoy_binary, run_envoy
+from rfedge.loadtest.envoy import (
+    Envoy,
+    EnvoySetup,
+    ServerGroup,
+    check_config,
+    envoy_binary,
+)
+from rfedge.loadtest.scale import ScaleJob, ScaleRow, run_scale
+from rfedge.results import read_result, rows_of
 
 pytestmark = pytest.mark.slow
 
@@ -34,49 +43,6 @@ PATIENT = AgentLimits(answer_s=60.0)
 """A busy machine is not a server that is lost."""
 
 EVERYWHERE = Ground(Area((-5.0, -5.0), (5.0, 5.0)), 0.0)
-PROXIED = (
-    "--drain-hold-s", "3", "--identity-share", "1", "--identity-streams", "256",
-    "--identity-fetches", "16", "--identity-rpcs", "512", "--identity-calls-per-s", "1000",
-)  # fmt: skip
-"""Without certificates the servers take Envoy, and all vehicles behind it, for one peer."""
-
-
-class Site:
-    """Servers as processes with ``options``, and Envoy with ``config`` before them."""
-
-    def __init__(
-        self, folder: Path, options: tuple[str, ...] = PROXIED, config: str = "envoy.yaml"
-    ) -> None:
-        self.servers: list[Service] = []
-        self.setup = EnvoySetup(envoy_binary(), DEPLOY / config, folder / "envoy")
-        self.setup.folder.mkdir()
-        self._folder, self._options = folder, options
-        self._stack = ExitStack()
-        self._started = 0
-
-    def start_server(self) -> Service:
-        self._started += 1
-        store = ("--fields", str(self._folder / "published"), "--listen", "127.0.0.1:0")
-        command = [*command_of("mec-server"), *store, *self._options]
-        started = self._stack.enter_context(
-            service(f"server{self._started}", command, self._folder)
-        )
-        self._stack.callback(started.process.kill)
-        self.servers.append(started)
-        return started
-
-    def start_envoy(self) -> Envoy:
-        return self._stack.enter_context(run_envoy(self.setup, self.addresses))
-
-    @property
-    def addresses(self) -> list[str]:
-        return [server.address for server in self.servers]
-
-    def list_servers(self) -> None:
-        self.setup.list_servers(self.addresses)
-
-    def close(self) -> None:
-        self._stack.close()
 
 
 def publish_street(street: Any, folder: Path) -> None:
@@ -112,9 +78,9 @@ async def test_envoy_places_streams_and_moves_them_when_a_server_dies_or_drains(
 ) -> None:
     monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
     publish_street(street, tmp_path)
-    site = Site(tmp_path)
+    setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy.yaml", tmp_path / "envoy")
     async with AsyncExitStack() as stack:
-        stack.callback(site.close)
+        site = stack.enter_context(ServerGroup(tmp_path / "published", setup))
         for _ in range(SERVERS):
             site.start_server()
         envoy = site.start_envoy()
@@ -174,10 +140,12 @@ async def test_over_mutual_tls_envoy_says_who_a_vehicle_is_and_nobody_else_can(
     monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
     publish_street(street, tmp_path)
     members = Members(("cav-1", "cav-raw", "thief"), proxies=("edge-proxy",))
+    (tmp_path / "envoy").mkdir()
     certs = tmp_path / "envoy" / "certs"
     files = ("--tls-cert", "server.pem", "--tls-key", "server.key", "--tls-ca", "ca.pem")
     tls = (word if word.startswith("--") else str(certs / word) for word in files)
-    site = Site(tmp_path, (*tls, "--proxy-identity", "edge-proxy"), "envoy-mtls.yaml")
+    options = (*tls, "--proxy-identity", "edge-proxy")
+    setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy-mtls.yaml", tmp_path / "envoy")
     write_certificates(certs, certify(members, datetime.now(UTC), days=30))
     metadata = ((FORWARDED, forwarded_header(certs / "vehicle-cav-raw.pem")),)
 
@@ -193,8 +161,7 @@ async def test_over_mutual_tls_envoy_says_who_a_vehicle_is_and_nobody_else_can(
                     pass
             return await stream.code()
 
-    with ExitStack() as stack:
-        stack.callback(site.close)
+    with ServerGroup(tmp_path / "published", setup, options) as site:
         site.start_server()
         address = site.start_envoy().address
         transport = TransportSettings(
@@ -213,6 +180,25 @@ async def test_over_mutual_tls_envoy_says_who_a_vehicle_is_and_nobody_else_can(
 def forwarded_header(certificate: Path) -> str:
     role, _, name = certificate.stem.partition("-")
     return f'Cert="{quote(certificate.read_bytes())}";URI=spiffe://rfedge/{role}/{name}'
+
+
+def test_the_cases_are_measured_with_vehicles_as_processes(street: Any, tmp_path: Path) -> None:
+    """Times and losses depend on the machine, and are left to the figures."""
+    job = ScaleJob(
+        vehicles=4, servers=2, rounds=1, hz=1.0, size_px=None, pairs=1, seconds=3.0,
+        field=street.store / "street.rff", drive=street.drive, config=DEPLOY / "envoy.yaml",
+        work=tmp_path / "work", out=tmp_path / "scale.json",
+    )  # fmt: skip
+    with suppress(RfedgeError):  # a bound in time that a busy machine does not hold
+        run_scale(job, Console(quiet=True))
+    rows = {row.case: row for row in rows_of(ScaleRow, read_result(job.out)["rows"])}
+    assert len(rows) == 8
+    for case in (
+        "placement: most streams over the mean",
+        "moved: pictures without the render as reference",
+        "moved: vehicles that two servers show",
+    ):
+        assert rows[case].held, rows[case]
 
 
 def test_with_mutual_tls_nothing_else_is_another() -> None:

