@@ -1,17 +1,18 @@
 """The evening demo: what the first vehicle of an evening sends teaches the field of the second.
 
-Server, link and vehicles are processes, as in ``rfedge.demo.run``. Two drives along the same way,
-round and round:
+Server, link and vehicles are processes, as in ``rfedge.demo.run``. Two drives along the same way:
 
-* ``first``: at dusk, against the field of noon, with consent to be recorded. The server's learning
-  process makes a colour layer of what it decoded, tries it on frames held back, and publishes it.
-* ``second``: at dusk, by another vehicle, which holds the field of noon, finds that it does not
-  fit, fetches the published light while it drives, and codes its frames against it.
+* ``first``: once, at dusk, against the field of noon, with consent to be recorded. The server's
+  learning process makes a colour layer of what it decoded, tries it on frames held back, and
+  publishes it.
+* ``second``: round and round at dusk, by another vehicle, which holds the field of noon, finds that
+  it does not fit, fetches the published light while it drives, and codes its frames against it.
 
-Figures are of one round of each, not the first: of the second vehicle, one that has the light
-throughout. All rounds show the same frames, so that this is the least that another drive costs;
-how much is left in another lane is measured by ``rfedge eval adapt``. The server learns from a
-single vehicle here, where it asks for two by itself.
+Figures are of one round of each, the drive's first frame apart, where there is nothing to predict
+from: of the second vehicle, the first round that has the light throughout. Both see the same
+frames, so that this is the least that another drive costs; how much is left in another lane is
+measured by ``rfedge eval adapt``. The server learns from a single vehicle here, where it asks for
+two by itself.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from rfcore.views import PosedPicture
 from rfcore.wire.publish import Ground, publish
 from rfedge.demo.dusk import write_dusk
 from rfedge.demo.field import FieldChoice, choose_field
-from rfedge.demo.processes import Service, await_result, command_of, run_until, service
+from rfedge.demo.processes import Service, await_result, command_of, run_to_end, run_until, service
 from rfedge.demo.run import (
     CAMERA,
     DRIVES,
@@ -70,7 +71,7 @@ NOT_LEARNT = ("not learnt", "update not kept", "learning failed", "learning post
 
 @dataclass(frozen=True)
 class EveningDrive:
-    """One round of one vehicle: means over its frames."""
+    """One round of one vehicle: means over its frames, the first one apart."""
 
     name: str
     light: str | None
@@ -191,7 +192,7 @@ class _Street:
         console: Console,
         light: LearntLight | None = None,
     ) -> EveningDrive:
-        """Let a vehicle drive until a round counts: the second, or one that has ``light``."""
+        """Let a vehicle drive once, or until it has had ``light`` for a round."""
         console.print(f"[bold]Vehicle[/] {name}: {dataset}")
         vehicle = _Vehicle(self, name, dataset, light)
         with vehicle.link(server) as link:
@@ -260,7 +261,7 @@ class _Vehicle:
             yield link
 
     def drive(self, address: str) -> float:
-        """Drive round and round until a round counts; return the seconds it took."""
+        """Drive, with a light to wait for round and round; return the seconds it took."""
         settings, field = self.street.settings, self.street.field
         fields = self.folder / "fields"
         fields.mkdir()
@@ -269,18 +270,23 @@ class _Vehicle:
         command = [
             *command_of("cav-agent"),
             *("--server", address, "--drive", str(self.dataset), "--camera", CAMERA),
-            *("--fields", str(fields), "--vehicle", self.name, "--loop", "--pace", "lockstep"),
+            *("--fields", str(fields), "--vehicle", self.name, "--pace", "lockstep"),
             *("--crf", str(settings.crf), *CoderSettings.of(settings.effort).arguments),
             *("--threads", str(settings.threads), "--report", str(self._report)),
             *("--give-up-s", "30", "--allow-recording"),
         ]
         began_s = monotonic()
-        run_until("cav-agent", command, self.folder, self._is_done, DRIVE_TIMEOUT_S)
+        if self.light is None:
+            run_to_end("cav-agent", command, self.folder, DRIVE_TIMEOUT_S)
+        else:
+            command.append("--loop")
+            run_until("cav-agent", command, self.folder, self._is_done, DRIVE_TIMEOUT_S)
         return monotonic() - began_s
 
     def figures(self, server: Service, seconds: float) -> EveningDrive:
         """Return the figures of the round, once the server has written what it saw of it."""
-        acked, counted = self._acked(), self._counted_round()
+        start = self._frames[0].name
+        counted = [row for row in self._counted_round() if row["name"] != start]
         pictures = await_result(server, lambda: self._pictures_of(counted), RECORD_TIMEOUT_S)
         posed = {picture.name: picture for picture in self._frames}
         own = self.street.field
@@ -300,7 +306,7 @@ class _Vehicle:
             kbit_per_frame=8e-3 * float(np.mean([row["packet_bytes"] for row in counted])),
             psnr_db=float(np.mean(db)),
             rf_psnr_db=float(np.mean(field_db)),
-            rounds=len(acked) / len(counted),
+            rounds=len(self._acked()) / len(self._frames),
             fetched_bytes=sum(path.stat().st_size for path in fetched),
             seconds=seconds,
         )
@@ -321,13 +327,14 @@ class _Vehicle:
         return self._report.exists() and bool(self._counted_round())
 
     def _counted_round(self) -> list[dict[str, Any]]:
-        """Return the frames that count, or none yet: the second round, or with a light the first
-        one that has it throughout."""
+        """Return the round that counts: the only one, or with a light the first one that has it
+        throughout, or none yet."""
         acked, frames = self._acked(), len(self._frames)
-        wanted = None if self.light is None else self.light.field_id
-        first_end = frames if wanted else 2 * frames
-        for end in range(first_end, len(acked) + 1):
-            if all(row["light_field"] == wanted for row in acked[end - frames : end]):
+        if self.light is None:
+            return acked
+        for end in range(frames, len(acked) + 1):
+            lit = [row["light_field"] == self.light.field_id for row in acked[end - frames : end]]
+            if all(lit):
                 return acked[end - frames : end]
         return []
 
