@@ -58,7 +58,9 @@ __all__ = [
 
 COVERED = 0.5
 """Opacity above which the field has a surface."""
-NOISE_LEVELS, CHANGE_LEVELS = 10.0, 20.0
+NOISE_LEVELS, CHANGE_LEVELS = 16.0, 32.0
+"""On the sample street, views from 1 to 3 m beside an unchanged drive lose up to 0.08 dB to what is
+no change; with 10 and 20 it is 0.17 dB, and what changed gains 0.3 dB less."""
 
 MOST_DISTANCE_M = 40.0
 """How far from a camera its picture vouches."""
