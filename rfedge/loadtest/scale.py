@@ -6,7 +6,6 @@ Times are of one clock (Unix time): a picture's Ack is its capture plus its late
 
 from __future__ import annotations
 
-import asyncio
 import json
 import math
 import shutil
@@ -15,7 +14,8 @@ import statistics
 import subprocess
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -291,7 +291,7 @@ def _kill_one(group: ServerGroup, envoy: Envoy, fleet: Fleet, seen: Seen) -> Non
     fleet.until_acked(time.time_ns())
     took_s = [resumed_s(lines, since_ns) for lines in fleet.lines()]
     seen.resumed_s += [s for s in took_s if s is not None]
-    seen.shown_twice += asyncio.run(_shown_twice(group.addresses))
+    seen.shown_twice += _shown_twice(group.addresses)
     _add_one(group, envoy)
 
 
@@ -313,7 +313,7 @@ def _drain_one(group: ServerGroup, envoy: Envoy, fleet: Fleet, seen: Seen) -> No
     until_ns = time.time_ns()
     fleet.until_acked(until_ns)
     seen.drained_frames += sum(failures(lines, since_ns, until_ns) for lines in fleet.lines())
-    seen.shown_twice += asyncio.run(_shown_twice(group.addresses))
+    seen.shown_twice += _shown_twice(group.addresses)
     _add_one(group, envoy)
 
 
@@ -336,24 +336,28 @@ def _restart_envoy(group: ServerGroup, envoy: Envoy, fleet: Fleet, seen: Seen) -
     seen.restarted_s += [s for s in took_s if s is not None]
 
 
-async def _shown_twice(addresses: Sequence[str]) -> int:
+def _shown_twice(addresses: Sequence[str]) -> int:
     """Return how many vehicles more than one server shows pictures of within two seconds."""
-    shown = await asyncio.gather(*(_shown(address, time.time_ns()) for address in addresses))
-    return sum(len(vehicles) for vehicles in shown) - len(set().union(*shown))
+    since_ns = time.time_ns()
+    with ThreadPoolExecutor(len(addresses)) as watchers:
+        shown = list(watchers.map(lambda address: _shown(address, since_ns), addresses))
+    return sum(len(vehicles) for vehicles in shown) - len(set[str]().union(*shown))
 
 
-async def _shown(address: str, since_ns: int) -> set[str]:
-    """Return the vehicles of which a server shows pictures that were taken from now on."""
+def _shown(address: str, since_ns: int) -> set[str]:
+    """Return the vehicles of which a server shows pictures that were taken from ``since_ns`` on."""
     vehicles: set[str] = set()
     wanted = subscription_to_wire(Subscription(encoding=PictureEncoding.NONE))
-    async with grpc.aio.insecure_channel(address, CONSUMER_OPTIONS) as channel:
-        watching = twin_pb2_grpc.TwinServiceStub(channel).Watch(wanted)
-        with suppress(TimeoutError):
-            async with asyncio.timeout(WATCH_S):
-                async for response in watching:
-                    message = twin_message_from_wire(response)
-                    if isinstance(message, TwinPicture) and message.capture_time_ns >= since_ns:
-                        vehicles.add(message.vehicle_id)
+    with grpc.insecure_channel(address, CONSUMER_OPTIONS) as channel:
+        watching = twin_pb2_grpc.TwinServiceStub(channel).Watch(wanted, timeout=WATCH_S)
+        try:
+            for response in watching:
+                message = twin_message_from_wire(response)
+                if isinstance(message, TwinPicture) and message.capture_time_ns >= since_ns:
+                    vehicles.add(message.vehicle_id)
+        except grpc.RpcError as error:
+            if error.code() is not grpc.StatusCode.DEADLINE_EXCEEDED:
+                raise RfedgeError(f"{address} does not show its pictures: {error}") from error
     return vehicles
 
 

@@ -182,17 +182,22 @@ def forwarded_header(certificate: Path) -> str:
     return f'Cert="{quote(certificate.read_bytes())}";URI=spiffe://rfedge/{role}/{name}'
 
 
+@pytest.mark.nightly
+@pytest.mark.timeout(300)
 def test_the_cases_are_measured_with_vehicles_as_processes(street: Any, tmp_path: Path) -> None:
     """Times and losses depend on the machine, and are left to the figures."""
     job = ScaleJob(
-        vehicles=4, servers=2, rounds=1, hz=1.0, size_px=None, pairs=1, seconds=3.0,
+        vehicles=4, servers=2, rounds=1, hz=1.0, size_px=None, pairs=0, seconds=3.0,
         field=street.store / "street.rff", drive=street.drive, config=DEPLOY / "envoy.yaml",
         work=tmp_path / "work", out=tmp_path / "scale.json",
     )  # fmt: skip
-    with suppress(RfedgeError):  # a bound in time that a busy machine does not hold
+    try:
         run_scale(job, Console(quiet=True))
+    except RfedgeError as error:
+        if not str(error).startswith("not held: "):  # a bound in time, on a busy machine
+            raise
     rows = {row.case: row for row in rows_of(ScaleRow, read_result(job.out)["rows"])}
-    assert len(rows) == 8
+    assert len(rows) == 7
     for case in (
         "placement: most streams over the mean",
         "moved: pictures without the render as reference",
