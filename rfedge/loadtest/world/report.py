@@ -23,7 +23,7 @@ class Row:
     case: str
     bound: str
     measured: str
-    held: bool | None = None
+    held: bool | None
 
 
 def world_section(path: Path, result: Result) -> str:
