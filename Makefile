@@ -16,7 +16,7 @@ PYTHONS ?=
 NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo sample sample-field test test-slow test-slices test-prometheus test-netns test-fault test-attack \
+.PHONY: help demo sample sample-field test test-slow test-slices test-scale test-prometheus test-netns test-fault test-attack \
 	test-compose test-system-packages drive-long stability check build bench proto figures images up \
 	down operations-figures load load-transport load-receiver load-full load-links load-overload load-ratio soak soak-short \
 	test-wheels build-full lock wheels nightly test-asan fuzz fuzz-nightly test-fault-core sizing
@@ -35,6 +35,9 @@ test-slow: build-full test-system-packages  ## run the tests that take more than
 
 test-slices: build-full  ## compare a million macroblocks of the slice coder with FFmpeg; fuzz it
 	$(BIN)/python -m pytest tests/codec/test_slice_conformance.py -m nightly
+
+test-scale: build-full  ## run each case of `rfedge eval scale` once, small: Envoy, its servers, their vehicles
+	$(BIN)/python -m pytest tests/integration/test_envoy.py -m nightly --timeout 600
 
 # Debian packages that slow tests use beside Python: cross compiler and emulator for
 # tests/native/test_aarch64.py, promtool and prometheus for tests/deploy, ip and tc for tests/link,
