@@ -5,9 +5,9 @@ Whoever took notices in Hello is told of every confirmed object (``mec_server.tw
 * stands within ``REACH_M`` ahead of the camera of its newest picture, in the same tile,
 * is seen by somebody else's camera, and was not seen by its own within the last second,
 
-when it is confirmed and again every ``REPEAT_S`` while that holds, the nearest first, at most
-``MOST_PER_S`` notices a second. Where a vehicle is known from its pictures: one whose pictures
-have no pose is told nothing of objects.
+when it is confirmed and again every ``REPEAT_S`` while that holds and it was seen since, the
+nearest first, at most ``MOST_PER_S`` notices a second. Where a vehicle is known from its pictures:
+one whose pictures have no pose is told nothing of objects.
 
 Pictures are looked at only while a vehicle takes notices, by the thread that composes views: at the
 lowest priority, newest picture first, and charged like a consumer to ``NOTICES_IDENTITY``, so that
@@ -76,6 +76,7 @@ class NoticeTaker(Protocol):
 class _Told:
     notice_id: int
     at_s: float
+    seen_s: float
 
 
 class StreamNotices:
@@ -106,8 +107,8 @@ class StreamNotices:
             if not self._may_tell(now):
                 break
             told = self._told.get((field_id, each.object_id))
-            if told is None or now - told.at_s >= REPEAT_S:
-                notice_id = self._note((field_id, each.object_id), told, now)
+            if told is None or (now - told.at_s >= REPEAT_S and each.last_s > told.seen_s):
+                notice_id = self._note((field_id, each.object_id), told, each.last_s, now)
                 subject = _object_ahead(field_id, each, distance_m, vehicles, now)
                 notices.append(StreetNotice(notice_id, VALID_S, subject))
         return notices
@@ -119,10 +120,10 @@ class StreamNotices:
     def _may_tell(self, now: float) -> bool:
         return len(self._recent_s) < MOST_PER_S or now - self._recent_s[0] >= 1.0
 
-    def _note(self, key: tuple[str, int], told: _Told | None, now: float) -> int:
+    def _note(self, key: tuple[str, int], told: _Told | None, seen_s: float, now: float) -> int:
         self._recent_s.append(now)
         notice_id = self._new_id() if told is None else told.notice_id
-        self._told[key] = _Told(notice_id, now)
+        self._told[key] = _Told(notice_id, now, seen_s)
         return notice_id
 
     def _new_id(self) -> int:

@@ -94,6 +94,12 @@ def test_a_thing_is_repeated_under_its_number_while_it_is_seen() -> None:
     assert len(times) == 5
 
 
+def test_what_nobody_has_seen_since_is_not_repeated() -> None:
+    stream, lost = StreamNotices("me"), thing(4, 30.0)
+    assert len(told(lost, stream=stream)) == 1
+    assert told(lost, stream=stream, now=NOW + REPEAT_S + 0.1) == []
+
+
 def test_what_expired_before_it_came_again_gets_a_new_number() -> None:
     stream = StreamNotices("me")
     (first,) = told(thing(4, 30.0), stream=stream)
