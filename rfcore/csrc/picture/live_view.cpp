@@ -5,13 +5,7 @@
 #include <cstddef>
 #include <vector>
 
-// As in warp.cpp: separate multiplications and additions in float32, so every instruction set gives
-// the same bytes.
-#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__)
-#define RFCORE_PER_ISA __attribute__((target_clones("avx2", "default")))
-#else
-#define RFCORE_PER_ISA
-#endif
+#include "picture/per_isa.h"
 
 namespace rfcore {
 namespace {

@@ -8,18 +8,11 @@
 #include <numeric>
 #include <vector>
 
+#include "picture/per_isa.h"
 #include "threads/thread_pool.h"
 
 #if defined(__SSE2__)
 #include <emmintrin.h>
-#endif
-
-// Separate multiplications and additions in float32 (no contraction, see CMakeLists.txt) and
-// integers: every instruction set gives the same bytes, so the compiler may use AVX2.
-#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__)
-#define RFCORE_PER_ISA __attribute__((target_clones("avx2", "default")))
-#else
-#define RFCORE_PER_ISA
 #endif
 
 namespace rfcore {

@@ -3,13 +3,7 @@
 #include <cstring>
 #include <vector>
 
-// Integer arithmetic gives the same bytes on every instruction set, so the compiler may use AVX2
-// where the machine has it.
-#if defined(__x86_64__) && defined(__gnu_linux__) && defined(__GNUC__) && !defined(__clang__)
-#define RFCORE_PER_ISA __attribute__((target_clones("avx2", "default")))
-#else
-#define RFCORE_PER_ISA
-#endif
+#include "picture/per_isa.h"
 
 namespace rfcore {
 namespace {

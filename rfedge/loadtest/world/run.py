@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from dataclasses import field as with_factory
 from pathlib import Path
 from threading import Event, Thread
 
@@ -53,8 +54,8 @@ CAMERA = ("eval", "front")
 MAX_AGE_S = 2.0
 LIVE_AGE_S = 0.1
 """How old the picture is that a view is composed of."""
-CHANGED_LEVELS = 10.0
 NOISE_SIGMA = 3.0
+SAME_TIME_S = 1e-6
 
 
 @dataclass(frozen=True)
@@ -121,11 +122,8 @@ class Found:
 
     to_find: int = 0
     found: int = 0
-    errors_m: list[float] | None = None
-    false: set[int] | None = None
-
-    def __post_init__(self) -> None:
-        self.errors_m, self.false = [], set()
+    errors_m: list[float] = with_factory(default_factory=list)
+    false: set[int] = with_factory(default_factory=set)
 
 
 def object_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
@@ -136,7 +134,7 @@ def object_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
     for name, sigma in (("", 0.0), (f", noise {NOISE_SIGMA:g}", NOISE_SIGMA)):
         found = followed(vehicles, field, sigma, truth)
         rows += _rows_of_found(f"vehicles{name}", found)
-        false = followed(empty, field, sigma, None).false or set()
+        false = followed(empty, field, sigma, None).false
         minutes = (empty.time_s(len(empty.pictures) - 1) + 0.1) / 60
         rows.append(
             Row(
@@ -144,7 +142,7 @@ def object_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
                 f"false ones where nothing stands{name}",
                 "<= 1 a minute",
                 f"{len(false)} in {60 * minutes:.1f} s",
-                len(false) <= max(0.0, minutes),
+                len(false) <= minutes,
             )
         )
     return rows
@@ -180,7 +178,7 @@ def _rows_of_found(name: str, found: Found) -> list[Row]:
             "objects",
             f"{name}, confirmed objects that are no vehicle",
             "",
-            f"{len(found.false or ())}",
+            f"{len(found.false)}",
             None,
         ),
     ]
@@ -189,18 +187,17 @@ def _rows_of_found(name: str, found: Found) -> list[Row]:
 def followed(drive: Drive, field: RadianceField, sigma: float, truth: SceneTruth | None) -> Found:
     """Return how what is followed through a drive compares with ``truth``, None: nothing there."""
     tracker, found = ObjectTracker(), Found()
-    assert found.errors_m is not None
-    assert found.false is not None
     rng = np.random.default_rng(3)
     for index, picture in enumerate(drive.pictures):
         time_s = drive.time_s(index)
         rgb = noisy(picture.read(), sigma, rng)
         live = live_picture(picture.camera, rgb, field.render(picture.camera))
         tracker.take(detect(live), CAMERA, time_s)
-        objects = [each for each in tracker.confirmed(time_s) if time_s - each.last_s < 1e-6]
-        followed_ = tracker.confirmed(time_s)
+        objects = tracker.confirmed(time_s)
         seen = [] if truth is None else truth.vehicles(picture.camera, time_s)
         for each in objects:
+            if time_s - each.last_s > SAME_TIME_S:
+                continue
             distances = [vehicle.footprint.distance_m(each.at(time_s)) for vehicle in seen]
             if distances and min(distances) <= MATCH_M:
                 found.errors_m.append(min(distances))
@@ -208,7 +205,7 @@ def followed(drive: Drive, field: RadianceField, sigma: float, truth: SceneTruth
                 found.false.add(each.object_id)
         for vehicle in seen:
             if vehicle.pixels >= LEAST_PX and vehicle.nearest_m <= REACH_M:
-                near = (vehicle.footprint.distance_m(each.at(time_s)) for each in followed_)
+                near = (vehicle.footprint.distance_m(each.at(time_s)) for each in objects)
                 found.to_find += 1
                 found.found += any(distance_m <= MATCH_M for distance_m in near)
     return found
