@@ -3,8 +3,8 @@
 Sans-IO: ``receive`` takes bytes from the socket and returns whole messages, ``data_to_send`` has
 what the socket is to be given. 100 vehicles at 30 Hz took 0.36 ms of CPU for a frame and its answer
 on grpc.aio and take 0.24 ms here; vehicles of a load test share the machine with the server they
-test. The server at the other end is gRPC's, unchanged. RFC 9113 and gRPC's PROTOCOL-HTTP2; no TLS,
-no compression, one call.
+test. The server at the other end is gRPC's, unchanged. RFC 9113 and gRPC's PROTOCOL-HTTP2; no
+compression, one call.
 
 As much of HPACK (RFC 7541) as one gRPC call needs: literal headers out, the status back.
 

@@ -7,6 +7,7 @@ a frame, so that one process plays a hundred vehicles in a small part of a core.
 from __future__ import annotations
 
 import asyncio
+import ssl
 import time
 from dataclasses import replace
 
@@ -28,15 +29,25 @@ CODES = {code.value[0]: code.name for code in grpc.StatusCode}
 
 
 class PrerecordedVehicle(asyncio.Protocol):
-    """``met`` is set when the server has answered Hello, ``over`` when nothing more will happen."""
+    """``met`` is set when the server has answered Hello, ``over`` when nothing more will happen.
 
-    def __init__(self, name: str, address: str, hello: Hello, drive: PrerecordedDrive) -> None:
+    ``tls``: how it proves who it is and speaks HTTP/2 (ALPN); None: without TLS.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        address: str,
+        hello: Hello,
+        drive: PrerecordedDrive,
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
         self.refused = ""
         self.failed = ""
         self.granted_hz = 0.0
         self.met = asyncio.Event()
         self.over = asyncio.Event()
-        self._address = address
+        self._address, self._tls = address, tls
         self._hello = replace(hello, vehicle_id=name)
         self.replays = [Replay(c.camera_id, drive, _wall_ns) for c in hello.cameras]
         self._call = GrpcCall(address, STREAM_METHOD)
@@ -50,7 +61,8 @@ class PrerecordedVehicle(asyncio.Protocol):
         host, port = self._address.rsplit(":", 1)
         try:
             async with asyncio.timeout(within_s):
-                await asyncio.get_running_loop().create_connection(lambda: self, host, int(port))
+                loop = asyncio.get_running_loop()
+                await loop.create_connection(lambda: self, host, int(port), ssl=self._tls)
                 await self.met.wait()
         except TimeoutError:
             self._fail(f"no Welcome within {within_s:g} s")

@@ -1,10 +1,11 @@
 """A server under compose's limits, a bystander at street size, and what an attack did to both.
 
-The shipped field, 640x360 at 10 Hz. The bystander's latencies during the attack are compared with
-calm ones and with a *control*: the same attacker, as long, aimed at a decoy that reads everything
-and answers nothing. The three take turns, so that what else the machine does meets all of them.
-Attacker and decoy are niced, also where the kernel shares the processor out by sessions
-(sched(7), "The autogroup feature"). Control groups (v1 or v2) need root, no docker.
+The shipped field, 640x360 at 10 Hz, coded beforehand (``attack.bystander``): a vehicle computes on
+a machine of its own. The bystander's latencies during the attack are compared with calm ones and
+with a *control*: the same attacker, as long, aimed at a decoy that reads everything and answers
+nothing. The three take turns, so that what else the machine does meets all of them. Attacker and
+decoy are niced, also where the kernel shares the processor out by sessions (sched(7), "The
+autogroup feature"). Control groups (v1 or v2) need root, no docker.
 """
 
 import asyncio
@@ -28,6 +29,7 @@ from rfedge.certs.authority import Members, certify, write_certificates
 from scoreboard import Scoreboard
 
 ROOT = Path(__file__).parents[2]
+FIELD = ROOT / "samples/fields/street.rff"
 ATTACKER = ("-m", "attack.attacker")
 GROUPS = Path("/sys/fs/cgroup")
 MEMORY_BYTES, PIDS, MAX_FIELD_GB = 1 << 30, 128, 0.25
@@ -36,6 +38,8 @@ ROUNDS = 2
 """How often calm, control and attack take turns."""
 NICE = 10
 ALLOWANCE_MS = 10.0
+REPORT_S = 30.0
+"""Within which the bystander knows how a picture ended: it loses its stream, and opens another."""
 BOARD = Scoreboard("attacks", "make test-attack")
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT / "tests")}
@@ -168,10 +172,16 @@ class Scene:
             "held": whole and not self.failed,
         }
 
-    def lines(self, begin_s: float, end_s: float) -> list[dict[str, Any]]:
-        """Return the bystander's pictures that were captured in a time."""
-        lines = [json.loads(line) for line in self.report.read_text().split("\n")[:-1]]
-        return [x for x in lines if begin_s <= x["capture_time_ns"] / 1e9 <= end_s]
+    async def _lines(self, begin_s: float, end_s: float) -> list[dict[str, Any]]:
+        """Return the bystander's pictures that were captured in a time, once all have ended."""
+        async with asyncio.timeout(REPORT_S):
+            while True:
+                lines = [json.loads(line) for line in self.report.read_text().split("\n")[:-1]]
+                captured_s = [x["capture_time_ns"] / 1e9 for x in lines]
+                if captured_s and captured_s[-1] > end_s:
+                    break
+                await asyncio.sleep(0.05)
+        return [x for x, s in zip(lines, captured_s, strict=True) if begin_s <= s <= end_s]
 
     async def phase(self, attack: str = "", target: Target | None = None) -> "Phase":
         """Let a while pass, attacking or not; return what the bystander had of it."""
@@ -191,8 +201,7 @@ class Scene:
             if attacker is not None:
                 attacker.kill()
                 attacker.wait()
-        await asyncio.sleep(0.5)  # the last answers
-        lines = self.lines(began_s, end_s)
+        lines = await self._lines(began_s, end_s)
         return Phase(lines, most_bytes, end_s - began_s, worked_s, attacked_s)
 
     async def _attacker(self, attack: str, target: Target) -> subprocess.Popen[bytes]:
@@ -306,9 +315,23 @@ def tls(root: Path, name: str) -> list[str]:
     return [str(part) for option, file in files.items() for part in (option, root / file)]
 
 
+@pytest.fixture(scope="session")
+def coded_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the sample's drive, coded against the field that ships."""
+    from rfcore.field import load_field
+    from rfedge.loadtest.prerecorded import prerecorded_drive
+
+    drive = ROOT / "samples/street/transforms_drive_vehicles.json"
+    return prerecorded_drive(drive, load_field(FIELD), tmp_path_factory.mktemp("coded"))
+
+
 @pytest.fixture
 async def scene(
-    request: pytest.FixtureRequest, tmp_path: Path, certificates: Path, group: ControlGroup
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+    certificates: Path,
+    group: ControlGroup,
+    coded_drive: Path,
 ) -> AsyncIterator[Scene]:
     from rfcore.field import FieldStore
 
@@ -317,7 +340,7 @@ async def scene(
         empty.write_text("[consumers.attacker]\nall = true\n")
     (tmp_path / "decoy-fields").mkdir()
     store = FieldStore(fields)
-    field_id = store.add(ROOT / "samples/fields/street.rff")
+    field_id = store.add(FIELD)
     started: list[subprocess.Popen[bytes]] = []
 
     def start(name: str, *command: object, limited: bool = False) -> Any:
@@ -359,15 +382,10 @@ async def scene(
             *(str(tmp_path / "decoy-fields"), str(tmp_path / "decoy.toml"), decoy.pid),
         )
         report = tmp_path / "bystander.jsonl"
-        agent, agent_log = start(
-            "bystander",
-            *("-m", "cav_agent", "--server", address, "--fields", fields, "--loop"),
-            *("--drive", ROOT / "samples/street/transforms_drive_vehicles.json"),
-            *("--vehicle", "bystander", "--rate", 10, "--effort", "fast"),
-            *("--report", report),
-            *tls(certificates, "vehicle-bystander"),
+        bystander, log = start(
+            "bystander", *("-m", "attack.bystander", coded_drive, address, root, report)
         )
-        await appears(report, agent, agent_log)
+        await appears(report, bystander, log)
         attack_s = request.config.getoption("--attack-s")
         made = Scene(tmp_path, group, server, target, in_vain, report, attack_s)
         yield made
