@@ -171,6 +171,8 @@ class Stream:
             raise
         end = self._session.closed
         assert end is not None
+        if isinstance(end.error, LimitExceeded) and end.error.limit == Limit.UNUSABLE_FRAMES:
+            self._account.opening_failed(time.monotonic())
         self._log.info("stream closed", error=str(end.error) if end.error else None)
         return end
 
@@ -306,10 +308,9 @@ class Stream:
         try:
             await self._decoders.open(self._account.identity, job, self._account.take_decoders())
         except RfedgeError as error:
-            self._account.opening_ended(opened=False, now=time.monotonic())
+            self._account.opening_failed(time.monotonic())
             self._session.open_failed(error, time.monotonic())
         else:
-            self._account.opening_ended(opened=True, now=time.monotonic())
             self._intrinsics = {c.camera_id: c.intrinsics for c in job.hello.cameras}
             self._log = self._log.bind(vehicle=job.hello.vehicle_id)
             self._metrics.forget()

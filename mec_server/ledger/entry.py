@@ -245,10 +245,13 @@ class StreamAccount:
         """Charge the time for which a frame kept a worker busy; not ``complete``: was rejected."""
         self._entry.promises.worked(self._session_id, field_id, worker_s, complete=complete)
         self._entry.ledger.charge(self.identity, Resource.WORKER_SECONDS, worker_s, now)
+        if complete:
+            self._entry.ledger.opening_paid(self.identity, now)
 
-    def opening_ended(self, opened: bool, now: float) -> None:
-        """Note how the opening of fields and decoders ended."""
-        self._entry.ledger.opening_ended(self.identity, opened, now)
+    def opening_failed(self, now: float) -> None:
+        """Count an opening that came to nothing: decoders that could not be opened, or a stream
+        that ended because its frames could not be used."""
+        self._entry.ledger.opening_failed(self.identity, now)
 
     def take_decoders(self) -> Hold:
         """Hand over what was granted for decoders to who opens them, and releases it once they

@@ -30,8 +30,9 @@ long."""
 
 FREE_FAILURES = 2
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
-"""Openings that fail one after another: two are answered at once, for one may be a mistake; after
-each further one the identity waits, twice as long each time."""
+"""Openings that come to nothing one after another, without a picture in between: two are answered
+at once, for one may be a mistake; after each further one the identity waits, twice as long each
+time."""
 
 HELD_RETRY_S = 1.0
 """When to try again for what others hold: nobody knows when they give it back."""
@@ -270,19 +271,23 @@ class Ledger:
             wait_s = account.opens_again_s - now
             raise LimitExceeded(
                 Limit.FAILED_OPENINGS,
-                f"{account.failed_openings} openings of this vehicle failed one after another; "
-                f"come again in {wait_s:.3g} s",
+                f"{account.failed_openings} openings of this vehicle came to nothing one after "
+                f"another; come again in {wait_s:.3g} s",
                 wait_s,
             )
 
-    def opening_ended(self, identity: str, opened: bool, now: float) -> None:
-        """Note how an opening ended; a row of failures makes the identity wait."""
+    def opening_failed(self, identity: str, now: float) -> None:
+        """Count an opening that came to nothing; a row of them makes the identity wait."""
         account = self._account(identity, now)
-        account.failed_openings = 0 if opened else account.failed_openings + 1
+        account.failed_openings += 1
         doublings = account.failed_openings - FREE_FAILURES - 1
         if doublings >= 0:
             pause_s = FIRST_PAUSE_S * 2 ** min(doublings, 16)
             account.opens_again_s = now + min(pause_s, LONGEST_PAUSE_S)
+
+    def opening_paid(self, identity: str, now: float) -> None:
+        """Note that a stream gave a picture: the openings before it were worth their cost."""
+        self._account(identity, now).failed_openings = 0
 
     # --- accounts
 

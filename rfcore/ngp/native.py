@@ -6,8 +6,6 @@ the same field and camera give the same bytes on every instruction set and threa
 
 from __future__ import annotations
 
-from threading import Lock
-
 import numpy as np
 
 from rfcore.camera import Camera
@@ -31,7 +29,8 @@ def ngp_camera(camera: Camera) -> _native.NgpCamera:
 
 
 class NgpRenderer:
-    """A copy of one hash grid field, ready to be rendered; may be shared between threads.
+    """A copy of one hash grid field, ready to be rendered; threads that share it render at the same
+    time.
 
     ``isa`` and ``threads`` as in ``rfcore.raster.native.Rasterizer``: neither changes a byte.
     """
@@ -54,7 +53,6 @@ class NgpRenderer:
             threads,
             self.isa,
         )
-        self._lock = Lock()
         self.samples = 0
         """Evaluated for the last picture."""
 
@@ -63,18 +61,16 @@ class NgpRenderer:
         shape = (camera.intrinsics.height_px, camera.intrinsics.width_px)
         view = View(*(np.empty(s, np.float32) for s in ((*shape, 3), shape, shape)))
         seen_from = ngp_camera(camera)
-        with self._lock:
-            self.samples = self._native.render(
-                seen_from, samples_per_ray or 0, view.colour, view.depth, view.opacity
-            )
+        self.samples = self._native.render(
+            seen_from, samples_per_ray or 0, view.colour, view.depth, view.opacity
+        )
         return view
 
     def render_colour(self, camera: Camera, samples_per_ray: int | None = None) -> F32:
         """Render colour [H, W, 3] alone: the same bytes as ``render``'s."""
         colour = np.empty((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), np.float32)
         seen_from = ngp_camera(camera)
-        with self._lock:
-            self.samples = self._native.render_colour(seen_from, samples_per_ray or 0, colour)
+        self.samples = self._native.render_colour(seen_from, samples_per_ray or 0, colour)
         return colour
 
 

@@ -110,6 +110,7 @@ def check_renderer(threads: int, isa: str | None) -> str:
 class Rasterizer:
     """A copy of one set of Gaussians, ready to be rendered; may be shared between threads.
 
+    The CPU draws pictures for several threads at the same time, an OpenCL device one by one.
     ``isa`` forces one of ``available_isas()`` (default: the best) or an OpenCL device; ``threads``
     is 1..256. Neither changes a byte of any picture. ``antialiased`` must be what the Gaussians
     were trained with. Raises ``BackendUnavailable`` or ``InvalidInput``. Rendering raises
@@ -158,7 +159,7 @@ class Rasterizer:
     def statistics(self, camera: Camera) -> RasterStatistics:
         """Count what rendering this view takes on the CPU; slower than rendering it."""
         seen_from = native_camera(camera)
-        with self._lock, overlaps_limited():
+        with overlaps_limited():
             counts = self._on_cpu().statistics(seen_from)
         pixels = camera.intrinsics.width_px * camera.intrinsics.height_px
         return RasterStatistics(*counts, blends_per_px=counts[3] / pixels)
@@ -172,7 +173,7 @@ class Rasterizer:
         opacity: F32 | None = None,
     ) -> None:
         seen_from, degree = native_camera(camera), bands_to_use(sh_degree, self.sh_degree)
-        with self._lock, overlaps_limited():
+        with overlaps_limited():
             if self._drawn_by_device(camera, degree, colour, depth, opacity):
                 return
             if depth is None or opacity is None:
@@ -187,15 +188,18 @@ class Rasterizer:
             return False
         from rfcore.raster.opencl import DeviceFull, DeviceLost
 
-        try:
-            self._device.draw(camera, degree, colour, depth, opacity)
-        except DeviceFull as error:
-            DEVICES.add_full()
-            log.warning("opencl picture drawn by cpu", reason=str(error))
-            return False
-        except DeviceLost as error:
-            self._leave_device(error)
-            return False
+        with self._lock:
+            if self._device is None:  # lost while another picture was drawn
+                return False
+            try:
+                self._device.draw(camera, degree, colour, depth, opacity)
+            except DeviceFull as error:
+                DEVICES.add_full()
+                log.warning("opencl picture drawn by cpu", reason=str(error))
+                return False
+            except DeviceLost as error:
+                self._leave_device(error)
+                return False
         return True
 
     def _move_to_device(self) -> None:
@@ -216,10 +220,12 @@ class Rasterizer:
 
     def _on_cpu(self) -> _native.Rasterizer:
         """Return the native renderer; of Gaussians on a device, made when it is first needed."""
-        if self._cpu is None:
-            assert self._gaussians is not None
-            self._cpu = self._native_rasterizer(self._gaussians, check_backend(self.threads, None))
-        return self._cpu
+        with self._lock:
+            if self._cpu is None:
+                assert self._gaussians is not None
+                isa = check_backend(self.threads, None)
+                self._cpu = self._native_rasterizer(self._gaussians, isa)
+            return self._cpu
 
     def _native_rasterizer(self, g: Gaussians, isa: str) -> _native.Rasterizer:
         arrays = (g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh)

@@ -146,9 +146,7 @@ def _recorded(load: Load, bed: TestBed) -> Path:
 def _server(load: Load, bed: TestBed) -> Any:
     fields, workers = str(bed.field.parent), str(_workers(load, bed))
     if load.mode is Mode.FULL:
-        # Renders of one field follow one another: only threads within one use the other cores.
         command = [*command_of("mec-server"), "--fields", fields, "--workers", workers]
-        command += ["--threads", workers]
         limits = () if load.admission else ("--max-load", "0")
         return service("mec-server", [*command, "--listen", "127.0.0.1:0", *limits], bed.work)
     module = [sys.executable, "-m", "rfedge.loadtest.server"]

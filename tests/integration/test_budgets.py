@@ -24,6 +24,7 @@ from structlog.testing import capture_logs
 from mec_server.config import AdmissionLimits, IdentityBudget, SessionLimits
 from mec_server.decode_jobs import DecodeJob, OpenJob
 from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
+from mec_server.session import MAX_UNUSABLE
 from rfcore.field import SplatField, save_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER, STREAM_METHOD
@@ -327,13 +328,41 @@ async def test_openings_that_fail_again_and_again_make_their_vehicle_wait(
                 assert isinstance(await vehicle.ask(broken), Nack)
             await vehicle.say(coded.hello)
             assert await vehicle.end() is EXHAUSTED
-            assert "3 openings of this vehicle failed" in await vehicle.stream.details()
+            assert "3 openings of this vehicle came to nothing" in await vehicle.stream.details()
             metadata = dict(await vehicle.stream.trailing_metadata())
             assert 0 < int(metadata[RETRY_AFTER]) <= 500
         assert limited(server, "failed_openings") == 1
         assert counted(server, "rfedge_server_openings_total", result="failed") == 3
         async with raw_vehicle(server.address) as other:
             await other.greet(replace(coded.hello, vehicle_id="cav-other"))
+
+
+async def test_streams_that_end_with_unusable_frames_make_their_vehicle_wait(
+    serve: Any, raw_vehicle: Any, coded: Any
+) -> None:
+    damaged = replace(coded.frames[0], packet=replace(coded.frames[0].packet, crc32=1))
+
+    async def wasted_stream(server: Any) -> None:
+        async with raw_vehicle(server.address) as vehicle:
+            await vehicle.greet(coded.hello)
+            for _ in range(MAX_UNUSABLE):
+                await vehicle.say(damaged)
+            assert await vehicle.end() is EXHAUSTED
+            assert "could not be used" in await vehicle.stream.details()
+
+    async with serve() as server:
+        for _ in range(2):
+            await wasted_stream(server)
+        async with raw_vehicle(server.address) as honest:
+            await honest.greet(coded.hello)
+            assert await honest.told(coded.frames[0]) == ("ack", 0)
+        for _ in range(3):
+            await wasted_stream(server)
+        async with raw_vehicle(server.address) as vehicle:
+            await vehicle.say(coded.hello)
+            assert await vehicle.end() is EXHAUSTED
+            assert "3 openings of this vehicle came to nothing" in await vehicle.stream.details()
+        assert limited(server, "failed_openings") == 1
 
 
 # --- frames

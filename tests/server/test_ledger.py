@@ -268,18 +268,18 @@ def test_lost_decoders_far_apart_are_accidents() -> None:
         ledger.lost_decoder("cav-1", i * BARRED_S / (MAX_LOST_DECODERS - 1))
 
 
-def test_openings_that_fail_in_a_row_are_waited_for_longer_and_longer() -> None:
+def test_openings_that_come_to_nothing_in_a_row_are_waited_for_longer_and_longer() -> None:
     ledger, now, pauses = ledger_of(), 0.0, []
     for _ in range(12):
-        ledger.opening_ended("cav-1", opened=False, now=now)
+        ledger.opening_failed("cav-1", now)
         pauses.append(refused_for_s(lambda at_s=now: ledger.check_opening("cav-1", at_s)))
         now += pauses[-1]
         ledger.check_opening("cav-1", now)
     assert pauses[:5] == [0.0, 0.0, 0.5, 1.0, 2.0]
     assert pauses[-1] == LONGEST_PAUSE_S
     ledger.check_opening("cav-2", now)
-    ledger.opening_ended("cav-1", opened=True, now=now)
-    ledger.opening_ended("cav-1", opened=False, now=now)
+    ledger.opening_paid("cav-1", now)
+    ledger.opening_failed("cav-1", now)
     ledger.check_opening("cav-1", now)
 
 

@@ -101,7 +101,7 @@ GridField::GridField(const FieldArrays& a) {
 }
 
 Renderer::Renderer(const FieldArrays& arrays, const Kernels& kernels, int threads)
-    : kernels_(kernels), pool_(threads), field_(arrays) {}
+    : kernels_(kernels), threads_(threads), field_(arrays) {}
 
 uint64_t Renderer::render(const Camera& camera, int samples_per_ray, float* colour, float* depth,
                           float* opacity) {
@@ -111,7 +111,8 @@ uint64_t Renderer::render(const Camera& camera, int samples_per_ray, float* colo
     const RenderJob job{&field_.view(), &camera, samples_per_ray, colour,
                         depth,          opacity, samples.data()};
     auto* kernel = kernels_.render_tile[field_.view().space.unbounded];
-    pool_.run(tiles, [&](int tile) {
+    const auto pool = pools_.take([this] { return std::make_unique<ThreadPool>(threads_); });
+    pool->run(tiles, [&](int tile) {
         thread_local AlignedBuffer<Chunk> chunks;
         chunks.reserve(kRenderChunks);
         kernel(job, tile, chunks.data());

@@ -6,6 +6,7 @@
 
 #include "ngp/kernels.h"
 #include "threads/aligned_buffer.h"
+#include "threads/kept.h"
 #include "threads/thread_pool.h"
 
 namespace rfcore::ngp {
@@ -54,6 +55,7 @@ class GridField {
     AlignedBuffer<uint32_t> occupancy_;
 };
 
+// Pictures may be drawn at the same time, each with `threads` threads of its own.
 class Renderer {
   public:
     Renderer(const FieldArrays& arrays, const Kernels& kernels, int threads);
@@ -66,8 +68,9 @@ class Renderer {
 
   private:
     const Kernels& kernels_;
-    ThreadPool pool_;
+    int threads_;
     GridField field_;
+    Kept<ThreadPool> pools_;
 };
 
 }  // namespace rfcore::ngp

@@ -43,7 +43,7 @@ void pack_parameters(const GaussianArrays& from, float* blocks) {
 Rasterizer::Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads,
                        bool antialiased)
     : kernels_(kernels),
-      pool_(threads),
+      threads_(threads),
       blocks_((gaussians.count + kLanes - 1) / kLanes),
       degree_(gaussians.degree),
       antialiased_(antialiased) {
@@ -55,7 +55,7 @@ Rasterizer::Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, 
     pack_parameters(gaussians, parameters.data());
     geometry_.reserve(static_cast<size_t>(blocks_) * kGeometryPlanes * kLanes);
     harmonics_.reserve(static_cast<size_t>(blocks_) * sh_size);
-    pool_.run(threads, [&](int part) {
+    workplace()->pool.run(threads, [&](int part) {
         const int begin = share_begin(blocks_, part, threads);
         const int end = share_begin(blocks_, part + 1, threads);
         kernels_.prepare(parameters.data(), planes, geometry_.data(), begin, end);
@@ -66,7 +66,11 @@ Rasterizer::Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, 
     }
 }
 
-void Rasterizer::run_front_end(const Camera& camera, int degree) {
+Kept<Rasterizer::Workplace>::Loan Rasterizer::workplace() {
+    return workplaces_.take([this] { return std::make_unique<Workplace>(threads_); });
+}
+
+void Rasterizer::run_front_end(Workplace& at, const Camera& camera, int degree) const {
     ProjectJob job{};
     job.camera = &camera;
     job.geometry = geometry_.data();
@@ -74,33 +78,36 @@ void Rasterizer::run_front_end(const Camera& camera, int degree) {
     job.stored_degree = degree_;
     job.degree = degree;
     job.antialiased = antialiased_;
-    front_end_.run(kernels_, pool_, job, blocks_, false);
+    at.front_end.run(kernels_, at.pool, job, blocks_, false);
 }
 
 void Rasterizer::render(const Camera& camera, int degree, float* colour, float* depth,
                         float* opacity) {
-    run_front_end(camera, degree);
-    const BlendJob job{&camera, front_end_.splats(), front_end_.lists(), colour,
-                       depth,   opacity,             nullptr};
-    blend_tiles(pool_, depth == nullptr ? kernels_.blend_colour : kernels_.blend_view, job);
+    const auto at = workplace();
+    run_front_end(*at, camera, degree);
+    const BlendJob job{&camera, at->front_end.splats(), at->front_end.lists(), colour,
+                       depth,   opacity,                nullptr};
+    blend_tiles(at->pool, depth == nullptr ? kernels_.blend_colour : kernels_.blend_view, job);
 }
 
 Statistics Rasterizer::statistics(const Camera& camera) {
-    run_front_end(camera, degree_);
+    const auto at = workplace();
+    run_front_end(*at, camera, degree_);
+    const FrontEnd& front_end = at->front_end;
     const size_t pixels = static_cast<size_t>(camera.width) * camera.height;
     AlignedBuffer<float> picture;
     picture.reserve(5 * pixels);
     BlendCounts counts{};
     const BlendJob job{&camera,
-                       front_end_.splats(),
-                       front_end_.lists(),
+                       front_end.splats(),
+                       front_end.lists(),
                        picture.data(),
                        picture.data() + 3 * pixels,
                        picture.data() + 4 * pixels,
                        &counts};
     const int tiles = camera.groups() * kTilesPerGroup;
     for (int tile = 0; tile < tiles; ++tile) kernels_.blend_counting(job, tile);
-    return {front_end_.visible(), front_end_.tile_entry_count(), counts.tile_entries, counts.useful,
+    return {front_end.visible(), front_end.tile_entry_count(), counts.tile_entries, counts.useful,
             counts.evaluated};
 }
 

@@ -1,7 +1,10 @@
 // A set of Gaussians ready to be rendered from any camera.
 #pragma once
 
+#include <memory>
+
 #include "raster/front_end.h"
+#include "threads/kept.h"
 
 namespace rfcore::raster {
 
@@ -30,6 +33,7 @@ constexpr float kTransparentLogit = -100.0f;  // of lanes without a Gaussian
 // Gaussian are transparent.
 void pack_parameters(const GaussianArrays& from, float* blocks);
 
+// Pictures may be drawn at the same time, each with `threads` threads and memory of its own.
 class Rasterizer {
   public:
     Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads,
@@ -42,17 +46,22 @@ class Rasterizer {
     Statistics statistics(const Camera& camera);
 
     const Kernels& kernels() const { return kernels_; }
-    int threads() const { return pool_.threads(); }
 
   private:
-    void run_front_end(const Camera& camera, int degree);
+    // What one picture at a time is drawn with.
+    struct Workplace {
+        explicit Workplace(int threads) : pool(threads) {}
+        ThreadPool pool;
+        FrontEnd front_end;
+    };
+    Kept<Workplace>::Loan workplace();
+    void run_front_end(Workplace& at, const Camera& camera, int degree) const;
 
     const Kernels& kernels_;
-    ThreadPool pool_;
-    int blocks_, degree_;
+    int threads_, blocks_, degree_;
     bool antialiased_;
     AlignedBuffer<float> geometry_, harmonics_;
-    FrontEnd front_end_;
+    Kept<Workplace> workplaces_;
 };
 
 // Run `kernel` over every tile of the picture.
