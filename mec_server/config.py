@@ -84,10 +84,17 @@ class IdentityBudget:
     """Messages it may send on its streams: frames, and what was to be one."""
     bytes_per_s: Annotated[float, arg(name="identity-bytes-per-s")] = 32e6
     """Bytes these may have."""
+    rejected_workers: Annotated[float, arg(name="identity-rejected-workers")] = 0.2
+    """Workers that those of its frames may keep busy, when others want them, that are rejected
+    after they were rendered. A correct vehicle whose packets are lost takes a quarter of it."""
 
     def __post_init__(self) -> None:
         if not 0 < self.share <= 1:
             raise InvalidInput("identity-share", f"{self.share:g} is outside 0..1")
+        if not 0 < self.rejected_workers <= 256:
+            raise InvalidInput(
+                "identity-rejected-workers", f"{self.rejected_workers:g} is outside 0..256"
+            )
         for name in ("streams", "decoders", "fetches", "watches", "rpcs"):
             _check_budget(f"identity.{name}", getattr(self, name), 100_000)
         for name in ("calls_per_s", "messages_per_s", "bytes_per_s"):

@@ -79,7 +79,7 @@ class OpeningResult(StrEnum):
 SPENT_FAMILY = Family(
     "rfedge_server_spent_total",
     "counter",
-    "What identities spent: calls, messages, bytes, worker_seconds.",
+    "What identities spent: calls, messages, bytes, worker_seconds, rejected_seconds.",
     ("resource",),
 )
 SUPPRESSED = Family(

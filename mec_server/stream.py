@@ -332,7 +332,7 @@ class Stream:
             if isinstance(outcome.reconstruction, Reconstruction):
                 self._reconstructed(job, outcome.reconstruction, now)
             else:
-                self._rejected(job, outcome.reconstruction, now)
+                self._rejected(job, outcome.reconstruction, outcome.worker_s, now)
         except Exception as error:  # a programming error ends the stream that met it, loudly
             self._fault = error
             self._wake.set()
@@ -358,16 +358,18 @@ class Stream:
         self._metrics.reconstructed(latency_s)
         return latency_s
 
-    def _rejected(self, job: DecodeJob, error: PacketRejected, now: float) -> None:
+    def _rejected(self, job: DecodeJob, error: PacketRejected, worker_s: float, now: float) -> None:
         self._log_rejected(job.frame, error)
         self._session.rejected(job, error, now)
         if isinstance(error, RenderTooLate):
             self._server.metrics.count_limited(Limit.RENDER_DEADLINE)
-        if isinstance(error.__cause__, DecoderLost):
-            try:
-                self._account.lost_decoder(now)
-            except LimitExceeded as barred:
-                self._session.end(barred)
+        if not isinstance(error.__cause__, DecoderLost):
+            self._account.rejected(worker_s, now)
+            return
+        try:
+            self._account.lost_decoder(now)
+        except LimitExceeded as barred:
+            self._session.end(barred)
 
     def _log_rejected(self, frame: Frame, error: PacketRejected) -> None:
         self._log.warning(

@@ -52,6 +52,8 @@ class Resource(StrEnum):
     """Bytes of these messages."""
     WORKER_SECONDS = "worker_seconds"
     """Time for which frames kept a worker busy, those that were rejected included."""
+    REJECTED_SECONDS = "rejected_seconds"
+    """Of this, the time of frames that were rejected, unless their decoder was lost."""
 
 
 HELD = (
@@ -61,7 +63,13 @@ HELD = (
     Resource.FETCHES,
     Resource.WATCHES,
 )
-SPENT = (Resource.CALLS, Resource.MESSAGES, Resource.BYTES, Resource.WORKER_SECONDS)
+SPENT = (
+    Resource.CALLS,
+    Resource.MESSAGES,
+    Resource.BYTES,
+    Resource.WORKER_SECONDS,
+    Resource.REJECTED_SECONDS,
+)
 
 
 class Limit(StrEnum):
@@ -76,6 +84,7 @@ class Limit(StrEnum):
     IDENTITY_MESSAGES = "identity_messages"
     IDENTITY_BYTES = "identity_bytes"
     IDENTITY_WORKER_SECONDS = "identity_worker_seconds"
+    IDENTITY_REJECTED_SECONDS = "identity_rejected_seconds"
     SERVER_RPCS = "server_rpcs"
     SERVER_STREAMS = "server_streams"
     SERVER_DECODERS = "server_decoders"
@@ -85,6 +94,7 @@ class Limit(StrEnum):
     SERVER_MESSAGES = "server_messages"
     SERVER_BYTES = "server_bytes"
     SERVER_WORKER_SECONDS = "server_worker_seconds"
+    SERVER_REJECTED_SECONDS = "server_rejected_seconds"
     CAPACITY = "capacity"
     CAMERA_TAKEN = "camera_taken"
     CAMERA_FRAMES = "camera_frames"
@@ -137,7 +147,12 @@ def budgets_of(
         for resource, total in totals.items()
     }
     # All together cannot spend more worker time than there is.
-    return budgets | {Resource.WORKER_SECONDS: Budget(identity.share * workers, math.inf)}
+    return budgets | {
+        Resource.WORKER_SECONDS: Budget(identity.share * workers, math.inf),
+        Resource.REJECTED_SECONDS: Budget(
+            min(identity.rejected_workers, identity.share * workers), math.inf
+        ),
+    }
 
 
 def _within(share: float, wanted: float, total: float, resource: Resource) -> float:

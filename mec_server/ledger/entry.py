@@ -228,14 +228,15 @@ class StreamAccount:
     def spend_frame(self, frame: Frame, message_bytes: int, now: float) -> None:
         """Count a frame of a camera; raise ``LimitExceeded`` if it is one too many.
 
-        An identity that kept workers busy for longer than its share waits until that is made up
-        for, unless it is alone.
+        An identity that kept workers busy for longer than its share, or for long with frames that
+        were rejected, waits until that is made up for, unless it is alone.
         """
         camera = self._cameras.get(frame.camera_id)
         if camera is not None:
             camera.spend(message_bytes, now)
         if self._entry.promises.is_crowded:
-            self._entry.ledger.check(self.identity, Resource.WORKER_SECONDS, now)
+            for resource in (Resource.WORKER_SECONDS, Resource.REJECTED_SECONDS):
+                self._entry.ledger.check(self.identity, resource, now)
 
     def expected_s(self) -> float:
         """Return for how long the next frame will keep a worker busy."""
@@ -247,6 +248,11 @@ class StreamAccount:
         self._entry.ledger.charge(self.identity, Resource.WORKER_SECONDS, worker_s, now)
         if complete:
             self._entry.ledger.opening_paid(self.identity, now)
+
+    def rejected(self, worker_s: float, now: float) -> None:
+        """Charge the time for which a frame kept a worker busy that is itself to blame for its
+        rejection."""
+        self._entry.ledger.charge(self.identity, Resource.REJECTED_SECONDS, worker_s, now)
 
     def opening_failed(self, now: float) -> None:
         """Count an opening that came to nothing: decoders that could not be opened, or a stream

@@ -38,9 +38,10 @@ HELD_RETRY_S = 1.0
 """When to try again for what others hold: nobody knows when they give it back."""
 
 BURST_S = 1.0
-WORKER_BURST_S = 5.0
+LONGER_BURST_S = {Resource.WORKER_SECONDS: 5.0, Resource.REJECTED_SECONDS: 2.0}
 """A bucket holds what its rate gives in this time; of worker time it is more, since a frame that
-meets a busy machine, or replaces its decoder, takes seconds."""
+meets a busy machine, or replaces its decoder, takes seconds, and since the frames in flight are
+rejected together."""
 
 
 class TokenBucket:
@@ -324,7 +325,7 @@ def _full_buckets(rates: Mapping[Resource, float], now: float) -> dict[Resource,
 
 
 def _burst_s(resource: Resource) -> float:
-    return WORKER_BURST_S if resource is Resource.WORKER_SECONDS else BURST_S
+    return LONGER_BURST_S.get(resource, BURST_S)
 
 
 def _words(resource: Resource) -> str:

@@ -30,7 +30,7 @@ def picture(target: Target, cameras: int = 1) -> tuple[Hello, Frame]:
     rounded = type(shown.camera)(k, shown.camera.world_from_cam.rounded())
     shown = type(shown)(shown.name, rounded, shown.read)
     field = load_field(ROOT / "samples/fields/street.rff")
-    pipeline = Pipeline(field, CodecConfig(k.width, k.height, "fast"), time.perf_counter_ns)
+    pipeline = Pipeline(field, CodecConfig(k.width_px, k.height_px, "fast"), time.perf_counter_ns)
     packet = pipeline.encode(EncodeJob(Capture(0, shown, 0.0, 0), 0, 1)).packet
     named = tuple(CameraDescription(f"c{i}", k, pipeline.header) for i in range(cameras))
     contract = RendererContract(RENDERER_CONTRACT, exact=True)

@@ -400,6 +400,30 @@ async def test_a_frame_that_could_not_be_decoded_in_time_is_not_rendered(
         assert counted(server, "rfedge_server_spent_total", resource="worker_seconds") < 0.01
 
 
+async def test_who_sends_what_cannot_be_decoded_is_soon_not_rendered_for(
+    serve: Any, raw_vehicle: Any, coded: Any
+) -> None:
+    """With next to no time for rejected frames, the first one spends it all."""
+    spent = IdentityBudget(rejected_workers=1e-6)
+    junk = coded.frames[0].packet
+    junk = replace(junk, render_digest=bytes(16), render_block_means=b"").sealed()
+    async with (
+        serve(identity_budget=spent) as server,
+        raw_vehicle(server.address) as mallory,
+        raw_vehicle(server.address) as modest,
+    ):
+        await mallory.greet(named(coded.hello, "mallory"))
+        await modest.greet(named(coded.hello, "modest"))
+        first, *others = [
+            await mallory.told(of_camera(replace(coded.frames[0], packet=junk), "mallory"))
+            for _ in range(4)
+        ]
+        assert first == ("render_mismatch", 0)
+        assert others == [("overloaded", 0)] * 3
+        assert limited(server, "identity_rejected_seconds") == 3
+        assert await modest.told(of_camera(coded.frames[0], "modest")) == ("ack", 0)
+
+
 class Slowed:
     """Calls ``before`` on the worker for each frame of ``decoder``."""
 

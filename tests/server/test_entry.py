@@ -13,6 +13,7 @@ from mec_server.ledger.entry import (
     CameraMeter,
     EntryControl,
 )
+from mec_server.ledger.ledger import LONGER_BURST_S
 from mec_server.ledger.peer_log import LINE_BURST, LINES_PER_S, LogLimiter
 from rfcore.errors import LimitExceeded
 from rfcore.wire.messages import Hello
@@ -113,6 +114,26 @@ def test_worker_time_binds_only_while_others_stream(hello: Hello, make_frame: ob
     other.spend_frame(frame, 10, 0.0)
     other.leave()
     account.spend_frame(frame, 10, 0.0)
+
+
+def test_frames_that_are_rejected_take_little_of_the_workers_while_others_stream(
+    hello: Hello, make_frame: object
+) -> None:
+    frame = make_frame(0)  # type: ignore[operator]
+    entry = entry_control()
+    account = entry.open("s-1", "mallory", named=True, now=0.0)
+    account.enter(hello, Sender(), 0.0)
+    budget = entry.ledger.budget(Resource.REJECTED_SECONDS).identity
+    burst_s = budget * LONGER_BURST_S[Resource.REJECTED_SECONDS]
+    account.rejected(burst_s + 0.5, 0.0)
+    account.spend_frame(frame, 10, 0.0)
+    other = entry.open("s-2", "modest", named=True, now=0.0)
+    other.enter(replace(hello, vehicle_id="modest"), Sender(), 0.0)
+    with pytest.raises(LimitExceeded, match="identity_rejected_seconds") as caught:
+        account.spend_frame(frame, 10, 0.0)
+    assert caught.value.retry_after_s == pytest.approx(0.5 / budget)
+    other.spend_frame(frame, 10, 0.0)
+    account.spend_frame(frame, 10, 0.5 / budget + 0.01)
 
 
 def test_lines_beyond_the_burst_are_suppressed_counted_and_told_once() -> None:

@@ -24,9 +24,9 @@ from mec_server.ledger.ledger import (
     BARRED_S,
     BURST_S,
     HELD_RETRY_S,
+    LONGER_BURST_S,
     LONGEST_PAUSE_S,
     MAX_LOST_DECODERS,
-    WORKER_BURST_S,
     Hold,
     Ledger,
     TokenBucket,
@@ -177,11 +177,11 @@ class LedgerMachine(RuleBasedStateMachine):
     @invariant()
     def nobody_spends_more_than_a_rate_a_burst_and_one_amount(self) -> None:
         for (_, resource), amount in self.allowed.items():
-            burst_s = WORKER_BURST_S if resource is Resource.WORKER_SECONDS else BURST_S
+            burst_s = LONGER_BURST_S.get(resource, BURST_S)
             assert amount <= 4 * self.now + 4 * burst_s + 3 + 1e-6
         for resource in SPENT:
             assert self.ledger.spent(resource) == pytest.approx(self.spent[resource])
-            burst_s = WORKER_BURST_S if resource is Resource.WORKER_SECONDS else BURST_S
+            burst_s = LONGER_BURST_S.get(resource, BURST_S)
             assert self.spent[resource] <= 10 * self.now + 10 * burst_s + 3 + 1e-6
 
     @invariant()
@@ -227,7 +227,7 @@ def test_who_spends_too_much_is_told_when_to_come_again_and_others_are_not_refus
     resource: Resource,
 ) -> None:
     ledger = ledger_of()
-    burst_s = WORKER_BURST_S if resource is Resource.WORKER_SECONDS else BURST_S
+    burst_s = LONGER_BURST_S.get(resource, BURST_S)
     ledger.charge("cav-1", resource, 4.0 * burst_s + 2.0, 0.0)
     with pytest.raises(LimitExceeded) as caught:
         ledger.spend("cav-1", resource, 0.1, 0.0)
@@ -241,7 +241,7 @@ def test_a_long_render_is_paid_for_by_who_asked_for_it_alone() -> None:
     budgets = budgets_of(IdentityBudget(), ServerBudget(), workers=2, memory_bytes=8 * GIB)
     ledger = Ledger(budgets, 0.0)
     ledger.charge("mallory", Resource.WORKER_SECONDS, 11.0, 0.0)
-    wait_s = 11.0 - WORKER_BURST_S
+    wait_s = 11.0 - LONGER_BURST_S[Resource.WORKER_SECONDS]
     with pytest.raises(LimitExceeded, match="identity_worker_seconds: more than 1 worker seconds"):
         ledger.check("mallory", Resource.WORKER_SECONDS, wait_s - 0.01)
     ledger.check("mallory", Resource.WORKER_SECONDS, wait_s + 0.01)
