@@ -8,6 +8,8 @@ A user's mistake ends in one line on stderr and exit status 2, never in a traceb
 from __future__ import annotations
 
 import io
+import os
+import select
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -67,6 +69,10 @@ CONFIG = (
 where a word says more."""
 
 
+SIGPIPE_STATUS = 141
+"""What shells report for a program that was ended by SIGPIPE."""
+
+
 def parse(arguments: Sequence[str] | None = None) -> Verb:
     """Return the verb that ``arguments`` ask for, by default those of the process.
 
@@ -79,6 +85,24 @@ def main() -> int:
     """Parse the command line, run one verb, and return its exit status."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # a log file gets cost and progress as they come
         sys.stdout.reconfigure(line_buffering=True)
+    try:
+        return _run()
+    except BrokenPipeError as error:
+        if not _nobody_reads():
+            print(f"rfedge: {error}", file=sys.stderr)
+            return 2
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at the exit
+        return SIGPIPE_STATUS
+
+
+def _nobody_reads() -> bool:
+    """Return whether standard output is a pipe whose reader, like `head`, has what it wanted."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
+
+
+def _run() -> int:
     if sys.argv[1:] == ["--version"]:
         from importlib.metadata import version
 
@@ -87,6 +111,8 @@ def main() -> int:
     verb = parse()
     try:
         verb.run()
+    except BrokenPipeError:
+        raise
     except (RfedgeError, OSError) as error:
         print(f"rfedge: {error}", file=sys.stderr)
         return 2

@@ -22,6 +22,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from attack.target import Target
@@ -263,10 +264,10 @@ class Phase:
     @property
     def p99_ms(self) -> float:
         """Return the 99th percentile of the latencies of what was delivered."""
-        latencies = sorted(x["latency_ms"] for x in self.lines if x["result"] == "acked")
-        if not latencies:
+        latencies_ms = [x["latency_ms"] for x in self.lines if x["result"] == "acked"]
+        if not latencies_ms:
             return 60e3  # nothing was answered for all that time
-        return float(latencies[min(len(latencies) - 1, int(0.99 * len(latencies)))])
+        return float(np.percentile(latencies_ms, 99))
 
     @property
     def cores(self) -> float:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import re
 import subprocess
 import sys
@@ -176,6 +177,15 @@ def test_a_process_ends_with_that_line_and_status() -> None:
     done = in_a_process("train", "nowhere", "--out", "field.txt")
     assert done == rfedge("train", "nowhere", "--out", "field.txt")
     assert done.returncode == 2
+
+
+def test_a_reader_that_has_enough_ends_the_command_quietly() -> None:
+    command = [sys.executable, "-m", "rfedge", "eval", "--help"]
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as nobody:
+        done = subprocess.run(command, stdout=nobody, stderr=subprocess.PIPE, check=False)
+    assert (done.returncode, done.stderr) == (141, b"")
 
 
 def test_a_log_file_gets_each_line_as_it_comes(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The native renderer: equal to the float64 definition, and to itself wherever it runs."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -32,6 +33,16 @@ def test_every_instruction_set_and_thread_count_gives_the_same_bytes(
     view = NgpRenderer(field, threads=threads, isa=isa).render(camera())
     assert view_bytes(view) == view_bytes(definition)
     assert 0.1 < float(view.opacity.mean()) < 0.99
+
+
+def test_pictures_drawn_at_the_same_time_are_those_drawn_one_by_one(
+    numbers: NumbersMaker, camera: CameraMaker, threads: int
+) -> None:
+    renderer = NgpRenderer(numbers(occupied_share=0.6), threads=threads)
+    one = view_bytes(renderer.render(camera()))
+    with ThreadPoolExecutor(4) as pool:
+        together = {view_bytes(view) for view in pool.map(renderer.render, [camera()] * 20)}
+    assert together == {one}
 
 
 @pytest.mark.parametrize("unbounded", [False, True])

@@ -1,6 +1,7 @@
 """The native renderer: equal to the float64 definition, and to itself wherever it runs."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -51,6 +52,17 @@ def test_every_instruction_set_and_thread_count_gives_the_same_bytes(
     assert rasterizer.isa == forward_isa
     assert view_bytes(view) == view_bytes(definition)
     assert 0.2 < float(view.opacity.mean()) < 0.95
+
+
+def test_pictures_drawn_at_the_same_time_are_those_drawn_one_by_one(
+    scene: SceneMaker, camera: CameraMaker, threads: int
+) -> None:
+    rasterizer = Rasterizer(scene(700), threads=threads)
+    cameras = [camera(*size_px) for size_px in ((67, 45), (200, 120), (16, 16), (131, 99))]
+    one_by_one = [view_bytes(rasterizer.render(each)) for each in cameras]
+    with ThreadPoolExecutor(len(cameras)) as pool:
+        together = [view_bytes(view) for view in pool.map(rasterizer.render, cameras * 10)]
+    assert together == one_by_one * 10
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
