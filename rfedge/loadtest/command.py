@@ -8,9 +8,9 @@ from pathlib import Path
 from rich.console import Console
 
 from rfedge.loadtest.plan import Load
+from rfedge.loadtest.planning import largest_held
 from rfedge.loadtest.result import LoadResult, print_runs, record, write_load_result
 from rfedge.loadtest.run import Run, TestBed, run_load
-from rfedge.loadtest.uplink import largest_held
 
 __all__ = ["Command"]
 

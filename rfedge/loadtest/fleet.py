@@ -18,8 +18,7 @@ from typing import Any
 
 from rfcore.files import write_whole
 from rfcore.wire.messages import Hello
-from rfedge.loadtest.prerecorded import PrerecordedDrive
-from rfedge.loadtest.replay import End, Schedule
+from rfedge.loadtest.prerecorded import End, PrerecordedDrive, Schedule
 from rfedge.loadtest.vehicle import PrerecordedVehicle
 
 __all__ = ["FleetSpec", "main", "run_fleet"]

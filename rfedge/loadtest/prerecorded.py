@@ -4,14 +4,21 @@ A prerecorded drive holds each picture twice: ``chain``, as a vehicle sends them
 from the one before, and ``alone``, predicted from the render only, for the picture after one that
 was dropped. On disk they are two coded drives (``rfcore.wire.drive_file``), in a folder named by
 the digest of field, drive and settings.
+
+``Replay`` is one camera of a vehicle that replays a drive: what is due when, what is sent, and how
+each picture ended. Sans-IO; times are seconds on one monotonic clock. Pictures are due at ``start_s + i / hz`` whatever
+became of those before. As in the agent, the newest waits for credit and replaces the one that
+waited. After a picture that was dropped or refused the next ones are sent alone, in a new epoch,
+until the drive begins again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from pathlib import Path
 from random import Random
 
@@ -26,9 +33,187 @@ from rfcore.field import RadianceField
 from rfcore.views import PosedPicture
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.drive_file import CodedDrive, read_drive, write_drive
-from rfcore.wire.messages import CameraDescription, Frame, FrameAddress, Hello, RendererContract
+from rfcore.wire.messages import (
+    Ack,
+    CameraDescription,
+    Credit,
+    Frame,
+    FrameAddress,
+    Hello,
+    Nack,
+    RendererContract,
+    ServerMessage,
+)
 
-__all__ = ["CAMERA", "PrerecordedDrive", "payload_drive", "prerecorded_drive"]
+__all__ = [
+    "CAMERA",
+    "End",
+    "PrerecordedDrive",
+    "Replay",
+    "Schedule",
+    "Shot",
+    "payload_drive",
+    "prerecorded_drive",
+]
+
+
+class End(StrEnum):
+    """How a picture ended; ``open``: it was not answered when the test was over."""
+
+    ACKED = "acked"
+    NACKED = "nacked"
+    DROPPED = "dropped"
+    OPEN = "open"
+
+
+@dataclass
+class Shot:
+    """One picture: when it was due, when it was handed to the socket, when it was answered."""
+
+    due_s: float
+    sent_s: float | None = None
+    ended_s: float | None = None
+    end: End = End.OPEN
+
+    @property
+    def latency_s(self) -> float | None:
+        """From due to Ack."""
+        if self.end is not End.ACKED or self.ended_s is None:
+            return None
+        return self.ended_s - self.due_s
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Pictures at ``start_s + i / hz`` until ``end_s``, ready to send ``ready_s`` later."""
+
+    start_s: float
+    end_s: float
+    hz: float
+    ready_s: float = 0.0
+
+
+NEVER = Schedule(float("inf"), float("inf"), 1.0)
+
+
+class Replay:
+    """Replays ``drive`` as camera ``camera_id``; ``wall_ns`` is the Unix time of a moment."""
+
+    def __init__(
+        self, camera_id: str, drive: PrerecordedDrive, wall_ns: Callable[[float], int]
+    ) -> None:
+        self.shots: list[Shot] = []
+        self._camera_id = camera_id
+        self._drive = drive
+        self._schedule = NEVER
+        self._wall_ns = wall_ns
+        self._granted = 0
+        self._used = 0
+        self._waiting: int | None = None
+        self._pending: dict[FrameAddress, Shot] = {}
+        self._epoch = -1
+        self._sequence = 0
+        self._chained = False
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether every picture was sent or dropped, and answered."""
+        return self._waiting is None and not self._pending and self.get_timer() is None
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether a picture waits and has credit."""
+        return self._waiting is not None and self._used < self._granted
+
+    def begin(self, schedule: Schedule) -> None:
+        """Follow ``schedule`` from now on; before, nothing is due."""
+        self._schedule = schedule
+
+    def get_timer(self) -> float | None:
+        """Return when the next picture is ready, or None when there is no other."""
+        due_s = self._due_s(len(self.shots))
+        return None if due_s >= self._schedule.end_s else due_s + self._schedule.ready_s
+
+    def frame_to_send(self, now: float) -> Frame | None:
+        """Return the frame to hand to the socket now, or None: not due, or no credit."""
+        while (timer := self.get_timer()) is not None and timer <= now:
+            if self._waiting is not None:
+                self._drop(self._waiting, now)
+            self._waiting = len(self.shots)
+            self.shots.append(Shot(self._due_s(self._waiting)))
+        if self._waiting is None or self._used >= self._granted:
+            return None
+        index, self._waiting = self._waiting, None
+        self._used += 1
+        return self._sent(index, now)
+
+    def receive(self, message: ServerMessage, now: float) -> None:
+        """Take an answer; answers for other cameras are not ours."""
+        match message:
+            case Credit(camera_id, frames) if camera_id == self._camera_id:
+                self._granted = max(self._granted, frames)
+            case Ack(address):
+                if (shot := self._pending.pop(address, None)) is not None:
+                    shot.ended_s, shot.end = now, End.ACKED
+            case Nack(address):
+                if (shot := self._pending.pop(address, None)) is not None:
+                    shot.ended_s, shot.end = now, End.NACKED
+                    self._chained = False
+
+    def give_up(self) -> None:
+        """The stream is lost: what was still to come is dropped."""
+        while self._due_s(len(self.shots)) < self._schedule.end_s:
+            self.shots.append(Shot(self._due_s(len(self.shots)), end=End.DROPPED))
+
+    def _due_s(self, index: int) -> float:
+        return self._schedule.start_s + index / self._schedule.hz
+
+    def _drop(self, index: int, now: float) -> None:
+        shot = self.shots[index]
+        shot.ended_s, shot.end = now, End.DROPPED
+        self._chained = False
+
+    def _sent(self, index: int, now: float) -> Frame:
+        shot = self.shots[index]
+        shot.sent_s = now
+        position = index % len(self._drive.chain)
+        if position == 0 or not self._chained:
+            self._epoch += 1
+            self._sequence = 0
+            self._chained = position == 0
+        coded = (self._drive.chain if self._chained else self._drive.alone)[position]
+        frame = Frame(
+            self._camera_id,
+            self._wall_ns(shot.due_s),
+            coded.pose,
+            coded.field_id_prefix,
+            _numbered(coded.packet, self._epoch, self._sequence),
+            coded.quality,
+        )
+        self._sequence += 1
+        self._pending[frame.address] = shot
+        return frame
+
+
+def _numbered(packet: DeltaPacket, epoch: int, sequence: int) -> DeltaPacket:
+    """Return the packet under other numbers, sealed; written out, as ``replace`` takes twice."""
+
+    def numbered(crc32: int) -> DeltaPacket:
+        return DeltaPacket(
+            epoch,
+            sequence,
+            packet.render_digest,
+            packet.render_block_means,
+            packet.reconstruction_digest,
+            packet.payload,
+            crc32,
+            packet.references,
+            packet.base_digest,
+            packet.photometric,
+        )
+
+    return numbered(numbered(0).expected_crc32())
+
 
 CAMERA = "front"
 VEHICLE = "prerecorded"

@@ -13,10 +13,15 @@ from typing import Any
 from rfcore.codec.h264.config import DEFAULT_EFFORT, CoderSettings
 from rfcore.field import load_field
 from rfedge.demo.processes import Service, command_of, service
-from rfedge.loadtest.drive import drive_live, drive_prerecorded
+from rfedge.loadtest.drive import (
+    RunMeasurements,
+    drive_live,
+    drive_prerecorded,
+    links_busy,
+    measured,
+)
 from rfedge.loadtest.plan import Load, Mode, Vehicles
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
-from rfedge.loadtest.run_measurements import RunMeasurements, links_busy, measured
 from rfedge.loadtest.usage import Usage
 from rfedge.loadtest.verdict import Verdict, judge
 

@@ -19,8 +19,7 @@ from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import Hello, Welcome
 from rfedge.loadtest.grpc_call import GrpcCall, Status
-from rfedge.loadtest.prerecorded import PrerecordedDrive
-from rfedge.loadtest.replay import Replay, Schedule
+from rfedge.loadtest.prerecorded import PrerecordedDrive, Replay, Schedule
 
 __all__ = ["PrerecordedVehicle"]
 

@@ -12,9 +12,8 @@ from rich.console import Console
 
 from rfedge.results import Result, read_result
 from rfedge.sizing.estimate import Demand, estimate
-from rfedge.sizing.interpolate import MAX_BEYOND_DB, MAX_BEYOND_FACTOR
 from rfedge.sizing.report import print_sizing, tables_page
-from rfedge.sizing.tables import SHIPPED, read_tables
+from rfedge.sizing.tables import MAX_BEYOND_DB, MAX_BEYOND_FACTOR, SHIPPED, read_tables
 
 __all__ = ["sizing_page"]
 

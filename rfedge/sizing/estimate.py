@@ -19,8 +19,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from rfcore.errors import InvalidInput
-from rfedge.sizing.interpolate import Wanted, check_reach, log_at
-from rfedge.sizing.tables import SizingCell, SizingTables
+from rfedge.sizing.tables import SizingCell, SizingTables, Wanted, check_reach, log_at
 
 __all__ = [
     "Assumptions",

@@ -1,25 +1,181 @@
-"""``rfedge eval sizing`` from its drives to the tables."""
+"""``rfedge eval sizing`` from its drives to the tables.
+
+A cell of the tables is a clip coded by ours and by the rivals, decoded, and timed. Rivals are those
+of ``rfedge eval compare``, in the form that is fairest to them at a PSNR: x264 and x265 veryfast
+tuned for PSNR, SVT-AV1 preset 8, all for low delay with one key frame.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from time import process_time_ns
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
+from rfcore.codec.decoder import DeltaDecoder
+from rfcore.codec.h264.config import DEFAULT_EFFORT, CodecConfig
+from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
-from rfedge.experiments.cells import CellStore
-from rfedge.experiments.clips import DriveName
+from rfcore.image import I420
+from rfcore.native.yuv import i420_from_rgb
+from rfedge.experiments.cells import CellStore, clip_key, program_version
+from rfedge.experiments.clips import STEADY, Clip, CodedClip, Drive, DriveName, psnr_of_mse
+from rfedge.experiments.field_coder import FieldCoder, RenderedClip, render_clip
+from rfedge.experiments.rivals import Rival, svtav1_lowdelay, x264_for_psnr, x265_for_psnr
+from rfedge.offline import FrameInput, decode_promised, encode_frames
 from rfedge.results import check_result_path, make_result, provenance, write_result
 from rfedge.sizing.estimate import Demand
-from rfedge.sizing.measure import MIN_FRAMES, SETTLED_FRAMES, measured_cells, read_sized_drive
-from rfedge.sizing.tables import SizingCell, SizingTables
+from rfedge.sizing.tables import SizingCell, SizingTables, interpolated
 
-__all__ = ["SizingJob", "own_tables", "run_sizing"]
+__all__ = [
+    "MIN_FRAMES",
+    "SETTLED_FRAMES",
+    "SizingJob",
+    "measured_cells",
+    "own_tables",
+    "read_sized_drive",
+    "run_sizing",
+]
+
+MIN_FRAMES = 5
+SETTLED_FRAMES = 8
+SETTLING = slice(4, None)
+"""A rival's frames after its key frame predict from what that frame was coded better than they
+need: at 30 Hz x264's sizes still grow in the fourth. Clips of ``SETTLED_FRAMES`` leave so many out;
+shorter ones, of slow cameras, the first alone."""
+MIDDLE_DB = 34.0
+"""Where the times and the sizes of single frames are taken."""
+STEP_DB = 0.5
+DRAWS, SEED = 200, 1
+RIVALS = {
+    "x264": x264_for_psnr("veryfast"),
+    "x265": x265_for_psnr("veryfast"),
+    "svtav1": svtav1_lowdelay(8),
+}
+
+
+def read_sized_drive(name: DriveName, size_px: tuple[int, int] | None, limit: int | None) -> Drive:
+    """Read at most ``limit`` frames, reduced to ``size_px`` (width, height) by averaging areas."""
+    pictures = read_dataset(name.dataset, size_px=size_px).pictures[:limit]
+    return Drive(name, pictures, [i420_from_rgb(picture.read()) for picture in pictures])
+
+
+def measured_cells(drive: Drive, field: RadianceField, store: CellStore) -> Iterator[SizingCell]:
+    """Yield the cell of each codec on a drive, taking from ``store`` what is there.
+
+    Raises ``InvalidInput`` for fewer than ``MIN_FRAMES`` frames or an odd size.
+    """
+    if len(drive.frames) < MIN_FRAMES:
+        raise InvalidInput("frames", f"{len(drive.frames)} are too few, at least {MIN_FRAMES}")
+    clip = drive.clip()
+    rendered = render_clip(field, drive.cameras)
+    name = f"rfedge-{DEFAULT_EFFORT}-{rendered.field_id[:12]}"
+    ours = FieldCoder(rendered, name, program_version(), effort=DEFAULT_EFFORT)
+    yield _measured("rfedge", ours, clip, rendered, store)
+    for codec, rival in RIVALS.items():
+        yield _measured(codec, rival, clip, rendered, store)
+
+
+def _measured(
+    codec: str, coder: FieldCoder | Rival, clip: Clip, rendered: RenderedClip, store: CellStore
+) -> SizingCell:
+    clips = [_coded(clip, coder, point, store) for point in coder.points]
+    steady = steady_frames(len(clip.frames))
+    nearest = min(clips, key=lambda coded: abs(coded.psnr_db(steady) - MIDDLE_DB))
+
+    def receive() -> list[dict[str, float]]:
+        if isinstance(coder, Rival):
+            made = coder.pictures(clip.frames, clip.rate_hz, nearest.point)
+            return [{"receiver_ms": made.decoder_cpu_ms / len(clip.frames)}]
+        cpu_ms = _our_receiver_ms(rendered, clip.frames, nearest.point)
+        return [{"receiver_ms": cpu_ms / len(clip.frames)}]
+
+    (row,) = store.rows({**clip_key(clip, coder, nearest.point), "receiver": 1}, receive)
+    return _cell(codec, clip, clips, nearest, row["receiver_ms"])
+
+
+def steady_frames(count: int) -> slice:
+    """Return which frames of a clip of ``count`` stand for its steady state."""
+    return SETTLING if count >= SETTLED_FRAMES else STEADY
+
+
+def _coded(clip: Clip, coder: FieldCoder | Rival, point: float, store: CellStore) -> CodedClip:
+    key = clip_key(clip, coder, point)
+    return store.clip(key, lambda: coder.code(clip.frames, clip.rate_hz, point))
+
+
+def _our_receiver_ms(rendered: RenderedClip, frames: Sequence[I420], crf: float) -> float:
+    encoder = DeltaEncoder(CodecConfig(*frames[0].size_px, effort=DEFAULT_EFFORT, crf=crf))
+    inputs = (FrameInput(frame, view) for frame, view in zip(frames, rendered.views, strict=True))
+    coded = list(encode_frames(encoder, inputs))
+    began_ns = process_time_ns()
+    for _ in decode_promised(DeltaDecoder(encoder.header), coded):
+        pass
+    return (process_time_ns() - began_ns) / 1e6 + rendered.render_cpu_ms
+
+
+def _cell(
+    codec: str, clip: Clip, clips: Sequence[CodedClip], nearest: CodedClip, receiver_ms: float
+) -> SizingCell:
+    steady = steady_frames(len(clip.frames))
+    mse = np.array([coded.luma_mse[steady] for coded in clips])
+    sizes = np.array([coded.frame_bytes[steady] for coded in clips], np.float64)
+    whole = np.arange(mse.shape[1])
+    grid_db = _grid_db(mse)
+    draws = np.random.default_rng(SEED).choice(whole, (DRAWS, len(whole)))
+    drawn = np.array([_bytes_at(grid_db, mse, sizes, draw) for draw in draws])
+    low, high = np.percentile(drawn, (2.5, 97.5), axis=0)
+    ratios = nearest.frame_bytes[steady] / nearest.bytes_per_frame(steady)
+    width_px, height_px = clip.frames[0].size_px
+    return SizingCell(
+        codec=codec,
+        width_px=width_px,
+        height_px=height_px,
+        hz=clip.rate_hz,
+        frames=len(clip.frames),
+        psnr_db=grid_db,
+        bytes_per_frame=_rounded(_bytes_at(grid_db, mse, sizes, whole)),
+        low_bytes=_rounded(low),
+        high_bytes=_rounded(high),
+        frame_ratios=[round(float(ratio), 3) for ratio in ratios],
+        sender_ms=round(nearest.cpu_ms / len(clip.frames), 2),
+        receiver_ms=round(receiver_ms, 2),
+    )
+
+
+def _grid_db(mse: NDArray[np.float64]) -> list[float]:
+    """Return the half decibels that the clip's curve spans."""
+    ends_db = sorted(psnr_of_mse(float(row.mean())) for row in (mse[0], mse[-1]))
+    first, last = np.ceil(ends_db[0] / STEP_DB), np.floor(ends_db[1] / STEP_DB)
+    return [float(n * STEP_DB) for n in np.arange(first, last + 1)]
+
+
+def _bytes_at(
+    grid_db: Sequence[float],
+    mse: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    frames: NDArray[np.intp],
+) -> list[float]:
+    """Return bytes a frame at each quality of the grid, over the chosen frames of every point."""
+    psnr_db = np.array([psnr_of_mse(float(value)) for value in mse[:, frames].mean(axis=1)])
+    log_bytes = np.log(sizes[:, frames].mean(axis=1))
+    order = np.argsort(psnr_db)
+    return [
+        float(np.exp(interpolated(psnr_db[order].tolist(), log_bytes[order].tolist(), at_db)))
+        for at_db in grid_db
+    ]
+
+
+def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
+    return [round(float(value), 1) for value in values]
+
 
 STEPS = (1, 2, 3, 5)
 """Every n-th frame of a drive stands for a slower camera."""
@@ -65,7 +221,7 @@ def run_sizing(job: SizingJob, console: Console) -> dict[str, Any]:
     cells: list[SizingCell] = []
     for footage in planned(job):
         console.print(f"  {_words(footage)}")
-        cells += _measured(footage, field, store)
+        cells += _footage_cells(footage, field, store)
     streets = ", ".join(f"{drive.scene} at {drive.rate_hz:g} Hz" for drive in job.drives)
     content = {
         "measured_on": f"{streets}; field {field.field_id[:12]}",
@@ -101,7 +257,9 @@ def _possible(job: SizingJob) -> Iterator[Footage]:
                         yield Footage(drive, size_px, step, frames)
 
 
-def _measured(footage: Footage, field: RadianceField, store: CellStore) -> Iterator[SizingCell]:
+def _footage_cells(
+    footage: Footage, field: RadianceField, store: CellStore
+) -> Iterator[SizingCell]:
     drive = read_sized_drive(footage.drive, footage.size_px, footage.frames * footage.step)
     yield from measured_cells(drive.every(footage.step), field, store)
 

@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from attack.target import Target
-from rfedge.loadtest.prerecorded import PrerecordedDrive
-from rfedge.loadtest.replay import End, Schedule, Shot
+from rfedge.loadtest.prerecorded import End, PrerecordedDrive, Schedule, Shot
 from rfedge.loadtest.vehicle import PrerecordedVehicle
 
 NAME = "bystander"

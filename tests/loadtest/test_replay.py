@@ -23,8 +23,7 @@ from rfcore.wire.messages import (
     RendererContract,
     StageTimes,
 )
-from rfedge.loadtest.prerecorded import PrerecordedDrive
-from rfedge.loadtest.replay import End, Replay, Schedule
+from rfedge.loadtest.prerecorded import End, PrerecordedDrive, Replay, Schedule
 
 PICTURES = 4
 

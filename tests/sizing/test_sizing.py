@@ -21,8 +21,17 @@ from rfedge.sizing.estimate import (
     needed_bps,
     share_in_time,
 )
-from rfedge.sizing.interpolate import MAX_BEYOND_DB, Wanted, check_reach, log_at
-from rfedge.sizing.tables import CODECS, SizingCell, SizingTables, read_tables, shipped_tables
+from rfedge.sizing.tables import (
+    CODECS,
+    MAX_BEYOND_DB,
+    SizingCell,
+    SizingTables,
+    Wanted,
+    check_reach,
+    log_at,
+    read_tables,
+    shipped_tables,
+)
 
 SIZES = ((320, 180), (640, 360), (1920, 1080))
 RATES = (2.0, 10.0, 30.0)
