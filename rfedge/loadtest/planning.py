@@ -1,19 +1,53 @@
-"""How many vehicles one uplink carries, computed on a virtual clock; and the search for a limit.
+"""What loads are told to take before they are run, and how right that was.
 
-Vehicles of a cell share its throughput. Each sends the drive's packets at its rate, at moments
-spread over a period; a packet that is transmitted later than the budget is late. The caller takes
-the rest of the deadline (server, way back, encoding) off the budget.
+``vehicles_carried``: vehicles of a cell share its throughput. Each sends the drive's packets at its
+rate, at moments spread over a period; a packet that is transmitted later than the budget is late.
+The caller takes the rest of the deadline (server, way back, encoding) off the budget.
+
+``compare_with_plan``: prerecorded vehicles, each on its own link, to a server that decodes against
+kept renders, beside the flow model of a city of as many cells. The model's costs of a frame are
+measured with fewer vehicles: cores as a straight line through two loads, and what of the ages at
+the smaller load the model does not explain (the way back among it, and the machine).
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+import numpy as np
+
+from mec_server.config import AdmissionLimits
+from rfcore.errors import InvalidInput
 from rfcore.link import LinkProfile
 from rfcore.link.plan import Arrival, delivery_times
+from rfcore.link.profile_file import read_link
+from rfcore.wire.convert import client_message_to_bytes
+from rfedge.loadtest.plan import Load, Mode
+from rfedge.loadtest.prerecorded import PrerecordedDrive
+from rfedge.loadtest.run import Run, TestBed, recorded, run_load
+from rfedge.sizing.city import Admission, Cells, City, Servers, VehicleKind
+from rfedge.sizing.city_plan import CityPlan, plan_city
+from rfedge.sizing.estimate import Assumptions, Demand
+from rfedge.sizing.flow import AGE_SAMPLES, Costs, Shared, age_samples_s, answer_bytes
+from rfedge.sizing.traffic import TrafficBlock
 
-__all__ = ["CLOSE", "RATES_MBPS", "Traffic", "largest_held", "on_time_share", "vehicles_carried"]
+__all__ = [
+    "CLOSE",
+    "RATES_MBPS",
+    "LoadFigures",
+    "PlannedLoad",
+    "PlannedRow",
+    "Traffic",
+    "compare_with_plan",
+    "fitted_costs",
+    "largest_held",
+    "on_time_share",
+    "planned_figures",
+    "vehicles_carried",
+]
 
 CLOSE = 1.1
 """Ratio of bounds at which the search stops: short runs on a noisy machine repeat no closer."""
@@ -72,3 +106,168 @@ def on_time_share(traffic: Traffic, rate_bps: float, vehicles: int) -> float:
         done_s - sent.at_s <= traffic.budget_s for sent, done_s in zip(schedule, due_s, strict=True)
     )
     return sum(in_time) / len(schedule)
+
+
+FIT_VEHICLES = (6, 18)
+"""Vehicles of the two loads that the costs are measured with."""
+
+
+@dataclass(frozen=True)
+class PlannedLoad:
+    """Loads to compare with their plan; ``link``: the profile of each vehicle's own link."""
+
+    vehicles: tuple[int, ...]
+    hz: float
+    seconds: float
+    link: Path
+    bed: TestBed
+
+    def __post_init__(self) -> None:
+        if not self.vehicles or any(not 1 <= count <= 1000 for count in self.vehicles):
+            raise InvalidInput("planned", f"{self.vehicles} are not one or more of 1..1000")
+        if set(self.vehicles) & set(FIT_VEHICLES):
+            raise InvalidInput(
+                "planned", f"with {FIT_VEHICLES} vehicles costs are measured; plan other numbers"
+            )
+
+    def load(self, vehicles: int) -> Load:
+        """Return the load of so many vehicles."""
+        return Load(Mode.RECEIVER, vehicles, self.hz, duration_s=self.seconds, link=self.link)
+
+
+@dataclass(frozen=True)
+class LoadFigures:
+    """What a load takes of the server, of all uplinks, and how old its pictures get."""
+
+    vehicles: int
+    cores: float
+    uplink_mbps: float
+    age_p99_ms: float
+
+
+@dataclass(frozen=True)
+class PlannedRow:
+    """A figure as planned and as measured, and the difference of the plan from it."""
+
+    vehicles: int
+    figure: str
+    planned: float
+    measured: float
+    difference_percent: float
+
+
+def compare_with_plan(job: PlannedLoad) -> list[PlannedRow]:
+    """Measure the costs, then each load; return three rows for each.
+
+    Raises ``RfedgeError`` naming the process that failed.
+    """
+    few, more = (run_load(job.load(count), job.bed) for count in FIT_VEHICLES)
+    costs, idle_cores = fitted_costs(job, few, more)
+    rows: list[PlannedRow] = []
+    for count in job.vehicles:
+        run = run_load(job.load(count), job.bed)
+        rows += _rows(planned_figures(job, costs, idle_cores, count), _measured(job, run))
+    return rows
+
+
+def _rows(planned: LoadFigures, measured: LoadFigures) -> list[PlannedRow]:
+    rows = []
+    for figure in ("cores", "uplink_mbps", "age_p99_ms"):
+        told, seen = getattr(planned, figure), getattr(measured, figure)
+        if not seen > 0:
+            raise InvalidInput("planning", f"{measured.vehicles} vehicles: {figure} is {seen:g}")
+        rows.append(PlannedRow(planned.vehicles, figure, told, seen, 100 * (told / seen - 1)))
+    return rows
+
+
+def _measured(job: PlannedLoad, run: Run) -> LoadFigures:
+    links = [json.loads(x) for x in (job.bed.work / "links.jsonl").read_text().splitlines()]
+    seconds = run.load.warm_up_s + run.load.duration_s
+    uplink_bytes = sum(link["uplink"]["bytes"] for link in links)
+    return LoadFigures(
+        vehicles=run.load.vehicles,
+        cores=run.row.server_cores,
+        uplink_mbps=8e-6 * uplink_bytes / seconds,
+        age_p99_ms=float(np.quantile(run.latency_ms, 0.99)) if run.latency_ms else 0.0,
+    )
+
+
+def fitted_costs(job: PlannedLoad, few: Run, more: Run) -> tuple[Costs, float]:
+    """Return what a frame costs, and the cores that the server takes without any."""
+    added = more.row.server_cores - few.row.server_cores
+    server_s = added / (more.load.vehicles - few.load.vehicles) / job.hz
+    if not server_s > 0:
+        raise InvalidInput(
+            "planning",
+            f"{more.load.vehicles} vehicles took {added:g} cores more than {few.load.vehicles}: "
+            "the machine was too busy, or the load too short; measure again",
+        )
+    costs = _unloaded_costs(job, server_s)
+    idle_cores = few.row.server_cores - few.load.vehicles * job.hz * server_s
+    ranks = (np.arange(AGE_SAMPLES) + 0.5) / AGE_SAMPLES
+    ages_s = np.quantile(few.latency_ms, ranks) / 1e3
+    told_s = np.sort(age_samples_s(costs, _shared(job, costs, few.load.vehicles), seed=1)[0])
+    return replace(costs, unexplained_s=tuple((ages_s - told_s).tolist())), idle_cores
+
+
+def _shared(job: PlannedLoad, costs: Costs, vehicles: int) -> Shared:
+    """Return what the frames of any of the vehicles meet: their own link, and all at the server."""
+    values = {
+        "vehicles": 1.0,
+        "rate_hz": costs.hz,
+        "uplink_bps": read_link(job.link).uplink.profile.rate_bps,
+        "link_limited": 0.0,
+        "held": 0.0,
+        "server_vehicles": float(vehicles),
+        "server_busy": vehicles * costs.hz * costs.server_s,
+        "server_cores": float(job.bed.workers),
+    }
+    return Shared(**{name: np.array([value]) for name, value in values.items()})
+
+
+def _unloaded_costs(job: PlannedLoad, server_s: float) -> Costs:
+    drive = PrerecordedDrive.read(recorded(job.load(1), job.bed))
+    sizes = np.array([len(client_message_to_bytes(frame)) for frame in drive.chain])
+    overhead = 1 + Assumptions().overhead_percent / 100
+    return Costs(
+        cameras=1,
+        hz=job.hz,
+        frame_bytes=overhead * float(sizes.mean()),
+        frame_ratios=tuple((sizes / sizes.mean()).tolist()),
+        sender_s=0.0,
+        server_s=server_s,
+        propagation_s=read_link(job.link).uplink.profile.delay_s,
+        answer_bytes=overhead * answer_bytes(),
+    )
+
+
+def planned_figures(
+    job: PlannedLoad, costs: Costs, idle_cores: float, vehicles: int
+) -> LoadFigures:
+    """Return what the flow model says of a load."""
+    row = _plan(job, costs, vehicles).rows[0]
+    return LoadFigures(vehicles, row.cores + idle_cores, row.uplink_mbps, row.age_p99_ms or 0.0)
+
+
+def _plan(job: PlannedLoad, costs: Costs, vehicles: int) -> CityPlan:
+    """Return the plan of a minute of a city of one vehicle a cell, all at one server that refuses
+    nobody."""
+    link = read_link(job.link)
+    cells = Cells(
+        names=tuple(f"link-{number}" for number in range(vehicles)),
+        centre_m=np.zeros((vehicles, 2)),
+        radius_m=np.ones(vehicles),
+        uplink_bps=np.full(vehicles, link.uplink.profile.rate_bps),
+        downlink_bps=np.full(vehicles, link.downlink.profile.rate_bps),
+        server=np.zeros(vehicles, dtype=np.int64),
+        weight=np.ones(vehicles),
+    )
+    limits = AdmissionLimits(load=1.0, lowest_hz=min(0.1, costs.hz))
+    city = City(
+        vehicle=VehicleKind(Demand(1, 1, 1, costs.hz, 34.0)),
+        cells=cells,
+        servers=Servers(("server",), np.array([float(job.bed.workers)])),
+        admission=Admission(limits, streams=100_000),
+    )
+    there, nobody = np.ones((1, vehicles)), np.zeros((1, vehicles))
+    return plan_city(city, costs, [TrafficBlock(0.0, 1.0, there, nobody, nobody, np.zeros(1))])

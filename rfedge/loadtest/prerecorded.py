@@ -6,10 +6,10 @@ was dropped. On disk they are two coded drives (``rfcore.wire.drive_file``), in 
 the digest of field, drive and settings.
 
 ``Replay`` is one camera of a vehicle that replays a drive: what is due when, what is sent, and how
-each picture ended. Sans-IO; times are seconds on one monotonic clock. Pictures are due at ``start_s + i / hz`` whatever
-became of those before. As in the agent, the newest waits for credit and replaces the one that
-waited. After a picture that was dropped or refused the next ones are sent alone, in a new epoch,
-until the drive begins again.
+each picture ended. Sans-IO; times are seconds on one monotonic clock. Pictures are due at
+``start_s + i / hz`` whatever became of those before. As in the agent, the newest waits for credit
+and replaces the one that waited. After a picture that was dropped or refused the next ones are sent
+alone, in a new epoch, until the drive begins again.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prereco
 from rfedge.loadtest.usage import Usage
 from rfedge.loadtest.verdict import Verdict, judge
 
-__all__ = ["LoadRow", "Run", "TestBed", "run_load"]
+__all__ = ["LoadRow", "Run", "TestBed", "recorded", "run_load"]
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class Run:
 
 def run_load(load: Load, bed: TestBed) -> Run:
     """Run one load to its end; raise ``RfedgeError`` naming the process that failed."""
-    folder = _recorded(load, bed)
+    folder = recorded(load, bed)
     drive = PrerecordedDrive.read(folder)
     bed.work.mkdir(parents=True, exist_ok=True)
     with ExitStack() as processes:
@@ -139,7 +139,8 @@ def run_load(load: Load, bed: TestBed) -> Run:
     return Run(load, verdict, row, latency_ms, payload_bytes, measurements.usage)
 
 
-def _recorded(load: Load, bed: TestBed) -> Path:
+def recorded(load: Load, bed: TestBed) -> Path:
+    """Return the folder of what the load's vehicles send, coded now if it is new."""
     field = load_field(bed.field)
     if load.mode is not Mode.TRANSPORT:
         return prerecorded_drive(bed.drive, field, bed.cache, bed.effort, bed.crf)

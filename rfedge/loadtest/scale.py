@@ -1,4 +1,4 @@
-"""The cases of several servers behind Envoy, and what it adds to the time of a frame.
+"""The cases of several servers behind Envoy, what it adds to the time of a frame, and a plan.
 
 All vehicles are ``cav-agent`` processes; what became of their pictures is read from their reports.
 Times are of one clock (Unix time): a picture's Ack is its capture plus its latency.
@@ -45,15 +45,28 @@ from rfedge.loadtest.envoy import (
     ServerGroup,
     envoy_binary,
 )
+from rfedge.loadtest.planning import PlannedLoad, PlannedRow, compare_with_plan
+from rfedge.loadtest.run import TestBed
 from rfedge.report.tables import cell, print_table
 from rfedge.results import make_result, provenance, write_result
+from rfedge.samples import sample_path
 
-__all__ = ["ScaleJob", "ScaleRow", "failures", "keyframes", "p99", "resumed_s", "run_scale"]
+__all__ = [
+    "ScaleJob",
+    "ScaleRow",
+    "failures",
+    "keyframes",
+    "p99",
+    "planned_load",
+    "resumed_s",
+    "run_scale",
+]
 
 MOST_OVER_MEAN = 1.5
 RESUME_S = 1.0
 RESTART_S = 3.0
 ADDED_MS = 3.0
+PLANNED_PERCENT, PLANNED_AGE_PERCENT = 15.0, 25.0
 PAIR_HZ = 10.0
 WATCH_S = 2.0
 WAIT_S = 120.0
@@ -95,8 +108,15 @@ class ScaleJob:
     config: Path
     work: Path
     out: Path
+    planned: tuple[int, ...] = ()
+    """Numbers of prerecorded vehicles whose load is compared with its plan."""
+    planned_hz: float = 3.0
+    envoy: bool = True
+    """Whether the cases behind Envoy are run."""
 
     def __post_init__(self) -> None:
+        if not (self.envoy or self.planned):
+            raise InvalidInput("envoy", "nothing is to be measured; give --planned numbers")
         for name, value, low, high in (
             ("vehicles", self.vehicles, 2, 200),
             ("servers", self.servers, 2, 20),
@@ -126,16 +146,38 @@ def run_scale(job: ScaleJob, console: Console) -> None:
     job.published.mkdir(parents=True)
     convert_dataset(job.drive, job.reduced, job.size_px)
     publish(job.published, "street", job.field, EVERYWHERE, datetime.now(UTC))
-    rows = moves(job)
-    if job.pairs:
+    rows = moves(job) if job.envoy else []
+    if job.envoy and job.pairs:
         rows.append(_added_by_envoy(job))
+    plans = compare_with_plan(planned_load(job)) if job.planned else []
+    rows += [_planned_row(plan) for plan in plans]
     job.out.parent.mkdir(parents=True, exist_ok=True)
-    write_result(str(job.out), make_result("scale", made, {"rows": rows}))
+    content = {"rows": rows, "planning": plans}
+    write_result(str(job.out), make_result("scale", made, content))
     columns = ("case", "at most", "measured", "held")
     print_table(console, "", columns, [_cells(row) for row in rows])
     broken = [row.case for row in rows if not row.held]
     if broken:
         raise RfedgeError("not held: " + "; ".join(broken))
+
+
+def planned_load(job: ScaleJob) -> PlannedLoad:
+    """Return the loads that are compared with their plan, on the drive in the size that is sent."""
+    bed = TestBed(
+        field=job.field,
+        drive=job.reduced,
+        workers=2,
+        cache=job.work / "coded",
+        work=job.work / "planned",
+    )
+    link = sample_path("links/steady.toml")
+    return PlannedLoad(job.planned, job.planned_hz, job.seconds, link, bed)
+
+
+def _planned_row(plan: PlannedRow) -> ScaleRow:
+    bound = PLANNED_AGE_PERCENT if plan.figure.startswith("age") else PLANNED_PERCENT
+    case = f"planned {plan.vehicles} vehicles: {plan.figure}, % off"
+    return ScaleRow.at_most(case, bound, abs(plan.difference_percent))
 
 
 def _cells(row: ScaleRow) -> list[str]:

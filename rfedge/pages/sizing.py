@@ -1,6 +1,7 @@
-"""``docs/sizing.md`` from the tables that ship with ``rfedge size``.
+"""``docs/sizing.md`` from the tables that ship with ``rfedge size``, and the cities of scale.md.
 
 python -m rfedge.pages.sizing > docs/sizing.md
+python -m rfedge.pages.sizing city    # the table that stands in docs/scale.md behind ``CITY_MARK``
 """
 
 from __future__ import annotations
@@ -10,12 +11,17 @@ from io import StringIO
 
 from rich.console import Console
 
+from rfedge.report.tables import table
 from rfedge.results import Result, read_result
+from rfedge.sizing.city import Density, VehicleKind, grid_city
+from rfedge.sizing.city_plan import plan_city
 from rfedge.sizing.estimate import Demand, estimate
+from rfedge.sizing.flow import costs_of
 from rfedge.sizing.report import print_sizing, tables_page
 from rfedge.sizing.tables import MAX_BEYOND_DB, MAX_BEYOND_FACTOR, SHIPPED, read_tables
+from rfedge.sizing.traffic import stated_traffic
 
-__all__ = ["sizing_page"]
+__all__ = ["CITY_MARK", "city_table", "sizing_page"]
 
 EXAMPLE = Demand(4, 640, 360, 10.0, 34.0, delay_ms=150.0)
 COMMAND = "rfedge size --cameras 4 --size 640x360 --hz 10 --db 34 --delay-ms 150"
@@ -106,6 +112,49 @@ def sizing_page(result: Result) -> str:
     )
 
 
+CITY_MARK = "<!-- made by: python -m rfedge.pages.sizing city -->"
+CITY_SERVERS = (10, 100, 1000)
+CITY_CORES = (4, 8)
+CITY_KIND = VehicleKind(Demand(1, 640, 360, 10.0, 34.0))
+CITY_COLUMNS = (
+    "servers",
+    "cores each",
+    "vehicles",
+    "served",
+    "refused",
+    "cores in use",
+    "Mbit/s up",
+    "Mbit/s down",
+    "handovers/s",
+    "age p50 / p99, ms",
+)
+
+
+def city_table() -> str:
+    """Return what the flow model says of cities of 10 vehicles a server, as Markdown."""
+    rows = [_city_row(servers, cores) for servers in CITY_SERVERS for cores in CITY_CORES]
+    return table(CITY_COLUMNS, rows)
+
+
+def _city_row(servers: int, cores: int) -> list[str]:
+    density = Density((8.0, 8.0 + 1 / 3600), (10.0, 10.0))
+    city = grid_city(CITY_KIND, density, servers, cores, busy_weight=2.0)
+    costs = costs_of(city, read_tables(SHIPPED))
+    (row,) = plan_city(city, costs, stated_traffic(city)).rows
+    return [
+        str(servers),
+        str(cores),
+        f"{row.vehicles:.0f}",
+        f"{row.served:.0f}",
+        f"{row.refused:.0f}",
+        f"{row.cores:.0f}",
+        f"{row.uplink_mbps:.0f}",
+        f"{row.downlink_mbps:.0f}",
+        f"{row.handovers_per_s:.1f}",
+        f"{row.age_p50_ms or 0.0:.0f} / {row.age_p99_ms or 0.0:.0f}",
+    ]
+
+
 def _example() -> str:
     text = StringIO()
     print_sizing(Console(file=text, width=100), estimate(EXAMPLE, read_tables(SHIPPED)))
@@ -113,4 +162,6 @@ def _example() -> str:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(sizing_page(read_result(SHIPPED)))
+    sys.stdout.write(
+        city_table() + "\n" if sys.argv[1:] == ["city"] else sizing_page(read_result(SHIPPED))
+    )

@@ -27,6 +27,7 @@ __all__ = [
     "Estimate",
     "Sizing",
     "estimate",
+    "nearest_cell",
     "needed_bps",
     "share_in_time",
 ]
@@ -221,7 +222,7 @@ def _estimate(
 ) -> Estimate:
     wanted = demand.wanted
     frame_bytes = math.exp(log_at(cells, wanted, lambda cell: cell.log_bytes(wanted.psnr_db)))
-    nearest = _nearest(cells, wanted)
+    nearest = nearest_cell(cells, wanted)
     low, high = (
         math.exp(nearest.log_bytes(wanted.psnr_db, column) - nearest.log_bytes(wanted.psnr_db))
         for column in ("low_bytes", "high_bytes")
@@ -249,7 +250,9 @@ def _estimate(
     )
 
 
-def _nearest(cells: Sequence[SizingCell], wanted: Wanted) -> SizingCell:
+def nearest_cell(cells: Sequence[SizingCell], wanted: Wanted) -> SizingCell:
+    """Return the measured cell whose rate and size differ least from ``wanted``, as ratios."""
+
     def distance(cell: SizingCell) -> float:
         return abs(math.log(cell.hz / wanted.hz)) + abs(math.log(cell.pixels / wanted.pixels))
 

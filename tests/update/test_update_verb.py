@@ -13,7 +13,7 @@ from rfcore.field import SplatField, load_field, save_field
 from rfcore.image import read_rgb, write_png
 from rfcore.update.passes import Pass
 from rfedge.cli.field_update import FieldDisagree, FieldUpdate
-from rfedge.fields.disagree import disagreement_picture
+from rfedge.fields.describe import disagreement_picture
 
 MakePass = Callable[..., Pass]
 
