@@ -159,6 +159,7 @@ class Stream:
         self._decoders.close()
         self._server.twin.leave(self._session.session_id)
         self._metrics.forget()
+        self._account.ended(time.monotonic())
         self._account.leave()
 
     async def run(self, requests: AsyncIterator[bytes]) -> StreamEnd:

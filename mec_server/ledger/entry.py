@@ -181,6 +181,7 @@ class StreamAccount:
         self._cameras: dict[str, CameraMeter] = {}
         self._granted: list[Callable[[], None]] = []
         self._decoders: Hold | None = None
+        self._is_unpaid = False
         self._stream = entry.ledger.hold(identity, Resource.STREAMS, now)
 
     def enter(self, hello: Hello, sender: CameraSender, now: float) -> float:
@@ -247,6 +248,7 @@ class StreamAccount:
         self._entry.promises.worked(self._session_id, field_id, worker_s, complete=complete)
         self._entry.ledger.charge(self.identity, Resource.WORKER_SECONDS, worker_s, now)
         if complete:
+            self._is_unpaid = False
             self._entry.ledger.opening_paid(self.identity, now)
 
     def rejected(self, worker_s: float, now: float) -> None:
@@ -257,12 +259,19 @@ class StreamAccount:
     def opening_failed(self, now: float) -> None:
         """Count an opening that came to nothing: decoders that could not be opened, or a stream
         that ended because its frames could not be used."""
+        self._is_unpaid = False
         self._entry.ledger.opening_failed(self.identity, now)
+
+    def ended(self, now: float) -> None:
+        """Note that the stream is over; decoders that never gave a picture were for nothing."""
+        if self._is_unpaid:
+            self.opening_failed(now)
 
     def take_decoders(self) -> Hold:
         """Hand over what was granted for decoders to who opens them, and releases it once they
         are closed: later than the stream, if a decoder hangs."""
         decoders, self._decoders = self._decoders, None
+        self._is_unpaid = True
         if decoders is None:
             raise AssertionError("no Hello was let in")
         return decoders

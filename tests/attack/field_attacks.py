@@ -27,7 +27,8 @@ async def strange_entries(target: Target) -> None:
     """A pipe, a link to nowhere, a folder and a sparse file of 3 GiB among the fields."""
     folder = Path(target.fields)
     for number in itertools.count():
-        paths = [folder / f"{kind}-{number}.rff" for kind in ("pipe", "link", "folder", "large")]
+        names = (f"{kind}-{os.getpid()}-{number}" for kind in ("pipe", "link", "folder", "large"))
+        paths = [folder / f"{name}.rff" for name in names]
         pipe, link, inner, large = paths
         os.mkfifo(pipe)
         link.symlink_to("/nowhere")

@@ -136,6 +136,29 @@ def test_frames_that_are_rejected_take_little_of_the_workers_while_others_stream
     account.spend_frame(frame, 10, 0.5 / budget + 0.01)
 
 
+def test_streams_that_open_decoders_and_give_no_picture_make_their_identity_wait(
+    hello: Hello,
+) -> None:
+    entry = entry_control()
+
+    def stream(number: int, *, gives_a_picture: bool) -> None:
+        account = entry.open(f"s-{number}", "cav-1", named=True, now=0.0)
+        account.enter(hello, Sender(), 0.0)
+        account.take_decoders().release()
+        if gives_a_picture:
+            account.worked(hello.field_ids[0], 0.01, 0.0)
+        account.ended(0.0)
+        account.close()
+
+    stream(0, gives_a_picture=False)
+    stream(1, gives_a_picture=False)
+    stream(2, gives_a_picture=True)
+    for number in (3, 4, 5):
+        stream(number, gives_a_picture=False)
+    with pytest.raises(LimitExceeded, match="failed_openings: 3 openings"):
+        stream(6, gives_a_picture=True)
+
+
 def test_lines_beyond_the_burst_are_suppressed_counted_and_told_once() -> None:
     limiter = LogLimiter()
     answers = [limiter.admit("mallory", 0.0) for _ in range(150)]
