@@ -22,6 +22,7 @@ import pytest
 
 from attack.conftest import ENVIRONMENT, ROOT
 from rfcore.dataset import read_dataset
+from rfcore.dataset.recorded_session import read_recorded_part, recordings_under
 from rfcore.field import FieldStore
 from rfcore.image import read_rgb
 from rfcore.metrics import psnr
@@ -95,12 +96,14 @@ class Cell:
 def qualities_db(folder: Path, report: Sequence[dict[str, Any]]) -> list[float]:
     """Return the PSNR of some pictures at the server against the camera's."""
     truth = {picture.name: picture for picture in read_dataset(DRIVE).pictures}
-    saved = [(folder / f"{x['sequence']:06}.png", x["name"]) for x in report if x["epoch"] == 0] + [
-        (folder / f"e{x['epoch']:04}-{x['sequence']:06}.png", x["name"])
-        for x in report
-        if x["epoch"]
+    shown = {x["capture_time_ns"]: x["name"] for x in report}
+    parts = [read_recorded_part(file) for file in recordings_under(folder)]
+    there = [
+        (part.path(picture), shown[picture.capture_time_ns])
+        for part in parts
+        for picture in part.pictures
+        if picture.capture_time_ns in shown
     ]
-    there = [(path, name) for path, name in saved if path.exists()]
     some = there[:: max(1, len(there) // PICTURES)]
     return [psnr(read_rgb(path), truth[name].read()) for path, name in some]
 
@@ -119,7 +122,7 @@ async def test_a_lossy_link(
         "F6",
     )
     number = os.getpid()
-    options = ("--allow-insecure", "--decoder", "in-process", "--save", str(tmp_path / "saved"))
+    options = ("--allow-insecure", "--decoder", "in-process", "--record", str(tmp_path / "kept"))
     field_id = FieldStore(tmp_path / "fields").add(ROOT / "samples/fields/street.rff")
     fields = ("--fields", str(tmp_path / "fields"))
     with ExitStack() as stack:
@@ -141,6 +144,7 @@ async def test_a_lossy_link(
                     f"cav-{i}",
                     *("--drive", str(DRIVE), *fields, "--field", field_id),
                     *("--rate", str(HZ), "--max-delay-ms", "1000", "--allow-insecure"),
+                    "--allow-recording",
                     within=("ip", "netns", "exec", near[rate]),
                 )
                 for i, rate in enumerate(RATES_MBPS)
@@ -153,7 +157,7 @@ async def test_a_lossy_link(
         await asyncio.sleep(2 * rtt_ms / 1e3 + 1.0)
     for i, (rate, agent) in enumerate(zip(RATES_MBPS, agents, strict=True)):
         lines = [x for x in agent.lines() if began_s <= x["capture_time_ns"] / 1e9 <= ended_s]
-        folder = tmp_path / "saved" / f"cav-{i}" / "front"
+        folder = tmp_path / "kept" / f"cav-{i}" / "front"
         acked = [x for x in lines if x["result"] == "acked"]
         cell = Cell(lines, ended_s - began_s, qualities_db(folder, acked))
         case.tells(f"{rate:g} Mbit/s: pictures, bits, freezes, ages, quality", cell.told())
