@@ -37,7 +37,7 @@ def run_case(
 
 def _rows_of(case: str, rows: Rows, field: Path | None, isa: str | None) -> Sequence[object]:
     if case == "raster" and isa is not None:
-        from rfedge.bench.opencl import opencl_rows
+        from rfedge.bench.raster import opencl_rows
 
         return opencl_rows(isa)
     if case == "raster":
@@ -57,7 +57,7 @@ def _rows_of(case: str, rows: Rows, field: Path | None, isa: str | None) -> Sequ
 
         return ngp_rows(field)
     if case == "decoders":
-        from rfedge.bench.decoders import decoder_rows
+        from rfedge.bench.codec import decoder_rows
 
         return decoder_rows()
     raise InvalidInput("case", f"{case!r} is not one of {', '.join(CASES)}")

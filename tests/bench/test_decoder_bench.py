@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from mec_server.config import DecoderKind
-from rfedge.bench import decoders, run_case
+from rfedge.bench import codec, run_case
 from rfedge.loadtest.prerecorded import PrerecordedDrive, prerecorded_drive
 
 KINDS = (DecoderKind.IN_PROCESS, DecoderKind.CHILD)
@@ -21,9 +21,9 @@ def short(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         PrerecordedDrive(whole.hello, whole.chain[:5], whole.alone[:5]).write(tmp_path)
         return tmp_path
 
-    monkeypatch.setattr(decoders, "prerecorded_drive", coded)
-    monkeypatch.setattr(decoders, "LAPS", 1)
-    monkeypatch.setattr(decoders, "KINDS", KINDS)
+    monkeypatch.setattr(codec, "prerecorded_drive", coded)
+    monkeypatch.setattr(codec, "LAPS", 1)
+    monkeypatch.setattr(codec, "KINDS", KINDS)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.views import View
 from rfedge import timing
-from rfedge.bench import opencl, print_rows, raster, run_case, train
+from rfedge.bench import print_rows, raster, run_case, train
 from rfedge.bench.street import street_camera, street_gaussians
 from rfedge.results import write_result
 
@@ -44,8 +44,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_a_device_is_named_with_its_driver_beside_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(opencl, "street_gaussians", lambda: street_gaussians(1000))
-    monkeypatch.setattr(opencl, "SIZES_PX", ((30, 20), (48, 32)))
+    monkeypatch.setattr(raster, "street_gaussians", lambda: street_gaussians(1000))
+    monkeypatch.setattr(raster, "OPENCL_SIZES_PX", ((30, 20), (48, 32)))
     rows = run_case("raster", isa=POCL)["rows"]
     assert [list(row) for row in rows] == [OPENCL_KEYS] * 2
     assert all("PoCL" in row["device"] and row["device_ms"] > 0 for row in rows)
@@ -53,7 +53,7 @@ def test_a_device_is_named_with_its_driver_beside_the_cpu(monkeypatch: pytest.Mo
 
 @pytest.mark.slow
 def test_a_device_that_draws_other_bytes_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(opencl, "street_gaussians", lambda: street_gaussians(1000))
+    monkeypatch.setattr(raster, "street_gaussians", lambda: street_gaussians(1000))
     render = Rasterizer.render
 
     def brighter(self: Rasterizer, camera: Camera) -> View:

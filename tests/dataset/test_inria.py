@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rfcore.dataset import read_dataset
-from rfcore.dataset.inria import trained_ply
+from rfcore.dataset.read import trained_ply
 from rfcore.dataset.source import SourcePoints
 from rfcore.dataset.write import write_points
 from rfcore.errors import DatasetError

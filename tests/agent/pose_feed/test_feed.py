@@ -11,11 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cav_agent.pose_feed.checks import NS, QUIET_S
-from cav_agent.pose_feed.feed import FieldFeed, PoseFeed
+from cav_agent.pose_feed.feed import FieldFeed, PoseFeed, TimeOffsetEstimator
 from cav_agent.pose_feed.fix import FeedProblem, Fix
 from cav_agent.pose_feed.placing import CameraMount, Place
 from cav_agent.pose_feed.settings import FeedSource, PoseFeedSettings, SourceKind, parse_source
-from cav_agent.pose_feed.time_offset import TimeOffsetEstimator
 from rfcore.camera import Pose, TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.field import Bounds
