@@ -36,21 +36,22 @@ test-slow: build-full test-system-packages  ## run the tests that take more than
 test-slices: build-full  ## compare a million macroblocks of the slice coder with FFmpeg; fuzz it
 	$(BIN)/python -m pytest tests/codec/test_slice_conformance.py -m nightly
 
-test-scale: build-full  ## run each case of `rfedge eval scale` once, small: Envoy, its servers, their vehicles
-	$(BIN)/python -m pytest tests/integration/test_envoy.py -m nightly --timeout 600
+test-scale: build-full  ## run each case of `rfedge eval scale` once, small: Envoy, NATS, servers, their vehicles
+	$(BIN)/python -m pytest tests/integration/test_envoy.py tests/integration/test_nats.py -m nightly --timeout 600
 
 # Debian packages that slow tests use beside Python: cross compiler and emulator for
 # tests/native/test_aarch64.py, promtool and prometheus for tests/deploy, ip and tc for tests/link,
 # OpenH264 for tests/codec/test_second_decoder.py, GStreamer's RTSP server for tests/agent/live,
 # Chromium for tests/twin, bwrap for tests/server and tests/confinement, libseccomp for
-# tests/confinement, nft for tests/fault, PoCL (OpenCL on the CPU) for tests/raster.
+# tests/confinement, nft for tests/fault, PoCL (OpenCL on the CPU) for tests/raster, NATS for
+# tests/integration/test_nats.py.
 # A test fails without its program, and says so.
 SYSTEM_PACKAGES := g++-aarch64-linux-gnu qemu-user prometheus iproute2 \
 	gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good gstreamer1.0-plugins-bad \
 	gstreamer1.0-plugins-ugly gir1.2-gst-rtsp-server-1.0 python3-gi bubblewrap libseccomp2 nftables \
-	chromium chromium-driver pocl-opencl-icd
+	chromium chromium-driver pocl-opencl-icd nats-server
 SYSTEM_PROGRAMS := aarch64-linux-gnu-g++ qemu-aarch64 promtool prometheus ip tc gst-inspect-1.0 \
-	bwrap nft chromium chromedriver
+	bwrap nft chromium chromedriver nats-server
 test-system-packages:  ## install the programs that test-slow uses (root, Debian)
 	@if (for name in $(SYSTEM_PROGRAMS); do command -v $$name >/dev/null || exit 1; done) && \
 		[ -e /etc/OpenCL/vendors/pocl.icd ]; then :; \

@@ -19,8 +19,8 @@ __all__ = ["ONLY_FULL", "SETS", "requirements"]
 ONLY_FULL = frozenset({"matplotlib", "jinja2"})
 """Base dependencies that only reports need: the services and `rfedge link` start without them."""
 SETS = {
-    "runtime": (("ops", "twin"), ()),
-    "full": (("ops", "eval", "twin"), ()),
+    "runtime": (("ops", "twin", "nats"), ()),
+    "full": (("ops", "eval", "twin", "nats"), ()),
     "demo": (("twin",), ("build",)),
     "test": (None, ("build", "test", "check")),
 }

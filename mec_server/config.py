@@ -12,6 +12,7 @@ from tyro.conf import Suppress, arg
 from rfcore.errors import InvalidInput
 from rfcore.update.run import LearnAs
 from rfcore.wire.checks import MAX_RATE_HZ, check_name
+from rfcore.wire.nats import NatsServers
 from rfcore.wire.settings import LogForm, MetricsSettings, RenderSettings, TransportSettings
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "DecoderKind",
     "IdentityBudget",
     "LearnSettings",
+    "NatsSettings",
     "RecordSettings",
     "ServerBudget",
     "ServerConfig",
@@ -214,6 +216,45 @@ class LearnSettings:
                 raise InvalidInput(f"learn-{name}", f"{value:g} is outside {low:g}..{high:g}")
 
 
+@dataclass(frozen=True)
+class NatsSettings:
+    """Where the pictures of several servers come together (docs/scale.md); nowhere without it."""
+
+    urls: Annotated[str | None, arg(name="nats", metavar="URL[,URL]")] = None
+    """Servers of NATS, nats://HOST:PORT or tls://HOST:PORT: publish pictures of vehicles and where
+    they are, and exchange fields with the other servers there."""
+    name: Annotated[str, arg(name="nats-name", metavar="NAME")] = ""
+    """What this server is called there; default: its host's name and its port."""
+    login: Annotated[Path | None, arg(name="nats-login", metavar="FILE")] = None
+    """File of one line, USER:PASSWORD or a token."""
+    authority: Annotated[Path | None, arg(name="nats-ca", metavar="FILE.pem")] = None
+    """Certificate of the authority that vouches for NATS."""
+    certificate: Annotated[Path | None, arg(name="nats-cert", metavar="FILE.pem")] = None
+    """Certificate by which NATS knows this server, as a client."""
+    key: Annotated[Path | None, arg(name="nats-key", metavar="FILE.pem")] = None
+    """Its private key."""
+
+    def __post_init__(self) -> None:
+        if self.name:
+            check_name("nats-name", self.name)
+        files = (self.name, self.login, self.authority, self.certificate, self.key)
+        if self.urls is None and any(files):
+            raise InvalidInput("nats", "the other --nats options are for nothing without it")
+
+    def servers(self, allow_insecure: bool) -> NatsServers | None:
+        """Return how NATS is reached, None without it; raise ``InvalidInput``."""
+        if self.urls is None:
+            return None
+        return NatsServers(
+            NatsServers.parse_urls(self.urls),
+            self.login,
+            self.authority,
+            self.certificate,
+            self.key,
+            allow_insecure,
+        )
+
+
 MAX_DRAIN_HOLD_S = 600.0
 
 
@@ -227,6 +268,7 @@ class ServerConfig:
     """HOST:PORT to accept vehicles on; port 0 takes a free one."""
     record: RecordSettings = RecordSettings()
     learn: LearnSettings = LearnSettings()
+    nats: NatsSettings = NatsSettings()
     workers: int = 2
     """Frames reconstructed at once."""
     decoder: DecoderKind = DecoderKind.AUTO
@@ -287,6 +329,7 @@ class ServerConfig:
             raise InvalidInput(
                 "proxy-identity", "without certificates no proxy is known; give --tls-cert, too"
             )
+        self.nats.servers(self.transport.allow_insecure)
         if not self.fields.is_dir():
             raise InvalidInput("fields", f"{self.fields} is not a directory")
         if not 0 <= self.drain_hold_s <= MAX_DRAIN_HOLD_S:

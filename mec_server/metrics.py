@@ -63,6 +63,10 @@ class BackgroundTask(StrEnum):
     """Looks at pictures for vehicles that take notices; goes on with the next picture."""
     RECORDING = "recording"
     """Writes pictures to disk; recording ends for good, streaming goes on."""
+    NATS_TWIN = "nats_twin"
+    """Publishes pictures over NATS; begins anew, with a connection of its own."""
+    NATS_FIELDS = "nats_fields"
+    """Exchanges fields with other servers over NATS; begins anew."""
     LEARNING = "learning"
     """Keeps the learning process running and reads what it learnt; goes on with its next look."""
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import re
+import socket
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import grpc
 import structlog
@@ -49,6 +51,10 @@ from rfcore.wire.checks import MAX_FIELDS
 from rfcore.wire.conventions import SERVER_OPTIONS
 from rfcore.wire.instruments import MetricsEndpoint
 
+if TYPE_CHECKING:
+    from mec_server.nats import FieldExchange
+    from mec_server.twin.nats import TwinPublisher
+
 __all__ = ["EdgeServer"]
 
 log = structlog.get_logger()
@@ -74,6 +80,14 @@ NOTICES_EVERY_S = 0.25
 
 CONNECTIONS_EVERY_S = 0.25
 """How often connections are counted by address."""
+
+NATS_AGAIN_S = 0.1
+"""How soon publishing begins, and begins anew after an unexpected exception."""
+
+NATS_FIELDS_S = 20.0
+"""How long a server waits at its start for fields that it lacks and NATS may have."""
+
+NATS_END_S = 2.0
 
 MAX_VIEWED_FIELDS = 2
 """Fields kept open for views of the twin, beside those that frames are decoded against."""
@@ -128,12 +142,12 @@ class EdgeServer:
             self._metrics.refused_certificates.inc,
             Proxies(config.proxy_identity),
         )
-        twin = Twin()
+        twin = self._twin = Twin()
         self._edge = EdgeService(self._context(twin, open_decoders))
         consumer_failed = self._failed(BackgroundTask.CONSUMER)
         ledger, limited = self._entry.ledger, self._metrics.count_limited
         self._views = self._twin_views(twin)
-        twin_metrics = self._twin_metrics(twin)
+        twin_metrics = self._nats_metrics = self._twin_metrics(twin)
         self._notices = StreetNotices(
             twin,
             self._views,
@@ -150,6 +164,9 @@ class EdgeServer:
             self._sight,
             self._views,
         )
+        self._on_nats: list[asyncio.Task[None]] = []
+        self._publisher: TwinPublisher | None = None
+        self._exchange: FieldExchange | None = None
         self._server = grpc.aio.server(
             interceptors=(self._guard, ChargeRpcs(ledger, limited)),
             options=_options(config),
@@ -231,6 +248,7 @@ class EdgeServer:
     async def _start(self) -> Address:
         self._serve_metrics()
         await asyncio.to_thread(self._index.start)
+        await self._open_exchange()
         await asyncio.to_thread(self._published.start)
         self._metrics.show_tiles(self._published.tiles)
         opened = await asyncio.to_thread(self._shelf.warm_up)
@@ -247,6 +265,7 @@ class EdgeServer:
         if self._config.notices:
             self._follow(self._notices.follow, NOTICES_EVERY_S, BackgroundTask.NOTICES)
         self._cap_connections()
+        self._publish_over_nats()
         await self._set_health(health_pb2.HealthCheckResponse.SERVING)
         if self._config.ready_file is not None:
             write_whole(self._config.ready_file, f"{self.address}\n")
@@ -289,6 +308,7 @@ class EdgeServer:
         self._edge.drain()
         self._twin_service.drain()
         await self._server.stop(drain_s)
+        await self._leave_nats()
         await asyncio.to_thread(self._opener.close)
         await asyncio.to_thread(self._workers.close)
         await asyncio.to_thread(self._decoders.close)
@@ -300,6 +320,60 @@ class EdgeServer:
             await asyncio.to_thread(self._recorder.close)
         if self._metrics_endpoint is not None:
             await asyncio.to_thread(self._metrics_endpoint.close)
+
+    async def _open_exchange(self) -> None:
+        """Fetch the fields that the folder's manifest names and lacks, where other servers put
+        theirs."""
+        servers = self._config.nats.servers(self._config.transport.allow_insecure)
+        if servers is None:
+            return
+        from mec_server.nats import FieldExchange, NatsLink
+
+        self._exchange = FieldExchange(
+            NatsLink(servers, "mec-server fields"),
+            self._config.fields,
+            self._index,
+            lambda: self._published.tiles,
+            self._published.look_again,
+        )
+        await self._exchange.bring_missing(NATS_FIELDS_S)
+
+    def _publish_over_nats(self) -> None:
+        servers = self._config.nats.servers(self._config.transport.allow_insecure)
+        if servers is None or self._exchange is None:
+            return
+        from mec_server.nats import NatsLink
+        from mec_server.twin.nats import TwinPublisher
+
+        metrics, name = self._nats_metrics, self._config.nats.name or _name_of(self.address)
+        link = NatsLink(
+            servers,
+            f"mec-server {name}",
+            lambda connected, _: metrics.nats_connected.set(connected),
+        )
+        self._publisher = TwinPublisher(
+            link,
+            name,
+            self._twin,
+            self._twin_service.pictures,
+            lambda: self._published.tiles,
+            metrics,
+        )
+        for work, task in (
+            (self._publisher.run, BackgroundTask.NATS_TWIN),
+            (self._exchange.run, BackgroundTask.NATS_FIELDS),
+        ):
+            repeated = repeat_forever(work, NATS_AGAIN_S, self._failed(task))
+            self._on_nats.append(asyncio.create_task(repeated))
+
+    async def _leave_nats(self) -> None:
+        """Publish the departures of the streams that have just ended, and disconnect."""
+        if self._publisher is None:
+            return
+        await self._publisher.say_farewell()
+        for task in self._on_nats:
+            task.cancel()
+        await asyncio.wait(self._on_nats, timeout=NATS_END_S)
 
     async def take_up_fields(self) -> None:
         """Serve what is published now, and tell the vehicles if it is something else."""
@@ -413,6 +487,12 @@ class EdgeServer:
     async def _set_health(self, status: health_pb2.HealthCheckResponse.ServingStatus) -> None:
         for service in SERVICES:
             await self._health.set(service, status)
+
+
+def _name_of(address: Address) -> str:
+    """Return what a server is called that was given no name: its host's name and its port."""
+    host = re.sub(r"[^A-Za-z0-9.-]", "-", socket.gethostname()).strip(".-")[:50]
+    return f"{host or 'server'}-{address.port}"
 
 
 def _options(config: ServerConfig) -> tuple[tuple[str, int], ...]:

@@ -72,6 +72,7 @@ class Stream:
         self._opening: asyncio.Task[None] | None = None
         self._identity = peer_identity(context.auth_context())
         self._account = account
+        self._opened_time_ns = 0
         self._over_budget = False
         self.is_stalled = False
         self._writing_since_s: float | None = None
@@ -276,6 +277,7 @@ class Stream:
         return None
 
     def _receive_hello(self, hello: Hello, now: float) -> None:
+        self._opened_time_ns = time.time_ns()
         session = self._session
         session.receive(hello, now)
         if session.state is not SessionState.OPENING:
@@ -399,6 +401,7 @@ class Stream:
                 digest=reconstruction.outcome.reconstruction_digest,
                 reconstructed_s=now,
                 latency_s=latency_s,
+                opened_time_ns=self._opened_time_ns,
             )
         )
 

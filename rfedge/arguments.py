@@ -27,6 +27,7 @@ from rfedge.samples import sample_path
 
 if TYPE_CHECKING:
     from rfcore.field import RadianceField, SplatField
+    from rfcore.wire.nats import NatsServers
 
 __all__ = [
     "ADDRESS",
@@ -46,6 +47,7 @@ __all__ = [
     "field_path",
     "is_field_file",
     "max_field_bytes",
+    "nats_servers",
     "open_field",
     "open_splats",
     "parse_size",
@@ -169,3 +171,19 @@ def time_text(seconds: float) -> str:
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def nats_servers(
+    urls: str,
+    login: Path | None,
+    authority: Path | None,
+    certificate: Path | None,
+    key: Path | None,
+    *,
+    allow_insecure: bool,
+) -> NatsServers:
+    """Return how NATS is reached, of the options of a consumer; raise ``InvalidInput``."""
+    from rfcore.wire.nats import NatsServers
+
+    parsed = NatsServers.parse_urls(urls)
+    return NatsServers(parsed, login, authority, certificate, key, allow_insecure)

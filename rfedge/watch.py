@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
+from typing import Protocol
 
 import av
 import grpc
@@ -46,6 +47,7 @@ from rfcore.wire.v1 import twin_pb2_grpc
 
 __all__ = [
     "PictureFolder",
+    "PictureSource",
     "PictureVideo",
     "TwinWatcher",
     "WatchSettings",
@@ -171,11 +173,24 @@ FINISH_S = 5.0
 UNFINISHED = "rfedge watch: ended before its files were complete\n"
 
 
+class PictureSource(Protocol):
+    """Where pictures come from, if not from one server."""
+
+    def messages(self, subscription: Subscription) -> Iterator[TwinPicture | Departure]:
+        """Yield what arrives until ``stop``; raise ``RfedgeError`` if the source is not there."""
+
+    def stop(self) -> None:
+        """End ``messages``, from any thread."""
+
+
 @dataclass(frozen=True)
 class WatchSettings:
-    """What to watch and what to keep; see ``rfedge watch --help``."""
+    """What to watch and what to keep; see ``rfedge watch --help``.
 
-    address: str
+    ``address`` None: a ``PictureSource`` is watched.
+    """
+
+    address: str | None
     vehicle_ids: frozenset[str] = frozenset()
     folder: Path | None = None
     video: Path | None = None
@@ -185,9 +200,10 @@ class WatchSettings:
     allow_insecure: bool = False
 
     def __post_init__(self) -> None:
-        address = Address.parse("address", self.address)
-        if self.tls is None:
-            address.require_private("address", self.allow_insecure)
+        if self.address is not None:
+            address = Address.parse("address", self.address)
+            if self.tls is None:
+                address.require_private("address", self.allow_insecure)
         for name in self.vehicle_ids:
             check_name("vehicle", name)
         if self.pictures is not None and self.pictures < 1:
@@ -211,10 +227,12 @@ class WatchSettings:
 
 
 class TwinWatcher:
-    """Receives what ``settings`` ask for; ``run`` on one thread, ``stop`` from any other."""
+    """Receives what ``settings`` ask for from their server, or from ``source``; ``run`` on one
+    thread, ``stop`` from any other."""
 
-    def __init__(self, settings: WatchSettings) -> None:
+    def __init__(self, settings: WatchSettings, source: PictureSource | None = None) -> None:
         self._settings = settings
+        self._source = source
         self._lock = threading.Lock()
         self._stopped = False
         self._call: grpc.Call | None = None
@@ -229,8 +247,11 @@ class TwinWatcher:
         with ExitStack() as stack:
             folder = PictureFolder(settings.folder) if settings.folder else None
             video = stack.enter_context(PictureVideo(settings.video)) if settings.video else None
-            channel = stack.enter_context(_open_channel(settings))
-            for message in self._messages(channel):
+            if self._source is None:
+                messages = self._messages(stack.enter_context(_open_channel(settings)))
+            else:
+                messages = self._source.messages(settings.subscription)
+            for message in messages:
                 print(_line(message), flush=True)
                 if isinstance(message, Departure):
                     continue
@@ -248,6 +269,8 @@ class TwinWatcher:
             self._stopped = True
             if self._call is not None:
                 self._call.cancel()
+            if self._source is not None:
+                self._source.stop()
 
     def _messages(self, channel: grpc.Channel) -> Iterator[TwinPicture | Departure]:
         request = subscription_to_wire(self._settings.subscription)
@@ -282,7 +305,7 @@ class TwinWatcher:
             timer.cancel()
         if expired.is_set() and not self._stopped:
             settings = self._settings
-            check_handshake(Address.parse("address", settings.address), settings.tls)
+            check_handshake(_address(settings), settings.tls)
             raise RfedgeError(f"no server at {settings.address} within {CONNECT_S:g} s")
 
 
@@ -291,7 +314,7 @@ def watch(settings: WatchSettings) -> None:
     TwinWatcher(settings).run()
 
 
-def watch_until_stopped(settings: WatchSettings) -> None:
+def watch_until_stopped(settings: WatchSettings, source: PictureSource | None = None) -> None:
     """Watch to the end, or until SIGINT or SIGTERM; to be called from the main thread.
 
     After the first signal files are completed. If that takes longer than ``FINISH_S``, because
@@ -305,7 +328,7 @@ def watch_until_stopped(settings: WatchSettings) -> None:
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        watcher = TwinWatcher(settings)
+        watcher = TwinWatcher(settings, source)
         ended = _started(watcher)
         while not ended.done() and not signals:
             wait([ended], timeout=LOOK_EVERY_S)
@@ -339,10 +362,17 @@ def _started(watcher: TwinWatcher) -> Future[None]:
 
 
 def _open_channel(settings: WatchSettings) -> grpc.Channel:
+    address = str(_address(settings))
     if settings.tls is None:
-        return grpc.insecure_channel(settings.address, options=CONSUMER_OPTIONS)
+        return grpc.insecure_channel(address, options=CONSUMER_OPTIONS)
     credentials = settings.tls.channel_credentials()
-    return grpc.secure_channel(settings.address, credentials, options=CONSUMER_OPTIONS)
+    return grpc.secure_channel(address, credentials, options=CONSUMER_OPTIONS)
+
+
+def _address(settings: WatchSettings) -> Address:
+    if settings.address is None:
+        raise InvalidInput("address", "is missing; where does mec-server listen?")
+    return Address.parse("address", settings.address)
 
 
 def _problem(error: grpc.RpcError) -> str:

@@ -147,6 +147,11 @@ class PublishedFields:
         self._seen = self._stamp()
         self._take(read_publication(self._folder).current())
 
+    def look_again(self) -> None:
+        """Have the next ``refresh`` follow the manifest though it was not replaced: a field that
+        was missing is there now."""
+        self._seen = None
+
     def refresh(self) -> bool:
         """Follow the manifest if it was replaced; return whether other tiles are current now."""
         stamp, before = self._stamp(), self.tiles

@@ -26,6 +26,13 @@ MISSED = Family(
 )
 
 
+NATS_DROPPED = Family(
+    "rfedge_twin_nats_dropped_total",
+    "counter",
+    "Pictures that NATS was too slow, too small or away for.",
+)
+
+
 class ConsumerEnd(StrEnum):
     """Why a consumer's stream ended."""
 
@@ -50,7 +57,7 @@ class TwinMetrics:
         labels = ("vehicle",) if per_vehicle else ()
         age = Family(AGE.name, AGE.kind, AGE.text, labels)
         make.collector(age, _Ages(age, ages_s))
-        make.collector(MISSED, _Missed(missed))
+        make.collector(MISSED, _Counted(MISSED, missed))
         self.consumers = make.gauge("rfedge_twin_consumers", "Consumers that watch the twin.")
         self.ended = make.counter(
             "rfedge_twin_consumers_ended",
@@ -74,12 +81,22 @@ class TwinMetrics:
             "rfedge_twin_notice_age_seconds",
             "From the capture of the picture that shows an object to the notice of it.",
         )
+        self.nats_connected = make.gauge(
+            "rfedge_twin_nats_connected", "1 while pictures are published over NATS (--nats)."
+        )
+        self.nats_published = make.counter(
+            "rfedge_twin_nats_published", "Pictures handed to NATS, by encoding.", ("encoding",)
+        )
+        self.nats_missed: Callable[[], int] = int
+        """How many pictures were not published so far; read at each scrape."""
+        make.collector(NATS_DROPPED, _Counted(NATS_DROPPED, lambda: self.nats_missed()))
         for kind in NOTICE_KINDS:
             self.notices.labels(kind)
         for reason in ConsumerEnd:
             self.ended.labels(reason)
         for encoding in PictureEncoding:
             self.sent.labels(encoding)
+            self.nats_published.labels(encoding)
 
     def noticed(self, notice: StreetNotice) -> None:
         """Count a notice that was handed to a vehicle's stream."""
@@ -111,12 +128,13 @@ class _Ages(Collector):
         )
 
 
-class _Missed(Collector):
-    def __init__(self, missed: Callable[[], int]) -> None:
-        self._missed = missed
+class _Counted(Collector):
+    def __init__(self, family: Family, counted: Callable[[], int]) -> None:
+        self._family = family
+        self._counted = counted
 
     def describe(self) -> Iterable[Metric]:
-        return [CounterMetricFamily(MISSED.name, MISSED.text)]
+        return [CounterMetricFamily(self._family.name, self._family.text)]
 
     def collect(self) -> Iterable[Metric]:
-        return [CounterMetricFamily(MISSED.name, MISSED.text, self._missed())]
+        return [CounterMetricFamily(self._family.name, self._family.text, self._counted())]

@@ -47,7 +47,7 @@ from rfcore.wire.twin_render import (
 from rfcore.wire.v1 import twin_pb2 as pb
 from rfcore.wire.v1 import twin_pb2_grpc
 
-__all__ = ["RenderCalls", "Sight", "TwinPictures", "TwinService", "encoded"]
+__all__ = ["RenderCalls", "Sight", "TwinPictures", "TwinService", "encoded", "picture_message"]
 
 log = structlog.get_logger()
 
@@ -135,6 +135,11 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
     def register(self, server: grpc.aio.Server) -> None:
         """Add the service to a server that has not started."""
         twin_pb2_grpc.add_TwinServiceServicer_to_server(self, server)
+
+    @property
+    def pictures(self) -> TwinPictures:
+        """What encodes pictures, each once for whoever wants it."""
+        return self._pictures
 
     def drain(self) -> None:
         """End the stream of every consumer."""
@@ -289,7 +294,8 @@ class _Consumer(_Mailed):
         encoding = mailbox.subscription.encoding
         data = await self._pictures.bytes_of(entry, encoding)
         age_s = entry.age_s(time.monotonic())
-        message = twin_message_to_wire(_message(entry, age_s, mailbox, data))
+        skipped = mailbox.skipped[entry.key]
+        message = twin_message_to_wire(picture_message(entry, age_s, encoding, data, skipped))
         await self._context.write(message)
         self._metrics.sent.labels(encoding).inc()
         self._metrics.bytes.inc(message.ByteSize())
@@ -332,7 +338,10 @@ class _ObjectsConsumer(_Mailed):
         return ObjectsSeen(time.time_ns(), self._place.field_id, objects)
 
 
-def _message(view: TwinView, age_s: float, mailbox: Mailbox, data: bytes) -> TwinPicture:
+def picture_message(
+    view: TwinView, age_s: float, encoding: PictureEncoding, data: bytes, skipped: int
+) -> TwinPicture:
+    """Return what a consumer is sent of ``view``: its picture as ``data``, in ``encoding``."""
     packet = view.frame.packet
     return TwinPicture(
         vehicle_id=view.vehicle_id,
@@ -346,9 +355,9 @@ def _message(view: TwinView, age_s: float, mailbox: Mailbox, data: bytes) -> Twi
         intrinsics=view.intrinsics,
         field_id=view.field_id,
         reconstruction_digest=view.digest,
-        encoding=mailbox.subscription.encoding,
+        encoding=encoding,
         picture=data,
-        skipped=mailbox.skipped[view.key],
+        skipped=skipped,
         payload_bytes=len(packet.payload),
         references=packet.references,
         clock=view.frame.clock,

@@ -32,7 +32,10 @@ Covers = Callable[[str, str], bool]
 
 @dataclass(frozen=True, eq=False)
 class TwinView:
-    """One reconstructed picture, and how old it was at ``reconstructed_s`` (monotonic)."""
+    """One reconstructed picture, and how old it was at ``reconstructed_s`` (monotonic).
+
+    ``opened_time_ns``: when its session's Hello came, Unix time of this server.
+    """
 
     vehicle_id: str
     session_id: str
@@ -43,6 +46,7 @@ class TwinView:
     digest: bytes
     reconstructed_s: float
     latency_s: float
+    opened_time_ns: int = 0
 
     @property
     def key(self) -> CameraKey:
@@ -60,7 +64,10 @@ class TwinView:
 
 
 class Mailbox:
-    """What one consumer has not taken yet; ``arrived`` is called for each new entry."""
+    """What one consumer has not taken yet; ``arrived`` is called for each new entry.
+
+    ``missed``: pictures that were replaced before they were taken, of all cameras ever.
+    """
 
     def __init__(
         self,
@@ -75,6 +82,7 @@ class Mailbox:
         self._covers = covers
         self._known: set[CameraKey] = set()
         self.skipped: Counter[CameraKey] = Counter()
+        self.missed = 0
         self._arrived = arrived
         self._entries: OrderedDict[tuple[CameraKey, type], TwinView | Departure] = OrderedDict()
 
@@ -91,6 +99,7 @@ class Mailbox:
             self._entries.pop((key, Departure), None)
         if missed:
             self.skipped[key] += 1
+            self.missed += 1
         self._entries[key, type(entry)] = entry
         self._arrived()
         return missed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
@@ -23,6 +23,9 @@ from rfedge.loadtest.rig import EvalRig
 from rfedge.loadtest.world import EvalWorld
 from rfedge.samples import sample_path
 from rfedge.sizing import EvalSizing
+
+if TYPE_CHECKING:
+    from rfedge.loadtest.scale import Case
 
 __all__ = ["Bench", "Eval", "EvalScale", "LoadTest"]
 
@@ -168,7 +171,9 @@ class EvalScale:
     planned_hz: float = 3.0
     """Pictures per second of each of those."""
     envoy: bool = True
-    """Run the cases behind Envoy; --no-envoy: only what is planned."""
+    """Run the cases behind Envoy; --no-envoy: only what else is asked for."""
+    nats: bool = False
+    """Also restart the NATS that two servers publish to, `rounds` times (Debian's nats-server)."""
     field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
     """Field archive that the servers publish."""
     drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")
@@ -203,8 +208,15 @@ class EvalScale:
             planned=self.planned,
             planned_hz=self.planned_hz,
             envoy=self.envoy,
+            also=_nats_cases() if self.nats else (),
         )
         run_scale(job, Console())
+
+
+def _nats_cases() -> tuple[Case, ...]:
+    from rfedge.loadtest.nats import nats_rows
+
+    return (nats_rows,)
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
 from rfedge.arguments import ADDRESS, FOLDER, JSON
+
+if TYPE_CHECKING:
+    from rfedge.watch import PictureSource
 
 __all__ = ["Certs", "CertsInit", "CertsShow", "Link", "Watch"]
 
@@ -70,8 +73,12 @@ class Link:
 class Watch:
     """Print, and if asked keep, the pictures a server reconstructs, until it stops or Ctrl-C."""
 
-    address: Annotated[str, Positional, ADDRESS]
+    address: Annotated[str | None, Positional, ADDRESS] = None
     """Where mec-server listens."""
+    nats: Annotated[str | None, arg(metavar="URL[,URL]")] = None
+    """Watch what all servers publish over this NATS (docs/scale.md), instead of one server."""
+    nats_login: Annotated[Path | None, arg(metavar="FILE")] = None
+    """With --nats: file of one line, USER:PASSWORD or a token."""
     vehicle: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
     """Only these vehicles; default: all."""
     dir: Annotated[Path | None, FOLDER] = None
@@ -83,19 +90,23 @@ class Watch:
     pictures: int | None = None
     """Stop after so many pictures."""
     tls_cert: Annotated[Path | None, PEM] = None
-    """Certificate of this consumer (PEM), for a server that has one."""
+    """Certificate of this consumer (PEM), for a server or a NATS that wants one."""
     tls_key: Annotated[Path | None, PEM] = None
     """Its private key."""
     tls_ca: Annotated[Path | None, PEM] = None
-    """Certificate of the authority that vouches for the server."""
+    """Certificate of the authority that vouches for the other end."""
     allow_insecure: bool = False
     """Watch a server on another machine in plaintext."""
 
     def run(self) -> None:
         """Watch until the server ends the stream, enough was seen, SIGINT or SIGTERM."""
+        from rfcore.errors import InvalidInput
         from rfcore.wire.tls import TlsFiles
         from rfedge.watch import WatchSettings, watch_until_stopped
 
+        if (self.address is None) == (self.nats is None):
+            raise InvalidInput("address", "give one: HOST:PORT of a server, or --nats URL")
+        has_server = self.address is not None
         settings = WatchSettings(
             address=self.address,
             vehicle_ids=frozenset(self.vehicle),
@@ -103,10 +114,19 @@ class Watch:
             video=self.mp4,
             encoding=self.encoding,
             pictures=self.pictures,
-            tls=TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca),
+            tls=TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca) if has_server else None,
             allow_insecure=self.allow_insecure,
         )
-        watch_until_stopped(settings)
+        watch_until_stopped(settings, None if has_server else self._shared())
+
+    def _shared(self) -> PictureSource:
+        from rfedge.arguments import nats_servers
+        from rfedge.twin.nats_source import NatsPictures
+
+        files = (self.nats_login, self.tls_ca, self.tls_cert, self.tls_key)
+        return NatsPictures(
+            nats_servers(self.nats or "", *files, allow_insecure=self.allow_insecure)
+        )
 
 
 @dataclass(frozen=True)

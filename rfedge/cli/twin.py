@@ -29,8 +29,12 @@ PEM = arg(metavar="FILE.pem")
 class Twin:
     """Look at a server's street, or at one field, in a browser, until Ctrl-C."""
 
-    target: Annotated[str, Positional, arg(metavar="HOST:PORT|FIELD")]
+    target: Annotated[str | None, Positional, arg(metavar="HOST:PORT|FIELD")] = None
     """Where mec-server listens; or a field (archive, name, .ply, .spz) to look at without one."""
+    nats: Annotated[str | None, arg(metavar="URL[,URL]")] = None
+    """Show what all servers publish over this NATS (docs/scale.md), instead of one server."""
+    nats_login: Annotated[Path | None, arg(metavar="FILE")] = None
+    """With --nats: file of one line, USER:PASSWORD or a token."""
     http: Annotated[str, ADDRESS] = "127.0.0.1:8080"
     """Where to serve the page; port 0 takes a free one. For browsers elsewhere give a token."""
     token: Annotated[str | None, arg(metavar="TOKEN")] = None
@@ -47,13 +51,13 @@ class Twin:
     threads: int = 1
     """Threads that render a field for comparison."""
     fields: Annotated[Path, FOLDER] = Path("out/twin/fields")
-    """With a server: where its fields are kept."""
+    """With servers: where their fields are kept."""
     tls_cert: Annotated[Path | None, PEM] = None
-    """Certificate of this consumer (PEM), for a server that has one."""
+    """Certificate of this consumer (PEM), for a server or a NATS that wants one."""
     tls_key: Annotated[Path | None, PEM] = None
     """Its private key."""
     tls_ca: Annotated[Path | None, PEM] = None
-    """Certificate of the authority that vouches for the server."""
+    """Certificate of the authority that vouches for the other end."""
     allow_insecure: bool = False
     """Watch a server on another machine in plaintext."""
     ready_file: Annotated[Path | None, arg(metavar="FILE")] = None
@@ -66,15 +70,26 @@ class Twin:
 
         token = self.token or os.environ.get("RFEDGE_TWIN_TOKEN")
         web = WebSettings(Address.parse("http", self.http), token)
-        source = self._server() if self._is_address() else self._field()
-        run_twin(TwinRun(web, source, self.ready_file, self.until_exit_of))
+        run_twin(TwinRun(web, self._source(), self.ready_file, self.until_exit_of))
 
-    def _is_address(self) -> bool:
-        """Whether the target reads HOST:PORT and is no file."""
-        port = self.target.rpartition(":")[2]
-        return ":" in self.target and port.isdigit() and not Path(self.target).exists()
+    def _source(self) -> Callable[[TwinScene], Source]:
+        from rfcore.errors import InvalidInput
 
-    def _server(self) -> Callable[[TwinScene], Source]:
+        if (self.target is None) == (self.nats is None):
+            raise InvalidInput("target", "give one: a server, a field, or --nats URL")
+        if self.target is None:
+            return self._nats()
+        return self._server(self.target) if _is_address(self.target) else self._field(self.target)
+
+    def _nats(self) -> Callable[[TwinScene], Source]:
+        from rfedge.arguments import nats_servers
+        from rfedge.twin.nats_source import NatsSource
+
+        files = (self.nats_login, self.tls_ca, self.tls_cert, self.tls_key)
+        servers = nats_servers(self.nats or "", *files, allow_insecure=self.allow_insecure)
+        return lambda scene: NatsSource(servers, self.fields, scene, self.threads)
+
+    def _server(self, address: str) -> Callable[[TwinScene], Source]:
         from rfcore.errors import InvalidInput
         from rfcore.wire.tls import TlsFiles
         from rfedge.twin.server_source import ServerSource, ServerTarget
@@ -82,37 +97,43 @@ class Twin:
         if self.drive is not None:
             raise InvalidInput("drive", "belongs to a field; a server shows what vehicles send")
         tls = TlsFiles.of(self.tls_cert, self.tls_key, self.tls_ca)
-        target = ServerTarget(self.target, self.fields, tls, self.allow_insecure)
+        target = ServerTarget(address, self.fields, tls, self.allow_insecure)
         return lambda scene: ServerSource(target, scene, self.threads)
 
-    def _field(self) -> Callable[[TwinScene], Source]:
+    def _field(self, target: str) -> Callable[[TwinScene], Source]:
         from rfcore.dataset import read_dataset
         from rfcore.errors import InvalidInput
         from rfedge.twin.drive_source import DriveSource
 
         if not 0 < self.rate_hz <= 120:
             raise InvalidInput("rate_hz", f"{self.rate_hz:g} is outside 0..120")
-        versions, origin = self._versions()
+        versions, origin = self._versions(target)
         drive = read_dataset(self.drive, tile_origin=origin).pictures if self.drive else ()
-        name = Path(self.target).stem
+        name = Path(target).stem
         return lambda scene: DriveSource(name, versions, drive, self.rate_hz, scene)
 
-    def _versions(self) -> tuple[FieldVersions, TileOrigin | None]:
+    def _versions(self, target: str) -> tuple[FieldVersions, TileOrigin | None]:
         """Return the field, or the file that is followed; and its origin where it is known."""
         from rfedge.twin.drive_source import FollowedFile, OneField
 
         if self.follow:
-            return FollowedFile(Path(self.target), self.threads), None
-        field = self._open()
+            return FollowedFile(Path(target), self.threads), None
+        field = self._open(target)
         return OneField(field), field.metadata.tile_origin
 
-    def _open(self) -> RadianceField:
+    def _open(self, target: str) -> RadianceField:
         from rfcore.field import FieldMetadata, SplatField, read_splat_file
         from rfcore.field.splat_file import SPLAT_SUFFIXES
         from rfedge.arguments import open_field
 
-        if self.target.endswith(SPLAT_SUFFIXES):
-            splats, antialiased = read_splat_file(Path(self.target))
+        if target.endswith(SPLAT_SUFFIXES):
+            splats, antialiased = read_splat_file(Path(target))
             metadata = FieldMetadata(antialiased=antialiased is True)
             return SplatField(splats, metadata, threads=self.threads)
-        return open_field(self.target, threads=self.threads)
+        return open_field(target, threads=self.threads)
+
+
+def _is_address(target: str) -> bool:
+    """Whether the target reads HOST:PORT and is no file."""
+    port = target.rpartition(":")[2]
+    return ":" in target and port.isdigit() and not Path(target).exists()

@@ -401,6 +401,29 @@ CAPACITY = Dashboard(
             ),
         ),
         Panel(
+            "NATS",
+            "1 while pictures are published over NATS; 0 without --nats, or while it is away.",
+            Unit.COUNT,
+            (Query(f"rfedge_twin_nats_connected{{{SERVER}}}"),),
+            PanelKind.NUMBER,
+        ),
+        Panel(
+            "Pictures to NATS",
+            "Published, by encoding, and dropped because NATS was too slow, too small or away.",
+            Unit.PER_S,
+            (
+                Query(
+                    f"sum by (encoding) (rate(rfedge_twin_nats_published_total{{{SERVER}}}"
+                    "[$__rate_interval]))",
+                    "{{encoding}}",
+                ),
+                Query(
+                    f"sum(rate(rfedge_twin_nats_dropped_total{{{SERVER}}}[$__rate_interval]))",
+                    "dropped",
+                ),
+            ),
+        ),
+        Panel(
             "Notices to vehicles",
             "What vehicles that take notices are told: objects ahead, other maps, other lights.",
             Unit.PER_S,

@@ -13,7 +13,7 @@ import signal
 import statistics
 import subprocess
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -52,6 +52,8 @@ from rfedge.results import make_result, provenance, write_result
 from rfedge.samples import sample_path
 
 __all__ = [
+    "Case",
+    "Fleet",
     "ScaleJob",
     "ScaleRow",
     "failures",
@@ -92,6 +94,10 @@ class ScaleRow:
         return ScaleRow(case, bound, measured, measured <= bound)
 
 
+Case = Callable[["ScaleJob"], list[ScaleRow]]
+"""Runs further processes, and returns what was measured."""
+
+
 @dataclass(frozen=True)
 class ScaleJob:
     """What ``EvalScale`` asks for."""
@@ -113,9 +119,11 @@ class ScaleJob:
     planned_hz: float = 3.0
     envoy: bool = True
     """Whether the cases behind Envoy are run."""
+    also: tuple[Case, ...] = ()
+    """Further cases."""
 
     def __post_init__(self) -> None:
-        if not (self.envoy or self.planned):
+        if not (self.envoy or self.planned or self.also):
             raise InvalidInput("envoy", "nothing is to be measured; give --planned numbers")
         for name, value, low, high in (
             ("vehicles", self.vehicles, 2, 200),
@@ -151,6 +159,8 @@ def run_scale(job: ScaleJob, console: Console) -> None:
         rows.append(_added_by_envoy(job))
     plans = compare_with_plan(planned_load(job)) if job.planned else []
     rows += [_planned_row(plan) for plan in plans]
+    for case in job.also:
+        rows += case(job)
     job.out.parent.mkdir(parents=True, exist_ok=True)
     content = {"rows": rows, "planning": plans}
     write_result(str(job.out), make_result("scale", made, content))
@@ -232,8 +242,8 @@ class Fleet:
 
     def start(self, stack: ExitStack, address: str, vehicles: int, hz: float) -> None:
         """Start vehicles and wait until each has had two pictures acknowledged."""
-        self.folder.mkdir(parents=True)
-        for number in range(vehicles):
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for number in range(len(self.reports), len(self.reports) + vehicles):
             report = self.folder / f"{number}.jsonl"
             self.reports.append(report)
             command = [

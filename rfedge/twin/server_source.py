@@ -32,7 +32,7 @@ from rfcore.wire.v1 import field_pb2, twin_pb2_grpc
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 from rfedge.twin.scene import CameraKey, PlacedField, SeenPicture, TwinScene
 
-__all__ = ["ServerSource", "ServerTarget"]
+__all__ = ["ServerSource", "ServerTarget", "seen_picture"]
 
 log = structlog.get_logger()
 
@@ -130,7 +130,7 @@ class ServerSource:
             self._scene.leave(key, self._clock())
             return
         self._cameras.add(key)
-        self._scene.show(_seen(message), self._clock())
+        self._scene.show(seen_picture(message), self._clock())
 
     def _depart_all(self) -> None:
         for key in self._cameras:
@@ -169,7 +169,8 @@ class ServerSource:
         return PlacedField.of(self._store.load(field_id, threads=self._threads), tile)
 
 
-def _seen(picture: TwinPicture) -> SeenPicture:
+def seen_picture(picture: TwinPicture) -> SeenPicture:
+    """Return a server's picture as the page shows it."""
     return SeenPicture(
         key=(picture.vehicle_id, picture.camera_id),
         sequence=picture.sequence,

@@ -13,7 +13,7 @@ import grpc
 import pytest
 from structlog.testing import capture_logs
 
-from mec_server.config import AdmissionLimits, DecoderKind, LearnSettings
+from mec_server.config import AdmissionLimits, DecoderKind, LearnSettings, NatsSettings
 from mec_server.connection_cap import ConnectionCap
 from mec_server.decode_jobs import DecodeJob, OpenJob
 from mec_server.metrics import BackgroundTask
@@ -454,6 +454,25 @@ async def access_fails(scene: Scene) -> Any:
         return server
 
 
+async def nats_twin_fails(scene: Scene) -> Any:
+    return await _nats_fails(scene, "mec_server.twin.nats.TwinPublisher", BackgroundTask.NATS_TWIN)
+
+
+async def nats_fields_fail(scene: Scene) -> Any:
+    return await _nats_fails(scene, "mec_server.nats.FieldExchange", BackgroundTask.NATS_FIELDS)
+
+
+async def _nats_fails(scene: Scene, part: str, task: BackgroundTask) -> Any:
+    """Have a part fail at first; nobody listens at the port, so that the other one waits."""
+    scene.patch.setattr("mec_server.server.NATS_AGAIN_S", 0.001)
+    scene.patch.setattr(f"{part}.run", surprise)
+    nats = NatsSettings("nats://127.0.0.1:1")
+    async with scene.serve(nats=nats) as server:
+        await until(lambda: failed(server, task))
+        await drive_on(scene, server)
+    return server
+
+
 SABOTAGE: dict[BackgroundTask, Callable[[Scene], Awaitable[Any]]] = {
     BackgroundTask.PUBLICATIONS: publications_fail,
     BackgroundTask.ACCESS: access_fails,
@@ -468,6 +487,8 @@ SABOTAGE: dict[BackgroundTask, Callable[[Scene], Awaitable[Any]]] = {
     BackgroundTask.RECORDING: recording_fails,
     BackgroundTask.LEARNING: learning_fails,
     BackgroundTask.NOTICES: notices_fail,
+    BackgroundTask.NATS_TWIN: nats_twin_fails,
+    BackgroundTask.NATS_FIELDS: nats_fields_fail,
 }
 ENDS_WITH_IT = {BackgroundTask.OPENING: BackgroundTask.STREAM}
 """A task that ends through the failure of another is counted, too."""
