@@ -233,8 +233,10 @@ class PlaceRecords:
 
     async def _update(self, key: str, value: bytes, revision: int) -> int:
         if revision:
-            return await self._bucket.update(key, value, last=revision)
-        return await self._bucket.create(key, value)
+            revision = await self._bucket.update(key, value, last=revision)
+        else:
+            revision = await self._bucket.create(key, value)
+        return revision
 
     async def _read(self, key: str) -> tuple[VehiclePlace, int] | None:
         """Return what is written and its revision; ``None`` for nothing that can be read."""
