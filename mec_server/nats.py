@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager, suppress
+from io import BufferedWriter
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,7 +48,6 @@ PING_S: Final = 2
 PENDING_BYTES: Final = 8 << 20
 """What waits for the socket, at most; the outbox before it holds one picture a camera."""
 REQUEST_S: Final = 3.0
-FETCH_S: Final = 600.0
 EXCHANGE_EVERY_S: Final = 2.0
 NO_JETSTREAM = "JetStream is off; start nats-server with -js, or with deploy/nats/nats.conf"
 
@@ -260,12 +260,31 @@ async def fetch_object(client: Client, field_id: str, folder: Path) -> None:
     partial = folder / f".{field_id}.nats"
     try:
         with partial.open("wb") as file:
-            async with asyncio.timeout(FETCH_S):
-                await objects.get(field_id, writeinto=file)
+            await _receive(objects, field_id, file)
         await asyncio.to_thread(FieldStore(folder).add, partial, field_id)
     finally:
         partial.unlink(missing_ok=True)
     log.info("field fetched from NATS", field=field_id)
+
+
+async def _receive(objects: ObjectStore, field_id: str, file: BufferedWriter) -> None:
+    """Write an object into ``file``; raise ``UnknownField`` when nothing more comes of it.
+
+    A server that puts the same field at the same time replaces the pieces that are waited for.
+    """
+    receiving = asyncio.create_task(objects.get(field_id, writeinto=file))
+    try:
+        had_bytes = -1
+        while file.tell() > had_bytes:
+            had_bytes = file.tell()
+            if (await asyncio.wait({receiving}, timeout=STALLED_S))[0]:
+                receiving.result()
+                return
+        raise UnknownField(
+            f"field {field_id} stopped after {had_bytes} bytes from NATS; it is tried again"
+        )
+    finally:
+        await _end(receiving)
 
 
 class FieldExchange:

@@ -7,9 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.camera import Intrinsics
-from rfcore.errors import ProtocolError
+from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.wire.nats import EXPIRES_S, VehiclePlace, picture_subject
 from rfcore.wire.twin import Departure, PictureEncoding, TwinPicture, twin_message_to_wire
+from rfedge.cli.services import Watch
+from rfedge.cli.twin import Twin
 from rfedge.twin.nats_source import SharedTwin, TwinMessage, published_message
 
 K = Intrinsics(2, 2, 1.0, 1.0, 1.0, 1.0)
@@ -136,3 +138,11 @@ def test_a_message_that_is_none_is_refused(header: str | None, body: bytes | Non
         published_message(
             subject, EAST.encode().decode() if header is None else header, body or good
         )
+
+
+@pytest.mark.parametrize("verb", [Twin, Watch])
+@pytest.mark.parametrize("where", [{}, {"nats": "nats://127.0.0.1:1"}])
+def test_one_place_to_look_at_is_asked_for(verb: type[Twin | Watch], where: dict[str, str]) -> None:
+    targets = () if not where else ("127.0.0.1:50051",)
+    with pytest.raises(InvalidInput, match=r"give one: .*--nats URL"):
+        verb(*targets, **where).run()
