@@ -170,6 +170,8 @@ class EvalScale:
     with what the flow model of `rfedge size --city` says."""
     planned_hz: float = 3.0
     """Pictures per second of each of those."""
+    planned_runs: int = 3
+    """How often each of these loads is run; the medians count."""
     envoy: bool = True
     """Run the cases behind Envoy; --no-envoy: only what else is asked for."""
     nats: bool = False
@@ -207,6 +209,7 @@ class EvalScale:
             out=self.out,
             planned=self.planned,
             planned_hz=self.planned_hz,
+            planned_runs=self.planned_runs,
             envoy=self.envoy,
             also=_nats_cases() if self.nats else (),
         )

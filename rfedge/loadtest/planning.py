@@ -6,8 +6,8 @@ The caller takes the rest of the deadline (server, way back, encoding) off the b
 
 ``compare_with_plan``: prerecorded vehicles, each on its own link, to a server that decodes against
 kept renders, beside the flow model of a city of as many cells. The model's costs of a frame are
-measured with fewer vehicles: cores as a straight line through two loads, and what of the ages at
-the smaller load the model does not explain (the way back among it, and the machine).
+measured with other numbers of vehicles: cores as a straight line through two loads, and what of the
+ages at the larger one the model does not explain (the way back among it, and the machine).
 """
 
 from __future__ import annotations
@@ -108,23 +108,30 @@ def on_time_share(traffic: Traffic, rate_bps: float, vehicles: int) -> float:
     return sum(in_time) / len(schedule)
 
 
-FIT_VEHICLES = (6, 18)
+FIT_VEHICLES = (6, 36)
 """Vehicles of the two loads that the costs are measured with."""
 
 
 @dataclass(frozen=True)
 class PlannedLoad:
-    """Loads to compare with their plan; ``link``: the profile of each vehicle's own link."""
+    """Loads to compare with their plan; ``link``: the profile of each vehicle's own link.
+
+    ``seconds`` are counted, after ``warm_up_s``, in each of ``runs`` runs.
+    """
 
     vehicles: tuple[int, ...]
     hz: float
     seconds: float
     link: Path
     bed: TestBed
+    warm_up_s: float = 5.0
+    runs: int = 3
 
     def __post_init__(self) -> None:
         if not self.vehicles or any(not 1 <= count <= 1000 for count in self.vehicles):
             raise InvalidInput("planned", f"{self.vehicles} are not one or more of 1..1000")
+        if not 1 <= self.runs <= 100:
+            raise InvalidInput("planned-runs", f"{self.runs} is outside 1..100")
         if set(self.vehicles) & set(FIT_VEHICLES):
             raise InvalidInput(
                 "planned", f"with {FIT_VEHICLES} vehicles costs are measured; plan other numbers"
@@ -132,7 +139,14 @@ class PlannedLoad:
 
     def load(self, vehicles: int) -> Load:
         """Return the load of so many vehicles."""
-        return Load(Mode.RECEIVER, vehicles, self.hz, duration_s=self.seconds, link=self.link)
+        return Load(
+            Mode.RECEIVER,
+            vehicles,
+            self.hz,
+            duration_s=self.seconds,
+            warm_up_s=self.warm_up_s,
+            link=self.link,
+        )
 
 
 @dataclass(frozen=True)
@@ -143,6 +157,7 @@ class LoadFigures:
     cores: float
     uplink_mbps: float
     age_p99_ms: float
+    ages_ms: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -157,17 +172,31 @@ class PlannedRow:
 
 
 def compare_with_plan(job: PlannedLoad) -> list[PlannedRow]:
-    """Measure the costs, then each load; return three rows for each.
+    """Run every load in turn, ``job.runs`` times, and return three rows for each that is planned.
 
-    Raises ``RfedgeError`` naming the process that failed.
+    Medians of the runs count. Raises ``RfedgeError`` naming the process that failed.
     """
-    few, more = (run_load(job.load(count), job.bed) for count in FIT_VEHICLES)
+    taken: dict[int, list[LoadFigures]] = {n: [] for n in (*FIT_VEHICLES, *job.vehicles)}
+    for _ in range(job.runs):
+        for count, figures in taken.items():
+            figures.append(_measured(job, run_load(job.load(count), job.bed)))
+    few, more = (_median(taken[count]) for count in FIT_VEHICLES)
     costs, idle_cores = fitted_costs(job, few, more)
     rows: list[PlannedRow] = []
     for count in job.vehicles:
-        run = run_load(job.load(count), job.bed)
-        rows += _rows(planned_figures(job, costs, idle_cores, count), _measured(job, run))
+        rows += _rows(planned_figures(job, costs, idle_cores, count), _median(taken[count]))
     return rows
+
+
+def _median(runs: Sequence[LoadFigures]) -> LoadFigures:
+    """Return the median of each figure, with the ages of the run whose p99 is the median."""
+    by_age = sorted(runs, key=lambda figures: figures.age_p99_ms)
+    middle = by_age[len(runs) // 2]
+    return replace(
+        middle,
+        cores=float(np.median([figures.cores for figures in runs])),
+        uplink_mbps=float(np.median([figures.uplink_mbps for figures in runs])),
+    )
 
 
 def _rows(planned: LoadFigures, measured: LoadFigures) -> list[PlannedRow]:
@@ -189,25 +218,35 @@ def _measured(job: PlannedLoad, run: Run) -> LoadFigures:
         cores=run.row.server_cores,
         uplink_mbps=8e-6 * uplink_bytes / seconds,
         age_p99_ms=float(np.quantile(run.latency_ms, 0.99)) if run.latency_ms else 0.0,
+        ages_ms=tuple(run.latency_ms),
     )
 
 
-def fitted_costs(job: PlannedLoad, few: Run, more: Run) -> tuple[Costs, float]:
-    """Return what a frame costs, and the cores that the server takes without any."""
-    added = more.row.server_cores - few.row.server_cores
-    server_s = added / (more.load.vehicles - few.load.vehicles) / job.hz
-    if not server_s > 0:
+def fitted_costs(job: PlannedLoad, few: LoadFigures, more: LoadFigures) -> tuple[Costs, float]:
+    """Return what a frame costs, and the cores that the server takes without any.
+
+    Raises ``InvalidInput`` for loads that tell nothing.
+    """
+    added = more.cores - few.cores
+    server_s = added / (more.vehicles - few.vehicles) / job.hz
+    if not (server_s > 0 and more.ages_ms):
         raise InvalidInput(
             "planning",
-            f"{more.load.vehicles} vehicles took {added:g} cores more than {few.load.vehicles}: "
-            "the machine was too busy, or the load too short; measure again",
+            f"{more.vehicles} vehicles took {added:g} cores more than {few.vehicles}, and "
+            f"{len(more.ages_ms)} pictures were acknowledged: the machine was too busy, or the "
+            "load too short; measure again",
         )
     costs = _unloaded_costs(job, server_s)
-    idle_cores = few.row.server_cores - few.load.vehicles * job.hz * server_s
+    idle_cores = few.cores - few.vehicles * job.hz * server_s
+    return replace(costs, unexplained_s=_unexplained_s(job, costs, more)), idle_cores
+
+
+def _unexplained_s(job: PlannedLoad, costs: Costs, load: LoadFigures) -> tuple[float, ...]:
+    """Return by how much the ages of a load exceed the model's, rank by rank."""
     ranks = (np.arange(AGE_SAMPLES) + 0.5) / AGE_SAMPLES
-    ages_s = np.quantile(few.latency_ms, ranks) / 1e3
-    told_s = np.sort(age_samples_s(costs, _shared(job, costs, few.load.vehicles), seed=1)[0])
-    return replace(costs, unexplained_s=tuple((ages_s - told_s).tolist())), idle_cores
+    ages_s = np.quantile(load.ages_ms, ranks) / 1e3
+    told_s = np.sort(age_samples_s(costs, _shared(job, costs, load.vehicles), seed=1)[0])
+    return tuple((ages_s - told_s).tolist())
 
 
 def _shared(job: PlannedLoad, costs: Costs, vehicles: int) -> Shared:

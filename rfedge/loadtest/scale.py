@@ -117,6 +117,8 @@ class ScaleJob:
     planned: tuple[int, ...] = ()
     """Numbers of prerecorded vehicles whose load is compared with its plan."""
     planned_hz: float = 3.0
+    planned_warm_up_s: float = 5.0
+    planned_runs: int = 3
     envoy: bool = True
     """Whether the cases behind Envoy are run."""
     also: tuple[Case, ...] = ()
@@ -181,7 +183,15 @@ def planned_load(job: ScaleJob) -> PlannedLoad:
         work=job.work / "planned",
     )
     link = sample_path("links/steady.toml")
-    return PlannedLoad(job.planned, job.planned_hz, job.seconds, link, bed)
+    return PlannedLoad(
+        vehicles=job.planned,
+        hz=job.planned_hz,
+        seconds=job.seconds,
+        link=link,
+        bed=bed,
+        warm_up_s=job.planned_warm_up_s,
+        runs=job.planned_runs,
+    )
 
 
 def _planned_row(plan: PlannedRow) -> ScaleRow:

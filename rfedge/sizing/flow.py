@@ -258,9 +258,12 @@ def _decay(load: Floats) -> Floats:
     return np.asarray(theta)
 
 
-def _all_busy(workers: Floats, load: Floats, own_load: Floats) -> Floats:
-    """Return the chance that all of W workers are busy; ``own_load``: of one, by one source."""
-    spread = np.sqrt(np.clip(1 - own_load, 0.05, 1.0))
+def _all_busy(workers: Floats, load: Floats, own_load: Floats, cameras: int) -> Floats:
+    """Return the chance that all of W workers are busy; ``own_load``: of one, by one camera.
+
+    Vehicles of several cameras come with as many frames at once, which spreads the number more.
+    """
+    spread = np.sqrt(cameras * np.clip(1 - own_load, 0.05, 1.0))
     beta = np.maximum(1 - load, 1e-6) * np.sqrt(workers) / spread
     below = np.vectorize(lambda x: math.erfc(-x / math.sqrt(2)) / 2)(beta)
     density = np.exp(-beta * beta / 2) / math.sqrt(2 * math.pi)
@@ -337,7 +340,7 @@ def _server_wait_s(costs: Costs, shared: Shared, chance: Floats) -> Floats:
     cores, vehicles = shared.server_cores[:, None], shared.server_vehicles[:, None]
     others = np.maximum(vehicles - 1, 0.0)
     load = shared.server_busy[:, None] / cores * others / np.maximum(vehicles, 1.0)
-    own_load = shared.rate_hz[:, None] * costs.cores_per_hz
-    busy = _all_busy(cores, load, own_load)
+    own_load = shared.rate_hz[:, None] * costs.server_s
+    busy = _all_busy(cores, load, own_load, costs.cameras)
     wait = queue_wait(chance, others, load, 0.0, busy)
     return np.asarray(wait * costs.cameras * costs.server_s / cores)

@@ -9,7 +9,13 @@ from rich.console import Console
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.datasets.convert import convert_dataset
-from rfedge.loadtest.planning import FIT_VEHICLES, PlannedLoad, planned_figures
+from rfedge.loadtest.planning import (
+    FIT_VEHICLES,
+    LoadFigures,
+    PlannedLoad,
+    fitted_costs,
+    planned_figures,
+)
 from rfedge.loadtest.run import TestBed
 from rfedge.loadtest.scale import ScaleJob, ScaleRow, run_scale
 from rfedge.results import read_result, rows_of
@@ -41,6 +47,12 @@ def test_numbers_that_cannot_be_planned_are_refused(
         planned(tmp_path, vehicles=vehicles)
 
 
+def test_a_load_without_a_cost_is_refused(tmp_path: Path) -> None:
+    few, more = (LoadFigures(n, 0.5, 1.0, 60.0, (60.0,)) for n in FIT_VEHICLES)
+    with pytest.raises(InvalidInput, match="measure again"):
+        fitted_costs(planned(tmp_path), few, more)
+
+
 @pytest.mark.slow
 @pytest.mark.sample
 @pytest.mark.timeout(300)
@@ -51,11 +63,13 @@ def test_a_small_load_is_compared_with_its_plan(tmp_path: Path) -> None:
     fields.mkdir()
     (fields / "street.rff").symlink_to(Path(sample_path("fields/street.rff")).resolve())
     drive = tmp_path / "small"
-    convert_dataset(sample_path("street/transforms_drive_vehicles.json"), drive, (160, 90))
+    pictures = sample_path("street/transforms_drive_vehicles.json")
+    convert_dataset(pictures, drive, (160, 90), slice(None, 6))
     job = ScaleJob(
         vehicles=2, servers=2, rounds=1, hz=1.0, size_px=None, pairs=0, seconds=3.0,
         field=fields / "street.rff", drive=drive, config=tmp_path, work=tmp_path / "work",
         out=tmp_path / "scale.json", planned=(12,), planned_hz=2.0, envoy=False,
+        planned_warm_up_s=1.0, planned_runs=1,
     )  # fmt: skip
     try:
         run_scale(job, Console(quiet=True))

@@ -46,6 +46,19 @@ def test_sessions_of_an_idle_server_come_to_what_the_flow_says() -> None:
     assert flow.age_p99_ms == pytest.approx(p99_ms, rel=0.25)
 
 
+def test_a_rig_of_four_cameras_is_sampled_too() -> None:
+    city, _ = town()
+    kind = replace(city.vehicle, demand=replace(city.vehicle.demand, cameras=4))
+    city = replace(city, vehicle=kind)
+    flow, sessions = both(city, costs_of(city, shipped_tables()), SampledServer(0, {0: 3}, {}))
+    assert sessions.served == flow.served == 3
+    assert sessions.pictures_per_s == pytest.approx(12 * flow.rate_hz, rel=0.03)
+    assert flow.cores == pytest.approx(sessions.cores, rel=0.03)
+    p50_ms, p99_ms = (1e3 * np.quantile(sessions.ages_s, q) for q in (0.5, 0.99))
+    assert flow.age_p50_ms == pytest.approx(p50_ms, rel=0.1)
+    assert flow.age_p99_ms == pytest.approx(p99_ms, rel=0.25)
+
+
 def test_every_byte_that_was_sent_came_or_is_under_way() -> None:
     city, costs = town()
     sampled = SampledServer(1, {2: 6}, {2: 0.5})
