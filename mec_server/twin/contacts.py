@@ -7,18 +7,23 @@ with the ground when
 * the field's surface just below it is level ground (z is up) within ``REACH_M``,
 * of the ``LOOKED_AT_M`` above it at least ``LEAST_MARKED_M`` are marked, at its distance: a thing
   may look like what is behind it in the middle, and paint on the road is not tall, and
-* it is not within ``TALL_M`` above another contact of its column, for then it belongs to that.
+* it is not within ``TALL_M`` above another contact of its column, for then it belongs to that, nor
+  above what is marked at the picture's lower edge, whose foot is outside of the picture.
 
 Left out thereby is mostly the field's own error, at the edges of facades, trees and roofs.
 
-A contact is as far away as the ray through it meets the ground: a plane, fitted to what the picture
-shows of the ground nearby, since a field's depth of the road is too short at a grazing angle (by
-1.7 of 17 m on the sample's field). Where the field's surface is not near it, its depth counts.
+A contact is as far away as the ray through it meets the ground (``mec_server.twin.ground``). Where
+the field's surface is not near that, its depth counts.
 
 Contacts of neighbouring columns that are near each other on the ground are one thing. One longer
 than ``LONG_M`` is taken for a row of parked vehicles, whose gaps cannot be seen from afar, and cut
 every ``PIECE_M`` along the axis of the world in which it is longer: the cuts stay where they are
 from one picture to the next. A thing stands where the middle of its near side is.
+
+How well that is known: across the view to ``ACROSS_PX`` and ``SIDE_M``, for the side that is seen
+changes with the view; along it to what ``CONTACT_PX`` of the ground are worth, which grows with the
+square of the distance over the camera's height. A near side that the picture's edge cuts off is
+anywhere within ``CUT_M``.
 """
 
 from __future__ import annotations
@@ -31,6 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mec_server.twin.composition import LivePicture
+from mec_server.twin.ground import FieldGround, points_of, rays_of
 from rfcore.camera import Camera
 
 __all__ = ["Detection", "detect"]
@@ -44,17 +50,17 @@ MOST_SLOPE = 0.4
 REACH_M = 32.0
 LOOKED_AT_M, LEAST_MARKED_M = 1.5, 0.3
 TALL_M = 2.2
-
-PLANE_REACH_M, PLANE_STEP_PX, PLANE_ROUNDS = 10.0, 6, 5
-LEAST_PLANE_POINTS = 30
-LEVEL_GROUND = 0.15
-NEAR_PLANE_M = 0.4
+NEAR_GROUND_M = 0.4
 
 LINK_PX, LINK_M, LINK_PER_M = 6, 0.3, 0.04
 LONG_M, PIECE_M = 5.5, 4.5
 LEAST_PX, LEAST_COLUMNS, LEAST_WIDTH_M = 200, 4, 0.15
 NEAR_SHARE, SAME_SIDE = 0.1, 1.1
 """The near side: the nearest tenth of a thing's contacts, and those up to so many times as far."""
+MIDDLE_SHARE = 0.5
+CONTACT_PX, ACROSS_PX, SIDE_M, CUT_M = 1.0, 2.0, 0.25, 1.5
+LEAST_EYE_M = 0.5
+"""Of the camera above the foot: none is lower."""
 
 Vec3 = tuple[float, float, float]
 F64 = NDArray[np.float64]
@@ -64,13 +70,22 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Detection:
-    """A thing in one picture: its foot relative to the tile's origin, ``distance_m`` from the
-    camera, and its size as the camera sees it."""
+    """A thing in one picture: its foot relative to the tile's origin, seen from ``eye_m``, its size
+    as the camera sees it, and of how many marked pixels it is. The sigmas are those of its foot on
+    the ground, along the view and across it."""
 
     at_m: Vec3
-    distance_m: float
+    eye_m: Vec3
     width_m: float
     height_m: float
+    marked_px: int
+    along_sigma_m: float
+    across_sigma_m: float
+
+    @property
+    def distance_m(self) -> float:
+        """How far its foot is from the camera."""
+        return math.dist(self.at_m, self.eye_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,11 +109,12 @@ class Contacts:
         )
 
 
-def detect(picture: LivePicture) -> list[Detection]:
-    """Return what ``picture`` shows that the field does not have, from left to right."""
+def detect(picture: LivePicture, ground: FieldGround) -> list[Detection]:
+    """Return what ``picture`` shows that the field does not have, from left to right. ``ground`` is
+    that field's."""
     if picture.trust == 0:
         return []
-    contacts = _contacts(picture)
+    contacts = _contacts(picture, ground)
     found = []
     for thing in _things(contacts):
         detection = _standing(contacts[thing], picture.camera)
@@ -107,20 +123,22 @@ def detect(picture: LivePicture) -> list[Detection]:
     return found
 
 
-def _contacts(picture: LivePicture) -> Contacts:
+def _contacts(picture: LivePicture, ground: FieldGround) -> Contacts:
     marked = picture.changed & (np.abs(picture.difference).max(axis=2) > THING_LEVELS)
     rows, columns = _feet(marked)
     camera, depth = picture.camera, picture.depth
     below_m = depth[rows + BELOW_PX, columns].astype(np.float64)
-    surface_m = _world(camera, rows + BELOW_PX, columns, below_m)
+    surface_m = points_of(camera, rows + BELOW_PX, columns, below_m)
     level = _is_level(picture, rows, columns, surface_m) & (below_m > 0)
-    z_m = _ground_z_m(picture, rows, columns, surface_m, below_m)
+    rows, columns = rows[level], columns[level]
+    z_m = _ground_z_m(picture, ground, rows, columns, surface_m[level], below_m[level])
     height_m = _marked_m(marked, rows, columns, z_m, camera.intrinsics.fy_px)
-    at_m = _world(camera, rows, columns, z_m)
-    good = level & (z_m > 0) & (z_m <= REACH_M) & (height_m >= LEAST_MARKED_M)
+    at_m = points_of(camera, rows, columns, z_m)
+    good = (z_m > 0) & (z_m <= REACH_M) & (height_m >= LEAST_MARKED_M)
     contacts = Contacts(rows, columns, z_m, height_m, at_m)[good]
     ordered = contacts[np.lexsort((-contacts.rows, contacts.columns))]
-    return ordered[_not_above_another(ordered, camera.intrinsics.fy_px)]
+    free_above = _free_above(marked, depth[-1], camera.intrinsics.fy_px)
+    return ordered[_not_above_another(ordered, camera.intrinsics.fy_px, free_above)]
 
 
 def _feet(marked: Mask) -> tuple[Index, Index]:
@@ -133,82 +151,32 @@ def _feet(marked: Mask) -> tuple[Index, Index]:
     return rows, columns
 
 
-def _world(camera: Camera, rows: Index, columns: Index, z_m: F64) -> F64:
-    """Return the points [N, 3] that pixels show at depths, relative to the tile's origin."""
-    pose = camera.world_from_cam
-    rays = _rays(camera, rows, columns)
-    return np.asarray(rays * z_m[:, None] + np.array(pose.translation_m))
-
-
-def _rays(camera: Camera, rows: Index, columns: Index) -> F64:
-    """Return directions of pixel centres in the world [N, 3], 1 long along the optical axis."""
-    k = camera.intrinsics
-    across, down = (columns + 0.5 - k.cx_px) / k.fx_px, (rows + 0.5 - k.cy_px) / k.fy_px
-    turn = np.array(camera.world_from_cam.rotation_matrix())
-    return np.asarray(np.stack([across, down, np.ones(len(rows))], axis=1) @ turn.T)
-
-
 def _is_level(picture: LivePicture, rows: Index, columns: Index, surface_m: F64) -> Mask:
     """Return whether the way from further below to the surface below a contact is level."""
     further = np.minimum(rows + GROUND_PX, picture.depth.shape[0] - 1)
     z_m = picture.depth[further, columns].astype(np.float64)
-    before_m = _world(picture.camera, further, columns, z_m)
+    before_m = points_of(picture.camera, further, columns, z_m)
     length_m = np.linalg.norm(surface_m - before_m, axis=1)
     climb_m = np.abs(surface_m[:, 2] - before_m[:, 2])
     return np.asarray((z_m > 0) & (length_m > 1e-3) & (climb_m <= MOST_SLOPE * length_m))
 
 
 def _ground_z_m(
-    picture: LivePicture, rows: Index, columns: Index, surface_m: F64, below_m: F64
+    picture: LivePicture,
+    ground: FieldGround,
+    rows: Index,
+    columns: Index,
+    surface_m: F64,
+    below_m: F64,
 ) -> F64:
-    """Return depths of contacts: of the ground's plane where the field is near it."""
-    plane = _ground_plane(picture)
+    """Return depths of contacts: of the ground's plane where the field's surface is near it."""
+    plane = ground.ahead_of(picture.camera) if len(rows) else None
     if plane is None:
         return below_m
-    eye_m = np.array(picture.camera.world_from_cam.translation_m)
-    rays = _rays(picture.camera, rows, columns)
-    falls = rays[:, 2] - rays[:, :2] @ plane[1:]
-    along_m = np.where(falls < -1e-6, (plane[0] - eye_m[2]) / np.minimum(falls, -1e-6), np.inf)
-    height_m = surface_m[:, 2] - (plane[0] + (surface_m[:, :2] - eye_m[:2]) @ plane[1:])
-    near = (np.abs(height_m) < NEAR_PLANE_M) & np.isfinite(along_m)
-    return np.asarray(np.where(near, along_m, below_m))
-
-
-def _ground_plane(picture: LivePicture) -> F64 | None:
-    """Return height under the camera and slopes along x and y of the ground, ``None`` if the
-    picture shows too little of it: weighted least squares, from which outliers are dropped."""
-    eye_m = np.array(picture.camera.world_from_cam.translation_m)
-    points_m = _ground_points(picture, eye_m)
-    if len(points_m) < LEAST_PLANE_POINTS:
-        return None
-    terms = np.column_stack([np.ones(len(points_m)), points_m[:, :2] - eye_m[:2]])
-    weight = 1 / np.maximum(np.linalg.norm(points_m - eye_m, axis=1), 1.0)
-    inside = np.abs(points_m[:, 2] - np.median(points_m[:, 2])) < 0.5
-    plane = np.zeros(3)
-    for _ in range(PLANE_ROUNDS):
-        sides = terms[inside] * weight[inside, None], points_m[inside, 2] * weight[inside]
-        plane = np.linalg.lstsq(*sides, rcond=None)[0]
-        error_m = np.abs(terms @ plane - points_m[:, 2])
-        inside = error_m <= max(2 * float(np.median(error_m[inside])), 0.02)
-    return plane
-
-
-def _ground_points(picture: LivePicture, eye_m: F64) -> F64:
-    """Return points [N, 3] of unchanged level ground below the camera."""
-    height, width = picture.depth.shape
-    step, ahead = PLANE_STEP_PX, GROUND_PX - BELOW_PX
-    grid = np.mgrid[step : height - ahead : step, step:width:step]
-    rows, columns = grid[0].ravel(), grid[1].ravel()
-    z_m = picture.depth[rows, columns].astype(np.float64)
-    good = (z_m > 0) & (z_m < PLANE_REACH_M) & ~picture.changed[rows, columns]
-    rows, columns, z_m = rows[good], columns[good], z_m[good]
-    below_m = picture.depth[rows + ahead, columns].astype(np.float64)
-    points_m = _world(picture.camera, rows, columns, z_m)
-    before_m = _world(picture.camera, rows + ahead, columns, below_m)
-    way_m = np.linalg.norm(points_m - before_m, axis=1)
-    level = np.abs(points_m[:, 2] - before_m[:, 2]) < LEVEL_GROUND * way_m
-    good = level & (below_m > 0) & (points_m[:, 2] < eye_m[2] - 0.5)
-    return np.asarray(points_m[good])
+    eye_m = picture.camera.world_from_cam.translation_m
+    along_m = plane.depths_m(eye_m, rays_of(picture.camera, rows, columns))
+    off_m = np.abs(surface_m[:, 2] - plane.heights_m(surface_m[:, :2]))
+    return np.asarray(np.where((off_m < NEAR_GROUND_M) & np.isfinite(along_m), along_m, below_m))
 
 
 def _marked_m(marked: Mask, rows: Index, columns: Index, z_m: F64, focal_px: float) -> F64:
@@ -220,16 +188,31 @@ def _marked_m(marked: Mask, rows: Index, columns: Index, z_m: F64, focal_px: flo
     return np.asarray((counted[rows + 1, columns] - counted[top, columns]) / px_per_m)
 
 
-def _not_above_another(contacts: Contacts, focal_px: float) -> Mask:
+def _free_above(marked: Mask, edge_m: NDArray[np.float32], focal_px: float) -> Index:
+    """Return, for each column, the row above which a thing at the picture's lower edge ends; the
+    number of rows where there is none. ``edge_m``: depths of the lowest row."""
+    height = len(marked)
+    px_per_m = focal_px / np.maximum(edge_m.astype(np.float64), 0.1)
+    free_above = np.full(marked.shape[1], height)
+    for column in np.flatnonzero(marked[-1] & (edge_m > 0)):
+        looked_at = max(0, height - int(LOOKED_AT_M * px_per_m[column]))
+        if marked[looked_at:, column].sum() >= LEAST_MARKED_M * px_per_m[column]:
+            free_above[column] = height - TALL_M * px_per_m[column]
+    return free_above
+
+
+def _not_above_another(contacts: Contacts, focal_px: float, free_above: Index) -> Mask:
     """Return which contacts stand on the ground by themselves."""
     own = np.ones(len(contacts.rows), bool)
     above_px = TALL_M * focal_px / np.maximum(contacts.z_m, 0.1)
     column, top = -1, 0.0
     for i, (row, at) in enumerate(zip(contacts.rows, contacts.columns, strict=True)):
-        if at == column and row > top:
+        if at != column:
+            column, top = at, float(free_above[at])
+        if row > top:
             own[i] = False
         else:
-            column, top = at, row - above_px[i]
+            top = row - above_px[i]
     return own
 
 
@@ -274,8 +257,26 @@ def _standing(thing: Contacts, camera: Camera) -> Detection | None:
         return None
     near = np.flatnonzero(thing.z_m <= SAME_SIDE * np.quantile(thing.z_m, NEAR_SHARE))
     middle = (thing.columns[near].min() + thing.columns[near].max()) / 2
-    foot = near[np.argmin(np.abs(thing.columns[near] - middle))]
-    x_m, y_m, up_m = (float(value) for value in thing.at_m[foot])
-    at_m = (x_m, y_m, up_m)
-    distance_m = math.dist(at_m, camera.world_from_cam.translation_m)
-    return Detection(at_m, distance_m, width_m, float(np.median(thing.marked_m)))
+    foot = near[_nearest_to(middle, thing.columns[near])]
+    x_m, y_m, up_m = (float(value) for value in thing.at_m[foot].mean(axis=0))
+    eye_m = camera.world_from_cam.translation_m
+    on_ground_m = math.hypot(x_m - eye_m[0], y_m - eye_m[1])
+    px_m = on_ground_m**2 / (max(eye_m[2] - up_m, LEAST_EYE_M) * k.fy_px)
+    edges = thing.columns[near].min() == 0 or thing.columns[near].max() == k.width_px - 1
+    unknown_m = CUT_M if edges else SIDE_M
+    return Detection(
+        (x_m, y_m, up_m),
+        eye_m,
+        width_m,
+        float(np.median(thing.marked_m)),
+        round(marked_px),
+        math.hypot(CONTACT_PX * px_m, unknown_m),
+        math.hypot(ACROSS_PX * on_ground_m / k.fx_px, unknown_m),
+    )
+
+
+def _nearest_to(middle: float, columns: Index) -> Index:
+    """Return which ``MIDDLE_SHARE`` of columns are nearest to ``middle``: the mean of many contacts
+    is better known than the one there."""
+    count = max(1, round(MIDDLE_SHARE * len(columns)))
+    return np.argsort(np.abs(columns - middle), kind="stable")[:count]

@@ -5,8 +5,12 @@ same objects.
 
 A detection (``mec_server.twin.contacts``) belongs to the nearest object not further away than
 ``GATE_M`` and a part of its distance from the camera, for that is how its error grows; greedy, the
-nearest pair first. Between pictures objects move at constant velocity (an alpha-beta filter). One
-is *confirmed* by a third picture and forgotten ``FORGOTTEN_S`` after its last.
+nearest pair first. Where an object is, and whether it moves, is what its sightings of the last
+``REMEMBERED_S`` say together (``mec_server.twin.triangulation``), those of all cameras alike.
+
+One is *confirmed* by a third picture, by a second one where that is of another vehicle, and at once
+where its pictures have ``LARGE_PX`` marked pixels of it. It is forgotten ``FORGOTTEN_S`` after its
+last.
 """
 
 from __future__ import annotations
@@ -17,26 +21,39 @@ from dataclasses import dataclass, field
 
 from mec_server.twin.contacts import Detection
 from mec_server.twin.state import CameraKey
+from mec_server.twin.triangulation import Sighting, placed
 from rfcore.wire.twin_render import StreetObject
 
 __all__ = ["FollowedObject", "ObjectTracker"]
 
 GATE_M = 1.5
 GATE_PER_M = 0.1
-POSITION_GAIN, VELOCITY_GAIN = 0.4, 0.15
+REMEMBERED_S, MOST_REMEMBERED = 1.0, 12
 MOST_SPEED_MPS = 60.0
 SEEN_BY_S = 1.0
 FORGOTTEN_S = 1.0
 CONFIRMED_BY = 3
+LARGE_PX = 600
+"""On the sample's empty drive the largest contact of all has 248."""
 SURE_BY = 4
 """Pictures that saw an object until nothing is missing from its confidence."""
+LEAST_RANGE_M = 0.1
 
 Vec3 = tuple[float, float, float]
 
 
+@dataclass(frozen=True)
+class _Seen:
+    """An object in one picture."""
+
+    time_s: float
+    detection: Detection
+
+
 @dataclass
 class FollowedObject:
-    """A thing over time. ``seen``: pictures that showed it; ``cameras``: when each saw it last."""
+    """A thing over time. ``seen``: pictures that showed it; ``cameras``: when each saw it last;
+    ``marked_px``: of how many marked pixels it is in all of them."""
 
     object_id: int
     at_m: Vec3
@@ -45,13 +62,16 @@ class FollowedObject:
     height_m: float
     first_s: float
     last_s: float
-    seen: int = 1
+    seen: int = 0
     cameras: dict[CameraKey, float] = field(default_factory=dict)
+    marked_px: int = 0
+    _sightings: list[_Seen] = field(default_factory=list, init=False)
 
     @property
     def is_confirmed(self) -> bool:
         """Whether enough pictures showed it."""
-        return self.seen >= CONFIRMED_BY
+        agreed = len({vehicle_id for vehicle_id, _ in self.cameras}) > 1
+        return self.seen >= CONFIRMED_BY - agreed or self.marked_px >= LARGE_PX
 
     def confidence(self, now: float) -> float:
         """Return 0 to 1: less after few pictures, and while nobody sees it."""
@@ -85,25 +105,43 @@ class FollowedObject:
         )
 
     def take(self, detection: Detection, camera: CameraKey, time_s: float) -> None:
-        """Move to what a picture of ``camera`` shows."""
-        expected = self.at(time_s)
-        off = [a - b for a, b in zip(detection.at_m, expected, strict=True)]
-        elapsed_s = time_s - self.last_s
-        gain = max(POSITION_GAIN, 1.0 / (self.seen + 1))
-        x, y, z = (at_m + gain * by for at_m, by in zip(expected, off, strict=True))
-        self.at_m = (x, y, z)
-        if elapsed_s > 1e-3:
-            vx, vy, vz = (
-                mps + VELOCITY_GAIN * by / max(elapsed_s, 0.05)
-                for mps, by in zip(self.velocity_mps, off, strict=True)
-            )
-            speed = math.hypot(vx, vy, vz)
-            slower = min(1.0, MOST_SPEED_MPS / speed) if speed else 1.0
-            self.velocity_mps = (slower * vx, slower * vy, slower * vz)
+        """Move to where a picture of ``camera`` and those before it show it."""
         self.last_s = max(self.last_s, time_s)
+        self._sightings.append(_Seen(time_s, detection))
+        self._sightings = [
+            each for each in self._sightings if self.last_s - each.time_s <= REMEMBERED_S
+        ][-MOST_REMEMBERED:]
+        placement = placed([_sighting(each) for each in self._sightings])
+        self.at_m = (*placement.at_m, self._foot_z_m())
+        speed_mps = math.hypot(*placement.velocity_mps)
+        slower = min(1.0, MOST_SPEED_MPS / speed_mps) if speed_mps else 1.0
+        vx_mps, vy_mps = placement.velocity_mps
+        self.velocity_mps = (slower * vx_mps, slower * vy_mps, 0.0)
         self.width_m, self.height_m = detection.width_m, detection.height_m
+        self.marked_px += detection.marked_px
         self.seen += 1
         self.cameras[camera] = time_s
+
+    def _foot_z_m(self) -> float:
+        """Return the height of its foot: the mean, weighted as ranges are."""
+        weights = [1 / each.detection.along_sigma_m**2 for each in self._sightings]
+        heights_m = [each.detection.at_m[2] for each in self._sightings]
+        return sum(w * z for w, z in zip(weights, heights_m, strict=True)) / sum(weights)
+
+
+def _sighting(seen: _Seen) -> Sighting:
+    """Return on the ground what a picture says of where an object is."""
+    detection = seen.detection
+    x_m, y_m = (detection.at_m[axis] - detection.eye_m[axis] for axis in (0, 1))
+    range_m = max(math.hypot(x_m, y_m), LEAST_RANGE_M)
+    return Sighting(
+        seen.time_s,
+        detection.eye_m[:2],
+        math.atan2(y_m, x_m),
+        detection.across_sigma_m / range_m,
+        range_m,
+        detection.along_sigma_m,
+    )
 
 
 class ObjectTracker:
@@ -147,7 +185,7 @@ class ObjectTracker:
             detection.height_m,
             time_s,
             time_s,
-            cameras={camera: time_s},
         )
+        begun.take(detection, camera, time_s)
         self._objects.append(begun)
         self._next_id += 1

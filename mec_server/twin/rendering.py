@@ -32,6 +32,7 @@ from mec_server.twin.composition import (
     shrunk,
 )
 from mec_server.twin.contacts import Detection, detect
+from mec_server.twin.ground import FieldGround
 from mec_server.twin.state import CameraKey, Covers, Twin, TwinView
 from rfcore.camera import Camera
 from rfcore.errors import AccessDenied, InvalidInput
@@ -57,6 +58,9 @@ R = TypeVar("R")
 
 MOST_KEPT = 16
 """Live pictures whose difference from the field is kept for the next view."""
+
+MOST_GROUNDS = 2
+"""Fields whose ground is kept, and which are open for it."""
 
 BEYOND_BOUNDS_M = 5.0
 """How far outside of a field's box a view may be."""
@@ -106,6 +110,7 @@ class TwinViews:
         self._ledger = ledger
         self._worker = Workers(1, failed, "views")
         self._kept: OrderedDict[tuple[CameraKey, str], tuple[TwinView, LivePicture]] = OrderedDict()
+        self._grounds: OrderedDict[str, FieldGround] = OrderedDict()
         self._lowered = False
 
     def close(self) -> None:
@@ -228,7 +233,16 @@ class TwinViews:
         )
 
     def _detected(self, seen: TwinView, place: Place) -> list[Detection]:
-        return detect(self._live(seen, self._open_field(place.field_id)))
+        field = self._open_field(place.field_id)
+        return detect(self._live(seen, field), self._ground(field))
+
+    def _ground(self, field: RadianceField) -> FieldGround:
+        """Return the ground of ``field``; what of it was drawn is kept."""
+        ground = self._grounds.pop(field.field_id, None) or FieldGround(field.render)
+        self._grounds[field.field_id] = ground
+        if len(self._grounds) > MOST_GROUNDS:
+            self._grounds.popitem(last=False)
+        return ground
 
     def _live(self, seen: TwinView, field: RadianceField) -> LivePicture:
         """Return what a picture changes in ``field``; made once for each picture."""

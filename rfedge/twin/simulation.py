@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from mec_server.twin.composition import LivePicture, compose, live_picture, nearest
 from mec_server.twin.contacts import detect
+from mec_server.twin.ground import FieldGround
 from mec_server.twin.objects import ObjectTracker
 from mec_server.twin.rendering import check_inside, check_outside_of_walls
 from rfcore.camera import Camera, Intrinsics, Pose
@@ -191,6 +192,7 @@ class RecordedStreet:
         if len(pictures) > 1 and self._pictures[0][0] == self._pictures[-1][0]:
             raise InvalidInput("recording", "its pictures have no times, or all the same")
         self._field = field
+        self._ground = FieldGround(field.render)
         self._live: dict[int, tuple[float, LivePicture]] = {}
         self.begin()
 
@@ -241,7 +243,7 @@ class RecordedStreet:
             self._next += 1
             live = live_picture(picture.camera, picture.read(), self._field.render(picture.camera))
             self._live[number] = (taken_s, live)
-            self._tracker.take(detect(live), _key(number), taken_s)
+            self._tracker.take(detect(live, self._ground), _key(number), taken_s)
 
     def _objects(self) -> tuple[StreetObject, ...]:
         now_s = self._now_s

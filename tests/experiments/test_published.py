@@ -5,7 +5,7 @@ import pytest
 
 from rfcore.errors import InvalidInput
 from rfcore.native.yuv import i420_from_rgb
-from rfedge.experiments.paper.published import (
+from rfedge.experiments.paper.run import (
     PublishedFrame,
     Setting,
     published_rows,

@@ -19,8 +19,7 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfedge.experiments.clips import DriveOfField
 from rfedge.experiments.slice_coder.report import BdRow, TimeRow, slice_coder_section
-from rfedge.experiments.slice_coder.run import SliceCoderJob, run_slice_coder
-from rfedge.experiments.slice_coder.tasks import header_of, slice_qp
+from rfedge.experiments.slice_coder.run import SliceCoderJob, header_of, run_slice_coder, slice_qp
 from rfedge.results import read_result, rows_of
 
 SAMPLES = Path(__file__).parents[2] / "samples"

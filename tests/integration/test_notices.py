@@ -15,6 +15,7 @@ from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.vehicle import Vehicle
 from mec_server.twin import contacts, rendering
 from mec_server.twin.composition import LivePicture
+from mec_server.twin.ground import FieldGround
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.h264.config import CoderSettings
 from rfcore.codec.packet import DeltaPacket
@@ -64,8 +65,8 @@ def looked_at(monkeypatch: pytest.MonkeyPatch) -> list[LivePicture]:
     pictures: list[LivePicture] = []
     detect = rendering.detect
 
-    def noted(picture: LivePicture) -> Any:
-        found = detect(picture)
+    def noted(picture: LivePicture, ground: FieldGround) -> Any:
+        found = detect(picture, ground)
         pictures.append(picture)
         return found
 

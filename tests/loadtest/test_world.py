@@ -1,6 +1,8 @@
 """What ``rfedge eval world`` compares with the generator's truth, and how."""
 
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +11,23 @@ import pytest
 from mec_server.twin.composition import live_picture
 from rfcore.camera import Camera, Intrinsics
 from rfcore.errors import InvalidInput
+from rfcore.field import SplatField
+from rfcore.update.passes import FEWEST_FRAMES
 from rfedge.loadtest.world import EvalWorld
-from rfedge.loadtest.world.run import Drive, _gains_db, noisy, run_world
-from rfedge.loadtest.world.truth import Footprint, SceneTruth, aside
+from rfedge.loadtest.world.objects import (
+    Found,
+    SeenDrive,
+    SeenPicture,
+    dusk_scenes,
+    empty_minute,
+    followed,
+    noisy,
+)
+from rfedge.loadtest.world.run import _gains_db, run_world
+from rfedge.loadtest.world.truth import Drive, Footprint, SceneTruth, VisibleVehicle, aside
 from rfedge.street.geometry.mesh import Label
-from server.test_objects import CAMERA_M, FIELD, STREET, camera_at, car, joined
+from rfedge.street.shots import Split, shots_of
+from server.test_objects import CAMERA_M, FIELD, GROUND, STREET, camera_at, car, joined
 
 SQUARE = Footprint(np.float32([[0, 0], [2, 0], [2, 1], [0, 1]]))
 SMALL = Intrinsics(96, 54, 48.0, 48.0, 48.0, 27.0)
@@ -60,6 +74,67 @@ def test_a_live_picture_betters_the_pixels_that_changed() -> None:
     assert _gains_db(FIELD, beside, bare, picture(beside)) == (0.0, None)
 
 
+def picture_of(field: SplatField, camera: Camera) -> np.ndarray:
+    return np.rint(field.render(camera).colour.clip(0, 1) * 255).astype(np.uint8)
+
+
+def approach(street: SplatField, vehicles: tuple[VisibleVehicle, ...]) -> SeenDrive:
+    """Six pictures on the way towards y = 10 m, one every 0.1 s."""
+    pictures = []
+    for step in range(6):
+        camera = camera_at(0.05 * step)
+        view = FIELD.render(camera)
+        rgb = picture_of(street, camera)
+        pictures.append(SeenPicture(camera, 0.1 * step, rgb, view, vehicles))
+    return SeenDrive(tuple(pictures), GROUND)
+
+
+CAR = Footprint(np.float32([[-0.1, 10], [1.7, 10], [1.7, 11], [-0.1, 11]]))
+
+
+def test_what_is_followed_is_compared_with_the_vehicles_that_are_seen() -> None:
+    seen = VisibleVehicle(0, CAR, pixels=5000, nearest_m=10.0)
+    hidden = replace(seen, number=1, pixels=399)
+    far = replace(seen, number=2, nearest_m=30.1)
+    found = followed(approach(joined(STREET, car(0.8, 10.0)), (seen, hidden, far)), 0.0)
+    assert found.to_find == 6, "those of 400 pixels within 30 m"
+    assert found.found >= 5, "large: confirmed by the second picture"
+    assert max(found.errors_m) < 0.5
+    assert found.false == set()
+
+
+def test_what_is_far_from_every_vehicle_is_false() -> None:
+    elsewhere = VisibleVehicle(0, SQUARE, pixels=5000, nearest_m=2.0)
+    found = followed(approach(joined(STREET, car(0.8, 10.0)), (elsewhere,)), 0.0)
+    assert (found.found, found.errors_m) == (0, [])
+    assert len(found.false) == 1
+    assert followed(approach(FIELD, ()), 0.0) == Found()
+
+
+def test_the_empty_minute_is_a_minute_with_noise_of_its_own_each_time() -> None:
+    drive = approach(FIELD, ())
+    assert drive.seconds == pytest.approx(0.6)
+    longer = SeenDrive(
+        tuple(replace(each, time_s=40 * each.time_s) for each in drive.pictures[:2]), GROUND
+    )
+    row = empty_minute(longer)
+    assert row.case.endswith("8 times the drive of 8.0 s, noise 3 of seeds 1 to 8")
+    assert (row.measured, row.held) == ("0 in 64 s", True)
+
+
+@pytest.mark.sample
+def test_dusk_is_the_same_drive_in_another_light_and_is_taught_beside_it() -> None:
+    scenes = dusk_scenes("samples/street/empty.toml", "samples/street/vehicles.toml")
+    assert set(scenes.empty.effects) == set(scenes.teacher.effects) == {"dusk"}
+    assert set(scenes.vehicles.effects) == {"parked", "traffic", "dusk"}
+    assert scenes.vehicles.drive == scenes.empty.drive
+    shots = shots_of(scenes.empty, Split.DRIVE), shots_of(scenes.teacher, Split.DRIVE)
+    first, beside = (shot[0].camera.world_from_cam for shot in shots)
+    assert math.dist(first.translation_m, beside.translation_m) == pytest.approx(0.5)
+    assert len(shots[1]) >= FEWEST_FRAMES
+    assert len({scene.name for scene in (scenes.empty, scenes.teacher, scenes.vehicles)}) == 3
+
+
 @pytest.mark.slow
 @pytest.mark.sample
 def test_the_generator_knows_what_a_camera_sees_of_each_vehicle() -> None:
@@ -87,7 +162,7 @@ def test_what_is_no_drive_or_case_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="'nothing' is not SCENE"):
         Drive.given("nothing")
     asked = EvalWorld(only=("weather",), work=tmp_path, out=tmp_path / "world.json")
-    with pytest.raises(InvalidInput, match="'weather' is none of objects, views, cost"):
+    with pytest.raises(InvalidInput, match="'weather' is none of objects, dusk, views"):
         run_world(asked)
     assert not asked.out.exists()
 

@@ -7,6 +7,7 @@ import pytest
 
 from mec_server.twin.composition import live_picture
 from mec_server.twin.contacts import Detection, detect
+from mec_server.twin.ground import FieldGround
 from mec_server.twin.objects import ObjectTracker
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.field import SplatField
@@ -62,6 +63,7 @@ def car(x_m: float, z_m: float) -> Gaussians:
 
 STREET = street()
 FIELD = SplatField(STREET)
+GROUND = FieldGround(FIELD.render)
 
 
 def camera_at(x_m: float = 0.0, yaw_rad: float = 0.0) -> Camera:
@@ -76,7 +78,7 @@ def seen(
     colour = field.render(camera).colour.clip(0, 1) * 255 * gain
     noise = np.random.default_rng(5).normal(scale=sigma, size=colour.shape)
     rgb = np.clip(np.rint(colour + noise), 0, 255).astype(np.uint8)
-    return detect(live_picture(camera, rgb, FIELD.render(camera)))
+    return detect(live_picture(camera, rgb, FIELD.render(camera)), GROUND)
 
 
 @pytest.mark.parametrize("z_m", [6.0, 10.0, 15.0])
@@ -113,8 +115,13 @@ def test_two_cars_are_two_and_one_without_a_foot_in_the_picture_is_none() -> Non
     assert seen(joined(STREET, car(0.0, 3.0)), camera_at()) == []
 
 
-def at(x_m: float, z_m: float = 10.0) -> Detection:
-    return Detection((x_m, CAMERA_M, z_m), math.hypot(x_m, z_m), 1.8, 1.4)
+def at(
+    x_m: float, y_m: float = 10.0, eye_m: tuple[float, float] = (0.0, 0.0), marked_px: int = 150
+) -> Detection:
+    """A thing as a camera at ``eye_m`` sees it; small, unless ``marked_px`` says otherwise."""
+    range_m = math.dist((x_m, y_m), eye_m)
+    sigmas_m = 0.3 + 0.002 * range_m**2, 0.3 + 0.006 * range_m
+    return Detection((x_m, y_m, -CAMERA_M), (*eye_m, 0.0), 1.8, 1.4, marked_px, *sigmas_m)
 
 
 def test_a_thing_that_moves_is_followed_with_its_velocity() -> None:
@@ -139,7 +146,41 @@ def test_two_vehicles_that_see_one_thing_see_one_thing() -> None:
     assert math.hypot(*thing.velocity_mps) < 1.0
 
 
-def test_two_pictures_confirm_nothing_and_what_nobody_sees_is_forgotten() -> None:
+def test_what_is_large_is_confirmed_at_once_and_what_two_vehicles_see_by_the_second() -> None:
+    tracker = ObjectTracker()
+    tracker.take([at(-4.0), at(0.0, marked_px=900), at(4.0)], FRONT, 0.0)
+    assert [thing.at_m[0] for thing in tracker.confirmed(0.0)] == [pytest.approx(0.0)]
+    assert tracker.confirmed(0.0)[0].confidence(0.0) <= 0.25, "nobody else has seen it yet"
+    tracker.take([at(4.0)], ("cav-1", "left"), 0.05)
+    assert len(tracker.confirmed(0.05)) == 1, "a vehicle's own cameras are one witness"
+    tracker.take([at(-4.0)], ("cav-2", "front"), 0.05)
+    assert [round(thing.at_m[0]) for thing in tracker.confirmed(0.05)] == [-4, 0]
+
+
+def test_what_stands_has_no_velocity_though_its_range_is_uncertain() -> None:
+    """Driving towards it at 9 m/s; far away it seems a metre nearer than it is."""
+    tracker = ObjectTracker()
+    for step in range(10):
+        eye_m = (0.0, 0.9 * step)
+        short_m = 0.003 * (25.0 - eye_m[1]) ** 2
+        tracker.take([at(3.0, 25.0 - short_m, eye_m)], FRONT, 0.1 * step)
+    (thing,) = tracker.confirmed(0.9)
+    assert thing.velocity_mps == (0.0, 0.0, 0.0)
+    assert math.dist(thing.at_m[:2], (3.0, 25.0)) < 1.4
+
+
+def test_an_oncoming_vehicle_is_where_it_is_not_where_it_was() -> None:
+    """At 9 m/s, seen by one that comes at 9 m/s, from its third picture on."""
+    tracker = ObjectTracker()
+    for step in range(8):
+        y_m, eye_m = 30.0 - 0.9 * step, (0.0, 0.9 * step)
+        tracker.take([at(-2.0, y_m, eye_m)], FRONT, 0.1 * step)
+    (thing,) = tracker.confirmed(0.7)
+    assert thing.at(0.7)[1] == pytest.approx(30.0 - 6.3, abs=0.7)
+    assert thing.velocity_mps[1] == pytest.approx(-9.0, abs=2.5)
+
+
+def test_two_pictures_confirm_nothing_small_and_what_nobody_sees_is_forgotten() -> None:
     tracker = ObjectTracker()
     for time_s in (0.0, 0.05):
         tracker.take([at(0.0)], FRONT, time_s)
@@ -156,10 +197,10 @@ def test_two_pictures_confirm_nothing_and_what_nobody_sees_is_forgotten() -> Non
 def test_things_side_by_side_keep_their_identity_in_any_order() -> None:
     tracker = ObjectTracker()
     for step in range(8):
-        things = [at(-2.0 + 0.1 * step), at(2.0)]
+        things = [at(-2.0 + 0.2 * step), at(2.0)]
         tracker.take(things[:: 1 if step % 2 else -1], FRONT, 0.1 * step)
     by_id = {thing.object_id: thing.at(0.7)[0] for thing in tracker.confirmed(0.7)}
-    assert sorted(by_id.values()) == pytest.approx([-1.3, 2.0], abs=0.15)
+    assert sorted(by_id.values()) == pytest.approx([-0.6, 2.0], abs=0.15)
     assert sorted(by_id) == [1, 2]
 
 

@@ -82,11 +82,11 @@ def test_a_car_that_keeps_its_wheel_drives_the_circle_of_its_wheelbase() -> None
 def test_a_recorded_car_is_seen_and_found_from_beside(recording: list[PosedPicture]) -> None:
     drive = TwinDrive(RecordedStreet(FIELD, [recording]), INTRINSICS)
     seen = drive.reset(replace(START, x_m=-0.5))
-    for _ in range(5):
+    for _ in range(8):
         seen = drive.step(0.0, 0.0)
     assert seen.live.any()
     (thing,) = seen.objects
-    assert math.dist(thing.at_m[:2], (0.8, 14.0 - 0.3 * 5)) < 1.0
+    assert math.dist(thing.at_m[:2], (0.8, 14.0 - 0.3 * 8)) < 1.0
     assert thing.velocity_mps[1] < 0
     bare = np.rint(FIELD.render(seen.place.camera(INTRINSICS)).colour * 255).astype(np.uint8)
     changed = (seen.picture != bare).any(axis=2)

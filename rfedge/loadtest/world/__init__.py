@@ -44,10 +44,10 @@ class EvalWorld:
     rounds: int = 3
     """How often ingest is measured without and with a live view, in turn."""
     only: tuple[str, ...] = ()
-    """Of objects, views, cost, notices, ingest: those; all without it. Rows of the others are kept
-    if the result file is of this revision."""
+    """Of objects, dusk, views, cost, notices, ingest: those; all without it. Rows of the others are
+    kept if the result file is of this revision."""
     work: Path = Path("out/eval/world")
-    """Folder of logs and prerecorded drives."""
+    """Folder of logs, prerecorded drives and the pictures of dusk, which take minutes to render."""
     out: Path = Path("out/eval/world.json")
     """The result file to write."""
 

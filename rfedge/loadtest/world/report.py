@@ -31,8 +31,10 @@ def world_section(path: Path, result: Result) -> str:
     notes = (
         "Objects and views of the twin against the generator's truth. *Distance from the outline*: "
         "of a vehicle on the ground, to where an object is told of. *Found*: by an object within "
-        "2 m of the outline, a vehicle's first pictures included. *Gain*: PSNR of a view less "
-        "that of the field alone."
+        "2 m of the outline, a vehicle's first pictures included. *The empty minute*: the drive "
+        "through the empty street again and again, each time with other noise. *Dusk*: the "
+        "generator's evening, in the light that the field learnt from another pass. *Gain*: PSNR "
+        "of a view less that of the field alone."
     )
     cells = [_cells(row) for row in rows_of(Row, result["rows"])]
     return "\n\n".join([heading(path, result), notes, table(COLUMNS, cells), ""])

@@ -6,8 +6,7 @@ import asyncio
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from dataclasses import field as with_factory
+from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
 
@@ -20,22 +19,21 @@ from cav_agent.config import AgentConfig
 from cav_agent.vehicle import Vehicle
 from mec_server.twin.composition import LivePicture, compose, live_picture
 from mec_server.twin.contacts import detect
-from mec_server.twin.objects import ObjectTracker
+from mec_server.twin.ground import FieldGround
 from rfcore.camera import Camera
 from rfcore.codec.h264.config import CoderSettings
-from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.metrics import psnr
-from rfcore.views import PosedPicture
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.notices import ObjectAhead, StreetNotice
 from rfcore.wire.twin import PictureEncoding
 from rfcore.wire.twin_render import ViewRequest, render_view
 from rfedge.loadtest.live.showing import TwinBed, ingest_latencies_ms
 from rfedge.loadtest.world import EvalWorld
+from rfedge.loadtest.world.objects import dusk_rows, object_rows
 from rfedge.loadtest.world.report import Row, print_world
-from rfedge.loadtest.world.truth import SceneTruth, aside
+from rfedge.loadtest.world.truth import Drive, SceneTruth, aside
 from rfedge.results import (
     as_json,
     make_result,
@@ -47,35 +45,9 @@ from rfedge.results import (
 
 __all__ = ["run_world"]
 
-LEAST_PX, REACH_M, MATCH_M = 400, 30.0, 2.0
-"""A vehicle of so many pixels within reach is to be found; an object further from its outline is
-another thing."""
-CAMERA = ("eval", "front")
 MAX_AGE_S = 2.0
 LIVE_AGE_S = 0.1
 """How old the picture is that a view is composed of."""
-NOISE_SIGMA = 3.0
-SAME_TIME_S = 1e-6
-
-
-@dataclass(frozen=True)
-class Drive:
-    """A drive of a scene, and the scene's truth."""
-
-    pictures: Sequence[PosedPicture]
-    scene: str
-
-    @staticmethod
-    def given(text: str) -> Drive:
-        """Read SCENE.toml,DATASET; raise ``InvalidInput`` for anything else."""
-        scene, comma, dataset = text.partition(",")
-        if not comma:
-            raise InvalidInput("drive", f"{text!r} is not SCENE.toml,DATASET")
-        return Drive(read_dataset(Path(dataset)).pictures, scene)
-
-    def time_s(self, index: int) -> float:
-        """Return when a picture was taken."""
-        return (self.pictures[index].time_ns - self.pictures[0].time_ns) / 1e9
 
 
 def run_world(asked: EvalWorld) -> None:
@@ -84,6 +56,7 @@ def run_world(asked: EvalWorld) -> None:
     asked.work.mkdir(parents=True, exist_ok=True)
     cases: dict[str, Callable[[], list[Row]]] = {
         "objects": lambda: object_rows(asked, field),
+        "dusk": lambda: dusk_rows(asked, field),
         "views": lambda: view_rows(asked, field),
         "cost": lambda: cost_rows(asked, field),
         "notices": lambda: notice_rows(asked),
@@ -113,119 +86,18 @@ def _kept(out: Path, revision: str) -> dict[str, list[Row]]:
     return kept
 
 
-# --- objects
-
-
-@dataclass
-class Found:
-    """How objects compare with the vehicles of a drive's pictures."""
-
-    to_find: int = 0
-    found: int = 0
-    errors_m: list[float] = with_factory(default_factory=list)
-    false: set[int] = with_factory(default_factory=set)
-
-
-def object_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
-    """Return what is found of vehicles, with and without noise, and what where there are none."""
-    vehicles, empty = Drive.given(asked.vehicles), Drive.given(asked.empty)
-    truth = SceneTruth(vehicles.scene)
-    rows = []
-    for name, sigma in (("", 0.0), (f", noise {NOISE_SIGMA:g}", NOISE_SIGMA)):
-        found = followed(vehicles, field, sigma, truth)
-        rows += _rows_of_found(f"vehicles{name}", found)
-        false = followed(empty, field, sigma, None).false
-        minutes = (empty.time_s(len(empty.pictures) - 1) + 0.1) / 60
-        rows.append(
-            Row(
-                "objects",
-                f"false ones where nothing stands{name}",
-                "<= 1 a minute",
-                f"{len(false)} in {60 * minutes:.1f} s",
-                len(false) <= minutes,
-            )
-        )
-    return rows
-
-
-def _rows_of_found(name: str, found: Found) -> list[Row]:
-    errors_m = np.array(found.errors_m or [np.nan])
-    median_m, p95_m = (float(np.nanpercentile(errors_m, q)) for q in (50, 95))
-    share = found.found / max(1, found.to_find)
-    return [
-        Row(
-            "objects",
-            f"{name}, distance from the outline, median",
-            "<= 0.5 m",
-            f"{median_m:.2f} m",
-            median_m <= 0.5,
-        ),
-        Row(
-            "objects",
-            f"{name}, distance from the outline, p95",
-            "<= 1.0 m",
-            f"{p95_m:.2f} m",
-            p95_m <= 1.0,
-        ),
-        Row(
-            "objects",
-            f"{name}, found where >= {LEAST_PX} px are seen within {REACH_M:g} m",
-            ">= 90 %",
-            f"{100 * share:.0f} % of {found.to_find}",
-            share >= 0.9,
-        ),
-        Row(
-            "objects",
-            f"{name}, confirmed objects that are no vehicle",
-            "",
-            f"{len(found.false)}",
-            None,
-        ),
-    ]
-
-
-def followed(drive: Drive, field: RadianceField, sigma: float, truth: SceneTruth | None) -> Found:
-    """Return how what is followed through a drive compares with ``truth``, None: nothing there."""
-    tracker, found = ObjectTracker(), Found()
-    rng = np.random.default_rng(3)
-    for index, picture in enumerate(drive.pictures):
-        time_s = drive.time_s(index)
-        rgb = noisy(picture.read(), sigma, rng)
-        live = live_picture(picture.camera, rgb, field.render(picture.camera))
-        tracker.take(detect(live), CAMERA, time_s)
-        objects = tracker.confirmed(time_s)
-        seen = [] if truth is None else truth.vehicles(picture.camera, time_s)
-        for each in objects:
-            if time_s - each.last_s > SAME_TIME_S:
-                continue
-            distances = [vehicle.footprint.distance_m(each.at(time_s)) for vehicle in seen]
-            if distances and min(distances) <= MATCH_M:
-                found.errors_m.append(min(distances))
-            else:
-                found.false.add(each.object_id)
-        for vehicle in seen:
-            if vehicle.pixels >= LEAST_PX and vehicle.nearest_m <= REACH_M:
-                near = (vehicle.footprint.distance_m(each.at(time_s)) for each in objects)
-                found.to_find += 1
-                found.found += any(distance_m <= MATCH_M for distance_m in near)
-    return found
-
-
-def noisy(rgb: NDArray[np.uint8], sigma: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Return a picture with sensor noise of ``sigma`` levels."""
-    if not sigma:
-        return rgb
-    return np.clip(np.rint(rgb + rng.normal(scale=sigma, size=rgb.shape)), 0, 255).astype(np.uint8)
-
-
 # --- views
 
 
 def view_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
     """Return how close views from beside the drives come to the generator's pictures."""
     rows = []
-    for name, given in (("unchanged street", asked.empty), ("vehicles", asked.vehicles)):
-        drive = Drive.given(given)
+    given = (
+        ("unchanged street", asked.empty, False),
+        ("vehicles", asked.vehicles, True),
+    )
+    for name, text, changes in given:
+        drive = Drive.given(text)
         truth, gains, changed_gains = SceneTruth(drive.scene), [], []
         for index in range(0, len(drive.pictures), asked.every):
             picture, time_s = drive.pictures[index], drive.time_s(index)
@@ -234,7 +106,7 @@ def view_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
                 camera = aside(picture.camera, left_m)
                 gain_db, changed_db = _gains_db(field, camera, live, truth.picture(camera, time_s))
                 gains.append(gain_db)
-                if changed_db is not None and drive.scene == asked.vehicles.split(",")[0]:
+                if changes and changed_db is not None:
                     changed_gains.append(changed_db)
         rows += _rows_of_gains(name, gains, changed_gains)
     return rows
@@ -286,6 +158,8 @@ def cost_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
     lives = [live_picture(p.camera, p.read(), field.render(p.camera)) for p in pictures]
     camera = aside(pictures[-1].camera, 1.0)
     rgb, own = pictures[-1].read(), field.render(pictures[-1].camera)
+    ground = FieldGround(field.render)
+    detect(lives[-1], ground)
     times: dict[str, list[float]] = {"render": [], "compose": [], "take up": [], "find": []}
     for _ in range(20):
         with _timed(times["render"]):
@@ -295,7 +169,7 @@ def cost_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
         with _timed(times["take up"]):
             live = live_picture(pictures[-1].camera, rgb, own)
         with _timed(times["find"]):
-            detect(live)
+            detect(live, ground)
     ms = {name: 1e3 * float(np.median(values)) for name, values in times.items()}
     renders = (ms["render"] + ms["compose"]) / ms["render"]
     k = camera.intrinsics

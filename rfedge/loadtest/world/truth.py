@@ -1,17 +1,24 @@
-"""What the generator knows of a scene: where its vehicles stand, and what a camera sees of them."""
+"""What the generator knows of a scene: where its vehicles stand, and what a camera sees of them.
+
+A ``Drive`` goes with it, the pictures that were taken there.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.camera import Camera, Pose
+from rfcore.dataset import read_dataset
+from rfcore.errors import InvalidInput
 from rfcore.extras import needs
 from rfcore.image import Rgb
+from rfcore.views import PosedPicture
 from rfedge.street.assembly import world_of
 from rfedge.street.frame import LinearFrame, display_rgb
 from rfedge.street.geometry.mesh import Label, Mesh
@@ -23,13 +30,33 @@ from rfedge.street.scene_file import load_scene
 with needs("scene"):
     import cv2
 
-__all__ = ["SceneTruth", "VisibleVehicle", "aside"]
+__all__ = ["Drive", "Footprint", "SceneTruth", "VisibleVehicle", "aside"]
 
 F64 = NDArray[np.float64]
 SAMPLED = 4
 """Every fourth pixel of vehicles is looked at."""
 GAP_M = 0.3
 """Pixels of a vehicle lie within so much of its outline on the ground."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive of a scene, and the scene's truth."""
+
+    pictures: Sequence[PosedPicture]
+    scene: str
+
+    @staticmethod
+    def given(text: str) -> Drive:
+        """Read SCENE.toml,DATASET; raise ``InvalidInput`` for anything else."""
+        scene, comma, dataset = text.partition(",")
+        if not comma:
+            raise InvalidInput("drive", f"{text!r} is not SCENE.toml,DATASET")
+        return Drive(read_dataset(Path(dataset)).pictures, scene)
+
+    def time_s(self, index: int) -> float:
+        """Return when a picture was taken."""
+        return (self.pictures[index].time_ns - self.pictures[0].time_ns) / 1e9
 
 
 @dataclass(frozen=True, eq=False)

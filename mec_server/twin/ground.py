@@ -1,0 +1,186 @@
+"""The plane of the ground ahead of a camera, from several views of the field along its way.
+
+A field's depth of the road is wrong by decimetres: what stands for the surface is thick, so that
+along the road depth is too short (by 1.7 of 17 m on the sample's field), and splats that float
+before a camera shorten all of its depths alike. So the field is drawn from places every ``STEP_M``
+on the way ahead, as high as the camera, looking down a little, as those looked that it was trained
+on:
+
+* the height is the median over the ground that is ``NEAR_M`` from those places: it looks neither
+  too near nor, in the mean of many views, too high,
+* the slopes are those of the ground ``FAR_M`` away, each view about its own middle, since what
+  floats before a view raises all of that; least absolute errors, by reweighting.
+
+The places lie on a lattice and are drawn once, for whichever camera comes there first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.views import View
+
+__all__ = ["FieldGround", "GroundPlane", "points_of", "rays_of"]
+
+STEP_M, STEPS = 4.0, 6
+SIDE_STEP_M, HEIGHT_STEP_M, TURN_STEP_RAD = 2.0, 0.1, math.pi / 8
+LOOKING_DOWN_RAD = 0.25
+WIDTH_PX, HEIGHT_PX, FOCAL_PX = 192, 128, 96.0
+"""In a view of half that size the depth of a far row mixes metres of road."""
+OPAQUE = 0.9
+NEAR_M, FAR_M = (3.0, 8.0), (8.0, 20.0)
+ASIDE_M = 3.5
+BELOW_M = (0.8, 3.0)
+"""Lower than the camera by so much is what may be ground."""
+NEAR_NTH, FAR_NTH = 16, 4
+"""Of the points of a view so many are kept."""
+LEAST_POINTS = 30
+ROUNDS, LEAST_ERROR_M = 8, 0.02
+LEVEL_WEIGHT = 1.0
+"""Metres squared, of each point: where the ground ahead is short, its slope is 0."""
+MOST_VIEWS = 512
+
+F64 = NDArray[np.float64]
+Index = NDArray[np.intp]
+Place = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class GroundPlane:
+    """``height_m`` of the ground at ``below`` (x, y), and its slopes along x and y."""
+
+    below: tuple[float, float]
+    height_m: float
+    slopes: tuple[float, float]
+
+    def heights_m(self, at_m: F64) -> F64:
+        """Return the height of the plane at points [N, 2]."""
+        return np.asarray(self.height_m + (at_m - self.below) @ np.array(self.slopes))
+
+    def depths_m(self, eye_m: tuple[float, float, float], rays: F64) -> F64:
+        """Return how far along rays [N, 3] from ``eye_m`` the plane is, infinite where it is not
+        ahead."""
+        falls = rays[:, 2] - rays[:, :2] @ np.array(self.slopes)
+        above_m = eye_m[2] - self.heights_m(np.array([eye_m[:2]]))[0]
+        return np.asarray(np.where(falls < -1e-6, above_m / np.maximum(-falls, 1e-6), np.inf))
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The ground in one view [N, 3]: near, and far less its own middle."""
+
+    near_m: F64
+    far_m: F64
+
+
+class FieldGround:
+    """The ground of one field, drawn by ``render`` where it is asked for."""
+
+    def __init__(self, render: Callable[[Camera], View]) -> None:
+        self._render = render
+        self._views: OrderedDict[Place, _Seen] = OrderedDict()
+
+    def ahead_of(self, camera: Camera) -> GroundPlane | None:
+        """Return the ground ahead of a camera, ``None`` where the field shows too little of it."""
+        pose = camera.world_from_cam
+        x_m, y_m, z_m = pose.translation_m
+        forward = np.array(pose.rotation_matrix())[:, 2]
+        heading_rad = math.atan2(forward[1], forward[0])
+        step_m = STEP_M * math.cos(heading_rad), STEP_M * math.sin(heading_rad)
+        seen = [
+            self._seen(_place_at(x_m + n * step_m[0], y_m + n * step_m[1], z_m, heading_rad))
+            for n in range(STEPS)
+        ]
+        near_m = np.concatenate([each.near_m for each in seen])
+        if len(near_m) < LEAST_POINTS:
+            return None
+        slopes = _slopes(np.concatenate([each.far_m for each in seen]))
+        height_m = float(np.median(near_m[:, 2] - (near_m[:, :2] - (x_m, y_m)) @ slopes))
+        return GroundPlane((x_m, y_m), height_m, (float(slopes[0]), float(slopes[1])))
+
+    def _seen(self, place: Place) -> _Seen:
+        seen = self._views.pop(place, None)
+        if seen is None:
+            seen = self._drawn(place)
+            if len(self._views) >= MOST_VIEWS:
+                self._views.popitem(last=False)
+        self._views[place] = seen
+        return seen
+
+    def _drawn(self, place: Place) -> _Seen:
+        camera, heading_rad = _camera_at(place)
+        view = self._render(camera)
+        rows, columns = np.nonzero((view.opacity > OPAQUE) & (view.depth > 0))
+        points_m = points_of(camera, rows, columns, view.depth[rows, columns].astype(np.float64))
+        away_m = points_m - np.array(camera.world_from_cam.translation_m)
+        across = np.array([-math.sin(heading_rad), math.cos(heading_rad)])
+        ground = (-away_m[:, 2] > BELOW_M[0]) & (-away_m[:, 2] < BELOW_M[1])
+        ground &= np.abs(away_m[:, :2] @ across) < ASIDE_M
+        range_m = np.linalg.norm(away_m[:, :2], axis=1)
+        near, far = (
+            points_m[ground & (range_m > low) & (range_m < high)] for low, high in (NEAR_M, FAR_M)
+        )
+        middle_m = np.median(far, axis=0) if len(far) else np.zeros(3)
+        return _Seen(near[::NEAR_NTH], (far - middle_m)[::FAR_NTH])
+
+
+def rays_of(camera: Camera, rows: Index, columns: Index) -> F64:
+    """Return directions of pixel centres in the world [N, 3], 1 long along the optical axis."""
+    k = camera.intrinsics
+    across, down = (columns + 0.5 - k.cx_px) / k.fx_px, (rows + 0.5 - k.cy_px) / k.fy_px
+    turn = np.array(camera.world_from_cam.rotation_matrix())
+    return np.asarray(np.stack([across, down, np.ones(len(rows))], axis=1) @ turn.T)
+
+
+def points_of(camera: Camera, rows: Index, columns: Index, z_m: F64) -> F64:
+    """Return the points [N, 3] that pixels show at depths, relative to the tile's origin."""
+    eye_m = np.array(camera.world_from_cam.translation_m)
+    return np.asarray(rays_of(camera, rows, columns) * z_m[:, None] + eye_m)
+
+
+def _slopes(points_m: F64) -> F64:
+    """Return the slopes [2] of points [N, 3] about their middle, by least absolute errors."""
+    slopes: F64 = np.zeros(2)
+    if not len(points_m):
+        return slopes
+    level = LEVEL_WEIGHT * len(points_m) * np.eye(2)
+    at_m, heights_m = points_m[:, :2], points_m[:, 2]
+    for _ in range(ROUNDS):
+        weight = 1 / np.maximum(np.abs(at_m @ slopes - heights_m), LEAST_ERROR_M)
+        weighted = at_m * weight[:, None]
+        normal = weighted.T @ at_m + level
+        slopes = np.asarray(np.linalg.solve(normal, weighted.T @ heights_m), np.float64)
+    return slopes
+
+
+def _place_at(x_m: float, y_m: float, z_m: float, heading_rad: float) -> Place:
+    turns = round(math.tau / TURN_STEP_RAD)
+    return (
+        round(x_m / SIDE_STEP_M),
+        round(y_m / SIDE_STEP_M),
+        round(z_m / HEIGHT_STEP_M),
+        round(heading_rad / TURN_STEP_RAD) % turns,
+    )
+
+
+def _camera_at(place: Place) -> tuple[Camera, float]:
+    """Return the camera of a place of the lattice, and its heading."""
+    x_m, y_m = (SIDE_STEP_M * step for step in place[:2])
+    heading_rad = TURN_STEP_RAD * place[3]
+    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+    level, fall = math.cos(LOOKING_DOWN_RAD), math.sin(LOOKING_DOWN_RAD)
+    rows = [
+        [sin, -fall * cos, level * cos, x_m],
+        [-cos, -fall * sin, level * sin, y_m],
+        [0.0, -level, -fall, HEIGHT_STEP_M * place[2]],
+    ]
+    middle_px = WIDTH_PX / 2, HEIGHT_PX / 2
+    intrinsics = Intrinsics(WIDTH_PX, HEIGHT_PX, FOCAL_PX, FOCAL_PX, *middle_px)
+    return Camera(intrinsics, Pose.from_matrix(rows)), heading_rad

@@ -1,0 +1,216 @@
+"""Where a thing is on the ground, from sightings of several moments, places and cameras.
+
+A *sighting* says in which direction a camera saw the thing and, where it saw its foot, how far away
+that is. The two err very differently: the direction by pixels, the range by what pixels of the
+ground are worth there, which grows with the square of the distance. Directions that cross place the
+thing by themselves (parallax). With a camera at c, the unit direction n and its normal m, time t_i
+of each sighting, and the thing at p with velocity v at the time t of the newest::
+
+    q = p + v (t_i - t) - c
+    n . q = range  +- range_sigma,      m . q = 0  +- bearing_sigma * distance,      v = 0  +- SPEED
+
+which is linear least squares for p and v; the distance of a sighting without a range is that of the
+last round (Stansfield, Proc. IEE 94 IIIA, 1947). A thing stands, v = 0, unless moving explains its
+sightings better by ``EVIDENCE``.
+
+A sighting that the others contradict, like that of a camera with a wrong pose, is outvoted: the one
+that is furthest off is left out while that is more than ``LIMIT_SIGMAS`` and most remain.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.errors import InvalidInput
+
+__all__ = ["Placement", "Sighting", "placed"]
+
+SPEED_MPS = 10.0
+"""How fast things move, one standard deviation along each axis."""
+EVIDENCE = 4.0
+"""By how much the sum of squared errors, in sigmas, falls for a thing that moves: what stands, with
+errors as stated, is taken for moving in 14 % of cases (chi-square, two degrees of freedom)."""
+LIMIT_SIGMAS = 4.0
+LEAST_TO_MOVE, LEAST_SPAN_S = 3, 0.05
+"""Sightings, and the time between the first and the last, that can tell of a velocity."""
+BEARING_ROUNDS = 6
+MOST_SIGMA_M = 1000.0
+"""What is known less well than this along some direction has no place."""
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A thing seen from ``eye_m`` (x, y) at ``time_s``, in the direction ``bearing_rad`` from x
+    towards y, ``range_m`` away on the ground; ``None``: its foot was not seen.
+
+    Raises ``InvalidInput`` for a value that is not finite, or a sigma or range that is not above 0.
+    """
+
+    time_s: float
+    eye_m: tuple[float, float]
+    bearing_rad: float
+    bearing_sigma_rad: float
+    range_m: float | None = None
+    range_sigma_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        given = (self.time_s, *self.eye_m, self.bearing_rad)
+        if not all(math.isfinite(value) for value in given):
+            raise InvalidInput("sighting", f"time, place and bearing {given} are not all finite")
+        if not 0 < self.bearing_sigma_rad < math.inf:
+            raise InvalidInput("sighting.bearing_sigma_rad", _not_above_0(self.bearing_sigma_rad))
+        if self.range_m is not None:
+            for name, value in (("range_m", self.range_m), ("range_sigma_m", self.range_sigma_m)):
+                if not 0 < value < math.inf:
+                    raise InvalidInput(f"sighting.{name}", _not_above_0(value))
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where a thing is at the time of its newest sighting: x, y, and the covariance [2, 2] of that;
+    a velocity of exactly 0 for what stands; ``outvoted``: which sightings were left out."""
+
+    at_m: tuple[float, float]
+    velocity_mps: tuple[float, float]
+    covariance_m2: F64
+    outvoted: tuple[int, ...]
+
+
+def placed(sightings: Sequence[Sighting]) -> Placement:
+    """Return where a thing is that was seen so.
+
+    Raises ``InvalidInput`` where that is nowhere: no sightings, or directions without a range that
+    do not cross, or behind a camera.
+    """
+    if not sightings:
+        raise InvalidInput("sightings", "there are none; one with a range or two directions place")
+    rays = _Rays.of(sightings)
+    stands = _majority(rays, moves=False)
+    moves = _majority(rays, moves=True) if rays.can_tell_velocity else stands
+    best = moves if stands.cost - moves.cost > EVIDENCE else stands
+    x_m, y_m, vx_mps, vy_mps = (float(value) for value in best.state)
+    left_out = set(range(len(sightings))) - set(best.kept.tolist())
+    return Placement((x_m, y_m), (vx_mps, vy_mps), best.covariance_m2, tuple(sorted(left_out)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """Sightings as arrays: ``eye_m``, ``towards``, ``across`` [N, 2], the others [N];
+    ``elapsed_s``: since the newest, so at most 0; ``range_m`` NaN where there is none."""
+
+    eye_m: F64
+    towards: F64
+    across: F64
+    elapsed_s: F64
+    range_m: F64
+    range_sigma_m: F64
+    bearing_sigma_rad: F64
+
+    @staticmethod
+    def of(sightings: Sequence[Sighting]) -> _Rays:
+        times_s = np.array([each.time_s for each in sightings])
+        bearings = np.array([each.bearing_rad for each in sightings])
+        ranges = [math.nan if each.range_m is None else each.range_m for each in sightings]
+        cos, sin = np.cos(bearings), np.sin(bearings)
+        return _Rays(
+            np.array([each.eye_m for each in sightings], np.float64),
+            np.stack([cos, sin], axis=1),
+            np.stack([-sin, cos], axis=1),
+            times_s - times_s.max(),
+            np.array(ranges, np.float64),
+            np.array([each.range_sigma_m for each in sightings], np.float64),
+            np.array([each.bearing_sigma_rad for each in sightings], np.float64),
+        )
+
+    def __getitem__(self, chosen: NDArray[np.intp]) -> _Rays:
+        return _Rays(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+    @property
+    def can_tell_velocity(self) -> bool:
+        """Whether there are enough, over time."""
+        return len(self.elapsed_s) >= LEAST_TO_MOVE and self.elapsed_s.min() <= -LEAST_SPAN_S
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """x, y and velocity [4] at the newest time; ``off``: of each sighting kept, in sigmas."""
+
+    state: F64
+    covariance_m2: F64
+    off: F64
+    cost: float
+    kept: NDArray[np.intp]
+
+
+def _majority(rays: _Rays, *, moves: bool) -> _Fit:
+    """Return the fit to those sightings that do not contradict it, at least most of them."""
+    count = len(rays.elapsed_s)
+    kept = np.arange(count)
+    while True:
+        fit = _fitted(rays[kept], kept, moves=moves)
+        worst = int(np.argmax(fit.off))
+        if fit.off[worst] <= LIMIT_SIGMAS or 2 * (len(kept) - 1) <= count:
+            break
+        kept = np.delete(kept, worst)
+    if np.isinf(fit.off).any():
+        raise InvalidInput("sightings", "their directions cross behind a camera")
+    return _Fit(
+        fit.state,
+        fit.covariance_m2,
+        fit.off,
+        fit.cost + LIMIT_SIGMAS**2 * (count - len(kept)),
+        kept,
+    )
+
+
+def _fitted(rays: _Rays, kept: NDArray[np.intp], *, moves: bool) -> _Fit:
+    """Return the least squares of these sightings."""
+    seen = ~np.isnan(rays.range_m)
+    distance_m = np.where(seen, rays.range_m, 1.0)
+    for _ in range(1 if seen.all() else BEARING_ROUNDS):
+        terms, sides = _equations(rays, seen, distance_m, moves=moves)
+        normal = terms.T @ terms
+        if np.linalg.eigvalsh(normal)[0] * MOST_SIGMA_M**2 < 1:
+            raise InvalidInput(
+                "sightings",
+                f"of {len(kept)} sightings none has a range, and their directions do not cross",
+            )
+        state = np.zeros(4)
+        state[: terms.shape[1]] = np.linalg.solve(normal, terms.T @ sides)
+        at_m = state[:2] + rays.elapsed_s[:, None] * state[2:] - rays.eye_m
+        along_m = (at_m * rays.towards).sum(axis=1)
+        distance_m = np.where(seen, rays.range_m, np.maximum(np.linalg.norm(at_m, axis=1), 0.1))
+    errors = terms @ state[: terms.shape[1]] - sides
+    squares = errors[: len(kept)] ** 2 + errors[len(kept) : 2 * len(kept)] ** 2
+    off = np.where(~seen & (along_m <= 0), np.inf, np.sqrt(squares))
+    covariance = np.asarray(np.linalg.inv(normal)[:2, :2], np.float64)
+    return _Fit(state, covariance, off, float((errors**2).sum()), kept)
+
+
+def _equations(
+    rays: _Rays, seen: NDArray[np.bool_], distance_m: F64, *, moves: bool
+) -> tuple[F64, F64]:
+    """Return terms [2 N, 2] for what stands, [2 N + 2, 4] for what moves, and the right sides: all
+    in sigmas; along the directions first, then across, then the velocity's own."""
+    along = np.where(seen, 1 / np.where(seen, rays.range_sigma_m, 1.0), 0.0)
+    across = 1 / (rays.bearing_sigma_rad * distance_m)
+    terms = np.concatenate([rays.towards * along[:, None], rays.across * across[:, None]])
+    ranges_m = np.where(seen, rays.range_m, 0.0) + (rays.towards * rays.eye_m).sum(axis=1)
+    sides = np.concatenate([ranges_m * along, (rays.across * rays.eye_m).sum(axis=1) * across])
+    if not moves:
+        return terms, sides
+    elapsed_s = np.tile(rays.elapsed_s, 2)[:, None]
+    own = np.concatenate([np.zeros((2, 2)), np.eye(2) / SPEED_MPS], axis=1)
+    terms = np.concatenate([np.concatenate([terms, terms * elapsed_s], axis=1), own])
+    return terms, np.concatenate([sides, np.zeros(2)])
+
+
+def _not_above_0(value: float) -> str:
+    return f"{value:g} is not a number above 0"
