@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,10 +12,12 @@ from tyro.conf import Positional, arg
 from rfedge.arguments import FIELD, FOLDER, field_path
 
 if TYPE_CHECKING:
-    from rfcore.wire.tile_manifest import VersionLabel
+    from rfcore.wire.tile_manifest import Publication, VersionLabel
     from rfcore.wire.tiles import Tile
 
 __all__ = ["FieldList", "FieldPublish", "FieldRollback"]
+
+DAMAGED, GONE = "damaged", "gone"
 
 
 @dataclass(frozen=True)
@@ -65,12 +68,32 @@ class FieldList:
 
     folder: Annotated[Path, Positional, FOLDER]
     """The server's folder of fields (mec-server --fields)."""
+    verify: bool = False
+    """Read every archive and compare its SHA-256 with the id: of a backup, say. What is
+    damaged is an error, and what is current and gone; earlier versions may be gone."""
 
     def run(self) -> None:
-        """Print a line a version; the current one has a star."""
+        """Print a line a version; the current one has a star. Verified: ``InvalidData`` if bad."""
+        from rfcore.errors import InvalidData
         from rfcore.wire.tile_manifest import read_publication
 
         publication = read_publication(self.folder)
+        if self.verify and not publication.tiles:
+            raise InvalidData(f"{self.folder} publishes no tiles: nothing to verify")
+        states = _states(self.folder, publication) if self.verify else {}
+        self._print(publication, states)
+        needed = {i for tile in publication.current() for i in tile.archive_ids}
+        bad = [i for i, state in states.items() if state == DAMAGED or (state and i in needed)]
+        if bad:
+            text = ", ".join(f"{field_id} is {states[field_id]}" for field_id in bad)
+            raise InvalidData(
+                f"{self.folder}: {text}; copy {bad[0]}.rff from another server or a backup"
+            )
+        if self.verify:
+            whole = sum(not state for state in states.values())
+            print(f"{whole} of {len(states)} archives are whole")
+
+    def _print(self, publication: Publication, states: Mapping[str, str]) -> None:
         if not publication.tiles:
             print(f"{self.folder} publishes no tiles")
         for name, tile in sorted(publication.tiles.items()):
@@ -82,7 +105,8 @@ class FieldList:
             for number, field_id in enumerate(tile.field_ids, 1):
                 is_current = number == tile.current or number in tile.lights.values()
                 mark, light = "*" if is_current else " ", _light_text(tile.label(number))
-                print(f"{mark} {number:3}  {tile.times[number - 1]}  {field_id}{light}")
+                state = f"  {states[field_id]}" if states.get(field_id) else ""
+                print(f"{mark} {number:3}  {tile.times[number - 1]}  {field_id}{light}{state}")
 
 
 @dataclass(frozen=True)
@@ -113,6 +137,25 @@ def _current(tile: Tile, light: str) -> str:
         if one.name == light:
             return f"{tile.name}, {light}: version {one.version}, field {one.field_id}"
     return f"{tile.name}, {light}: withdrawn"
+
+
+def _states(folder: Path, publication: Publication) -> dict[str, str]:
+    """Return of each archive that is named what is wrong with it, or nothing."""
+    from hashlib import sha256
+
+    from rfcore.field.archive import read_file
+
+    states: dict[str, str] = {}
+    for tile in publication.tiles.values():
+        bases = (label.base_field_id for label in tile.labels if label.base_field_id)
+        for field_id in dict.fromkeys((*tile.field_ids, *bases)):
+            path = folder / f"{field_id}.rff"
+            if not path.exists():
+                states[field_id] = GONE
+            else:
+                whole = sha256(read_file(path)).hexdigest() == field_id
+                states[field_id] = "" if whole else DAMAGED
+    return states
 
 
 def _light_text(label: VersionLabel) -> str:

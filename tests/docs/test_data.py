@@ -1,9 +1,7 @@
 """The commands of docs/data.md do what the page says, on two small recordings of the sample."""
 
 import re
-import shlex
 import tomllib
-from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import av
 import numpy as np
 import pytest
 
+from docs.pages import Page
 from rfcore.camera import Pose
 from rfcore.dataset import read_dataset
 from rfcore.dataset.recording import SECTIONS
@@ -20,38 +19,27 @@ from rfcore.views import PosedPicture
 from rfedge.cli import parse
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
+PAGE = Page("data.md")
 SAMPLE = ROOT / "samples" / "street"
 SIZE_PX = (96, 54)
 OFFSET_S = 12.5
 BODY_FROM_CAM = Pose.from_matrix([[0, 0, 1, 1.2], [-1, 0, 0, 0], [0, -1, 0, 1.4]])
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-
-
-def commands(language: str) -> Iterator[list[str]]:
-    for block in blocks(language):
-        for line in block.splitlines():
-            if line.startswith("rfedge "):
-                yield shlex.split(line)[1:]
-
-
-@pytest.mark.parametrize("command", [*commands("sh"), *commands("text")], ids=" ".join)
+@pytest.mark.parametrize("command", [*PAGE.commands("sh"), *PAGE.commands("text")], ids=" ".join)
 def test_every_command_of_the_page_is_one(command: list[str]) -> None:
     assert parse(command) is not None
 
 
 def test_the_toml_of_the_page_has_only_keys_that_are_read() -> None:
-    content = tomllib.loads("\n".join(blocks("toml")))
+    content = tomllib.loads("\n".join(PAGE.blocks("toml")))
     assert set(content) == set(SECTIONS)
     for section, keys in content.items():
         assert set(keys) <= set(SECTIONS[section].split())
 
 
 def test_the_page_is_not_empty() -> None:
-    assert len(list(commands("sh"))) == 6
+    assert len(list(PAGE.commands("sh"))) == 6
 
 
 @pytest.mark.slow
@@ -62,7 +50,7 @@ def test_the_commands_lead_from_recordings_to_a_decoded_drive(
     monkeypatch.chdir(tmp_path)
     make_recording(Path("my-street"), "transforms_drive_empty.json", with_points=True)
     make_recording(Path("my-drive"), "transforms_drive_vehicles.json", with_points=False)
-    for command in commands("sh"):
+    for command in PAGE.commands("sh"):
         small = ["96x54" if word == "640x360" else word for word in command]
         if small[0] == "train":
             small += ["--iterations", "40", "--gaussians", "2000", "--threads", "1"]
@@ -96,7 +84,7 @@ def make_recording(folder: Path, transforms: str, *, with_points: bool) -> None:
         "k1": 0.0,
         "k2": 0.0,
     }
-    text = next(iter(blocks("toml")))
+    text = next(iter(PAGE.blocks("toml")))
     for key, value in values.items():
         text = re.sub(rf"^{key} = \S+", f"{key} = {value}", text, flags=re.MULTILINE)
     if not with_points:

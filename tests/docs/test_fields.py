@@ -1,38 +1,29 @@
 """The commands of docs/fields.md and docs/training.md are commands, and their options exist."""
 
 import re
-import shlex
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
+from docs.pages import Page
 from rfedge.arguments import IMPORTED, SAMPLES
 from rfedge.cli import parse
 from rfedge.cli.train import Train
 
-DOCS = Path(__file__).parents[2] / "docs"
-FIELDS, TRAINING = ((DOCS / name).read_text("utf-8") for name in ("fields.md", "training.md"))
+FIELDS, TRAINING = Page("fields.md"), Page("training.md").text
 
 
-def commands() -> Iterator[list[str]]:
-    for block in re.findall(r"^```sh\n(.*?)^```", FIELDS, re.MULTILINE | re.DOTALL):
-        for line in block.splitlines():
-            yield shlex.split(line)[1:]
-
-
-@pytest.mark.parametrize("command", list(commands()), ids=" ".join)
+@pytest.mark.parametrize("command", list(FIELDS.commands("sh")), ids=" ".join)
 def test_every_command_of_the_page_is_one(command: list[str]) -> None:
     assert parse(command) is not None
 
 
 def test_the_page_shows_what_can_be_done_with_a_field() -> None:
-    assert len(list(commands())) == 7
+    assert len(list(FIELDS.commands("sh"))) == 7
 
 
 def test_the_page_says_where_names_are_looked_up() -> None:
     for folder in (IMPORTED, SAMPLES):
-        assert f"`{folder}/NAME.rff`" in FIELDS
+        assert f"`{folder}/NAME.rff`" in FIELDS.text
 
 
 def test_every_option_in_the_table_of_training_is_one_of_the_verb() -> None:

@@ -1,0 +1,270 @@
+"""The commands of docs/runbook.md, on a small field, with real servers and a vehicle."""
+
+import asyncio
+import os
+import shlex
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from contextlib import AsyncExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tyro
+
+from cav_agent.config import AgentConfig, AgentLimits
+from docs.pages import Page
+from integration.conftest import serve, street, vehicle
+from mec_server.config import ServerConfig
+from rfcore.errors import FieldFormatError, InvalidData, RfedgeError
+from rfcore.wire.publish import Ground, publish
+from rfcore.wire.settings import OPTIONS
+from rfcore.wire.tile_manifest import read_publication
+from rfcore.wire.tiles import Area
+from rfedge.cli import parse
+from rfedge.demo.processes import command_of, service
+
+__all__ = ["serve", "street", "vehicle"]
+
+PAGE = Page("runbook.md")
+SERVE, ROLL, CANARY, PUBLISH, EVERYWHERE, ROLLBACK, BACKUP, RESTORE = PAGE.blocks("sh")
+PATIENT = AgentLimits(answer_s=60.0)
+"""A busy machine is not a server that is lost."""
+
+GROUND = Ground(Area((-5.0, -5.0), (5.0, 5.0)), 0.0)
+FRAMES = 6
+MOST_MORE_BYTES = 1.02
+"""From there on the page takes a version back."""
+
+
+class Operator:
+    """Types the lines of the page; ``127.0.0.1:PORT`` of the page is wherever there is a free one.
+
+    Servers are processes, or in this one with ``serve``; vehicles are in this one.
+    """
+
+    def __init__(self, stack: AsyncExitStack, vehicle: Any, serve: Any = None) -> None:
+        self.vehicles: list[Any] = []
+        self.servers: list[Any] = []
+        self._stack, self._vehicle, self._serve = stack, vehicle, serve
+        self._addresses: dict[str, str] = {}
+
+    async def types(self, block: str) -> None:
+        """Run the lines of a block, one after another."""
+        for line in block.splitlines():
+            await self._line(line)
+
+    async def _line(self, line: str) -> None:
+        words = shlex.split(line.partition(" &")[0], comments=True)
+        if words[0] == "rfedge":
+            await asyncio.to_thread(parse(words[1:]).run)
+        elif words[0] == "cav-agent":
+            await self._drive(words[1:])
+        elif words[0] == "mec-server":
+            await self._start(words[1:], line.partition("echo $! > ")[2])
+        else:
+            shell = await asyncio.create_subprocess_exec("bash", "-euc", line)
+            assert await shell.wait() == 0, line
+            if words[0] == "kill":
+                await self._ended(line)
+
+    async def _drive(self, words: list[str]) -> None:
+        page = tyro.cli(AgentConfig, config=OPTIONS, args=words)
+        changes = {
+            "drive": page.drive, "fields": page.fields, "loop": page.loop, "report": page.report,
+            "neighbours": tuple(self._addresses[place] for place in page.neighbours),
+            "limits": PATIENT,
+        }  # fmt: skip
+        drive = self._vehicle(self._addresses[page.server], **changes)
+        self.vehicles.append(await self._stack.enter_async_context(drive))
+
+    async def _start(self, words: list[str], pid_file: str) -> None:
+        page = tyro.cli(ServerConfig, config=OPTIONS, args=words)
+        if self._serve is not None:
+            server = await self._stack.enter_async_context(self._serve(fields=page.fields))
+            self._addresses[page.listen] = str(server.address)
+        else:
+            listen = self._addresses.get(page.listen, "127.0.0.1:0")
+            words = [listen if word == page.listen else word for word in words]
+            command = [*command_of("mec-server"), *words]
+            process = service(f"server{len(self.servers)}", command, Path())
+            server = await asyncio.to_thread(self._stack.enter_context, process)
+            self._addresses[page.listen] = server.address
+            Path(pid_file).write_text(str(server.process.pid))
+        self.servers.append(server)
+
+    async def _ended(self, line: str) -> None:
+        """Wait until the server that was told to stop has ended: well, and by itself."""
+        pid = int(Path(line.partition("cat ")[2].rstrip(")")).read_text())
+        (stopped,) = (server for server in self.servers if server.process.pid == pid)
+        assert await asyncio.to_thread(stopped.process.wait, 60) == 0
+
+
+@pytest.fixture
+def desk(street: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Go to a folder with what the page starts from: published fields, a drive, another field."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
+    Path("fields").mkdir()
+    publish(Path("fields"), "street", street.store / "street.rff", GROUND, datetime.now(UTC))
+    Path("drive").symlink_to(street.drive)
+    Path("better.rff").symlink_to(street.other_store / "other.rff")
+
+
+@pytest.fixture
+async def stack() -> AsyncIterator[AsyncExitStack]:
+    async with AsyncExitStack() as opened:
+        yield opened
+
+
+@pytest.mark.parametrize(
+    "command", [*PAGE.commands("sh"), *PAGE.commands("text")], ids=" ".join
+)  # fmt: skip
+def test_every_command_of_the_page_is_one(command: list[str]) -> None:
+    assert parse(command) is not None
+
+
+def every_result(vehicle: Any) -> set[str]:
+    return {line["result"] for line in vehicle.lines()}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("desk")
+async def test_servers_are_updated_one_after_another_without_a_lost_frame(
+    vehicle: Any, stack: AsyncExitStack
+) -> None:
+    operator = Operator(stack, vehicle)
+    await operator.types(SERVE)
+    (driving,) = operator.vehicles
+    await driving.until(lambda: driving.acked() >= FRAMES)
+    await operator.types(ROLL)
+    moves = [driving.handovers(cause) for cause in ("server_lost", "tile")]
+    assert moves[0] >= 1
+    assert sum(moves) == 2, "away from the first, and back to it"
+    there = driving.acked()
+    await driving.until(lambda: driving.acked() >= there + FRAMES)
+    lines = driving.lines()
+    assert every_result(driving) == {"acked"}
+    assert [line["index"] for line in lines] == [i % FRAMES for i in range(len(lines))]
+    for line in lines:
+        assert line["server_digest"] == line["reconstruction_digest"], "the same bytes"
+        assert "render" in line["references"], "never a keyframe"
+
+
+def bytes_a_frame(server: Any, since: Mapping[str, float]) -> float:
+    """Return what the page's expression says, of the frames since then."""
+    now = counted(server)
+    return (now["payload_bytes"] - since["payload_bytes"]) / (
+        now["coded_frames"] - since["coded_frames"]
+    )
+
+
+def counted(server: Any) -> dict[str, float]:
+    return {
+        name: sum(
+            sample.value
+            for metric in server.registry.collect()
+            for sample in metric.samples
+            if sample.name == f"rfedge_server_{name}_total"
+        )
+        for name in ("payload_bytes", "coded_frames")
+    }
+
+
+@pytest.mark.usefixtures("desk")
+async def test_a_canary_shows_that_bytes_rose_and_is_taken_back(
+    street: Any, vehicle: Any, serve: Any, stack: AsyncExitStack
+) -> None:
+    """The field that the page calls better is one of another place: bytes have to rise."""
+    assert "rfedge_server_payload_bytes_total" in PAGE.text
+    operator = Operator(stack, vehicle, serve)
+    await operator.types(CANARY)
+    (canary,), (driving,) = operator.servers, operator.vehicles
+    bytes_of = [await one_round(canary, driving, moved=0)]
+    for moved, block in enumerate((PUBLISH, ROLLBACK), 1):
+        await operator.types(block)
+        await canary.take_up_fields()
+        bytes_of.append(await one_round(canary, driving, moved))
+    before, bad, after = bytes_of
+    assert bad > MOST_MORE_BYTES * before
+    assert after < bad / MOST_MORE_BYTES
+    assert every_result(driving) == {"acked"}
+    versions = {name: read_publication(Path(name)).tiles["street"] for name in ("canary", "fields")}
+    assert (versions["canary"].current, len(versions["canary"].field_ids)) == (1, 2)
+    assert versions["fields"].field_ids == (street.field_id,), "the others noticed nothing"
+
+
+async def one_round(server: Any, driving: Any, moved: int) -> float:
+    """Wait until the vehicle has moved so often, and then for a round; return bytes a frame."""
+    await driving.until(lambda: driving.handovers("tile") == moved)
+    there, since = driving.acked(), counted(server)
+    await driving.until(lambda: driving.acked() >= there + 2 * FRAMES)
+    return bytes_a_frame(server, since)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files: Iterable[Path] = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return {path.name: path.read_bytes() for path in files}
+
+
+@pytest.mark.usefixtures("desk")
+async def test_what_is_published_is_backed_up_and_restored(
+    street: Any, stack: AsyncExitStack, capsys: pytest.CaptureFixture[str]
+) -> None:
+    operator = Operator(stack, None)
+    await operator.types(EVERYWHERE)
+    published = contents(Path("fields"))
+    await operator.types(BACKUP)
+    assert capsys.readouterr().out.endswith("2 of 2 archives are whole\n")
+    assert contents(Path("backup")) == published
+    damage(Path("fields") / f"{street.field_id}.rff")
+    Path("fields/tiles.json").write_text("{")
+    with pytest.raises(FieldFormatError, match=r"tiles\.json"):
+        parse(["field", "list", "fields", "--verify"]).run()
+    await operator.types(RESTORE)
+    assert contents(Path("fields")) == published
+
+
+def damage(archive: Path) -> None:
+    """Turn one bit; the length stays."""
+    data = bytearray(archive.read_bytes())
+    data[len(data) // 2] ^= 1
+    archive.write_bytes(data)
+
+
+Harm = Callable[[Path, Path], None]
+
+
+@pytest.mark.parametrize(
+    ("harm", "says"),
+    [
+        (lambda first, _: damage(first), "is damaged; copy"),
+        (lambda first, _: os.truncate(first, 0), "is damaged; copy"),
+        (lambda _, current: damage(current), "is damaged; copy"),
+        (lambda _, current: current.unlink(), "is gone; copy"),
+        (lambda first, _: first.with_name("tiles.json").unlink(), "publishes no tiles"),
+    ],
+    ids=["earlier damaged", "earlier empty", "current damaged", "current gone", "no manifest"],
+)
+@pytest.mark.usefixtures("desk")
+async def test_a_bad_copy_is_told(
+    street: Any, stack: AsyncExitStack, harm: Harm, says: str
+) -> None:
+    await Operator(stack, None).types(EVERYWHERE)
+    ids = street.field_id, street.other_id
+    harm(Path(f"fields/{ids[0]}.rff"), Path(f"fields/{ids[1]}.rff"))
+    with pytest.raises(RfedgeError, match=says) as told:
+        parse(["field", "list", "fields", "--verify"]).run()
+    assert isinstance(told.value, InvalidData)
+
+
+@pytest.mark.usefixtures("desk")
+async def test_an_earlier_version_may_be_gone(
+    street: Any, stack: AsyncExitStack, capsys: pytest.CaptureFixture[str]
+) -> None:
+    await Operator(stack, None).types(EVERYWHERE)
+    Path(f"fields/{street.field_id}.rff").unlink()
+    parse(["field", "list", "fields", "--verify"]).run()
+    out = capsys.readouterr().out
+    assert f"{street.field_id}  gone" in out
+    assert out.endswith("1 of 2 archives are whole\n")
