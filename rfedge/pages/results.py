@@ -47,6 +47,7 @@ HEADLINE_ENDS = "<!-- end -->"
 
 SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
     "adapt": adapt_section,
+    "attacks": lambda path, result: _reference(path, result, "attacks", "attacks"),
     "bench": bench_section,
     "compare": compare_section,
     "demo": demo_section,

@@ -9,6 +9,7 @@ from rfcore.errors import InvalidInput
 from rfedge.pages.attacks import AttackRow, attacks_page
 from rfedge.results import Provenance, make_result, write_result
 
+ROOT = Path(__file__).parents[2]
 MADE = Provenance("make test-attack", "abc", False, {"cpu": "C", "cores": 2, "isa": "avx2"}, {})
 HELD = AttackRow("junk: Bytes.", "vehicle", "p99 <= 9 ms; alive", "8 ms; yes", 8.0, held=True)
 MISSED = AttackRow("flood: Calls.", "none", "p99 <= 9 ms; alive", "99 ms; no", 99.0, held=False)
@@ -17,6 +18,11 @@ MISSED = AttackRow("flood: Calls.", "none", "p99 <= 9 ms; alive", "99 ms; no", 9
 def recorded(path: Path, *rows: Any, kind: str = "attacks") -> Path:
     write_result(path, make_result(kind, MADE, {"rows": rows}))
     return path
+
+
+def test_the_page_is_generated_from_the_scoreboard() -> None:
+    page = (ROOT / "docs/attacks.md").read_text()
+    assert page == attacks_page(ROOT / "results/attacks.json"), "run `make figures`"
 
 
 def test_each_attack_is_there_with_its_verdict_and_those_that_hold_are_counted(

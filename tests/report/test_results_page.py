@@ -23,7 +23,7 @@ from rfedge.results import Provenance, make_result, read_result, write_result
 ROOT = Path(__file__).parents[2]
 HOST = {"cpu": "C", "cores": 2, "isa": "avx2"}
 MADE = Provenance("rfedge bench codec", "abc123", False, HOST, {})
-ANY_ROW = {"bench", "ladder", "faults", "stability"}
+ANY_ROW = {"attacks", "bench", "ladder", "faults", "stability"}
 """Kinds that the page shows whatever their rows hold, or only counts."""
 RIG = {"link_bps": 1e6, "crf": 23.0, "rate_hz": 2.0, "max_delay_ms": 500.0}
 CODEC_ROW = {"width": 64, "sender_ms": {"render": 1.25, "total": 3.0}, "reference_ms": None}
@@ -155,7 +155,9 @@ def test_a_foreign_file_is_refused_by_name(tmp_path: Path) -> None:
 
 
 def test_an_unknown_kind_is_refused_with_those_there_are(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match=r"speed\.json: kind 'speed' is none of adapt, bench"):
+    with pytest.raises(
+        InvalidInput, match=r"speed\.json: kind 'speed' is none of adapt, attacks, bench"
+    ):
         page_of(tmp_path, "speed", rows=[])
 
 
