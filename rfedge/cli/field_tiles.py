@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +14,7 @@ from rfedge.arguments import FIELD, FOLDER, field_path
 if TYPE_CHECKING:
     from rfcore.wire.tile_manifest import Publication, VersionLabel
     from rfcore.wire.tiles import Tile
+    from rfedge.datasets.split import SplitTile
 
 __all__ = ["FieldList", "FieldPublish", "FieldRollback"]
 
@@ -25,7 +26,8 @@ class FieldPublish:
     """Publish a field as the next version of a tile; running servers take it up."""
 
     field: Annotated[Path, Positional, FIELD]
-    """The archive (.rff), or the field's name."""
+    """The archive (.rff), or the field's name; or a folder of tiles that `rfedge train` trained,
+    each of which is published under its name, for its ground."""
     folder: Annotated[Path, FOLDER]
     """The server's folder of fields (mec-server --fields)."""
     tile: Annotated[str, arg(metavar="NAME")] = "street"
@@ -51,7 +53,12 @@ class FieldPublish:
         from rfcore.wire.publish import Ground, publish
         from rfcore.wire.tile_manifest import VersionLabel
         from rfcore.wire.tiles import Area
+        from rfedge.datasets.split import read_tiles
 
+        tiles = read_tiles(self.field)
+        if tiles is not None:
+            self._publish_tiles(tiles)
+            return
         area = None
         if self.area is not None:
             west_m, south_m, east_m, north_m = self.area
@@ -60,6 +67,26 @@ class FieldPublish:
         label = VersionLabel(self.light, "", self.passes, self.time_of_day_h)
         now, path = datetime.now(UTC), field_path(self.field)
         print(_current(publish(self.folder, self.tile, path, ground, now, label), self.light))
+
+    def _publish_tiles(self, tiles: tuple[SplitTile, ...]) -> None:
+        """Publish every tile of a split, or none where a field is missing."""
+        from datetime import UTC, datetime
+
+        from rfcore.errors import InvalidInput
+        from rfcore.wire.publish import Ground, publish
+        from rfcore.wire.tiles import Area
+
+        default = {each.name: each.default for each in fields(self)}
+        for name in ("tile", "area", "margin_m", "light", "time_of_day_h", "passes"):
+            if getattr(self, name) != default[name]:
+                raise InvalidInput(name, "goes with one field: tiles.json says it of each tile")
+        archives = [self.field / f"{tile.name}.rff" for tile in tiles]
+        missing = [str(archive) for archive in archives if not archive.is_file()]
+        if missing:
+            raise InvalidInput("field", f"{', '.join(missing)} is missing: train all tiles first")
+        for tile, archive in zip(tiles, archives, strict=True):
+            ground = Ground(Area(tile.area_m[:2], tile.area_m[2:]), tile.margin_m)
+            print(_current(publish(self.folder, tile.name, archive, ground, datetime.now(UTC)), ""))
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from rfedge.cli.scene_street import SceneBuild, ScenePlan, SceneSheet, SceneSize
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["Scene", "SceneConvert", "SceneFeed", "ScenePoses", "SceneRecordCarla"]
+__all__ = ["Scene", "SceneConvert", "SceneFeed", "ScenePoses", "SceneRecordCarla", "SceneSplit"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,35 @@ class SceneConvert:
         size_px = parse_size(self.size) if self.size is not None else None
         chosen = slice(self.offset, None, self.every)
         print(convert_dataset(self.dataset, self.out, size_px, chosen))
+
+
+@dataclass(frozen=True)
+class SceneSplit:
+    """Cut a long recording into tiles of ground that overlap, for `rfedge train` to train."""
+
+    dataset: Annotated[Path, Positional, DATASET]
+    """A dataset of any format; lenses are undistorted."""
+    out: Annotated[Path, FOLDER]
+    """The folder to make: a dataset a tile, and tiles.json, which lists them."""
+    length: Annotated[float, arg(metavar="M")]
+    """Longest side of a tile's ground, m."""
+    overlap: Annotated[float, arg(metavar="M")] = 10.0
+    """How far two tiles side by side share their pictures, m."""
+    fewest: int = 8
+    """Pictures that a tile must have."""
+    points_within: Annotated[float, arg(metavar="M")] = 60.0
+    """A tile has the dataset's points on its ground and so far around, m."""
+
+    def run(self) -> None:
+        """Split; the folder appears when all of it is there."""
+        from rfedge.datasets.split import SplitSettings, split_dataset
+
+        settings = SplitSettings(self.length, self.overlap, self.fewest, self.points_within)
+        for tile in split_dataset(self.dataset, self.out, settings):
+            west, south, east, north = tile.area_m
+            ground = f"{west:.1f}, {south:.1f} to {east:.1f}, {north:.1f} m"
+            beside = ", ".join(tile.neighbours) or "no tile"
+            print(f"{self.out / tile.name}: {len(tile.pictures)} pictures, {ground}, by {beside}")
 
 
 @dataclass(frozen=True)
@@ -322,11 +351,12 @@ class SceneRecordCarla:
 
 @dataclass(frozen=True)
 class Scene:
-    """Make datasets: render a street, convert recordings, find poses, record a simulator."""
+    """Make datasets: render a street, convert, split or pose recordings, record a simulator."""
 
     verb: Annotated[
         Annotated[SceneBuild, subcommand("build")]
         | Annotated[SceneConvert, subcommand("convert")]
+        | Annotated[SceneSplit, subcommand("split")]
         | Annotated[ScenePoses, subcommand("poses")]
         | Annotated[SceneFeed, subcommand("feed")]
         | Annotated[ScenePlan, subcommand("plan")]

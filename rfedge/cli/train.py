@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from rfedge.arguments import DATASET, FOLDER, PLY, RFF, SIZE, parse_size
+from rfedge.arguments import DATASET, FOLDER, PLY, SIZE, parse_size
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,13 +20,17 @@ if TYPE_CHECKING:
     from rfcore.dataset import Dataset
     from rfcore.field import RadianceField
     from rfcore.train import NgpTrainingConfig, SplatTrainingConfig
+    from rfedge.datasets.split import SplitTile
+    from rfedge.jobs import Job, Tell
     from rfedge.training.run import Trained, TrainingJob
     from rfedge.training.view import Snapshots
 
-__all__ = ["Train"]
+__all__ = ["Train", "train_tile"]
 
 SH_RISE = 0.1
 """Share of the run after which one more band joins: the same quality, in less time."""
+TILE_CHECKPOINT_EVERY = 500
+"""Iterations: what a killed worker loses, at most."""
 DEFAULT_LIMIT = 250_000
 """Gaussians of a run limited by time: about what two cores train in five minutes."""
 
@@ -40,9 +45,14 @@ class Train:
     """
 
     dataset: Annotated[Path, Positional, DATASET]
-    """A dataset's folder, or the file that describes it (transforms.json, COLMAP, KITTI, ...)."""
-    out: Annotated[Path, RFF]
-    """The field archive to write."""
+    """A dataset's folder, or the file that describes it (transforms.json, COLMAP, KITTI, ...). Or a
+    folder that `rfedge scene split` made: then every tile is trained."""
+    out: Annotated[Path, arg(metavar="FILE.rff|FOLDER")]
+    """The field archive to write; of tiles the folder of their archives, which keeps what is
+    done."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Train tiles at the same time on the Ray at this address, or on one started here: local. Each
+    takes --threads cores; the fields are the same bytes. Needs rfedge[ray]."""
     held_out: Annotated[Path | None, DATASET] = None
     """Another dataset of the same place to measure on, never trained on."""
     holdout: Annotated[int | None, arg(metavar="N")] = None
@@ -101,9 +111,22 @@ class Train:
     """3D Gaussians, or the hash grid of Instant-NGP, which takes none of their settings."""
 
     def run(self) -> None:
-        """Train, write the archive and what was asked for beside it."""
+        """Train, write the archive and what was asked for beside it; of every tile of a split."""
         from rich.console import Console
 
+        from rfcore.errors import InvalidInput
+        from rfedge.datasets.split import read_tiles
+
+        tiles = read_tiles(self.dataset)
+        if tiles is not None:
+            self._train_tiles(tiles)
+            return
+        if self.ray is not None:
+            raise InvalidInput("ray", f"trains tiles, and {self.dataset} has no tiles.json")
+        self.train_one(Console(stderr=self.json == "-"))
+
+    def train_one(self, console: Console) -> None:
+        """Train the field of one dataset, and write it."""
         from rfcore.errors import InvalidInput
         from rfcore.field import save_field
         from rfedge.results import write_result
@@ -120,8 +143,7 @@ class Train:
             )
         if self.refine_poses and self.kind == "ngp":
             raise InvalidInput("refine_poses", "goes with --kind splats alone")
-        console = Console(stderr=self.json == "-")
-        job = self._job()
+        job = self.training_job()
         with self._shown(console) as show:
             trained = train(job, console, show)
         field = self._finished(job, trained.field, console)
@@ -137,6 +159,60 @@ class Train:
 
             write_training_report(self.report, result, field, job.held_out)
             console.print(f"{self.report}: held-out pictures and the curve over time")
+
+    def _train_tiles(self, tiles: tuple[SplitTile, ...]) -> None:
+        """Train every tile into ``out``, which becomes a folder for `rfedge field publish`."""
+        import shutil
+
+        from rfcore.extras import require
+        from rfedge.datasets.split import LIST_NAME
+        from rfedge.jobs import run_jobs
+
+        self._require_tile_options()
+        if self.ray is not None:
+            require("ray", "ray")
+        jobs = [self._tile_job(tile.name) for tile in tiles]
+        self.out.mkdir(parents=True, exist_ok=True)
+        done_before = run_jobs(jobs, partial(print, flush=True), self.ray)
+        shutil.copyfile(self.dataset / LIST_NAME, self.out / LIST_NAME)
+        print(f"{self.out}: {len(jobs)} tiles, {done_before} of them trained before")
+
+    def _require_tile_options(self) -> None:
+        from rfcore.errors import InvalidInput
+
+        refused = ["held_out", "points", "depths", "minutes", "json", "report", "view", "resume"]
+        default = {each.name: each.default for each in fields(self)}
+        for name in refused:
+            if getattr(self, name) != default[name]:
+                raise InvalidInput(name, "goes with one dataset, not with a folder of tiles")
+        if self.out.suffix == ".rff":
+            raise InvalidInput("out", f"{self.out} must be a folder: every tile has a field")
+
+    def _tile_job(self, name: str) -> Job:
+        """Return the job that trains a tile: it says what the bytes of its field depend on."""
+        from hashlib import sha256
+
+        from rfedge.jobs import Job
+        from rfedge.training.run import needed_bytes
+
+        tile = replace(
+            self,
+            dataset=(self.dataset / name).resolve(),
+            out=self.out.resolve() / f"{name}.rff",
+            ray=None,
+            name=name,
+            checkpoint_every=self.checkpoint_every or TILE_CHECKPOINT_EVERY,
+        )
+        described = (tile.dataset / "transforms.json").read_bytes()
+        settings = replace(tile, dataset=Path(name), out=Path(name))
+        return Job(
+            name=name,
+            work=partial(train_tile, tile),
+            outputs=(tile.out,),
+            made_from=f"{settings} of pictures described in {sha256(described).hexdigest()}",
+            cores=self.threads,
+            memory_bytes=needed_bytes(tile.training_job()),
+        )
 
     @contextmanager
     def _shown(self, console: Console) -> Iterator[Snapshots | None]:
@@ -173,7 +249,8 @@ class Train:
             f"{refinement.median_deg:.3f} degrees (median)"
         )
 
-    def _job(self) -> TrainingJob:
+    def training_job(self) -> TrainingJob:
+        """Return what is to be trained, and how."""
         from rfedge.training.loop import LoopLimits
         from rfedge.training.run import TrainingJob
 
@@ -213,8 +290,6 @@ class Train:
         return read_views(choice)
 
     def _config(self, exposure_varies: bool) -> SplatTrainingConfig | NgpTrainingConfig:
-        from dataclasses import replace
-
         from rfcore.train import Bands, DensityControl, NgpTrainingConfig
         from rfedge.training.run import UNLIMITED_ITERATIONS, training_config
 
@@ -244,3 +319,12 @@ class Train:
         held_out = job.held_out.pictures if job.held_out is not None else ()
         levels = LevelFitConfig(threads=self.threads)
         return finish_field(trained, job.dataset.pictures, held_out, levels, console)
+
+
+def train_tile(tile: Train, tell: Tell) -> None:
+    """Train one tile, going on after the checkpoint of a run that was stopped."""
+    from rfedge.jobs import console_of
+
+    checkpoint = tile.out.with_suffix(".ckpt")
+    replace(tile, resume=checkpoint.exists()).train_one(console_of(tell))
+    checkpoint.unlink(missing_ok=True)

@@ -16,7 +16,7 @@ from rfcore.files import whole_folder
 from rfcore.geodesy import Anchor
 from rfcore.image import write_png
 
-__all__ = ["convert_dataset"]
+__all__ = ["convert_dataset", "global_anchor"]
 
 
 def convert_dataset(
@@ -49,12 +49,13 @@ def convert_dataset(
                     time_ns=picture.time_ns if timed else None,
                 )
             )
-        write_transforms(folder, written, _global_points(dataset), _global_anchor(dataset))
+        write_transforms(folder, written, _global_points(dataset), global_anchor(dataset))
     lens = f", {dataset.undistorted} of the dataset's undistorted" if dataset.undistorted else ""
     return f"{out}: {len(written)} pictures{lens}"
 
 
-def _global_anchor(dataset: Dataset) -> Anchor | None:
+def global_anchor(dataset: Dataset) -> Anchor | None:
+    """Return the anchor of the dataset's own world, where it states one."""
     if dataset.anchor is None:
         return None
     east_m, north_m, up_m = astuple(dataset.tile_origin)

@@ -43,6 +43,7 @@ __all__ = [
     "TrainingJob",
     "available_bytes",
     "check_memory",
+    "needed_bytes",
     "ngp_training_bytes",
     "splat_training_bytes",
     "train",
@@ -214,16 +215,24 @@ def _trainer(job: TrainingJob) -> FieldTrainer:
     return SplatTrainer(pictures, points, job.config, seed=job.seed)
 
 
-def _announce(job: TrainingJob, console: Console) -> None:
-    config, pictures = job.config, job.dataset.pictures
-    sizes = [(k.width_px, k.height_px) for k in (p.camera.intrinsics for p in pictures)]
+def needed_bytes(job: TrainingJob) -> int:
+    """Return an estimate of the memory that a job takes at most."""
+    config = job.config
+    cameras = [picture.camera.intrinsics for picture in job.dataset.pictures]
+    sizes = [(k.width_px, k.height_px) for k in cameras]
     if isinstance(config, NgpTrainingConfig):
-        what, needed = "a hash grid", ngp_training_bytes(config.model, sizes)
+        return ngp_training_bytes(config.model, sizes)
+    most = max(config.gaussians, config.density.limit)
+    return splat_training_bytes(most, config.bands.degree, sizes)
+
+
+def _announce(job: TrainingJob, console: Console) -> None:
+    config, pictures, needed = job.config, job.dataset.pictures, needed_bytes(job)
+    if isinstance(config, NgpTrainingConfig):
+        what = "a hash grid"
     else:
-        most = max(config.gaussians, config.density.limit)
-        what = f"{most:,} Gaussians at most"
+        what = f"{max(config.gaussians, config.density.limit):,} Gaussians at most"
         what += "" if job.dataset.points is not None else ", from random points,"
-        needed = splat_training_bytes(most, config.bands.degree, sizes)
     length = f"{config.iterations:,} iterations"
     if job.limits.minutes is not None:
         length = f"{job.limits.minutes:g} minutes"

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cav_agent.live.clock import CaptureClock, Stamp
+from cav_agent.live.source import CaptureClock, Stamp
 from rfcore.wire.sensing import ClockKind
 
 MS, S = 1_000_000, 1_000_000_000

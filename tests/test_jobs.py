@@ -1,0 +1,119 @@
+"""Lists of jobs: what is done is skipped, what fails is named, and does not stop the rest."""
+
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from rfcore.errors import InvalidInput, RfedgeError
+from rfcore.files import write_whole
+from rfedge.jobs import Job, Tell, console_of, run_jobs
+
+
+def write_text(out: Path, text: str, tell: Tell) -> None:
+    tell(f"writing\n{len(text)} letters")
+    write_whole(out, text)
+
+
+def refuse(tell: Tell) -> None:
+    tell("looking at 3 pictures")
+    raise InvalidInput("pictures", "3 are too few")
+
+
+def break_down(tell: Tell) -> None:
+    tell("about to")
+    raise ZeroDivisionError("by hand")
+
+
+def forget(tell: Tell) -> None:
+    tell("nothing is written")
+
+
+def job(folder: Path, name: str, text: str = "text") -> Job:
+    out = folder / f"{name}.txt"
+    return Job(name, partial(write_text, out, text), (out,), f"the text {text!r}", 1, 1 << 20)
+
+
+def failing(folder: Path, name: str, work: object) -> Job:
+    assert callable(work)
+    return Job(name, work, (folder / f"{name}.txt",), name, 1, 1 << 20)
+
+
+def test_every_line_has_its_jobs_name_and_process(tmp_path: Path) -> None:
+    told: list[str] = []
+    assert run_jobs([job(tmp_path, "a")], told.append) == 0
+    begin = "a, process "
+    assert [line.startswith(begin) for line in told] == [True, True, False]
+    assert [line.rpartition(": ")[2] for line in told] == ["writing", "4 letters", "done"]
+
+
+def test_what_is_done_is_skipped_and_what_was_made_from_something_else_is_made_again(
+    tmp_path: Path,
+) -> None:
+    told: list[str] = []
+    jobs = [job(tmp_path, "a"), job(tmp_path, "b")]
+    assert run_jobs(jobs, told.append) == 0
+    written_ns = (tmp_path / "a.txt").stat().st_mtime_ns
+    again = [job(tmp_path, "a"), job(tmp_path, "b", "another text")]
+    assert run_jobs(again, told.append) == 1
+    assert (tmp_path / "a.txt").stat().st_mtime_ns == written_ns
+    assert (tmp_path / "b.txt").read_text() == "another text"
+    assert "a: done before" in told
+    assert run_jobs(again, told.append) == 2
+
+
+def test_a_file_that_was_removed_is_made_again(tmp_path: Path) -> None:
+    run_jobs([job(tmp_path, "a")], lambda _: None)
+    (tmp_path / "a.txt").unlink()
+    assert run_jobs([job(tmp_path, "a")], lambda _: None) == 0
+    assert (tmp_path / "a.txt").read_text() == "text"
+
+
+def test_failures_are_listed_at_the_end_and_stop_nobody(tmp_path: Path) -> None:
+    told: list[str] = []
+    jobs = [
+        failing(tmp_path, "bad", refuse),
+        failing(tmp_path, "worse", break_down),
+        failing(tmp_path, "lazy", forget),
+        job(tmp_path, "good"),
+    ]
+    with pytest.raises(RfedgeError) as raised:
+        run_jobs(jobs, told.append)
+    lines = str(raised.value).splitlines()
+    assert lines[0].startswith("3 of 4 jobs failed")
+    assert lines[1] == "  bad: pictures: 3 are too few"
+    assert lines[2] == "  worse: ZeroDivisionError: by hand"
+    assert lines[3] == f"  lazy: did not write {tmp_path / 'lazy.txt'}"
+    assert (tmp_path / "good.txt").read_text() == "text"
+    assert told[-1] == "good: done"
+    assert any("break_down" in line for line in told), "where an unexpected error came from"
+    with pytest.raises(RfedgeError, match=r"^3 of 4 jobs failed"):
+        run_jobs(jobs, told.append)
+    assert "good: done before" in told
+
+
+def test_a_job_that_fails_is_no_longer_taken_for_done(tmp_path: Path) -> None:
+    good = job(tmp_path, "a")
+    run_jobs([good], lambda _: None)
+    bad = Job("a", refuse, good.outputs, "another text", 1, 1 << 20)
+    with pytest.raises(RfedgeError):
+        run_jobs([bad], lambda _: None)
+    assert not good.is_done
+
+
+def test_two_jobs_of_one_name_no_output_and_no_core_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="more than one is named a"):
+        run_jobs([job(tmp_path, "a"), job(tmp_path, "a")], lambda _: None)
+    with pytest.raises(InvalidInput, match="job a makes no file"):
+        Job("a", refuse, (), "", 1, 0)
+    with pytest.raises(InvalidInput, match="0 of job a must be at least 1"):
+        Job("a", refuse, (tmp_path / "a",), "", 0, 0)
+
+
+def test_a_consoles_lines_are_told_whole_and_without_colours() -> None:
+    told: list[str] = []
+    console = console_of(told.append)
+    console.print("[bold]Training[/] a tile", end="")
+    assert told == []
+    console.print(", 3 pictures\nnext")
+    assert told == ["Training a tile, 3 pictures", "next"]
