@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from rich.console import Console
@@ -132,7 +133,10 @@ def _run_telling(job: Job, tell: Tell) -> str | None:
         for line in text.splitlines():
             tell(f"{job.name}, process {process}: {line.strip()}")
 
-    return job.run(tell_of_job)
+    begun_s = monotonic()
+    problem = job.run(tell_of_job)
+    tell_of_job(f"ended after {monotonic() - begun_s:.2f} s")
+    return problem
 
 
 class _Lines:
@@ -155,6 +159,7 @@ def _on_ray(jobs: Sequence[Job], tell: Tell, address: str) -> Iterator[tuple[Job
         return
     with _connected(address) as ray:
         machines = [machine["Resources"] for machine in ray.nodes() if machine["Alive"]]
+        tell(_reached(address, machines))
         lines = ray.remote(num_cpus=0)(_Lines).remote()
         run = ray.remote(max_retries=RETRIES)(_run_on_worker)
         running = {}
@@ -171,6 +176,13 @@ def _on_ray(jobs: Sequence[Job], tell: Tell, address: str) -> Iterator[tuple[Job
                 tell(line)
             for task in ended:
                 yield running.pop(task), _outcome(ray, task)
+
+
+def _reached(address: str, machines: Sequence[dict[str, float]]) -> str:
+    cores, memory = (sum(each.get(name, 0) for each in machines) for name in ("CPU", "memory"))
+    return (
+        f"Ray at {address}: {cores:.0f} cores, {memory / 2**30:.1f} GiB on {len(machines)} machines"
+    )
 
 
 def _run_on_worker(job: Job, lines: Any) -> str | None:

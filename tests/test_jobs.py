@@ -1,5 +1,6 @@
 """Lists of jobs: what is done is skipped, what fails is named, and does not stop the rest."""
 
+import re
 from functools import partial
 from pathlib import Path
 
@@ -43,8 +44,10 @@ def test_every_line_has_its_jobs_name_and_process(tmp_path: Path) -> None:
     told: list[str] = []
     assert run_jobs([job(tmp_path, "a")], told.append) == 0
     begin = "a, process "
-    assert [line.startswith(begin) for line in told] == [True, True, False]
-    assert [line.rpartition(": ")[2] for line in told] == ["writing", "4 letters", "done"]
+    assert [line.startswith(begin) for line in told] == [True, True, True, False]
+    said = [line.rpartition(": ")[2] for line in told]
+    assert said[:2] + said[3:] == ["writing", "4 letters", "done"]
+    assert re.fullmatch(r"ended after \d+\.\d\d s", said[2])
 
 
 def test_what_is_done_is_skipped_and_what_was_made_from_something_else_is_made_again(

@@ -112,8 +112,8 @@ class LoadTest:
     def run(self) -> None:
         """Run, write the report, print the rows; fail if the asked number is not held."""
         from rfcore.errors import InvalidInput, RfedgeError
-        from rfedge.loadtest.command import Command
         from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
+        from rfedge.loadtest.result import Command
         from rfedge.loadtest.run import TestBed
 
         if not 1 <= self.runs <= 100 or (self.find_limit and self.runs > 1):
@@ -176,6 +176,11 @@ class EvalScale:
     """Run the cases behind Envoy; --no-envoy: only what else is asked for."""
     nats: bool = False
     """Also restart the NATS that two servers publish to, `rounds` times (Debian's nats-server)."""
+    ray_tiles: Annotated[Path | None, FOLDER] = None
+    """Also train the tiles that `rfedge scene split` put there: one after another, on a Ray started
+    here, and again with a worker killed; needs rfedge[ray], and three trainings' time."""
+    ray_iterations: int = 2000
+    """Iterations of each of those."""
     field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
     """Field archive that the servers publish."""
     drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")
@@ -211,15 +216,23 @@ class EvalScale:
             planned_hz=self.planned_hz,
             planned_runs=self.planned_runs,
             envoy=self.envoy,
-            also=_nats_cases() if self.nats else (),
+            also=self._further_cases(),
         )
         run_scale(job, Console())
 
+    def _further_cases(self) -> tuple[Case, ...]:
+        cases: list[Case] = []
+        if self.nats:
+            from rfedge.loadtest.nats import nats_rows
 
-def _nats_cases() -> tuple[Case, ...]:
-    from rfedge.loadtest.nats import nats_rows
+            cases.append(nats_rows)
+        if self.ray_tiles is not None:
+            from rfcore.extras import require
+            from rfedge.loadtest.ray import ray_case
 
-    return (nats_rows,)
+            require("ray", "ray")
+            cases.append(ray_case(self.ray_tiles, self.ray_iterations))
+        return tuple(cases)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,9 @@
 """The result of a load test: JSON, report, figure, table, and its section of the results page.
 
 ``record`` collects rows of several runs in one file, each with its own command and revision.
+
+``Command`` is what ``rfedge loadtest`` runs: one load, or a search for the limit; then files and a
+table.
 """
 
 from __future__ import annotations
@@ -18,9 +21,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from rich.console import Console
 
 from rfcore.files import write_whole
-from rfedge.loadtest.plan import Mode, Vehicles
-from rfedge.loadtest.planning import MOST, RATES_MBPS, Traffic, vehicles_carried
-from rfedge.loadtest.run import LoadRow, Run
+from rfedge.loadtest.plan import Load, Mode, Vehicles
+from rfedge.loadtest.planning import MOST, RATES_MBPS, Traffic, largest_held, vehicles_carried
+from rfedge.loadtest.run import LoadRow, Run, TestBed, run_load
 from rfedge.report.charts import GRID, INK, MUTED, PAYLOAD, RENDER, STYLE, new_axes, svg
 from rfedge.report.tables import cell, heading, print_table, table
 from rfedge.results import (
@@ -33,6 +36,7 @@ from rfedge.results import (
 )
 
 __all__ = [
+    "Command",
     "LoadResult",
     "latency_chart",
     "load_section",
@@ -41,6 +45,48 @@ __all__ = [
     "uplink_chart",
     "write_load_result",
 ]
+
+
+@dataclass(frozen=True)
+class Command:
+    """A load on a test bed; files go to ``out``, rows also to ``record`` if there is one."""
+
+    load: Load
+    bed: TestBed
+    out: Path
+    record: Path | None = None
+
+    def run(self, *, find_limit: bool, repeated: int = 1) -> LoadResult:
+        """Run ``repeated`` times, or search for the largest number of vehicles that is held."""
+        console = Console()
+        runs: list[Run] = []
+
+        def held(vehicles: int) -> bool:
+            console.print(f"[bold]{vehicles}[/] vehicles, {self.load.mode}, {self.load.hz:g} Hz")
+            runs.append(run_load(replace(self.load, vehicles=vehicles), self.bed))
+            console.print(f"  {_outcome(runs[-1])}")
+            return runs[-1].verdict.held
+
+        if find_limit:
+            largest_held(self.load.vehicles, held)
+        for _ in range(0 if find_limit else repeated):
+            held(self.load.vehicles)
+        if repeated > 1:
+            runs = [replace(x, row=replace(x.row, run=n)) for n, x in enumerate(runs, 1)]
+        result = LoadResult(sorted(runs, key=lambda run: run.load.vehicles))
+        write_load_result(result, self.out)
+        if self.record is not None:
+            record(self.record, result)
+        print_runs(console, result)
+        for name in ("report.html", "result.json", "vehicles_vs_uplink.svg"):
+            console.print(f"  {self.out / name}")
+        return result
+
+
+def _outcome(run: Run) -> str:
+    verdict = run.verdict
+    found = "held" if verdict.held else "not held: " + "; ".join(verdict.broken)
+    return f"{found}; limit: {verdict.limited_by}"
 
 
 def latency_chart(latency_ms: Mapping[str, Sequence[float]], deadline_ms: float) -> str:

@@ -11,10 +11,10 @@ from mec_server.config import AdmissionLimits
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.field import render_field_view
 from rfcore.field.quality import FULL
-from rfedge.loadtest.command import Command
 from rfedge.loadtest.fleet import FleetSpec, run_fleet
 from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
+from rfedge.loadtest.result import Command
 from rfedge.loadtest.run import TestBed
 from rfedge.loadtest.server import KeptRenders, passing, with_kept_renders
 

@@ -1,9 +1,6 @@
 """``rfedge train`` of the tiles of a split: here or on Ray, killed or not, the same bytes."""
 
 import json
-import os
-import re
-import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -19,6 +16,7 @@ from rfcore.wire.tile_manifest import read_publication
 from rfedge.cli.field_tiles import FieldPublish
 from rfedge.cli.train import Train
 from rfedge.datasets.split import SplitSettings, split_dataset
+from rfedge.loadtest.ray import train_tiles
 
 OPTIONS = {"iterations": 60, "gaussians": 200, "threads": 1, "plain": True, "checkpoint_every": 20}
 
@@ -140,39 +138,19 @@ def test_nothing_is_published_where_a_tile_is_missing(trained: Path, tmp_path: P
     assert not (tmp_path / "published").exists()
 
 
-def train_on_ray(split: Path, out: Path, iterations: int, kill: bool) -> tuple[list[str], int]:
-    """Train on a Ray of this machine; return its lines and how many workers were killed."""
-    command = [sys.executable, "-m", "rfedge", "train", str(split), "--out", str(out)]
-    options = {**OPTIONS, "iterations": iterations}
-    for name, value in options.items():
-        flag = f"--{name.replace('_', '-')}"
-        command += [flag] if value is True else [flag, str(value)]
-    lines, killed = [], 0
-    with subprocess.Popen(
-        [*command, "--ray", "local"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            lines.append(line.rstrip())
-            at_work = re.match(r"tile-0-0, process (\d+): +(\d+)%", line)
-            if kill and not killed and at_work and int(at_work[2]) >= 10:
-                os.kill(int(at_work[1]), signal.SIGKILL)
-                killed += 1
-    assert process.returncode == 0, "\n".join(lines)
-    return lines, killed
-
-
 @pytest.mark.slow
 def test_on_ray_the_fields_are_the_same_bytes_also_when_a_worker_is_killed(
     split: Path, tmp_path: Path
 ) -> None:
+    options = ["--iterations", "4000", "--gaussians", "200", "--threads", "1", "--plain"]
+    options += ["--checkpoint-every", "20"]
     here, there = tmp_path / "here", tmp_path / "there"
     replace(verb(split, here), iterations=4000).run()
-    lines, killed = train_on_ray(split, there, 4000, kill=True)
-    assert killed == 1
-    workers = {re.match(r"tile-0-0, process (\d+)", line) for line in lines} - {None}
-    assert len({found[1] for found in workers if found}) == 2, "\n".join(lines)
-    assert any("going on after iteration" in line for line in lines)
+    run = train_tiles(split, there, options, "local", kill_at="tile-0-0")
+    assert run.killed == 1
+    assert len(run.workers_of("tile-0-0")) == 2
+    assert any("going on after iteration" in line for line in run.lines)
+    assert len(run.work_s) == 2
     assert fields_of(there) == fields_of(here)
     assert len(fields_of(here)) == 2
 
