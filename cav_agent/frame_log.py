@@ -232,6 +232,7 @@ def _coding_of(result: FrameResult) -> dict[str, Any]:
         "tries": encoded.tries if encoded else None,
         "rung": encoded.rung.name if encoded else None,
         "crf": encoded.crf if encoded else None,
+        "relit": packet.relit if packet else None,
         "light_field": encoded.field_id or None if encoded else None,
         "pose": _pose_of(encoded.fix) if encoded and encoded.fix else None,
         "target_bytes": result.budget.target_bytes if result.budget else None,

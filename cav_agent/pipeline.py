@@ -17,7 +17,7 @@ from cav_agent.frames import Capture, EncodedFrame, EncodeJob, RigPose
 from cav_agent.lights import TileLights
 from cav_agent.rig_poses import RigPoses, TrackedRig
 from rfcore.camera import Camera, Intrinsics, Pose, camera_on_rig
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import CodecConfig, LightChange
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice, without_field
@@ -95,6 +95,8 @@ class PipelineOptions:
     """Fields of other lights, of which the nearest is coded against; without ``tracking``."""
     check_decode: bool = False
     """Decode every slice on the vehicle, too, to see that it is what its coder promised."""
+    light: LightChange = LightChange.AUTO
+    """Whether the render's light may be changed before it is predicted from."""
 
 
 class Stopwatch:
@@ -221,9 +223,11 @@ class Pipeline:
         budget, limit_bytes = job.budget, self._options.limit_bytes
         if budget is not None:
             limit_bytes = min(limit_bytes, budget.limit_bytes)
+        changes_light = rung.photometric and self._options.light is LightChange.AUTO
         return FrameChoice(
             references=None if rung.references else RENDER_ONLY,
-            photometric=None if rung.photometric else (),
+            photometric=None if changes_light else (),
+            relight=None if job.relights else False,
             max_references=max(1, rung.references),
             block_means=not job.exact,
             limit_bytes=limit_bytes,

@@ -114,6 +114,7 @@ class AgentSession:
         self.state = LinkState.DISCONNECTED
         self.session_id = ""
         self.exact: bool | None = None
+        self.relights = False
         self.is_sent_away = False
         self.rate_limit_hz = 0.0
         self.failed: RfedgeError | None = None
@@ -192,10 +193,10 @@ class AgentSession:
     def receive(self, message: ServerMessage, now: float) -> None:
         """Take one message of the server."""
         match message:
-            case Welcome(session_id, exact):
+            case Welcome(session_id, exact, rate_hz, relights):
                 self.state = LinkState.STREAMING
                 self.session_id, self.exact = session_id, exact
-                self.rate_limit_hz = message.rate_hz
+                self.rate_limit_hz, self.relights = rate_hz, relights
             case Credit(camera_id, frames) if camera_id in self._cameras:
                 camera = self._cameras[camera_id]
                 camera.granted = max(camera.granted, frames)
@@ -270,7 +271,16 @@ class AgentSession:
         exact, chain = bool(self.exact), self._of(capture.camera_id).chain
         base = chain.base if exact else None
         budget = self._budgets.get(capture.camera_id)
-        self._job = EncodeJob(capture, chain.epoch, self._connection, base, exact, budget, now)
+        self._job = EncodeJob(
+            capture,
+            chain.epoch,
+            self._connection,
+            base,
+            exact=exact,
+            relights=self.relights,
+            budget=budget,
+            started_s=now,
+        )
         chain.started()
         return self._job
 

@@ -316,6 +316,7 @@ class StreamFactory:
         is_alone = on_rig is None
         options = PipelineOptions(
             check_decode=config.coding.check_decode,
+            light=config.coding.light,
             rungs=prepared.rungs,
             steering=camera.steering,
             threads=config.render.threads,

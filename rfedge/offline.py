@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import tee
 
 from rfcore.codec.decoder import DeltaDecoder
-from rfcore.codec.h264.config import DEFAULT_EFFORT, CodecConfig
+from rfcore.codec.h264.config import DEFAULT_EFFORT, CodecConfig, LightChange
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.codec.h264.splice import PictureDecoder
 from rfcore.codec.packet import DeltaPacket
@@ -152,6 +152,8 @@ class CodingSettings:
     crf: float = 23.0
     steering: Steering = NO_STEERING
     check_decode: bool = False
+    light: LightChange = LightChange.AUTO
+    """Whether the light of renders is changed where that saves bits."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +195,8 @@ def _placed(
 ) -> Iterator[FrameInput]:
     """Read one picture after another and render the field at the pose it is coded at."""
     intrinsics = dataset.pictures[0].camera.intrinsics
-    choice = replace(FITTING, qp_map=settings.steering.qp_map)
+    photometric = () if settings.light is LightChange.OFF else None
+    choice = replace(FITTING, qp_map=settings.steering.qp_map, photometric=photometric)
     for picture in dataset.pictures:
         if picture.camera.intrinsics != intrinsics:
             raise DatasetError(f"{picture.name}: its camera differs from the first picture's")

@@ -22,14 +22,13 @@ from rfcore.codec.h264.pcm_picture import without_zeros
 from rfcore.codec.h264.splice import PictureDecoder, SpliceDecoder
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.prediction import Prediction
-from rfcore.codec.references import is_temporal
 from rfcore.codec.state import DecoderState, Past
 from rfcore.errors import BitstreamError, CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
 from rfcore.native.digest import digest_pair
 from rfcore.views import FieldView
 
-__all__ = ["Decoded", "DeltaDecoder"]
+__all__ = ["Decoded", "DeltaDecoder", "prediction_of"]
 
 Clock = Callable[[], int]
 
@@ -106,7 +105,7 @@ class DeltaDecoder:
         try:
             past = self._past(state, packet)
             self._check_payload(packet)
-            prediction = Prediction.under_light(view, packet.photometric, past)
+            prediction = prediction_of(packet, view, past)
             pictures = _pictures(packet, prediction)
             made_ns = self._clock_ns()
             spliced_ns, frame = self._reconstruct(packet, pictures)
@@ -169,7 +168,7 @@ class DeltaDecoder:
 
     def _past(self, state: DecoderState, packet: DeltaPacket) -> Past | None:
         """Return the earlier frame the packet predicts from, if it does."""
-        if not is_temporal(packet.references):
+        if not packet.needs_base:
             return None
         if not self._exact:
             raise PacketRejected(
@@ -204,6 +203,16 @@ class DeltaDecoder:
             return spliced_ns, self._splice.decode(packet.payload)
         except CodecError as error:
             raise PacketRejected(RejectReason.DECODER_FAILED, str(error)) from error
+
+
+def prediction_of(packet: DeltaPacket, view: FieldView, past: Past | None) -> Prediction:
+    """Return what ``packet`` was predicted from; raise ``PacketRejected`` if that cannot be."""
+    if not packet.relit:
+        return Prediction.under_light(view, packet.photometric, past)
+    try:
+        return Prediction.relit(view, past)
+    except InvalidInput as error:
+        raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
 
 
 def _pictures(packet: DeltaPacket, prediction: Prediction) -> tuple[I420, ...]:

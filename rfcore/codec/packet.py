@@ -36,7 +36,8 @@ class DeltaPacket:
     ``reconstruction_digest`` is of the picture the receiver must get (``I420.digest``).
     ``base_digest`` names the earlier frame that ``references`` call for by the first bytes of its
     reconstruction digest (4 as we write it, up to all 16), and is empty when they call for none;
-    ``photometric`` changes the render before it is used.
+    ``photometric`` changes the render before it is used. A frame that is ``relit`` has its render
+    mapped to the light of the frame ``base_digest`` names (``rfcore.native.warp.relight_i420``).
     ``crc32`` covers all other fields (``expected_crc32``): a damaged sequence number would
     otherwise make every later packet look stale.
     """
@@ -51,6 +52,7 @@ class DeltaPacket:
     references: References = RENDER_ONLY
     base_digest: bytes = b""
     photometric: Photometric = ()
+    relit: bool = False
 
     def __post_init__(self) -> None:
         _require_number("epoch", self.epoch, _UINT64)
@@ -59,16 +61,23 @@ class DeltaPacket:
         check_references(self.references)
         if self.photometric:
             check_photometric(self.photometric)
-        base_lengths = _BASE if is_temporal(self.references) else _NOTHING
+            if self.relit:
+                raise InvalidInput("packet.relit", "photometric already changes the render")
+        base_lengths = _BASE if self.needs_base else _NOTHING
         _require_length("render_digest", self.render_digest, _DIGEST)
         _require_length("render_block_means", self.render_block_means, _BLOCK_MEANS)
         _require_length("reconstruction_digest", self.reconstruction_digest, _DIGEST)
         _require_length("base_digest", self.base_digest, base_lengths)
 
+    @property
+    def needs_base(self) -> bool:
+        """Whether an earlier frame is needed, which ``base_digest`` names."""
+        return self.relit or is_temporal(self.references)
+
     def expected_crc32(self) -> int:
         """Return zlib.crc32 of epoch and sequence (8 bytes each, big-endian), the digests in the
-        order of the fields, the payload, a byte for each reference, the base digest, and the
-        photometric numbers (2 bytes each)."""
+        order of the fields, the payload, a byte for each reference, the base digest, the
+        photometric numbers (2 bytes each), and a byte 1 if the frame is relit."""
         head = (
             self.epoch.to_bytes(8, "big"),
             self.sequence.to_bytes(8, "big"),
@@ -80,6 +89,7 @@ class DeltaPacket:
             bytes(self.references),
             self.base_digest,
             *(number.to_bytes(2, "big", signed=True) for number in self.photometric),
+            b"\x01" if self.relit else b"",
         )
         crc = zlib.crc32(self.payload, zlib.crc32(b"".join(head)))
         return zlib.crc32(b"".join(tail), crc)

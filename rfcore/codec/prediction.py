@@ -13,7 +13,7 @@ from rfcore.codec.references import Reference, References
 from rfcore.codec.state import Past
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.native.warp import correct_i420, warp_i420
+from rfcore.native.warp import correct_i420, relight_i420, warp_i420
 from rfcore.views import FieldView
 
 __all__ = ["Prediction"]
@@ -30,20 +30,41 @@ class Prediction:
     view: FieldView
     past: Past | None = None
     threads: int = 1
+    photometric: Photometric = ()
+    """How the light of the render of ``view`` was changed by numbers."""
+    is_relit: bool = False
+    """Whether its light was learnt from the frame in ``past``."""
+    plain_render: I420 | None = None
+    """The render of the field, where that of ``view`` is under another light."""
 
     @staticmethod
     def under_light(
         view: FieldView, photometric: Photometric, past: Past | None, threads: int = 1
     ) -> Prediction:
         """Return the prediction with the render of ``view`` changed by ``photometric``."""
-        return Prediction(replace(view, render=adapt(view.render, photometric)), past, threads)
+        if not photometric:
+            return Prediction(view, past, threads)
+        lit = replace(view, render=adapt(view.render, photometric))
+        return Prediction(lit, past, threads, photometric, plain_render=view.render)
+
+    @staticmethod
+    def relit(view: FieldView, past: Past | None, threads: int = 1) -> Prediction:
+        """Return the prediction with the render of ``view`` under the light ``past`` was seen in.
+
+        Raises ``InvalidInput`` without an earlier frame, or for one of another size.
+        """
+        if past is None:
+            raise InvalidInput("relit", "there is no earlier frame to learn the light from")
+        render = relight_i420(past.picture, past.field_render, view.render)
+        lit = replace(view, render=render)
+        return Prediction(lit, past, threads, is_relit=True, plain_render=view.render)
 
     def past_of(self, picture: I420, digest: bytes | None = None) -> Past:
         """Return what later frames predict from once this frame was decoded to ``picture``.
 
         ``digest``: the picture's, where it is known already.
         """
-        return Past(picture, replace(self.view, opacity=None), digest)
+        return Past(picture, replace(self.view, opacity=None), digest, self.plain_render)
 
     @property
     def available(self) -> frozenset[Reference]:

@@ -34,6 +34,13 @@ class Past:
     view: FieldView
     known_digest: bytes | None = None
     """The picture's digest, where it was computed already."""
+    plain_render: I420 | None = None
+    """The render as the field shows it, where ``view`` has it under another light."""
+
+    @property
+    def field_render(self) -> I420:
+        """The render as the field shows it, whatever the frame's light."""
+        return self.view.render if self.plain_render is None else self.plain_render
 
     @cached_property
     def digest(self) -> bytes:

@@ -156,6 +156,14 @@ class NgpTrainer:
 _U8 = NDArray[np.uint8]
 
 def block_costs(frame: _U8, reference: _U8, satd: _I32, ssd: _I32) -> None: ...
+def relight_i420(
+    seen: tuple[_U8, _U8, _U8],
+    seen_render: tuple[_U8, _U8, _U8],
+    render: tuple[_U8, _U8, _U8],
+    y: _U8,
+    u: _U8,
+    v: _U8,
+) -> None: ...
 def warp_i420(
     previous: tuple[_U8, _U8, _U8],
     previous_depth: _F32,
@@ -190,6 +198,18 @@ def carry_to_view(
     limits: Sequence[float],
     rgb: _U8,
     chosen: _U8,
+) -> None: ...
+def draw_patch(
+    samples: _F32,
+    numbers: Sequence[float],
+    source: int,
+    limits: Sequence[float],
+    box: Sequence[int],
+    camera: Sequence[float],
+    rgb: _U8,
+    depth: _F32,
+    chosen: _U8,
+    nearest: _F32,
 ) -> None: ...
 
 # --- h264 -------------------------------------------------------------------

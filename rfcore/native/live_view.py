@@ -1,7 +1,8 @@
-"""What a live picture changes in a field, and several of those carried to another view of it.
+"""What a live picture changes in a field, and several of those carried to another view of it; and
+cut-outs of pictures, upright at their own depth, drawn there.
 
-``csrc/picture/live_view.cpp`` computes exactly what is defined here, in float32 without fused
-operations: the same bytes on every machine.
+``csrc/picture/live_view.cpp`` and ``patch.cpp`` compute exactly what is defined here, in float32
+without fused operations: the same bytes on every machine.
 
 *Change* (``live_difference``). A picture is ``gain * colour + offset`` in the light of the day; its
 difference from the field's render, in the light of the field, is
@@ -28,6 +29,18 @@ of the view's resolution, ``r = fx' / fx * z / Pz``. Its weight is the source's 
 Its change is taken at (u, v) bilinearly, times the source's ``fade``. Of several that vouch, the
 weighted median by the sum of the three channels counts: one that is alone with its opinion is
 outvoted by two. The picture is ``level(colour)`` plus that, rounded and clamped likewise.
+
+*Patches* (``draw_patch``). With the ray of a pixel as above, and R, t mapping points of the view's
+axes into those of the patch's camera::
+
+    T = R[:, 0] * ray_x + (R[:, 1] * ray_y + R[:, 2]);   z = (z_m - t_z) / T_z;   P = z * T + t
+    (u, v) = (Px / z_m * fx' + (cx' - 0.5) - left, Py / z_m * fy' + (cy' - 0.5) - top)
+
+The patch is sampled there bilinearly, upper row first, colours weighted by its mask, so that what
+is beside a thing does not bleed into it; outside of it there is nothing. A pixel is the thing's
+where T_z > 1e-6, z lies between ``NEAREST_M`` and ``Canvas.nearest_m``, and the mask is above
+``LEAST_MASK``. Its colour is that behind it plus ``fade`` times the difference, rounded, halves to
+even, and clipped to 0..255; its depth is z.
 """
 
 from __future__ import annotations
@@ -38,7 +51,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera
+from rfcore.camera import Camera, Pose
 from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
 from rfcore.native import _native
@@ -46,13 +59,17 @@ from rfcore.views import View
 
 __all__ = [
     "COVERED",
+    "LEAST_MASK",
     "MOST_DISTANCE_M",
     "MOST_SOURCES",
     "NOBODY",
     "OWN_LIGHT",
+    "Canvas",
     "Light",
     "LiveSource",
+    "Patch",
     "carry_to_view",
+    "draw_patch",
     "live_difference",
 ]
 
@@ -70,6 +87,7 @@ RELATIVE_DEPTH, ABSOLUTE_DEPTH_M = 0.08, 0.1
 LEAST_COSINE = 0.5
 LEAST_RESOLUTION = 0.25
 
+LEAST_MASK = 0.5
 MOST_SOURCES = 16
 NOBODY = 255
 
@@ -97,6 +115,35 @@ class LiveSource:
     depth: F32
     weight: float
     fade: float
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A cut-out of the picture of ``camera``, from pixel (``left``, ``top``) on, that stands
+    ``z_m`` along the optical axis.
+
+    ``samples``: float32 [h, w, 4], red, green and blue (levels) times the mask, and the mask: 1
+    where it shows the thing, 0 beside it.
+    """
+
+    camera: Camera
+    samples: F32
+    left: int
+    top: int
+    z_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Canvas:
+    """What is drawn on, the view of ``camera``: ``rgb`` uint8 [H, W, 3], ``depth`` float32 [H, W],
+    metres; ``chosen`` uint8 [H, W], whose picture a pixel is; ``nearest_m`` float32 [H, W], up to
+    which depth something is in front of what is there."""
+
+    camera: Camera
+    rgb: Rgb
+    depth: F32
+    chosen: NDArray[np.uint8]
+    nearest_m: F32
 
 
 def live_difference(rgb: Rgb, view: View, light: Light) -> tuple[F32, F32]:
@@ -154,6 +201,45 @@ def carry_to_view(
         chosen,
     )
     return rgb, chosen
+
+
+def draw_patch(
+    canvas: Canvas,
+    patch: Patch,
+    patch_from_view: Pose,
+    box: tuple[slice, slice],
+    source: int,
+    fade: float,
+) -> None:
+    """Draw on ``canvas``, within rows and columns ``box``, what is seen of a ``patch`` of picture
+    ``source``; 0 < ``fade`` <= 1 of it is left. ``patch_from_view`` maps points of the view's axes
+    into those of the patch's camera.
+
+    Raises ``InvalidInput`` for a box outside of the canvas, or a patch at no depth.
+    """
+    rows, columns = box
+    height, width = canvas.depth.shape
+    if not (0 <= rows.start <= rows.stop <= height and 0 <= columns.start <= columns.stop <= width):
+        raise InvalidInput("patch.box", f"{box} is outside of {width}x{height} px")
+    if not patch.z_m > 0:
+        raise InvalidInput("patch.z_m", f"{patch.z_m} m must be above 0")
+    if not 0 <= source < NOBODY:
+        raise InvalidInput("patch.source", f"{source} is outside 0..{NOBODY - 1}")
+    numbers = [value for row in patch_from_view.rotation_matrix() for value in row]
+    numbers += [*patch_from_view.translation_m, *_pinhole(patch.camera)]
+    numbers += [float(patch.left), float(patch.top), patch.z_m, fade]
+    _native.draw_patch(
+        np.ascontiguousarray(patch.samples),
+        numbers,
+        source,
+        [NEAREST_M, LEAST_MASK],
+        [rows.start, rows.stop, columns.start, columns.stop],
+        _pinhole(canvas.camera),
+        canvas.rgb,
+        canvas.depth,
+        canvas.chosen,
+        canvas.nearest_m,
+    )
 
 
 def _numbers(source: LiveSource, camera: Camera) -> tuple[F32, F32, list[float]]:

@@ -280,6 +280,7 @@ def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
             references=_references_from_wire(tuple(frame.references)),
             base_digest=frame.base_digest,
             photometric=tuple(frame.photometric),
+            relit=frame.relit,
         )
     except InvalidInput as error:
         raise InvalidInput(error.field.replace("packet.", "frame.", 1), error.problem) from error
@@ -309,6 +310,7 @@ def _frame_to_wire(frame: Frame) -> pb.Frame:
         crc32=packet.crc32,
         base_digest=packet.base_digest,
         photometric=packet.photometric,
+        relit=packet.relit,
         capture_clock=clock_to_wire(frame.clock),
         localisation=localisation_to_wire(frame.localisation),
         instant=frame.instant,

@@ -135,12 +135,14 @@ class Frame:
 class Welcome:
     """The server accepted Hello; ``exact`` says whether the renderers agree to the bit.
 
-    Each camera may send ``rate_hz`` pictures per second; 0: as many as Credit allows.
+    Each camera may send ``rate_hz`` pictures per second; 0: as many as Credit allows. ``relights``:
+    whether the server takes frames whose render is relit.
     """
 
     session_id: str
     exact: bool
     rate_hz: float = 0.0
+    relights: bool = False
 
 
 @dataclass(frozen=True)

@@ -149,7 +149,8 @@ class ObjectsRequest:
 @dataclass(frozen=True)
 class StreetObject:
     """A thing that the field does not have: see twin.proto. ``at_m`` is the foot of the side that
-    is seen, relative to the tile's origin; ``seen_by``: (vehicle id, camera id)."""
+    is seen, relative to the tile's origin; ``seen_by``: (vehicle id, camera id). ``is_doubtful``:
+    only pictures show it that disagree with the field in many places, as with a wrong pose."""
 
     object_id: int
     at_m: Vec3
@@ -160,6 +161,7 @@ class StreetObject:
     age_s: float
     unseen_s: float
     seen_by: tuple[tuple[str, str], ...]
+    is_doubtful: bool = False
 
 
 @dataclass(frozen=True)
@@ -318,6 +320,7 @@ def _object_to_wire(each: StreetObject) -> pb.StreetObject:
         age_ms=round(1e3 * each.age_s),
         unseen_ms=round(1e3 * each.unseen_s),
         seen_by=[pb.Sighting(vehicle_id=v, camera_id=c) for v, c in each.seen_by],
+        doubtful=each.is_doubtful,
     )
 
 
@@ -342,6 +345,7 @@ def _object_from_wire(each: pb.StreetObject) -> StreetObject:
             )
             for s in each.seen_by
         ),
+        each.doubtful,
     )
 
 

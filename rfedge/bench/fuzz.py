@@ -23,7 +23,7 @@ from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket
-from rfcore.codec.references import INTRA, Reference
+from rfcore.codec.references import INTRA, Reference, is_temporal
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.codec.state import DecoderState
 from rfcore.errors import CodecError, PacketRejected
@@ -43,7 +43,7 @@ SHIFT_PX = 3.0
 LIGHT = (4096, 0, 0, 32, 0, 4096, 0, 0, 0, 0, 4096, 0)
 """Two levels brighter."""
 
-CHOICES = (
+PLAIN = (
     FrameChoice(INTRA),
     FrameChoice((Reference.RENDER,)),
     FrameChoice((Reference.PREVIOUS,)),
@@ -51,6 +51,11 @@ CHOICES = (
     FrameChoice((Reference.PREVIOUS, Reference.RENDER, Reference.CORRECTION)),
     FrameChoice((Reference.RENDER, Reference.WARP), photometric=LIGHT),
     FrameChoice((Reference.CORRECTION,), pose_only=True),
+)
+CHOICES = (
+    *(replace(choice, relight=False) for choice in PLAIN),
+    FrameChoice((Reference.PREVIOUS, Reference.RENDER), relight=True),
+    FrameChoice((Reference.RENDER,), relight=True),
 )
 
 Rng = np.random.Generator
@@ -189,15 +194,19 @@ def exchange_references(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     """Name other references, in another order."""
     count = int(rng.integers(4))
     order = [Reference(int(n)) for n in rng.permutation(4)[:count] + 1]
-    needs = any(reference is not Reference.RENDER for reference in order)
+    needs = packet.relit or any(reference is not Reference.RENDER for reference in order)
     base = (packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)) if needs else b""
     return replace(packet, references=tuple(order), base_digest=base)
 
 
 def relight(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
-    """Send another matrix, as large as it may be."""
+    """Send another matrix, as large as it may be, or the other way of relighting."""
     matrix = tuple(int(n) for n in rng.integers(-(1 << 15), 1 << 15, 12))
-    return replace(packet, photometric=matrix if rng.integers(4) else ())
+    relit = not rng.integers(3)
+    photometric = matrix if not relit and rng.integers(4) else ()
+    base = packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)
+    needed = base if relit or is_temporal(packet.references) else b""
+    return replace(packet, photometric=photometric, base_digest=needed, relit=relit)
 
 
 MUTATIONS: dict[str, Mutation] = {

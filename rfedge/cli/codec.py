@@ -65,7 +65,10 @@ class Encode:
         asked = SteeringSettings(self.mask, self.mask_qp)
         k = dataset.pictures[0].camera.intrinsics
         steering = asked.steering((k.width_px, k.height_px))
-        settings = CodingSettings(self.coding.name, self.crf, steering, self.coding.check_decode)
+        coding = self.coding
+        settings = CodingSettings(
+            coding.name, self.crf, steering, coding.check_decode, coding.light
+        )
         coded = encode_drive(dataset, field, settings, self._located(field, dataset))
         write_drive(self.out, coded)
         payload_bytes = sum(len(frame.packet.payload) for frame in coded.frames)

@@ -99,7 +99,7 @@ def _digest(arrays: Iterable[NDArray[Any]]) -> str:
 class FieldCoder:
     """Codes the clip that a field was rendered along; ``version`` names the program that does.
 
-    ``references`` and ``photometric`` None leave them to the encoder.
+    ``references``, ``photometric`` and ``relight`` None leave them to the encoder.
 
     With ``foregrounds``, bool [H, W] a frame, the notes have the luma's squared error there.
     """
@@ -113,6 +113,7 @@ class FieldCoder:
         effort: str,
         references: References | None = None,
         photometric: Photometric | None = None,
+        relight: bool | None = None,
         points: Sequence[float] = CRFS,
         foregrounds: Sequence[NDArray[np.bool_]] = (),
     ) -> None:
@@ -125,11 +126,11 @@ class FieldCoder:
         self._foregrounds = foregrounds
         if references == WITHOUT_FIELD:
             photometric = ()
-        self._choice = FrameChoice(references=references, photometric=photometric)
+        self._choice = FrameChoice(references, photometric=photometric, relight=relight)
         first = references
         if references is not None and is_temporal(references):  # from the second frame on
             first = INTRA if references == WITHOUT_FIELD else None
-        self._first_choice = FrameChoice(references=first, photometric=photometric)
+        self._first_choice = FrameChoice(first, photometric=photometric, relight=False)
         self._renders = references != WITHOUT_FIELD
 
     @cached_property
@@ -140,6 +141,7 @@ class FieldCoder:
         if choice.references is not None:
             references = references_name(choice.references)
         light = "chosen" if choice.photometric is None else str(tuple(choice.photometric))
+        light += "" if choice.relight is None else f", relit {choice.relight}"
         return (
             f"{self._program}; effort {self._effort}, references {references}, light {light}, "
             f"views {self._rendered.digest}, foregrounds {self._foregrounds_digest()}"

@@ -210,6 +210,7 @@ def _numbered(packet: DeltaPacket, epoch: int, sequence: int) -> DeltaPacket:
             packet.references,
             packet.base_digest,
             packet.photometric,
+            packet.relit,
         )
 
     return numbered(numbered(0).expected_crc32())

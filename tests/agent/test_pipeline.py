@@ -10,9 +10,9 @@ from cav_agent.deadline import FixedRung
 from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline, PipelineOptions, Stopwatch
 from cav_agent.rate_control import ByteBudget
-from rfcore.camera import Camera
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.decoder import DeltaDecoder
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import CodecConfig, LightChange
 from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.references import Reference
 from rfcore.codec.sender.ladder import Rung
@@ -62,6 +62,43 @@ def test_block_means_are_sent_only_where_the_server_is_not_exact(noisy: Capture)
         for exact in (True, False)
     ]
     assert lengths == [0, 64]
+
+
+@pytest.mark.parametrize(
+    ("relights", "light", "relit", "changed"),
+    [
+        (True, LightChange.AUTO, True, True),
+        (False, LightChange.AUTO, False, True),
+        (True, LightChange.OFF, False, False),
+    ],
+)
+def test_the_light_is_changed_as_the_server_and_the_settings_allow(
+    make_capture: Callable[..., Capture],
+    relights: bool,
+    light: LightChange,
+    relit: bool,
+    changed: bool,
+) -> None:
+    """The street is darker on one side than the field shows it, which no matrix says."""
+    ramp = np.linspace(200, 20, 64)[None, :, None] + np.zeros((48, 64, 3))
+    noise = np.random.default_rng(1).normal(0, 3, ramp.shape)
+    pixels = np.clip(ramp + noise, 0, 255).astype(np.uint8)
+    k = Intrinsics(64, 48, 64.0, 64.0, 32.0, 24.0)
+    captures = [make_capture(index) for index in range(2)]
+    seen = [
+        replace(
+            c, picture=replace(c.picture, camera=Camera(k, Pose.identity()), read=lambda: pixels)
+        )
+        for c in captures
+    ]
+    options = PipelineOptions(light=light)
+    pipeline = Pipeline(Grey(), CodecConfig(64, 48, effort="fast"), lambda: 0, options)
+    first = pipeline.encode(EncodeJob(seen[0], 0, 1, relights=relights))
+    base = FrameAddress("front", 0, first.packet.sequence)
+    second = pipeline.encode(EncodeJob(seen[1], 0, 1, base, relights=relights))
+    assert not first.packet.relit
+    assert second.packet.relit == relit
+    assert changed or not (first.packet.photometric or second.packet.photometric)
 
 
 def test_a_budget_of_bytes_is_aimed_at_and_costs_quality(noisy: Capture) -> None:

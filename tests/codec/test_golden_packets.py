@@ -17,13 +17,14 @@ from rfcore.wire.convert import client_message_from_bytes
 from rfcore.wire.messages import Frame, Hello
 
 DATA = Path(__file__).parents[1] / "data"
-FRAMES = 7
+OLD = ["delta_packets_own.npz", "delta_packets.npz", "delta_packets_long.npz"]
 
 
 @pytest.mark.parametrize(
-    "name", ["delta_packets_own.npz", "delta_packets.npz", "delta_packets_long.npz"]
+    ("name", "frames", "relit"),
+    [*((name, 7, 0) for name in OLD), ("delta_packets_relit.npz", 9, 2)],
 )
-def test_golden_packets_decode_to_their_digests(name: str) -> None:
+def test_golden_packets_decode_to_their_digests(name: str, frames: int, relit: int) -> None:
     with np.load(DATA / name, allow_pickle=False) as stored:
         arrays = dict(stored)
     hello = client_message_from_bytes(arrays["hello"].tobytes())
@@ -32,7 +33,8 @@ def test_golden_packets_decode_to_their_digests(name: str) -> None:
     decoder = DeltaDecoder(camera.codec)
     state = decoder.start(1)
     used: set[Reference] = set()
-    for index in range(FRAMES):
+    found = 0
+    for index in range(frames):
         frame = client_message_from_bytes(arrays[f"frame{index}"].tobytes())
         assert isinstance(frame, Frame)
         render = I420(*(arrays[f"{name}{index}"] for name in "yuv"))
@@ -41,4 +43,6 @@ def test_golden_packets_decode_to_their_digests(name: str) -> None:
         assert decoded.frame.digest() == frame.packet.reconstruction_digest
         state = decoded.state
         used |= set(frame.packet.references)
+        found += frame.packet.relit
     assert used == set(Reference)
+    assert found == relit

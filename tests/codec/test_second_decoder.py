@@ -22,7 +22,7 @@ from rfcore.image import I420
 from rfedge.bench.fuzz import make_stream
 
 NEEDED = ("gst-launch-1.0", "gst-inspect-1.0")
-PICTURES = 6 + (1 + 1 + 1 + 3 + 3 + 2)
+PICTURES = 8 + (1 + 1 + 1 + 3 + 3 + 2 + 2 + 1)
 """A slice for each frame but the pose-only one, and before it its references, or a grey picture."""
 
 

@@ -116,7 +116,7 @@ def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(
     )
     result = run_adapt(job, Console(file=io.StringIO(), width=200))
     rows = {row["variant"]: row for row in result["rows"]}
-    assert list(rows) == ["off", "matrix", "again"]
+    assert list(rows) == ["off", "matrix", "auto", "again"]
     assert rows["again"]["kbit_33db"] == rows["off"]["kbit_33db"]
     assert rows["again"]["side_bytes"] == thumbnail.field.stat().st_size
     assert rows["again"]["noon_bits_percent"] is None
@@ -125,7 +125,7 @@ def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(
     assert rows["off"]["kbit_33db"] > 0
     assert rows["off"]["lowest_psnr_db"] < 33
     assert rows["off"]["noon_bits_percent"] == 0.0
-    assert rows["matrix"]["noon_bits_percent"] == 0.0
+    assert rows["matrix"]["noon_bits_percent"] == rows["auto"]["noon_bits_percent"] == 0.0
     assert json.loads(job.out.read_text())["rows"] == result["rows"]
     cells = {path: path.read_bytes() for path in job.cells.iterdir()}
     assert run_adapt(job, Console(quiet=True))["rows"] == result["rows"]
@@ -141,7 +141,7 @@ def test_where_a_field_shows_33_db_before_a_bit_is_sent_no_bits_are_stated(
         (AdaptCase.parse(text),), "fast", "ultrafast", tmp_path / "a.json", tmp_path / "cells", True
     )
     said = io.StringIO()
-    off, _, again = run_adapt(job, Console(file=said, width=200))["rows"]
+    off, _, _, again = run_adapt(job, Console(file=said, width=200))["rows"]
     assert off["kbit_33db"] is None
     assert off["lowest_psnr_db"] > 33
     assert off["x264_kbit_33db"] > 0

@@ -91,7 +91,7 @@ def test_what_disturbs_is_compared_with_what_does_not(robust):
     assert lane["against_x264_percent"] == pytest.approx(
         100 * (lane["kbit"] / lane["x264_kbit"] - 1)
     )
-    assert {("light", "uncorrected"), ("light", "photometric")} <= rows.keys()
+    assert {("light", "uncorrected"), ("light", "adapted")} <= rows.keys()
 
 
 def test_a_run_that_is_finished_gives_the_same_rows_from_its_cells(robust):

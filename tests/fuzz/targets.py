@@ -15,8 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from mec_server.decode_jobs import OpenJob
-from mec_server.session import ServerSession
+from mec_server.session import OpenJob, ServerSession
 from rfcore.codec.h264.bitstream import split_nals
 from rfcore.codec.h264.parameter_sets import parse_pps, parse_slice_start, parse_sps
 from rfcore.dataset.transforms import read_transforms_source

@@ -2,6 +2,7 @@
 
 import asyncio
 import itertools
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,11 @@ from structlog.testing import capture_logs
 from cav_agent.config import PaceKind
 from forward_isas import POCL
 from recorded import recorded, recorded_parts
+from rfcore.codec.h264.config import CoderSettings, LightChange
 from rfcore.codec.sender.steering import SteeringSettings
 from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable
-from rfcore.image import write_png
+from rfcore.image import read_rgb, write_png
 from rfcore.native.backend import available_isas
 from rfcore.wire.settings import RenderSettings
 from rfedge.link.proxy import LinkProxy, ProxySettings
@@ -212,3 +214,29 @@ async def test_a_server_that_forces_a_missing_instruction_set_does_not_start(ser
     with pytest.raises(BackendUnavailable):
         async with serve(render=RenderSettings(isa="neon")):
             pass
+
+
+def after_sunset(drive: Path, folder: Path) -> Path:
+    """Copy a drive, darker from left to right: what no matrix of colours says."""
+    shutil.copytree(drive, folder)
+    for path in folder.rglob("*.png"):
+        rgb = read_rgb(path)
+        lit = np.linspace(1.0, 0.3, rgb.shape[1])[None, :, None]
+        write_png(path, np.rint(rgb * lit).astype(np.uint8))
+    return folder
+
+
+@pytest.mark.parametrize("light", LightChange)
+async def test_under_another_light_both_ends_relight_what_they_render(
+    street: Any, serve: Any, travel: Any, tmp_path: Path, light: LightChange
+) -> None:
+    drive = after_sunset(street.drive, tmp_path / "drive")
+    coding = CoderSettings(effort="fast", check_decode=True, light=light)
+    async with serve(record=tmp_path / "seen") as server:
+        record = await travel(server.address, drive=drive, coding=coding)
+    assert record.counts == {"acked": 6}
+    relit = [line["relit"] for line in record.lines]
+    assert relit == [False] + [light is LightChange.AUTO] * 5
+    assert [picture.digest for picture in recorded(tmp_path / "seen")] == [
+        line["reconstruction_digest"] for line in record.lines
+    ]

@@ -6,9 +6,10 @@
 //
 // SCENE: int32 width, height, doubt; float rotation[9], translation[3], fx, fy, cx, cy; bytes Y, U, V
 // of the previous picture, of the render and of the previous render; float previous depth, depth.
-// RESULT: bytes Y, U, V carried and corrected; int32 SATD and SSD of the previous picture's blocks
+// RESULT: bytes Y, U, V carried, corrected and relit; int32 SATD and SSD of the previous picture's blocks
 // against the render.
 #include "exactness_file.h"
+#include "picture/light_grid.h"
 #include "picture/warp.h"
 
 namespace {
@@ -55,8 +56,9 @@ void run(const char* scene, const char* result) {
     correction.previous_render = previous_render.view();
     correction.doubt = header[2];
     warp_i420(correction, geometry[0], size, corrected.out());
-    write_planes(out, carried);
-    write_planes(out, corrected);
+    Planes relit(size);
+    relight_i420(previous.view(), previous_render.view(), render.view(), size, relit.out());
+    for (const Planes* made : {&carried, &corrected, &relit}) write_planes(out, *made);
     const size_t blocks = static_cast<size_t>(size.width_px / 8) * (size.height_px / 8);
     std::vector<std::int32_t> satd(blocks), ssd(blocks);
     block_costs(previous.y.data(), render.y.data(), size, satd.data(), ssd.data());

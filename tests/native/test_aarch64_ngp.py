@@ -21,7 +21,7 @@ from rfcore.ngp.shape import (
 )
 from rfcore.ngp.trainable import NgpRates, RayBatch, TrainableNgp
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.timeout(900)]
 
 Emulated = Callable[[str, str, int, bytes], bytes]
 FirstDifference = Callable[[bytes, bytes], int | None]

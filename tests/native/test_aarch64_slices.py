@@ -11,7 +11,7 @@ from rfcore.image import I420
 from rfcore.native import _native
 from rfcore.native.backend import available_isas
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.timeout(900)]
 
 Emulated = Callable[[str, str, int, bytes], bytes]
 FirstDifference = Callable[[bytes, bytes], int | None]

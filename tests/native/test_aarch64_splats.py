@@ -17,7 +17,7 @@ from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.timeout(900)]
 
 Emulated = Callable[[str, str, int, bytes], bytes]
 FirstDifference = Callable[[bytes, bytes], int | None]

@@ -1,4 +1,4 @@
-"""The warp, the correction and the block costs on another architecture: the same bytes."""
+"""Warp, correction, relit render and block costs on another architecture: the same bytes."""
 
 import struct
 from collections.abc import Callable
@@ -12,12 +12,13 @@ from rfcore.native.warp import (
     CORRECTION_DOUBT,
     block_costs,
     correct_i420,
+    relight_i420,
     warp_i420,
     warp_numbers,
 )
 from rfcore.views import FieldView
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.timeout(900)]
 
 Emulated = Callable[[str, str, int, bytes], bytes]
 FirstDifference = Callable[[bytes, bytes], int | None]
@@ -54,6 +55,7 @@ def test_aarch64_carries_a_picture_to_the_same_bytes(
     here = as_bytes(
         warp_i420(previous, before, now),
         correct_i420(previous, before, now),
+        relight_i420(previous, previous_render, render),
     )
     costs = block_costs(previous.y, render.y)
     here += costs.satd.tobytes() + costs.ssd.tobytes()

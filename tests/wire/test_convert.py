@@ -104,6 +104,7 @@ ADDRESS = FrameAddress("front", 2, 7)
     [
         Welcome("s-1", exact=True),
         Welcome("s-1", exact=False, rate_hz=2.5),
+        Welcome("s-1", exact=True, relights=True),
         Ack(ADDRESS, StageTimes(1, 2, 3, 4, 10), b"d" * 16),
         *[Nack(ADDRESS, reason, "why", count=2) for reason in RejectReason],
         Nack(ADDRESS, RejectReason.CRC_MISMATCH, "why", last_good_sequence=0, current_epoch=9),

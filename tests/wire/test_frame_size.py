@@ -75,6 +75,12 @@ def test_the_long_form_costs_more_than_twice_as_much() -> None:
     assert sum(budget.values()) == 232
 
 
+def test_the_light_of_an_earlier_frame_adds_three_bytes() -> None:
+    frame = frame_of(TURN.rounded())
+    packet = replace(frame.packet, relit=True)
+    assert budget_bytes(replace(frame, packet=packet)) == BUDGET_BYTES | {"relit": 3}
+
+
 def test_a_new_light_adds_at_most_three_bytes_a_number() -> None:
     frame = frame_of(TURN.rounded())
     worst = replace(frame.packet, photometric=(-(1 << 15),) * 12)

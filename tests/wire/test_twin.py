@@ -127,7 +127,7 @@ def test_an_impossible_view_is_the_servers_fault(change: dict[str, object]) -> N
 
 def test_objects_survive_the_wire() -> None:
     thing = StreetObject(
-        7, (1.0, 2.0, 3.0), (0.5, 0.0, -0.25), 1.8, 1.5, 0.75, 2.5, 0.1, (("cav-1", "front"),)
+        7, (1.0, 2.0, 3.0), (0.5, 0.0, -0.25), 1.8, 1.5, 0.75, 2.5, 0.1, (("cav-1", "front"),), True
     )
     seen = ObjectsSeen(10**18, "ab" * 32, (thing,))
     sent = objects_to_wire(seen).SerializeToString()

@@ -25,6 +25,7 @@ __all__ = [
     "CodecConfig",
     "Coder",
     "CoderSettings",
+    "LightChange",
     "check_crf",
     "check_effort",
     "coder_of",
@@ -200,6 +201,13 @@ class CodecConfig:
         raise InvalidInput("codec.size", f"{self.size_px} px fit no level of H.264")
 
 
+class LightChange(StrEnum):
+    """Whether the light of a render may be changed before frames are predicted from it."""
+
+    AUTO = "auto"
+    OFF = "off"
+
+
 @dataclass(frozen=True)
 class CoderSettings:
     """What codes the slices, and how hard it tries: the form on a command line."""
@@ -212,6 +220,9 @@ class CoderSettings:
     """With --coder x264: ultrafast to veryslow, normally medium."""
     check_decode: bool = False
     """Decode every slice on the vehicle, too, to see that it is what its coder promised."""
+    light: LightChange = LightChange.AUTO
+    """auto: change the render's light to the frame's where that saves bits. off: predict from the
+    render as it is."""
 
     def __post_init__(self) -> None:
         other = self.preset if self.coder is Coder.OWN else self.effort

@@ -36,7 +36,12 @@ from rfcore.codec.references import (
 from rfcore.codec.sender.frame_costs import FrameCosts
 from rfcore.codec.sender.picture_coder import Asked, CodedPicture, picture_coder
 from rfcore.codec.sender.rate import FittedSlice, RateModel, RateTarget, bits_curve, code_to_fit
-from rfcore.codec.sender.reference_choice import choose_photometric, choose_references
+from rfcore.codec.sender.reference_choice import (
+    choose_photometric,
+    choose_references,
+    light_differs,
+    relighting_pays,
+)
 from rfcore.codec.state import EncoderState, Past
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
@@ -61,7 +66,10 @@ class FrameChoice:
     crf: float | None = None
     """Replaces the configured CRF."""
     photometric: Photometric | None = None
-    """The change of the render's light, see there; ``None`` leaves it to the encoder."""
+    """The change of the render's light, see there; ``None`` leaves the light to the encoder."""
+    relight: bool | None = None
+    """Map the render to the light of the earlier frame; ``None`` leaves it to the encoder where
+    ``photometric`` does. Receivers of older releases cannot."""
     pose_only: bool = False
     """Send no slice: the frame is its only reference."""
     max_references: int = DEFAULT_REFERENCES
@@ -92,6 +100,8 @@ class FrameChoice:
             raise InvalidInput(
                 "max_references", f"{self.max_references} is outside 1..{REFERENCE_FRAMES}"
             )
+        if self.relight and self.photometric:
+            raise InvalidInput("relight", "photometric already changes the render")
         if self.pose_only and (self.references is None or len(self.references) != 1):
             raise InvalidInput("references", "a pose-only packet names exactly one reference")
 
@@ -105,7 +115,7 @@ def without_field(choice: FrameChoice, state: EncoderState) -> FrameChoice:
     Its view is ``FieldView.nothing``. Frames after it may use the field again at once.
     """
     references = INTRA if state.past is None else (Reference.PREVIOUS,)
-    return replace(choice, references=references, photometric=())
+    return replace(choice, references=references, photometric=(), relight=False)
 
 
 @dataclass(frozen=True)
@@ -131,10 +141,14 @@ class Encoded:
 class _Plan:
     """What a frame is predicted from: ``pictures`` are ``references`` of ``prediction``."""
 
-    photometric: Photometric
     prediction: Prediction
     references: References
     pictures: tuple[I420, ...]
+
+    @property
+    def needs_base(self) -> bool:
+        """Whether the receiver needs the earlier frame."""
+        return self.prediction.is_relit or is_temporal(self.references)
 
 
 class DeltaEncoder:
@@ -209,8 +223,9 @@ class DeltaEncoder:
             payload=made.coded.payload,
             crc32=0,
             references=plan.references,
-            base_digest=_base_digest(state.past) if is_temporal(plan.references) else b"",
-            photometric=plan.photometric,
+            base_digest=_base_digest(state.past) if plan.needs_base else b"",
+            photometric=plan.prediction.photometric,
+            relit=plan.prediction.is_relit,
         ).sealed()
         stage_ns = {
             "references": chosen_ns - started_ns,
@@ -231,14 +246,31 @@ class DeltaEncoder:
     ) -> _Plan:
         """Return what to predict the frame from, choosing what ``choice`` leaves open."""
         crf = self._first_crf(choice)
-        photometric = choice.photometric
-        if photometric is None:
-            photometric = choose_photometric(costs, view.render, crf)
-        prediction = Prediction.under_light(view, photometric, state.past, self._threads)
+        prediction = self._under_light(state, view, choice, costs, crf)
         references = choice.references
         if references is None:
             references = choose_references(costs, prediction, crf, choice.max_references)
-        return _Plan(photometric, prediction, references, prediction.pictures(references))
+        return _Plan(prediction, references, prediction.pictures(references))
+
+    def _under_light(
+        self,
+        state: EncoderState,
+        view: FieldView,
+        choice: FrameChoice,
+        costs: FrameCosts,
+        crf: float,
+    ) -> Prediction:
+        """Return the prediction under the light that ``choice`` names, or that pays."""
+        if choice.relight:
+            return Prediction.relit(view, state.past, self._threads)
+        photometric: Photometric = choice.photometric or ()
+        if choice.photometric is None and light_differs(costs.frame, view.render):
+            if state.past is not None and _may_relight(choice):
+                relit = Prediction.relit(view, state.past, self._threads)
+                if relighting_pays(costs, view.render, relit.render, crf):
+                    return relit
+            photometric = choose_photometric(costs, view.render, crf)
+        return Prediction.under_light(view, photometric, state.past, self._threads)
 
     def _first_crf(self, choice: FrameChoice) -> float:
         """Return the CRF that references are chosen for: with a target, about the one to come."""
@@ -289,6 +321,11 @@ class DeltaEncoder:
         if promised is not None and decoded.digest() != promised.digest():
             raise CodecError("a decoder makes another picture of the slice than its coder")
         return decoded
+
+
+def _may_relight(choice: FrameChoice) -> bool:
+    """A frame that is to need its render alone has no earlier one to learn the light from."""
+    return choice.relight is None and (choice.references is None or is_temporal(choice.references))
 
 
 def _base_digest(past: Past | None) -> bytes:

@@ -1,4 +1,4 @@
-// Binds rfcore/csrc/picture/live_view.h. Values are checked by rfcore/native/live_view.py.
+// Binds picture/live_view.h and picture/patch.h. Values are checked by rfcore/native/live_view.py.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/tuple.h>
@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "picture/live_view.h"
+#include "picture/patch.h"
 
 namespace nb = nanobind;
 
@@ -19,6 +20,7 @@ using InRgb = nb::ndarray<const std::uint8_t, nb::shape<-1, -1, 3>, nb::c_contig
 using OutRgb = nb::ndarray<std::uint8_t, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using InColour = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using OutColour = nb::ndarray<float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using InSamples = nb::ndarray<const float, nb::shape<-1, -1, 4>, nb::c_contig, nb::device::cpu>;
 using InPlane = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using OutPlane = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using OutBytes = nb::ndarray<std::uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
@@ -53,6 +55,23 @@ LiveSource source_of(const Source& from) {
     std::copy_n(numbers.begin(), 9, source.rotation);
     std::copy_n(numbers.begin() + 9, 3, source.translation);
     return source;
+}
+
+// 20 numbers: rotation 9, translation 3, fx, fy, cx, cy, left, top, depth, fade.
+Patch patch_of(const InSamples& samples, const std::vector<float>& numbers) {
+    require_count(numbers, 20);
+    Patch patch{samples.data(), size_of(samples), camera_of(&numbers[12]), {}, {},
+                numbers[16],    numbers[17],      numbers[18],             numbers[19]};
+    std::copy_n(numbers.begin(), 9, patch.rotation);
+    std::copy_n(numbers.begin() + 9, 3, patch.translation);
+    return patch;
+}
+
+Box box_of(const std::vector<int>& box, PictureSize size) {
+    if (box.size() != 4 || box[0] < 0 || box[1] > size.height_px || box[2] < 0 || box[3] > size.width_px) {
+        throw nb::value_error("a box is outside of the picture");
+    }
+    return {box[0], box[1], box[2], box[3]};
 }
 
 }  // namespace
@@ -97,6 +116,23 @@ void bind_live_view(nb::module_& m) {
         },
         nb::arg("colour"), nb::arg("opacity"), nb::arg("depth"), nb::arg("camera"), nb::arg("sources"),
         nb::arg("limits"), nb::arg("rgb"), nb::arg("chosen"));
+    m.def(
+        "draw_patch",
+        [](InSamples samples, const std::vector<float>& numbers, std::uint8_t source,
+           const std::vector<float>& limits, const std::vector<int>& box, const std::vector<float>& camera,
+           OutRgb rgb, OutPlane depth, OutBytes chosen, OutPlane nearest) {
+            const PictureSize size = size_of(rgb);
+            require_size(depth, size);
+            require_size(chosen, size);
+            require_size(nearest, size);
+            require_count(limits, 2);
+            require_count(camera, 4);
+            const Canvas canvas{rgb.data(),     depth.data(), chosen.data(),
+                                nearest.data(), size,         camera_of(camera.data())};
+            draw_patch(patch_of(samples, numbers), source, limits[0], limits[1], box_of(box, size), canvas);
+        },
+        nb::arg("samples"), nb::arg("numbers"), nb::arg("source"), nb::arg("limits"), nb::arg("box"),
+        nb::arg("camera"), nb::arg("rgb"), nb::arg("depth"), nb::arg("chosen"), nb::arg("nearest"));
 }
 
 }  // namespace rfcore

@@ -1,5 +1,5 @@
-// Binds rfcore/csrc/warp.h. Shapes and dtypes are checked by rfcore/native/warp.py; the types below
-// refuse anything else that nanobind can see.
+// Binds picture/warp.h and picture/light_grid.h. Shapes and dtypes are checked by
+// rfcore/native/warp.py; the types below refuse anything else that nanobind can see.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -9,6 +9,7 @@
 #include <optional>
 #include <tuple>
 
+#include "picture/light_grid.h"
 #include "picture/warp.h"
 
 namespace nb = nanobind;
@@ -94,6 +95,21 @@ void bind_warp(nb::module_& m) {
         nb::arg("previous"), nb::arg("previous_depth"), nb::arg("depth"), nb::arg("render"),
         nb::arg("previous_render").none(), nb::arg("doubt"), nb::arg("numbers"), nb::arg("y"),
         nb::arg("u"), nb::arg("v"), nb::arg("threads"));
+    m.def(
+        "relight_i420",
+        [](const Picture& seen, const Picture& seen_render, const Picture& render, OutPlane y,
+           OutPlane u, OutPlane v) {
+            const PictureSize size = size_of(y);
+            require_i420(size, y, u, v);
+            for (const Picture* picture : {&seen, &seen_render, &render}) {
+                require_picture(size, *picture);
+            }
+            const nb::gil_scoped_release released;
+            relight_i420(planes_of(seen), planes_of(seen_render), planes_of(render), size,
+                         {y.data(), u.data(), v.data()});
+        },
+        nb::arg("seen"), nb::arg("seen_render"), nb::arg("render"), nb::arg("y"), nb::arg("u"),
+        nb::arg("v"));
     m.def(
         "block_costs",
         [](InPlane frame, InPlane reference, OutCosts satd, OutCosts ssd) {

@@ -519,6 +519,7 @@ class Frame(_message.Message):
     INSTANT_FIELD_NUMBER: _builtins.int
     CAPTURE_CLOCK_FIELD_NUMBER: _builtins.int
     LOCALISATION_FIELD_NUMBER: _builtins.int
+    RELIT_FIELD_NUMBER: _builtins.int
     camera_id: _builtins.str
     epoch: _builtins.int
     """A new epoch starts the state of both ends afresh; sequences count from 0 in it."""
@@ -548,6 +549,11 @@ class Frame(_message.Message):
     capture_clock: Global___CaptureClock.ValueType
     """For those who look at the twin; nothing is decoded by either."""
     localisation: Global___Localisation.ValueType
+    relit: _builtins.bool
+    """Whether the render's light is mapped to that of the frame base_digest names, before it is a
+    reference (rfcore.native.warp). For servers whose Welcome says that they relight; others find a
+    wrong crc32.
+    """
     @_builtins.property
     def pose(self) -> Global___Pose:
         """Either: the pose in float64. Or, in less than half the bytes, pose_f32. Neither: the camera is
@@ -596,10 +602,11 @@ class Frame(_message.Message):
         instant: _builtins.int = ...,
         capture_clock: Global___CaptureClock.ValueType = ...,
         localisation: Global___Localisation.ValueType = ...,
+        relit: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["pose", b"pose", "quality", b"quality"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "camera_id", b"camera_id", "capture_clock", b"capture_clock", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "instant", b"instant", "localisation", b"localisation", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "quality", b"quality", "reconstruction_digest", b"reconstruction_digest", "references", b"references", "render_block_means", b"render_block_means", "render_digest", b"render_digest", "sequence", b"sequence"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "camera_id", b"camera_id", "capture_clock", b"capture_clock", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "instant", b"instant", "localisation", b"localisation", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "quality", b"quality", "reconstruction_digest", b"reconstruction_digest", "references", b"references", "relit", b"relit", "render_block_means", b"render_block_means", "render_digest", b"render_digest", "sequence", b"sequence"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -612,6 +619,7 @@ class Welcome(_message.Message):
     SESSION_ID_FIELD_NUMBER: _builtins.int
     EXACT_FIELD_NUMBER: _builtins.int
     RATE_HZ_FIELD_NUMBER: _builtins.int
+    RELIGHTS_FIELD_NUMBER: _builtins.int
     session_id: _builtins.str
     """Distinguishes this session in the logs of both ends."""
     exact: _builtins.bool
@@ -620,16 +628,19 @@ class Welcome(_message.Message):
     """Pictures per second that each camera may send; 0: as many as Credit allows. A later Welcome of
     the same session changes it.
     """
+    relights: _builtins.bool
+    """Whether the server takes frames whose render is relit."""
     def __init__(
         self,
         *,
         session_id: _builtins.str = ...,
         exact: _builtins.bool = ...,
         rate_hz: _builtins.float = ...,
+        relights: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["exact", b"exact", "rate_hz", b"rate_hz", "session_id", b"session_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["exact", b"exact", "rate_hz", b"rate_hz", "relights", b"relights", "session_id", b"session_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

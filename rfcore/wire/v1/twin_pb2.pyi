@@ -465,6 +465,7 @@ class StreetObject(_message.Message):
     AGE_MS_FIELD_NUMBER: _builtins.int
     UNSEEN_MS_FIELD_NUMBER: _builtins.int
     SEEN_BY_FIELD_NUMBER: _builtins.int
+    DOUBTFUL_FIELD_NUMBER: _builtins.int
     object_id: _builtins.int
     """Within the stream."""
     x_m: _builtins.float
@@ -482,6 +483,8 @@ class StreetObject(_message.Message):
     age_ms: _builtins.int
     """Since it was first seen, and since it was last."""
     unseen_ms: _builtins.int
+    doubtful: _builtins.bool
+    """Whether only pictures show it that disagree with the field in many places, as with a wrong pose."""
     @_builtins.property
     def seen_by(self) -> _containers.RepeatedCompositeFieldContainer[Global___Sighting]:
         """Those that saw it within the last second."""
@@ -502,10 +505,11 @@ class StreetObject(_message.Message):
         age_ms: _builtins.int = ...,
         unseen_ms: _builtins.int = ...,
         seen_by: _abc.Iterable[Global___Sighting] | None = ...,
+        doubtful: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ms", b"age_ms", "confidence", b"confidence", "height_m", b"height_m", "object_id", b"object_id", "seen_by", b"seen_by", "unseen_ms", b"unseen_ms", "velocity_x_mps", b"velocity_x_mps", "velocity_y_mps", b"velocity_y_mps", "velocity_z_mps", b"velocity_z_mps", "width_m", b"width_m", "x_m", b"x_m", "y_m", b"y_m", "z_m", b"z_m"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ms", b"age_ms", "confidence", b"confidence", "doubtful", b"doubtful", "height_m", b"height_m", "object_id", b"object_id", "seen_by", b"seen_by", "unseen_ms", b"unseen_ms", "velocity_x_mps", b"velocity_x_mps", "velocity_y_mps", b"velocity_y_mps", "velocity_z_mps", b"velocity_z_mps", "width_m", b"width_m", "x_m", b"x_m", "y_m", b"y_m", "z_m", b"z_m"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

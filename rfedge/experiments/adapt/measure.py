@@ -1,9 +1,11 @@
 """Bits that another light costs, and which of them each way of adapting to it wins back.
 
 A variant is how a drive is coded: ``off``, with the field as it is; ``matrix``, with the sender's
-matrix of colours (``rfcore.codec.photometric``) wherever it chooses to send one; and any field or
-colour layer that the case names. With b the bits at 33 dB, ``recovered_percent`` is
-100 (b_off - b) / (b_off - b_noon), b_noon being those of the same drive in the field's own light.
+matrix of colours (``rfcore.codec.photometric``) wherever it chooses to send one; ``auto``, as
+vehicles do it: with renders under the light of the frame before (``rfcore.native.warp``) wherever
+that pays, else a matrix; and any field or colour layer that the case names. With b the bits at
+33 dB, ``recovered_percent`` is 100 (b_off - b) / (b_off - b_noon), b_noon being those of the same
+drive in the field's own light.
 """
 
 from __future__ import annotations
@@ -50,9 +52,14 @@ __all__ = [
 AT_DB = 33.0
 POINTS = (18.0, 22.0, 26.0, 30.0, 34.0, 38.0, 42.0)
 QUICK_FRAMES = 6
-OFF, MATRIX = "off", "matrix"
-TOOLS: Mapping[str, Photometric | None] = {OFF: (), MATRIX: None}
-"""Variants with the case's own field, and what the sender is told about the light."""
+OFF, MATRIX, AUTO = "off", "matrix", "auto"
+TOOLS: Mapping[str, tuple[Photometric | None, bool | None]] = {
+    OFF: ((), False),
+    MATRIX: (None, False),
+    AUTO: (None, None),
+}
+"""Variants with the case's own field, and what the sender is told about the light: the numbers, and
+whether to relight; None: where that pays."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +192,7 @@ class _Measured:
         plain = self._coded(drive, OFF, case.field)
         noon = self._other("noon", case.noon)
         noon_off, empty_off = self._off_kbit(noon), self._off_kbit(self._other("empty", case.empty))
-        for variant in (OFF, MATRIX, *case.variants):
+        for variant in (*TOOLS, *case.variants):
             is_other = variant in case.variants
             path = case.variants.get(variant, case.field)
             done = plain if variant == OFF else self._coded(drive, variant, path)
@@ -233,12 +240,14 @@ class _Measured:
 
     def _coded(self, drive: Drive, variant: str, path: Path) -> Performance:
         rendered = render_clip(load_field(path), drive.cameras)
+        photometric, relight = TOOLS.get(variant, TOOLS[OFF])
         coder = FieldCoder(
             rendered,
             f"rfedge-{variant}-{self.job.effort}-{rendered.field_id[:12]}",
             program_version(),
             effort=self.job.effort,
-            photometric=TOOLS.get(variant, ()),
+            photometric=photometric,
+            relight=relight,
             points=POINTS,
         )
         return self._performed(drive, coder)

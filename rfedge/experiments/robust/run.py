@@ -284,13 +284,13 @@ class Bench:
         return self._row("lane offset", drive.name.scene, kbit, None, self._rival(drive))
 
     def light_rows(self) -> list[DisturbanceRow]:
-        """Return what a drive at dusk costs with a field of noon, with and without the matrix."""
+        """Return what a drive at dusk costs with a field of noon, its light changed or not."""
         if self.job.dusk is None:
             why = "no drive in another light was given (--dusk NAME@HZ=DATASET)"
             return [DisturbanceRow("light", "n/a", why)]
         drive = read_drive(self.job.dusk, len(self.drive.frames))
         rival, rows = self._rival(drive), list[DisturbanceRow]()
-        for level, choice in (("uncorrected", ()), ("photometric", None)):
+        for level, choice in (("uncorrected", ()), ("adapted", None)):
             kbit = self._own(drive, level, drive.cameras, photometric=choice)
             rows.append(self._row("light", level, kbit, rows[0] if rows else None, rival))
         return rows
