@@ -9,6 +9,7 @@ loop. ``LazyTimer`` is a timer that is restarted with every message.
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 from collections import Counter, OrderedDict, deque
 from collections.abc import Awaitable, Callable, Iterator
@@ -18,12 +19,16 @@ from itertools import count as count_up
 from queue import SimpleQueue
 from typing import Any, Generic, TypeVar
 
-__all__ = ["FairQueue", "LazyTimer", "Workers", "repeat_forever"]
+__all__ = ["BACKGROUND_NICE", "LOWEST_NICE", "FairQueue", "LazyTimer", "Workers", "repeat_forever"]
 
 R = TypeVar("R")
 T = TypeVar("T")
 Work = Callable[[], Any]
 Done = Callable[[Any], None]
+
+LOWEST_NICE = 19
+BACKGROUND_NICE = 10
+"""Of threads whose work can wait: beside others that are busy they get a tenth of a processor."""
 
 MAX_SUBSTITUTES = 16
 """Threads that work in place of waiting ones, at most."""
@@ -63,7 +68,8 @@ class Workers:
 
     ``callback_failed`` is called on the loop with what a ``done`` raised; the others still run.
     While ``crowded``, no owner keeps more than all threads but one busy: work cannot be
-    interrupted, and a thread is to be there for the others when one's pieces take long.
+    interrupted, and a thread is to be there for the others when one's pieces take long. ``nice``:
+    how far the threads give way to others where processors are scarce (setpriority(2)).
     """
 
     def __init__(
@@ -72,8 +78,10 @@ class Workers:
         callback_failed: Callable[[Exception], None],
         name: str = "worker",
         crowded: Callable[[], bool] = lambda: False,
+        nice: int = 0,
     ) -> None:
         self._count = count
+        self._nice = nice
         self._callback_failed = callback_failed
         self._name = name
         self._threads: list[threading.Thread] = []
@@ -154,6 +162,10 @@ class Workers:
         self._threads.append(thread)
 
     def _run(self, loop: asyncio.AbstractEventLoop) -> None:
+        if self._nice:
+            thread = threading.get_native_id()
+            nice = min(LOWEST_NICE, os.getpriority(os.PRIO_PROCESS, thread) + self._nice)
+            os.setpriority(os.PRIO_PROCESS, thread, nice)
         while self._permits.get():
             self._work_next(loop)
 

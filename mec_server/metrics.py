@@ -215,6 +215,18 @@ class ServerMetrics:
             "rfedge_server_recording",
             "1 while pictures are recorded, 0 when none are asked for or the disk refused.",
         )
+        self._tile_payload = make.counter(
+            "rfedge_server_tile_payload_bytes",
+            "Bytes of P slices that became pictures, by the tile of their field; empty: of none.",
+            ("tile",),
+        )
+        self._tile_pictures = make.counter(
+            "rfedge_server_tile_pictures",
+            "Pictures reconstructed, by the tile of their field; empty: of none.",
+            ("tile",),
+        )
+        self._tile_of: dict[str, str] = {}
+        self._published_tile_of: dict[str, str] = {}
         self._lights = make.gauge(
             "rfedge_server_tile_lights", "Fields of other lights that a tile publishes.", ("tile",)
         )
@@ -283,7 +295,16 @@ class ServerMetrics:
         self._fields.labels(field.field_id[:16], field.metadata.kind).set(1)
 
     def show_tiles(self, tiles: Iterable[Tile]) -> None:
-        """Publish which lights the tiles have."""
+        """Publish which lights the tiles have, and count pictures of their fields from now on.
+
+        Those of the fields that were published before are counted, too: vehicles follow later.
+        """
+        tiles = tuple(tiles)
+        before = self._published_tile_of
+        self._published_tile_of = {
+            field_id: tile.name for tile in reversed(tiles) for field_id in tile.renderable_ids
+        }
+        self._tile_of = before | self._published_tile_of
         for tile in tiles:
             self._lights.labels(tile.name).set(len(tile.lights))
             self._passes.labels(tile.name).set(sum(light.passes for light in tile.lights))
@@ -300,6 +321,12 @@ class ServerMetrics:
     def count_limited(self, limit: str, count: int = 1) -> None:
         """Count what was refused or ended because of ``limit``."""
         self.limited.labels(limit).inc(count)
+
+    def count_picture(self, field_id: str, payload_bytes: int) -> None:
+        """Count a reconstructed picture for the tile that publishes its field."""
+        tile = self._tile_of.get(field_id, "")
+        self._tile_payload.labels(tile).inc(payload_bytes)
+        self._tile_pictures.labels(tile).inc()
 
     def count_lost_decoder(self, cause: LossCause) -> None:
         """Count a decoder process that died in use."""

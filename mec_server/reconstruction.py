@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
 from mec_server.decoding.decoders import OpenDecoder
+from mec_server.session import DecodeJob, DecodeOutcome, OpenJob
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.state import DecoderState
 from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason

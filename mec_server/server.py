@@ -6,7 +6,8 @@ import asyncio
 import re
 import socket
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -23,7 +24,7 @@ from mec_server.config import RecordSettings, ServerConfig
 from mec_server.connection_cap import ConnectionCap
 from mec_server.decoding.decoders import Decoders, DecoderSettings
 from mec_server.edge_service import EdgeService
-from mec_server.event_loop import Workers, repeat_forever
+from mec_server.event_loop import BACKGROUND_NICE, Workers, repeat_forever
 from mec_server.fields.index import FieldIndex, PublishedFields, field_loader
 from mec_server.fields.service import FieldService
 from mec_server.fields.shelf import FieldShelf
@@ -119,12 +120,13 @@ class EdgeServer:
         self._entry = self._entry_control()
         promises = self._entry.promises
         self._opener = Workers(1, outcome_failed, "opener")
+        self._background = Workers(1, outcome_failed, "background", nice=BACKGROUND_NICE)
         self._workers = Workers(config.workers, outcome_failed, crowded=lambda: promises.is_crowded)
         self._decoders = Decoders(
             DecoderSettings(config.decoder, not self.address.is_loopback, config.sandbox_as_root),
             self._metrics.count_lost_decoder,
             self._failed(BackgroundTask.DECODER_START),
-            self._workers.waiting,
+            self._waiting,
         )
         self._health = health_aio.HealthServicer()
         self._index = FieldIndex(config.fields)
@@ -183,6 +185,12 @@ class EdgeServer:
         ).register(self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
 
+    @contextmanager
+    def _waiting(self) -> Iterator[None]:
+        """Let another thread work while a worker waits for a decoder."""
+        with self._workers.waiting(), self._background.waiting():
+            yield
+
     def _failed(self, task: BackgroundTask) -> Callable[[Exception], None]:
         return partial(self._metrics.task_failed, task)
 
@@ -192,6 +200,7 @@ class EdgeServer:
             fields=self._shelf,
             held_field_ids=self._index.ids,
             workers=self._workers,
+            background=self._background,
             opener=self._opener,
             tools=Tools(time.perf_counter_ns, self._decoders.open),
             metrics=self._metrics,
@@ -310,6 +319,7 @@ class EdgeServer:
         await self._server.stop(drain_s)
         await self._leave_nats()
         await asyncio.to_thread(self._opener.close)
+        await asyncio.to_thread(self._background.close)
         await asyncio.to_thread(self._workers.close)
         await asyncio.to_thread(self._decoders.close)
         self._twin_service.close()

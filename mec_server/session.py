@@ -13,12 +13,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from mec_server.camera_queue import SessionCameras
 from mec_server.config import SessionLimits
-from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob, StreamEnd
 from mec_server.ledger.budgets import Limit
 from rfcore.errors import (
     AccessDenied,
@@ -49,7 +48,15 @@ from rfcore.wire.messages import (
 )
 from rfcore.wire.notices import StreetNotice
 
-__all__ = ["ServerSession", "SessionState"]
+__all__ = [
+    "DecodeJob",
+    "DecodeOutcome",
+    "OpenJob",
+    "RenderTooLate",
+    "ServerSession",
+    "SessionState",
+    "StreamEnd",
+]
 
 
 MAX_UNUSABLE = 64
@@ -58,6 +65,54 @@ MAX_UNUSABLE = 64
 MAX_UNREAD = 256
 """Answers that wait for a peer to read them; a correct one has a few frames in flight. Then the
 stream ends: a peer that sends and does not read must cost no memory."""
+
+
+@dataclass(frozen=True)
+class OpenJob:
+    """Open fields and decoders for ``hello``; ``exact``: both renderers give the same bits."""
+
+    hello: Hello
+    exact: bool
+
+
+@dataclass(frozen=True)
+class DecodeJob:
+    """Reconstruct one frame of one camera."""
+
+    frame: Frame
+    field_id: str
+    received_s: float
+    started_s: float
+
+
+@dataclass(frozen=True)
+class DecodeOutcome:
+    """A reconstructed frame: its digest and the time it took.
+
+    ``exact`` is false when the renders differed by rounding, and with them the pictures.
+    """
+
+    reconstruction_digest: bytes
+    times: StageTimes
+    exact: bool = True
+
+
+@dataclass(frozen=True)
+class StreamEnd:
+    """The stream is over; ``error`` is None when it ended as it should."""
+
+    error: RfedgeError | None = None
+
+
+class RenderTooLate(PacketRejected):
+    """A frame that was not rendered, since it would have been decoded after its deadline."""
+
+    def __init__(self, waited_s: float, expected_s: float, deadline_s: float) -> None:
+        super().__init__(
+            RejectReason.OVERLOADED,
+            f"it waited {waited_s:.3g} s and would take {expected_s:.3g} s to render and decode; "
+            f"the deadline is {deadline_s:g} s after its arrival",
+        )
 
 
 class SessionState(StrEnum):
@@ -223,7 +278,7 @@ class ServerSession:
         self.hello = job.hello
         self._cameras.open(job.hello)
         self._exact = job.exact
-        self._say(Welcome(self.session_id, job.exact, self._rate_hz))
+        self._say(self._welcome())
         for credit in self._cameras.credits():
             self._say(credit)
         if self._is_to_drain:
@@ -234,7 +289,10 @@ class ServerSession:
         """Let each camera send so many pictures per second; 0: as many as credits allow."""
         self._rate_hz = rate_hz
         if self.state is SessionState.OPEN:
-            self._say(Welcome(self.session_id, self._exact, rate_hz))
+            self._say(self._welcome())
+
+    def _welcome(self) -> Welcome:
+        return Welcome(self.session_id, self._exact, self._rate_hz, relights=True)
 
     def open_failed(self, error: RfedgeError, now: float) -> None:
         """Hello named something that cannot be opened; a bad value leaves room for another."""

@@ -15,14 +15,20 @@ from collections.abc import AsyncIterator, Callable, Mapping
 import grpc
 import structlog
 
-from mec_server.decode_jobs import DecodeJob, OpenJob, RenderTooLate, StreamEnd
 from mec_server.decoding.process import DecoderLost
 from mec_server.event_loop import LazyTimer
 from mec_server.ledger.budgets import Limit
 from mec_server.ledger.entry import StreamAccount
 from mec_server.ledger.peer_log import PeerLog
 from mec_server.reconstruction import Reconstruction
-from mec_server.session import ServerSession, SessionState
+from mec_server.session import (
+    DecodeJob,
+    OpenJob,
+    RenderTooLate,
+    ServerSession,
+    SessionState,
+    StreamEnd,
+)
 from mec_server.stream_decoders import FrameResult, ServerContext, StreamDecoders
 from mec_server.twin.state import TwinView
 from rfcore.camera import Intrinsics
@@ -191,9 +197,11 @@ class Stream:
 
     def _advance(self) -> None:
         """Start the work that can be started, and wake the writer if there is something to send."""
-        for job in self._session.jobs_to_start(time.monotonic()):
+        now = time.monotonic()
+        for job in self._session.jobs_to_start(now):
             if isinstance(job, DecodeJob):
-                self._decoders.submit(job, self._account.expected_s(), self._finished)
+                expected_s, doubtful = self._account.expected_s(), self._account.is_doubtful(now)
+                self._decoders.submit(job, expected_s, self._finished, in_background=doubtful)
             else:
                 self._opening = self._tasks.create_task(self._open(job))
         for frame, error in self._session.take_damaged():
@@ -348,6 +356,7 @@ class Stream:
         latency_s = self._latency_s(job)
         if not outcome.exact:
             self._server.metrics.inexact.inc()
+        self._server.metrics.count_picture(job.field_id, len(job.frame.packet.payload))
         self._show(job, reconstruction, now, latency_s)
 
     def _latency_s(self, job: DecodeJob) -> float:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from mec_server.config import SessionLimits
-from mec_server.decode_jobs import DecodeJob, OpenJob, RenderTooLate
 from mec_server.event_loop import Workers
 from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.ledger import Hold
@@ -17,6 +16,7 @@ from mec_server.ledger.peer_log import LogLimiter
 from mec_server.metrics import BackgroundTask, OpeningResult, ServerMetrics
 from mec_server.reconstruction import Decoder, FieldSource, OpenCameras, Reconstruction, Tools
 from mec_server.recorder import Recorder, SessionRecording
+from mec_server.session import DecodeJob, OpenJob, RenderTooLate
 from mec_server.twin.state import Twin
 from rfcore.codec.h264.splice import PictureDecoder
 from rfcore.errors import PacketRejected, RfedgeError
@@ -32,6 +32,9 @@ class ServerContext:
     held_field_ids: Callable[[], tuple[str, ...]]
     workers: Workers
     """Threads that decode frames."""
+    background: Workers
+    """One that decodes those of identities whose work came to nothing lately, and gives way to the
+    threads above where processors are scarce: a render cannot be interrupted."""
     opener: Workers
     """One thread that opens fields and decoders for new vehicles: a crowd of them, or a decoder
     process that is slow to start, must not delay the frames of others."""
@@ -109,6 +112,8 @@ class StreamDecoders:
         job: DecodeJob,
         expected_s: float,
         finished: Callable[[DecodeJob, FrameResult | Exception], None],
+        *,
+        in_background: bool = False,
     ) -> None:
         """Decode a frame on a worker, then call ``finished`` on the loop; never after ``close``.
 
@@ -120,7 +125,8 @@ class StreamDecoders:
             if outcome is not None and not self._closed:
                 finished(job, outcome)
 
-        self._server.workers.submit(self._owner, partial(self._reconstruct, job, expected_s), done)
+        workers = self._server.background if in_background else self._server.workers
+        workers.submit(self._owner, partial(self._reconstruct, job, expected_s), done)
 
     def close(self) -> None:
         """Close the decoders on threads, those that are still being opened included."""

@@ -1,18 +1,24 @@
-"""The decoder process: runs FFmpeg's H.264 decoder alone, with as few rights as possible.
+"""The decoder processes: each runs FFmpeg's H.264 decoder alone, with as few rights as possible.
 
-Started by ``mec_server.decoding.process`` as ``python -m mec_server.decoding.child CONFINEMENT
-SOCKET MEMORY``, the last two inherited descriptors; it ends when the socket is closed. Before it
-reads the first byte that comes from a vehicle it confines itself (``rfcore.confinement``). The
-limit of CPU time is for one request and is moved on before each.
+``mec_server.decoding.process`` starts ``python -m mec_server.decoding.child CONFINEMENT SOCKET``
+once: the fork server. It imports what decoders need, reads nothing but the server's requests, and
+forks a decoder process for each, which takes milliseconds where a start of Python and FFmpeg takes
+0.3 s of a processor. A decoder process confines itself (``rfcore.confinement``) before it reads
+the first byte that comes from a vehicle, and ends when its socket is closed. The limit of CPU time
+is for one request and is moved on before each.
 """
 
 from __future__ import annotations
 
+import ctypes
 import mmap
+import os
 import resource
 import socket
 import sys
+import traceback
 from collections.abc import Iterator, Sequence
+from typing import NoReturn
 
 import numpy as np
 
@@ -22,6 +28,7 @@ from mec_server.decoding.protocol import (
     MAX_ANSWER_BYTES,
     MAX_REQUEST_BYTES,
     MEMORY_BYTES,
+    NUMBER,
     OUTPUT_AT,
     Command,
     request_from_bytes,
@@ -31,12 +38,17 @@ from rfcore.confinement.confine import Confinement, ProcessLimits, confine
 from rfcore.errors import CodecError
 from rfcore.image import I420
 
-__all__ = ["LIMITS", "REQUEST_CPU_S", "main"]
+__all__ = ["DECODER_NAME", "LIMITS", "REQUEST_CPU_S", "main"]
 
 LIMITS = ProcessLimits(address_space_bytes=1 << 30)
 """0.2 GiB is the interpreter; a 4096x2304 picture is 14 MB, and FFmpeg holds some twenty."""
 
 REQUEST_CPU_S = 5
+
+DECODER_NAME, FORK_SERVER_NAME = "decoder", "decoder-forks"
+"""What the processes are called in lists of processes (``ps -o comm``)."""
+
+PR_SET_NAME = 15
 
 
 class DecoderChild:
@@ -94,16 +106,85 @@ def _allow_cpu() -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (until_s, resource.RLIM_INFINITY))
 
 
-def main() -> None:
-    """Serve until the socket closes."""
-    confinement, control_fd, memory_fd = sys.argv[1:]
-    control = socket.socket(fileno=int(control_fd))
-    child = DecoderChild(mmap.mmap(int(memory_fd), MEMORY_BYTES))
-    confine(Confinement(confinement), LIMITS)
+def _name_process(name: str) -> None:
+    ctypes.CDLL(None).prctl(PR_SET_NAME, name.encode(), 0, 0, 0)
+
+
+def _decode(confinement: Confinement, control_fd: int, memory_fd: int) -> None:
+    """Serve a decoder's requests until its socket closes."""
+    control = socket.socket(fileno=control_fd)
+    child = DecoderChild(mmap.mmap(memory_fd, MEMORY_BYTES))
+    confine(confinement, LIMITS)
     control.send(DONE)
     while request := control.recv(MAX_REQUEST_BYTES):
         _allow_cpu()
         control.send(child.answer(request))
+
+
+def _run_decoder(confinement: Confinement, control_fd: int, memory_fd: int, errors_fd: int) -> int:
+    """Run in a forked process; return its exit status."""
+    try:
+        os.dup2(errors_fd, sys.stderr.fileno())
+        _name_process(DECODER_NAME)
+        _decode(confinement, control_fd, memory_fd)
+    except BaseException:
+        traceback.print_exc()
+        sys.stderr.flush()
+        return 1
+    return 0
+
+
+class ForkServer:
+    """Forks decoder processes, and reaps them."""
+
+    def __init__(self, requests: socket.socket, confinement: Confinement) -> None:
+        self._requests = requests
+        self._confinement = confinement
+
+    def serve(self) -> None:
+        """Answer requests until their socket closes."""
+        self._requests.send(DONE)
+        while True:
+            request, descriptors, _, _ = socket.recv_fds(self._requests, MAX_REQUEST_BYTES, 3)
+            if not request:
+                return
+            try:
+                if descriptors:
+                    self._fork(descriptors)
+                else:
+                    self._reap(request)
+            except OSError as error:
+                self._requests.send(FAILED + str(error).encode()[: MAX_ANSWER_BYTES - 1])
+            finally:
+                for descriptor in descriptors:
+                    os.close(descriptor)
+
+    def _fork(self, descriptors: Sequence[int]) -> None:
+        pid = os.fork()
+        if not pid:
+            self._become_decoder(descriptors)
+        pidfd = os.pidfd_open(pid)
+        try:
+            socket.send_fds(self._requests, [DONE + NUMBER.pack(pid)], [pidfd])
+        finally:
+            os.close(pidfd)
+
+    def _become_decoder(self, descriptors: Sequence[int]) -> NoReturn:
+        self._requests.close()
+        control_fd, memory_fd, errors_fd = descriptors
+        os._exit(_run_decoder(self._confinement, control_fd, memory_fd, errors_fd))
+
+    def _reap(self, request: bytes) -> None:
+        (pid,) = NUMBER.unpack(request)
+        _, status = os.waitpid(pid, 0)
+        self._requests.send(DONE + NUMBER.pack(os.waitstatus_to_exitcode(status)))
+
+
+def main() -> None:
+    """Be the fork server until its socket closes."""
+    confinement, requests_fd = sys.argv[1:]
+    _name_process(FORK_SERVER_NAME)
+    ForkServer(socket.socket(fileno=int(requests_fd)), Confinement(confinement)).serve()
 
 
 if __name__ == "__main__":

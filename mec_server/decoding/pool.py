@@ -1,8 +1,9 @@
 """Decoders in processes of their own, one per camera, and a spare one.
 
-Starting Python and FFmpeg takes 0.3 s, so the next process is started before it is needed: a
-decoder that loses its process has another one at once. All are started by one thread, which lives
-as long as the pool.
+Processes are forked from one that has started Python and FFmpeg, which takes 0.3 s of a processor;
+after a loss that one is replaced. The next process is forked before it is needed, so that a decoder
+that loses its process has another one at once. All is started by one thread, which lives as long as
+the pool.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 
-from mec_server.decoding.process import DecoderLost, DecoderProcess, Waiting
+from mec_server.decoding.process import DecoderLost, DecoderProcess, ForkServer, Waiting
 from mec_server.decoding.protocol import INPUT_BYTES, Command
 from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import CodecError, RfedgeError
@@ -39,11 +40,12 @@ class DecoderPool:
         start_failed: Callable[[Exception], None],
         waiting: Waiting = nullcontext,
     ) -> None:
-        self.lost = lost
         self.waiting = waiting
+        self._lost = lost
         self._start_failed = start_failed
         self._program = program
         self._lock = threading.Lock()
+        self._forks: ForkServer | None = None
         self._starter = ThreadPoolExecutor(1, "decoder-starter")
         self._spare = self._starter.submit(self._start)
 
@@ -75,10 +77,18 @@ class DecoderPool:
         """Return a decoder for pictures of ``size_px``, in a process of its own."""
         return ChildDecoder(self, size_px)
 
+    def lose(self, process: DecoderProcess, lost: DecoderLost) -> None:
+        """Close a process that died in use, report it, and fork no other from where it came."""
+        process.close()
+        process.forks.retire()
+        self._lost(lost)
+
     def close(self) -> None:
         """End the spare process; those in use are closed by their decoders."""
         self._starter.shutdown(cancel_futures=True)
         self._spare.add_done_callback(_close_started)
+        if self._forks is not None:
+            self._forks.retire()
 
     def _start_spare(self) -> DecoderProcess:
         try:
@@ -88,7 +98,12 @@ class DecoderPool:
             raise
 
     def _start(self) -> DecoderProcess:
-        process = DecoderProcess(self._program)
+        """Runs on the starter's thread."""
+        if self._forks is None or not self._forks.is_usable:
+            if self._forks is not None:
+                self._forks.retire()
+            self._forks = ForkServer(self._program)
+        process = DecoderProcess(self._forks)
         process.wait_until_ready()
         return process
 
@@ -171,8 +186,7 @@ class ChildDecoder:
             process.ask(command, *numbers, waiting=self._pool.waiting)
         except DecoderLost as lost:
             self._process = None
-            process.close()
-            self._pool.lost(lost)
+            self._pool.lose(process, lost)
             raise
 
 

@@ -1,7 +1,11 @@
-"""One decoder process as the server sees it: started, sent requests, and found dead or killed.
+"""Decoder processes as the server sees them: forked, sent requests, and found dead or killed.
 
 A process that dies or does not answer is a ``DecoderLost``. The server reads nothing from it but
 one-byte answers, short texts, and as many samples as it asked for.
+
+Processes of one fork server have the same addresses in memory, which a sender could try to find out
+by crashing one after the other. One fork server is therefore not used any more once a decoder of it
+was lost (``ForkServer.retire``).
 """
 
 from __future__ import annotations
@@ -14,14 +18,19 @@ import signal
 import socket
 import subprocess
 import tempfile
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from enum import StrEnum
+from pathlib import Path
+from typing import IO
 
 from mec_server.decoding.protocol import (
     DONE,
+    FAILED,
     MAX_ANSWER_BYTES,
     MEMORY_BYTES,
+    NUMBER,
     OUTPUT_AT,
     Command,
     request_to_bytes,
@@ -29,10 +38,11 @@ from mec_server.decoding.protocol import (
 from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import CodecError, RfedgeError
 
-__all__ = ["DecoderLost", "DecoderProcess", "LossCause", "Waiting"]
+__all__ = ["DecoderLost", "DecoderProcess", "ForkServer", "LossCause", "Waiting"]
 
 START_S = 20.0
-"""Time limit of its start: 0.3 s on an idle machine, more on one that swaps or is overloaded."""
+"""Time limit of the fork server's start, 0.3 s on an idle machine and more on one that swaps or is
+overloaded, and of a fork, some ms."""
 
 ANSWER_S = 2.0
 """Time limit of an answer: a thousand times what a 640x360 picture takes."""
@@ -63,13 +73,117 @@ class DecoderLost(CodecError):
         self.pid = pid
 
 
-class DecoderProcess:
-    """A decoder process: ``program`` is ``mec_server.decoding.child`` in its confinement.
+class ForkServer:
+    """The process that decoder processes are forked from; ``program`` is
+    ``mec_server.decoding.child`` in its confinement.
 
-    Make it on a thread that outlives the process: bubblewrap ends with the thread that started it.
+    Make it on a thread that outlives it: bubblewrap ends with the thread that started it, and all
+    processes in the sandbox with bubblewrap. Its methods may be called on any thread. Raises
+    ``RfedgeError`` if it does not start.
     """
 
     def __init__(self, program: ConfinedProgram) -> None:
+        self._lock = threading.Lock()
+        self._in_use = 0
+        self._retired = self._closed = False
+        with ExitStack() as until_started:
+            self._errors = until_started.enter_context(tempfile.TemporaryFile())
+            self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            until_started.enter_context(self._requests)
+            descriptor = theirs.fileno()
+            with theirs:
+                self._process = program.start([str(descriptor)], [descriptor], stderr=self._errors)
+            until_started.pop_all()
+        self._requests.settimeout(START_S)
+        try:
+            self._answer()
+        except RfedgeError as error:
+            self._close()
+            with self._errors:
+                message = _last_line(self._errors)
+            raise RfedgeError(f"{error} at its start: {message}") from error
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether processes may be forked from it: it runs, and no decoder of it was lost."""
+        return not self._retired and self._process.poll() is None
+
+    def fork(self, descriptors: Sequence[int]) -> tuple[int, int]:
+        """Fork a decoder process with ``descriptors``: its socket, memory and file for errors.
+
+        Returns the number to reap it by and its pidfd, which is the caller's to close. Raises
+        ``RfedgeError``.
+        """
+        with self._lock:
+            answer, received = self._ask(b" ", descriptors)
+            self._in_use += 1
+        (pidfd,) = received
+        (number,) = NUMBER.unpack(answer.removeprefix(DONE))
+        return number, pidfd
+
+    def reap(self, number: int) -> int | None:
+        """Return the exit status of a process that ended, negative for a signal.
+
+        None if the fork server has ended itself. The last process of one that is retired closes it.
+        """
+        status: int | None = None
+        with self._lock:
+            with suppress(RfedgeError):
+                answer, _ = self._ask(NUMBER.pack(number))
+                (status,) = NUMBER.unpack(answer.removeprefix(DONE))
+            self._in_use -= 1
+            self._close_if_done()
+        return status
+
+    def retire(self) -> None:
+        """Fork no more; it ends with the last process of it."""
+        with self._lock:
+            self._retired = True
+            self._close_if_done()
+
+    def _ask(self, request: bytes, descriptors: Sequence[int] = ()) -> tuple[bytes, Sequence[int]]:
+        try:
+            socket.send_fds(self._requests, [request], descriptors)
+        except OSError as error:
+            raise RfedgeError(f"fork server of decoders: {error}") from error
+        return self._answer()
+
+    def _answer(self) -> tuple[bytes, Sequence[int]]:
+        flags = socket.MSG_CMSG_CLOEXEC
+        try:
+            answer, received, _, _ = socket.recv_fds(self._requests, MAX_ANSWER_BYTES, 1, flags)
+        except OSError as error:
+            self._process.kill()  # what it answers late would be taken for another answer
+            raise RfedgeError(f"fork server of decoders: {error}") from error
+        if not answer:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(ANSWER_S)
+            status = self._process.returncode
+            raise RfedgeError(f"fork server of decoders ended with status {status}")
+        if answer.startswith(FAILED):
+            text = answer[1:].decode(errors="replace")
+            raise RfedgeError(f"fork server of decoders: {text}")
+        return answer, received
+
+    def _close_if_done(self) -> None:
+        if self._retired and not self._in_use and not self._closed:
+            self._close()
+            self._errors.close()
+
+    def _close(self) -> None:
+        self._closed = True
+        self._process.kill()
+        self._process.wait()
+        self._requests.close()
+
+
+class DecoderProcess:
+    """A decoder process, forked from ``forks``."""
+
+    def __init__(self, forks: ForkServer) -> None:
+        self.forks = forks
+        self._status: int | None = None
+        self._reaped = False
         with ExitStack() as until_started:
             self._errors = until_started.enter_context(tempfile.TemporaryFile())
             memory_fd = os.memfd_create("decoder", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
@@ -80,30 +194,25 @@ class DecoderProcess:
             self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             until_started.enter_context(self._control)
             with theirs:
-                self._process = self._start(program, theirs.fileno(), memory_fd)
+                descriptors = (theirs.fileno(), memory_fd, self._errors.fileno())
+                self._number, self._pidfd = forks.fork(descriptors)
             until_started.pop_all()
             os.close(memory_fd)
-        self.pid = self._process.pid
-
-    def _start(self, program: ConfinedProgram, *descriptors: int) -> subprocess.Popen[bytes]:
-        return program.start(list(map(str, descriptors)), descriptors, stderr=self._errors)
+        self.pid = _pid_of(self._pidfd)
 
     def wait_until_ready(self) -> None:
         """Return when it answers; raise ``RfedgeError`` with its last line of errors otherwise."""
         try:
             self._receive(START_S)
         except DecoderLost as lost:
-            self._errors.seek(0)
-            errors = self._errors.read()[-4000:].decode(errors="replace").strip().splitlines()
+            message = _last_line(self._errors)
             self.close()
-            raise RfedgeError(
-                f"{lost} at its start: {errors[-1] if errors else 'no message'}"
-            ) from lost
+            raise RfedgeError(f"{lost} at its start: {message}") from lost
 
     @property
     def is_alive(self) -> bool:
         """Whether it runs."""
-        return self._process.poll() is None
+        return not _is_readable(self._pidfd, 0.0)
 
     def ask(self, command: Command, *numbers: int, waiting: Waiting = nullcontext) -> None:
         """Send a request and wait for its answer, for long in the context of ``waiting``.
@@ -112,7 +221,7 @@ class DecoderProcess:
         """
         with suppress(OSError):  # a process that ended is noticed when its answer is received
             self._control.send(request_to_bytes(command, *numbers))
-        with nullcontext() if self._answers_within(PATIENCE_S) else waiting():
+        with nullcontext() if _is_readable(self._control.fileno(), PATIENCE_S) else waiting():
             answer = self._receive(ANSWER_S)
         if answer != DONE:
             raise CodecError(answer[1:].decode(errors="replace"))
@@ -127,23 +236,29 @@ class DecoderProcess:
 
     def close(self) -> None:
         """Kill and reap it."""
-        self._process.kill()
-        self._process.wait()
+        self._kill()
+        self._reap()
         self._control.close()
         self._memory.close()
         self._errors.close()
+        os.close(self._pidfd)
 
-    def _answers_within(self, patience_s: float) -> bool:
-        poll = select.poll()
-        poll.register(self._control, select.POLLIN)
-        return bool(poll.poll(patience_s * 1e3))
+    def _kill(self) -> None:
+        with suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
+
+    def _reap(self) -> int | None:
+        """Return the exit status of a process that ended or was killed, once it is known."""
+        if not self._reaped:
+            self._reaped, self._status = True, self.forks.reap(self._number)
+        return self._status
 
     def _receive(self, within_s: float) -> bytes:
         self._control.settimeout(within_s)
         try:
             answer = self._control.recv(MAX_ANSWER_BYTES)
         except TimeoutError:
-            self._process.kill()
+            self._kill()
             problem = f"did not answer within {within_s:g} s and was killed"
             raise DecoderLost(LossCause.TIMEOUT, self.pid, problem) from None
         except OSError:
@@ -153,15 +268,34 @@ class DecoderProcess:
         return answer
 
     def _ended(self) -> DecoderLost:
-        try:
-            status = self._process.wait(ANSWER_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
+        if not _is_readable(self._pidfd, ANSWER_S):
+            self._kill()
             return DecoderLost(LossCause.EXIT, self.pid, "hung up and was killed")
-        number = -status if status < 0 else status - 128  # as bubblewrap and shells pass it on
-        if number in signal.valid_signals():
-            return DecoderLost(LossCause.SIGNAL, self.pid, f"was killed by {_signal_name(number)}")
+        status = self._reap()
+        if status is None:
+            return DecoderLost(LossCause.EXIT, self.pid, "ended, and its fork server too")
+        if status < 0:
+            return DecoderLost(LossCause.SIGNAL, self.pid, f"was killed by {_signal_name(-status)}")
         return DecoderLost(LossCause.EXIT, self.pid, f"ended with status {status}")
+
+
+def _is_readable(descriptor: int, within_s: float) -> bool:
+    """Return whether there is something to read in time; of a pidfd: whether its process ended."""
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    return bool(poll.poll(within_s * 1e3))
+
+
+def _pid_of(pidfd: int) -> int:
+    """Return the number that a process has here, whatever it is called in a sandbox."""
+    lines = Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("Pid:")).removeprefix("Pid:"))
+
+
+def _last_line(errors: IO[bytes]) -> str:
+    errors.seek(0)
+    lines = errors.read()[-4000:].decode(errors="replace").strip().splitlines()
+    return lines[-1] if lines else "no message"
 
 
 def _signal_name(number: int) -> str:

@@ -5,6 +5,13 @@ A request is a command and its numbers, one message of a SOCK_SEQPACKET socket; 
 the memory, a decoded picture (I420, plane after plane, of the size given by OPEN) at ``OUTPUT_AT``.
 The memory is a sealed memfd: it cannot shrink under its reader, is on no disk, and only pages in
 use take memory.
+
+Decoder processes are forked from one that has imported all they need, the fork server, over a
+socket of the same kind. A message with three descriptors (socket, memory, file for errors) forks
+one; the answer is ``DONE`` with its process number in the fork server's namespace and, as a
+descriptor, its pidfd (pidfd_open(2)). A message with such a number reaps a process that ended or
+was killed; the answer is ``DONE`` with its exit status, negative for a signal. What fails is
+answered as above.
 """
 
 from __future__ import annotations
@@ -21,6 +28,7 @@ __all__ = [
     "MAX_ANSWER_BYTES",
     "MAX_REQUEST_BYTES",
     "MEMORY_BYTES",
+    "NUMBER",
     "OUTPUT_AT",
     "Command",
     "request_from_bytes",
@@ -36,6 +44,8 @@ OUTPUT_AT = (INPUT_BYTES + 4095) // 4096 * 4096
 MEMORY_BYTES = OUTPUT_AT + MAX_MACROBLOCKS * SAMPLES_PER_MACROBLOCK
 
 DONE, FAILED = b".", b"!"
+NUMBER = struct.Struct("<i")
+"""A process number, or an exit status."""
 MAX_ANSWER_BYTES = 1024
 MAX_REQUEST_BYTES = 1 + 4 * 16
 

@@ -239,6 +239,10 @@ class StreamAccount:
             for resource in (Resource.WORKER_SECONDS, Resource.REJECTED_SECONDS):
                 self._entry.ledger.check(self.identity, resource, now)
 
+    def is_doubtful(self, now: float) -> bool:
+        """Return whether work for this identity came to nothing lately (``Ledger.is_doubtful``)."""
+        return self._entry.ledger.is_doubtful(self.identity, now)
+
     def expected_s(self) -> float:
         """Return for how long the next frame will keep a worker busy."""
         return self._entry.promises.expected_s(self._session_id)

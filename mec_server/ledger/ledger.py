@@ -249,6 +249,15 @@ class Ledger:
 
     # --- what went wrong
 
+    def is_doubtful(self, identity: str, now: float) -> bool:
+        """Return whether work for ``identity`` came to nothing lately: its last opening, or frames
+        that were themselves to blame for being rejected."""
+        account = self._accounts.get(identity)
+        if account is None:
+            return False
+        rejected = account.spent[Resource.REJECTED_SECONDS]
+        return account.failed_openings > 0 or not rejected.is_full(now)
+
     def check_decoders(self, identity: str, now: float) -> None:
         """Raise ``LimitExceeded`` if packets of ``identity`` cost too many decoders lately."""
         account = self._accounts.get(identity)

@@ -5,7 +5,7 @@ six arguments) that is run before each call; seccomp(2). It is assembled here an
 libseccomp, so that a machine without that library is not one without a filter; the tests compare
 numbers and verdicts with libseccomp's.
 
-``WHILE_STARTING`` is what an interpreter needs to start and to load what it will use;
+``WHILE_STARTING`` is what an interpreter needs to start, to load what it will use, and to fork;
 ``WHILE_READING`` is what is left when it reads the first byte of somebody else's: memory that is
 not executable, the descriptors it was given, clocks. No path can be opened then, no process or
 thread started, no socket, no namespace, no signal sent to others.
@@ -40,8 +40,11 @@ NUMBERS: dict[str, tuple[int | None, int | None]] = {
     "arch_prctl": (158, None),
     "brk": (12, 214),
     "clock_gettime": (228, 113),
+    "clone": (56, 220),
     "close": (3, 57),
     "dup": (32, 23),
+    "dup2": (33, None),
+    "dup3": (292, 24),
     "execve": (59, 221),
     "exit": (60, 93),
     "exit_group": (231, 94),
@@ -77,6 +80,7 @@ NUMBERS: dict[str, tuple[int | None, int | None]] = {
     "newfstatat": (262, 79),
     "open": (2, None),
     "openat": (257, 56),
+    "pidfd_open": (434, 434),
     "prctl": (157, 167),
     "pread64": (17, 67),
     "prlimit64": (302, 261),
@@ -84,6 +88,7 @@ NUMBERS: dict[str, tuple[int | None, int | None]] = {
     "readlink": (89, None),
     "readlinkat": (267, 78),
     "recvfrom": (45, 207),
+    "recvmsg": (47, 212),
     "restart_syscall": (219, 128),
     "rseq": (334, 293),
     "rt_sigaction": (13, 134),
@@ -92,6 +97,7 @@ NUMBERS: dict[str, tuple[int | None, int | None]] = {
     "sched_getaffinity": (204, 123),
     "sched_yield": (24, 124),
     "seccomp": (317, 277),
+    "sendmsg": (46, 211),
     "sendto": (44, 206),
     "set_robust_list": (273, 99),
     "set_tid_address": (218, 96),
@@ -114,7 +120,11 @@ X32_BIT = 0x40000000
 """Numbers from here on are another table of x86_64's, and never allowed."""
 
 PROT_EXEC = 4
-PR_SET_PDEATHSIG, PR_SET_SECCOMP, PR_SET_NO_NEW_PRIVS, PR_SET_VMA = 1, 22, 38, 0x53564D41
+PR_SET_PDEATHSIG, PR_SET_NAME, PR_SET_SECCOMP = 1, 15, 22
+PR_SET_NO_NEW_PRIVS, PR_SET_VMA = 38, 0x53564D41
+FORK = 0x01200011
+"""Flags of ``clone`` for fork(2): CLONE_CHILD_SETTID, CLONE_CHILD_CLEARTID and SIGCHLD; a new
+process that shares nothing, and no namespace."""
 TCGETS, TIOCGWINSZ, FIOCLEX, FIONBIO = 0x5401, 0x5413, 0x5451, 0x5421
 
 
@@ -165,8 +175,10 @@ WHILE_STARTING: tuple[Allowed, ...] = (
         "prctl",
         0,
         0xFFFFFFFF,
-        (PR_SET_PDEATHSIG, PR_SET_SECCOMP, PR_SET_NO_NEW_PRIVS, PR_SET_VMA),
+        (PR_SET_PDEATHSIG, PR_SET_NAME, PR_SET_SECCOMP, PR_SET_NO_NEW_PRIVS, PR_SET_VMA),
     ),
+    Allowed("clone", 0, 0xFFFFFFFF, (FORK,)),
+    *_all("dup2 dup3 pidfd_open recvmsg sendmsg"),
 )
 
 LOAD, EQUAL, AT_LEAST, AND, RETURN = 0x20, 0x15, 0x35, 0x54, 0x06

@@ -458,6 +458,20 @@ CAPACITY = Dashboard(
             ),
         ),
         Panel(
+            "Bytes a picture by tile",
+            "Coded bytes of a picture, by the tile of its field: after a new version they must not "
+            "rise.",
+            Unit.BYTES,
+            (
+                Query(
+                    "sum by (instance, tile) (rate(rfedge_server_tile_payload_bytes_total"
+                    f"{{{SERVER}}}[$__rate_interval])) / (sum by (instance, tile) (rate("
+                    f"rfedge_server_tile_pictures_total{{{SERVER}}}[$__rate_interval])) > 0)",
+                    "{{instance}} {{tile}}",
+                ),
+            ),
+        ),
+        Panel(
             "Saved by learning",
             "Share of bits that each tile's last learnt field saved on frames held back.",
             Unit.SHARE,

@@ -18,7 +18,6 @@ import numpy as np
 
 from mec_server.__main__ import serve
 from mec_server.config import AdmissionLimits, ServerBudget, ServerConfig
-from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
 from mec_server.reconstruction import (
     Decoder,
     FieldSource,
@@ -27,6 +26,7 @@ from mec_server.reconstruction import (
     Tools,
     open_cameras,
 )
+from mec_server.session import DecodeJob, DecodeOutcome, OpenJob
 from rfcore.camera import Camera
 from rfcore.field import Quality, Renderer
 from rfcore.image import I420

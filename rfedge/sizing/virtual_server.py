@@ -15,12 +15,11 @@ from functools import partial
 from itertools import count
 
 from mec_server.config import IdentityBudget, ServerBudget
-from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob, RenderTooLate
 from mec_server.event_loop import FairQueue
 from mec_server.ledger.budgets import budgets_of
 from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.ledger import Hold
-from mec_server.session import ServerSession
+from mec_server.session import DecodeJob, DecodeOutcome, OpenJob, RenderTooLate, ServerSession
 from rfcore.errors import LimitExceeded
 from rfcore.link import Link, LinkProfile
 from rfcore.wire.convert import client_message_from_bytes

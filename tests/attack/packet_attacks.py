@@ -15,6 +15,7 @@ from pathlib import Path
 from attack.target import ROOT, SEED, VEHICLE, Target, all_of, for_ever, stream_of
 from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
+from mec_server.decoding.child import DECODER_NAME
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.dataset import read_dataset
 from rfcore.field import load_field
@@ -98,6 +99,6 @@ def decoders(pid: int) -> set[int]:
             with suppress(OSError):
                 left += [int(child) for child in children.read_text().split()]
         with suppress(OSError):
-            if b"mec_server.decoding.child" in Path(f"/proc/{of}/cmdline").read_bytes():
+            if Path(f"/proc/{of}/comm").read_text().strip() == DECODER_NAME:
                 found.add(of)
     return found - {pid}

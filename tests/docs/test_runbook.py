@@ -151,12 +151,10 @@ async def test_servers_are_updated_one_after_another_without_a_lost_frame(
         assert "render" in line["references"], "never a keyframe"
 
 
-def bytes_a_frame(server: Any, since: Mapping[str, float]) -> float:
-    """Return what the page's expression says, of the frames since then."""
+def bytes_a_picture(server: Any, since: Mapping[str, float]) -> float:
+    """Return what the page's expression says of the tile `street`, of the pictures since then."""
     now = counted(server)
-    return (now["payload_bytes"] - since["payload_bytes"]) / (
-        now["coded_frames"] - since["coded_frames"]
-    )
+    return (now["payload_bytes"] - since["payload_bytes"]) / (now["pictures"] - since["pictures"])
 
 
 def counted(server: Any) -> dict[str, float]:
@@ -165,9 +163,10 @@ def counted(server: Any) -> dict[str, float]:
             sample.value
             for metric in server.registry.collect()
             for sample in metric.samples
-            if sample.name == f"rfedge_server_{name}_total"
+            if sample.name == f"rfedge_server_tile_{name}_total"
+            and sample.labels["tile"] == "street"
         )
-        for name in ("payload_bytes", "coded_frames")
+        for name in ("payload_bytes", "pictures")
     }
 
 
@@ -176,7 +175,7 @@ async def test_a_canary_shows_that_bytes_rose_and_is_taken_back(
     street: Any, vehicle: Any, serve: Any, stack: AsyncExitStack
 ) -> None:
     """The field that the page calls better is one of another place: bytes have to rise."""
-    assert "rfedge_server_payload_bytes_total" in PAGE.text
+    assert "rfedge_server_tile_payload_bytes_total" in PAGE.text
     operator = Operator(stack, vehicle, serve)
     await operator.types(CANARY)
     (canary,), (driving,) = operator.servers, operator.vehicles
@@ -195,11 +194,11 @@ async def test_a_canary_shows_that_bytes_rose_and_is_taken_back(
 
 
 async def one_round(server: Any, driving: Any, moved: int) -> float:
-    """Wait until the vehicle has moved so often, and then for a round; return bytes a frame."""
+    """Wait until the vehicle has moved so often, and then for a round; return bytes a picture."""
     await driving.until(lambda: driving.handovers("tile") == moved)
     there, since = driving.acked(), counted(server)
     await driving.until(lambda: driving.acked() >= there + 2 * FRAMES)
-    return bytes_a_frame(server, since)
+    return bytes_a_picture(server, since)
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -26,6 +26,7 @@ import pytest
 from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from integration.conftest import coded, raw_vehicle, street
+from mec_server.decoding.child import DECODER_NAME
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.dataset import read_dataset
 from rfcore.wire.messages import FrameAddress
@@ -122,7 +123,7 @@ class Server(Program):
 
     def decoders(self) -> list[int]:
         """Return its decoder processes, the one that stands ready included."""
-        return [p for p in self.descendants() if b"mec_server.decoding.child" in _command(p)]
+        return [p for p in self.descendants() if _name(p) == DECODER_NAME]
 
 
 @dataclass
@@ -148,11 +149,11 @@ class Vehicle(Program):
         return sorted(end for end in ends if end > after_s)
 
 
-def _command(pid: int) -> bytes:
+def _name(pid: int) -> str:
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
+        return Path(f"/proc/{pid}/comm").read_text().strip()
     except OSError:
-        return b""
+        return ""
 
 
 class Site:

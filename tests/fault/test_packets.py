@@ -51,6 +51,7 @@ def truncated(data: bytes, rng: random.Random) -> bytes:
     return data[: rng.randrange(1, len(data))]
 
 
+@pytest.mark.fault_core
 @pytest.mark.parametrize("damage", [flipped, truncated], ids=lambda f: f.__name__)
 async def test_damaged_packets(
     damage: Callable[[bytes, random.Random], bytes],

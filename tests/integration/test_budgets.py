@@ -22,9 +22,8 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from structlog.testing import capture_logs
 
 from mec_server.config import AdmissionLimits, IdentityBudget, SessionLimits
-from mec_server.decode_jobs import DecodeJob, OpenJob
 from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
-from mec_server.session import MAX_UNUSABLE
+from mec_server.session import MAX_UNUSABLE, DecodeJob, OpenJob
 from rfcore.field import SplatField, save_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER, STREAM_METHOD
@@ -474,6 +473,39 @@ async def test_a_long_render_is_charged_to_its_identity_and_leaves_a_worker_to_t
         gate.set()
         for _ in range(4):
             assert isinstance(await greedy.hear(), Ack)
+
+
+async def test_frames_of_who_sent_what_cannot_be_decoded_give_way_to_those_of_others(
+    serve: Any, raw_vehicle: Any, coded: Any
+) -> None:
+    threads: list[tuple[str, str]] = []
+
+    def note(vehicle_id: str) -> None:
+        threads.append((vehicle_id, threading.current_thread().name.rpartition("_")[0]))
+
+    def opened(job: OpenJob, fields: FieldSource, tools: Tools) -> dict[str, Decoder]:
+        vehicle_id = job.hello.vehicle_id
+        decoders = open_cameras(job, fields, tools)
+        return {name: Slowed(each, vehicle_id, note) for name, each in decoders.items()}
+
+    never_made_up_for = IdentityBudget(rejected_workers=1e-6)
+    junk = replace(coded.frames[0].packet, render_digest=bytes(16), render_block_means=b"")
+    async with serve(opened, identity_budget=never_made_up_for) as server:
+        async with raw_vehicle(server.address) as mallory:
+            await mallory.greet(named(coded.hello, "mallory"))
+            bad = replace(coded.frames[0], packet=junk.sealed())
+            assert await mallory.told(of_camera(bad, "mallory")) == ("render_mismatch", 0)
+            good = of_camera(coded.frames[0], "mallory")
+            assert await mallory.told(good) == ("ack", 0)
+            await mallory.farewell()
+        async with raw_vehicle(server.address) as modest:
+            await modest.greet(named(coded.hello, "modest"))
+            assert await modest.told(of_camera(coded.frames[0], "modest")) == ("ack", 0)
+    assert threads == [
+        ("mallory", "worker"),
+        ("mallory", "background"),
+        ("modest", "worker"),
+    ]
 
 
 async def test_answers_that_nobody_reads_end_the_stream(

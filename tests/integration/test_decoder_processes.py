@@ -3,6 +3,7 @@
 import asyncio
 import os
 import signal
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,20 +11,24 @@ from typing import Any
 import pytest
 
 from mec_server.config import DecoderKind
+from mec_server.decoding.child import DECODER_NAME
 from rfcore.wire.messages import Ack
 
 
 def processes_of_decoders() -> list[int]:
-    """Return those this process started, the spare one included."""
-    own = os.getpid()
-    children = []
-    for thread in Path(f"/proc/{own}/task").iterdir():
-        children += (thread / "children").read_text().split()
-    return [
-        int(pid)
-        for pid in children
-        if b"mec_server.decoding.child" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    ]
+    """Return those of servers in this process, the spare one included."""
+    found, left = [], [os.getpid()]
+    while left:
+        for thread in Path(f"/proc/{left.pop()}/task").glob("*"):
+            with suppress(OSError):  # it ended meanwhile
+                children = [int(pid) for pid in (thread / "children").read_text().split()]
+                left += children
+                found += [pid for pid in children if is_decoder(pid)]
+    return found
+
+
+def is_decoder(pid: int) -> bool:
+    return Path(f"/proc/{pid}/comm").read_text().strip() == DECODER_NAME
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,10 @@ from structlog.testing import capture_logs
 
 from mec_server.config import AdmissionLimits, DecoderKind, LearnSettings, NatsSettings
 from mec_server.connection_cap import ConnectionCap
-from mec_server.decode_jobs import DecodeJob, OpenJob
 from mec_server.metrics import BackgroundTask
 from mec_server.peers import FAILED
 from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
+from mec_server.session import DecodeJob, OpenJob
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.wire.conventions import AGENT_PROCESS
 from rfcore.wire.messages import Ack, Frame, Hello

@@ -11,7 +11,6 @@ import pytest
 from structlog.testing import capture_logs
 
 from cav_agent.config import PaceKind
-from mec_server.decode_jobs import DecodeJob, OpenJob
 from mec_server.reconstruction import (
     Decoder,
     FieldSource,
@@ -20,6 +19,7 @@ from mec_server.reconstruction import (
     Tools,
     open_cameras,
 )
+from mec_server.session import DecodeJob, OpenJob
 from mec_server.twin.state import Twin, TwinView
 from rfcore.camera import Pose, camera_on_rig
 from rfcore.dataset.rig import read_rig, read_rig_drive

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from cav_agent.frames import Capture, EncodedFrame, EncodeJob, FrameResult, Outcome
 from cav_agent.session import AgentSession
-from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
-from mec_server.session import ServerSession
+from mec_server.session import DecodeJob, DecodeOutcome, OpenJob, ServerSession
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader

@@ -80,13 +80,10 @@ def decoder(pool: DecoderPool) -> Iterator[ChildDecoder]:
     opened.close()
 
 
-def python_of(decoder: ChildDecoder) -> int:
-    """Return the process that decodes: bubblewrap's is its grandchild."""
+def process_of(decoder: ChildDecoder) -> int:
+    """Return the process that decodes."""
     assert decoder._process is not None
-    pid = decoder._process.pid
-    while children := Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-        pid = int(children[0])
-    return pid
+    return decoder._process.pid
 
 
 def test_pictures_are_those_of_a_decoder_in_this_process(
@@ -141,7 +138,7 @@ def test_what_ffmpeg_refuses_is_the_same_error_and_the_process_lives_on(
 
 def test_a_killed_process_costs_one_picture(decoder: ChildDecoder, units: Sequence[bytes]) -> None:
     expected = decoder.decode(units[0]).digest()
-    os.kill(python_of(decoder), signal.SIGKILL)
+    os.kill(process_of(decoder), signal.SIGKILL)
     with pytest.raises(DecoderLost, match="was killed by SIGKILL"):
         decoder.decode(units[1])
     decoder.reset()
@@ -152,7 +149,7 @@ def test_a_killed_process_costs_one_picture(decoder: ChildDecoder, units: Sequen
 def test_a_process_that_hangs_is_killed(
     decoder: ChildDecoder, units: Sequence[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hung = python_of(decoder)
+    hung = process_of(decoder)
     os.kill(hung, signal.SIGSTOP)
     with monkeypatch.context() as patience:
         patience.setattr(process, "ANSWER_S", 0.05)
@@ -168,7 +165,7 @@ def test_a_process_has_the_limits_it_is_said_to_have(
     decoder: ChildDecoder, units: Sequence[bytes]
 ) -> None:
     decoder.decode(units[0])
-    lines = Path(f"/proc/{python_of(decoder)}/limits").read_text().splitlines()
+    lines = Path(f"/proc/{process_of(decoder)}/limits").read_text().splitlines()
     limits = {line[:26].strip(): line[26:].split()[:2] for line in lines}
     assert limits["Max address space"] == [str(LIMITS.address_space_bytes)] * 2
     assert limits["Max open files"] == ["16", "16"]
@@ -179,7 +176,7 @@ def test_a_process_has_the_limits_it_is_said_to_have(
 
 def test_a_process_ends_when_its_decoder_is_closed(pool: DecoderPool) -> None:
     decoder = pool.open(SIZE_PX)
-    pid = python_of(decoder)
+    pid = process_of(decoder)
     decoder.close()
     while Path(f"/proc/{pid}/exe").exists():  # the kernel ends a sandbox after its front
         os.sched_yield()
@@ -198,7 +195,7 @@ def test_bubblewrap_shows_no_network_no_process_and_no_file_of_ours(
     decoder = pool.open(SIZE_PX)
     try:
         decoder.decode(units[0])
-        proc = Path(f"/proc/{python_of(decoder)}")
+        proc = Path(f"/proc/{process_of(decoder)}")
         for namespace in ("net", "pid", "ipc", "mnt", "uts"):
             there, here = (p / "ns" / namespace for p in (proc, Path("/proc/self")))
             assert there.readlink() != here.readlink(), namespace
@@ -308,7 +305,7 @@ def test_a_lost_decoder_is_counted_by_cause(units: Sequence[bytes]) -> None:
     made = Decoders(DecoderSettings(DecoderKind.CHILD), count_loss, unexpected)
     made.start()
     decoder: Any = made.open(SIZE_PX)
-    os.kill(python_of(decoder), signal.SIGSEGV)
+    os.kill(process_of(decoder), signal.SIGSEGV)
     with pytest.raises(CodecError, match="SIGSEGV"):
         decoder.decode(units[0])
     decoder.close()

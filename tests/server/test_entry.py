@@ -136,6 +136,25 @@ def test_frames_that_are_rejected_take_little_of_the_workers_while_others_stream
     account.spend_frame(frame, 10, 0.5 / budget + 0.01)
 
 
+def test_work_for_who_caused_work_for_nothing_can_wait_until_that_is_made_up_for(
+    hello: Hello,
+) -> None:
+    entry = entry_control()
+    account = entry.open("s-1", "mallory", named=True, now=0.0)
+    other = entry.open("s-2", "modest", named=True, now=0.0)
+    assert not account.is_doubtful(0.0)
+    account.enter(hello, Sender(), 0.0)
+    account.rejected(0.06, 0.0)
+    refilled_s = 0.06 / entry.ledger.budget(Resource.REJECTED_SECONDS).identity
+    assert account.is_doubtful(0.9 * refilled_s)
+    assert not account.is_doubtful(1.1 * refilled_s)
+    account.opening_failed(10.0)
+    assert account.is_doubtful(20.0)
+    account.worked(hello.field_ids[0], 0.01, 20.0)
+    assert not account.is_doubtful(20.0), "a picture pays for the opening"
+    assert not other.is_doubtful(0.0)
+
+
 def test_streams_that_open_decoders_and_give_no_picture_make_their_identity_wait(
     hello: Hello,
 ) -> None:

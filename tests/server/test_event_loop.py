@@ -1,6 +1,7 @@
 """Workers take turns among owners, bring every outcome back to the loop, and wake it once."""
 
 import asyncio
+import os
 import threading
 from collections import Counter, defaultdict
 
@@ -126,6 +127,23 @@ def test_one_worker_does_work_in_the_order_of_asking() -> None:
         return order
 
     assert asyncio.run(run()) == list(range(100))
+
+
+def test_threads_of_background_work_give_way_and_no_other_thread_does() -> None:
+    async def niceness(workers: Workers) -> int:
+        found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        workers.submit("cav-1", own_niceness, found.set_result)
+        try:
+            return await asyncio.wait_for(found, 30)
+        finally:
+            await asyncio.to_thread(workers.close)
+
+    def own_niceness() -> int:
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    own = own_niceness()
+    for nice, expected in ((0, own), (4, min(19, own + 4)), (40, 19)):
+        assert asyncio.run(niceness(Workers(1, unexpected, nice=nice))) == expected
 
 
 def test_while_others_come_one_owner_leaves_them_a_worker_and_all_its_work_is_done() -> None:

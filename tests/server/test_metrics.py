@@ -20,6 +20,7 @@ from rfcore.errors import RejectReason
 from rfcore.field.interface import KINDS
 from rfcore.wire.messages import Ack, Frame, FrameAddress, Nack, StageTimes
 from rfcore.wire.notices import NOTICE_KINDS
+from rfcore.wire.tiles import Tile, TileLight
 from rfcore.wire.twin import PictureEncoding
 
 ADDRESS = FrameAddress("front", 0, 0)
@@ -68,6 +69,37 @@ def test_with_the_flag_a_vehicles_series_leave_with_its_last_stream(
     assert vehicles(registry) == {"cav-1", "cav-2"}, "its other stream lives"
     metrics.forget("cav-1")
     assert vehicles(registry) == {"cav-2"}
+
+
+def test_pictures_are_counted_for_the_tile_that_publishes_their_field_or_did_before(
+    registry: CollectorRegistry,
+) -> None:
+    def tile(field_id: str, *lights: str) -> Tile:
+        of_lights = tuple(TileLight(name, name * 64, 1) for name in lights)
+        return Tile("street", field_id * 64, lights=of_lights)
+
+    def counted(name: str) -> tuple[float | None, float | None]:
+        families = ("rfedge_server_tile_pictures_total", "rfedge_server_tile_payload_bytes_total")
+        payload, pictures = (
+            registry.get_sample_value(family, {"tile": name}) for family in families[::-1]
+        )
+        return pictures, payload
+
+    metrics = ServerMetrics(registry)
+    metrics.show_tiles([tile("a", "d")])
+    metrics.count_picture("a" * 64, 100)
+    metrics.count_picture("d" * 64, 20)
+    metrics.count_picture("f" * 64, 3)
+    assert counted("street") == (2, 120)
+    assert counted("") == (1, 3)
+    metrics.show_tiles([tile("b")])
+    metrics.count_picture("a" * 64, 100)
+    metrics.count_picture("b" * 64, 10)
+    assert counted("street") == (4, 230)
+    metrics.show_tiles([tile("c")])
+    metrics.count_picture("a" * 64, 100)
+    assert counted("street") == (4, 230), "two publications ago"
+    assert counted("") == (2, 103)
 
 
 REFERENCES = [

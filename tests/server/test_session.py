@@ -6,8 +6,14 @@ from dataclasses import replace
 import pytest
 
 from mec_server.config import SessionLimits
-from mec_server.decode_jobs import DecodeJob, DecodeOutcome, OpenJob
-from mec_server.session import MAX_UNUSABLE, ServerSession, SessionState
+from mec_server.session import (
+    MAX_UNUSABLE,
+    DecodeJob,
+    DecodeOutcome,
+    OpenJob,
+    ServerSession,
+    SessionState,
+)
 from rfcore.errors import (
     AccessDenied,
     CodecError,
@@ -103,7 +109,7 @@ def test_hello_is_answered_with_welcome_and_credit_for_every_camera(hello: Hello
     assert job == OpenJob(hello, exact=True)
     session.opened(job, 0.1)
     assert session.messages_to_send(0.1) == [
-        Welcome("s-1", exact=True),
+        Welcome("s-1", exact=True, relights=True),
         Credit("front", 2),
         Credit("rear", 2),
     ]
