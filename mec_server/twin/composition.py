@@ -11,6 +11,9 @@ A camera's word weighs, beside angle, resolution and distance, by
 * age: 1 at capture, 0 at the age from which pictures vouch for nothing, and
 * trust: 1 less the share of the picture that disagrees with the field.
 
+Things that stand or move in the street and are not in the field come as patches at their own depth
+(``mec_server.twin.patches``), once they were found (``mec_server.twin.contacts``).
+
 A camera of which more than half disagrees with the field, as with a wrong pose, vouches for
 nothing. In the last half of its time a difference fades, so that a vehicle that is gone leaves
 nothing standing.
@@ -19,13 +22,14 @@ nothing standing.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mec_server.twin.patches import Standing, draw_standing, in_front_of
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420, Rgb
 from rfcore.native.live_view import (
@@ -33,8 +37,10 @@ from rfcore.native.live_view import (
     MOST_DISTANCE_M,
     NOBODY,
     OWN_LIGHT,
+    Canvas,
     Light,
     LiveSource,
+    Patch,
     carry_to_view,
     live_difference,
 )
@@ -42,7 +48,16 @@ from rfcore.native.yuv import rgb_from_i420
 from rfcore.raster.gaussians import F32
 from rfcore.views import View
 
-__all__ = ["ComposedView", "LivePicture", "compose", "live_picture", "nearest", "shrunk"]
+__all__ = [
+    "ComposedView",
+    "LivePicture",
+    "Outline",
+    "compose",
+    "live_picture",
+    "nearest",
+    "shrunk",
+    "with_things",
+]
 
 T = TypeVar("T")
 
@@ -65,12 +80,24 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
+class Outline:
+    """Where a picture shows a thing: rows and columns, ``mask`` bool in them; ``z_m`` along the
+    optical axis, and ``foot_m``, where it stands on the tile's ground."""
+
+    box: tuple[slice, slice]
+    mask: Mask
+    z_m: float
+    foot_m: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
 class LivePicture:
     """What one camera's picture changes in the field.
 
     ``difference``: float32 [H, W, 3], levels in the light of the field, 0 where there is only
     noise. ``depth``: the field's, float32 [H, W]. ``trust``: 0 (outvoted) to 1. ``changed``: bool
-    [H, W], where it is more likely a change than noise.
+    [H, W], where it is more likely a change than noise. ``colour``: the field's, float32 [H, W, 3].
+    ``things``: cut out of all of these (``with_things``).
     """
 
     camera: Camera
@@ -78,11 +105,14 @@ class LivePicture:
     depth: F32
     trust: float
     changed: Mask
+    colour: F32
+    things: tuple[Standing, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class ComposedView:
-    """``rgb`` uint8 [H, W, 3]; ``depth`` of the field, float32 [H, W], metres, 0: nothing hit.
+    """``rgb`` uint8 [H, W, 3]; ``depth`` of the field or of a thing before it, float32 [H, W],
+    metres, 0: nothing hit.
 
     ``age_s``: float32 [H, W], of the picture that vouches for a pixel, infinite where none does.
     ``shares``: of the pixels, for each live picture.
@@ -120,7 +150,28 @@ def live_picture(camera: Camera, rgb: Rgb, view: View) -> LivePicture:
     disagreement = float(changed.sum() / seen) if seen else 1.0
     trust = 0.0 if disagreement > MOST_DISAGREEMENT else 1.0 - disagreement
     depth = np.where(covered, view.depth, np.float32(0))
-    return LivePicture(camera, difference, depth, trust, changed)
+    return LivePicture(camera, difference, depth, trust, changed, view.colour)
+
+
+def with_things(picture: LivePicture, outlines: Sequence[Outline]) -> LivePicture:
+    """Return ``picture`` with what is inside of ``outlines`` as patches: there it shows no surface
+    of the field."""
+    if not outlines:
+        return picture
+    depth = picture.depth.copy()
+    for outline in outlines:
+        depth[outline.box][outline.mask] = 0
+    things = tuple(Standing(_patch(picture, each), each.foot_m) for each in outlines)
+    return replace(picture, depth=depth, things=things)
+
+
+def _patch(picture: LivePicture, outline: Outline) -> Patch:
+    rows, columns = outline.box
+    level = np.rint((picture.colour[outline.box] * np.float32(255)).clip(0, 255))
+    rgb = (level + picture.difference[outline.box]).clip(0, 255)
+    mask = outline.mask[..., None].astype(np.float32)
+    samples = np.concatenate((rgb * mask, mask), axis=2)
+    return Patch(picture.camera, samples, columns.start, rows.start, outline.z_m)
 
 
 def compose(
@@ -141,10 +192,25 @@ def compose(
         )
         sources.append(source)
     rgb, chosen = carry_to_view(camera, view, sources)
+    depth, things = view.depth, list(_standing(pictures, sources))
+    if things:
+        depth = depth.copy()
+        draw_standing(Canvas(camera, rgb, depth, chosen, in_front_of(view)), things)
     age_of = np.full(NOBODY + 1, np.inf, np.float32)
     age_of[: len(ages_s)] = ages_s
     shares = np.bincount(chosen.ravel(), minlength=NOBODY + 1) / chosen.size
-    return ComposedView(rgb, view.depth, age_of[chosen], tuple(map(float, shares[: len(sources)])))
+    found = tuple(map(float, shares[: len(sources)]))
+    return ComposedView(rgb, depth, age_of[chosen], found)
+
+
+def _standing(
+    pictures: Sequence[tuple[LivePicture, float]], sources: Sequence[LiveSource]
+) -> Iterator[Standing]:
+    """Yield the things of the pictures that vouch for anything, with what each weighs."""
+    for number, ((picture, _), source) in enumerate(zip(pictures, sources, strict=True)):
+        if source.weight > 0:
+            for each in picture.things:
+                yield replace(each, source=number, weight=source.weight, fade=source.fade)
 
 
 def nearest(pictures: Sequence[T], camera: Camera, pose_of: Callable[[T], Pose | None]) -> list[T]:

@@ -35,11 +35,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mec_server.twin.composition import LivePicture
+from mec_server.twin.composition import LivePicture, Outline
 from mec_server.twin.ground import FieldGround, points_of, rays_of
-from rfcore.camera import Camera
 
-__all__ = ["Detection", "detect"]
+__all__ = ["Detection", "Found", "detect", "find"]
 
 THING_LEVELS = 30.0
 """On the sample's empty drive one picture in 12 has a contact at all."""
@@ -50,6 +49,8 @@ MOST_SLOPE = 0.4
 REACH_M = 32.0
 LOOKED_AT_M, LEAST_MARKED_M = 1.5, 0.3
 TALL_M = 2.2
+OUTLINE_M = 2.6
+"""How far above its foot a thing's picture is looked for: a van is that tall."""
 NEAR_GROUND_M = 0.4
 
 LINK_PX, LINK_M, LINK_PER_M = 6, 0.3, 0.04
@@ -72,7 +73,7 @@ Mask = NDArray[np.bool_]
 class Detection:
     """A thing in one picture: its foot relative to the tile's origin, seen from ``eye_m``, its size
     as the camera sees it, and of how many marked pixels it is. The sigmas are those of its foot on
-    the ground, along the view and across it."""
+    the ground, along the view and across it. ``trust``: in the picture (``LivePicture``)."""
 
     at_m: Vec3
     eye_m: Vec3
@@ -81,6 +82,7 @@ class Detection:
     marked_px: int
     along_sigma_m: float
     across_sigma_m: float
+    trust: float = 1.0
 
     @property
     def distance_m(self) -> float:
@@ -109,7 +111,15 @@ class Contacts:
         )
 
 
-def detect(picture: LivePicture, ground: FieldGround) -> list[Detection]:
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A thing in one picture, and where the picture shows it."""
+
+    detection: Detection
+    outline: Outline
+
+
+def find(picture: LivePicture, ground: FieldGround) -> list[Found]:
     """Return what ``picture`` shows that the field does not have, from left to right. ``ground`` is
     that field's."""
     if picture.trust == 0:
@@ -117,14 +127,41 @@ def detect(picture: LivePicture, ground: FieldGround) -> list[Detection]:
     contacts = _contacts(picture, ground)
     found = []
     for thing in _things(contacts):
-        detection = _standing(contacts[thing], picture.camera)
+        detection = _standing(contacts[thing], picture)
         if detection is not None:
-            found.append(detection)
+            outline = _outline(picture, contacts[thing], detection)
+            found.append(Found(detection, outline))
     return found
 
 
+def detect(picture: LivePicture, ground: FieldGround) -> list[Detection]:
+    """Return the things alone."""
+    return [each.detection for each in find(picture, ground)]
+
+
+def _outline(picture: LivePicture, thing: Contacts, detection: Detection) -> Outline:
+    """Return all between the contacts of a thing and the uppermost change above each.
+
+    Between columns with contacts, feet and tops lie on straight lines.
+    """
+    z_m = float(np.median(thing.z_m))
+    tall_px = math.ceil(OUTLINE_M * picture.camera.intrinsics.fy_px / z_m)
+    columns, firsts = np.unique(thing.columns, return_index=True)  # the lowest contact of each
+    feet = thing.rows[firsts]
+    rows_above = np.maximum(feet - np.arange(tall_px, -1, -1)[:, None], 0)
+    tops = rows_above[np.argmax(picture.changed[rows_above, columns], axis=0), range(len(columns))]
+    across = np.arange(columns[0], columns[-1] + 1)
+    foot, top = (np.rint(np.interp(across, columns, ends)) for ends in (feet, tops))
+    rows = slice(int(top.min()), int(foot.max()) + 1)
+    row = np.arange(rows.start, rows.stop)[:, None]
+    mask = (row >= top) & (row <= foot)
+    box = (rows, slice(int(columns[0]), int(columns[-1]) + 1))
+    return Outline(box, mask, z_m, detection.at_m[:2])
+
+
 def _contacts(picture: LivePicture, ground: FieldGround) -> Contacts:
-    marked = picture.changed & (np.abs(picture.difference).max(axis=2) > THING_LEVELS)
+    red, green, blue = (np.abs(picture.difference[..., channel]) for channel in range(3))
+    marked = picture.changed & (np.maximum(np.maximum(red, green), blue) > THING_LEVELS)
     rows, columns = _feet(marked)
     camera, depth = picture.camera, picture.depth
     below_m = depth[rows + BELOW_PX, columns].astype(np.float64)
@@ -206,13 +243,14 @@ def _not_above_another(contacts: Contacts, focal_px: float, free_above: Index) -
     own = np.ones(len(contacts.rows), bool)
     above_px = TALL_M * focal_px / np.maximum(contacts.z_m, 0.1)
     column, top = -1, 0.0
-    for i, (row, at) in enumerate(zip(contacts.rows, contacts.columns, strict=True)):
+    each = zip(contacts.rows.tolist(), contacts.columns.tolist(), above_px.tolist(), strict=True)
+    for i, (row, at, tall_px) in enumerate(each):
         if at != column:
             column, top = at, float(free_above[at])
         if row > top:
             own[i] = False
         else:
-            top = row - above_px[i]
+            top = row - tall_px
     return own
 
 
@@ -233,27 +271,36 @@ def _things(contacts: Contacts) -> Iterator[Index]:
 
 
 def _linked(contacts: Contacts) -> Index:
-    """Return a number for each contact, the same for those of one thing."""
-    numbers = np.arange(len(contacts.rows))
-    reach_m = LINK_M + LINK_PER_M * contacts.z_m
-    first = 0
-    for i, column in enumerate(contacts.columns):
-        while column - contacts.columns[first] > LINK_PX:
-            first += 1
-        away_m = np.linalg.norm(contacts.at_m[first:i, :2] - contacts.at_m[i, :2], axis=1)
-        for other in dict.fromkeys(numbers[first:i][away_m <= reach_m[i]].tolist()):
-            low, high = sorted((int(numbers[i]), other))
-            numbers[numbers == high] = low
-    return numbers
+    """Return a number for each contact, the same for those of one thing: that of its first."""
+    count = len(contacts.rows)
+    numbers = np.arange(count)
+    firsts = np.searchsorted(contacts.columns, contacts.columns - LINK_PX)
+    befores = numbers - firsts
+    later = np.repeat(numbers, befores)
+    earlier = np.arange(len(later)) - np.repeat(np.cumsum(befores) - befores - firsts, befores)
+    away_m = np.linalg.norm(contacts.at_m[later, :2] - contacts.at_m[earlier, :2], axis=1)
+    near = away_m <= LINK_M + LINK_PER_M * contacts.z_m[later]
+    later, earlier = later[near], earlier[near]
+    while True:
+        before = numbers.copy()
+        lowest = np.minimum(numbers[later], numbers[earlier])
+        for ends in (later, earlier):
+            np.minimum.at(numbers, numbers[ends], lowest)
+            np.minimum.at(numbers, ends, lowest)
+        numbers = numbers[numbers]
+        if np.array_equal(numbers, before):
+            return numbers
 
 
-def _standing(thing: Contacts, camera: Camera) -> Detection | None:
+def _standing(thing: Contacts, picture: LivePicture) -> Detection | None:
     """Return where a thing stands, ``None`` for one that is too small to be one."""
+    if len(np.unique(thing.columns)) < LEAST_COLUMNS:
+        return None
+    camera = picture.camera
     k, z_m = camera.intrinsics, float(np.median(thing.z_m))
     width_m = float(np.ptp(thing.columns) + 1) * z_m / k.fx_px
     marked_px = float((thing.marked_m * k.fy_px / thing.z_m).sum())
-    narrow = len(np.unique(thing.columns)) < LEAST_COLUMNS or width_m < LEAST_WIDTH_M
-    if narrow or marked_px < LEAST_PX:
+    if width_m < LEAST_WIDTH_M or marked_px < LEAST_PX:
         return None
     near = np.flatnonzero(thing.z_m <= SAME_SIDE * np.quantile(thing.z_m, NEAR_SHARE))
     middle = (thing.columns[near].min() + thing.columns[near].max()) / 2
@@ -272,6 +319,7 @@ def _standing(thing: Contacts, camera: Camera) -> Detection | None:
         round(marked_px),
         math.hypot(CONTACT_PX * px_m, unknown_m),
         math.hypot(ACROSS_PX * on_ground_m / k.fx_px, unknown_m),
+        picture.trust,
     )
 
 

@@ -5,9 +5,9 @@ Whoever took notices in Hello is told of every confirmed object (``mec_server.tw
 * stands within ``REACH_M`` ahead of the camera of its newest picture, in the same tile,
 * is seen by somebody else's camera, and was not seen by its own within the last second,
 
-when it is confirmed and again every ``REPEAT_S`` while that holds and it was seen since, the
-nearest first, at most ``MOST_PER_S`` notices a second. Where a vehicle is known from its pictures:
-one whose pictures have no pose is told nothing of objects.
+with a picture that shows it: when it is confirmed and again every ``REPEAT_S`` while that holds,
+the nearest first, at most ``MOST_PER_S`` notices a second. Where a vehicle is known from its
+pictures: one whose pictures have no pose is told nothing of objects.
 
 Pictures are looked at only while a vehicle takes notices, by the thread that composes views: at the
 lowest priority, newest picture first, and charged like a consumer to ``NOTICES_IDENTITY``, so that
@@ -243,7 +243,11 @@ class StreetNotices:
         tracker = self._trackers.setdefault(place.field_ids, ObjectTracker())
         tracker.take(found, seen.key, seen.captured_s)
         now = time.monotonic()
-        objects = tracker.confirmed(now)
+        objects = [
+            each
+            for each in tracker.confirmed(now)
+            if each.last_s == seen.captured_s and not each.is_doubtful
+        ]
         self._forget_streams()
         for taker in takers:
             self._tell_of(taker, place, objects, now)

@@ -9,8 +9,6 @@ pay with worker time, the same as vehicles.
 from __future__ import annotations
 
 import asyncio
-import os
-import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -20,7 +18,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mec_server.event_loop import Workers
+from mec_server.event_loop import LOWEST_NICE, Workers
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Ledger
 from mec_server.twin.composition import (
@@ -30,8 +28,9 @@ from mec_server.twin.composition import (
     live_picture,
     nearest,
     shrunk,
+    with_things,
 )
-from mec_server.twin.contacts import Detection, detect
+from mec_server.twin.contacts import Detection, find
 from mec_server.twin.ground import FieldGround
 from mec_server.twin.state import CameraKey, Covers, Twin, TwinView
 from rfcore.camera import Camera
@@ -67,8 +66,6 @@ BEYOND_BOUNDS_M = 5.0
 INSIDE_M, INSIDE_SHARE = 0.3, 0.9
 """A view of which so much is nearer than this is inside of something."""
 
-LOWEST_PRIORITY = 19
-
 
 @dataclass(frozen=True)
 class Place:
@@ -87,6 +84,15 @@ def place_of(request: ViewRequest | ObjectsRequest, tiles: Sequence[Tile]) -> Pl
         return Place(request.field_id, frozenset((request.field_id,)))
     here = ", ".join(tile.name for tile in tiles) or "none; name a field_id"
     raise InvalidInput("tile", f"{shown(request.tile)} is not published here; published: {here}")
+
+
+@dataclass(frozen=True, eq=False)
+class _LookedAt:
+    """A picture, what it changes in a field, and the things in it."""
+
+    seen: TwinView
+    live: LivePicture
+    detections: list[Detection]
 
 
 class TwinViews:
@@ -108,10 +114,9 @@ class TwinViews:
         self._open_field = open_field
         self._tiles = tiles
         self._ledger = ledger
-        self._worker = Workers(1, failed, "views")
-        self._kept: OrderedDict[tuple[CameraKey, str], tuple[TwinView, LivePicture]] = OrderedDict()
+        self._worker = Workers(1, failed, "views", nice=LOWEST_NICE)
+        self._kept: OrderedDict[tuple[CameraKey, str], _LookedAt] = OrderedDict()
         self._grounds: OrderedDict[str, FieldGround] = OrderedDict()
-        self._lowered = False
 
     def close(self) -> None:
         """Stop the thread."""
@@ -194,18 +199,12 @@ class TwinViews:
         """Return for how long the thread was busy, and the result, or why there is none."""
         if answer.cancelled():
             return 0.0, asyncio.InvalidStateError("nobody waits for this")
-        self._lower_priority()
         started = time.monotonic()
         try:
             result: R | Exception = compute()
         except Exception as error:
             result = error
         return time.monotonic() - started, result
-
-    def _lower_priority(self) -> None:
-        if not self._lowered:
-            self._lowered = True
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOWEST_PRIORITY)
 
     def _composed(self, request: ViewRequest, place: Place, recent: list[TwinView]) -> RenderedView:
         field = self._open_field(place.field_id)
@@ -215,7 +214,7 @@ class TwinViews:
         check_outside_of_walls(view)
         seen = nearest(sorted(recent, key=lambda it: it.key), camera, lambda it: it.frame.pose)
         now = time.monotonic()
-        live = [(self._live(each, field), each.age_s(now)) for each in seen]
+        live = [(self._looked_at(each, field).live, each.age_s(now)) for each in seen]
         composed = compose(camera, view, live, request.max_age_s)
         cameras = tuple(
             LiveCamera(each.vehicle_id, each.frame.camera_id, age_s, share, picture.trust == 0)
@@ -233,8 +232,7 @@ class TwinViews:
         )
 
     def _detected(self, seen: TwinView, place: Place) -> list[Detection]:
-        field = self._open_field(place.field_id)
-        return detect(self._live(seen, field), self._ground(field))
+        return self._looked_at(seen, self._open_field(place.field_id)).detections
 
     def _ground(self, field: RadianceField) -> FieldGround:
         """Return the ground of ``field``; what of it was drawn is kept."""
@@ -244,20 +242,23 @@ class TwinViews:
             self._grounds.popitem(last=False)
         return ground
 
-    def _live(self, seen: TwinView, field: RadianceField) -> LivePicture:
-        """Return what a picture changes in ``field``; made once for each picture."""
+    def _looked_at(self, seen: TwinView, field: RadianceField) -> _LookedAt:
+        """Return what a picture changes in ``field``; found once for each picture."""
         key = (seen.key, field.field_id)
         kept = self._kept.get(key)
-        if kept is None or kept[0] is not seen:
+        if kept is None or kept.seen is not seen:
             assert seen.frame.pose is not None
             rgb, intrinsics = shrunk(seen.picture, seen.intrinsics)
             camera = Camera(intrinsics, seen.frame.pose)
-            kept = (seen, live_picture(camera, rgb, field.render(camera, FULL)))
+            live = live_picture(camera, rgb, field.render(camera, FULL))
+            found = find(live, self._ground(field))
+            live = with_things(live, [each.outline for each in found])
+            kept = _LookedAt(seen, live, [each.detection for each in found])
             self._kept[key] = kept
             if len(self._kept) > MOST_KEPT:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
-        return kept[1]
+        return kept
 
 
 def check_inside(camera: Camera, field: RadianceField) -> None:

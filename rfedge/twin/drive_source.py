@@ -89,6 +89,10 @@ class DriveSource:
         self._clock = clock
         self._field_id = ""
 
+    @property
+    def live(self) -> None:
+        """Nothing: neither objects nor views."""
+
     async def run(self) -> None:
         """Show until cancelled; raises ``DatasetError`` for a picture that cannot be read."""
         self._scene.connection("waiting", f"{self._name} is being read", self._clock())

@@ -210,6 +210,10 @@ class NatsSource:
         self._wanted: OrderedDict[str, str] = OrderedDict()
         self._asked = asyncio.Event()
 
+    @property
+    def live(self) -> None:
+        """Nothing: neither objects nor views."""
+
     async def run(self) -> None:
         """Show pictures until cancelled; fields come over a connection of their own."""
         await together(self._reader.run(), self._link.run(self._bring_fields))

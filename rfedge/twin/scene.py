@@ -6,7 +6,7 @@ small enough for the browser's float32.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from rfcore.field import RadianceField, SplatField
 from rfcore.field.spz import encode_spz
 from rfcore.localise.fix import State
 from rfcore.wire.sensing import ClockKind
+from rfcore.wire.twin_render import StreetObject
 from rfedge.twin.board import Board, Message
 
 __all__ = ["CameraKey", "PlacedField", "SeenPicture", "TwinScene"]
@@ -86,6 +87,11 @@ class TwinScene:
     def newest(self) -> Mapping[CameraKey, SeenPicture]:
         """The newest picture of every camera."""
         return self._newest
+
+    @property
+    def field_ids(self) -> tuple[str, ...]:
+        """The fields that are placed."""
+        return tuple(self._fields)
 
     def field(self, field_id: str) -> PlacedField | None:
         """Return a field that was placed, if it was."""
@@ -161,6 +167,25 @@ class TwinScene:
         key = ("comparison", picture.key)
         self._board.post(key, Message(header, now_s, (picture.jpeg, *parts)))
 
+    def show_objects(
+        self, field_id: str, objects: Sequence[StreetObject], now_s: float, problem: str = ""
+    ) -> None:
+        """Show what stands on a field's ground that the field does not have, in place of what was
+        shown there; ``problem``: why nothing is known of it."""
+        header = {
+            "kind": "objects",
+            "field": field_id,
+            "origin_m": self._offset_m(field_id),
+            "objects": [_object(each) for each in objects],
+            "problem": problem,
+        }
+        self._board.post(("objects", field_id), Message(header, now_s))
+
+    def hide_objects(self, field_id: str, now_s: float) -> None:
+        """Take the objects of a field away."""
+        header = {"kind": "objects", "field": field_id, "objects": [], "problem": ""}
+        self._board.clear(("objects", field_id), Message(header, now_s))
+
     def _post_fields(self, now_s: float) -> None:
         shown = [self._described(placed) for placed in self._fields.values()]
         notes = [{"tile": tile, "text": text} for tile, text in self._notes.items()]
@@ -193,6 +218,21 @@ class TwinScene:
 
 def _name(key: CameraKey) -> dict[str, str]:
     return {"vehicle": key[0], "camera": key[1]}
+
+
+def _object(each: StreetObject) -> dict[str, Any]:
+    return {
+        "id": each.object_id,
+        "at_m": each.at_m,
+        "velocity_mps": each.velocity_mps,
+        "width_m": each.width_m,
+        "height_m": each.height_m,
+        "confidence": each.confidence,
+        "age_ms": 1e3 * each.age_s,
+        "unseen_ms": 1e3 * each.unseen_s,
+        "seen_by": ["/".join(camera) for camera in each.seen_by],
+        "doubtful": each.is_doubtful,
+    }
 
 
 def _intrinsics(k: Intrinsics) -> dict[str, float]:

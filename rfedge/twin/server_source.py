@@ -1,18 +1,23 @@
-"""Fields and pictures from a mec-server: a consumer of TwinService and FieldService like any other.
+"""Fields, pictures, objects and views from a mec-server: a consumer of its services like any other.
 
-Survives restarts of the server: what was shown stays, and says that it waits.
+Survives restarts of the server: what was shown stays, and says that it waits. Objects and views
+take the server's time, so they are asked for only while a browser shows them.
 """
 
 from __future__ import annotations
 
 import asyncio
 import time
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import grpc
+import numpy as np
 import structlog
+from numpy.typing import NDArray
 
 from cav_agent.field_cache import fetch_field
 from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
@@ -28,11 +33,22 @@ from rfcore.wire.twin import (
     subscription_to_wire,
     twin_message_from_wire,
 )
-from rfcore.wire.v1 import field_pb2, twin_pb2_grpc
+from rfcore.wire.twin_render import (
+    NO_AGE,
+    ObjectsRequest,
+    RenderedView,
+    ViewRequest,
+    objects_from_wire,
+    objects_request_to_wire,
+    rendered_view_from_wire,
+    view_request_to_wire,
+)
+from rfcore.wire.v1 import field_pb2, twin_pb2, twin_pb2_grpc
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
+from rfedge.twin.board import Message
 from rfedge.twin.scene import CameraKey, PlacedField, SeenPicture, TwinScene
 
-__all__ = ["ServerSource", "ServerTarget", "seen_picture"]
+__all__ = ["LiveView", "ServerSource", "ServerTarget", "seen_picture", "view_message"]
 
 log = structlog.get_logger()
 
@@ -44,6 +60,14 @@ REFUSED = (
 """What does not pass by waiting."""
 RETRY_S = 0.5
 FIELDS_EVERY_S = 5.0
+OBJECTS_AGAIN_S = 0.5
+"""How soon a field that was placed, or a wish to see objects, is noticed."""
+VIEW_EVERY_S = 0.25
+"""A view takes the server a render and more; a browser gets at most so many."""
+FRESHNESS_STEP_MS = 10
+FIELD_ALONE = 255
+"""Freshness of pixels that no live picture vouches for; others: their age in steps of the above, at
+most 254."""
 
 
 @dataclass(frozen=True)
@@ -87,18 +111,74 @@ class ServerSource:
         self._clock = clock
         self._store = FieldStore(target.fields)
         self._cameras: set[CameraKey] = set()
+        self._channel: grpc.aio.Channel | None = None
+        self._showing_objects = 0
+
+    @property
+    def live(self) -> ServerSource:
+        """A server shows objects, and the street from anywhere."""
+        return self
 
     async def run(self) -> None:
         """Watch until cancelled; raises ``AccessDenied`` where the server does not let us."""
         async with self._target.channel() as channel:
+            self._channel = channel
             fields = asyncio.create_task(self._follow_fields(channel))
+            objects = asyncio.create_task(self._follow_objects(channel))
             try:
                 while True:
                     problem = await self._watch(channel)
                     self._say("waiting", problem)
                     await asyncio.sleep(RETRY_S)
             finally:
+                self._channel = None
                 fields.cancel()
+                objects.cancel()
+
+    def open_view(self, tell: Callable[[Message], None]) -> LiveView:
+        """Return a view for one browser, which is told of it by ``tell``."""
+        return LiveView(lambda: self._channel, tell, self._clock)
+
+    def want_objects(self, wanted: bool) -> None:
+        """Count one browser more, or less, that shows objects."""
+        self._showing_objects += 1 if wanted else -1
+
+    async def _follow_objects(self, channel: grpc.aio.Channel) -> None:
+        """Tell the scene of the objects on every field's ground, while anybody wants them."""
+        following: dict[str, asyncio.Task[None]] = {}
+        try:
+            while True:
+                wanted = set(self._scene.field_ids) if self._showing_objects else set()
+                ended = {field_id for field_id, task in following.items() if task.done()}
+                for field_id in (following.keys() - wanted) | ended:
+                    following.pop(field_id).cancel()
+                for field_id in following.keys() ^ wanted:
+                    watching = self._watch_objects(channel, field_id)
+                    following[field_id] = asyncio.create_task(watching)
+                await asyncio.sleep(OBJECTS_AGAIN_S)
+        finally:
+            for task in following.values():
+                task.cancel()
+
+    async def _watch_objects(self, channel: grpc.aio.Channel, field_id: str) -> None:
+        """Show the objects on one field's ground until the stream ends, and for a while why."""
+        request = objects_request_to_wire(ObjectsRequest(field_id=field_id))
+        call = twin_pb2_grpc.TwinServiceStub(channel).Objects(request)
+        try:
+            problem = "the server ended the stream"
+            try:
+                async for response in call:
+                    seen = objects_from_wire(response)
+                    self._scene.show_objects(field_id, seen.objects, self._clock())
+            except grpc.aio.AioRpcError as error:
+                problem = str(error.details())
+            except ProtocolError as error:
+                problem = str(error)
+            self._scene.show_objects(field_id, (), self._clock(), problem)
+            await asyncio.sleep(FIELDS_EVERY_S)
+        finally:
+            call.cancel()
+            self._scene.hide_objects(field_id, self._clock())
 
     def _say(self, state: str, detail: str) -> None:
         self._scene.connection(state, detail, self._clock())
@@ -167,6 +247,103 @@ class ServerSource:
 
     def _placed(self, tile: str, field_id: str) -> PlacedField:
         return PlacedField.of(self._store.load(field_id, threads=self._threads), tile)
+
+
+class LiveView:
+    """What one browser sees through a camera that its user moves: ``RenderStream``, asked again and
+    again while it is open, at most once in ``VIEW_EVERY_S``.
+
+    A refusal is told and ends the stream; the next viewpoint opens another. Used on the event loop.
+    """
+
+    def __init__(
+        self,
+        channel: Callable[[], grpc.aio.Channel | None],
+        tell: Callable[[Message], None],
+        clock: Callable[[], float],
+    ) -> None:
+        self._channel = channel
+        self._tell = tell
+        self._clock = clock
+        self._wanted: ViewRequest | None = None
+        self._following: asyncio.Task[None] | None = None
+
+    def look(self, request: ViewRequest | None) -> None:
+        """Show this viewpoint from now on; None: nothing."""
+        self._wanted = request
+        if request is None:
+            self.close()
+        elif self._following is None or self._following.done():
+            self._following = asyncio.create_task(self._follow())
+
+    def close(self) -> None:
+        """Ask for nothing any more."""
+        if self._following is not None:
+            self._following.cancel()
+            self._following = None
+
+    async def _follow(self) -> None:
+        channel = self._channel()
+        if channel is None:
+            self._refused("there is no connection to the server")
+            return
+        call = twin_pb2_grpc.TwinServiceStub(channel).RenderStream()
+        try:
+            await self._ask(call)
+        except grpc.aio.AioRpcError as error:
+            self._refused(str(error.details()))
+        except asyncio.InvalidStateError:
+            self._refused(await call.details())
+        except (ProtocolError, InvalidInput) as error:
+            self._refused(str(error))
+        finally:
+            call.cancel()
+
+    async def _ask(self, call: Any) -> None:
+        while (request := self._wanted) is not None:
+            asked_s = self._clock()
+            await call.write(twin_pb2.RenderStreamRequest(view=view_request_to_wire(request)))
+            response = await call.read()
+            if response is grpc.aio.EOF:
+                self._refused(await call.details() or "the server ended the stream")
+                return
+            intrinsics = request.camera.intrinsics
+            view = rendered_view_from_wire(response.view, intrinsics)
+            self._tell(await asyncio.to_thread(view_message, view, self._clock()))
+            await asyncio.sleep(max(0.0, VIEW_EVERY_S - (self._clock() - asked_s)))
+
+    def _refused(self, problem: str) -> None:
+        self._tell(Message({"kind": "view_refused", "problem": problem}, self._clock()))
+
+
+def view_message(view: RenderedView, now_s: float) -> Message:
+    """Return a view for the page; its parts: the picture as JPEG, and how old each pixel is, one
+    byte each (``FRESHNESS_STEP_MS``, ``FIELD_ALONE``), deflated (RFC 1950)."""
+    header = {
+        "kind": "view",
+        "width_px": view.age_ms.shape[1],
+        "height_px": view.age_ms.shape[0],
+        "field": view.field_id,
+        "step_ms": FRESHNESS_STEP_MS,
+        "field_alone": FIELD_ALONE,
+        "live_share": float(view.live.mean()),
+        "cameras": [
+            {
+                "vehicle": camera.vehicle_id,
+                "camera": camera.camera_id,
+                "age_ms": 1e3 * camera.age_s,
+                "share": camera.share,
+                "outvoted": camera.outvoted,
+            }
+            for camera in view.cameras
+        ],
+    }
+    return Message(header, now_s, (view.picture, zlib.compress(_freshness(view.age_ms), 1)))
+
+
+def _freshness(age_ms: NDArray[np.uint16]) -> bytes:
+    steps = np.minimum(age_ms // FRESHNESS_STEP_MS, FIELD_ALONE - 1)
+    return np.where(age_ms == NO_AGE, FIELD_ALONE, steps).astype(np.uint8).tobytes()
 
 
 def seen_picture(picture: TwinPicture) -> SeenPicture:

@@ -21,8 +21,14 @@ import grpc
 import numpy as np
 from numpy.typing import NDArray
 
-from mec_server.twin.composition import LivePicture, compose, live_picture, nearest
-from mec_server.twin.contacts import detect
+from mec_server.twin.composition import (
+    LivePicture,
+    compose,
+    live_picture,
+    nearest,
+    with_things,
+)
+from mec_server.twin.contacts import find
 from mec_server.twin.ground import FieldGround
 from mec_server.twin.objects import ObjectTracker
 from mec_server.twin.rendering import check_inside, check_outside_of_walls
@@ -242,8 +248,9 @@ class RecordedStreet:
                 return
             self._next += 1
             live = live_picture(picture.camera, picture.read(), self._field.render(picture.camera))
-            self._live[number] = (taken_s, live)
-            self._tracker.take(detect(live, self._ground), _key(number), taken_s)
+            found = find(live, self._ground)
+            self._live[number] = (taken_s, with_things(live, [each.outline for each in found]))
+            self._tracker.take([each.detection for each in found], _key(number), taken_s)
 
     def _objects(self) -> tuple[StreetObject, ...]:
         now_s = self._now_s

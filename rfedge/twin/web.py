@@ -21,18 +21,32 @@ from typing import Any, Final, Protocol
 
 import structlog
 
+from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.extras import needs
 from rfcore.files import write_whole
 from rfcore.wire.address import Address
-from rfedge.twin.board import Board, Reader
+from rfcore.wire.twin_render import ViewRequest
+from rfedge.twin.board import Board, Message, Reader
 from rfedge.twin.comparing import Comparer
 from rfedge.twin.scene import CameraKey, TwinScene
 
 with needs("twin"):
     from aiohttp import WSCloseCode, WSMsgType, web
 
-__all__ = ["Source", "TwinRun", "TwinWeb", "WebSettings", "run_twin"]
+__all__ = [
+    "LiveSource",
+    "Look",
+    "MovingView",
+    "Select",
+    "ShowObjects",
+    "Source",
+    "TwinRun",
+    "TwinWeb",
+    "WebSettings",
+    "run_twin",
+    "wish",
+]
 
 log = structlog.get_logger()
 
@@ -74,8 +88,50 @@ class WebSettings:
             )
 
 
+@dataclass(frozen=True)
+class Select:
+    """The browser's user looks at this camera in full; ``None``: at none."""
+
+    camera: CameraKey | None
+
+
+@dataclass(frozen=True)
+class Look:
+    """The browser shows the live view from here; ``None``: none any more."""
+
+    request: ViewRequest | None
+
+
+@dataclass(frozen=True)
+class ShowObjects:
+    """Whether the browser shows objects."""
+
+    shown: bool
+
+
+class MovingView(Protocol):
+    """A live view whose viewpoint moves."""
+
+    def look(self, request: ViewRequest | None) -> None:
+        """Show this viewpoint from now on; None: nothing."""
+
+    def close(self) -> None:
+        """Ask for nothing any more."""
+
+
+class LiveSource(Protocol):
+    """What can show more than pictures: objects, and the street from anywhere."""
+
+    def open_view(self, tell: Callable[[Message], None]) -> MovingView:
+        """Return a view for one browser, which is told of it by ``tell``."""
+
+    def want_objects(self, wanted: bool) -> None:
+        """Count one browser more, or less, that shows objects."""
+
+
 class TwinWeb:
-    """Serves the page, its splats, and the board's messages."""
+    """Serves the page, its splats, and the board's messages; with ``live`` also objects and views
+    from anywhere."""
 
     def __init__(
         self,
@@ -84,8 +140,10 @@ class TwinWeb:
         scene: TwinScene,
         comparer: Comparer,
         clock: Callable[[], float] = time.monotonic,
+        live: LiveSource | None = None,
     ) -> None:
         self._settings = settings
+        self._live = live
         self._board = board
         self._scene = scene
         self._comparer = comparer
@@ -176,10 +234,14 @@ class TwinWeb:
     async def _serve(self, socket: web.WebSocketResponse) -> None:
         arrived = asyncio.Event()
         reader = self._board.read(arrived.set)
+        if self._live is not None:
+            reader.put("abilities", Message({"kind": "abilities", "live": True}, self._clock()))
         writing = asyncio.create_task(self._write(socket, reader, arrived))
+        user = _User(self._comparer, self._live, reader)
         try:
-            await self._listen(socket)
+            await self._listen(socket, user)
         finally:
+            user.leave()
             writing.cancel()
             self._board.leave(reader)
 
@@ -200,38 +262,82 @@ class TwinWeb:
                 await socket.close(code=WSCloseCode.TRY_AGAIN_LATER)
                 return
 
-    async def _listen(self, socket: web.WebSocketResponse) -> None:
+    async def _listen(self, socket: web.WebSocketResponse, user: _User) -> None:
         """Follow what the browser's user looks at, until it leaves."""
-        looked_at: CameraKey | None = None
         try:
             async for message in socket:
-                if message.type is not WSMsgType.TEXT:
-                    continue
-                chosen = selection(message.data)
-                if looked_at is not None:
-                    self._comparer.release(looked_at)
-                looked_at = chosen
-                if looked_at is not None:
-                    self._comparer.select(looked_at)
+                if message.type is WSMsgType.TEXT:
+                    user.take(wish(message.data))
         except ValueError as error:
             log.info("browser sent what the page does not", problem=str(error))
             await socket.close(code=WSCloseCode.POLICY_VIOLATION)
-        finally:
-            if looked_at is not None:
-                self._comparer.release(looked_at)
 
 
-def selection(text: str) -> CameraKey | None:
-    """Return the camera that a browser's message selects, None for none; raise ``ValueError``."""
-    value: Any = json.loads(text)
-    if not isinstance(value, dict) or value.keys() != {"select"}:
-        raise ValueError("a message has one member, select")
-    match value["select"]:
-        case None:
-            return None
-        case [str(vehicle), str(camera)]:
-            return (vehicle, camera)
-    raise ValueError("select is null or [vehicle, camera]")
+class _User:
+    """What one browser's user looks at."""
+
+    def __init__(self, comparer: Comparer, live: LiveSource | None, reader: Reader) -> None:
+        self._comparer = comparer
+        self._live = live
+        self._camera: CameraKey | None = None
+        self._shows_objects = False
+        self._view = live.open_view(lambda message: reader.put("view", message)) if live else None
+
+    def take(self, wished: Select | Look | ShowObjects) -> None:
+        """Follow a message of the browser."""
+        match wished:
+            case Select(camera):
+                self._select(camera)
+            case Look(request) if self._view is not None:
+                self._view.look(request)
+            case ShowObjects(shown) if self._live is not None and shown != self._shows_objects:
+                self._shows_objects = shown
+                self._live.want_objects(shown)
+
+    def leave(self) -> None:
+        """Let go of everything."""
+        self._select(None)
+        self.take(ShowObjects(False))
+        if self._view is not None:
+            self._view.close()
+
+    def _select(self, camera: CameraKey | None) -> None:
+        if self._camera is not None:
+            self._comparer.release(self._camera)
+        self._camera = camera
+        if camera is not None:
+            self._comparer.select(camera)
+
+
+def wish(text: str) -> Select | Look | ShowObjects:
+    """Return what a browser's message asks for; raise ``ValueError``, which ``InvalidInput`` is,
+    for what the page does not send.
+
+    One member: ``select`` is null or [vehicle, camera]; ``objects`` a boolean; ``look`` null, or
+    the ``field`` and a camera relative to its tile: ``translation_m``, ``rotation_wxyz``, and
+    ``intrinsics`` by the names of ``Intrinsics``.
+    """
+    match json.loads(text):
+        case {"select": None, **rest} if not rest:
+            return Select(None)
+        case {"select": [str(vehicle), str(camera)], **rest} if not rest:
+            return Select((vehicle, camera))
+        case {"objects": bool(shown), **rest} if not rest:
+            return ShowObjects(shown)
+        case {"look": None, **rest} if not rest:
+            return Look(None)
+        case {"look": dict() as place, **rest} if not rest:
+            return Look(_viewpoint(place))
+    raise ValueError("a message has one member: select, objects or look")
+
+
+def _viewpoint(place: dict[str, Any]) -> ViewRequest:
+    try:
+        intrinsics = Intrinsics(**place["intrinsics"])
+        pose = Pose(tuple(place["translation_m"]), tuple(place["rotation_wxyz"]))
+        return ViewRequest(Camera(intrinsics, pose), field_id=place["field"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"look: {error!r}") from error
 
 
 def _host(host_and_port: str) -> Address:
@@ -241,7 +347,11 @@ def _host(host_and_port: str) -> Address:
 
 
 class Source(Protocol):
-    """Where fields and pictures come from."""
+    """Where fields and pictures come from; ``live``: whether more can be asked of it."""
+
+    @property
+    def live(self) -> LiveSource | None:
+        """Itself, if it shows objects and views from anywhere."""
 
     def run(self) -> Coroutine[Any, Any, None]:
         """Tell the scene, until cancelled."""
@@ -273,13 +383,14 @@ async def _serve(run: TwinRun) -> None:
         loop.add_signal_handler(number, stopped.set)
     with ThreadPoolExecutor(1, "compare") as executor:
         comparer = Comparer(scene, executor)
-        page = TwinWeb(run.web, board, scene, comparer)
+        source = run.source(scene)
+        page = TwinWeb(run.web, board, scene, comparer, live=source.live)
         address = await page.start()
         print(f"open {address}", flush=True)
         if run.ready_file is not None:
             write_whole(run.ready_file, address.encode())
         tasks = [
-            asyncio.create_task(run.source(scene).run()),
+            asyncio.create_task(source.run()),
             asyncio.create_task(comparer.run()),
             asyncio.create_task(stopped.wait()),
             *([asyncio.create_task(_exit_of(run.until_exit_of))] if run.until_exit_of else []),

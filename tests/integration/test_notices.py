@@ -63,14 +63,14 @@ async def heard(vehicle: Any, notices: list[StreetNotice]) -> Ack:
 def looked_at(monkeypatch: pytest.MonkeyPatch) -> list[LivePicture]:
     """What the server has looked at so far."""
     pictures: list[LivePicture] = []
-    detect = rendering.detect
+    find = rendering.find
 
     def noted(picture: LivePicture, ground: FieldGround) -> Any:
-        found = detect(picture, ground)
+        found = find(picture, ground)
         pictures.append(picture)
         return found
 
-    monkeypatch.setattr(rendering, "detect", noted)
+    monkeypatch.setattr(rendering, "find", noted)
     return pictures
 
 

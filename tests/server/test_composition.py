@@ -157,7 +157,9 @@ def test_another_light_is_no_change() -> None:
 
 def test_a_camera_vouches_for_nothing_far_away_or_from_the_side() -> None:
     seen = live(STREET, at(0.0), picture(STREET, at(0.0)))
-    far = LivePicture(seen.camera, seen.difference, seen.depth * np.float32(12), 1.0, seen.changed)
+    far = LivePicture(
+        seen.camera, seen.difference, seen.depth * np.float32(12), 1.0, seen.changed, seen.colour
+    )
     view = STREET.render(at(0.0))
     view = type(view)(view.colour, view.depth * np.float32(12), view.opacity)
     composed = compose(at(0.0), view, [(far, LIVE_S)], MAX_S)

@@ -3,15 +3,18 @@
 import math
 from dataclasses import replace
 from itertools import pairwise
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 
+from mec_server.twin import notices
 from mec_server.twin.notices import (
     MOST_PER_S,
     REACH_M,
     REPEAT_S,
     VALID_S,
     StreamNotices,
+    StreetNotices,
     field_changes,
 )
 from mec_server.twin.objects import FollowedObject
@@ -39,8 +42,8 @@ def told(*objects: FollowedObject, stream: StreamNotices | None = None, now: flo
     return stream.about_objects(FIELD, HERE, objects, now)
 
 
-def distances_m(notices: list[StreetNotice]) -> list[float]:
-    return [n.subject.distance_m for n in notices if isinstance(n.subject, ObjectAhead)]
+def distances_m(given: list[StreetNotice]) -> list[float]:
+    return [n.subject.distance_m for n in given if isinstance(n.subject, ObjectAhead)]
 
 
 def test_the_test_looks_along_x() -> None:
@@ -56,6 +59,26 @@ def test_a_vehicle_is_told_what_another_sees_ahead_of_it() -> None:
     assert ahead.distance_m == pytest.approx(math.hypot(20.0, 1.5))
     assert (ahead.age_s, ahead.unseen_s) == pytest.approx((3.0, 0.1))
     assert 0.8 < ahead.confidence <= 1
+
+
+async def test_an_object_is_told_of_with_a_picture_that_shows_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    picture = Mock(key=("other", "front"), captured_s=NOW - 0.1, field_id=FIELD)
+    shown = thing(1, 20.0)
+    seen_before = replace(thing(2, 10.0), last_s=NOW - 0.3)
+    tracker = Mock(confirmed=lambda _: [shown, seen_before])
+    monkeypatch.setattr(notices, "ObjectTracker", lambda: tracker)
+    monkeypatch.setattr(notices.time, "monotonic", lambda: NOW)
+    own = Mock(frame=Mock(pose=HERE), field_id=FIELD, age_s=lambda _: 0.1)
+    twin = Mock(newest_of=lambda _: own)
+    views = Mock(detections=AsyncMock(return_value=[]))
+    taker = Mock(session_id="s", vehicle_id="me", uses=lambda _: True)
+    street = StreetNotices(twin, views, lambda: [taker], lambda: (), Mock())
+    await street._look_at(picture)
+    (notice,) = (call.args[0] for call in taker.tell.call_args_list)
+    assert notice.subject.at_m == (20.0, 0.0, 0.0)
+    assert notice.subject.unseen_s == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(

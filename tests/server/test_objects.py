@@ -1,6 +1,7 @@
 """Things that are not in the field are found where they stand, and followed."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -134,6 +135,17 @@ def test_a_thing_that_moves_is_followed_with_its_velocity() -> None:
     assert thing.velocity_mps[0] == pytest.approx(5.0, abs=0.5)
     assert thing.confidence(1.9) == 1.0
     assert thing.seen_by(1.9) == [FRONT]
+
+
+def test_a_thing_is_doubtful_while_nobody_sees_it_whose_picture_fits_the_field() -> None:
+    tracker = ObjectTracker()
+    for step in range(4):
+        tracker.take([replace(at(1.0), trust=0.6)], FRONT, 0.1 * step)
+    (thing,) = tracker.confirmed(0.3)
+    assert thing.told(0.3).is_doubtful
+    tracker.take([replace(at(1.0), trust=0.9)], ("cav-2", "front"), 0.4)
+    (thing,) = tracker.confirmed(0.4)
+    assert not thing.told(0.4).is_doubtful
 
 
 def test_two_vehicles_that_see_one_thing_see_one_thing() -> None:

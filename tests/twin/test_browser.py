@@ -23,6 +23,7 @@ from rfedge.samples import sample_path
 pytestmark = [pytest.mark.slow, pytest.mark.sample]
 
 DRIVE = sample_path("street/transforms_drive_empty.json")
+WITH_VEHICLES = sample_path("street/transforms_drive_vehicles.json")
 LOADED_S = 120.0
 """Software WebGL on a busy machine: the sample's splats take 10 s on an idle one."""
 OPTIONS = (
@@ -66,10 +67,10 @@ def until(holds: Callable[[], Any], timeout_s: float = 60.0) -> Any:
 
 
 @contextmanager
-def vehicle(name: str, address: str, folder: Path) -> Iterator[None]:
+def vehicle(name: str, address: str, folder: Path, drive: Path = DRIVE) -> Iterator[None]:
     """An agent that drives the sample again and again at 2 Hz."""
     command = [*command_of("cav-agent"), "--server", address, "--vehicle", name, "--loop"]
-    command += ["--drive", str(DRIVE), "--fields", str(sample_path("fields")), "--rate", "2"]
+    command += ["--drive", str(drive), "--fields", str(sample_path("fields")), "--rate", "2"]
     with (folder / f"{name}.log").open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
         try:
@@ -119,6 +120,51 @@ def test_two_vehicles_are_seen_and_seen_again_after_the_server_restarts(tmp_path
         stack.enter_context(server(tmp_path, address))
         until(lambda: state(page) == "connected")
         until(lambda: len(sequences(page)) == 2)
+
+
+@pytest.mark.timeout(600)
+def test_the_street_is_seen_from_anywhere_with_what_vehicles_see(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        address = stack.enter_context(server(tmp_path, "127.0.0.1:0"))
+        twin = [*command_of("rfedge"), "twin", address, "--http", "127.0.0.1:0"]
+        twin += ["--fields", str(tmp_path / "fields")]
+        page_address = stack.enter_context(service("twin", twin, tmp_path)).address
+        stack.enter_context(vehicle("cav-1", address, tmp_path, WITH_VEHICLES))
+        page = stack.enter_context(browser())
+        page.get(page_address)
+        until(lambda: page.execute_script("return !!window.twin?.street.loaded()"), LOADED_S)
+        until(lambda: sequences(page))
+        until(lambda: page.execute_script("return document.querySelector('#things li')?.innerText"))
+
+        page.execute_script(
+            "window.twin.street.renderer.setAnimationLoop(null)"
+        )  # takes seconds each
+        page.execute_script(LOOK_FROM_CAMERA)
+        page.execute_script("document.getElementById('look').click()")
+        until(lambda: "cav-1/front" in live_text(page) and "live" in live_text(page), LOADED_S)
+        plain = page.execute_script(DRAWN)
+        page.execute_script("document.getElementById('live-freshness').click()")
+        until(lambda: page.execute_script(DRAWN) != plain)
+        assert page.execute_script("return document.getElementById('live-legend').offsetHeight") > 0
+
+        page.execute_script("window.twin.street.view.position.set(0, 0, 500)")
+        until(lambda: "more than 5 m outside of the field" in live_text(page))
+        escape = "document.dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))"
+        page.execute_script(escape)
+        assert page.execute_script("return document.getElementById('live').hidden")
+        page.execute_script("document.getElementById('objects').click()")
+        until(lambda: page.execute_script("return document.getElementById('things').hidden"))
+
+
+LOOK_FROM_CAMERA = (
+    "const {view, cameras} = window.twin.street, {group} = cameras.get('cav-1/front');"
+    "view.position.copy(group.position); view.quaternion.copy(group.quaternion)"
+)
+DRAWN = "return document.getElementById('live-canvas').toDataURL()"
+
+
+def live_text(page: webdriver.Chrome) -> str:
+    return str(page.execute_script("return document.getElementById('live-state').textContent"))
 
 
 def state(page: webdriver.Chrome) -> str:

@@ -1,9 +1,11 @@
 """Who may open the page, what a browser is sent, and that a slow one delays nobody."""
 
+from __future__ import annotations
+
 import asyncio
 import json
 import struct
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Executor
 from contextlib import asynccontextmanager
 from typing import Any
@@ -15,10 +17,11 @@ import pytest
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.wire.address import Address
+from rfcore.wire.twin_render import ViewRequest
 from rfedge.twin.board import Board, Message
 from rfedge.twin.comparing import Comparer
 from rfedge.twin.scene import PlacedField, TwinScene
-from rfedge.twin.web import TwinWeb, WebSettings, selection
+from rfedge.twin.web import Look, Select, ShowObjects, TwinWeb, WebSettings, wish
 from wall_scene import seen
 
 TOKEN = "correct-horse-battery"
@@ -40,11 +43,16 @@ class Site:
 
 
 @asynccontextmanager
-async def site(token: str | None = None) -> AsyncIterator[Site]:
+async def site(token: str | None = None, live: Any = None) -> AsyncIterator[Site]:
     board = Board()
     made = Site("", Mock(aiohttp.ClientSession), board)
     web = TwinWeb(
-        WebSettings(Address("127.0.0.1", 0), token), board, made.scene, made.comparer, lambda: 0.0
+        WebSettings(Address("127.0.0.1", 0), token),
+        board,
+        made.scene,
+        made.comparer,
+        lambda: 0.0,
+        live,
     )
     made.url = (await web.start()).partition("?")[0]
     async with aiohttp.ClientSession() as session:
@@ -151,12 +159,98 @@ async def test_a_browser_that_reads_nothing_delays_nobody() -> None:
                     pass
 
 
+PLACE = {
+    "field": "ab" * 32,
+    "translation_m": [1.0, 2.0, 3.0],
+    "rotation_wxyz": [1.0, 0.0, 0.0, 0.0],
+    "intrinsics": {
+        "width_px": 640,
+        "height_px": 360,
+        "fx_px": 400.0,
+        "fy_px": 400.0,
+        "cx_px": 320.0,
+        "cy_px": 180.0,
+    },
+}
+
+
 @pytest.mark.parametrize(
-    "text", ["{", "[]", '{"select": 1}', '{"other": null}', '{"select": [1, 2]}']
+    "text",
+    [
+        "{",
+        "[]",
+        '{"select": 1}',
+        '{"other": null}',
+        '{"select": [1, 2]}',
+        '{"select": null, "look": null}',
+        '{"objects": 1}',
+        json.dumps({"look": {**PLACE, "field": "../etc"}}),
+        json.dumps({"look": {**PLACE, "rotation_wxyz": [2, 0, 0, 0]}}),
+        json.dumps({"look": {**PLACE, "translation_m": 1}}),
+        json.dumps({"look": {**PLACE, "translation_m": ["a", 0, 0]}}),
+        json.dumps({"look": {**PLACE, "intrinsics": {"width_px": 1}}}),
+        json.dumps({"look": {"field": "ab" * 32}}),
+    ],
 )
 def test_what_the_page_never_says_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"."):
-        selection(text)
+        wish(text)
+
+
+def test_what_the_page_says_is_understood() -> None:
+    assert wish('{"select": null}') == Select(None)
+    assert wish('{"select": ["cav-1", "front"]}') == Select(("cav-1", "front"))
+    assert wish('{"objects": true}') == ShowObjects(True)
+    assert wish('{"look": null}') == Look(None)
+    asked = wish(json.dumps({"look": PLACE}))
+    assert isinstance(asked, Look)
+    assert asked.request is not None
+    assert asked.request.field_id == PLACE["field"]
+    assert asked.request.camera.world_from_cam.translation_m == (1.0, 2.0, 3.0)
+    assert asked.request.camera.intrinsics.fx_px == 400.0
+
+
+class Asked:
+    """A source that notes what is asked of it, and shows one view."""
+
+    def __init__(self) -> None:
+        self.said: list[object] = []
+
+    def open_view(self, tell: Callable[[Message], None]) -> Asked:
+        self._tell = tell
+        return self
+
+    def look(self, request: ViewRequest | None) -> None:
+        self.said.append(request and request.field_id)
+        self._tell(Message({"kind": "view"}, 0.0, (b"jpeg", b"freshness")))
+
+    def close(self) -> None:
+        self.said.append("closed")
+
+    def want_objects(self, wanted: bool) -> None:
+        self.said.append(wanted)
+
+
+async def test_a_browsers_view_and_objects_are_its_own_and_end_with_it() -> None:
+    live = Asked()
+    async with site(live=live) as made:
+        async with made.socket() as other, made.socket() as socket:
+            abilities = header_of(await socket.receive_bytes(timeout=5))
+            assert (abilities["kind"], abilities["live"]) == ("abilities", True)
+            for said in ({"objects": True}, {"objects": True}, {"look": PLACE}):
+                await socket.send_str(json.dumps(said))
+            view = await socket.receive_bytes(timeout=5)
+            assert header_of(view)["kind"] == "view"
+            assert view.endswith(b"jpegfreshness")
+            assert live.said == [True, PLACE["field"]]
+            await socket.close()
+            made.board.post("a", Message({"kind": "news"}, 0.0))
+            kinds = [header_of(await other.receive_bytes(timeout=5))["kind"] for _ in range(2)]
+            assert kinds == ["abilities", "news"], "nothing of another browser's view"
+        async with asyncio.timeout(5):
+            while live.said.count("closed") < 2:
+                await asyncio.sleep(0)
+    assert live.said == [True, PLACE["field"], False, "closed", "closed"]
 
 
 @pytest.mark.parametrize(

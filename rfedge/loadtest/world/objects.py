@@ -36,8 +36,8 @@ from rfcore.image import Rgb
 from rfcore.update.passes import Pass
 from rfcore.update.run import LearnAs, UpdateSettings, learn
 from rfcore.views import View
+from rfedge.loadtest.cases import WorldRow
 from rfedge.loadtest.world import EvalWorld
-from rfedge.loadtest.world.report import Row
 from rfedge.loadtest.world.truth import Drive, SceneTruth, VisibleVehicle
 from rfedge.street.build.run import Settings, build_scene
 from rfedge.street.effects.dusk import Dusk
@@ -120,7 +120,7 @@ class Found:
                 self.found += any(distance_m <= MATCH_M for distance_m in near)
 
 
-def object_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
+def object_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
     """Return what is found of vehicles, with and without noise, and what where there are none."""
     vehicles, empty = Drive.given(asked.vehicles), Drive.given(asked.empty)
     with_vehicles = SeenDrive.of(vehicles, field, SceneTruth(vehicles.scene))
@@ -132,12 +132,12 @@ def object_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
     return [*rows, empty_minute(nothing)]
 
 
-def empty_minute(drive: SeenDrive) -> Row:
+def empty_minute(drive: SeenDrive) -> WorldRow:
     """Return how many objects a minute of an empty street has."""
     drives = math.ceil(MINUTE_S / drive.seconds)
     false = sum(len(followed(drive, NOISE_SIGMA, seed).false) for seed in range(1, drives + 1))
     minutes = drives * drive.seconds / 60
-    return Row(
+    return WorldRow(
         "objects",
         f"false ones in the empty minute: {drives} times the drive of {drive.seconds:.1f} s, "
         f"noise {NOISE_SIGMA:g} of seeds 1 to {drives}",
@@ -166,39 +166,39 @@ def noisy(rgb: NDArray[np.uint8], sigma: float, rng: np.random.Generator) -> NDA
     return np.clip(np.rint(rgb + rng.normal(scale=sigma, size=rgb.shape)), 0, 255).astype(np.uint8)
 
 
-def _row_of_empty(case: str, drive: SeenDrive, sigma: float) -> Row:
+def _row_of_empty(case: str, drive: SeenDrive, sigma: float) -> WorldRow:
     false = len(followed(drive, sigma).false)
     told = f"{false} in {drive.seconds:.1f} s"
-    return Row("objects", case, "<= 1 a minute", told, false <= drive.seconds / 60)
+    return WorldRow("objects", case, "<= 1 a minute", told, false <= drive.seconds / 60)
 
 
-def _rows_of_found(name: str, found: Found) -> list[Row]:
+def _rows_of_found(name: str, found: Found) -> list[WorldRow]:
     errors_m = np.array(found.errors_m or [np.nan])
     median_m, p95_m = (float(np.nanpercentile(errors_m, q)) for q in (50, 95))
     share = found.found / max(1, found.to_find)
     return [
-        Row(
+        WorldRow(
             "objects",
             f"{name}, distance from the outline, median",
             "<= 0.5 m",
             f"{median_m:.2f} m",
             median_m <= 0.5,
         ),
-        Row(
+        WorldRow(
             "objects",
             f"{name}, distance from the outline, p95",
             "<= 1.0 m",
             f"{p95_m:.2f} m",
             p95_m <= 1.0,
         ),
-        Row(
+        WorldRow(
             "objects",
             f"{name}, found where >= {LEAST_PX} px are seen within {REACH_M:g} m",
             ">= 90 %",
             f"{100 * share:.0f} % of {found.to_find}",
             share >= 0.9,
         ),
-        Row(
+        WorldRow(
             "objects",
             f"{name}, confirmed objects that are no vehicle",
             "",
@@ -240,7 +240,7 @@ def _at_dusk(scene: Scene) -> Scene:
     return replace(scene, name=f"{scene.name}-dusk", effects={**scene.effects, "dusk": Dusk()})
 
 
-def dusk_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
+def dusk_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
     """Return what is found at dusk, in the light that the field has learnt."""
     paths = [given.partition(",")[0] for given in (asked.empty, asked.vehicles)]
     scenes, console = dusk_scenes(paths[0], paths[1]), Console(soft_wrap=True)

@@ -17,8 +17,8 @@ from rich.console import Console
 
 from cav_agent.config import AgentConfig
 from cav_agent.vehicle import Vehicle
-from mec_server.twin.composition import LivePicture, compose, live_picture
-from mec_server.twin.contacts import detect
+from mec_server.twin.composition import LivePicture, compose, live_picture, with_things
+from mec_server.twin.contacts import find
 from mec_server.twin.ground import FieldGround
 from rfcore.camera import Camera
 from rfcore.codec.h264.config import CoderSettings
@@ -29,10 +29,10 @@ from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.notices import ObjectAhead, StreetNotice
 from rfcore.wire.twin import PictureEncoding
 from rfcore.wire.twin_render import ViewRequest, render_view
+from rfedge.loadtest.cases import WorldRow, print_world
 from rfedge.loadtest.live.showing import TwinBed, ingest_latencies_ms
 from rfedge.loadtest.world import EvalWorld
 from rfedge.loadtest.world.objects import dusk_rows, object_rows
-from rfedge.loadtest.world.report import Row, print_world
 from rfedge.loadtest.world.truth import Drive, SceneTruth, aside
 from rfedge.results import (
     as_json,
@@ -54,7 +54,7 @@ def run_world(asked: EvalWorld) -> None:
     """Measure what is asked for, write the rows, print them."""
     field, console = load_field(asked.field), Console()
     asked.work.mkdir(parents=True, exist_ok=True)
-    cases: dict[str, Callable[[], list[Row]]] = {
+    cases: dict[str, Callable[[], list[WorldRow]]] = {
         "objects": lambda: object_rows(asked, field),
         "dusk": lambda: dusk_rows(asked, field),
         "views": lambda: view_rows(asked, field),
@@ -76,12 +76,12 @@ def run_world(asked: EvalWorld) -> None:
     print_world(console, read_result(asked.out))
 
 
-def _kept(out: Path, revision: str) -> dict[str, list[Row]]:
+def _kept(out: Path, revision: str) -> dict[str, list[WorldRow]]:
     """Return the rows that are there of this revision, by part."""
-    kept: dict[str, list[Row]] = {}
+    kept: dict[str, list[WorldRow]] = {}
     if out.is_file():
         result = read_result(out)
-        for row in rows_of(Row, result["rows"]) if result["revision"] == revision else ():
+        for row in rows_of(WorldRow, result["rows"]) if result["revision"] == revision else ():
             kept.setdefault(row.part, []).append(row)
     return kept
 
@@ -89,7 +89,7 @@ def _kept(out: Path, revision: str) -> dict[str, list[Row]]:
 # --- views
 
 
-def view_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
+def view_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
     """Return how close views from beside the drives come to the generator's pictures."""
     rows = []
     given = (
@@ -99,9 +99,11 @@ def view_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
     for name, text, changes in given:
         drive = Drive.given(text)
         truth, gains, changed_gains = SceneTruth(drive.scene), [], []
+        ground = FieldGround(field.render)
         for index in range(0, len(drive.pictures), asked.every):
             picture, time_s = drive.pictures[index], drive.time_s(index)
-            live = live_picture(picture.camera, picture.read(), field.render(picture.camera))
+            seen = live_picture(picture.camera, picture.read(), field.render(picture.camera))
+            live = with_things(seen, [each.outline for each in find(seen, ground)])
             for left_m in asked.aside_m:
                 camera = aside(picture.camera, left_m)
                 gain_db, changed_db = _gains_db(field, camera, live, truth.picture(camera, time_s))
@@ -112,17 +114,17 @@ def view_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
     return rows
 
 
-def _rows_of_gains(name: str, gains: Sequence[float], changed: Sequence[float]) -> list[Row]:
+def _rows_of_gains(name: str, gains: Sequence[float], changed: Sequence[float]) -> list[WorldRow]:
     worst_db, median_db = min(gains), float(np.median(gains))
     if not changed:
         told = f"{worst_db:+.3f} dB (median {median_db:+.3f})"
         case = f"{name}, worst gain of {len(gains)}"
-        return [Row("views", case, ">= -0.1 dB", told, worst_db >= -0.1)]
+        return [WorldRow("views", case, ">= -0.1 dB", told, worst_db >= -0.1)]
     told = f"{median_db:+.2f} dB (worst {worst_db:+.2f})"
     changed_db = float(np.median(changed))
     return [
-        Row("views", f"{name}, median gain of {len(gains)}", "> 0 dB", told, median_db > 0),
-        Row(
+        WorldRow("views", f"{name}, median gain of {len(gains)}", "> 0 dB", told, median_db > 0),
+        WorldRow(
             "views",
             f"{name}, median gain in the changed pixels",
             ">= +2 dB",
@@ -151,7 +153,7 @@ def _gains_db(
 # --- cost
 
 
-def cost_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
+def cost_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
     """Return what a view takes on one core, beside the field's own render, in turn."""
     drive = Drive.given(asked.vehicles)
     pictures = drive.pictures[-4:]
@@ -159,7 +161,7 @@ def cost_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
     camera = aside(pictures[-1].camera, 1.0)
     rgb, own = pictures[-1].read(), field.render(pictures[-1].camera)
     ground = FieldGround(field.render)
-    detect(lives[-1], ground)
+    lives = [with_things(live, [each.outline for each in find(live, ground)]) for live in lives]
     times: dict[str, list[float]] = {"render": [], "compose": [], "take up": [], "find": []}
     for _ in range(20):
         with _timed(times["render"]):
@@ -169,27 +171,27 @@ def cost_rows(asked: EvalWorld, field: RadianceField) -> list[Row]:
         with _timed(times["take up"]):
             live = live_picture(pictures[-1].camera, rgb, own)
         with _timed(times["find"]):
-            detect(live, ground)
+            find(live, ground)
     ms = {name: 1e3 * float(np.median(values)) for name, values in times.items()}
     renders = (ms["render"] + ms["compose"]) / ms["render"]
     k = camera.intrinsics
     what = f"{k.width_px}x{k.height_px}, {len(lives)} live pictures, one core"
     return [
-        Row(
+        WorldRow(
             "cost",
             f"a view, {what}",
             "<= 2 renders",
             f"{renders:.2f} renders of {ms['render']:.1f} ms",
             renders <= 2,
         ),
-        Row(
+        WorldRow(
             "cost",
             "a live picture, once for all views of it, beside its render",
             "",
             f"{ms['take up']:.1f} ms",
             None,
         ),
-        Row("cost", "the things in it", "", f"{ms['find']:.1f} ms", None),
+        WorldRow("cost", "the things in it", "", f"{ms['find']:.1f} ms", None),
     ]
 
 
@@ -203,7 +205,7 @@ def _timed(seconds: list[float]) -> Iterator[None]:
 # --- processes
 
 
-def notice_rows(asked: EvalWorld) -> list[Row]:
+def notice_rows(asked: EvalWorld) -> list[WorldRow]:
     """Return how old what a vehicle is told is: since the capture of the picture that shows it."""
     vehicles, empty = (Path(d.split(",")[1]) for d in (asked.vehicles, asked.empty))
     bed = TwinBed(asked.field, vehicles, asked.work, asked.notices_hz, asked.seconds)
@@ -211,7 +213,7 @@ def notice_rows(asked: EvalWorld) -> list[Row]:
         ages_ms = asyncio.run(_told(asked, server.address, empty))
     p50, p99 = np.percentile(ages_ms, (50, 99)) if ages_ms else (np.nan, np.nan)
     return [
-        Row(
+        WorldRow(
             "notices",
             f"age at the other vehicle, {asked.notices_hz:g} Hz, p99",
             "<= 200 ms",
@@ -246,7 +248,7 @@ async def _told(asked: EvalWorld, address: str, drive: Path) -> list[float]:
     return ages_ms
 
 
-def ingest_rows(asked: EvalWorld) -> list[Row]:
+def ingest_rows(asked: EvalWorld) -> list[WorldRow]:
     """Return the p99 of ingest without and with a live view that is asked for again and again."""
     drive = Drive.given(asked.vehicles)
     path = Path(asked.vehicles.split(",")[1])
@@ -268,7 +270,7 @@ def ingest_rows(asked: EvalWorld) -> list[Row]:
     alone, viewed = (float(np.percentile(values, 99)) for values in (alone_ms, viewed_ms))
     bound_ms = max(1.1 * alone, alone + 5)
     return [
-        Row(
+        WorldRow(
             "ingest",
             "p99 with a live view asked for again and again",
             f"<= {bound_ms:.0f} ms (+10 % or +5 ms)",

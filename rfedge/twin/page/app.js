@@ -3,6 +3,8 @@ import { Street } from "/page/street.js";
 import { Wall } from "/page/wall.js";
 import { Inspector } from "/page/inspect.js";
 import { Plots } from "/page/plots.js";
+import { LiveView } from "/page/live.js";
+import { StreetObjects } from "/page/objects.js";
 
 const RECONNECT_MS = 500;
 const AGES_KEPT = 20000;
@@ -12,17 +14,25 @@ const select = (camera) => {
   state.selected = camera;
   wall.select(camera);
   street.select(camera);
-  send();
+  send({ select: camera });
 };
 const street = new Street(element("street"));
 const wall = new Wall(element("wall"), (camera) => { select(camera); inspector.open(camera); });
 const inspector = new Inspector(element("inspect"), () => select(null));
 const plots = new Plots(element("plots"));
-const state = { socket: null, selected: null, pictures: 0, ages: [] };
+const live = new LiveView(element("live"), street, (place) => send({ look: place }));
+const objects = new StreetObjects(street, element("things"));
+const state = { socket: null, selected: null, isLive: false, pictures: 0, ages: [] };
 
-function send() {
-  if (state.socket?.readyState === WebSocket.OPEN)
-    state.socket.send(JSON.stringify({ select: state.selected }));
+function send(wish) {
+  if (state.socket?.readyState === WebSocket.OPEN) state.socket.send(JSON.stringify(wish));
+}
+
+// What of the page takes the server's time is asked for only where it can be had, and is looked at.
+function showObjects() {
+  const shown = state.isLive && element("objects").checked;
+  objects.show(shown);
+  if (state.isLive) send({ objects: shown });
 }
 
 function decode(buffer) {
@@ -67,6 +77,19 @@ const handlers = {
     wall.setQuality(key(header), header);
     inspector.show(key(header), header, { shown, render, difference });
   },
+  abilities(header) {
+    state.isLive = header.live;
+    for (const control of document.querySelectorAll(".of-server")) control.hidden = !header.live;
+    showObjects();
+    live.again();
+  },
+  objects(header) { if (element("objects").checked) objects.set(header); },
+  async view(header, parts) {
+    const bitmap = await picture(parts[0]);
+    if (live.isOpen) await live.show(header, bitmap, parts[1]);
+    else bitmap.close();
+  },
+  view_refused(header) { live.refuse(header.problem); },
   departure(header) {
     street.remove(key(header));
     wall.remove(key(header));
@@ -83,7 +106,7 @@ function connect() {
   const socket = new WebSocket(`ws${location.protocol.slice(4)}//${location.host}/socket`);
   socket.binaryType = "arraybuffer";
   state.socket = socket;
-  socket.onopen = send;
+  socket.onopen = () => send({ select: state.selected });
   socket.onmessage = ({ data }) => {
     const [header, parts] = decode(data);
     handlers[header.kind]?.(header, parts);  // kinds of a newer server are passed over
@@ -106,7 +129,9 @@ setInterval(() => {
 element("overview").onclick = () => street.overview();
 element("follow").onchange = ({ target }) => { street.following = target.checked; };
 element("marks").onchange = ({ target }) => street.showMarks(target.checked);
+element("objects").onchange = showObjects;
+element("look").onclick = () => live.open();
 connect();
 
 // For tests and for the console: look from a pose, read the picture, read what was measured.
-window.twin = { state, street, select };
+window.twin = { state, street, select, live, objects };

@@ -30,7 +30,10 @@ export class Street {
     this.drawingMs = 0;  // what the last drawing took, until the GPU was done
     this.resolution = 1;  // pixels drawn for one of the page, in each direction
     this.renderer = new THREE.WebGLRenderer({ antialias: false, preserveDrawingBuffer: true });
-    parent.append(this.renderer.domElement);
+    const canvas = this.renderer.domElement;
+    Object.assign(canvas, { tabIndex: 0, title: "Drag, scroll, or arrow keys" });
+    canvas.setAttribute("aria-label", "The street; arrow keys move the view");
+    parent.prepend(canvas);
     this.scene = new THREE.Scene();
     this.scene.background = new THREE.Color(0x0d1117);
     this.scene.add(new SparkRenderer({ renderer: this.renderer, onDirty: () => this.touch() }));
@@ -38,6 +41,7 @@ export class Street {
     this.view.position.set(-20, -20, 15);
     this.controls = new OrbitControls(this.view, this.renderer.domElement);
     this.controls.addEventListener("change", () => this.touch());
+    this.controls.listenToKeyEvents(canvas);
     new ResizeObserver(() => this.resize()).observe(parent);
     this.renderer.setAnimationLoop(() => this.draw());
   }
@@ -154,6 +158,34 @@ export class Street {
     const middle = cameras.length ? cameras[0].group.position : box.getCenter(new THREE.Vector3());
     this.controls.target.copy(middle);
     this.view.position.copy(middle).add(new THREE.Vector3(-18, -6, 12));
+    this.touch();
+  }
+
+  // Where the user looks from, relative to the field whose ground is nearest; null without a field.
+  viewpoint({ width_px, height_px }) {
+    const fields = [...this.tiles.values()].map(({ field }) => field);
+    if (!fields.length) return null;
+    const { position } = this.view;
+    const distance = (field) => {
+      const origin = vector(field.origin_m);
+      return new THREE.Box3(vector(field.low_m).add(origin), vector(field.high_m).add(origin))
+        .distanceToPoint(position);
+    };
+    const nearest = fields.reduce((best, field) => (distance(field) < distance(best) ? field : best));
+    const { w, x, y, z } = this.view.quaternion.clone().multiply(HALF_TURN).normalize();
+    const focal_px = height_px / 2 / Math.tan((Math.PI / 360) * this.view.fov);
+    return {
+      field: nearest.field,
+      translation_m: position.clone().sub(vector(nearest.origin_m)).toArray(),
+      rotation_wxyz: [w, x, y, z],
+      intrinsics: { width_px, height_px, fx_px: focal_px, fy_px: focal_px,
+        cx_px: width_px / 2, cy_px: height_px / 2 },
+    };
+  }
+
+  turnTo(point) {
+    this.following = false;
+    this.controls.target.copy(point);
     this.touch();
   }
 

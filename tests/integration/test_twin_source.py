@@ -1,0 +1,155 @@
+"""What a browser's user asks for beside pictures: objects, and views from a real server."""
+
+import asyncio
+import json
+import struct
+import zlib
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.image import rgb_from_bytes
+from rfcore.wire.twin_render import ViewRequest
+from rfedge.twin import server_source
+from rfedge.twin.board import Board, Message
+from rfedge.twin.scene import TwinScene
+from rfedge.twin.server_source import FIELD_ALONE, ServerSource, ServerTarget
+
+INTRINSICS = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
+NEAR = Camera(INTRINSICS, Pose.identity())
+FAR = Camera(INTRINSICS, Pose((0.0, 0.0, -40.0), (1.0, 0.0, 0.0, 0.0)))
+
+
+class Browser:
+    """The messages that a browser would be sent."""
+
+    def __init__(self, board: Board) -> None:
+        self.arrived = asyncio.Event()
+        self.board = board
+        self.reader = board.read(self.arrived.set)
+        self.views: asyncio.Queue[Message] = asyncio.Queue()
+
+    async def next(self, kind: str) -> dict[str, Any]:
+        """Return the header of the next message of this kind that the board sends."""
+        async with asyncio.timeout(30):
+            while True:
+                while (message := self.reader.take()) is not None:
+                    data = message.encode(message.made_s)
+                    (length,) = struct.unpack_from("<I", data)
+                    header: dict[str, Any] = json.loads(data[4 : 4 + length])
+                    if header["kind"] == kind:
+                        return header
+                self.arrived.clear()
+                await self.arrived.wait()
+
+    def board_keys(self) -> list[Any]:
+        """Return what a browser that comes now would be shown."""
+        return list(self.board._messages)
+
+    async def view(self) -> Message:
+        return await asyncio.wait_for(self.views.get(), 30)
+
+
+@asynccontextmanager
+async def following(server: Any, folder: Path) -> AsyncIterator[tuple[ServerSource, Browser]]:
+    board = Board()
+    source = ServerSource(ServerTarget(str(server.address), folder), TwinScene(board))
+    browser = Browser(board)
+    running = asyncio.create_task(source.run())
+    try:
+        await browser.next("fields")
+        yield source, browser
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+
+async def test_a_live_view_follows_its_user_says_what_is_refused_and_goes_on(
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any, tmp_path: Path
+) -> None:
+    near = ViewRequest(NEAR, field_id=street.field_id, max_age_s=10.0)
+    async with (
+        serve() as server,
+        raw_vehicle(server.address) as vehicle,
+        following(server, tmp_path) as (source, browser),
+    ):
+        await vehicle.greet(coded.hello)
+        await vehicle.told(coded.frames[0])
+        view = source.open_view(browser.views.put_nowait)
+        view.look(near)
+        shown = await browser.view()
+        assert shown.header["kind"] == "view"
+        assert shown.header["field"] == street.field_id
+        (camera,) = shown.header["cameras"]
+        assert (camera["vehicle"], camera["camera"]) == ("cav-raw", "front")
+        jpeg, deflated = shown.parts
+        assert rgb_from_bytes(jpeg, "view").shape == (52, 76, 3)
+        freshness = np.frombuffer(zlib.decompress(deflated), np.uint8)
+        assert freshness.size == 52 * 76
+        assert (freshness != FIELD_ALONE).mean() == pytest.approx(shown.header["live_share"])
+        assert shown.header["live_share"] > 0.1
+        assert (await browser.view()).header["kind"] == "view", "again, without being asked"
+
+        view.look(replace(near, camera=FAR))
+        while (told := (await browser.view()).header)["kind"] == "view":
+            pass
+        assert told["kind"] == "view_refused"
+        assert "-40 is more than 5 m outside of the field" in told["problem"]
+        view.look(near)
+        assert (await browser.view()).header["kind"] == "view"
+        view.look(None)
+
+
+async def test_a_view_without_a_server_says_so(tmp_path: Path) -> None:
+    source = ServerSource(ServerTarget("127.0.0.1:1", tmp_path), TwinScene(Board()))
+    told: asyncio.Queue[Message] = asyncio.Queue()
+    source.open_view(told.put_nowait).look(ViewRequest(NEAR, field_id="0" * 64))
+    message = await asyncio.wait_for(told.get(), 30)
+    assert message.header == {
+        "kind": "view_refused",
+        "problem": "there is no connection to the server",
+    }
+
+
+async def test_objects_are_followed_while_somebody_shows_them(
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any, tmp_path: Path
+) -> None:
+    async with (
+        serve() as server,
+        raw_vehicle(server.address) as vehicle,
+        following(server, tmp_path) as (source, browser),
+    ):
+
+        async def until_consumers(count: int) -> None:
+            async with asyncio.timeout(30):
+                while server.registry.get_sample_value("rfedge_twin_consumers") != count:
+                    await asyncio.sleep(0)
+
+        await vehicle.greet(coded.hello)
+        await until_consumers(1)
+        source.want_objects(True)
+        await until_consumers(2)
+        await vehicle.told(coded.frames[0])
+        shown = await browser.next("objects")
+        assert (shown["field"], shown["problem"]) == (street.field_id, "")
+        source.want_objects(False)
+        await until_consumers(1)
+        assert not [key for key in browser.board_keys() if key[0] == "objects"]
+
+
+async def test_objects_that_a_server_refuses_leave_the_reason(
+    street: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nowhere = server_source.ObjectsRequest(tile="west")
+    monkeypatch.setattr(server_source, "ObjectsRequest", lambda field_id: nowhere)  # noqa: ARG005
+    async with serve() as server, following(server, tmp_path) as (source, browser):
+        source.want_objects(True)
+        shown = await browser.next("objects")
+        assert shown["field"] == street.field_id
+        assert "west" in shown["problem"]
