@@ -2,7 +2,8 @@
 
 A job is named, can be pickled, and depends on nothing but what it was made from, threads included:
 its files have the same bytes wherever it runs. A job whose files are there, made from the same, is
-skipped; the file ``FIRST_OUTPUT.job`` beside them says from what. What it writes is whole or not
+skipped; the file ``FIRST_OUTPUT.job`` beside them says from what. (One that does not say what it is
+made from is done each time, and looks itself for what is there.) What it writes is whole or not
 there at all (``rfcore.files``), so a job whose process was killed is begun again, and goes on where
 it left a checkpoint. One that fails does not stop the others.
 
@@ -49,13 +50,13 @@ class Job:
     work: Callable[[Tell], None]
     """Makes the files; a function of a module, or a partial of one, since it is pickled."""
     outputs: tuple[Path, ...]
-    made_from: str
-    """All that the files' bytes depend on, in one line."""
+    made_from: str | None
+    """All that the files' bytes depend on, in one line; None: it is done each time."""
     cores: int
     memory_bytes: int
 
     def __post_init__(self) -> None:
-        if not self.outputs:
+        if not self.outputs and self.made_from is not None:
             raise InvalidInput("outputs", f"job {self.name} makes no file")
         if self.cores < 1:
             raise InvalidInput("cores", f"{self.cores} of job {self.name} must be at least 1")
@@ -63,6 +64,8 @@ class Job:
     @property
     def is_done(self) -> bool:
         """Whether the files are there, made from the same."""
+        if self.made_from is None:
+            return False
         if not all(path.exists() for path in (self._marker, *self.outputs)):
             return False
         return self._marker.read_text(encoding="utf-8") == self._mark
@@ -78,12 +81,14 @@ class Job:
     def run(self, tell: Tell) -> str | None:
         """Make the files; return None, or what went wrong."""
         try:
-            self._marker.unlink(missing_ok=True)
+            if self.made_from is not None:
+                self._marker.unlink(missing_ok=True)
             self.work(tell)
             missing = [str(path) for path in self.outputs if not path.exists()]
             if missing:
                 return f"did not write {', '.join(missing)}"
-            write_whole(self._marker, self._mark)
+            if self.made_from is not None:
+                write_whole(self._marker, self._mark)
         except (RfedgeError, OSError) as error:
             return str(error)
         except Exception as error:
@@ -148,6 +153,10 @@ class _Lines:
     def add(self, line: str) -> None:
         self._lines.append(line)
 
+    def have_arrived(self) -> bool:
+        """Be called last: the calls of one caller are taken in their order."""
+        return True
+
     def take(self) -> list[str]:
         taken, self._lines = self._lines, []
         return taken
@@ -186,8 +195,10 @@ def _reached(address: str, machines: Sequence[dict[str, float]]) -> str:
 
 
 def _run_on_worker(job: Job, lines: Any) -> str | None:
-    ray = _ray()
-    return _run_telling(job, lambda line: ray.get(lines.add.remote(line)))
+    # Waits for nothing while the job works: Ray lends the cores of a task that waits to others.
+    problem = _run_telling(job, lambda line: lines.add.remote(line))
+    _ray().get(lines.have_arrived.remote())
+    return problem
 
 
 def _outcome(ray: Any, task: Any) -> str | None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,10 +17,12 @@ if TYPE_CHECKING:
     from rfcore.field import RadianceField
     from rfcore.update.passes import Pass
     from rfcore.update.run import Update, UpdateSettings
+    from rfedge.jobs import Job, Tell
 
 __all__ = ["FieldDisagree", "FieldUpdate"]
 
 PNG = arg(metavar="FILE.png")
+JOB_BYTES = 2_500_000_000
 
 
 @dataclass(frozen=True)
@@ -43,18 +46,53 @@ class FieldUpdate:
     """Refuse to learn from fewer passes: what one alone shows may be what drove by."""
     threads: int = 1
     """Threads of the renderer."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Learn on a Ray (`local` starts one here; docs/scale.md), as a job of --threads cores; the
+    archive is the same bytes. Needs rfedge[ray]."""
 
     def run(self) -> None:
-        """Learn, try, write."""
+        """Learn, try, write, here or as a job."""
         from rich.console import Console
 
+        from rfcore.errors import InvalidInput
+        from rfcore.extras import require
+        from rfedge.jobs import run_jobs
+
+        if self.out.suffix != ".rff":
+            raise InvalidInput("out", f"{self.out} must end in .rff")
+        if self.ray is None:
+            self.learn(Console())
+            return
+        require("ray", "ray")
+        run_jobs([self._job()], partial(print, flush=True), self.ray)
+
+    def _job(self) -> Job:
+        from rfedge.arguments import field_path
+        from rfedge.jobs import Job
+
+        settled = replace(
+            self,
+            field=field_path(self.field).resolve(),
+            recordings=tuple(path.resolve() for path in self.recordings),
+            out=self.out.resolve(),
+            ray=None,
+        )  # workers run in folders of their own
+        work = partial(_learn_as_job, settled)
+        return Job(
+            f"update-{self.out.stem}",
+            work,
+            (settled.out,),
+            None,
+            cores=self.threads,
+            memory_bytes=JOB_BYTES,
+        )
+
+    def learn(self, console: Console) -> None:
+        """Learn, try, and write what takes fewer bits; raise ``InvalidInput`` if nothing does."""
         from rfcore.errors import InvalidInput
         from rfcore.field import save_field
         from rfedge.fields.describe import size_mb
 
-        if self.out.suffix != ".rff":
-            raise InvalidInput("out", f"{self.out} must end in .rff")
-        console = Console()
         base = open_field(self.field, threads=self.threads)
         update = _learnt(base, _passes(self.recordings, base), self._settings(), console)
         for name, percent in update.saved_percent.items():
@@ -81,6 +119,12 @@ class FieldUpdate:
             fine_tuning=FineTuning(self.iterations, threads=self.threads),
             colours=ColourFit(threads=self.threads),
         )
+
+
+def _learn_as_job(update: FieldUpdate, tell: Tell) -> None:
+    from rfedge.jobs import console_of
+
+    update.learn(console_of(tell))
 
 
 @dataclass(frozen=True)

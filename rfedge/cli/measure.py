@@ -174,6 +174,8 @@ class EvalScale:
     """How often each of these loads is run; the medians count."""
     envoy: bool = True
     """Run the cases behind Envoy; --no-envoy: only what else is asked for."""
+    moves: bool = True
+    """Kill, drain and add servers there; --no-moves: only measure what Envoy adds."""
     nats: bool = False
     """Also restart the NATS that two servers publish to, `rounds` times (Debian's nats-server)."""
     ray_tiles: Annotated[Path | None, FOLDER] = None
@@ -181,6 +183,8 @@ class EvalScale:
     here, and again with a worker killed; needs rfedge[ray], and three trainings' time."""
     ray_iterations: int = 2000
     """Iterations of each of those."""
+    city: Annotated[Path | None, arg(metavar="CITY.toml")] = None
+    """Also time `rfedge size --city` of this city, such as samples/sizing/metropolis.toml."""
     field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
     """Field archive that the servers publish."""
     drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")
@@ -190,7 +194,9 @@ class EvalScale:
     work: Annotated[Path, FOLDER] = Path("out/eval/scale")
     """Folder for the reduced drive, logs and reports; what is in it is replaced."""
     out: Annotated[Path, JSON] = Path("out/eval/scale.json")
-    """The result file to write."""
+    """The result file to write; after every group of cases."""
+    add: bool = False
+    """Keep that file's rows of other cases, if they are of this host and field."""
 
     def run(self) -> None:
         """Measure, print and write the rows."""
@@ -216,7 +222,9 @@ class EvalScale:
             planned_hz=self.planned_hz,
             planned_runs=self.planned_runs,
             envoy=self.envoy,
+            moves=self.moves,
             also=self._further_cases(),
+            add=self.add,
         )
         run_scale(job, Console())
 
@@ -232,6 +240,10 @@ class EvalScale:
 
             require("ray", "ray")
             cases.append(ray_case(self.ray_tiles, self.ray_iterations))
+        if self.city is not None:
+            from rfedge.loadtest.scale import city_case
+
+            cases.append(city_case(self.city))
         return tuple(cases)
 
 

@@ -38,6 +38,9 @@ class SceneBuild:
     """Samples a pixel, a square number."""
     workers: int = 1
     """Processes. One uses all cores; more share them and take 1 to 2.5 GB each."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Render on a Ray (`local` starts one here; docs/scale.md), each job on this machine's cores
+    divided by --workers; the pictures are the same. Needs rfedge[ray]."""
     frames: Annotated[str | None, arg(metavar="A:B")] = None
     """Only frames a:b of the chosen splits, counted through drive, train, eval in that order."""
     split: Annotated[str, arg(metavar="SPLIT")] = "default"
@@ -53,6 +56,7 @@ class SceneBuild:
         """Build."""
         from rich.console import Console
 
+        from rfcore.extras import require
         from rfedge.street import load_scene
         from rfedge.street.render.backend import require_renderer
         from rfedge.street.shots import Selection
@@ -65,7 +69,9 @@ class SceneBuild:
         if self.rig is not None:
             scene = replace(scene, drive=replace(scene.drive, rig=self.rig))
         selection = Selection(scene, self.split, self.frames, size_px)
-        settings = Settings(self.out, self.spp, self.workers)
+        if self.ray is not None:
+            require("ray", "ray")
+        settings = Settings(self.out, self.spp, self.workers, self.ray)
         build_scene(selection, settings, Console(soft_wrap=True))
 
 

@@ -79,7 +79,7 @@ class EnvoySetup:
             if text.count(deployed) != 1:
                 raise InvalidInput("envoy", f"{self.config} must say `{deployed}` once")
             text = text.replace(deployed, f"port_value: {port}")
-        path = self.folder / "envoy.yaml"
+        path = self.folder.resolve() / "envoy.yaml"  # Envoy runs in that folder
         path.write_text(text, encoding="utf-8")
         return path
 
@@ -164,7 +164,7 @@ def run_envoy(setup: EnvoySetup, addresses: Sequence[str]) -> Iterator[Envoy]:
     Raises ``RfedgeError`` when Envoy ends or a server is not healthy within 60 s.
     """
     setup.list_servers(addresses)
-    admin = setup.folder / "admin"
+    admin = setup.folder.resolve() / "admin"
     admin.unlink(missing_ok=True)
     command = [setup.binary, "--config-path", setup.write(), "--admin-address-path", admin]
     with (setup.folder / "envoy.log").open("ab") as log:

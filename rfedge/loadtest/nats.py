@@ -21,7 +21,8 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.nats import NatsServers
 from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
 from rfedge.demo.processes import command_of, service
-from rfedge.loadtest.scale import Fleet, ScaleJob, ScaleRow, failures
+from rfedge.loadtest.cases import ScaleRow
+from rfedge.loadtest.scale import Fleet, ScaleJob, failures
 from rfedge.twin.nats_source import NatsPictures
 
 __all__ = ["NatsServer", "nats_binary", "nats_rows"]
@@ -51,7 +52,7 @@ class NatsServer:
     """
 
     def __init__(self, folder: Path, config: Path | None = None) -> None:
-        self._folder = folder
+        self._folder = folder.resolve()  # the server runs in it
         self._config = config
         self._port = -1
         self._process: subprocess.Popen[bytes] | None = None

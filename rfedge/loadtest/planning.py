@@ -108,8 +108,8 @@ def on_time_share(traffic: Traffic, rate_bps: float, vehicles: int) -> float:
     return sum(in_time) / len(schedule)
 
 
-FIT_VEHICLES = (6, 36)
-"""Vehicles of the two loads that the costs are measured with."""
+FIT_VEHICLES = (6, 60)
+"""Vehicles of the two loads that the costs are measured with; plans are trusted in between."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from pathlib import Path
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.datasets.split import read_tiles
 from rfedge.demo.processes import command_of
-from rfedge.loadtest.scale import Case, ScaleJob, ScaleRow
+from rfedge.loadtest.cases import ScaleRow
+from rfedge.loadtest.scale import Case, ScaleJob
 
 __all__ = ["TileRun", "overhead_percent", "ray_case", "train_tiles"]
 

@@ -13,11 +13,12 @@ import signal
 import statistics
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from rfcore.wire.twin import (
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.datasets.convert import convert_dataset
 from rfedge.demo.processes import command_of
+from rfedge.loadtest.cases import Measured, ScaleRecord, ScaleRow, print_scale
 from rfedge.loadtest.envoy import (
     PROXIED,
     Envoy,
@@ -47,15 +49,14 @@ from rfedge.loadtest.envoy import (
 )
 from rfedge.loadtest.planning import PlannedLoad, PlannedRow, compare_with_plan
 from rfedge.loadtest.run import TestBed
-from rfedge.report.tables import cell, print_table
-from rfedge.results import make_result, provenance, write_result
+from rfedge.results import provenance
 from rfedge.samples import sample_path
 
 __all__ = [
     "Case",
     "Fleet",
     "ScaleJob",
-    "ScaleRow",
+    "city_case",
     "failures",
     "keyframes",
     "p99",
@@ -69,6 +70,7 @@ RESUME_S = 1.0
 RESTART_S = 3.0
 ADDED_MS = 3.0
 PLANNED_PERCENT, PLANNED_AGE_PERCENT = 15.0, 25.0
+CITY_S = 600.0
 PAIR_HZ = 10.0
 WATCH_S = 2.0
 WAIT_S = 120.0
@@ -77,21 +79,6 @@ EVERYWHERE = Ground(Area((-1e4, -1e4), (1e4, 1e4)), 0.0)
 
 Lines = Sequence[Mapping[str, Any]]
 """A vehicle's report: a line a picture (``cav_agent.frame_log``), in the order they ended."""
-
-
-@dataclass(frozen=True)
-class ScaleRow:
-    """A case: what was measured, and the most it may be."""
-
-    case: str
-    bound: float
-    measured: float
-    held: bool
-
-    @staticmethod
-    def at_most(case: str, bound: float, measured: float) -> ScaleRow:
-        """Return the row of a case that is held if ``measured`` is not above ``bound``."""
-        return ScaleRow(case, bound, measured, measured <= bound)
 
 
 Case = Callable[["ScaleJob"], list[ScaleRow]]
@@ -121,11 +108,16 @@ class ScaleJob:
     planned_runs: int = 3
     envoy: bool = True
     """Whether the cases behind Envoy are run."""
+    moves: bool = True
+    """Whether servers are killed, drained and added behind it."""
     also: tuple[Case, ...] = ()
     """Further cases."""
+    add: bool = False
+    """Whether rows of other cases that ``out`` holds are kept."""
 
     def __post_init__(self) -> None:
-        if not (self.envoy or self.planned or self.also):
+        behind_envoy = self.envoy and (self.moves or self.pairs)
+        if not (behind_envoy or self.planned or self.also):
             raise InvalidInput("envoy", "nothing is to be measured; give --planned numbers")
         for name, value, low, high in (
             ("vehicles", self.vehicles, 2, 200),
@@ -150,27 +142,54 @@ class ScaleJob:
 
 
 def run_scale(job: ScaleJob, console: Console) -> None:
-    """Measure, print, write; raise ``RfedgeError`` naming the cases that were not held."""
+    """Measure, print, write; raise ``RfedgeError`` naming the cases that were not held.
+
+    The file is written after every group of cases: a run that breaks off keeps what was measured.
+    """
     made = provenance([job.field])
+    record = ScaleRecord.read(job.out, made) if job.add else ScaleRecord()
     shutil.rmtree(job.work, ignore_errors=True)
     job.published.mkdir(parents=True)
     convert_dataset(job.drive, job.reduced, job.size_px)
     publish(job.published, "street", job.field, EVERYWHERE, datetime.now(UTC))
-    rows = moves(job) if job.envoy else []
-    if job.envoy and job.pairs:
-        rows.append(_added_by_envoy(job))
-    plans = compare_with_plan(planned_load(job)) if job.planned else []
-    rows += [_planned_row(plan) for plan in plans]
-    for case in job.also:
-        rows += case(job)
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-    content = {"rows": rows, "planning": plans}
-    write_result(str(job.out), make_result("scale", made, content))
-    columns = ("case", "at most", "measured", "held")
-    print_table(console, "", columns, [_cells(row) for row in rows])
+    rows: list[ScaleRow] = []
+    for measured in _groups(job):
+        rows += measured.rows
+        record = record.plus(made, measured)
+        record.write(job.out, made)
+    print_scale(console, rows)
     broken = [row.case for row in rows if not row.held]
     if broken:
         raise RfedgeError("not held: " + "; ".join(broken))
+
+
+def _groups(job: ScaleJob) -> Iterator[Measured]:
+    """Run one group of cases after another."""
+    if job.envoy and job.moves:
+        yield Measured(moves(job))
+    if job.envoy and job.pairs:
+        yield _added_by_envoy(job)
+    if job.planned:
+        plans = compare_with_plan(planned_load(job))
+        yield Measured([_planned_row(plan) for plan in plans], planning=plans)
+    for case in job.also:
+        yield Measured(case(job))
+
+
+def city_case(city: Path) -> Case:
+    """Return the case of a city that ``rfedge size --city`` plans: how long that takes."""
+    return partial(_city_rows, city)
+
+
+def _city_rows(city: Path, job: ScaleJob) -> list[ScaleRow]:
+    out = job.work / "city"
+    command = [*command_of("rfedge"), "size", "--city", str(city), "--out", str(out)]
+    begin_s = time.monotonic()
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    took_s = time.monotonic() - begin_s
+    if done.returncode != 0:
+        raise RfedgeError(f"{city} was not planned: {done.stderr[-500:]}")
+    return [ScaleRow.at_most(f"{city.stem} planned, s", CITY_S, took_s)]
 
 
 def planned_load(job: ScaleJob) -> PlannedLoad:
@@ -198,10 +217,6 @@ def _planned_row(plan: PlannedRow) -> ScaleRow:
     bound = PLANNED_AGE_PERCENT if plan.figure.startswith("age") else PLANNED_PERCENT
     case = f"planned {plan.vehicles} vehicles: {plan.figure}, % off"
     return ScaleRow.at_most(case, bound, abs(plan.difference_percent))
-
-
-def _cells(row: ScaleRow) -> list[str]:
-    return [row.case, cell(row.bound), cell(row.measured), "yes" if row.held else "no"]
 
 
 def resumed_s(lines: Lines, since_ns: int) -> float | None:
@@ -423,7 +438,7 @@ def _shown(address: str, since_ns: int) -> set[str]:
     return vehicles
 
 
-def _added_by_envoy(job: ScaleJob) -> ScaleRow:
+def _added_by_envoy(job: ScaleJob) -> Measured:
     """One vehicle, straight to a server and through Envoy in turn: the p99 of its link, compared.
 
     The link is a frame's time from sending to Ack without the server's own; the median of the
@@ -439,9 +454,10 @@ def _added_by_envoy(job: ScaleJob) -> ScaleRow:
             order = sorted(ways, reverse=bool(pair % 2))
             p99_ms = {way: _link_p99_ms(job, ways[way], f"pair{pair}-{way}") for way in order}
             differences_ms.append(p99_ms["envoy"] - p99_ms["straight"])
-    return ScaleRow.at_most(
+    row = ScaleRow.at_most(
         "Envoy between: p99 of a frame's way, ms more", ADDED_MS, statistics.median(differences_ms)
     )
+    return Measured([row], envoy_added_ms=differences_ms)
 
 
 def _link_p99_ms(job: ScaleJob, address: str, name: str) -> float:

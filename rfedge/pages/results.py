@@ -25,10 +25,10 @@ from rfedge.experiments.paper.figures import write_paper_figures
 from rfedge.experiments.paper.report import PaperRow, paper_section
 from rfedge.experiments.robust.report import robust_section, write_robust_figure
 from rfedge.experiments.slice_coder.report import slice_coder_section
+from rfedge.loadtest.cases import scale_section, world_section
 from rfedge.loadtest.live.report import live_section
 from rfedge.loadtest.result import load_section
 from rfedge.loadtest.rig.report import rig_section
-from rfedge.loadtest.world.report import world_section
 from rfedge.report.tables import heading
 from rfedge.results import Result, read_result, rows_of
 from rfedge.training.report import training_section
@@ -61,6 +61,7 @@ SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
     "paper": paper_section,
     "rig": rig_section,
     "robust": robust_section,
+    "scale": scale_section,
     "slice-coder": slice_coder_section,
     "stability": lambda path, result: _reference(path, result, "cases", "stability"),
     "world": world_section,

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import pickle
 import re
 import sys
 from pathlib import Path
@@ -18,8 +19,9 @@ from rfedge.experiments.compare import EvalCompare
 from rfedge.experiments.compare import run as compare_run
 from rfedge.experiments.compare.drives import CompareJob, foreign_coder, read_drive_comparisons
 from rfedge.experiments.compare.measure import BEST
-from rfedge.experiments.compare.run import run_compare
+from rfedge.experiments.compare.run import code_on_ray, run_compare
 from rfedge.experiments.rivals import x264_lowdelay
+from rfedge.jobs import run_jobs
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 ROW_KEYS = {
@@ -191,6 +193,52 @@ def test_a_finished_comparison_is_not_coded_again(compared):
     assert again["rows"] == result["rows"]
     assert {path: path.read_bytes() for path in job.cells.iterdir()} == cells
     assert json.loads(job.out.read_text())["curves"] == result["curves"]
+
+
+def test_jobs_leave_all_cells_that_a_comparison_looks_for(
+    compared, thumbnail, tmp_path, monkeypatch
+):
+    here, result, _ = compared
+    addresses = []
+
+    def on_workers(jobs, tell, address):
+        addresses.append(address)
+        return run_jobs(pickle.loads(pickle.dumps(jobs)), tell)
+
+    monkeypatch.setattr(compare_run, "run_jobs", on_workers)
+    job = job_of(thumbnail, tmp_path, window_db=here.window_db, backgrounds=here.backgrounds)
+    lines = []
+    code_on_ray(job, "10.0.0.1:6379", lines.append)
+    assert addresses == ["10.0.0.1:6379"]
+    assert sum(line.endswith(": done") for line in lines) == compare_run.PARTS
+    cells = {path.name: path.read_bytes() for path in job.cells.iterdir()}
+    assert len(cells) >= 75
+    again = run_compare(job, Console(quiet=True))
+    after = {path.name: path.read_bytes() for path in job.cells.iterdir()}
+    assert {name: after[name] for name in cells} == cells
+    assert len(after) == len(cells) + 2, "processor times, and whose bits they are"
+    assert [row["bytes_per_frame"] for row in again["curves"]] == [
+        row["bytes_per_frame"] for row in result["curves"]
+    ]
+
+
+def test_each_drive_of_a_comparison_keeps_its_background(tmp_path):
+    job = CompareJob(
+        field=Path("wall.rff"),
+        drives=("a@10=a.json", "b@5=b.json,own.rff"),
+        decimated=("c@30=c.json",),
+        backgrounds=("b@5=nothing.json",),
+        effort="fast",
+        preset="veryfast",
+        out=tmp_path / "compare.json",
+        cells=tmp_path,
+    )
+    apart = [(one.drives, one.decimated, one.backgrounds) for one in job.of_each_drive()]
+    assert apart == [
+        (("a@10=a.json",), (), ()),
+        (("b@5=b.json,own.rff",), (), ("b@5=nothing.json",)),
+        ((), ("c@30=c.json",), ()),
+    ]
 
 
 def test_a_window_nobody_reaches_ends_the_comparison_before_its_long_part(thumbnail, tmp_path):

@@ -24,6 +24,7 @@ from rfcore.wire.settings import TransportSettings
 from rfcore.wire.tiles import Area
 from rfcore.wire.tls import TlsFiles
 from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.loadtest.cases import ScaleRow
 from rfedge.loadtest.envoy import (
     Envoy,
     EnvoySetup,
@@ -31,7 +32,7 @@ from rfedge.loadtest.envoy import (
     check_config,
     envoy_binary,
 )
-from rfedge.loadtest.scale import ScaleJob, ScaleRow, run_scale
+from rfedge.loadtest.scale import ScaleJob, run_scale
 from rfedge.results import read_result, rows_of
 
 pytestmark = pytest.mark.slow
@@ -78,7 +79,8 @@ async def test_envoy_places_streams_and_moves_them_when_a_server_dies_or_drains(
 ) -> None:
     monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
     publish_street(street, tmp_path)
-    setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy.yaml", tmp_path / "envoy")
+    monkeypatch.chdir(tmp_path)
+    setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy.yaml", Path("envoy"))
     async with AsyncExitStack() as stack:
         site = stack.enter_context(ServerGroup(tmp_path / "published", setup))
         for _ in range(SERVERS):

@@ -26,8 +26,9 @@ from rfcore.wire.tile_manifest import MANIFEST
 from rfcore.wire.tiles import Area
 from rfcore.wire.twin import Departure, PictureEncoding, Subscription, TwinPicture
 from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.loadtest.cases import ScaleRow
 from rfedge.loadtest.nats import NatsServer, nats_rows
-from rfedge.loadtest.scale import ScaleJob, ScaleRow, run_scale
+from rfedge.loadtest.scale import ScaleJob, run_scale
 from rfedge.results import read_result, rows_of
 from rfedge.twin.board import Board
 from rfedge.twin.nats_source import NatsPictures, NatsReader, NatsSource, TwinMessage
@@ -41,8 +42,9 @@ CONNECTED = "rfedge_twin_nats_connected"
 
 
 @pytest.fixture
-def broker(tmp_path: Path) -> Any:
-    with NatsServer(tmp_path / "nats") as running:
+def broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.chdir(tmp_path)
+    with NatsServer(Path("nats")) as running:
         yield running
 
 

@@ -9,6 +9,7 @@ from rich.console import Console
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.datasets.convert import convert_dataset
+from rfedge.loadtest.cases import ScaleRow
 from rfedge.loadtest.planning import (
     FIT_VEHICLES,
     LoadFigures,
@@ -17,7 +18,7 @@ from rfedge.loadtest.planning import (
     planned_figures,
 )
 from rfedge.loadtest.run import TestBed
-from rfedge.loadtest.scale import ScaleJob, ScaleRow, run_scale
+from rfedge.loadtest.scale import ScaleJob, run_scale
 from rfedge.results import read_result, rows_of
 from rfedge.samples import sample_path
 from rfedge.sizing.flow import Costs

@@ -1,13 +1,26 @@
 """What is read from vehicles' reports, and the cases once, with few small vehicles."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
-from rfcore.errors import InvalidInput
+from rfcore.errors import InvalidInput, RfedgeError
+from rfedge.datasets.convert import convert_dataset
+from rfedge.loadtest.cases import (
+    Measured,
+    ScaleRecord,
+    ScaleRow,
+    ScaleRun,
+    scale_section,
+)
 from rfedge.loadtest.envoy import EnvoySetup
-from rfedge.loadtest.scale import ScaleJob, ScaleRow, failures, keyframes, p99, resumed_s
+from rfedge.loadtest.planning import PlannedRow
+from rfedge.loadtest.scale import ScaleJob, failures, keyframes, p99, resumed_s, run_scale
+from rfedge.results import Provenance, provenance, read_result
+from rfedge.samples import sample_path
 
 S = 10**9
 
@@ -73,6 +86,95 @@ def test_a_job_that_cannot_be_run_is_refused(changes: dict[str, Any]) -> None:
     (name,) = changes
     with pytest.raises(InvalidInput, match=name):
         job(**changes)
+
+
+def test_behind_envoy_there_is_something_to_measure() -> None:
+    with pytest.raises(InvalidInput, match="nothing is to be measured"):
+        job(moves=False)
+    assert job(moves=False, pairs=2).pairs == 2
+
+
+# --- one result of several runs
+
+
+def made(command: str = "rfedge eval scale", **changes: Any) -> Provenance:
+    host = {"cpu": "C", "cores": 2, "isa": "avx2"}
+    return Provenance(command, changes.get("at", "abc"), False, changes.get("host", host), {})
+
+
+def rows(**measured: float) -> list[ScaleRow]:
+    return [ScaleRow.at_most(case, 2.0, value) for case, value in measured.items()]
+
+
+def test_a_case_measured_again_replaces_its_row_and_leaves_its_earlier_run(tmp_path: Path) -> None:
+    out = tmp_path / "scale.json"
+    plan = PlannedRow(12, "cores", 1.0, 2.0, -50.0)
+    first = ScaleRecord().plus(made("a"), Measured(rows(x=1.0, y=3.0), [plan], [0.5, 1.5]))
+    first.write(out, made("a"))
+    again = ScaleRecord.read(out, made("b")).plus(made("b", at="def"), Measured(rows(y=1.0, z=2.5)))
+    again.write(out, made("b"))
+    read = ScaleRecord.read(out, made())
+    assert read.rows == rows(x=1.0, y=1.0, z=2.5)
+    assert [row.held for row in read.rows] == [True, True, False]
+    assert read.runs == [ScaleRun("a", "abc", ["x"]), ScaleRun("b", "def", ["y", "z"])]
+    assert (read.planning, read.envoy_added_ms) == ([plan], [0.5, 1.5])
+
+
+def test_groups_of_one_run_are_one_run() -> None:
+    record = ScaleRecord()
+    for case in ("x", "y"):
+        record = record.plus(made(), Measured(rows(**{case: 1.0})))
+    assert record.runs == [ScaleRun("rfedge eval scale", "abc", ["x", "y"])]
+
+
+def test_a_run_without_rows_left_is_forgotten() -> None:
+    record = ScaleRecord().plus(made("a"), Measured(rows(x=1.0)))
+    assert [run.command for run in record.plus(made("b"), Measured(rows(x=1.0))).runs] == ["b"]
+
+
+def test_rows_of_another_host_or_input_are_not_added_to(tmp_path: Path) -> None:
+    out = tmp_path / "scale.json"
+    ScaleRecord().plus(made(), Measured(rows(x=1.0))).write(out, made())
+    with pytest.raises(InvalidInput, match=r"measured on .*'cores': 2.* not .*'cores': 4"):
+        ScaleRecord.read(out, made(host={"cpu": "C", "cores": 4, "isa": "avx2"}))
+    with pytest.raises(InvalidInput, match="other inputs"):
+        ScaleRecord.read(out, replace(made(), inputs={"street.rff": "00"}))
+
+
+def test_a_run_that_breaks_off_keeps_what_it_measured(tmp_path: Path) -> None:
+    """The case of each group is written before the next one begins."""
+
+    def broken(job: ScaleJob) -> list[ScaleRow]:
+        assert [row.case for row in ScaleRecord.read(job.out, made_here).rows] == ["x", "y"]
+        raise RfedgeError("no more")
+
+    drive = tmp_path / "small"
+    convert_dataset(
+        sample_path("street/transforms_drive_vehicles.json"), drive, (160, 90), slice(None, 2)
+    )
+    field = sample_path("fields/street.rff")
+    made_here = provenance([field])
+    out = tmp_path / "scale.json"
+    given = {"drive": drive, "field": field, "work": tmp_path / "work", "out": out}
+    run_scale(job(**given, envoy=False, also=(lambda _: rows(x=1.0),)), Console(quiet=True))
+    with pytest.raises(RfedgeError, match="no more"):
+        run_scale(
+            job(**given, envoy=False, add=True, also=(lambda _: rows(y=1.0), broken)),
+            Console(quiet=True),
+        )
+    assert [row.case for row in ScaleRecord.read(out, made_here).rows] == ["x", "y"]
+
+
+def test_the_page_shows_rows_runs_and_the_spread_of_the_pairs(tmp_path: Path) -> None:
+    out = tmp_path / "scale.json"
+    measured = Measured(rows(x=1.0, y=3.0), envoy_added_ms=[0.5, 2.5, 1.5])
+    ScaleRecord().plus(made(), measured).write(out, made())
+    page = scale_section(out, read_result(out))
+    assert "| case | bound | measured | held |" in page
+    assert "| x | 2.00 | 1.00 | yes |" in page
+    assert "| y | 2.00 | 3.00 | no |" in page
+    assert "in 3 pairs of runs: median 1.50 ms, 0.50 to 2.50 ms." in page
+    assert "* `rfedge eval scale` at `abc`: x; y." in page
 
 
 def test_a_configuration_without_the_ports_to_take_is_refused(tmp_path: Path) -> None:

@@ -79,6 +79,25 @@ def test_two_workers_take_the_same_pictures_as_one(standing: Scene, tmp_path: Pa
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_jobs_on_ray_take_the_same_pictures_as_one_worker(
+    standing: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # a relative folder: workers of Ray run elsewhere
+    selection = Selection(standing, "drive", "0:2", (64, 36))
+    for settings in (Settings(Path("one")), Settings(Path("jobs"), ray="local")):
+        build_scene(selection, settings, Console(file=io.StringIO()))
+    one, jobs = (
+        [picture.read() for picture in read_dataset(Path(name)).pictures]
+        for name in ("one", "jobs")
+    )
+    assert len(one) == 2
+    for a, b in zip(one, jobs, strict=True):
+        np.testing.assert_array_equal(a, b)
+    verify_manifest(tmp_path / "jobs")
+
+
+@pytest.mark.slow
 def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     file = tmp_path / "driving.toml"
     file.write_text(SHORT.format(speed_mps=5.0))

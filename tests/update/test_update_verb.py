@@ -1,6 +1,7 @@
 """``rfedge field update`` and ``disagree`` on recordings of two vehicles."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,28 @@ def test_what_pays_is_written(
     ).run()
     assert "% fewer bits" in capsys.readouterr().out
     assert load_field(out).field_id != noon.field_id
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_job_on_ray_learns_the_same_bytes(
+    noon: SplatField,
+    dusk: SplatField,
+    make_pass: MakePass,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)  # relative files: workers of Ray run elsewhere
+    save_field(noon, Path("noon.rff"))
+    passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
+    folders = tuple(recorded(Path(drive.identity), drive) for drive in passes)
+    update = FieldUpdate(Path("noon.rff"), folders, Path("here.rff"), iterations=60)
+    update.run()
+    replace(update, out=Path("job.rff"), ray="local").run()
+    assert Path("job.rff").read_bytes() == Path("here.rff").read_bytes()
+    assert "update-job: done" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.glob("*.job")) == []
 
 
 def test_what_does_not_pay_is_not(noon: SplatField, make_pass: MakePass, tmp_path: Path) -> None:

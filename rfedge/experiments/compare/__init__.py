@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from rfcore.codec.h264.config import DEFAULT_EFFORT
 
@@ -49,16 +49,22 @@ class EvalCompare:
     """Eight frames and few rivals: to see that it works, not for figures."""
     retime: bool = False
     """Take the processor times anew (on a quiet machine) and keep everything else."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Code what is not there yet on a Ray (`local` starts one here; docs/scale.md); processor times
+    are taken here afterwards, and the rows are the same. Needs rfedge[ray]."""
     figures: Path | None = None
     """Folder for the curves as SVG, with their numbers as CSV."""
 
     def run(self) -> None:
         """Run what is not there yet and write the rows."""
+        from functools import partial
+
         from rich.console import Console
 
+        from rfcore.extras import require
         from rfedge.arguments import field_path
         from rfedge.experiments.compare.drives import CompareJob
-        from rfedge.experiments.compare.run import run_compare
+        from rfedge.experiments.compare.run import code_on_ray, run_compare
 
         job = CompareJob(
             field=field_path(self.field),
@@ -75,6 +81,9 @@ class EvalCompare:
             window_db=self.window,
         )
         console = Console()
+        if self.ray is not None:
+            require("ray", "ray")
+            code_on_ray(job, self.ray, partial(print, flush=True))
         result = run_compare(job, console)
         if self.figures is not None:
             from rfedge.experiments.compare.figures import write_compare_figures

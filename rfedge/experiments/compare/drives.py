@@ -10,7 +10,7 @@ import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -202,6 +202,18 @@ class CompareJob:
         low_db, high_db = self.windows_db[0]
         if not 0 < low_db < high_db < math.inf:
             raise InvalidInput("window", f"{low_db:g} {high_db:g} are not two rising decibels")
+
+    def of_each_drive(self) -> list[CompareJob]:
+        """Return a job for every drive, each with the background that stands behind it."""
+        behind = {_name(DriveName.parse(text)): text for text in self.backgrounds}
+
+        def whole(text: str) -> CompareJob:
+            background = behind.get(_name(DriveOfField.parse(text, self.field).name))
+            backgrounds = () if background is None else (background,)
+            return replace(self, drives=(text,), decimated=(), backgrounds=backgrounds)
+
+        slow = [replace(self, drives=(), decimated=(d,), backgrounds=()) for d in self.decimated]
+        return [*map(whole, self.drives), *slow]
 
     @property
     def windows_db(self) -> tuple[Window, ...]:

@@ -20,7 +20,10 @@ scaled to its size.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import chdir
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,8 +31,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from rfcore.camera import Camera
+from rfcore.codec.decoder import prediction_of
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.prediction import Prediction
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.state import EncoderState
 from rfcore.image import I420
@@ -54,9 +57,10 @@ from rfedge.experiments.performance import (
     time_in_turns,
 )
 from rfedge.experiments.rate_curve import Window
+from rfedge.jobs import Job, Tell, run_jobs
 from rfedge.results import make_result, provenance, rows_of, write_result
 
-__all__ = ["KINDS", "SplitClip", "macroblock_kinds", "run_compare", "split_rows"]
+__all__ = ["KINDS", "SplitClip", "code_on_ray", "macroblock_kinds", "run_compare", "split_rows"]
 
 
 KINDS = ("static", "moving", "disoccluded", "entering", "off-map")
@@ -186,9 +190,10 @@ def _slice_bytes(frame: I420, coding: _Coding, made: Encoded, kinds: NDArray[np.
     if not packet.references:  # an I picture has no reference to show
         spared += np.bincount(kinds.ravel(), minlength=len(KINDS))
     else:
-        prediction = Prediction.under_light(coding.view, packet.photometric, coding.state.past)
+        prediction = prediction_of(packet, coding.view, coding.state.past)
         reference = prediction.picture(packet.references[-1])
-        choice = FrameChoice(references=packet.references, photometric=packet.photometric)
+        light = packet.photometric
+        choice = FrameChoice(packet.references, photometric=light, relight=packet.relit)
         for kind in np.unique(kinds):
             without = composed(reference, frame, kinds == kind)
             spared[kind] = max(0, whole - len(coding.of(without, choice).packet.payload))
@@ -225,6 +230,46 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
     write_result(job.out, result)
     print_compared(console, tables["rows"])
     return result
+
+
+PARTS = 4
+"""Of the coders of a drive, on Ray: each part renders the drive anew, which takes seconds."""
+JOB_BYTES = 2_000_000_000
+
+
+def code_on_ray(job: CompareJob, address: str, tell: Tell) -> None:
+    """Code every drive with every coder as jobs of a Ray whose machines see the same folders.
+
+    What they leave in ``job.cells`` is what ``run_compare`` then finds there. Processor times are
+    not taken: it takes them, with the machine to itself. Raises ``RfedgeError`` naming the jobs
+    that failed and why; what the others coded stays.
+    """
+    folder = Path.cwd()
+    jobs = [
+        Job(
+            f"drive-{number}-part-{part}",
+            partial(_code_part, one, part, folder),
+            (),
+            None,
+            cores=1,
+            memory_bytes=JOB_BYTES,
+        )
+        for number, one in enumerate(job.of_each_drive(), start=1)
+        for part in range(1, PARTS + 1)
+    ]
+    run_jobs(jobs, tell, address)
+
+
+def _code_part(job: CompareJob, part: int, folder: Path, tell: Tell) -> None:
+    with chdir(folder):  # workers run in folders of their own
+        (comparison,) = read_drive_comparisons(job)
+        store, clip = CellStore(job.cells), comparison.clip
+        spanning = {coder.name for coder in comparison.compared}
+        every = list({coder.name: coder for coder in comparison.coders}.values())
+        for coder in every[part - 1 :: PARTS]:
+            window = job.windows_db[0] if coder.name in spanning else None
+            perform(clip, coder, store, window_db=window, timed=False)
+            tell(f"{clip.scene} {clip.rate_hz:g} Hz: {coder.name}")
 
 
 def _announce(

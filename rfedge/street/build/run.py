@@ -1,4 +1,5 @@
-"""Run a build: estimate its cost, render missing shots in worker processes, report progress.
+"""Run a build: estimate its cost, render missing shots in worker processes or on Ray, and say how
+it goes.
 
 The estimate was measured on a busy 2-core x86-64 machine (AVX-512, 2.5 GHz) with Mitsuba 3.9.1 and
 LLVM 19; on other machines the progress bar's remaining time is the better figure.
@@ -13,7 +14,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -24,6 +26,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.arguments import time_text
+from rfedge.jobs import Job, Tell, run_jobs
 from rfedge.results import as_json, provenance
 from rfedge.street.build.listing import claim_folder, list_dataset, origin_of
 from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer, ShotFiles
@@ -72,6 +75,34 @@ def _take_apart(job: RenderJob, shots: Sequence[Shot], workers: int) -> Iterator
                 yield shot
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+SHOTS_A_JOB = 24
+"""On Ray: each job makes the world anew, which takes as long as some shots."""
+JOB_BYTES = 2_500_000_000
+
+
+def _take_on_ray(job: RenderJob, shots: Sequence[Shot], address: str, tell: Tell) -> None:
+    """Take the shots as jobs of a Ray whose machines see the same folder.
+
+    Raises ``RfedgeError`` naming the jobs that failed; the shots that were taken stay valid.
+    """
+    job = replace(job, folder=job.folder.resolve())  # workers run in folders of their own
+    groups = [tuple(shots[i : i + SHOTS_A_JOB]) for i in range(0, len(shots), SHOTS_A_JOB)]
+    run_jobs([_job_of(job, group) for group in groups], tell, address)
+
+
+def _job_of(job: RenderJob, shots: tuple[Shot, ...]) -> Job:
+    first, last = shots[0], shots[-1]
+    name = f"{first.split}-{first.name}-to-{last.split}-{last.name}"
+    work = partial(_take_group, job, shots)
+    return Job(name, work, (), None, cores=job.threads, memory_bytes=JOB_BYTES)
+
+
+def _take_group(job: RenderJob, shots: Sequence[Shot], tell: Tell) -> None:
+    missing = [shot for shot in shots if not ShotFiles.of(job.folder, shot).done]
+    for count, shot in enumerate(_take_here(job, missing), start=1):
+        tell(f"{count} of {len(missing)}: {shot.split}/{shot.name}")
 
 
 def _open_renderer(job: RenderJob) -> None:
@@ -164,6 +195,8 @@ class Settings:
     out: Path
     samples: int = 16
     workers: int = 1
+    ray: str | None = None
+    """Address of the Ray that renders (``rfedge.jobs``); None: worker processes do."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.workers <= 256:
@@ -192,10 +225,20 @@ def build_scene(selection: Selection, settings: Settings, console: Console) -> N
         console.print(f"{len(shots) - len(missing)} of {len(shots)} frames are there already")
     if missing:
         console.print(cost_line(missing, sampling, backend, cores, settings.workers))
-        taken = take_all(job, missing, min(settings.workers, len(missing)))
-        show_progress(taken, len(missing), console, time.monotonic)
+        _take_missing(job, missing, settings, console)
     counts = list_dataset(job, _about(job))
     console.print(f"{settings.out}: " + ", ".join(f"{n} {split}" for split, n in counts.items()))
+
+
+def _take_missing(
+    job: RenderJob, missing: Sequence[Shot], settings: Settings, console: Console
+) -> None:
+    if settings.ray is not None:
+        tell = partial(console.print, markup=False, highlight=False)
+        _take_on_ray(job, missing, settings.ray, tell)
+        return
+    taken = take_all(job, missing, min(settings.workers, len(missing)))
+    show_progress(taken, len(missing), console, time.monotonic)
 
 
 def _about(job: RenderJob) -> dict[str, Any]:
