@@ -9,10 +9,12 @@ from rfcore.errors import BackendUnavailable
 from rfedge.street.render import backend
 
 
-def test_the_newest_llvm_comes_first_one_a_version(tmp_path: Path) -> None:
+def test_the_newest_llvm_comes_first_one_a_version_and_none_too_old(tmp_path: Path) -> None:
     for name in (
-        "libLLVM-14.so",
-        "libLLVM-14.so.1",
+        "libLLVM-18.so",
+        "libLLVM-18.so.1",
+        "libLLVM-17.so",
+        "libLLVM-16.so",
         "libLLVM-9.so",
         "libLLVM.so.19.1",
         "libLLDB.so",
@@ -21,8 +23,8 @@ def test_the_newest_llvm_comes_first_one_a_version(tmp_path: Path) -> None:
     found = backend.installed_llvms([str(tmp_path), "/nowhere"])
     assert [Path(name).name for name in found] == [
         "libLLVM.so.19.1",
-        "libLLVM-14.so",
-        "libLLVM-9.so",
+        "libLLVM-18.so",
+        "libLLVM-17.so",
     ]
 
 
@@ -39,15 +41,15 @@ def test_a_library_that_aborts_the_process_is_passed_over(
 ) -> None:
     """Stood in for by a Python that aborts for one library and renders with the other."""
     python = tmp_path / "python"
-    python.write_text('#!/bin/sh\ncase "$DRJIT_LIBLLVM_PATH" in *LLVM-16*) kill -ABRT $$;; esac\n')
+    python.write_text('#!/bin/sh\ncase "$DRJIT_LIBLLVM_PATH" in *LLVM-18*) kill -ABRT $$;; esac\n')
     python.chmod(0o755)
-    for name in ("libLLVM-16.so", "libLLVM-15.so"):
+    for name in ("libLLVM-18.so", "libLLVM-17.so"):
         (tmp_path / name).touch()
     monkeypatch.setattr(sys, "executable", str(python))
     monkeypatch.setattr(backend, "FOLDERS", (str(tmp_path),))
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     chosen = backend.chosen_backend()
-    assert (chosen.variant, Path(chosen.llvm).name) == ("llvm_ad_rgb", "libLLVM-15.so")
+    assert (chosen.variant, Path(chosen.llvm).name) == ("llvm_ad_rgb", "libLLVM-17.so")
 
 
 @pytest.mark.parametrize("missing", ["mitsuba", "pyoidn", "scipy"])

@@ -2,7 +2,8 @@
 
 Mitsuba is told by ``DRJIT_LIBLLVM_PATH`` which LLVM to load, and the wrong one ends the process: of
 Debian's, 14 is refused, 15 and 16 abort in code generation ("Cannot select", Mitsuba 3.9.1), 19
-works. An abort is no exception, so each is tried in a process of its own, newest first.
+works. So versions below ``OLDEST_LLVM`` are passed over, and since an abort is no exception, each
+newer one is tried in a process of its own, newest first.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ FOLDERS = (
     "/usr/local/lib",
 )
 VERSION = re.compile(r"libLLVM(?:-|\.so\.)(\d+)")
-PROBE_LIMIT_S = 120
+OLDEST_LLVM = 17
+PROBE_LIMIT_S = 60
 PROBE = """
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
@@ -68,11 +70,12 @@ def chosen_backend() -> Backend:
 
 
 def installed_llvms(folders: Iterable[str]) -> list[str]:
-    """Return the LLVM libraries in these folders, one a version, newest first."""
+    """Return the LLVM libraries in these folders that can work, one a version, newest first."""
     found: dict[int, str] = {}
     for folder in folders:
         for path in sorted(Path(folder).glob("libLLVM*")):
-            if version := VERSION.search(path.name):
+            version = VERSION.search(path.name)
+            if version and int(version[1]) >= OLDEST_LLVM:
                 found.setdefault(int(version[1]), str(path))
     return [found[version] for version in sorted(found, reverse=True)]
 
