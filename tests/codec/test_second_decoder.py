@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rfcore.codec.decoder import DeltaDecoder
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import REFERENCE_FRAMES, CodecConfig
 from rfcore.codec.h264.header import own_header
 from rfcore.codec.h264.slice_coder import Effort, MacroblockMode, SliceCoder
 from rfcore.codec.h264.splice import SpliceDecoder
@@ -83,7 +83,10 @@ def record_own_slices(
     for number in range(4 * len(MacroblockMode)):
         mode = MacroblockMode(number % len(MacroblockMode))
         inter = mode < MacroblockMode.INTRA_16X16
-        references = [pattern(rng, size_px, 2 * k) for k in range(number % 4 or int(inter))]
+        references = [
+            pattern(rng, size_px, 2 * k)
+            for k in range(number % (REFERENCE_FRAMES + 1) or int(inter))
+        ]
         forced = np.where(rng.integers(0, 3, macroblocks) > 0, int(mode), -1).astype(np.int8)
         coded = coder.encode(
             pattern(rng, size_px, 1),

@@ -1,6 +1,6 @@
 """The conformance sweep of the slice coder: FFmpeg decodes its own reconstruction, byte for byte.
 
-Pictures from flat to noise, sizes from 2x2 to 4096x2304 px, every quantiser, one to three
+Pictures from flat to noise, sizes from 2x2 to 4096x2304 px, every quantiser, one to four
 references or none, all efforts, quantiser maps, the deblocking filter on and off, and every mode
 forced. A small sweep runs with the tests, the whole one by ``make test-slices``.
 """
@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import REFERENCE_FRAMES, CodecConfig
 from rfcore.codec.h264.header import StreamHeader, own_header
 from rfcore.codec.h264.slice_coder import Effort, MacroblockMode, OwnSlice, SliceCoder
 from rfcore.codec.h264.splice import SpliceDecoder
@@ -168,7 +168,7 @@ def check(case: Case) -> OwnSlice:
 
 
 def random_case(rng: np.random.Generator, size: Size) -> Case:
-    references = int(rng.integers(0, 4))
+    references = int(rng.integers(0, REFERENCE_FRAMES + 1))
     modes = list(MacroblockMode) if references else list(INTRA_MODES)
     forced = [None, None, ANY, int(rng.choice(modes))][rng.integers(4)]
     return Case(
@@ -211,7 +211,7 @@ def test_every_mode_decodes_to_the_coders_own_reconstruction(mode: MacroblockMod
     """Alone and with the coder's own decisions around it, at quantisers from 0 to 51."""
     met = 0
     for seed, qp in enumerate(range(0, 52, 3)):
-        references = 0 if mode in INTRA_MODES and seed % 3 == 0 else 1 + seed % 3
+        references = 0 if mode in INTRA_MODES and seed % 3 == 0 else 1 + seed % REFERENCE_FRAMES
         effort = list(Effort)[seed % 3]
         for forced in (int(mode), ANY):
             slice_ = check(
@@ -248,7 +248,7 @@ CASES = st.builds(
     Case,
     size=st.sampled_from(((2, 2), (3, 17), (35, 33), (16, 48), (66, 18))),
     kind=st.sampled_from(sorted(PAINTERS)),
-    references=st.integers(1, 3),
+    references=st.integers(1, REFERENCE_FRAMES),
     qp=st.integers(0, 51),
     effort=st.sampled_from(Effort),
     mapped=st.booleans(),
