@@ -2,6 +2,7 @@
 
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,14 +13,24 @@ from rich.console import Console
 from rfcore.codec.h264.bitstream import split_nals
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.ffmpeg import PictureKind, encode_pictures
+from rfcore.codec.h264.header import StreamHeader, own_header
 from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, nal_type
 from rfcore.codec.h264.slice_coder import Effort, SliceCoder
-from rfcore.codec.h264.slices import CodedSlice, encode_slice, slice_options
+from rfcore.codec.h264.slices import CodedSlice, SliceCoding, encode_slice, slice_options
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfedge.experiments.clips import DriveOfField
+from rfedge.experiments.slice_coder import run
 from rfedge.experiments.slice_coder.report import BdRow, TimeRow, slice_coder_section
-from rfedge.experiments.slice_coder.run import SliceCoderJob, header_of, run_slice_coder, slice_qp
+from rfedge.experiments.slice_coder.run import (
+    SliceCoderJob,
+    header_of,
+    resized,
+    run_slice_coder,
+    slice_qp,
+    slice_tasks,
+    time_rows,
+)
 from rfedge.results import read_result, rows_of
 
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -78,6 +89,50 @@ def job(tmp_path: Path, *sizes: str) -> SliceCoderJob:
 def test_a_size_of_another_form_is_refused_before_anything_is_coded(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="'720p' is not WIDTHxHEIGHT"):
         run_slice_coder(job(tmp_path, "720p"), Console(file=io.StringIO()))
+
+
+def test_all_coders_are_timed_on_the_threads_that_the_rows_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    used: list[tuple[str, int]] = []
+
+    class Recorded(SliceCoder):
+        def __init__(self, header: StreamHeader, *, threads: int) -> None:
+            used.append(("own", threads))
+            super().__init__(header, threads=threads)
+
+    def recorded(
+        config: CodecConfig, references: Sequence[I420], frame: I420, coding: SliceCoding
+    ) -> CodedSlice:
+        used.append(("x264", coding.threads))
+        return encode_slice(config, references, frame, coding)
+
+    footage = resized(*DriveOfField.parse(DRIVE, FIELD).read(3), 64, 48)
+    tasks = list(slice_tasks(footage, 26.0, []))
+    monkeypatch.setattr(run, "slice_tasks", lambda *_: iter(tasks))
+    monkeypatch.setattr(run, "header_of", lambda _: own_header(CodecConfig(64, 48)))
+    monkeypatch.setattr(run, "CRFS", (26.0,))
+    monkeypatch.setattr(run, "SliceCoder", Recorded)
+    monkeypatch.setattr(run, "encode_slice", recorded)
+    rows = time_rows(footage, threads=2)
+    assert set(used) == {("own", 2), ("x264", 2)}
+    assert [(row.threads, row.effort) for row in rows] == [
+        (2, effort.name.lower()) for effort in Effort
+    ]
+    assert all((row.wall_ms or 0) > 0 and (row.x264_wall_ms or 0) > 0 for row in rows)
+
+
+def test_no_threads_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="threads: 0 is less than 1"):
+        replace(job(tmp_path), threads=(0,))
+
+
+def test_times_from_before_the_clock_was_read_have_their_row() -> None:
+    path = Path(__file__).parents[2] / "results/slice-coder.json"
+    result = json.loads(path.read_text())
+    for row in result["times"]:
+        row.pop("wall_ms", None), row.pop("x264_wall_ms", None)
+    assert "| 1280x720 | 3 | 1 | fast |" in slice_coder_section(path, result)
 
 
 @pytest.mark.slow

@@ -36,6 +36,8 @@ class EvalSliceCoder:
     """The drive whose frames are timed."""
     sizes: tuple[str, ...] = ("640x360", "1280x720")
     """WIDTHxHEIGHT of the timed frames, each resampled to it; none: no times."""
+    threads: tuple[int, ...] = (1,)
+    """How many threads all coders run on, one measurement of the times for each."""
     out: Path = Path("out/eval/slice-coder.json")
     """The result file to write."""
     quick: bool = False
@@ -55,6 +57,7 @@ class EvalSliceCoder:
             timed=self.timed,
             sizes=self.sizes,
             out=self.out,
+            threads=self.threads,
             quick=self.quick,
         )
         run_slice_coder(job, Console())

@@ -29,9 +29,11 @@ class BdRow:
 
 @dataclass(frozen=True)
 class TimeRow:
-    """Processor time of a slice, mean over frames and CRFs of the least of a few repetitions.
+    """Times of a slice, mean over frames and CRFs of the least of a few repetitions.
 
-    ``x264_encode_ms``: x264 medium's, which codes the references before it, in the same run.
+    ``encode_ms``: of the processor, all threads together; ``wall_ms``: of the clock, none in
+    results from before it was measured. ``x264_*``: x264 medium's, which codes the references
+    before it, in the same run.
     """
 
     width: int
@@ -41,10 +43,22 @@ class TimeRow:
     effort: str
     encode_ms: float
     x264_encode_ms: float
+    wall_ms: float | None = None
+    x264_wall_ms: float | None = None
 
 
 BD_COLUMNS = ("drive", "Hz", "size", "effort", "against x264", "BD-rate %")
-TIME_COLUMNS = ("size", "references", "threads", "effort", "ms", "x264 medium ms", "ratio")
+TIME_COLUMNS = (
+    "size",
+    "references",
+    "threads",
+    "effort",
+    "ms",
+    "x264 medium ms",
+    "ratio",
+    "ms of the clock",
+    "x264 medium",
+)
 
 
 def slice_coder_section(path: Path, result: Result) -> str:
@@ -87,4 +101,10 @@ def _time_cells(row: TimeRow) -> list[str]:
         f"{row.encode_ms:.1f}",
         f"{row.x264_encode_ms:.1f}",
         f"{row.encode_ms / row.x264_encode_ms:.2f}",
+        _ms(row.wall_ms),
+        _ms(row.x264_wall_ms),
     ]
+
+
+def _ms(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f}"

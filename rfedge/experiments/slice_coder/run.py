@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import process_time_ns
+from time import perf_counter_ns, process_time_ns
 from typing import Any, Protocol
 
 import numpy as np
@@ -28,7 +28,7 @@ from rfcore.codec.h264.config import CodecConfig, effort_of_preset
 from rfcore.codec.h264.header import StreamHeader, check_header
 from rfcore.codec.h264.parameter_sets import NAL_IDR, nal_type, parse_pps
 from rfcore.codec.h264.slice_coder import Effort, SliceCoder
-from rfcore.codec.h264.slices import CodedSlice, encode_slice
+from rfcore.codec.h264.slices import CodedSlice, SliceCoding, encode_slice
 from rfcore.codec.h264.splice import SpliceDecoder, grey
 from rfcore.codec.photometric import Photometric
 from rfcore.codec.prediction import Prediction
@@ -49,19 +49,32 @@ __all__ = [
     "CRFS",
     "NOISE_SIGMA",
     "RIVALS",
+    "Footage",
     "SliceCoderJob",
+    "SliceTask",
     "bd_rows",
+    "header_of",
+    "noisy",
+    "resized",
     "run_slice_coder",
+    "slice_qp",
+    "slice_tasks",
     "time_rows",
 ]
 
 with needs("eval"):
     import cv2
 
-__all__ = ["Footage", "SliceTask", "header_of", "noisy", "resized", "slice_qp", "slice_tasks"]
-
-RIVAL = "medium"
-"""x264's preset that makes the references."""
+CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0)
+RIVALS = ("medium", "veryfast")
+"""x264's presets; the first makes the references and is timed."""
+QP_ABOVE = 1
+"""Our quantiser above x264's: the same bytes and quality within 3 %. References differ from point
+to point, so a coder with finer points would predict from worse pictures at the same quality."""
+REPEATS = 3
+NOISE_SIGMA, NOISE_SEED = 3.0, 1
+QUICK_FRAMES = 4
+TIMED_FRAMES = 6
 _END_OF_CHANGES = 3
 """Of modification_of_pic_nums_idc (table 7-7)."""
 
@@ -82,7 +95,7 @@ class Footage:
     @property
     def config(self) -> CodecConfig:
         """The stream's configuration but for its quality."""
-        return CodecConfig(*self.frames[0].size_px, effort=effort_of_preset(RIVAL))
+        return CodecConfig(*self.frames[0].size_px, effort=effort_of_preset(RIVALS[0]))
 
 
 @dataclass(frozen=True)
@@ -191,33 +204,22 @@ def _at(config: CodecConfig, crf: float) -> CodecConfig:
     return CodecConfig(config.width_px, config.height_px, config.effort, crf)
 
 
-CRFS = (17.0, 20.0, 23.0, 26.0, 29.0, 32.0)
-RIVALS = ("medium", "veryfast")
-"""x264's presets; the first makes the references and is timed."""
-QP_ABOVE = 1
-"""Our quantiser above x264's: the same bytes and quality within 3 %. References differ from point
-to point, so a coder with finer points would predict from worse pictures at the same quality."""
-REPEATS = 3
-TIMED_FRAMES = 4
-
-
 class TaskCoder(Protocol):
     """Codes a task as one slice NAL unit without start code."""
 
     def __call__(self, task: SliceTask) -> bytes: ...
 
 
-def _coders(config: CodecConfig) -> Mapping[str, TaskCoder]:
+def _coders(config: CodecConfig, threads: int = 1) -> Mapping[str, TaskCoder]:
     """Return x264 at the presets of ``RIVALS`` and our coder at every effort, by name."""
-    own = SliceCoder(header_of(config))
+    own = SliceCoder(header_of(config), threads=threads)
 
     def x264(preset: str) -> TaskCoder:
         at_preset = replace(config, effort=effort_of_preset(preset))
 
         def code(task: SliceTask) -> bytes:
-            return encode_slice(
-                replace(at_preset, crf=task.crf), task.references, task.frame
-            ).payload
+            coding = SliceCoding(crf=task.crf, threads=threads)
+            return encode_slice(at_preset, task.references, task.frame, coding).payload
 
         return code
 
@@ -278,39 +280,58 @@ def _curve(points: Sequence[tuple[float, float]]) -> RateCurve:
     return RateCurve(qualities, sizes)
 
 
+@dataclass(frozen=True)
+class Times:
+    """What one slice took: of the processor, all threads together, and of the clock."""
+
+    processor_ms: float
+    wall_ms: float
+
+
 def time_rows(footage: Footage, threads: int = 1) -> list[TimeRow]:
-    """Return a row per effort over the tasks of three references, the coders taking turns."""
-    coders = _coders(footage.config)
+    """Return a row per effort over the tasks of most references, the coders taking turns.
+
+    All coders run on so many threads.
+    """
+    coders = _coders(footage.config, threads)
     names = [RIVALS[0], *(effort.name.lower() for effort in Effort)]
-    spent: dict[str, list[float]] = {name: [] for name in names}
+    spent: dict[str, list[Times]] = {name: [] for name in names}
     lights: list[Photometric] = []
     most = 0
     for crf in CRFS:
         tasks = list(slice_tasks(footage, crf, lights))
         most = max(most, *(len(task.references) for task in tasks))
-        for task in [task for task in tasks if len(task.references) == most][-TIMED_FRAMES:]:
+        for task in (task for task in tasks if len(task.references) == most):
             for name in names:
-                spent[name].append(_least_ms(coders[name], task))
-    means = {name: float(np.mean(found)) for name, found in spent.items()}
+                spent[name].append(_least_times(coders[name], task))
+    means = {name: _mean_times(found) for name, found in spent.items()}
+    rival = means[RIVALS[0]]
     width, height = footage.config.size_px
     return [
-        TimeRow(width, height, most, threads, name, means[name], means[RIVALS[0]])
+        TimeRow(
+            width, height, most, threads, name,
+            means[name].processor_ms, rival.processor_ms, means[name].wall_ms, rival.wall_ms,
+        )
         for name in names[1:]
-    ]
+    ]  # fmt: skip
 
 
-def _least_ms(code: TaskCoder, task: SliceTask) -> float:
-    times = []
-    for _ in range(REPEATS):
-        began_ns = process_time_ns()
-        code(task)
-        times.append((process_time_ns() - began_ns) / 1e6)
-    return min(times)
+def _mean_times(found: Sequence[Times]) -> Times:
+    processor_ms, wall_ms = np.mean([(t.processor_ms, t.wall_ms) for t in found], axis=0)
+    return Times(float(processor_ms), float(wall_ms))
 
 
-NOISE_SIGMA, NOISE_SEED = 3.0, 1
-QUICK_FRAMES = 4
-TIMED_FRAMES = 6
+def _least_times(code: TaskCoder, task: SliceTask) -> Times:
+    """Return the least of either time over a few repetitions."""
+    found = [_times(code, task) for _ in range(REPEATS)]
+    return Times(min(t.processor_ms for t in found), min(t.wall_ms for t in found))
+
+
+def _times(code: TaskCoder, task: SliceTask) -> Times:
+    began_ns, processor_ns = perf_counter_ns(), process_time_ns()
+    code(task)
+    spent_ns = process_time_ns() - processor_ns
+    return Times(spent_ns / 1e6, (perf_counter_ns() - began_ns) / 1e6)
 
 
 @dataclass(frozen=True)
@@ -323,12 +344,16 @@ class SliceCoderJob:
     timed: str
     sizes: Sequence[str]
     out: Path
+    threads: Sequence[int] = (1,)
     quick: bool = False
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
         if not (self.drives or self.noisy):
             raise InvalidInput("drives", "there is none")
+        for number in self.threads:
+            if number < 1:
+                raise InvalidInput("threads", f"{number} is less than 1")
 
     @property
     def sizes_px(self) -> list[tuple[int, int]]:
@@ -359,7 +384,7 @@ def run_slice_coder(job: SliceCoderJob, console: Console) -> dict[str, Any]:
     for drive in noise:
         rows += _bd_rows(drive, limit, sigma=NOISE_SIGMA)
         console.print(f"{drive.name.scene} with noise: done")
-    times = _time_rows(timed, sizes_px)
+    times = _time_rows(timed, sizes_px, job.threads)
     result = make_result("slice-coder", made, {"quick": job.quick, "rows": rows, "times": times})
     write_result(job.out, result)
     print_slice_coder(console, rows, times)
@@ -374,8 +399,11 @@ def _bd_rows(drive: DriveOfField, limit: int | None, sigma: float) -> list[BdRow
     return list(bd_rows(name.scene, name.rate_hz, footage))
 
 
-def _time_rows(drive: DriveOfField, sizes_px: Sequence[tuple[int, int]]) -> list[TimeRow]:
+def _time_rows(
+    drive: DriveOfField, sizes_px: Sequence[tuple[int, int]], threads: Sequence[int]
+) -> list[TimeRow]:
     if not sizes_px:
         return []
     given, field = drive.read(TIMED_FRAMES)
-    return [row for size in sizes_px for row in time_rows(resized(given, field, *size))]
+    sized = [resized(given, field, *size) for size in sizes_px]
+    return [row for footage in sized for number in threads for row in time_rows(footage, number)]
