@@ -1,4 +1,4 @@
-"""Each place where packets are decoded has its row."""
+"""Each coder, and each place where packets are decoded, has its row."""
 
 from pathlib import Path
 from typing import Any
@@ -7,6 +7,7 @@ import pytest
 
 from mec_server.config import DecoderKind
 from rfedge.bench import codec, run_case
+from rfedge.bench.street import street_gaussians
 from rfedge.loadtest.prerecorded import PrerecordedDrive, prerecorded_drive
 
 KINDS = (DecoderKind.IN_PROCESS, DecoderKind.CHILD)
@@ -33,3 +34,23 @@ def test_every_place_has_its_row_and_the_difference_to_here() -> None:
     assert (here["decoder"], here["frames"], here["more_ms"]) == ("in-process", 5, 0.0)
     assert (child["decoder"], child["frames"]) == ("child", 5)
     assert child["median_ms"] > 0.0
+
+
+def test_every_coder_has_its_row_at_each_number_of_references(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(codec, "street_gaussians", lambda: street_gaussians(2000))
+    monkeypatch.setattr(codec, "SIZES_PX", ((64, 48),))
+    monkeypatch.setattr(codec, "THREADS", (2,))
+    monkeypatch.setattr(codec, "WARM_UP", 1)
+    monkeypatch.setattr(codec, "REPETITIONS", 2)
+    rows = codec.codec_rows()
+    assert [(row.references, row.effort) for row in rows] == [
+        (references, effort) for references in (1, 3) for effort in codec.EFFORTS
+    ]
+    for row in rows:
+        assert (row.threads, row.width, row.height) == (2, 64, 48)
+        assert row.payload_bytes > 0
+        assert row.psnr_db > 25
+        assert row.sender_ms["total"] > row.sender_ms["render"] > 0
+        assert row.receiver_ms["total"] > 0
