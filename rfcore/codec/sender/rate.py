@@ -1,7 +1,7 @@
 """Rate control of one frame: how long a slice will be at which CRF, and coding until it fits.
 
 The bits of a frame at every CRF are estimated from what its references leave of each 8x8 block
-(``rfcore.codec.sender.frame_costs`` has the formula); what x264 makes of it differs by a
+(``rfcore.codec.sender.frame_costs`` has the formula); what the coder makes of it differs by a
 factor that changes little from one frame to the next of the same references. ``RateModel`` keeps
 that factor for each set of references. States are values: ``after`` returns the next.
 
