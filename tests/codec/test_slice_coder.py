@@ -7,6 +7,7 @@ deblocking filter on or off.
 import hashlib
 from collections.abc import Callable, Sequence
 from functools import cache
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,10 +15,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from rfcore.codec.h264.bitstream import join_nals
 from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.codec.h264.header import StreamHeader, own_header
 from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, nal_type
-from rfcore.codec.h264.slice_coder import Effort, OwnSlice, SliceCoder
+from rfcore.codec.h264.slice_coder import Effort, MacroblockMode, OwnSlice, SliceCoder
 from rfcore.codec.h264.slices import encode_slice
 from rfcore.codec.h264.splice import SpliceDecoder, grey
 from rfcore.errors import BackendUnavailable, InvalidInput
@@ -312,6 +315,55 @@ def digest(effort: Effort, references: int, qp: int) -> str:
 @pytest.mark.parametrize(("effort", "references", "qp"), GOLDEN)
 def test_slices_keep_their_bytes(effort: Effort, references: int, qp: int) -> None:
     assert digest(effort, references, qp) == GOLDEN[effort, references, qp]
+
+
+def ramp(size: Size, lifted: int) -> I420:
+    """Brighter by 1 from row to row: a vertical shift of so many rows, that every step of a search
+    comes nearer to."""
+    width, height = size
+    rows = np.repeat(60 + lifted + np.arange(height)[:, None], width, 1).astype(np.uint8)
+    half = np.ascontiguousarray(rows[::2, ::2])
+    return I420(rows, half, half)
+
+
+def vertical_vectors(size: Size, coded: OwnSlice, references: Sequence[I420]) -> NDArray[np.int32]:
+    """The vertical components of a slice's vectors as FFmpeg reads them, in quarter samples."""
+    splice = SpliceDecoder(own_header(CodecConfig(*size)))
+    decoder = splice._decoder
+    assert isinstance(decoder, H264Decoder)
+    decoder._context.options = {"flags2": "+export_mvs"}
+    splice.predict_from(*references)
+    picture = decoder._frame(join_nals([coded.payload]))
+    fields = cast(Any, picture.side_data).get("MOTION_VECTORS").to_ndarray()
+    assert (fields["motion_scale"] == 4).all()
+    vertical: NDArray[np.int32] = fields["motion_y"]
+    return vertical
+
+
+@pytest.mark.parametrize("shift", [72, -72])
+@pytest.mark.parametrize(
+    ("size", "level_idc", "least", "most"),
+    [((64, 112), 10, -256, 255), ((256, 112), 12, -512, 511)],
+)
+def test_vectors_stay_within_the_levels_vertical_range(
+    size: Size, level_idc: int, least: int, most: int, shift: int
+) -> None:
+    """MaxVmvR of table A-1: -64..63.75 samples at level 1, where 72 would fit best; a larger
+    picture's level has room for them."""
+    config = CodecConfig(*size)
+    assert config.level_idc == level_idc
+    frame, reference = ramp(size, max(-shift, 0)), ramp(size, max(shift, 0))
+    coded = SliceCoder(own_header(config)).encode(
+        frame,
+        [reference],
+        26,
+        effort=Effort.THOROUGH,
+        forced=np.full(config.macroblocks, MacroblockMode.INTER_16X16, np.int8),
+    )
+    vectors = vertical_vectors(size, coded, [reference])
+    assert least <= vectors.min() <= vectors.max() <= most
+    farthest = int(np.abs(vectors).max())
+    assert farthest > 250 if level_idc == 10 else farthest == 4 * 72
 
 
 @pytest.mark.parametrize("qp", [-1, 61])
