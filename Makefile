@@ -33,8 +33,8 @@ test: build-full  ## run the fast tests (four minutes of two cores)
 test-slow: build-full test-system-packages  ## run the tests that take more than ten seconds each
 	$(BIN)/python -m pytest -m "slow and not compose and not fault and not attack and not nightly" --timeout 600
 
-test-slices: build-full  ## compare a million macroblocks of the slice coder with FFmpeg; fuzz it
-	$(BIN)/python -m pytest tests/codec/test_slice_conformance.py -m nightly
+test-slices: build-full  ## compare a million macroblocks of the slice coder with FFmpeg; fuzz it and packets
+	$(BIN)/python -m pytest tests/codec/test_slice_conformance.py tests/bench/test_fuzz.py -m nightly --timeout 1800
 
 test-scale: build-full  ## run each case of `rfedge eval scale` once, small: Envoy, NATS, servers, their vehicles
 	$(BIN)/python -m pytest tests/integration/test_envoy.py tests/integration/test_nats.py -m nightly --timeout 600

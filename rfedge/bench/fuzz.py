@@ -1,5 +1,7 @@
 """Damage packets at random and hand them to the receiver: python -m rfedge.bench.fuzz --packets N
 
+``--adapting`` takes a stream under another light than the field's, whose renders are relit.
+
 What must hold for every damaged packet: the decoder refuses it with a reason, or shows exactly the
 picture whose digest the packet carries; no other exception, no crash, and at most 50 ms of
 processor time. Half of the packets get a fresh CRC, so that the later checks have to do the work;
@@ -12,8 +14,9 @@ import argparse
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,14 +27,21 @@ from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket
 from rfcore.codec.references import INTRA, Reference, is_temporal
-from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
+from rfcore.codec.sender.encoder import LEFT_TO_THE_ENCODER, DeltaEncoder, FrameChoice
 from rfcore.codec.state import DecoderState
 from rfcore.errors import CodecError, PacketRejected
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_colour
 from rfcore.views import FieldView
 
-__all__ = ["MUTATIONS", "FuzzStream", "fuzz", "make_stream"]
+__all__ = [
+    "MUTATIONS",
+    "FuzzStream",
+    "fuzz",
+    "make_adapting_stream",
+    "make_stream",
+    "mutations_of",
+]
 
 MAX_CPU_MS = 50.0
 WHOLE_EVERY = 50
@@ -57,6 +67,14 @@ CHOICES = (
     FrameChoice((Reference.PREVIOUS, Reference.RENDER), relight=True),
     FrameChoice((Reference.RENDER,), relight=True),
 )
+RELIT = (
+    (Reference.PREVIOUS, Reference.RENDER),
+    (Reference.RENDER,),
+    (Reference.PREVIOUS, Reference.CORRECTION),
+    (Reference.WARP, Reference.PREVIOUS, Reference.RENDER),
+    (Reference.CORRECTION, Reference.PREVIOUS, Reference.RENDER),
+)
+"""References of the frames of an adapting stream that are relit."""
 
 Rng = np.random.Generator
 Mutation = Callable[[DeltaPacket, Rng], DeltaPacket]
@@ -81,12 +99,30 @@ class FuzzStream:
 
 def make_stream(size_px: tuple[int, int] = SIZE_PX) -> FuzzStream:
     """Code one frame of every kind."""
+    moments = [_moment(index, size_px) for index in range(len(CHOICES))]
+    return _coded(size_px, CHOICES, moments)
+
+
+def make_adapting_stream(size_px: tuple[int, int] = SIZE_PX) -> FuzzStream:
+    """Code frames of a street that grows dark: the first is not relit, all others are."""
+    choices = [LEFT_TO_THE_ENCODER, *(FrameChoice(names, relight=True) for names in RELIT)]
+    moments = [_moment(index, size_px) for index in range(len(choices))]
+    darker = [
+        (_lamplit(frame, 0.9 - 0.05 * index), view) for index, (frame, view) in enumerate(moments)
+    ]
+    return _coded(size_px, choices, darker)
+
+
+def _coded(
+    size_px: tuple[int, int],
+    choices: Sequence[FrameChoice],
+    moments: Sequence[tuple[I420, FieldView]],
+) -> FuzzStream:
     encoder = DeltaEncoder(CodecConfig(*size_px))
     decoder = DeltaDecoder(encoder.header)
     sending, receiving = encoder.start(1), decoder.start(1)
     frames = []
-    for index, choice in enumerate(CHOICES):
-        frame, view = _moment(index, size_px)
+    for choice, (frame, view) in zip(choices, moments, strict=True):
         sent = encoder.encode(sending, frame, view, choice)
         frames.append(SentFrame(sent.packet, view, receiving))
         sending = sent.state
@@ -102,11 +138,11 @@ def fuzz(stream: FuzzStream, packets: int, seed: int = 0) -> Counter[str]:
     """
     rng = np.random.default_rng(seed)
     decoder = DeltaDecoder(stream.header)
+    mutations = list(mutations_of(stream).values())
     outcomes: Counter[str] = Counter()
     for number in range(packets):
         frame = stream.frames[rng.integers(len(stream.frames))]
-        name = MUTATION_NAMES[rng.integers(len(MUTATION_NAMES))]
-        damaged = MUTATIONS[name](frame.packet, rng)
+        damaged = mutations[rng.integers(len(mutations))](frame.packet, rng)
         repaired = damaged.sealed() if number % 2 else damaged
         outcomes[_try(decoder, frame, repaired)] += 1
         if number % WHOLE_EVERY == 0 and _try(decoder, frame, frame.packet) != "shown":
@@ -209,6 +245,22 @@ def relight(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     return replace(packet, photometric=photometric, base_digest=needed, relit=relit)
 
 
+def switch_relit(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Relight the render or leave it; the base stays, or is made up where one is needed now."""
+    relit = not packet.relit
+    base = packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)
+    needed = base if relit or is_temporal(packet.references) else b""
+    return replace(packet, photometric=(), base_digest=needed, relit=relit)
+
+
+def exchange_base(packet: DeltaPacket, rng: Rng, digests: Sequence[bytes]) -> DeltaPacket:
+    """Learn the light, and predict, from another of the frames with ``digests``."""
+    base = digests[int(rng.integers(len(digests)))][:BASE_DIGEST_BYTES]
+    if packet.needs_base:
+        return replace(packet, base_digest=base)
+    return replace(packet, photometric=(), base_digest=base, relit=True)
+
+
 MUTATIONS: dict[str, Mutation] = {
     mutation.__name__: mutation
     for mutation in (
@@ -222,9 +274,16 @@ MUTATIONS: dict[str, Mutation] = {
         renumber,
         exchange_references,
         relight,
+        switch_relit,
     )
 }
-MUTATION_NAMES = tuple(MUTATIONS)
+"""Damage that needs nothing but the packet."""
+
+
+def mutations_of(stream: FuzzStream) -> Mapping[str, Mutation]:
+    """Return every kind of damage, by its name."""
+    digests = tuple(frame.packet.reconstruction_digest for frame in stream.frames)
+    return {**MUTATIONS, "exchange_base": partial(exchange_base, digests=digests)}
 
 
 # --- the stream
@@ -247,6 +306,14 @@ def _moment(index: int, size_px: tuple[int, int]) -> tuple[I420, FieldView]:
     return frame, FieldView(Camera(k, pose), render, depth)
 
 
+def _lamplit(picture: I420, brightness: float) -> I420:
+    """Return the picture darkened to ``brightness`` from the left to the right, and bluer."""
+    ramp = np.linspace(1.1, brightness, picture.size_px[0], dtype=np.float32)[None, :]
+    y = (picture.y - 16.0) * ramp + 16
+    u, v = (picture.u - 128.0) * ramp[:, ::2] + 136, (picture.v - 128.0) * ramp[:, ::2] + 128
+    return I420(*(np.clip(np.rint(plane), 1, 255).astype(np.uint8) for plane in (y, u, v)))
+
+
 def _report(outcomes: Counter[str], seconds: float) -> Iterator[str]:
     total = sum(outcomes.values())
     yield f"{total} packets in {seconds:.0f} s"
@@ -259,9 +326,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, prog="python -m rfedge.bench.fuzz")
     parser.add_argument("--packets", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--adapting", action="store_true")
     given = parser.parse_args()
+    stream = make_adapting_stream() if given.adapting else make_stream()
     started_s = time.monotonic()
-    outcomes = fuzz(make_stream(), given.packets, given.seed)
+    outcomes = fuzz(stream, given.packets, given.seed)
     print("\n".join(_report(outcomes, time.monotonic() - started_s)))
 
 

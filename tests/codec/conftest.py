@@ -13,6 +13,7 @@ from rfcore.views import FieldView
 PictureMaker = Callable[..., I420]
 PairMaker = Callable[..., tuple[I420, FieldView]]
 ViewMaker = Callable[[I420], FieldView]
+EveningMaker = Callable[[I420, float], I420]
 
 
 def make_picture(width_px: int, height_px: int, shift_px: float = 0.0, cars: int = 0) -> I420:
@@ -49,6 +50,18 @@ def make_pair(width_px: int, height_px: int, shift_px: float = 0.0) -> tuple[I42
     return I420(noisy, camera.u, camera.v), view
 
 
+def make_evening(picture: I420, evening: float) -> I420:
+    """Return a street as the sun sets: at 0 as it is, at 1 dark and blue, but for what a lamp on
+    the left still lights. No matrix says that: what it adds depends on the place."""
+    width_px = picture.size_px[0]
+    lit = (1 + evening * np.linspace(0.1, -0.65, width_px))[None, :]
+    chroma = lit[:, ::2]
+    y = (picture.y - 16.0) * lit + 16
+    u = (picture.u - 128.0) * chroma + 128 + 12 * (1 - chroma)
+    v = (picture.v - 128.0) * chroma + 128
+    return I420(*(np.clip(np.rint(p), 1, 255).astype(np.uint8) for p in (y, u, v)))
+
+
 def make_flat(width_px: int, height_px: int, level: int) -> I420:
     half = ((height_px + 1) // 2, (width_px + 1) // 2)
     return I420(*(np.full(s, level, np.uint8) for s in ((height_px, width_px), half, half)))
@@ -75,6 +88,11 @@ def pair() -> PairMaker:
 @pytest.fixture(scope="session")
 def view_of() -> ViewMaker:
     return make_view
+
+
+@pytest.fixture(scope="session")
+def evening() -> EveningMaker:
+    return make_evening
 
 
 @pytest.fixture(scope="session")

@@ -51,10 +51,11 @@ def coded() -> tuple[Hello, list[Frame]]:
     pose = Pose((0.0, 0.0, -4.0), (1.0, 0.0, 0.0, 0.0))
     encoder = DeltaEncoder(CodecConfig(16, 16))
     state, frames = encoder.start(1), []
-    for number in range(2):
+    choices = (FrameChoice(RENDER_ONLY), FrameChoice(RENDER_ONLY), FrameChoice(relight=True))
+    for number, choice in enumerate(choices):
         view = render_field_view(field(0), Camera(camera, pose).rounded())
         picture = i420_from_rgb(np.full((16, 16, 3), 90 + 40 * number, np.uint8))
-        encoded = encoder.encode(state, picture, view, choice=FrameChoice(RENDER_ONLY))
+        encoded = encoder.encode(state, picture, view, choice=choice)
         state = encoded.state
         frames.append(Frame("front", 10**9 + number, pose, bytes.fromhex(FIELD_ID), encoded.packet))
     described = CameraDescription("front", camera, encoder.header)
@@ -66,7 +67,8 @@ def coded() -> tuple[Hello, list[Frame]]:
 def put_wire() -> None:
     hello, frames = coded()
     messages = [client_message_to_bytes(message) for message in (hello, *frames)]
-    for name, data in zip(("hello", "frame-0", "frame-1"), messages, strict=True):
+    names = ("hello", "frame-0", "frame-1", "frame-relit")
+    for name, data in zip(names, messages, strict=True):
         put("message", name, data)
     ack = Ack(FrameAddress("front", 1, 0), StageTimes(1, 2, 3), bytes(16))
     put("message", "answers", server_messages_to_bytes([ack])[0])
