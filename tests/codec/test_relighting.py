@@ -1,9 +1,12 @@
 """Renders under the light of an earlier frame: what is sent, decoded, refused, and left alone."""
 
-from collections.abc import Callable
-from dataclasses import replace
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
@@ -158,3 +161,145 @@ def test_a_receiver_whose_renderer_is_not_exact_refuses(street: Street) -> None:
     with pytest.raises(PacketRejected) as refused:
         decoder.decode(state, second.packet, street(1)[1])
     assert refused.value.reason is RejectReason.INVALID_ARGUMENT
+
+
+# --- light that changes during the drive
+
+SMALL_PX = (160, 96)
+CRFS = (22.0, 30.0)
+MESSAGE_BYTES = 100
+"""Of a frame's message besides its slice, about."""
+WINDOW = 20
+OFF = FrameChoice(photometric=(), relight=False)
+NOISE = 1.01
+"""Bits of ``auto`` over those of ``off`` at equal quality, in any ``WINDOW`` frames."""
+Light = Callable[[I420, int], I420]
+
+
+def gained(picture: I420, gain: NDArray[np.float64] | float) -> I420:
+    """Return a picture whose luma is exposed otherwise, everywhere or column by column."""
+    y = (picture.y - 16.0) * gain + 16
+    return I420(np.clip(np.rint(y), 1, 235).astype(np.uint8), picture.u, picture.v)
+
+
+def passing_cloud(picture: I420, index: int) -> I420:
+    """A shadow's edge enters at frame 20, another one leaves at frame 70; 30 frames take each."""
+    x = np.linspace(0, 1, picture.size_px[0])
+    entered, left = (
+        1 / (1 + np.exp(12 * (x - ((index - start) / 30 * 1.8 - 0.4)))) for start in (20, 70)
+    )
+    return gained(picture, 1 - 0.4 * (entered - left)[None, :])
+
+
+def hunting(picture: I420, index: int) -> I420:
+    """Exposure swings by 15 % around the right one, once in 14 frames."""
+    return gained(picture, 1 + 0.15 * math.sin(2 * math.pi * index / 14))
+
+
+def tunnel(picture: I420, index: int) -> I420:
+    """From frame 20 to 80 it is dark, and the exposure answers late, in and out."""
+    inside = 0.25 + 0.35 * (1 - math.exp(-(index - 20) / 8))
+    behind = 1 + 0.8 * math.exp(-(index - 80) / 4)
+    return gained(picture, 1.0 if index < 20 else inside if index < 80 else behind)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A drive whose light changes.
+
+    ``passings``: how often it passes the threshold from which on a change is looked for. Decisions
+    flap if they change more often than that and the two times that noise at a passing may add.
+    """
+
+    light: Light | None
+    frames: int
+    passings: int
+    most_percent: float
+    """Bits of the whole drive at equal quality, of those of ``off``."""
+
+
+SWEEPS = {
+    "the light fades": Sweep(None, 300, 1, 50),
+    "a cloud passes": Sweep(passing_cloud, 120, 2, 65),
+    "exposure hunts": Sweep(hunting, 84, 24, 60),
+    "a tunnel": Sweep(tunnel, 110, 4, 40),
+}
+
+
+@dataclass(frozen=True)
+class CodedSweep:
+    """Bytes and squared errors [CRFs, frames]; which frames were relit, at the lower CRF."""
+
+    size_bytes: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    relit: NDArray[np.bool_]
+
+    def log_bytes(self, frames: slice, psnr_db: float) -> float:
+        sizes, qualities = self.size_bytes[:, frames].mean(axis=1), self.psnr_db(frames)
+        order = np.argsort(qualities)
+        return float(np.interp(psnr_db, qualities[order], np.log(sizes[order])))
+
+    def psnr_db(self, frames: slice) -> NDArray[np.float64]:
+        return 10 * np.log10(255.0**2 / self.errors[:, frames].mean(axis=1))
+
+
+def swept(moments: Sequence[tuple[I420, FieldView]], choice: FrameChoice) -> CodedSweep:
+    sizes, errors = np.zeros((2, len(CRFS), len(moments)))
+    relit = np.zeros(len(moments), bool)
+    for row, crf in enumerate(CRFS):
+        encoder = DeltaEncoder(CodecConfig(*SMALL_PX, crf=crf))
+        state = encoder.start(1)
+        for index, (frame, view) in enumerate(moments):
+            made = encoder.encode(state, frame, view, choice)
+            state = made.state
+            sizes[row, index] = MESSAGE_BYTES + len(made.packet.payload)
+            errors[row, index] = np.mean((frame.y.astype(float) - made.reconstruction.y) ** 2)
+            if row == 0:
+                relit[index] = made.packet.relit
+    return CodedSweep(sizes, errors, relit)
+
+
+def bits_ratio(auto: CodedSweep, off: CodedSweep, frames: slice) -> float:
+    """Return bits of ``auto`` over those of ``off`` at a quality that both reach."""
+    both = [one.psnr_db(frames) for one in (auto, off)]
+    middle = (max(q.min() for q in both) + min(q.max() for q in both)) / 2
+    return math.exp(auto.log_bytes(frames, middle) - off.log_bytes(frames, middle))
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_light_that_changes_never_costs_more_than_off_and_no_decision_flaps(
+    pair: PairMaker, evening: EveningMaker, name: str
+) -> None:
+    sweep = SWEEPS[name]
+    light = sweep.light or (lambda picture, index: evening(picture, index / sweep.frames))
+    given = [pair(*SMALL_PX, 1.5 * index) for index in range(sweep.frames)]
+    moments = [(light(frame, index), view) for index, (frame, view) in enumerate(given)]
+    auto, off = (swept(moments, choice) for choice in (FrameChoice(), OFF))
+    for start in range(0, sweep.frames - WINDOW + 1, WINDOW // 2):
+        assert bits_ratio(auto, off, slice(start, start + WINDOW)) < NOISE, start
+    assert 100 * bits_ratio(auto, off, slice(None)) < sweep.most_percent
+    assert np.count_nonzero(np.diff(auto.relit)) <= sweep.passings + 2
+    assert auto.relit.any()
+    assert not auto.relit.all()
+
+
+def test_a_lost_frame_costs_one_packet_while_the_light_fades(
+    pair: PairMaker, evening: EveningMaker
+) -> None:
+    """Every fifth frame is lost; the sender goes on from the last one that arrived."""
+    encoder = DeltaEncoder(CodecConfig(*SMALL_PX))
+    decoder = DeltaDecoder(encoder.header)
+    state, receiving = encoder.start(1), decoder.start(1)
+    relit = 0
+    for index in range(40):
+        frame, view = pair(*SMALL_PX, 1.5 * index)
+        made = encoder.encode(state, evening(frame, 0.2 + index / 60), view)
+        if index % 5 == 4:
+            state = replace(made.state, past=state.past)
+            continue
+        decoded = decoder.decode(receiving, made.packet, view)
+        assert decoded.lost == (1 if index % 5 == 0 and index else 0)
+        assert decoded.frame.digest() == made.reconstruction.digest()
+        relit += made.packet.relit
+        state, receiving = made.state, decoded.state
+    assert relit == 31, "all that arrived but the first"
