@@ -20,6 +20,7 @@ from rfedge.results import Provenance, Result, make_result, read_result, rows_of
 
 __all__ = [
     "Measured",
+    "RayTiles",
     "ScaleRecord",
     "ScaleRow",
     "ScaleRun",
@@ -52,6 +53,17 @@ class ScaleRow:
 
 
 @dataclass(frozen=True)
+class RayTiles:
+    """The tiles that were trained on Ray."""
+
+    tiles: int
+    list_sha256: str
+    """Of their ``tiles.json``, which names ground and pictures of each."""
+    iterations: int
+    """Of each tile."""
+
+
+@dataclass(frozen=True)
 class Measured:
     """What a group of cases measured."""
 
@@ -60,6 +72,8 @@ class Measured:
     """Figures of planned loads, of which ``rows`` has the differences."""
     envoy_added_ms: Sequence[float] = ()
     """Of each pair of runs, straight and through Envoy: the difference of the two p99."""
+    ray: Sequence[RayTiles] = ()
+    """What the rows of Ray are of: one, or none."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +92,7 @@ class ScaleRecord:
     rows: Sequence[ScaleRow] = ()
     planning: Sequence[PlannedRow] = ()
     envoy_added_ms: Sequence[float] = ()
+    ray: Sequence[RayTiles] = ()
     runs: Sequence[ScaleRun] = ()
 
     @staticmethod
@@ -99,6 +114,7 @@ class ScaleRecord:
             list(({row.case: row for row in (*self.rows, *measured.rows)}).values()),
             list((plans | {(p.vehicles, p.figure): p for p in measured.planning}).values()),
             measured.envoy_added_ms or self.envoy_added_ms,
+            measured.ray or self.ray,
             self._runs_with(made, [row.case for row in measured.rows]),
         )
 
@@ -108,6 +124,7 @@ class ScaleRecord:
             "rows": self.rows,
             "planning": self.planning,
             "envoy_added_ms": self.envoy_added_ms,
+            "ray": self.ray,
             "runs": self.runs,
         }
         write_result(path, make_result(SCALE, made, content))
@@ -126,6 +143,7 @@ def _record(result: Result) -> ScaleRecord:
         rows_of(ScaleRow, result["rows"]),
         rows_of(PlannedRow, result["planning"]),
         result["envoy_added_ms"],
+        rows_of(RayTiles, result.get("ray", [])),  # older files do not say
         rows_of(ScaleRun, result["runs"]),
     )
 
@@ -159,6 +177,11 @@ def scale_section(path: Path, result: Result) -> str:
             f"Envoy added to the p99 in {len(added_ms)} pairs of runs: median "
             f"{statistics.median(added_ms):.2f} ms, {min(added_ms):.2f} to {max(added_ms):.2f} ms."
         )
+    parts += [
+        f"Ray: {of.tiles} tiles, {of.iterations} iterations each; the SHA-256 of their "
+        f"`tiles.json` is `{of.list_sha256}`."
+        for of in record.ray
+    ]
     runs = (f"* `{x.command}` at `{x.revision}`: {'; '.join(x.cases)}." for x in record.runs)
     return "\n\n".join([*parts, "\n".join(runs), ""])
 

@@ -21,7 +21,7 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.nats import NatsServers
 from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
 from rfedge.demo.processes import command_of, service
-from rfedge.loadtest.cases import ScaleRow
+from rfedge.loadtest.cases import Measured, ScaleRow
 from rfedge.loadtest.scale import Fleet, ScaleJob, failures
 from rfedge.twin.nats_source import NatsPictures
 
@@ -129,7 +129,7 @@ class _Watched:
         return {name: at_s for name, at_s in tuple(self.newest_s.items()) if at_s >= since_s}
 
 
-def nats_rows(job: ScaleJob) -> list[ScaleRow]:
+def nats_rows(job: ScaleJob) -> Measured:
     """Restart NATS ``job.rounds`` times while vehicles stream; return what that did."""
     job.work.mkdir(parents=True, exist_ok=True)
     fleet = Fleet(job, job.work / "vehicles")
@@ -146,12 +146,13 @@ def nats_rows(job: ScaleJob) -> list[ScaleRow]:
         until_ns = time.time_ns()
         fleet.until_acked(until_ns)
         lost = sum(failures(lines, since_ns, until_ns) for lines in fleet.lines())
-    return [
-        ScaleRow.at_most(
-            "NATS restarted under load: s until the twin is back", BACK_S, max(back_s)
-        ),
-        ScaleRow.at_most("NATS away or restarted: pictures lost or refused", 0, lost),
-    ]
+    at_most = ScaleRow.at_most
+    return Measured(
+        [
+            at_most("NATS restarted under load: s until the twin is back", BACK_S, max(back_s)),
+            at_most("NATS away or restarted: pictures lost or refused", 0, lost),
+        ]
+    )
 
 
 def _command(job: ScaleJob, name: str, url: str) -> list[str]:

@@ -6,6 +6,7 @@ Start-up, until Ray has been reached, does not count; whatever a worker does fir
 
 from __future__ import annotations
 
+import hashlib
 import heapq
 import os
 import re
@@ -19,17 +20,21 @@ from functools import partial
 from pathlib import Path
 
 from rfcore.errors import InvalidInput, RfedgeError
-from rfedge.datasets.split import read_tiles
+from rfedge.datasets.split import LIST_NAME, read_tiles
 from rfedge.demo.processes import command_of
-from rfedge.loadtest.cases import ScaleRow
+from rfedge.loadtest.cases import Measured, RayTiles, ScaleRow
 from rfedge.loadtest.scale import Case, ScaleJob
 
-__all__ = ["TileRun", "overhead_percent", "ray_case", "train_tiles"]
+__all__ = ["TileRun", "overhead_percent", "ray_case", "require_resumed", "train_tiles"]
 
 OVERHEAD_PERCENT = 5.0
-KILL_PERCENT = 10
+FEWEST_TILES = 3
+KILL_PERCENT = 50
 """A worker is killed once it has told of so much of its tile."""
+CHECKPOINTS = 10
+"""In the training of a tile, evenly spread."""
 PROGRESS = re.compile(r"(\S+), process (\d+): +(\d+)%")
+RESUMED = re.compile(r"(\S+), process (\d+): going on after iteration ([\d,]+)")
 ENDED = re.compile(r"(\S+), process \d+: ended after ([0-9.]+) s")
 REACHED = re.compile(r"Ray at \S+: (\d+) cores")
 
@@ -64,6 +69,11 @@ class TileRun:
         """Return the processes that worked on a tile."""
         found = [each for each in map(PROGRESS.match, self.lines) if each and each[1] == tile]
         return {int(each[2]) for each in found}
+
+    def resumed_after(self, tile: str) -> tuple[int, ...]:
+        """Return the iterations of the checkpoints from which work on a tile went on."""
+        found = [each for each in map(RESUMED.match, self.lines) if each and each[1] == tile]
+        return tuple(int(each[3].replace(",", "")) for each in found)
 
     def _reached(self) -> re.Match[str]:
         for line in self.lines:
@@ -114,35 +124,54 @@ def overhead_percent(seconds: float, work_s: Sequence[float], workers: int) -> f
     return 100 * (seconds / max(free_s) - 1)
 
 
+def require_resumed(run: TileRun, tile: str) -> None:
+    """Raise ``RfedgeError`` unless a worker of ``tile`` was killed and another one went on.
+
+    From a checkpoint: a tile that was begun anew would have the same bytes.
+    """
+    workers, iterations = run.workers_of(tile), run.resumed_after(tile)
+    if run.killed != 1 or len(workers) != 2 or len(iterations) != 1 or iterations[0] < 1:
+        raise RfedgeError(
+            f"{run.killed} workers of {tile} were killed at {KILL_PERCENT} %, {len(workers)} told "
+            f"of progress, going on after iterations {list(iterations)}; it takes 1, 2 and one "
+            "checkpoint: take more iterations"
+        )
+
+
 def ray_case(tiles: Path, iterations: int) -> Case:
     """Return the case of the tiles in a folder that ``rfedge scene split`` made.
 
-    Raises ``InvalidInput`` for a folder without tiles.
+    Raises ``InvalidInput`` for a folder with fewer than ``FEWEST_TILES``, and for fewer iterations
+    than ``CHECKPOINTS``.
     """
     listed = read_tiles(tiles)
     if listed is None:
         raise InvalidInput("ray_tiles", f"{tiles} has no tiles.json: `rfedge scene split` makes it")
-    return partial(_rows, tiles, listed[0].name, iterations)
+    if len(listed) < FEWEST_TILES:
+        raise InvalidInput(
+            "ray_tiles",
+            f"{tiles} has {len(listed)} tiles, the case takes {FEWEST_TILES}; split with a smaller "
+            "--length",
+        )
+    if iterations < CHECKPOINTS:
+        raise InvalidInput("ray_iterations", f"{iterations} must be at least {CHECKPOINTS}")
+    digest = hashlib.sha256((tiles / LIST_NAME).read_bytes()).hexdigest()
+    return partial(_measure, tiles, listed[0].name, RayTiles(len(listed), digest, iterations))
 
 
-def _rows(tiles: Path, first: str, iterations: int, job: ScaleJob) -> list[ScaleRow]:
+def _measure(tiles: Path, first: str, trained: RayTiles, job: ScaleJob) -> Measured:
     folder = job.work / "ray"
     shutil.rmtree(folder, ignore_errors=True)
-    options = ("--iterations", str(iterations), "--threads", "1")
-    runs = {}
-    for name, ray, kill_at in (
-        ("alone", None, None),
-        ("on-ray", "local", None),
-        ("killed", "local", first),
-    ):
-        runs[name] = train_tiles(tiles, folder / name, options, ray, kill_at)
-    if runs["killed"].killed != 1:
-        raise RfedgeError(f"no worker of {first} told of its progress: take more iterations")
+    options = ("--iterations", str(trained.iterations), "--threads", "1")
+    options += ("--checkpoint-every", str(trained.iterations // CHECKPOINTS))
+    train_tiles(tiles, folder / "alone", options, None)
+    on_ray = train_tiles(tiles, folder / "on-ray", options, "local")
+    killed = train_tiles(tiles, folder / "killed", options, "local", first)
+    require_resumed(killed, first)
     alone = _fields(folder / "alone")
-    on_ray = runs["on-ray"]
     added = overhead_percent(on_ray.seconds, on_ray.work_s, on_ray.cores)
     at_most = ScaleRow.at_most
-    return [
+    rows = [
         at_most("Ray: tiles with other bytes", 0, _differing(alone, _fields(folder / "on-ray"))),
         at_most(
             "Ray, a worker killed: tiles with other bytes",
@@ -151,6 +180,7 @@ def _rows(tiles: Path, first: str, iterations: int, job: ScaleJob) -> list[Scale
         ),
         at_most("Ray: longer than its jobs, % (start-up apart)", OVERHEAD_PERCENT, added),
     ]
+    return Measured(rows, ray=(trained,))
 
 
 def _fields(folder: Path) -> dict[str, bytes]:

@@ -81,7 +81,7 @@ Lines = Sequence[Mapping[str, Any]]
 """A vehicle's report: a line a picture (``cav_agent.frame_log``), in the order they ended."""
 
 
-Case = Callable[["ScaleJob"], list[ScaleRow]]
+Case = Callable[["ScaleJob"], Measured]
 """Runs further processes, and returns what was measured."""
 
 
@@ -173,7 +173,7 @@ def _groups(job: ScaleJob) -> Iterator[Measured]:
         plans = compare_with_plan(planned_load(job))
         yield Measured([_planned_row(plan) for plan in plans], planning=plans)
     for case in job.also:
-        yield Measured(case(job))
+        yield case(job)
 
 
 def city_case(city: Path) -> Case:
@@ -181,7 +181,7 @@ def city_case(city: Path) -> Case:
     return partial(_city_rows, city)
 
 
-def _city_rows(city: Path, job: ScaleJob) -> list[ScaleRow]:
+def _city_rows(city: Path, job: ScaleJob) -> Measured:
     out = job.work / "city"
     command = [*command_of("rfedge"), "size", "--city", str(city), "--out", str(out)]
     begin_s = time.monotonic()
@@ -189,7 +189,7 @@ def _city_rows(city: Path, job: ScaleJob) -> list[ScaleRow]:
     took_s = time.monotonic() - begin_s
     if done.returncode != 0:
         raise RfedgeError(f"{city} was not planned: {done.stderr[-500:]}")
-    return [ScaleRow.at_most(f"{city.stem} planned, s", CITY_S, took_s)]
+    return Measured([ScaleRow.at_most(f"{city.stem} planned, s", CITY_S, took_s)])
 
 
 def planned_load(job: ScaleJob) -> PlannedLoad:

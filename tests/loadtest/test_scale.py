@@ -11,6 +11,7 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.datasets.convert import convert_dataset
 from rfedge.loadtest.cases import (
     Measured,
+    RayTiles,
     ScaleRecord,
     ScaleRow,
     ScaleRun,
@@ -109,7 +110,8 @@ def rows(**measured: float) -> list[ScaleRow]:
 def test_a_case_measured_again_replaces_its_row_and_leaves_its_earlier_run(tmp_path: Path) -> None:
     out = tmp_path / "scale.json"
     plan = PlannedRow(12, "cores", 1.0, 2.0, -50.0)
-    first = ScaleRecord().plus(made("a"), Measured(rows(x=1.0, y=3.0), [plan], [0.5, 1.5]))
+    tiles = RayTiles(3, "ab", 600)
+    first = ScaleRecord().plus(made("a"), Measured(rows(x=1.0, y=3.0), [plan], [0.5, 1.5], [tiles]))
     first.write(out, made("a"))
     again = ScaleRecord.read(out, made("b")).plus(made("b", at="def"), Measured(rows(y=1.0, z=2.5)))
     again.write(out, made("b"))
@@ -117,7 +119,7 @@ def test_a_case_measured_again_replaces_its_row_and_leaves_its_earlier_run(tmp_p
     assert read.rows == rows(x=1.0, y=1.0, z=2.5)
     assert [row.held for row in read.rows] == [True, True, False]
     assert read.runs == [ScaleRun("a", "abc", ["x"]), ScaleRun("b", "def", ["y", "z"])]
-    assert (read.planning, read.envoy_added_ms) == ([plan], [0.5, 1.5])
+    assert (read.planning, read.envoy_added_ms, read.ray) == ([plan], [0.5, 1.5], [tiles])
 
 
 def test_groups_of_one_run_are_one_run() -> None:
@@ -144,7 +146,7 @@ def test_rows_of_another_host_or_input_are_not_added_to(tmp_path: Path) -> None:
 def test_a_run_that_breaks_off_keeps_what_it_measured(tmp_path: Path) -> None:
     """The case of each group is written before the next one begins."""
 
-    def broken(job: ScaleJob) -> list[ScaleRow]:
+    def broken(job: ScaleJob) -> Measured:
         assert [row.case for row in ScaleRecord.read(job.out, made_here).rows] == ["x", "y"]
         raise RfedgeError("no more")
 
@@ -156,10 +158,12 @@ def test_a_run_that_breaks_off_keeps_what_it_measured(tmp_path: Path) -> None:
     made_here = provenance([field])
     out = tmp_path / "scale.json"
     given = {"drive": drive, "field": field, "work": tmp_path / "work", "out": out}
-    run_scale(job(**given, envoy=False, also=(lambda _: rows(x=1.0),)), Console(quiet=True))
+    run_scale(
+        job(**given, envoy=False, also=(lambda _: Measured(rows(x=1.0)),)), Console(quiet=True)
+    )
     with pytest.raises(RfedgeError, match="no more"):
         run_scale(
-            job(**given, envoy=False, add=True, also=(lambda _: rows(y=1.0), broken)),
+            job(**given, envoy=False, add=True, also=(lambda _: Measured(rows(y=1.0)), broken)),
             Console(quiet=True),
         )
     assert [row.case for row in ScaleRecord.read(out, made_here).rows] == ["x", "y"]
@@ -167,13 +171,15 @@ def test_a_run_that_breaks_off_keeps_what_it_measured(tmp_path: Path) -> None:
 
 def test_the_page_shows_rows_runs_and_the_spread_of_the_pairs(tmp_path: Path) -> None:
     out = tmp_path / "scale.json"
-    measured = Measured(rows(x=1.0, y=3.0), envoy_added_ms=[0.5, 2.5, 1.5])
+    tiles = RayTiles(3, "ab12", 600)
+    measured = Measured(rows(x=1.0, y=3.0), envoy_added_ms=[0.5, 2.5, 1.5], ray=[tiles])
     ScaleRecord().plus(made(), measured).write(out, made())
     page = scale_section(out, read_result(out))
     assert "| case | bound | measured | held |" in page
     assert "| x | 2.00 | 1.00 | yes |" in page
     assert "| y | 2.00 | 3.00 | no |" in page
     assert "in 3 pairs of runs: median 1.50 ms, 0.50 to 2.50 ms." in page
+    assert "Ray: 3 tiles, 600 iterations each; the SHA-256 of their `tiles.json` is `ab12`." in page
     assert "* `rfedge eval scale` at `abc`: x; y." in page
 
 
