@@ -25,6 +25,8 @@ Without clock or sockets. ``AccessList`` decides, ``Guard`` keeps track of calls
 
 from __future__ import annotations
 
+import os
+import stat
 import tomllib
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -120,6 +122,8 @@ class AccessFile:
     def refresh(self) -> bool:
         """Read the file again if it was changed; return whether the list is another one now.
 
+        Not for the event loop: it reads and parses up to ``MAX_ACCESS_BYTES``.
+
         Raises ``RfedgeError`` once for a file that cannot be used: the list before it stays.
         """
         stamp = self._stamp()
@@ -133,10 +137,10 @@ class AccessFile:
         if self.path is None:
             return None
         try:
-            stat = self.path.stat()
+            status = self.path.stat()
         except OSError:
             return None
-        return stat.st_mtime_ns, stat.st_ino, stat.st_size
+        return status.st_mtime_ns, status.st_ino, status.st_size
 
 
 MAX_ACCESS_BYTES = 4 << 20
@@ -145,12 +149,20 @@ MAX_ACCESS_BYTES = 4 << 20
 def read_access(path: Path) -> AccessList:
     """Read an access file; raise ``InvalidInput`` naming the file and what is wrong in it."""
     try:
-        if path.stat().st_size > MAX_ACCESS_BYTES:
-            raise InvalidInput("access", f"{path} is longer than {MAX_ACCESS_BYTES} bytes")
-        table = tomllib.loads(path.read_text())
-        return _access_of(table)
+        return _access_of(tomllib.loads(_text_of(path)))
     except (OSError, ValueError, TypeError, AttributeError, RfedgeError) as error:
         raise InvalidInput("access", f"{path}: {error}") from error
+
+
+def _text_of(path: Path) -> str:
+    """Return what a file holds that is one; a pipe nobody writes to would keep its reader."""
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise InvalidInput("access", "is no file, but a pipe, a folder or a device")
+        data = file.read(MAX_ACCESS_BYTES + 1)
+    if len(data) > MAX_ACCESS_BYTES:
+        raise InvalidInput("access", f"is longer than {MAX_ACCESS_BYTES} bytes")
+    return data.decode()
 
 
 def _access_of(table: dict[str, object]) -> AccessList:

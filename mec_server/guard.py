@@ -4,7 +4,8 @@ Of a call through a proxy, the client's and the proxy's (``mec_server.proxies``)
 client's alone.
 
 An interceptor around all services. A call of a certificate that is revoked, or has expired, is
-refused; ``sweep`` ends open ones whose certificate is no longer good, or whose grants changed.
+refused; ``sweep`` ends open ones whose certificate is no longer good, or whose grants changed,
+after ``refresh``.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ import grpc
 import structlog
 
 from mec_server.access import AccessFile, Grant
+from mec_server.ledger.peer_log import LogLimiter
+from mec_server.peers import peer_log
 from mec_server.proxies import Proxies
 from rfcore.errors import AccessDenied, RfedgeError
 from rfcore.wire.identity import PeerIdentity, peer_identity
@@ -28,6 +31,7 @@ from rfcore.wire.identity import PeerIdentity, peer_identity
 __all__ = ["Guard"]
 
 log = structlog.get_logger()
+Context = grpc.aio.ServicerContext[Any, Any]
 Handler = Any  # grpc's RpcMethodHandler: of any of four kinds
 
 
@@ -56,28 +60,52 @@ class Guard(grpc.aio.ServerInterceptor):
         utc_now: Callable[[], datetime],
         refused: Callable[[], None],
         proxies: Proxies,
+        limiter: LogLimiter,
     ) -> None:
         self._access = access
         self._proxies = proxies
         self._utc_now = utc_now
         self._refused = refused
+        self._limiter = limiter
         self._open: set[OpenCall] = set()
 
-    def grant(self, context: grpc.aio.ServicerContext[Any, Any]) -> Grant:
+    def grant(self, context: Context) -> Grant:
         """Return what the peer of a call may see."""
         return self._access.current.grant(peer_identity(context.auth_context()))
 
-    def may_fetch(self, context: grpc.aio.ServicerContext[Any, Any], tiles: frozenset[str]) -> bool:
+    def may_fetch(self, context: Context, tiles: frozenset[str]) -> bool:
         """Whether the peer of a call may have a field that belongs to ``tiles``."""
         return self._access.current.may_fetch(peer_identity(context.auth_context()), tiles)
 
-    def sweep(self) -> None:
-        """Read the access file if it changed, and end calls that would be refused now."""
+    def payer(self, context: Context) -> Context:
+        """Return the context that names who pays for a call: its client, or its peer if that is
+        no proxy that may speak for one."""
+        try:
+            return self._client(context)[1]
+        except RfedgeError:
+            return context
+
+    def _client(self, context: Context) -> tuple[PeerIdentity | None, Context]:
+        """Return the proxy of a call, if there is one, and the context that names its client.
+
+        Raises ``AccessDenied`` for a proxy whose certificate is not good, or that names nobody.
+        """
+        proxy = self._proxies.proxy_of(context)
+        if proxy is None:
+            return None, context
+        self._access.current.check(proxy, self._utc_now())
+        return proxy, self._proxies.client_context(context)
+
+    def refresh(self) -> None:
+        """Read the access file if it changed; not for the event loop."""
         try:
             if self._access.refresh():
                 log.info("access list taken up", file=str(self._access.path))
         except RfedgeError as error:
             log.error("access list not taken up, the old one holds", problem=str(error))
+
+    def sweep(self) -> None:
+        """End calls that would be refused now."""
         access, now = self._access.current, self._utc_now()
         for call in tuple(self._open):
             try:
@@ -121,7 +149,7 @@ class Guard(grpc.aio.ServerInterceptor):
         return call
 
     @asynccontextmanager
-    async def _admitted(self, context: Any) -> AsyncIterator[Any]:
+    async def _admitted(self, context: Context) -> AsyncIterator[Any]:
         """Hold the call open; yields its context, which names the client behind a proxy."""
         seen, call = await self._admit(context)
         if call is None:
@@ -135,22 +163,18 @@ class Guard(grpc.aio.ServerInterceptor):
                 raise
             call.task.uncancel()
             self._refused()
-            log.warning("call ended", peer=context.peer(), problem=call.ended)
+            peer_log(self._limiter, seen).warning("call ended", problem=call.ended)
             await context.abort(grpc.StatusCode.UNAUTHENTICATED, call.ended)
         finally:
             self._open.discard(call)
 
-    async def _admit(self, context: Any) -> tuple[Any, OpenCall | None]:
+    async def _admit(self, context: Context) -> tuple[Context, OpenCall | None]:
         """Return the context that services are to see, and the call (None in plaintext).
 
         Aborts the call if its certificate, or its proxy's, is not good.
         """
-        seen = context
         try:
-            proxy = self._proxies.proxy_of(context)
-            if proxy is not None:
-                self._access.current.check(proxy, self._utc_now())
-                seen = self._proxies.client_context(context)
+            proxy, seen = self._client(context)
             identity = peer_identity(seen.auth_context())
             if identity is None:
                 return seen, None
@@ -158,7 +182,7 @@ class Guard(grpc.aio.ServerInterceptor):
             grant = self._access.current.grant(identity)
         except RfedgeError as error:
             self._refused()
-            log.warning("call refused", peer=context.peer(), problem=str(error))
+            peer_log(self._limiter, self.payer(context)).warning("call refused", problem=str(error))
             await context.abort(grpc.StatusCode.UNAUTHENTICATED, str(error))
             raise AssertionError("abort raises") from error
         task = asyncio.current_task()

@@ -1,8 +1,9 @@
 """Peers of gRPC calls: whom a call is charged to, and how it is told that it is refused.
 
 ``ChargeRpcs`` charges every call of the server, whatever its service, for as long as it lasts: also
-health checks, and calls whose peer does not read its status. What fails unexpectedly in a call is
-told to the log; the peer learns no more than that it failed.
+health checks, calls whose peer does not read its status, those that ``mec_server.guard`` refuses,
+and those of methods that there are not. What fails unexpectedly in a call is told to the log; the
+peer learns no more than that it failed.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ import structlog
 
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Hold, Ledger
+from mec_server.ledger.peer_log import LogLimiter, PeerLog
 from rfcore.errors import LimitExceeded, RfedgeError
 from rfcore.wire.conventions import RETRY_AFTER
 from rfcore.wire.identity import peer_identity
 from rfcore.wire.status import status_of
 
-__all__ = ["ChargeRpcs", "Slots", "abort", "peer_account"]
+__all__ = ["ChargeRpcs", "Slots", "abort", "peer_account", "peer_log"]
 
 log = structlog.get_logger()
 
@@ -45,6 +47,12 @@ def peer_account(context: Context) -> tuple[str, bool]:
     return identity.uris[0], True
 
 
+def peer_log(limiter: LogLimiter, context: Context) -> PeerLog:
+    """Return a log for lines about the peer of a call, at no more than its identity's rate."""
+    identity, _ = peer_account(context)
+    return PeerLog(log.bind(peer=context.peer()), limiter, identity, time.monotonic)
+
+
 async def abort(context: Context, error: RfedgeError) -> NoReturn:
     """End a call with the status of ``error``, and with the time to try again if it has one."""
     await context.abort(status_of(error), str(error), _retry_after(error))
@@ -57,12 +65,24 @@ def _retry_after(error: RfedgeError) -> tuple[tuple[str, str], ...]:
 
 
 class Slots:
-    """Lets calls of one kind hold one of ``resource`` each; ``limited`` counts who is refused."""
+    """Lets calls of one kind hold one of ``resource`` each; ``limited`` counts who is refused,
+    ``limiter`` is that of lines about them."""
 
-    def __init__(self, ledger: Ledger, resource: Resource, limited: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        ledger: Ledger,
+        resource: Resource,
+        limited: Callable[[str], None],
+        limiter: LogLimiter,
+    ) -> None:
         self._ledger = ledger
         self._resource = resource
         self._limited = limited
+        self._limiter = limiter
+
+    def log(self, context: Context) -> PeerLog:
+        """Return a log for lines about the peer of a call."""
+        return peer_log(self._limiter, context)
 
     def hold(self, context: Context) -> Hold:
         """Return what the call holds, to be released when it is over; raise ``LimitExceeded``."""
@@ -78,21 +98,40 @@ class Slots:
         self._limited(error.limit)
 
 
-class ChargeRpcs(grpc.aio.ServerInterceptor):
-    """Charges calls to their identities; ``limited`` counts the limit that refused one."""
+async def _unknown_method(requests: AsyncIterator[bytes], context: Context) -> None:  # noqa: ARG001
+    await context.abort(grpc.StatusCode.UNIMPLEMENTED, "this server has no such method")
 
-    def __init__(self, ledger: Ledger, limited: Callable[[str], None]) -> None:
+
+UNKNOWN_METHOD = grpc.stream_stream_rpc_method_handler(_unknown_method)
+
+
+class ChargeRpcs(grpc.aio.ServerInterceptor):
+    """Charges calls to their identities; ``limited`` counts the limit that refused one.
+
+    ``payer`` returns the context that names who pays for a call: not the peer, behind a proxy. It
+    belongs before the interceptors that refuse calls, or those cost nobody anything.
+    """
+
+    def __init__(
+        self,
+        ledger: Ledger,
+        limited: Callable[[str], None],
+        limiter: LogLimiter,
+        payer: Callable[[Context], Context],
+    ) -> None:
         self._ledger = ledger
         self._limited = limited
+        self._limiter = limiter
+        self._payer = payer
 
     async def intercept_service(
         self,
         continuation: Callable[[grpc.HandlerCallDetails], Awaitable[Handler | None]],
         handler_call_details: grpc.HandlerCallDetails,
-    ) -> Handler | None:
-        """Return the method's handler, charged for."""
+    ) -> Handler:
+        """Return the method's handler, charged for; of an unknown method, one that says so."""
         handler = await continuation(handler_call_details)
-        return None if handler is None else self._charged(handler)
+        return self._charged(UNKNOWN_METHOD if handler is None else handler)
 
     def _charged(self, handler: Any) -> Handler:
         """Return ``handler`` with its one behaviour wrapped (see grpc.RpcMethodHandler)."""
@@ -124,11 +163,11 @@ class ChargeRpcs(grpc.aio.ServerInterceptor):
             except grpc.aio.AbortError:
                 raise
             except Exception:
-                log.exception("call failed", peer=context.peer())
+                peer_log(self._limiter, self._payer(context)).error("call failed", exc_info=True)
                 await context.abort(grpc.StatusCode.INTERNAL, FAILED)
 
     async def _hold(self, context: Context) -> Hold:
-        identity, _ = peer_account(context)
+        identity, _ = peer_account(self._payer(context))
         now = time.monotonic()
         try:
             self._ledger.spend(identity, Resource.CALLS, 1, now)

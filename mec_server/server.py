@@ -126,6 +126,7 @@ class EdgeServer:
             DecoderSettings(config.decoder, not self.address.is_loopback, config.sandbox_as_root),
             self._metrics.count_lost_decoder,
             self._failed(BackgroundTask.DECODER_START),
+            self._log_limiter,
             self._waiting,
         )
         self._health = health_aio.HealthServicer()
@@ -143,6 +144,7 @@ class EdgeServer:
             lambda: datetime.now(UTC),
             self._metrics.refused_certificates.inc,
             Proxies(config.proxy_identity),
+            self._log_limiter,
         )
         twin = self._twin = Twin()
         self._edge = EdgeService(self._context(twin, open_decoders))
@@ -160,7 +162,7 @@ class EdgeServer:
         self._twin_service = TwinService(
             twin,
             twin_metrics,
-            Slots(ledger, Resource.WATCHES, limited),
+            Slots(ledger, Resource.WATCHES, limited, self._log_limiter),
             config.limits,
             consumer_failed,
             self._sight,
@@ -170,7 +172,10 @@ class EdgeServer:
         self._publisher: TwinPublisher | None = None
         self._exchange: FieldExchange | None = None
         self._server = grpc.aio.server(
-            interceptors=(self._guard, ChargeRpcs(ledger, limited)),
+            interceptors=(
+                ChargeRpcs(ledger, limited, self._log_limiter, self._guard.payer),
+                self._guard,
+            ),
             options=_options(config),
             maximum_concurrent_rpcs=config.server_budget.rpcs + SPARE_RPCS,
         )
@@ -179,7 +184,7 @@ class EdgeServer:
         FieldService(
             self._index,
             lambda: self._published.tiles,
-            Slots(ledger, Resource.FETCHES, limited),
+            Slots(ledger, Resource.FETCHES, limited, self._log_limiter),
             config.limits.stalled_s,
             self._guard.may_fetch,
         ).register(self._server)
@@ -405,6 +410,7 @@ class EdgeServer:
             await asyncio.to_thread(self._learner.look)
 
     async def _sweep_calls(self) -> None:
+        await asyncio.to_thread(self._guard.refresh)
         self._guard.sweep()
         self._edge.end_stalled(time.monotonic())
 

@@ -9,6 +9,7 @@ decodes in the server only when no other machine can reach it.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ import structlog
 from mec_server.config import DecoderKind
 from mec_server.decoding.pool import DecoderPool
 from mec_server.decoding.process import DecoderLost, LossCause, Waiting
+from mec_server.ledger.peer_log import LogLimiter, PeerLog
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.codec.h264.splice import PictureDecoder
 from rfcore.confinement.confine import Confinement
@@ -72,7 +74,8 @@ class Decoders:
 
     ``kind`` is the kind in force, never AUTO once started. ``count_loss`` is called for each
     decoder process that dies in use, on any thread; ``start_failed`` with what a spare process
-    could not be started for; ``waiting``: see ``DecoderPool``.
+    could not be started for; ``limiter``: of lines about decoders that are lost; ``waiting``: see
+    ``DecoderPool``.
     """
 
     def __init__(
@@ -80,6 +83,7 @@ class Decoders:
         settings: DecoderSettings,
         count_loss: Callable[[LossCause], None],
         start_failed: Callable[[Exception], None],
+        limiter: LogLimiter,
         waiting: Waiting = nullcontext,
     ) -> None:
         self.kind = settings.kind
@@ -94,6 +98,7 @@ class Decoders:
         self._count_loss = count_loss
         self._start_failed = start_failed
         self._waiting = waiting
+        self._lines = PeerLog(log, limiter, "decoders", time.monotonic)
         self._pool: DecoderPool | None = None
 
     def start(self) -> None:
@@ -142,4 +147,4 @@ class Decoders:
 
     def _lost(self, lost: DecoderLost) -> None:
         self._count_loss(lost.cause)
-        log.error("decoder lost", reason=str(lost.cause), pid=lost.pid, problem=str(lost))
+        self._lines.error("decoder lost", reason=str(lost.cause), pid=lost.pid, problem=str(lost))

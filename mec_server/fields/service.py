@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import grpc
-import structlog
 
 from mec_server.fields.shelf import Store, read_chunk
 from mec_server.ledger.budgets import Limit
 from mec_server.ledger.ledger import HELD_RETRY_S
+from mec_server.ledger.peer_log import PeerLog
 from mec_server.peers import Slots, abort
 from rfcore.errors import AccessDenied, LimitExceeded, RfedgeError, UnknownField
 from rfcore.wire.checks import check_field_id
@@ -22,7 +22,6 @@ from rfcore.wire.v1 import field_pb2_grpc
 
 __all__ = ["FieldService"]
 
-log = structlog.get_logger()
 R = TypeVar("R")
 AnyContext = grpc.aio.ServicerContext[Any, Any]
 
@@ -87,7 +86,8 @@ class FieldService(field_pb2_grpc.FieldServiceServicer):
         """Return size and digest of an archive."""
         try:
             path = self._path(request.field_id, context)
-            status = await _readable(request.field_id, path.stat)
+            lines = self._slots.log(context)
+            status = await _readable(request.field_id, lines, path.stat)
         except RfedgeError as error:
             await abort(context, error)
         return pb.GetManifestResponse(
@@ -121,7 +121,8 @@ class FieldService(field_pb2_grpc.FieldServiceServicer):
         context: grpc.aio.ServicerContext[pb.FetchFieldRequest, pb.FetchFieldResponse],
     ) -> None:
         path, offset_bytes = self._path(request.field_id, context), request.offset_bytes
-        while chunk := await _readable(request.field_id, read_chunk, path, offset_bytes):
+        lines = self._slots.log(context)
+        while chunk := await _readable(request.field_id, lines, read_chunk, path, offset_bytes):
             response = pb.FetchFieldResponse(offset_bytes=offset_bytes, chunk=chunk)
             offset_bytes += len(chunk)
             writing = asyncio.ensure_future(context.write(response))
@@ -137,15 +138,15 @@ class FieldService(field_pb2_grpc.FieldServiceServicer):
                 writing.cancel()
 
 
-async def _readable(field_id: str, read: Callable[..., R], *arguments: object) -> R:
+async def _readable(field_id: str, lines: PeerLog, read: Callable[..., R], *arguments: object) -> R:
     """Return what ``read`` returns on a thread; raise ``UnknownField`` where the disk refuses.
 
-    What the peer is told names the field and no path of this machine; the log has it.
+    What the peer is told names the field and no path of this machine; ``lines`` has it.
     """
     try:
         return await asyncio.to_thread(read, *arguments)
     except OSError as error:
-        log.error("field not readable", field=field_id, problem=str(error))
+        lines.error("field not readable", field=field_id, problem=str(error))
         raise UnknownField(f"field {field_id} cannot be read here; list the fields again") from None
 
 

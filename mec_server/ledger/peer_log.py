@@ -80,6 +80,12 @@ class PeerLog:
         if suppressed is not None:
             self._logger.warning(event, **values, **_missing(suppressed))
 
+    def error(self, event: str, **values: Any) -> None:
+        """Write a line about something that failed here."""
+        suppressed = self._limiter.admit(self._identity, self._clock_s())
+        if suppressed is not None:
+            self._logger.error(event, **values, **_missing(suppressed))
+
 
 def _missing(suppressed: int) -> dict[str, int]:
     return {"suppressed": suppressed} if suppressed else {}

@@ -16,7 +16,6 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import grpc
-import structlog
 
 from mec_server.config import SessionLimits
 from mec_server.peers import Slots, abort, peer_account
@@ -48,8 +47,6 @@ from rfcore.wire.v1 import twin_pb2 as pb
 from rfcore.wire.v1 import twin_pb2_grpc
 
 __all__ = ["RenderCalls", "Sight", "TwinPictures", "TwinService", "encoded", "picture_message"]
-
-log = structlog.get_logger()
 
 
 class TwinPictures:
@@ -211,7 +208,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
         finally:
             self._metrics.consumers.dec()
             self._metrics.ended.labels(end).inc()
-            log.info("consumer ended", peer=context.peer(), reason=str(end))
+            self._slots.log(context).info("consumer ended", reason=str(end))
         if consumer.unread is not None:
             await consumer.unread  # gRPC sends no status before what is being written
             await context.abort(
@@ -411,7 +408,7 @@ class RenderCalls:
                 moving.close()
                 self._metrics.consumers.dec()
                 self._metrics.ended.labels(end).inc()
-                log.info("consumer ended", peer=context.peer(), reason=str(end))
+                self._slots.log(context).info("consumer ended", reason=str(end))
         if moving.unread is not None:
             await moving.unread  # gRPC sends no status before what is being written
             await context.abort(

@@ -30,6 +30,7 @@ import numpy as np
 from mec_server.config import DecoderKind
 from mec_server.decoding.decoders import Decoders, DecoderSettings
 from mec_server.decoding.process import LossCause
+from mec_server.ledger.peer_log import LogLimiter
 from rfcore.camera import Camera
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
@@ -93,7 +94,7 @@ def decoder_rows() -> list[DecoderRow]:
 
 def _decoder(kind: DecoderKind, drive: PrerecordedDrive, opened: ExitStack) -> DeltaDecoder:
     decoders = Decoders(
-        DecoderSettings(kind, as_root=True), _fail, lambda _: None
+        DecoderSettings(kind, as_root=True), _fail, lambda _: None, LogLimiter()
     )  # taking the spare raises
     decoders.start()
     opened.callback(decoders.close)

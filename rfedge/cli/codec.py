@@ -109,6 +109,7 @@ class Decode:
         """Decode every frame; stop at the first packet that fails a check."""
         from mec_server.config import DecoderKind
         from mec_server.decoding.decoders import Decoders, DecoderSettings
+        from mec_server.ledger.peer_log import LogLimiter
         from rfcore.image import write_png
         from rfcore.native.yuv import rgb_from_i420
         from rfcore.raster.renderers import renderer_isa
@@ -122,7 +123,7 @@ class Decode:
         self.out.mkdir(parents=True, exist_ok=True)
         # A decoder of root becomes another user, and nothing but it runs on what the file says.
         settings = DecoderSettings(DecoderKind(self.decoder), as_root=True)
-        decoders = Decoders(settings, count_loss=lambda _: None, start_failed=lambda _: None)
+        decoders = Decoders(settings, lambda _: None, lambda _: None, LogLimiter())
         decoders.start()
         try:
             for decoded in decode_drive(drive, field, decoders.open):

@@ -8,8 +8,10 @@ from typing import Any
 
 import grpc
 import pytest
+from structlog.testing import capture_logs
 
 import mec_server.server
+from mec_server.config import IdentityBudget
 from rfcore.camera import Camera
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
@@ -22,6 +24,7 @@ from rfcore.wire.v1 import field_pb2, field_pb2_grpc, twin_pb2_grpc
 from rfedge.certs.authority import Members, certify, write_certificates
 
 Files = Callable[[str], TlsFiles]
+SUPPRESSED = "rfedge_server_log_lines_suppressed_total"
 MEMBERS = Members(("cav-raw", "cav-1", "cav-2"), ("desk", "other"), operators=("op",))
 
 
@@ -223,3 +226,67 @@ async def test_views_show_what_their_consumer_is_granted(
                 await seen_by(name)
             assert caught.value.code() is grpc.StatusCode.PERMISSION_DENIED
             assert "may not see that tile" in caught.value.details()
+
+
+async def test_calls_that_are_refused_are_charged_for(
+    certs: Files, serve: Any, tmp_path: Path
+) -> None:
+    access = tmp_path / "access.toml"
+    access.write_text('revoked = ["spiffe://rfedge/vehicle/cav-raw"]')
+    budget = IdentityBudget(calls_per_s=5)
+    async with (
+        serve(tls=certs("server"), access=access, identity_budget=budget) as server,
+        channel_to(server.address, certs("vehicle-cav-raw")) as channel,
+        channel_to(server.address, certs("vehicle-cav-1")) as other,
+    ):
+        told = set()
+        async with asyncio.timeout(30):
+            while grpc.StatusCode.RESOURCE_EXHAUSTED not in told:
+                told.add(await channel.stream_stream(STREAM_METHOD)().code())
+        assert grpc.StatusCode.UNAUTHENTICATED in told
+        listing = field_pb2_grpc.FieldServiceStub(other).ListFields(field_pb2.ListFieldsRequest())
+        assert await listing.code() is grpc.StatusCode.OK
+
+
+async def test_lines_about_calls_that_are_refused_are_written_at_a_rate(
+    certs: Files, serve: Any, tmp_path: Path
+) -> None:
+    access = tmp_path / "access.toml"
+    access.write_text('revoked = ["spiffe://rfedge/vehicle/cav-raw"]')
+    calls = 0
+    with capture_logs() as lines:
+        async with (
+            serve(
+                tls=certs("server"), access=access, identity_budget=IdentityBudget(calls_per_s=1e6)
+            ) as server,
+            channel_to(server.address, certs("vehicle-cav-raw")) as channel,
+        ):
+            async with asyncio.timeout(60):
+                while not server.registry.get_sample_value(SUPPRESSED):
+                    calls += 1
+                    code = await channel.stream_stream(STREAM_METHOD)().code()
+                    assert code is grpc.StatusCode.UNAUTHENTICATED
+    assert sum(line["event"] == "call refused" for line in lines) == calls - 1
+
+
+async def test_calls_of_methods_that_there_are_not_are_charged_for(
+    certs: Files, serve: Any
+) -> None:
+    budget = IdentityBudget(calls_per_s=5)
+    async with (
+        serve(tls=certs("server"), identity_budget=budget) as server,
+        channel_to(server.address, certs("vehicle-cav-raw")) as channel,
+    ):
+        unary = channel.unary_unary("/rfcore.wire.v1.EdgeService/Nothing")(b"")
+        assert await unary.code() is grpc.StatusCode.UNIMPLEMENTED
+        assert "no such method" in (await unary.details() or "")
+        told = set()
+        async with asyncio.timeout(30):
+            while grpc.StatusCode.RESOURCE_EXHAUSTED not in told:
+                told.add(await channel.unary_unary("/no.Service/Nothing")(b"").code())
+        assert limited_calls(server) >= 1
+
+
+def limited_calls(server: Any) -> float:
+    labels = {"limit": "identity_calls"}
+    return float(server.registry.get_sample_value("rfedge_server_limited_total", labels))

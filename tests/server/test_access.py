@@ -1,5 +1,6 @@
 """What an access file grants and takes away, as a table; and files that make no sense."""
 
+import os
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -139,3 +140,18 @@ def test_a_file_that_breaks_later_leaves_the_list_before_it(tmp_path: Path) -> N
     path.write_text("revoked = []")
     assert file.refresh()
     assert file.current.consumers == {}
+
+
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(InvalidInput, match="is no file, but a pipe, a folder or a device"):
+            read_access(path)
+
+
+def test_a_long_file_is_not_read_to_its_end(tmp_path: Path) -> None:
+    long = tmp_path / "long.toml"
+    with long.open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(InvalidInput, match="is longer than 4194304 bytes"):
+        read_access(long)

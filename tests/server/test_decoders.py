@@ -19,6 +19,7 @@ from mec_server.decoding.child import LIMITS
 from mec_server.decoding.decoders import Decoders, DecoderSettings, decoder_program
 from mec_server.decoding.pool import ChildDecoder, DecoderPool
 from mec_server.decoding.process import DecoderLost, LossCause
+from mec_server.ledger.peer_log import LogLimiter
 from mec_server.metrics import ServerMetrics
 from rfcore.codec.h264.ffmpeg import EncoderOptions, H264Decoder, PictureKind, encode_pictures
 from rfcore.confinement import start
@@ -217,7 +218,9 @@ def decoders() -> Callable[..., Decoders]:
     """Make decoders; tests may run as root."""
 
     def make(kind: DecoderKind, reachable: bool = True, as_root: bool = True) -> Decoders:
-        return Decoders(DecoderSettings(kind, reachable, as_root), lambda _: None, unexpected)
+        return Decoders(
+            DecoderSettings(kind, reachable, as_root), lambda _: None, unexpected, LogLimiter()
+        )
 
     return make
 
@@ -302,7 +305,7 @@ def test_a_spare_that_cannot_be_started_is_reported_though_nobody_waits_for_it()
 def test_a_lost_decoder_is_counted_by_cause(units: Sequence[bytes]) -> None:
     registry = CollectorRegistry()
     count_loss = ServerMetrics(registry).count_lost_decoder
-    made = Decoders(DecoderSettings(DecoderKind.CHILD), count_loss, unexpected)
+    made = Decoders(DecoderSettings(DecoderKind.CHILD), count_loss, unexpected, LogLimiter())
     made.start()
     decoder: Any = made.open(SIZE_PX)
     os.kill(process_of(decoder), signal.SIGSEGV)
