@@ -68,6 +68,7 @@ def picture_file(where: str, folder: Path, name: str) -> Path | None:
 def read_picture(path: Path, intrinsics: Intrinsics) -> Rgb:
     """Read a picture; raise ``DatasetError`` when its size is not the camera's."""
     check_size(path, intrinsics)
+    _require_length(path, intrinsics)
     _require_whole_jpeg(path)
     rgb = read_rgb(path)
     _require_size(path, (rgb.shape[1], rgb.shape[0]), intrinsics)
@@ -106,6 +107,24 @@ def _require_size(path: Path, size_px: tuple[int, int], intrinsics: Intrinsics) 
         raise DatasetError(
             f"{path}: picture is {size_px[0]}x{size_px[1]} px, its camera says "
             f"{intrinsics.width_px}x{intrinsics.height_px}"
+        )
+
+
+LONGEST_PIXEL_BYTES, LONGEST_HEADER_BYTES = 8, 1 << 20
+"""Four channels of 16 bits, stored; and metadata beside them."""
+
+
+def _require_length(path: Path, intrinsics: Intrinsics) -> None:
+    """FFmpeg, as the search for the end of a JPEG, reads the whole file at once."""
+    pixels = intrinsics.width_px * intrinsics.height_px
+    most_bytes, length_bytes = (
+        pixels * LONGEST_PIXEL_BYTES + LONGEST_HEADER_BYTES,
+        path.stat().st_size,
+    )
+    if length_bytes > most_bytes:
+        raise DatasetError(
+            f"{path}: {length_bytes} bytes are too many for {intrinsics.width_px}x"
+            f"{intrinsics.height_px} px, at most {most_bytes}; save the picture anew"
         )
 
 

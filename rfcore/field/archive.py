@@ -22,6 +22,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
+import stat
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,8 +35,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import FieldFormatError, InvalidInput
+from rfcore.files import DECODED_BYTES
 
-__all__ = ["Archive", "decode_archive", "encode_archive", "read_file"]
+__all__ = [
+    "RAISE_LIMIT",
+    "Archive",
+    "check_array_bytes",
+    "decode_archive",
+    "encode_archive",
+    "read_file",
+]
 
 MAGIC = b"RFFIELD\0"
 VERSION = 1
@@ -45,6 +55,7 @@ MAX_HEADER_BYTES = 1 << 20
 MAX_DIMENSIONS = 4
 MAX_EMPTY_SIZE = 1 << 40
 """Product of an empty array's other sides: numpy refuses shapes beyond 2^63."""
+RAISE_LIMIT = "if you trust the file, raise it (--max-field-gb; RFEDGE_MAX_FIELD_GB for rfedge)"
 DTYPES = ("<f4", "<f2", "<f8", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8")
 
 Array = NDArray[Any]
@@ -86,12 +97,35 @@ def decode_archive(data: bytes, source: str = "field") -> Archive:
         raise FieldFormatError(f"{source}: {damage}") from damage
 
 
-def read_file(path: Path) -> bytes:
-    """Return a file's bytes; raise ``FieldFormatError`` when it cannot be read."""
+def read_file(path: Path, max_bytes: int = DECODED_BYTES) -> bytes:
+    """Return the bytes of a file that may hold a field of ``max_bytes`` of memory.
+
+    No archive is longer than its field, but for its header. Raises ``FieldFormatError`` for one
+    that is, or is no file, before any of it is read, and for one that cannot be read.
+    """
     try:
-        return path.read_bytes()
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise FieldFormatError(f"{path}: is no file, but a pipe, a folder or a device")
+            if status.st_size > max_bytes + MAX_HEADER_BYTES:
+                raise FieldFormatError(
+                    f"{path}: {status.st_size / 1e9:.3g} GB are over the limit of "
+                    f"{max_bytes / 1e9:.3g} GB; {RAISE_LIMIT}"
+                )
+            return file.read(max_bytes + MAX_HEADER_BYTES)
     except OSError as error:
         raise FieldFormatError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def check_array_bytes(archive: Archive, taken_bytes: int, max_bytes: int) -> None:
+    """Raise ``InvalidInput`` if the arrays of an archive take more memory than ``max_bytes``."""
+    if taken_bytes > max_bytes:
+        raise InvalidInput(
+            archive.kind,
+            f"takes {taken_bytes / 1e9:.3g} GB of memory, over the limit of "
+            f"{max_bytes / 1e9:.3g} GB; {RAISE_LIMIT}",
+        )
 
 
 class _Damage(Exception):

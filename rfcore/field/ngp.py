@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
-from rfcore.field.archive import Archive, encode_archive
+from rfcore.field.archive import Archive, check_array_bytes, encode_archive
 from rfcore.field.interface import NGP, Bounds, FieldMetadata, stored_metadata
 from rfcore.field.quality import FULL, Quality
 from rfcore.field.scale import colour_at_scale, view_at_scale
+from rfcore.files import DECODED_BYTES
 from rfcore.native.backend import check_backend
 from rfcore.ngp.native import NgpRenderer
 from rfcore.ngp.shape import HashGrid, Marching, NgpParameters, NgpShape, Space
@@ -73,8 +74,8 @@ def ngp_archive(numbers: NgpParameters, metadata: FieldMetadata) -> Archive:
     return Archive(NGP, {**header, "ngp": _stored_shape(numbers.shape)}, arrays)
 
 
-def ngp_of_archive(archive: Archive) -> NgpParameters:
-    """Return the numbers of an archive.
+def ngp_of_archive(archive: Archive, max_bytes: int = DECODED_BYTES) -> NgpParameters:
+    """Return the numbers of an archive, which take ``max_bytes`` of memory at most.
 
     Raises ``InvalidInput``, ``KeyError`` or ``TypeError`` if it does not hold a hash grid; the
     shape is checked before anything of its size is made.
@@ -85,6 +86,8 @@ def ngp_of_archive(archive: Archive) -> NgpParameters:
     table, matrices = archive.arrays["table"], archive.arrays["matrices"]
     if table.dtype != np.float16:
         raise InvalidInput("ngp.table", f"is {table.dtype}, not float16")
+    taken_bytes = 4 * (table.size + matrices.size + shape.occupancy_words)
+    check_array_bytes(archive, taken_bytes, max_bytes)
     occupancy = _occupancy(shape, archive.arrays["occupancy_at"], archive.arrays["occupancy_words"])
     return NgpParameters(shape, table.astype(np.float32), matrices, occupancy)
 

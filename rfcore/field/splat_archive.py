@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
-from rfcore.field.archive import Archive, Array
+from rfcore.field.archive import RAISE_LIMIT, Archive, Array, check_array_bytes
 from rfcore.field.importance import reordered
 from rfcore.field.integers import Columns, Integers, encode_columns, open_columns
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
@@ -131,8 +131,7 @@ def check_decoded_size(count: int, sh_degree: int, max_bytes: int) -> None:
         raise InvalidInput(
             "splats",
             f"{count} of SH degree {sh_degree} take {size_bytes / 1e9:.2f} GB of memory, over the "
-            f"limit of {max_bytes / 1e9:.2f} GB; if you trust the file, raise it "
-            "(--max-field-gb; RFEDGE_MAX_FIELD_GB for rfedge)",
+            f"limit of {max_bytes / 1e9:.2f} GB; {RAISE_LIMIT}",
         )
 
 
@@ -253,10 +252,11 @@ def splats_of_archive(
     """Return the content of an archive, raw or compressed.
 
     Raises ``InvalidInput`` if it does not hold splats; see also ``splats_of_compressed``. Those of
-    a raw archive take no memory beside the file's.
+    a raw archive take no memory beside the file's, and ``max_bytes`` of it at most.
     """
     if "encoding" in archive.metadata:
         return splats_of_compressed(archive, max_bytes)
+    check_array_bytes(archive, sum(a.nbytes for a in archive.arrays.values()), max_bytes)
     arrays = dict(archive.arrays)
     levels = {
         detail: LevelOfDetail(*(arrays.pop(_own(detail, name)) for name in LEVEL_NAMES))

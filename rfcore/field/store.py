@@ -99,7 +99,7 @@ def _splats(file: FieldFile) -> RadianceField:
 
 
 def _ngp(file: FieldFile) -> RadianceField:
-    numbers = ngp_of_archive(file.archive)
+    numbers = ngp_of_archive(file.archive, file.max_bytes)
     isa = None if is_opencl(file.isa) else file.isa  # hash grids have no kernels for devices
     field = NgpField(numbers, file.metadata, threads=file.threads, isa=isa)
     field.field_id = file.field_id
@@ -135,7 +135,7 @@ def decode_field(
     max_bytes: int = DECODED_BYTES,
     open_base: OpenBase = _no_base,
 ) -> RadianceField:
-    """Return the field of an archive; its splats take ``max_bytes`` of memory at most.
+    """Return the field of an archive; it takes ``max_bytes`` of memory at most.
 
     Raises ``FieldFormatError`` naming ``source`` if it is damaged or larger, and for a layer what
     ``open_base`` raises.
@@ -158,7 +158,7 @@ def load_field(
     path: Path, *, threads: int = 1, isa: str | None = None, max_bytes: int = DECODED_BYTES
 ) -> RadianceField:
     """Read a field archive; raise ``FieldFormatError`` naming the file and what is wrong."""
-    data = read_file(path)
+    data = read_file(path, max_bytes)
 
     def beside(field_id: str) -> RadianceField:
         paths = FieldFolder(path.parent).look().paths
@@ -265,7 +265,7 @@ def load_checked(
 
     Raises ``FieldFormatError``, and for a layer what ``open_base`` raises.
     """
-    data = read_file(path)
+    data = read_file(path, max_bytes)
     _checked_id(data, field_id, str(path))
     return decode_field(
         data, str(path), threads=threads, isa=isa, max_bytes=max_bytes, open_base=open_base

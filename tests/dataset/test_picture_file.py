@@ -74,3 +74,14 @@ def test_a_truncated_picture_is_refused(name: str, share: float, tmp_path: Path)
     path.write_bytes(content[: int(share * len(content))])
     with pytest.raises(DatasetError, match=rf"{path.name}: (truncated|not a readable)"):
         read_picture(path, camera)
+
+
+def test_a_picture_longer_than_its_pixels_can_be_is_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / "long.jpg"
+    assert cv2.imwrite(str(path), RGB)
+    k = Intrinsics(77, 31, 9, 9, 4, 3)
+    assert read_picture(path, k).shape == RGB.shape
+    with path.open("r+b") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(DatasetError, match="1099511627776 bytes are too many for 77x31 px"):
+        read_picture(path, k)

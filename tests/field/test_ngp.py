@@ -120,3 +120,12 @@ def test_a_file_that_makes_no_sense_is_refused_by_name(
     with pytest.raises(FieldFormatError, match=named) as refused:
         decode_field(data, "street.rff")
     assert "street.rff" in str(refused.value)
+
+
+def test_a_grid_takes_no_more_memory_than_it_may(field: NgpField) -> None:
+    data, arrays = encode_field(field), field.archive().arrays
+    occupancy_words = 20 * 10 * 5 // 32 + 1
+    taken_bytes = 4 * (arrays["table"].size + arrays["matrices"].size + occupancy_words)
+    assert decode_field(data, max_bytes=taken_bytes).field_id == field.field_id
+    with pytest.raises(FieldFormatError, match="of memory, over the limit of"):
+        decode_field(data, max_bytes=taken_bytes - 1)

@@ -1,12 +1,14 @@
 """A store gives back what was added, by id, and is never left with half a field."""
 
+import os
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from rfcore.errors import FieldFormatError, UnknownField
 from rfcore.field import FieldStore, SplatField, save_field
-from rfcore.field.store import encode_field
+from rfcore.field.store import decode_field, encode_field, load_checked, load_field
 
 
 def test_an_added_field_is_listed_found_and_loaded(make_gaussians, tmp_path: Path) -> None:
@@ -76,3 +78,27 @@ def test_a_field_damaged_in_the_store_is_refused(make_gaussians, tmp_path: Path)
     path.write_bytes(path.read_bytes()[:-64])
     with pytest.raises(FieldFormatError, match="not the field id"):
         store.load(field_id)
+
+
+def test_a_file_longer_than_its_field_may_be_is_refused_unread(tmp_path: Path) -> None:
+    long, field_id = tmp_path / "long.rff", "0" * 64
+    with long.open("wb") as file:
+        file.truncate(1 << 40)
+    for load in (load_field, partial(load_checked, field_id=field_id)):
+        with pytest.raises(FieldFormatError, match=r"1\.1e\+03 GB are over the limit of 0\.01 GB"):
+            load(long, max_bytes=10**7)
+
+
+def test_a_pipe_is_refused_and_hangs_nobody(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.rff")
+    with pytest.raises(FieldFormatError, match="is no file, but a pipe, a folder or a device"):
+        load_field(tmp_path / "pipe.rff")
+
+
+def test_a_raw_archive_takes_no_more_memory_than_it_may(make_gaussians) -> None:
+    field = SplatField(make_gaussians(40))
+    data = encode_field(field)
+    taken_bytes = sum(array.nbytes for array in field.archive().arrays.values())
+    assert decode_field(data, max_bytes=taken_bytes).primitives == 40
+    with pytest.raises(FieldFormatError, match="of memory, over the limit of"):
+        decode_field(data, max_bytes=taken_bytes - 1)
