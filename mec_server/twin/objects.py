@@ -25,7 +25,7 @@ from mec_server.twin.state import CameraKey
 from mec_server.twin.triangulation import Sighting, placed
 from rfcore.wire.twin_render import StreetObject
 
-__all__ = ["FollowedObject", "ObjectTracker"]
+__all__ = ["FollowedObject", "ObjectTracker", "ToldObjects"]
 
 GATE_M = 1.5
 GATE_PER_M = 0.1
@@ -38,6 +38,7 @@ LARGE_PX = 600
 """On the sample's empty drive the largest contact of all has 248."""
 SURE_BY = 4
 """Pictures that saw an object until nothing is missing from its confidence."""
+REPEAT_S = 0.5
 LEAST_RANGE_M = 0.1
 LEAST_TRUST = 0.7
 """Pictures of the sample's drive among parked and moving vehicles have 0.77 to 0.89; at poses that
@@ -200,3 +201,18 @@ class ObjectTracker:
         begun.take(detection, camera, time_s)
         self._objects.append(begun)
         self._next_id += 1
+
+
+class ToldObjects:
+    """What one consumer is told of a tracker: whenever ``now`` is called, and again at ``again_s``
+    while there is anything, so that what nobody sees any more goes where no pictures come."""
+
+    def __init__(self) -> None:
+        self.tracker = ObjectTracker()
+        self.again_s = math.inf
+
+    def now(self, now: float) -> tuple[StreetObject, ...]:
+        """Return the confirmed objects, as of ``now``."""
+        objects = tuple(each.told(now) for each in self.tracker.confirmed(now))
+        self.again_s = now + REPEAT_S if objects else math.inf
+        return objects

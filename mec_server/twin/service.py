@@ -7,9 +7,10 @@ consumers take no time from the workers that decode.
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,7 +21,7 @@ import grpc
 from mec_server.config import SessionLimits
 from mec_server.peers import Slots, abort, peer_account
 from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
-from mec_server.twin.objects import ObjectTracker
+from mec_server.twin.objects import ToldObjects
 from mec_server.twin.rendering import Place, TwinViews
 from mec_server.twin.state import Covers, Mailbox, Twin, TwinView
 from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded, RfedgeError
@@ -241,11 +242,11 @@ class _Mailed(ABC):
                 ()
             )  # from here on every missed picture is counted
             while not draining.is_set():
-                entry = mailbox.take()
-                if entry is None:
+                work = self._next(mailbox)
+                if work is None:
                     await self._rest(drained)
                     continue
-                writing = asyncio.create_task(self._write(mailbox, entry))
+                writing = asyncio.create_task(work)
                 await asyncio.wait(
                     {writing, drained},
                     timeout=stalled_s,
@@ -263,9 +264,20 @@ class _Mailed(ABC):
             drained.cancel()
             self._twin.unwatch(mailbox)
 
+    def _next(self, mailbox: Mailbox) -> Coroutine[None, None, None] | None:
+        """Return what is to be written now, None for nothing."""
+        entry = mailbox.take()
+        return None if entry is None else self._write(mailbox, entry)
+
+    def _rest_s(self) -> float | None:
+        """How long to wait for an entry; None: until there is one."""
+        return None
+
     async def _rest(self, drained: asyncio.Task[bool]) -> None:
         arrived = asyncio.create_task(self._arrived.wait())
-        await asyncio.wait({arrived, drained}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait(
+            {arrived, drained}, timeout=self._rest_s(), return_when=asyncio.FIRST_COMPLETED
+        )
         arrived.cancel()
         self._arrived.clear()
 
@@ -300,7 +312,7 @@ class _Consumer(_Mailed):
 
 
 class _ObjectsConsumer(_Mailed):
-    """Writes what the pictures show that the field does not have."""
+    """Writes what the pictures show that the field does not have, as of now."""
 
     def __init__(
         self,
@@ -314,25 +326,34 @@ class _ObjectsConsumer(_Mailed):
         self._views = views
         self._metrics = metrics
         self._place = place
-        self._tracker = ObjectTracker()
+        self._told = ToldObjects()
         self._identity, _ = peer_account(context)
 
+    def _next(self, mailbox: Mailbox) -> Coroutine[None, None, None] | None:
+        """Return the next entry's work, or that of telling again what is due."""
+        if time.monotonic() >= self._told.again_s:
+            return self._tell()
+        return super()._next(mailbox)
+
+    def _rest_s(self) -> float | None:
+        again_s = self._told.again_s
+        return max(0.0, again_s - time.monotonic()) if math.isfinite(again_s) else None
+
     async def _write(self, mailbox: Mailbox, entry: TwinView | Departure) -> None:
-        if isinstance(entry, Departure):
-            return
-        try:
-            found = await self._views.detections(entry, self._place, self._identity)
-        except LimitExceeded:  # out of worker time: this picture is missed, as by a slow consumer
-            mailbox.skipped[entry.key] += 1
-            return
-        self._tracker.take(found, entry.key, entry.captured_s)
-        message = objects_to_wire(self._seen(entry.captured_s))
+        if isinstance(entry, TwinView):
+            try:
+                found = await self._views.detections(entry, self._place, self._identity)
+            except LimitExceeded:  # out of worker time: it is missed, as by a slow consumer
+                mailbox.skipped[entry.key] += 1
+                return
+            self._told.tracker.take(found, entry.key, entry.captured_s)
+        await self._tell()
+
+    async def _tell(self) -> None:
+        objects = self._told.now(time.monotonic())
+        message = objects_to_wire(ObjectsSeen(time.time_ns(), self._place.field_id, objects))
         await self._context.write(message)
         self._metrics.bytes.inc(message.ByteSize())
-
-    def _seen(self, now: float) -> ObjectsSeen:
-        objects = tuple(each.told(now) for each in self._tracker.confirmed(now))
-        return ObjectsSeen(time.time_ns(), self._place.field_id, objects)
 
 
 def picture_message(

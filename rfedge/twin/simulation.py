@@ -316,7 +316,9 @@ class ServedStreet:
         return rgb, view.depth, view.live, self._objects
 
     def _read(self) -> None:
-        """Keep the newest objects until the call ends; whoever looks hears why from ``look``."""
+        """Keep the newest objects until the call ends, and none then; whoever looks hears why from
+        ``look``."""
         with suppress(grpc.RpcError):
             for response in self._call:
                 self._objects = objects_from_wire(response).objects
+        self._objects = ()

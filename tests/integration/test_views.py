@@ -271,7 +271,7 @@ async def test_a_view_that_nobody_waits_for_any_more_is_not_drawn(
 async def test_objects_are_what_the_vehicle_sees_and_the_field_does_not_have(
     street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The red box of the drive, once three pictures have shown it."""
+    """The red box of the drive, once three pictures have shown it, until it is forgotten."""
     for name in ("LEAST_PX", "LEAST_COLUMNS", "LEAST_WIDTH_M", "LEAST_MARKED_M"):
         monkeypatch.setattr(contacts, name, 0)  # of a picture of 76x52
     monkeypatch.setattr(contacts, "MOST_SLOPE", 1.0)  # the field is a cloud, without ground
@@ -284,12 +284,17 @@ async def test_objects_are_what_the_vehicle_sees_and_the_field_does_not_have(
             for frame in coded.frames[:4]:
                 await vehicle.told(frame)
                 told.append(objects_from_wire(await call.read()))
+        async with asyncio.timeout(20):
+            while (last := objects_from_wire(await call.read())).objects:
+                assert last.objects[0].unseen_s > 0
+    assert last.time_ns - told[3].time_ns < 3e9, "nothing freezes when the vehicle leaves"
     assert told[0].objects == told[1].objects == ()
     assert {each.field_id for each in told} == {street.field_id}
     assert told[0].time_ns < told[1].time_ns < told[2].time_ns
     thing = told[3].objects[0]
     assert thing.seen_by == (("cav-raw", "front"),)
     assert 0 < thing.confidence <= 1
+    assert thing.unseen_s > 0, "it is told of as of now, not as of the picture's capture"
     assert 2 < thing.at_m[2] < 9, "on the surface behind the box: the field is a cloud at 2 to 8 m"
 
 

@@ -9,7 +9,7 @@ import pytest
 from mec_server.twin.composition import live_picture
 from mec_server.twin.contacts import Detection, detect
 from mec_server.twin.ground import FieldGround
-from mec_server.twin.objects import ObjectTracker
+from mec_server.twin.objects import FORGOTTEN_S, REPEAT_S, ObjectTracker, ToldObjects
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.field import SplatField
 from rfcore.raster.gaussians import Gaussians
@@ -223,3 +223,21 @@ def test_a_picture_that_comes_late_moves_nothing_wildly() -> None:
     (thing,) = tracker.confirmed(0.3)
     assert thing.last_s == 0.3
     assert abs(thing.velocity_mps[0]) < 20
+
+
+def test_objects_are_told_of_as_of_now_and_again_until_none_is_left() -> None:
+    """A mover at 10 m/s whose pictures are 0.2 s old when they are looked at, and then stop."""
+    told = ToldObjects()
+    assert told.now(0.0) == ()
+    assert told.again_s == math.inf, "where nothing is, nothing is told again"
+    for step in range(8):
+        told.tracker.take([at(-4.0 + step)], FRONT, 0.1 * step)
+    (thing,) = told.now(0.9)
+    assert thing.at_m[0] == pytest.approx(5.0, abs=0.3)
+    assert thing.unseen_s == pytest.approx(0.2)
+    counts, now = [], told.again_s
+    assert now == 0.9 + REPEAT_S
+    while math.isfinite(now):
+        counts.append(len(told.now(now)))
+        now = told.again_s
+    assert counts == [1, 0], f"forgotten {FORGOTTEN_S} s after its last picture"

@@ -3,7 +3,9 @@
 import math
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
+import grpc
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,13 +16,17 @@ from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field
 from rfcore.views import PosedPicture
+from rfcore.wire.twin_render import ObjectsSeen, StreetObject, objects_to_wire
+from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.samples import sample_path
+from rfedge.twin import simulation
 from rfedge.twin.simulation import (
     MOST_SPEED_MPS,
     WHEELBASE_M,
     Observation,
     Place,
     RecordedStreet,
+    ServedStreet,
     TwinDrive,
     place_of,
 )
@@ -175,3 +181,29 @@ def test_a_minute_in_the_sample_street_repeats_to_the_byte() -> None:
     first = driven()
     assert first == driven()
     assert len(set(first)) > 100, "it begins anew where the field ends"
+
+
+def test_a_served_street_keeps_no_objects_beyond_its_stream(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    still = (0.0, 0.0, 0.0)
+    thing = StreetObject(1, (1.0, 2.0, 0.0), still, 1.0, 1.0, 1.0, 1.0, 0.1, (("v", "front"),))
+    message = objects_to_wire(ObjectsSeen(1, FIELD.field_id, (thing,)))
+    seen: list[Any] = []
+
+    class Stream:
+        def __iter__(self) -> Any:
+            yield message
+            seen.append(street.look(camera_at())[3])
+            raise grpc.RpcError
+
+        def cancel(self) -> None:
+            pass
+
+    stub = Mock(return_value=Mock(Objects=lambda *_, **__: Stream()))
+    monkeypatch.setattr(twin_pb2_grpc, "TwinServiceStub", stub)
+    monkeypatch.setattr(simulation, "render_view", lambda *_: Mock())
+    with (street := ServedStreet(Mock(), tile="west")):
+        street._reading.join(10)
+        assert [each.object_id for each in seen[0]] == [1]
+        assert street.look(camera_at())[3] == ()

@@ -424,7 +424,7 @@ class ObjectsResponse(_message.Message):
     FIELD_ID_FIELD_NUMBER: _builtins.int
     OBJECTS_FIELD_NUMBER: _builtins.int
     time_ns: _builtins.int
-    """When it was put together, by the server's clock."""
+    """When it was put together, by the server's clock; objects are told of as they are then."""
     field_id: _builtins.str
     """Of the field that the pictures were compared with."""
     @_builtins.property

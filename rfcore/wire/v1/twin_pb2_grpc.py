@@ -84,7 +84,8 @@ class TwinServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def Objects(self, request, context):
-        """Things that the vehicles see and the field does not have, again and again while pictures come.
+        """Things that the vehicles see and the field does not have: with each picture, when a camera
+        leaves, and every half second while there are any; an empty list once when there are none left.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

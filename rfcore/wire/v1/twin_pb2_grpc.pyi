@@ -47,7 +47,9 @@ class TwinServiceStub:
     view, of the newest; `skipped` counts the others.
     """
     Objects: _grpc.UnaryStreamMultiCallable[_twin_pb2.ObjectsRequest, _twin_pb2.ObjectsResponse]
-    """Things that the vehicles see and the field does not have, again and again while pictures come."""
+    """Things that the vehicles see and the field does not have: with each picture, when a camera
+    leaves, and every half second while there are any; an empty list once when there are none left.
+    """
 
 @_typing.type_check_only
 class TwinServiceAsyncStub(TwinServiceStub):
@@ -65,7 +67,9 @@ class TwinServiceAsyncStub(TwinServiceStub):
     view, of the newest; `skipped` counts the others.
     """
     Objects: _aio.UnaryStreamMultiCallable[_twin_pb2.ObjectsRequest, _twin_pb2.ObjectsResponse]  # type: ignore[assignment]
-    """Things that the vehicles see and the field does not have, again and again while pictures come."""
+    """Things that the vehicles see and the field does not have: with each picture, when a camera
+    leaves, and every half second while there are any; an empty list once when there are none left.
+    """
 
 class TwinServiceServicer(metaclass=_abc_1.ABCMeta):
     @_abc_1.abstractmethod
@@ -104,6 +108,8 @@ class TwinServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _twin_pb2.ObjectsRequest,
         context: _ServicerContext,
     ) -> _typing.Union[_abc.Iterator[_twin_pb2.ObjectsResponse], _abc.AsyncIterator[_twin_pb2.ObjectsResponse]]:
-        """Things that the vehicles see and the field does not have, again and again while pictures come."""
+        """Things that the vehicles see and the field does not have: with each picture, when a camera
+        leaves, and every half second while there are any; an empty list once when there are none left.
+        """
 
 def add_TwinServiceServicer_to_server(servicer: TwinServiceServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...
