@@ -128,6 +128,12 @@ class Stream:
         """Whether the vehicle wants to be told of the street."""
         return self._session.takes_notices
 
+    @property
+    def camera_ids(self) -> tuple[str, ...]:
+        """The cameras of its Hello, in their order."""
+        hello = self._session.hello
+        return () if hello is None else tuple(camera.camera_id for camera in hello.cameras)
+
     def uses(self, field_ids: frozenset[str]) -> bool:
         """Whether the vehicle codes against one of these fields."""
         hello = self._session.hello

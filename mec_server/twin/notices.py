@@ -2,12 +2,15 @@
 
 Whoever took notices in Hello is told of every confirmed object (``mec_server.twin.objects``) that
 
-* stands within ``REACH_M`` ahead of the camera of its newest picture, in the same tile,
+* stands within ``REACH_M`` ahead of it, in the same tile,
 * is seen by somebody else's camera, and was not seen by its own within the last second,
+* is not the vehicle itself: further than ``OWN_M`` from where its cameras are and were since,
 
 with a picture that shows it: when it is confirmed and again every ``REPEAT_S`` while that holds,
 the nearest first, at most ``MOST_PER_S`` notices a second. Where a vehicle is known from its
-pictures: one whose pictures have no pose is told nothing of objects.
+pictures: one whose pictures have no pose is told nothing of objects. Ahead is where it drives, by
+the last ``LEAST_WAY_M`` of its way; for one that stands, where its camera ``front`` looks, or else
+the first camera of its Hello.
 
 Pictures are looked at only while a vehicle takes notices, by the thread that composes views: at the
 lowest priority, newest picture first, and charged like a consumer to ``NOTICES_IDENTITY``, so that
@@ -25,6 +28,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from mec_server.twin.metrics import TwinMetrics
 from mec_server.twin.objects import FollowedObject, ObjectTracker
 from mec_server.twin.rendering import Place, TwinViews, place_of
@@ -36,12 +41,25 @@ from rfcore.wire.tiles import Tile
 from rfcore.wire.twin import PictureEncoding, Subscription
 from rfcore.wire.twin_render import ObjectsRequest
 
-__all__ = ["NoticeTaker", "StreamNotices", "StreetNotices", "field_changes"]
+__all__ = [
+    "NoticeTaker",
+    "OwnCamera",
+    "StreamNotices",
+    "StreetNotices",
+    "Whereabouts",
+    "field_changes",
+]
 
 NOTICES_IDENTITY = "server: notices"
 """Whom looking at pictures is charged to."""
 
 REACH_M = 100.0
+OWN_M = 3.5
+"""From a camera of the vehicle's own, 1.5 m above the road, to the foot of its own front, side or
+rear as others see it: 3.2 m on the ground."""
+LEAST_WAY_M, WAY_S = 1.0, 2.0
+"""Who drove less in so long stands."""
+FRONT = "front"
 REPEAT_S = 0.5
 MOST_PER_S = 10
 VALID_S = 1.0
@@ -52,6 +70,9 @@ KNOWN_FOR_S = 2.0
 """How old the picture may be that says where a vehicle is."""
 LOOK_AGAIN_S = 1.0
 """How soon it is noticed that nobody takes notices any more, where no pictures come."""
+
+
+Vec3 = tuple[float, float, float]
 
 
 class NoticeTaker(Protocol):
@@ -65,11 +86,97 @@ class NoticeTaker(Protocol):
     def vehicle_id(self) -> str:
         """Whose stream it is."""
 
+    @property
+    def camera_ids(self) -> tuple[str, ...]:
+        """The cameras of its Hello, in their order."""
+
     def uses(self, field_ids: frozenset[str]) -> bool:
         """Whether the vehicle codes against one of these fields."""
 
     def tell(self, notice: StreetNotice) -> None:
         """Pass a notice on."""
+
+
+@dataclass(frozen=True)
+class OwnCamera:
+    """Where a camera of a vehicle was at the capture of its newest picture, and how it moves."""
+
+    captured_s: float
+    at_m: Vec3
+    velocity_mps: Vec3
+
+    @staticmethod
+    def of(views: Sequence[TwinView]) -> OwnCamera:
+        """Return that of one camera's pictures, all of a known pose, the oldest first."""
+        newest = views[-1]
+        at_m, velocity_mps = _place_of(newest), (0.0, 0.0, 0.0)
+        for view in reversed(views[:-1]):
+            before_m, elapsed_s = _place_of(view), newest.captured_s - view.captured_s
+            if elapsed_s > WAY_S:
+                break
+            if elapsed_s > 0 and math.dist(at_m, before_m) >= LEAST_WAY_M:
+                x, y, z = (a - b for a, b in zip(at_m, before_m, strict=True))
+                velocity_mps = (x / elapsed_s, y / elapsed_s, z / elapsed_s)
+                break
+        return OwnCamera(newest.captured_s, at_m, velocity_mps)
+
+    def at(self, time_s: float) -> Vec3:
+        """Return where it is at another time, if it goes on like this."""
+        elapsed_s = time_s - self.captured_s
+        x, y, z = (a + elapsed_s * v for a, v in zip(self.at_m, self.velocity_mps, strict=True))
+        return x, y, z
+
+    def passed_m(self, point_m: Vec3, from_s: float, to_s: float) -> float:
+        """Return how near it comes to a point between two times."""
+        start_m, end_m = np.array(self.at(from_s)), np.array(self.at(to_s))
+        way_m, length2 = end_m - start_m, float(((end_m - start_m) ** 2).sum())
+        share = float((point_m - start_m) @ way_m) / length2 if length2 else 0.0
+        return float(np.linalg.norm(start_m + min(1.0, max(0.0, share)) * way_m - point_m))
+
+
+@dataclass(frozen=True)
+class Whereabouts:
+    """Where a vehicle is: its cameras, that of its newest picture first, and the direction ahead."""
+
+    cameras: tuple[OwnCamera, ...]
+    ahead: Vec3
+
+    @staticmethod
+    def of(cameras: Sequence[Sequence[TwinView]], camera_ids: Sequence[str]) -> Whereabouts:
+        """Return those of a vehicle by the pictures of its cameras, at least one of one, all of
+        known poses, the oldest first; ``camera_ids``: in the order of its Hello."""
+        newest_first = sorted(cameras, key=lambda views: -views[-1].captured_s)
+        own = tuple(OwnCamera.of(views) for views in newest_first)
+        way = own[0].velocity_mps
+        if any(way):
+            return Whereabouts(own, way)
+        order = (FRONT, *camera_ids, *(views[-1].frame.camera_id for views in newest_first))
+        by_id = {views[-1].frame.camera_id: views[-1] for views in cameras}
+        pose = _pose_of(next(by_id[name] for name in order if name in by_id))
+        origin_m, on_axis_m = pose.apply((0.0, 0.0, 0.0)), pose.apply((0.0, 0.0, 1.0))
+        x, y, z = (a - b for a, b in zip(on_axis_m, origin_m, strict=True))
+        return Whereabouts(own, (x, y, z))
+
+    def distance_ahead_m(self, each: FollowedObject, now: float) -> float | None:
+        """Return how far an object is in front of the vehicle; ``None`` if it is behind it, out of
+        reach, or the vehicle itself."""
+        at_m, eye_m = each.at(now), self.cameras[0].at(now)
+        distance_m = math.dist(at_m, eye_m)
+        along_m = sum((a - b) * c for a, b, c in zip(at_m, eye_m, self.ahead, strict=True))
+        if along_m <= 0 or distance_m > REACH_M:
+            return None
+        if any(own.passed_m(at_m, min(each.last_s, now), now) <= OWN_M for own in self.cameras):
+            return None
+        return distance_m
+
+
+def _pose_of(view: TwinView) -> Pose:
+    assert view.frame.pose is not None
+    return view.frame.pose
+
+
+def _place_of(view: TwinView) -> Vec3:
+    return _pose_of(view).translation_m
 
 
 @dataclass
@@ -92,13 +199,13 @@ class StreamNotices:
         self._recent_s: deque[float] = deque(maxlen=MOST_PER_S)
 
     def about_objects(
-        self, field_id: str, pose: Pose, objects: Iterable[FollowedObject], now: float
+        self, field_id: str, own: Whereabouts, objects: Iterable[FollowedObject], now: float
     ) -> list[StreetNotice]:
-        """Return what a vehicle whose camera is at ``pose`` (world_from_cam) is to be told now."""
+        """Return what the vehicle, which is at ``own``, is to be told now."""
         ahead = []
         for each in objects:
             seen_by = {vehicle_id for vehicle_id, _ in each.seen_by(now)}
-            distance_m = _distance_ahead_m(pose, each, now)
+            distance_m = own.distance_ahead_m(each, now)
             if distance_m is not None and seen_by and self._vehicle_id not in seen_by:
                 ahead.append((distance_m, each, len(seen_by)))
         self._forget(now)
@@ -134,14 +241,6 @@ class StreamNotices:
         """Give what was not told of for so long that it has expired a new number."""
         for key in [key for key, told in self._told.items() if now - told.at_s > VALID_S]:
             del self._told[key]
-
-
-def _distance_ahead_m(pose: Pose, each: FollowedObject, now: float) -> float | None:
-    """Return how far an object is in front of a camera; ``None`` if behind it or out of reach."""
-    at_m = each.at(now)
-    distance_m = math.dist(at_m, pose.translation_m)
-    _, _, along_m = pose.inverse().apply(at_m)
-    return distance_m if along_m > 0 and distance_m <= REACH_M else None
 
 
 def _object_ahead(
@@ -255,13 +354,16 @@ class StreetNotices:
     def _tell_of(
         self, taker: NoticeTaker, place: Place, objects: Sequence[FollowedObject], now: float
     ) -> None:
-        own = self._twin.newest_of(taker.session_id)
-        if own is None or own.frame.pose is None or own.age_s(now) > KNOWN_FOR_S:
+        cameras = [
+            [view for view in views if view.frame.pose is not None]
+            for views in self._twin.cameras_of(taker.session_id)
+            if views[-1].field_id in place.field_ids and views[-1].age_s(now) <= KNOWN_FOR_S
+            if views[-1].frame.pose is not None
+        ]
+        if not cameras:
             return
-        if own.field_id not in place.field_ids:
-            return
-        stream, pose = self._stream(taker), own.frame.pose
-        for notice in stream.about_objects(place.field_id, pose, objects, now):
+        stream, own = self._stream(taker), Whereabouts.of(cameras, taker.camera_ids)
+        for notice in stream.about_objects(place.field_id, own, objects, now):
             self._tell(taker, notice)
 
     def _tell(self, taker: NoticeTaker, notice: StreetNotice) -> None:

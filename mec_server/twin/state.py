@@ -1,4 +1,4 @@
-"""The twin: the newest picture of every camera, and a mailbox for each consumer.
+"""The twin: the newest picture of every camera and some before it, and a mailbox for each consumer.
 
 Without asyncio or clock. ``show`` costs the same whether anybody reads or not: a mailbox holds at
 most the newest picture of a camera and its departure, so a consumer that reads slowly misses
@@ -8,20 +8,28 @@ has: the newest capture wins.
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
-from collections.abc import Callable, Mapping
+import math
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from rfcore.camera import Intrinsics
 from rfcore.image import I420
 from rfcore.wire.messages import Frame
 from rfcore.wire.twin import Departure, Subscription
-from rfcore.wire.twin_render import MAX_AGE_S
+from rfcore.wire.twin_render import DEFAULT_AGE_S, MAX_AGE_S
 
-__all__ = ["CameraKey", "Covers", "Mailbox", "Twin", "TwinView"]
+__all__ = ["PAST_S", "CameraKey", "Covers", "Mailbox", "PastViews", "Twin", "TwinView"]
 
 MAX_DEPARTED = 32
 """Last pictures kept of cameras that left."""
+
+PAST_S = 5.0
+"""How long ago a moment may be of which the pictures are still there."""
+KEPT_S, KEPT_EVERY_S = PAST_S + DEFAULT_AGE_S, 0.2
+"""How long pictures are kept, and how many of one camera: those that vouch for such a moment."""
+MOST_PAST_BYTES = 128 << 20
+"""Of all cameras together: 18 at 640 x 360, 2 at 1920 x 1080. With more the past is shorter."""
 
 CameraKey = tuple[str, str]
 """(vehicle id, camera id)"""
@@ -57,6 +65,11 @@ class TwinView:
     def captured_s(self) -> float:
         """When it was captured, on the server's own clock: no vehicle can claim the future."""
         return self.reconstructed_s - self.latency_s
+
+    @property
+    def picture_bytes(self) -> int:
+        """How much memory its picture takes."""
+        return sum(plane.nbytes for plane in self.picture.planes)
 
     def age_s(self, now: float) -> float:
         """Return the seconds since capture; a clock that is set back makes it no younger."""
@@ -124,10 +137,55 @@ class Mailbox:
         return entry
 
 
+class PastViews:
+    """Pictures that newer ones replaced: of each camera at most one in ``KEPT_EVERY_S``, for
+    ``KEPT_S``, of all together at most ``most_bytes``, of which the oldest go first."""
+
+    def __init__(self, most_bytes: int = MOST_PAST_BYTES) -> None:
+        self._most_bytes = most_bytes
+        self._bytes = 0
+        self._order: deque[TwinView] = deque()
+        self._cameras: dict[CameraKey, deque[TwinView]] = {}
+        self.whole_from_s = -math.inf
+        """Moments before this one lack pictures for want of memory."""
+
+    def keep(self, view: TwinView, now: float) -> None:
+        """Keep a picture that a newer one, of the moment ``now``, replaces."""
+        kept = self._cameras.setdefault(view.key, deque())
+        if not kept or view.captured_s - kept[-1].captured_s >= KEPT_EVERY_S:
+            kept.append(view)
+            self._order.append(view)
+            self._bytes += view.picture_bytes
+        while self._order and now - self._order[0].captured_s > KEPT_S:
+            self._drop()
+        while self._bytes > self._most_bytes:
+            self.whole_from_s = max(self.whole_from_s, self._drop())
+
+    def of(self, key: CameraKey) -> Iterable[TwinView]:
+        """Return the pictures of a camera, the oldest first."""
+        return tuple(self._cameras.get(key, ()))
+
+    def keys(self) -> Iterable[CameraKey]:
+        """Return of which cameras there are any."""
+        return tuple(self._cameras)
+
+    def _drop(self) -> float:
+        """Forget the oldest; return until when it was its camera's newest."""
+        oldest = self._order.popleft()
+        kept = self._cameras[oldest.key]
+        kept.popleft()
+        self._bytes -= oldest.picture_bytes
+        if kept:
+            return kept[0].captured_s
+        del self._cameras[oldest.key]
+        return oldest.captured_s + KEPT_EVERY_S
+
+
 class Twin:
-    """The newest picture of every camera of every vehicle."""
+    """The newest picture of every camera of every vehicle, and some before it."""
 
     def __init__(self) -> None:
+        self._past = PastViews()
         self._views: dict[CameraKey, TwinView] = {}
         self._departed: OrderedDict[CameraKey, TwinView] = OrderedDict()
         self._mailboxes: list[Mailbox] = []
@@ -142,6 +200,9 @@ class Twin:
             and newest.captured_s > view.captured_s
         ):
             return
+        replaced = newest or self._departed.get(view.key)
+        if replaced is not None and replaced.captured_s < view.captured_s:
+            self._past.keep(replaced, view.captured_s)
         self._views[view.key] = view
         self._departed.pop(view.key, None)
         self._tell(view.key, view)
@@ -156,10 +217,13 @@ class Twin:
                     self._departed.popitem(last=False)
                 self._tell(key, Departure(*key))
 
-    def newest_of(self, session_id: str) -> TwinView | None:
-        """Return the picture of a stream that was captured last, of all its cameras."""
-        views = (view for view in self._views.values() if view.session_id == session_id)
-        return max(views, key=lambda view: view.captured_s, default=None)
+    def cameras_of(self, session_id: str) -> list[list[TwinView]]:
+        """Return the kept pictures of each camera that a stream has now, the oldest first."""
+        return [
+            [*(past for past in self._past.of(key) if past.session_id == session_id), view]
+            for key, view in self._views.items()
+            if view.session_id == session_id
+        ]
 
     def recent(self, now: float, max_age_s: float) -> list[TwinView]:
         """Return the newest picture of every camera that is no older than ``max_age_s``, also of

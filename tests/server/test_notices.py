@@ -13,8 +13,10 @@ from mec_server.twin.notices import (
     REACH_M,
     REPEAT_S,
     VALID_S,
+    OwnCamera,
     StreamNotices,
     StreetNotices,
+    Whereabouts,
     field_changes,
 )
 from mec_server.twin.objects import FollowedObject
@@ -26,6 +28,8 @@ FIELD, NEW, DUSK = "ab" * 32, "cd" * 32, "ef" * 32
 NOW = 100.0
 HERE = Pose((0.0, 0.0, 1.5), (0.5, -0.5, 0.5, -0.5))
 """A camera that looks along x, as those of the sample's street."""
+STANDING = OwnCamera(NOW, HERE.translation_m, (0.0, 0.0, 0.0))
+OWN = Whereabouts((STANDING,), (1.0, 0.0, 0.0))
 
 
 def thing(
@@ -37,9 +41,25 @@ def thing(
     )
 
 
-def told(*objects: FollowedObject, stream: StreamNotices | None = None, now: float = NOW) -> list:
+def told(
+    *objects: FollowedObject,
+    stream: StreamNotices | None = None,
+    now: float = NOW,
+    own: Whereabouts = OWN,
+) -> list:
     stream = stream or StreamNotices("me")
-    return stream.about_objects(FIELD, HERE, objects, now)
+    return stream.about_objects(FIELD, own, objects, now)
+
+
+def view(pose: Pose | None, captured_s: float = NOW - 0.1, camera_id: str = "front") -> Mock:
+    frame = Mock(pose=pose, camera_id=camera_id)
+    return Mock(
+        frame=frame, captured_s=captured_s, field_id=FIELD, age_s=lambda now: now - captured_s
+    )
+
+
+def moved(x_m: float, y_m: float = 0.0) -> Pose:
+    return replace(HERE, translation_m=(x_m, y_m, 1.5))
 
 
 def distances_m(given: list[StreetNotice]) -> list[float]:
@@ -70,10 +90,9 @@ async def test_an_object_is_told_of_with_a_picture_that_shows_it(
     tracker = Mock(confirmed=lambda _: [shown, seen_before])
     monkeypatch.setattr(notices, "ObjectTracker", lambda: tracker)
     monkeypatch.setattr(notices.time, "monotonic", lambda: NOW)
-    own = Mock(frame=Mock(pose=HERE), field_id=FIELD, age_s=lambda _: 0.1)
-    twin = Mock(newest_of=lambda _: own)
+    twin = Mock(cameras_of=lambda _: [[view(None), view(HERE)], [view(None, camera_id="rear")]])
     views = Mock(detections=AsyncMock(return_value=[]))
-    taker = Mock(session_id="s", vehicle_id="me", uses=lambda _: True)
+    taker = Mock(session_id="s", vehicle_id="me", camera_ids=("front",), uses=lambda _: True)
     street = StreetNotices(twin, views, lambda: [taker], lambda: (), Mock())
     await street._look_at(picture)
     (notice,) = (call.args[0] for call in taker.tell.call_args_list)
@@ -94,6 +113,65 @@ async def test_an_object_is_told_of_with_a_picture_that_shows_it(
 )
 def test_nothing_is_told_of_what_does_not_concern_it(object_: FollowedObject) -> None:
     assert told(object_) == []
+
+
+BACK = Pose((-1.0, 0.0, 1.5), (0.5, -0.5, -0.5, 0.5))
+"""A camera that looks the other way."""
+
+
+def test_the_other_camera_looks_along_minus_x() -> None:
+    assert BACK.apply((0.0, 0.0, 1.0)) == pytest.approx((-2.0, 0.0, 1.5))
+
+
+def test_a_vehicle_is_not_told_of_itself() -> None:
+    """An oncoming vehicle sees this one's front, 2 m ahead of its camera."""
+    assert told(thing(1, 2.0)) == []
+    assert told(thing(1, 1.0, y_m=-2.5)) == []
+    assert len(told(thing(1, 4.0))) == 1
+    side = replace(STANDING, at_m=(3.5, 0.0, 1.5))
+    assert told(thing(1, 4.0), own=Whereabouts((STANDING, side), OWN.ahead)) == []
+
+
+def test_a_vehicle_that_drives_is_not_told_of_where_it_just_was_or_is_by_now() -> None:
+    """At 20 m/s its newest picture is 0.4 s old; others saw it 0.1 s ago, as standing."""
+    driving = OwnCamera(NOW - 0.4, (0.0, 0.0, 1.5), (20.0, 0.0, 0.0))
+    own = Whereabouts((driving,), (1.0, 0.0, 0.0))
+    assert told(thing(1, 8.0), own=own) == [], "it is at 8 m by now"
+    assert told(thing(1, 6.5), own=own) == []
+    assert told(thing(1, 10.5), own=own) == []
+    (notice,) = told(thing(1, 20.0), own=own)
+    assert distances_m([notice]) == pytest.approx([math.hypot(12.0, 1.5)])
+
+
+def test_ahead_is_the_way_driven_whichever_camera_came_last() -> None:
+    """A rig whose rear camera sent the newest picture, on its way along x, then standing."""
+    front = [view(moved(0.2 * n), NOW - 0.6 + 0.1 * n) for n in range(6)]
+    rear_poses = [replace(BACK, translation_m=(0.2 * n - 2, 0.0, 1.5)) for n in range(6)]
+    rear = [view(p, NOW - 0.59 + 0.1 * n, "rear") for n, p in enumerate(rear_poses)]
+    own = Whereabouts.of([front, rear], ("rear", "front"))
+    assert own.ahead == pytest.approx((2.0, 0.0, 0.0))
+    assert own.cameras[0].at_m == (-1.0, 0.0, 1.5)
+    assert own.distance_ahead_m(thing(1, 20.0), NOW) is not None
+    assert own.distance_ahead_m(thing(1, -20.0), NOW) is None
+    reversing = [view(moved(-0.5 * n), NOW - 0.6 + 0.1 * n) for n in range(6)]
+    assert Whereabouts.of([reversing], ("front",)).distance_ahead_m(thing(1, -20.0), NOW)
+
+
+@pytest.mark.parametrize(
+    ("names", "camera_ids", "ahead"),
+    [
+        (("front", "rear"), ("rear", "front"), 1.0),
+        (("left", "right"), ("left", "right"), 1.0),
+        (("left", "right"), ("right", "left"), -1.0),
+    ],
+    ids=["the one that is called front", "else the first of its Hello", "whichever that is"],
+)
+def test_ahead_of_a_rig_that_stands_is_where_its_first_camera_looks(
+    names: tuple[str, str], camera_ids: tuple[str, str], ahead: float
+) -> None:
+    """The camera of the second name looks back, and its picture came last."""
+    one, other = [view(HERE, NOW - 0.2, names[0])], [view(BACK, NOW - 0.1, names[1])]
+    assert Whereabouts.of([one, other], camera_ids).ahead[0] == pytest.approx(ahead)
 
 
 def test_a_thing_that_its_own_camera_loses_is_told_of() -> None:

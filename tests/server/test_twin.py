@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mec_server.twin.state import Mailbox, Twin, TwinView
+from mec_server.twin.state import KEPT_EVERY_S, KEPT_S, Mailbox, PastViews, Twin, TwinView
 from rfcore.camera import Intrinsics
 from rfcore.image import I420
 from rfcore.wire.messages import Frame
@@ -195,3 +195,33 @@ def test_cameras_that_come_and_go_cost_no_memory(view: MakeView) -> None:
         twin.show(view(f"cav-{number}", session=f"s-{number}"))
         twin.leave(f"s-{number}")
     assert len(twin.recent(10.0, 2.0)) == 32
+
+
+def test_pictures_before_the_newest_are_kept_one_in_a_while_and_not_for_ever(
+    view: MakeView,
+) -> None:
+    twin = Twin()
+    for number in range(200):
+        twin.show(replace(view(sequence=number), reconstructed_s=0.05 * number))
+    (pictures,) = twin.cameras_of("s-1")
+    times_s = [picture.captured_s for picture in pictures]
+    assert times_s[-1] == pytest.approx(0.05 * 199 - 0.25)
+    assert times_s[-1] - times_s[0] == pytest.approx(KEPT_S, abs=0.3)
+    gaps_s = np.diff(times_s[:-1])
+    assert (gaps_s >= KEPT_EVERY_S - 1e-9).all()
+    assert gaps_s.max() < KEPT_EVERY_S + 0.1
+    assert twin.cameras_of("s-2") == []
+
+
+def test_the_past_of_all_cameras_has_a_limit_and_says_from_when_on_it_is_whole(
+    view: MakeView,
+) -> None:
+    past = PastViews(most_bytes=10 * view().picture_bytes)
+    assert view().picture_bytes == 6
+    for number in range(30):
+        for vehicle in ("cav-1", "cav-2"):
+            kept = replace(view(vehicle, sequence=number), reconstructed_s=0.25 + 0.25 * number)
+            past.keep(kept, kept.captured_s)
+    counts = {key: len(list(past.of(key))) for key in past.keys()}
+    assert counts == {("cav-1", "front"): 5, ("cav-2", "front"): 5}
+    assert past.whole_from_s == 0.25 * 25
