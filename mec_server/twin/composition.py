@@ -33,10 +33,13 @@ from mec_server.twin.patches import Standing, draw_standing, in_front_of
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import I420, Rgb
 from rfcore.native.live_view import (
+    ABSOLUTE_DEPTH_M,
     COVERED,
     MOST_DISTANCE_M,
+    NEAREST_M,
     NOBODY,
     OWN_LIGHT,
+    RELATIVE_DEPTH,
     Canvas,
     Light,
     LiveSource,
@@ -66,6 +69,9 @@ MOST_CAMERAS = 4
 
 MOST_DISAGREEMENT = 0.5
 """Share of a picture; one that differs in more is taken to be somewhere else."""
+
+LOOKED_FOR_M, SOMETHING = 25.0, 0.2
+"""Things further away may be too small to be found."""
 
 MOST_GAIN = 4.0
 SAME_GAIN, SAME_OFFSET = 0.05, 4.0
@@ -107,6 +113,29 @@ class LivePicture:
     changed: Mask
     colour: F32
     things: tuple[Standing, ...] = ()
+
+    def lacks(self, at_m: tuple[float, float, float], width_m: float, height_m: float) -> bool:
+        """Return whether it should show a thing whose foot is at ``at_m`` and does not.
+
+        It should where the foot is in the picture, within ``LOOKED_FOR_M``, and no surface of the
+        field is before it; it does not where less than ``SOMETHING`` of the thing's box differs
+        from the field. A picture that is outvoted says nothing.
+        """
+        k = self.camera.intrinsics
+        x_m, y_m, z_m = self.camera.cam_from_world().apply(at_m)
+        if self.trust == 0 or not NEAREST_M < z_m <= LOOKED_FOR_M:
+            return False
+        foot_px = round(k.fy_px * y_m / z_m + k.cy_px - 0.5)
+        middle_px = round(k.fx_px * x_m / z_m + k.cx_px - 0.5)
+        half_px = max(1, round(k.fx_px * width_m / z_m / 2))
+        top_px = max(0, foot_px - max(1, round(k.fy_px * height_m / z_m)))
+        if not (half_px <= middle_px < k.width_px - half_px and 0 < foot_px < k.height_px - 1):
+            return False
+        surface_m = float(self.depth[foot_px, middle_px])
+        if surface_m < z_m * (1 - RELATIVE_DEPTH) - ABSOLUTE_DEPTH_M:
+            return False
+        box = (slice(top_px, foot_px), slice(middle_px - half_px, middle_px + half_px + 1))
+        return float(self.changed[box].mean()) < SOMETHING
 
 
 @dataclass(frozen=True, eq=False)

@@ -136,7 +136,7 @@ class OwnCamera:
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Where a vehicle is: its cameras, that of its newest picture first, and the direction ahead."""
+    """Where a vehicle is: its cameras, the one of its newest picture first; and where ahead is."""
 
     cameras: tuple[OwnCamera, ...]
     ahead: Vec3
@@ -336,11 +336,11 @@ class StreetNotices:
             self._trackers.pop(place.field_ids, None)
             return
         try:
-            found = await self._views.detections(seen, place, NOTICES_IDENTITY)
+            glance = await self._views.glance(seen, place, NOTICES_IDENTITY)
         except LimitExceeded:
             return
         tracker = self._trackers.setdefault(place.field_ids, ObjectTracker())
-        tracker.take(found, seen.key, seen.captured_s)
+        tracker.take(glance.detections, seen.key, seen.captured_s, glance.lacks)
         now = time.monotonic()
         objects = [
             each

@@ -8,8 +8,14 @@ A detection (``mec_server.twin.contacts``) belongs to the nearest object not fur
 nearest pair first. Where an object is, and whether it moves, is what its sightings of the last
 ``REMEMBERED_S`` say together (``mec_server.twin.triangulation``), those of all cameras alike.
 
-One is *confirmed* by a third picture, by a second one where that is of another vehicle, and at once
-where its pictures have ``LARGE_PX`` marked pixels of it. It is *doubtful* while every picture that
+What counts is a vehicle at an instant, not a picture: the cameras of a rig see one moment together,
+and with one pose. Pictures of a vehicle within ``SAME_INSTANT_S`` are of one instant.
+
+One is *confirmed* by a third instant, by a second one where that is of another vehicle, and at once
+where its instants have ``LARGE_PX`` marked pixels of it. It is *missed* by a picture that should
+show it and shows the field there instead (``LivePicture.lacks``), at an instant at which no other
+picture of the vehicle shows it; its *confidence* is the share of the last ``LOOKS`` instants that
+did not miss it, less after few. It is *doubtful* while every picture that
 showed it lately is trusted less than ``LEAST_TRUST``, as with a wrong pose, which shows things
 wherever the field has edges. It is forgotten ``FORGOTTEN_S`` after its last.
 """
@@ -17,7 +23,8 @@ wherever the field has edges. It is forgotten ``FORGOTTEN_S`` after its last.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from mec_server.twin.contacts import Detection
@@ -25,11 +32,14 @@ from mec_server.twin.state import CameraKey
 from mec_server.twin.triangulation import Sighting, placed
 from rfcore.wire.twin_render import StreetObject
 
-__all__ = ["FollowedObject", "ObjectTracker", "ToldObjects"]
+__all__ = ["FollowedObject", "Lacks", "ObjectTracker", "ToldObjects"]
 
 GATE_M = 1.5
 GATE_PER_M = 0.1
 REMEMBERED_S, MOST_REMEMBERED = 1.0, 12
+"""Sightings from which its place is told: of so many instants."""
+SAME_INSTANT_S = 0.01
+LOOKS = 40
 MOST_SPEED_MPS = 60.0
 SEEN_BY_S = 1.0
 FORGOTTEN_S = 1.0
@@ -37,7 +47,7 @@ CONFIRMED_BY = 3
 LARGE_PX = 600
 """On the sample's empty drive the largest contact of all has 248."""
 SURE_BY = 4
-"""Pictures that saw an object until nothing is missing from its confidence."""
+"""Instants that saw an object until nothing is missing from its confidence."""
 REPEAT_S = 0.5
 LEAST_RANGE_M = 0.1
 LEAST_TRUST = 0.7
@@ -45,19 +55,43 @@ LEAST_TRUST = 0.7
 are off by 0.5 m and 1 degree 0.57 to 0.68, on the empty street by 1 m and 2 degrees 0.65."""
 
 Vec3 = tuple[float, float, float]
+Lacks = Callable[[Vec3, float, float], bool]
+"""Whether a picture should show a thing of a width and height (metres) at a place, and does not."""
+
+
+@dataclass(frozen=True)
+class _Instant:
+    """A vehicle at a moment."""
+
+    vehicle_id: str
+    time_s: float
+
+    def is_of(self, camera: CameraKey, time_s: float) -> bool:
+        """Whether a picture belongs to it."""
+        return camera[0] == self.vehicle_id and abs(time_s - self.time_s) <= SAME_INSTANT_S
+
+
+@dataclass
+class _Look:
+    """What one instant says of an object. ``marked_px``: the most in one of its pictures; none: it
+    missed it."""
+
+    instant: _Instant
+    marked_px: int = 0
 
 
 @dataclass(frozen=True)
 class _Seen:
     """An object in one picture."""
 
+    instant: _Instant
     time_s: float
     detection: Detection
 
 
 @dataclass
 class FollowedObject:
-    """A thing over time. ``seen``: pictures that showed it; ``cameras``: when each saw it last;
+    """A thing over time. ``seen``: instants that showed it; ``cameras``: when each saw it last;
     ``marked_px``: of how many marked pixels it is in all of them."""
 
     object_id: int
@@ -71,10 +105,11 @@ class FollowedObject:
     cameras: dict[CameraKey, float] = field(default_factory=dict)
     marked_px: int = 0
     _sightings: list[_Seen] = field(default_factory=list, init=False)
+    _looks: deque[_Look] = field(default_factory=lambda: deque(maxlen=LOOKS), init=False)
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether enough pictures showed it."""
+        """Whether enough instants showed it."""
         agreed = len({vehicle_id for vehicle_id, _ in self.cameras}) > 1
         return self.seen >= CONFIRMED_BY - agreed or self.marked_px >= LARGE_PX
 
@@ -85,9 +120,12 @@ class FollowedObject:
         return trust < LEAST_TRUST
 
     def confidence(self, now: float) -> float:
-        """Return 0 to 1: less after few pictures, and while nobody sees it."""
+        """Return 0 to 1: less after few instants, by how many missed it, and while nobody sees
+        it."""
         fresh = max(0.0, 1.0 - max(0.0, now - self.last_s) / FORGOTTEN_S)
-        return fresh * min(1.0, self.seen / SURE_BY)
+        missed = sum(not look.marked_px for look in self._looks)
+        agreed = 1.0 - missed / max(1, len(self._looks))
+        return fresh * agreed * min(1.0, self.seen / SURE_BY)
 
     def seen_by(self, now: float) -> list[CameraKey]:
         """Return the cameras that saw it lately, sorted."""
@@ -118,31 +156,55 @@ class FollowedObject:
 
     def take(self, detection: Detection, camera: CameraKey, time_s: float) -> None:
         """Move to where a picture of ``camera`` and those before it show it."""
+        look = self._look(camera, time_s)
+        self.seen += not look.marked_px
+        marked_px = max(look.marked_px, detection.marked_px, 1)
+        self.marked_px += marked_px - look.marked_px
+        look.marked_px = marked_px
         self.last_s = max(self.last_s, time_s)
-        self._sightings.append(_Seen(time_s, detection))
-        self._sightings = [
-            each for each in self._sightings if self.last_s - each.time_s <= REMEMBERED_S
-        ][-MOST_REMEMBERED:]
-        placement = placed([_sighting(each) for each in self._sightings])
-        self.at_m = (*placement.at_m, self._foot_z_m())
+        self._remember(_Seen(look.instant, time_s, detection))
+        shared = Counter(each.instant for each in self._sightings)
+        votes = [1 / shared[each.instant] for each in self._sightings]
+        sightings = zip(self._sightings, votes, strict=True)
+        placement = placed([_sighting(each, vote) for each, vote in sightings])
+        self.at_m = (*placement.at_m, self._foot_z_m(votes))
         speed_mps = math.hypot(*placement.velocity_mps)
         slower = min(1.0, MOST_SPEED_MPS / speed_mps) if speed_mps else 1.0
         vx_mps, vy_mps = placement.velocity_mps
         self.velocity_mps = (slower * vx_mps, slower * vy_mps, 0.0)
         self.width_m, self.height_m = detection.width_m, detection.height_m
-        self.marked_px += detection.marked_px
-        self.seen += 1
         self.cameras[camera] = time_s
 
-    def _foot_z_m(self) -> float:
+    def miss(self, camera: CameraKey, time_s: float) -> None:
+        """Take in that a picture should show it and does not."""
+        self._look(camera, time_s)
+
+    def _look(self, camera: CameraKey, time_s: float) -> _Look:
+        """Return what the instant of a picture says of it, so far."""
+        for look in reversed(self._looks):
+            if look.instant.is_of(camera, time_s):
+                return look
+        begun = _Look(_Instant(camera[0], time_s))
+        self._looks.append(begun)
+        return begun
+
+    def _remember(self, seen: _Seen) -> None:
+        """Add a sighting, and forget those that are too old or too many."""
+        self._sightings.append(seen)
+        late = [each for each in self._sightings if self.last_s - each.time_s <= REMEMBERED_S]
+        instants = list(dict.fromkeys(each.instant for each in late))[-MOST_REMEMBERED:]
+        self._sightings = [each for each in late if each.instant in instants]
+
+    def _foot_z_m(self, votes: Sequence[float]) -> float:
         """Return the height of its foot: the mean, weighted as ranges are."""
-        weights = [1 / each.detection.along_sigma_m**2 for each in self._sightings]
+        seen = zip(self._sightings, votes, strict=True)
+        weights = [vote / each.detection.along_sigma_m**2 for each, vote in seen]
         heights_m = [each.detection.at_m[2] for each in self._sightings]
         return sum(w * z for w, z in zip(weights, heights_m, strict=True)) / sum(weights)
 
 
-def _sighting(seen: _Seen) -> Sighting:
-    """Return on the ground what a picture says of where an object is."""
+def _sighting(seen: _Seen, vote: float) -> Sighting:
+    """Return on the ground what a picture says of where an object is, and how much that counts."""
     detection = seen.detection
     x_m, y_m = (detection.at_m[axis] - detection.eye_m[axis] for axis in (0, 1))
     range_m = max(math.hypot(x_m, y_m), LEAST_RANGE_M)
@@ -153,6 +215,7 @@ def _sighting(seen: _Seen) -> Sighting:
         detection.across_sigma_m / range_m,
         range_m,
         detection.along_sigma_m,
+        vote,
     )
 
 
@@ -163,8 +226,15 @@ class ObjectTracker:
         self._objects: list[FollowedObject] = []
         self._next_id = 1
 
-    def take(self, detections: Sequence[Detection], camera: CameraKey, time_s: float) -> None:
-        """Take in what one picture of ``camera``, captured at ``time_s``, shows."""
+    def take(
+        self,
+        detections: Sequence[Detection],
+        camera: CameraKey,
+        time_s: float,
+        lacks: Lacks = lambda _at_m, _width_m, _height_m: False,
+    ) -> None:
+        """Take in what one picture of ``camera``, captured at ``time_s``, shows, and of which
+        things it says that they are not there (``lacks``)."""
         self._objects = [each for each in self._objects if time_s - each.last_s <= FORGOTTEN_S]
         pairs = sorted(
             (distance_m, each.object_id, index)
@@ -179,6 +249,9 @@ class ObjectTracker:
             if object_id in by_id and index in free:
                 by_id.pop(object_id).take(detections[index], camera, time_s)
                 free.discard(index)
+        for each in by_id.values():
+            if lacks(each.at(time_s), each.width_m, each.height_m):
+                each.miss(camera, time_s)
         for index in sorted(free):
             self._begin(detections[index], camera, time_s)
 

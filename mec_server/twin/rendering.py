@@ -32,6 +32,7 @@ from mec_server.twin.composition import (
 )
 from mec_server.twin.contacts import Detection, find
 from mec_server.twin.ground import FieldGround
+from mec_server.twin.objects import Lacks
 from mec_server.twin.state import CameraKey, Covers, Twin, TwinView
 from rfcore.camera import Camera
 from rfcore.errors import AccessDenied, InvalidInput
@@ -51,7 +52,7 @@ from rfcore.wire.twin_render import (
     ViewRequest,
 )
 
-__all__ = ["Place", "TwinViews", "check_inside", "place_of"]
+__all__ = ["Glance", "Place", "TwinViews", "check_inside", "place_of"]
 
 R = TypeVar("R")
 
@@ -84,6 +85,15 @@ def place_of(request: ViewRequest | ObjectsRequest, tiles: Sequence[Tile]) -> Pl
         return Place(request.field_id, frozenset((request.field_id,)))
     here = ", ".join(tile.name for tile in tiles) or "none; name a field_id"
     raise InvalidInput("tile", f"{shown(request.tile)} is not published here; published: {here}")
+
+
+@dataclass(frozen=True, eq=False)
+class Glance:
+    """What a picture says of things that the field does not have: those it shows, and of which it
+    says that they are not there."""
+
+    detections: list[Detection]
+    lacks: Lacks = lambda _at_m, _width_m, _height_m: False
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,13 +159,14 @@ class TwinViews:
         ]
         return await self._on_thread(identity, partial(self._composed, request, place, recent))
 
-    async def detections(self, seen: TwinView, place: Place, identity: str) -> list[Detection]:
-        """Return what a picture shows that the field of ``place`` does not have.
+    async def glance(self, seen: TwinView, place: Place, identity: str) -> Glance:
+        """Return what a picture shows that the field of ``place`` does not have; nothing for one
+        without a pose.
 
         Raises ``LimitExceeded`` while ``identity`` has spent its worker time.
         """
         if seen.frame.pose is None:
-            return []
+            return Glance([])
         return await self._on_thread(identity, partial(self._detected, seen, place))
 
     def place(
@@ -231,8 +242,9 @@ class TwinViews:
             cameras=cameras,
         )
 
-    def _detected(self, seen: TwinView, place: Place) -> list[Detection]:
-        return self._looked_at(seen, self._open_field(place.field_id)).detections
+    def _detected(self, seen: TwinView, place: Place) -> Glance:
+        looked = self._looked_at(seen, self._open_field(place.field_id))
+        return Glance(looked.detections, looked.live.lacks)
 
     def _ground(self, field: RadianceField) -> FieldGround:
         """Return the ground of ``field``; what of it was drawn is kept."""

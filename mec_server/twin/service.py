@@ -342,11 +342,12 @@ class _ObjectsConsumer(_Mailed):
     async def _write(self, mailbox: Mailbox, entry: TwinView | Departure) -> None:
         if isinstance(entry, TwinView):
             try:
-                found = await self._views.detections(entry, self._place, self._identity)
+                glance = await self._views.glance(entry, self._place, self._identity)
             except LimitExceeded:  # out of worker time: it is missed, as by a slow consumer
                 mailbox.skipped[entry.key] += 1
                 return
-            self._told.tracker.take(found, entry.key, entry.captured_s)
+            seen_s = entry.captured_s
+            self._told.tracker.take(glance.detections, entry.key, seen_s, glance.lacks)
         await self._tell()
 
     async def _tell(self) -> None:

@@ -165,7 +165,7 @@ class PastViews:
         """Return the pictures of a camera, the oldest first."""
         return tuple(self._cameras.get(key, ()))
 
-    def keys(self) -> Iterable[CameraKey]:
+    def cameras(self) -> Iterable[CameraKey]:
         """Return of which cameras there are any."""
         return tuple(self._cameras)
 

@@ -14,7 +14,9 @@ last round (Stansfield, Proc. IEE 94 IIIA, 1947). A thing stands, v = 0, unless 
 sightings better by ``EVIDENCE``.
 
 A sighting that the others contradict, like that of a camera with a wrong pose, is outvoted: the one
-that is furthest off is left out while that is more than ``LIMIT_SIGMAS`` and most remain.
+that is furthest off is left out while that is more than ``LIMIT_SIGMAS`` and most remain. Sightings
+of one vehicle at one moment share one ``vote``, which weighs their squared errors as well: they err
+together where its pose does.
 """
 
 from __future__ import annotations
@@ -36,6 +38,8 @@ EVIDENCE = 4.0
 """By how much the sum of squared errors, in sigmas, falls for a thing that moves: what stands, with
 errors as stated, is taken for moving in 14 % of cases (chi-square, two degrees of freedom)."""
 LIMIT_SIGMAS = 4.0
+TIE = 1e-9
+"""Halves of all votes that differ by less, relatively, are equal: shares are rounded."""
 LEAST_TO_MOVE, LEAST_SPAN_S = 3, 0.05
 """Sightings, and the time between the first and the last, that can tell of a velocity."""
 BEARING_ROUNDS = 6
@@ -48,9 +52,11 @@ F64 = NDArray[np.float64]
 @dataclass(frozen=True)
 class Sighting:
     """A thing seen from ``eye_m`` (x, y) at ``time_s``, in the direction ``bearing_rad`` from x
-    towards y, ``range_m`` away on the ground; ``None``: its foot was not seen.
+    towards y, ``range_m`` away on the ground; ``None``: its foot was not seen. ``vote``: how much
+    it counts.
 
-    Raises ``InvalidInput`` for a value that is not finite, or a sigma or range that is not above 0.
+    Raises ``InvalidInput`` for a value that is not finite, or a sigma, range or vote that is not
+    above 0.
     """
 
     time_s: float
@@ -59,6 +65,7 @@ class Sighting:
     bearing_sigma_rad: float
     range_m: float | None = None
     range_sigma_m: float = 0.0
+    vote: float = 1.0
 
     def __post_init__(self) -> None:
         given = (self.time_s, *self.eye_m, self.bearing_rad)
@@ -66,6 +73,8 @@ class Sighting:
             raise InvalidInput("sighting", f"time, place and bearing {given} are not all finite")
         if not 0 < self.bearing_sigma_rad < math.inf:
             raise InvalidInput("sighting.bearing_sigma_rad", _not_above_0(self.bearing_sigma_rad))
+        if not 0 < self.vote < math.inf:
+            raise InvalidInput("sighting.vote", _not_above_0(self.vote))
         if self.range_m is not None:
             for name, value in (("range_m", self.range_m), ("range_sigma_m", self.range_sigma_m)):
                 if not 0 < value < math.inf:
@@ -112,6 +121,7 @@ class _Rays:
     range_m: F64
     range_sigma_m: F64
     bearing_sigma_rad: F64
+    votes: F64
 
     @staticmethod
     def of(sightings: Sequence[Sighting]) -> _Rays:
@@ -127,6 +137,7 @@ class _Rays:
             np.array(ranges, np.float64),
             np.array([each.range_sigma_m for each in sightings], np.float64),
             np.array([each.bearing_sigma_rad for each in sightings], np.float64),
+            np.array([each.vote for each in sightings], np.float64),
         )
 
     def __getitem__(self, chosen: NDArray[np.intp]) -> _Rays:
@@ -151,12 +162,12 @@ class _Fit:
 
 def _majority(rays: _Rays, *, moves: bool) -> _Fit:
     """Return the fit to those sightings that do not contradict it, at least most of them."""
-    count = len(rays.elapsed_s)
-    kept = np.arange(count)
+    kept, total = np.arange(len(rays.votes)), float(rays.votes.sum())
     while True:
         fit = _fitted(rays[kept], kept, moves=moves)
         worst = int(np.argmax(fit.off))
-        if fit.off[worst] <= LIMIT_SIGMAS or 2 * (len(kept) - 1) <= count:
+        left = float(np.delete(rays.votes[kept], worst).sum())
+        if fit.off[worst] <= LIMIT_SIGMAS or 2 * left <= total * (1 + TIE):
             break
         kept = np.delete(kept, worst)
     if np.isinf(fit.off).any():
@@ -165,7 +176,7 @@ def _majority(rays: _Rays, *, moves: bool) -> _Fit:
         fit.state,
         fit.covariance_m2,
         fit.off,
-        fit.cost + LIMIT_SIGMAS**2 * (count - len(kept)),
+        fit.cost + LIMIT_SIGMAS**2 * (total - float(rays.votes[kept].sum())),
         kept,
     )
 
@@ -188,7 +199,7 @@ def _fitted(rays: _Rays, kept: NDArray[np.intp], *, moves: bool) -> _Fit:
         along_m = (at_m * rays.towards).sum(axis=1)
         distance_m = np.where(seen, rays.range_m, np.maximum(np.linalg.norm(at_m, axis=1), 0.1))
     errors = terms @ state[: terms.shape[1]] - sides
-    squares = errors[: len(kept)] ** 2 + errors[len(kept) : 2 * len(kept)] ** 2
+    squares = (errors[: len(kept)] ** 2 + errors[len(kept) : 2 * len(kept)] ** 2) / rays.votes
     off = np.where(~seen & (along_m <= 0), np.inf, np.sqrt(squares))
     covariance = np.asarray(np.linalg.inv(normal)[:2, :2], np.float64)
     return _Fit(state, covariance, off, float((errors**2).sum()), kept)
@@ -199,8 +210,9 @@ def _equations(
 ) -> tuple[F64, F64]:
     """Return terms [2 N, 2] for what stands, [2 N + 2, 4] for what moves, and the right sides: all
     in sigmas; along the directions first, then across, then the velocity's own."""
-    along = np.where(seen, 1 / np.where(seen, rays.range_sigma_m, 1.0), 0.0)
-    across = 1 / (rays.bearing_sigma_rad * distance_m)
+    weight = np.sqrt(rays.votes)
+    along = np.where(seen, weight / np.where(seen, rays.range_sigma_m, 1.0), 0.0)
+    across = weight / (rays.bearing_sigma_rad * distance_m)
     terms = np.concatenate([rays.towards * along[:, None], rays.across * across[:, None]])
     ranges_m = np.where(seen, rays.range_m, 0.0) + (rays.towards * rays.eye_m).sum(axis=1)
     sides = np.concatenate([ranges_m * along, (rays.across * rays.eye_m).sum(axis=1) * across])

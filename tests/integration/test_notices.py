@@ -77,8 +77,8 @@ def looked_at(monkeypatch: pytest.MonkeyPatch) -> list[LivePicture]:
 async def test_what_one_vehicle_sees_another_is_told(
     street: Any, coded: Any, serve: Any, raw_vehicle: Any, looked_at: list[LivePicture]
 ) -> None:
-    """The first vehicle's pictures have a red box. The second, four metres behind, sends one picture,
-    of the bare field."""
+    """The first vehicle's pictures have a red box. The second, four metres behind, sends one
+    picture, of the bare field."""
     notices: list[StreetNotice] = []
     behind = Pose((0.0, 0.0, -4.0), (1.0, 0.0, 0.0, 0.0))
     async with serve() as server, raw_vehicle(server.address) as first:

@@ -20,6 +20,7 @@ from mec_server.twin.notices import (
     field_changes,
 )
 from mec_server.twin.objects import FollowedObject
+from mec_server.twin.rendering import Glance
 from rfcore.camera import Pose
 from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
 from rfcore.wire.tiles import Tile, TileLight
@@ -91,7 +92,7 @@ async def test_an_object_is_told_of_with_a_picture_that_shows_it(
     monkeypatch.setattr(notices, "ObjectTracker", lambda: tracker)
     monkeypatch.setattr(notices.time, "monotonic", lambda: NOW)
     twin = Mock(cameras_of=lambda _: [[view(None), view(HERE)], [view(None, camera_id="rear")]])
-    views = Mock(detections=AsyncMock(return_value=[]))
+    views = Mock(glance=AsyncMock(return_value=Glance([])))
     taker = Mock(session_id="s", vehicle_id="me", camera_ids=("front",), uses=lambda _: True)
     street = StreetNotices(twin, views, lambda: [taker], lambda: (), Mock())
     await street._look_at(picture)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mec_server.twin.composition import live_picture
+from mec_server.twin.composition import LivePicture, live_picture
 from mec_server.twin.contacts import Detection, detect
 from mec_server.twin.ground import FieldGround
 from mec_server.twin.objects import FORGOTTEN_S, REPEAT_S, ObjectTracker, ToldObjects
@@ -167,6 +167,83 @@ def test_what_is_large_is_confirmed_at_once_and_what_two_vehicles_see_by_the_sec
     assert len(tracker.confirmed(0.05)) == 1, "a vehicle's own cameras are one witness"
     tracker.take([at(-4.0)], ("cav-2", "front"), 0.05)
     assert [round(thing.at_m[0]) for thing in tracker.confirmed(0.05)] == [-4, 0]
+
+
+RIG = tuple(("cav-1", name) for name in ("front", "left", "right"))
+
+
+def test_the_cameras_of_a_rig_are_one_witness_of_an_instant() -> None:
+    """Three pictures of one instant, of 250 marked pixels each, which come in any order."""
+    tracker = ObjectTracker()
+    for instant, time_s in enumerate((0.0, 0.1, 0.2)):
+        for number, camera in enumerate(RIG):
+            tracker.take([at(1.0, marked_px=250)], camera, time_s + 0.001 * number)
+            assert len(tracker.confirmed(time_s)) == (instant == 2)
+    (thing,) = tracker.confirmed(0.2)
+    assert thing.seen == 3
+    assert thing.marked_px == 750, "of each instant the picture that shows most of it"
+    assert thing.confidence(0.202) == pytest.approx(0.75)
+
+
+def test_a_rig_with_a_wrong_pose_moves_a_thing_no_more_than_one_camera_does() -> None:
+    placed_m = []
+    for cameras in (RIG[:1], RIG):
+        tracker = ObjectTracker()
+        for step in range(4):
+            time_s = 0.1 * step
+            for vehicle in ("cav-2", "cav-3"):
+                tracker.take([at(1.0)], (vehicle, "front"), time_s)
+            for camera in cameras:
+                tracker.take([at(2.2)], camera, time_s)
+        (thing,) = tracker.confirmed(0.3)
+        placed_m.append(thing.at_m)
+    assert placed_m[1] == pytest.approx(placed_m[0])
+
+
+def test_a_thing_of_which_pictures_show_the_field_instead_is_less_sure() -> None:
+    """A ghost that one vehicle sees wherever it drives, and another never."""
+    tracker, sure = ObjectTracker(), []
+    for step in range(30):
+        time_s = 0.1 * step
+        tracker.take([at(1.0)], FRONT, time_s)
+        (begun,) = [each.confidence(time_s) for each in tracker._objects]
+        sure.append(begun)
+        tracker.take([], ("cav-2", "front"), time_s + 0.05, lambda *_: True)
+    assert max(sure[4:]) < 0.6
+    tracker.take([], ("cav-3", "front"), 2.96, lambda *_: False)
+    (ghost,) = tracker.confirmed(2.97)
+    assert ghost.confidence(2.9) == pytest.approx(0.5), "who cannot see it says nothing"
+
+
+def test_what_one_camera_of_a_rig_sees_no_other_of_it_misses() -> None:
+    for order in (RIG, RIG[::-1]):
+        tracker = ObjectTracker()
+        for step in range(6):
+            for camera in order:
+                found = [at(1.0)] if camera == FRONT else []
+                tracker.take(found, camera, 0.1 * step, lambda *_: True)
+        (thing,) = tracker.confirmed(0.5)
+        assert thing.confidence(0.5) == 1.0
+
+
+def picture_of(field: SplatField, camera: Camera) -> LivePicture:
+    rgb = np.rint(field.render(camera).colour.clip(0, 1) * 255).astype(np.uint8)
+    return live_picture(camera, rgb, FIELD.render(camera))
+
+
+def test_a_picture_lacks_what_it_should_show_and_does_not() -> None:
+    empty, with_car = picture_of(FIELD, camera_at()), picture_of(joined(STREET, car(0.8, 10.0)),
+                                                                 camera_at())  # fmt: skip
+    foot_m, size_m = (0.8, 10.0, -CAMERA_M), (1.8, 1.4)
+    assert empty.lacks(foot_m, *size_m)
+    assert not with_car.lacks(foot_m, *size_m), "something is there"
+    assert with_car.lacks((-3.0, 12.0, -CAMERA_M), *size_m), "and nothing beside it"
+    assert not with_car.lacks((0.8, 14.0, -CAMERA_M), *size_m), "behind it nobody knows"
+    for elsewhere in ((0.8, -10.0), (20.0, 10.0), (0.8, 2.0), (0.8, 30.0)):
+        assert not empty.lacks((*elsewhere, -CAMERA_M), *size_m), "outside of the picture, or far"
+    assert not replace(empty, trust=0.0).lacks(foot_m, *size_m)
+    wall_m = np.full_like(empty.depth, 4.0)
+    assert not replace(empty, depth=wall_m).lacks(foot_m, *size_m), "behind a surface of the field"
 
 
 def test_what_stands_has_no_velocity_though_its_range_is_uncertain() -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -157,6 +158,27 @@ def test_of_two_that_disagree_none_is_outvoted() -> None:
     assert 0 < found.at_m[1] < 3
 
 
+def test_a_rig_with_a_wrong_pose_has_one_vote_however_many_cameras_it_has() -> None:
+    """Three of its cameras and two other vehicles see one thing at a moment."""
+    thing = (15.0, 3.0)
+    honest = [sighting(thing, eye) for eye in ((0.0, 0.0), (1.0, 5.0))]
+    wrong = sighting(thing, (0.9, -2.0), moved_m=(0.0, 3.0))
+    shared = [replace(wrong, vote=1 / 3)] * 3
+    found = placed([*shared, *honest])
+    assert found.outvoted == (0, 1, 2)
+    assert math.dist(found.at_m, thing) < 1e-6
+    assert math.dist(placed([wrong, wrong, wrong, *honest]).at_m, thing) > 1
+
+
+def test_a_vote_that_is_shared_places_as_one_does() -> None:
+    """Whichever way it is divided."""
+    one = [sighting((15.0, 3.0), (0.0, 0.0)), sighting((15.2, 3.0), (1.0, 5.0))]
+    shared = [replace(one[0], vote=0.25), replace(one[0], vote=0.75), one[1]]
+    whole, parts = placed(one), placed(shared)
+    assert parts.at_m == pytest.approx(whole.at_m)
+    np.testing.assert_allclose(parts.covariance_m2, whole.covariance_m2)
+
+
 def test_directions_that_place_nothing_are_refused() -> None:
     ahead = [Sighting(0.0, (0.0, y_m), 0.3, 0.01) for y_m in (0.0, 1.0, 2.0)]
     with pytest.raises(InvalidInput, match="of 3 sightings none has a range"):
@@ -183,5 +205,7 @@ def test_sigmas_and_ranges_are_above_0(bad: float) -> None:
         Sighting(0.0, (0.0, 0.0), 0.0, bad)
     with pytest.raises(InvalidInput, match="range_m"):
         Sighting(0.0, (0.0, 0.0), 0.0, 0.01, bad, 1.0)
+    with pytest.raises(InvalidInput, match="vote"):
+        Sighting(0.0, (0.0, 0.0), 0.0, 0.01, vote=bad)
     with pytest.raises(InvalidInput, match="range_sigma_m"):
         Sighting(0.0, (0.0, 0.0), 0.0, 0.01, 10.0, bad)

@@ -222,6 +222,6 @@ def test_the_past_of_all_cameras_has_a_limit_and_says_from_when_on_it_is_whole(
         for vehicle in ("cav-1", "cav-2"):
             kept = replace(view(vehicle, sequence=number), reconstructed_s=0.25 + 0.25 * number)
             past.keep(kept, kept.captured_s)
-    counts = {key: len(list(past.of(key))) for key in past.keys()}
+    counts = {key: len(list(past.of(key))) for key in past.cameras()}
     assert counts == {("cav-1", "front"): 5, ("cav-2", "front"): 5}
     assert past.whole_from_s == 0.25 * 25

@@ -429,7 +429,7 @@ class ObjectsResponse(_message.Message):
     """Of the field that the pictures were compared with."""
     @_builtins.property
     def objects(self) -> _containers.RepeatedCompositeFieldContainer[Global___StreetObject]:
-        """Sorted by object_id; without those that fewer than three pictures showed."""
+        """Sorted by object_id; without those that too few instants of vehicles showed."""
 
     def __init__(
         self,
@@ -479,7 +479,9 @@ class StreetObject(_message.Message):
     """As seen by the camera that saw it last, which may see a part."""
     height_m: _builtins.float
     confidence: _builtins.float
-    """0 to 1: by how many pictures it was seen in, and how many missed it."""
+    """0 to 1: the share of the last 40 instants of vehicles that saw it, of those that did or should
+    have; less before the fourth, and while nobody sees it. A rig's cameras see one instant together.
+    """
     age_ms: _builtins.int
     """Since it was first seen, and since it was last."""
     unseen_ms: _builtins.int
