@@ -252,7 +252,7 @@ class TrainableRasterizer:
         return value
 
     def gaussians(self) -> Gaussians:
-        """Return the parameters as they are now, in the order they came in."""
+        """Return the parameters as they are now, in the order of the kernels."""
         arrays = self._empty_arrays()
         with self._lock:
             self._native.parameters(*arrays.values())
@@ -285,6 +285,15 @@ class TrainableRasterizer:
         with self._lock:
             self._forget()
             self._native.remove_dead(DEAD_LOGIT)
+
+    def order_along_curve(self) -> None:
+        """Sort the Gaussians along a Morton curve through space, with moments and scores.
+
+        Most blocks of 16 are then wholly in view or wholly out; what is out costs nothing.
+        """
+        with self._lock:
+            self._forget()
+            self._native.order_along_curve()
 
     def state(self) -> TrainingState:
         """Return a copy of everything a run goes on from."""

@@ -25,9 +25,13 @@ __all__ = [
     "RateSchedule",
     "Regularisation",
     "control_density",
+    "is_order_due",
     "view_order",
 ]
 
+ORDER_INTERVAL = 500
+"""Iterations between two sorts along the curve. A round of density control adds at the end what
+lies next to its sources, in their order, so only many rounds take memory and space apart."""
 NOISE_INTERVAL = 10
 """Iterations between two moves of the faint: moving them by less, more often, gives the same."""
 
@@ -193,6 +197,11 @@ def control_density(
         rasterizer.control_density(control.step_after(iteration, len(rasterizer), seed))
     if control.noise > 0 and iteration % NOISE_INTERVAL == 0 and progress < control.stop:
         rasterizer.perturb(control.noise, _seed_of(seed, iteration) ^ 1)
+
+
+def is_order_due(control: DensityControl, iteration: int, progress: float) -> bool:
+    """Return whether Gaussians added by ``control`` are sorted in after ``iteration``."""
+    return iteration % ORDER_INTERVAL == 0 and control.is_due(iteration, progress)
 
 
 def _seed_of(seed: int, iteration: int) -> int:

@@ -34,6 +34,7 @@ from rfcore.train.schedule import (
     RateSchedule,
     Regularisation,
     control_density,
+    is_order_due,
     view_order,
 )
 from rfcore.train.start import gaussians_from_points
@@ -112,6 +113,7 @@ class SplatTrainer(FieldTrainer):
         self.depth_m = typical_depth_m(initial, cameras)
         self._poses = PoseModel(cameras, self.depth_m) if self.config.refine_poses else None
         self._rasterizer = self._rasterizer_of(initial)
+        self._rasterizer.order_along_curve()
 
     @property
     def primitives(self) -> int:
@@ -232,6 +234,8 @@ class SplatTrainer(FieldTrainer):
     def _after_iteration(self, progress: float) -> None:
         control = self.config.density
         control_density(self._rasterizer, control, self.iteration, progress, self._seed)
+        if is_order_due(control, self.iteration, progress):
+            self._rasterizer.order_along_curve()
 
     def _parameters(self) -> Gaussians:
         return self.gaussians()

@@ -168,6 +168,48 @@ def test_removing_the_dead_keeps_the_others_in_order_with_their_moments() -> Non
     rasterizer.iterate(CAMERA, grey(), RATES)
 
 
+def curve_order(means: np.ndarray) -> np.ndarray:
+    """Return the stable order along a Morton curve of 21 bits an axis, x in the lowest bit."""
+    x = means.astype(np.float64) - means.min(axis=0).astype(np.float64)
+    cells = (x / x.max() * (2**21 - 1)).astype(int)
+    codes = [
+        sum((cell[axis] >> bit & 1) << (3 * bit + axis) for bit in range(21) for axis in range(3))
+        for cell in cells.tolist()
+    ]
+    return np.argsort(np.array(codes, np.uint64), kind="stable")
+
+
+def test_sorting_along_the_curve_takes_moments_and_scores_along() -> None:
+    rasterizer = TrainableRasterizer(many())
+    rasterizer.keep_scores(True)
+    rasterizer.iterate(CAMERA, grey(), RATES)
+    before = rasterizer.state()
+    rasterizer.order_along_curve()
+    after, order = rasterizer.state(), curve_order(before.gaussians.means)
+    assert (order != np.arange(200)).any()
+    for part in ("gaussians", "first_moments", "second_moments"):
+        for f in fields(Gaussians):
+            rows = [getattr(getattr(state, part), f.name) for state in (before, after)]
+            np.testing.assert_array_equal(rows[1], rows[0][order])
+    assert before.scores.any()
+    np.testing.assert_array_equal(after.scores, before.scores[order])
+
+
+def test_gaussians_in_one_place_keep_their_order_on_the_curve() -> None:
+    start = many(40)
+    start.means[:] = [0.0, 0.0, 3.0]
+    rasterizer = TrainableRasterizer(start)
+    rasterizer.order_along_curve()
+    assert values_of(rasterizer.gaussians()) == values_of(start)
+
+
+def test_no_gaussians_at_all_can_be_sorted() -> None:
+    shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, 16, 3))
+    rasterizer = TrainableRasterizer(Gaussians(*(np.zeros(s, np.float32) for s in shapes)))
+    rasterizer.order_along_curve()
+    assert len(rasterizer) == 0
+
+
 def trained_bytes(isa: str, threads: int, by_gradient: bool, in_place: bool) -> bytes:
     rasterizer = TrainableRasterizer(many(), isa=isa, threads=threads)
     rasterizer.keep_scores(by_gradient)
@@ -176,6 +218,7 @@ def trained_bytes(isa: str, threads: int, by_gradient: bool, in_place: bool) -> 
         rasterizer.perturb(0.5, seed)
         step = DensityStep(added=21, seed=seed, by_gradient=by_gradient, in_place=in_place)
         rasterizer.control_density(step)
+        rasterizer.order_along_curve()
     return values_of(rasterizer.gaussians())
 
 

@@ -9,7 +9,7 @@ from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.raster.gaussians import Gaussians
-from rfcore.train import HeldOut, SplatTrainer, SplatTrainingConfig, mean_psnr_db
+from rfcore.train import DensityControl, HeldOut, SplatTrainer, SplatTrainingConfig, mean_psnr_db
 from rfcore.views import PointCloud
 
 SHORT = SplatTrainingConfig(gaussians=300, iterations=60)
@@ -64,6 +64,26 @@ def test_the_same_seed_gives_the_same_bytes(posed, points, change) -> None:
     first = trained(pictures, points).field(name="a")
     again = trained(pictures, points, replace(SHORT, **change)).field(name="a")
     assert again.field_id == first.field_id
+
+
+def test_gaussians_near_in_space_are_near_in_memory_from_the_start_and_after_growing(
+    posed, points
+) -> None:
+    def hop_m(trainer: SplatTrainer) -> float:
+        return float(np.linalg.norm(np.diff(trainer.gaussians().means, axis=0), axis=1).mean())
+
+    density = DensityControl(limit=400, interval=50, growth=0.1, start=0, stop=1)
+    config = replace(SHORT, iterations=1000, density=density)
+    trainer = SplatTrainer(posed(checked), points, config)
+    at_start_m = hop_m(trainer)
+    shuffled = np.random.default_rng(0).permutation(trainer.gaussians().means)
+    assert at_start_m < 0.5 * np.linalg.norm(np.diff(shuffled, axis=0), axis=1).mean()
+    for _ in range(499):
+        trainer.step(0.5)
+    before_m = hop_m(trainer)
+    trainer.step(0.5)
+    assert trainer.primitives == 400
+    assert hop_m(trainer) < 0.8 * before_m
 
 
 def test_another_seed_gives_another_field(posed, points) -> None:

@@ -147,6 +147,8 @@ void bind_density(Trainable& trainable) {
              nb::call_guard<nb::gil_scoped_release>())
         .def("remove_dead", &TrainableRasterizer::remove_dead, "dead_logit"_a,
              nb::call_guard<nb::gil_scoped_release>())
+        .def("order_along_curve", &TrainableRasterizer::order_along_curve,
+             nb::call_guard<nb::gil_scoped_release>())
         .def("moments",
              [](const TrainableRasterizer& self, const std::vector<FloatsOut>& first,
                 const std::vector<FloatsOut>& second, const DoublesOut& beta_powers) {

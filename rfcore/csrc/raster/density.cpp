@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <utility>
 
 #include "raster/portable_math.h"
 
@@ -16,6 +17,8 @@ constexpr double kMaxOpacity = 1.0 - 1e-6;
 constexpr double kHalfOffset = 0.7, kHalfScale = 0.6, kHalfOpacity = 0.85;
 constexpr double kGateSteepness = 100.0, kGateOpacity = 0.005;
 constexpr double kGateClosedLogit = -2.2;  // an opacity of 0.1 moves by e^-9.5 of the strength
+
+constexpr int kCurveBits = 21;             // an axis of the Morton curve; three fit in 64 bits
 
 // SplitMix64 (Steele et al. 2014): a stream that can be entered anywhere.
 uint64_t mix(uint64_t x) {
@@ -170,6 +173,57 @@ std::vector<uint32_t> places_to_fill(const TrainableBlocks& b, const DensityPlan
     return places;
 }
 
+// Return x with bit i moved to bit 3 i, for the kCurveBits lowest bits.
+uint64_t spread_bits(uint64_t x) {
+    x = (x | x << 32) & 0x001f00000000ffffu;
+    x = (x | x << 16) & 0x001f0000ff0000ffu;
+    x = (x | x << 8) & 0x100f00f00f00f00fu;
+    x = (x | x << 4) & 0x10c30c30c30c30c3u;
+    return (x | x << 2) & 0x1249249249249249u;
+}
+
+// Which Gaussian comes first along the curve, which second and so on; equal cells keep their order.
+std::vector<uint32_t> curve_order(const TrainableBlocks& b) {
+    double low[3], side = 0.0;
+    for (int k = 0; k < 3; ++k) {
+        double high = low[k] = b.count > 0 ? static_cast<double>(gaussian(b, 0)[kMeanPlane + k]) : 0.0;
+        for (int n = 1; n < b.count; ++n) {
+            const double x = static_cast<double>(gaussian(b, n)[kMeanPlane + k]);
+            low[k] = std::min(low[k], x);
+            high = std::max(high, x);
+        }
+        side = std::max(side, high - low[k]);
+    }
+    constexpr double kLastCell = (1 << kCurveBits) - 1;
+    std::vector<std::pair<uint64_t, uint32_t>> places(static_cast<size_t>(b.count));
+    for (int n = 0; n < b.count; ++n) {
+        uint64_t code = 0;
+        for (int k = 0; k < 3; ++k) {
+            const double x = static_cast<double>(gaussian(b, n)[kMeanPlane + k]);
+            const double cell = (x - low[k]) / side * kLastCell;
+            const double inside = cell > 0.0 ? std::min(cell, kLastCell) : 0.0;  // 0 when not a number
+            code |= spread_bits(static_cast<uint64_t>(inside)) << k;
+        }
+        places[static_cast<size_t>(n)] = {code, static_cast<uint32_t>(n)};
+    }
+    std::sort(places.begin(), places.end());
+    std::vector<uint32_t> order;
+    order.reserve(places.size());
+    for (const auto& place : places) order.push_back(place.second);
+    return order;
+}
+
+// Lane i of `part` becomes what lane order[i] was.
+void permute(float* part, int planes, const std::vector<uint32_t>& order,
+             std::vector<float>* scratch) {
+    const size_t blocks = (order.size() + kLanes - 1) / kLanes;
+    scratch->assign(part, part + blocks * static_cast<size_t>(planes) * kLanes);
+    for (size_t i = 0; i < order.size(); ++i) {
+        copy_lane(lane_of(scratch->data(), planes, static_cast<int>(order[i])),
+                  lane_of(part, planes, static_cast<int>(i)), planes);
+    }
+}
+
 }  // namespace
 
 std::vector<uint32_t> draw_by_weight(const std::vector<double>& weights, int draws,
@@ -241,6 +295,16 @@ void perturb(const TrainableBlocks& blocks, float strength, uint64_t seed) {
                       near_normal(seed, index + static_cast<uint64_t>(k)));
         }
     }
+}
+
+void order_along_curve(const TrainableBlocks& blocks) {
+    const std::vector<uint32_t> order = curve_order(blocks);
+    const int planes = parameter_planes(blocks.degree);
+    std::vector<float> scratch;
+    for (float* part : {blocks.parameters, blocks.first_moments, blocks.second_moments}) {
+        permute(part, planes, order, &scratch);
+    }
+    permute(blocks.scores, kScorePlanes, order, &scratch);
 }
 
 int remove_dead(const TrainableBlocks& blocks, float dead_logit) {

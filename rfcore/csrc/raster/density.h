@@ -50,6 +50,10 @@ void perturb(const TrainableBlocks& blocks, float strength, uint64_t seed);
 // Close the gaps of the dead, order kept; return how many Gaussians are left.
 int remove_dead(const TrainableBlocks& blocks, float dead_logit);
 
+// Sort along a Morton curve through the cube around all centres, moments and scores along with
+// them: what is near in space is then near in memory, and most blocks are wholly in view or out.
+void order_along_curve(const TrainableBlocks& blocks);
+
 // Systematic resampling: item i comes floor or ceil of draws * w_i / sum(w) times, in order.
 // `offset` is in 0..1. No weight may be negative, one must be positive.
 std::vector<uint32_t> draw_by_weight(const std::vector<double>& weights, int draws, double offset);

@@ -272,6 +272,8 @@ void TrainableRasterizer::perturb(float strength, uint64_t seed) {
     rfcore::raster::perturb(blocks(), strength, seed);
 }
 
+void TrainableRasterizer::order_along_curve() { rfcore::raster::order_along_curve(blocks()); }
+
 void TrainableRasterizer::remove_dead(float dead_logit) {
     set_count(rfcore::raster::remove_dead(blocks(), dead_logit));
     hide_lanes_from(count_);

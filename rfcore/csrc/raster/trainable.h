@@ -51,6 +51,7 @@ class TrainableRasterizer {
     int control_density(const DensityPlan& plan);
     void perturb(float strength, uint64_t seed);
     void remove_dead(float dead_logit);
+    void order_along_curve();
 
     int count() const { return count_; }
     int degree() const { return degree_; }
