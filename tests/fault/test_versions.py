@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from integration.test_version_skew import previous
+from integration.test_version_skew import Release, previous
 from integration.test_version_skew import (
-    test_the_previous_release_is_understood as understand_the_previous_release,
+    test_earlier_releases_are_understood as understand_the_previous_release,
 )
 
 __all__ = ["previous"]
@@ -16,7 +16,7 @@ __all__ = ["previous"]
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(("server_is_old", "agent_is_old"), [(True, False), (False, True)])
 async def test_version_skew(
-    previous: Path,
+    previous: Release,
     street: Any,
     case: Any,
     tmp_path: Path,

@@ -199,9 +199,10 @@ def test_the_cases_are_measured_with_vehicles_as_processes(street: Any, tmp_path
         if not str(error).startswith("not held: "):  # a bound in time, on a busy machine
             raise
     rows = {row.case: row for row in rows_of(ScaleRow, read_result(job.out)["rows"])}
-    assert len(rows) == 7
+    assert len(rows) == 8
     for case in (
         "placement: most streams over the mean",
+        "a server added: most over the mean once others joined",
         "moved: pictures without the render as reference",
         "moved: vehicles that two servers show",
     ):

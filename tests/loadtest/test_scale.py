@@ -19,7 +19,16 @@ from rfedge.loadtest.cases import (
 )
 from rfedge.loadtest.envoy import EnvoySetup
 from rfedge.loadtest.planning import PlannedRow
-from rfedge.loadtest.scale import ScaleJob, failures, keyframes, p99, resumed_s, run_scale
+from rfedge.loadtest.scale import (
+    ScaleJob,
+    Shown,
+    failures,
+    keyframes,
+    p99,
+    resumed_s,
+    run_scale,
+    shown_twice,
+)
 from rfedge.results import Provenance, provenance, read_result
 from rfedge.samples import sample_path
 
@@ -57,6 +66,36 @@ def test_a_keyframe_is_an_acknowledged_picture_without_the_render() -> None:
     alone = {"references": ["previous"]}
     lines = [line(0, 1), line(1, 1, **alone), line(2, 1, "lost", **alone)]
     assert keyframes(lines) == 1
+
+
+def shown(text: str, vehicle: str = "cav", camera: str = "front") -> list[Shown]:
+    """Return pictures in the order they were shown: ``1a 2a`` are the first two, at server a."""
+    return [Shown(vehicle, camera, int(each[:-1]), each[-1]) for each in text.split()]
+
+
+@pytest.mark.parametrize(
+    ("text", "twice"),
+    [
+        ("1a 2a 3a", 0),
+        ("1a 2a 4b 3a 5b", 0),
+        ("1a 3a 3a 2a 4b", 0),
+        ("1a 2a 2b 3b", 1),
+        ("1a 2b 3a", 1),
+        ("1a 2b 3c 4b", 1),
+    ],
+    ids=["stays", "old frames end late", "told again", "one at both", "back and forth", "old goes"],
+)
+def test_a_vehicle_that_moves_is_shown_once_by_the_time_its_pictures_were_taken(
+    text: str, twice: int
+) -> None:
+    assert shown_twice(shown(text)) == twice
+
+
+def test_vehicles_that_are_shown_twice_are_counted_once_and_cameras_are_apart() -> None:
+    good = shown("1a 2a", "x", "left") + shown("1b 2b", "x", "right")
+    assert shown_twice(good) == 0
+    bad = shown("1a 1b", "y", "left") + shown("1a 1b", "y", "right") + shown("1a 1b", "z")
+    assert shown_twice(good + bad) == 2
 
 
 def test_a_percentile_of_few_values_is_the_largest_and_of_none_an_error() -> None:
