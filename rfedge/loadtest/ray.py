@@ -162,8 +162,9 @@ def ray_case(tiles: Path, iterations: int) -> Case:
 def _measure(tiles: Path, first: str, trained: RayTiles, job: ScaleJob) -> Measured:
     folder = job.work / "ray"
     shutil.rmtree(folder, ignore_errors=True)
-    options = ("--iterations", str(trained.iterations), "--threads", "1")
-    options += ("--checkpoint-every", str(trained.iterations // CHECKPOINTS))
+    every = str(trained.iterations // CHECKPOINTS)
+    options = ["--iterations", str(trained.iterations), "--threads", "1"]
+    options += ["--checkpoint-every", every]
     train_tiles(tiles, folder / "alone", options, None)
     on_ray = train_tiles(tiles, folder / "on-ray", options, "local")
     killed = train_tiles(tiles, folder / "killed", options, "local", first)

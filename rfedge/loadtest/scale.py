@@ -12,13 +12,14 @@ import shutil
 import signal
 import statistics
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,8 @@ __all__ = [
     "Case",
     "Fleet",
     "ScaleJob",
+    "Shown",
+    "TwinWatch",
     "city_case",
     "failures",
     "keyframes",
@@ -63,6 +66,7 @@ __all__ = [
     "planned_load",
     "resumed_s",
     "run_scale",
+    "shown_twice",
 ]
 
 MOST_OVER_MEAN = 1.5
@@ -72,7 +76,6 @@ ADDED_MS = 3.0
 PLANNED_PERCENT, PLANNED_AGE_PERCENT = 15.0, 25.0
 CITY_S = 600.0
 PAIR_HZ = 10.0
-WATCH_S = 2.0
 WAIT_S = 120.0
 POLL_S = 0.05
 EVERYWHERE = Ground(Area((-1e4, -1e4), (1e4, 1e4)), 0.0)
@@ -309,34 +312,143 @@ def _acked_since(lines: Lines, since_ns: int) -> int:
     return sum(x["result"] == "acked" and x["capture_time_ns"] >= since_ns for x in lines)
 
 
+@dataclass(frozen=True)
+class Shown:
+    """A picture that the twin of a server (HOST:PORT) showed."""
+
+    vehicle_id: str
+    camera_id: str
+    capture_time_ns: int
+    server: str
+
+
+def shown_twice(pictures: Iterable[Shown]) -> int:
+    """Return how many vehicles two servers showed at the same time.
+
+    While a vehicle moves, both of its streams are open, and the old server shows what it took
+    before: that is one vehicle. It is shown twice if two servers show one of its pictures, or if
+    a server shows a picture that was taken after one that its successor has shown.
+    """
+    of_camera: dict[tuple[str, str], set[tuple[int, str]]] = {}
+    for picture in pictures:
+        camera = picture.vehicle_id, picture.camera_id
+        of_camera.setdefault(camera, set()).add((picture.capture_time_ns, picture.server))
+    return len({camera[0] for camera, shown in of_camera.items() if _are_mixed(sorted(shown))})
+
+
+def _are_mixed(shown: Sequence[tuple[int, str]]) -> bool:
+    """Return whether two servers have one moment, or the moments of a server another between."""
+    moments = {moment for moment, _ in shown}
+    stays = [server for server, _ in groupby(server for _, server in shown)]
+    return len(moments) < len(shown) or len(set(stays)) < len(stays)
+
+
+class TwinWatch:
+    """Watches the twins of servers, in a thread each, until it is left.
+
+    A server that ends or is killed has been watched to its end.
+    """
+
+    def __init__(self) -> None:
+        self.pictures: list[Shown] = []
+        self._calls: list[grpc.Call] = []
+        self._problems: list[str] = []
+        self._stack = ExitStack()
+
+    def __enter__(self) -> TwinWatch:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for call in self._calls:
+            call.cancel()
+        self._stack.close()
+
+    def add(self, address: str) -> None:
+        """Watch one more server from now on."""
+        channel = self._stack.enter_context(grpc.insecure_channel(address, CONSUMER_OPTIONS))
+        wanted = subscription_to_wire(Subscription(encoding=PictureEncoding.NONE))
+        call = twin_pb2_grpc.TwinServiceStub(channel).Watch(wanted)
+        self._calls.append(call)
+        thread = threading.Thread(target=self._watch, args=(address, call), daemon=True)
+        thread.start()
+        self._stack.callback(thread.join, WAIT_S)
+
+    def result(self) -> list[Shown]:
+        """Return what was shown so far; raise ``RfedgeError`` for a server that showed nothing."""
+        if self._problems:
+            raise RfedgeError("; ".join(self._problems))
+        return list(self.pictures)
+
+    def _watch(self, address: str, call: Iterable[Any]) -> None:
+        try:
+            for response in call:
+                message = twin_message_from_wire(response)
+                if isinstance(message, TwinPicture):
+                    self.pictures.append(
+                        Shown(
+                            message.vehicle_id, message.camera_id, message.capture_time_ns, address
+                        )
+                    )
+        except grpc.RpcError as error:
+            if error.code() not in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED):
+                self._problems.append(f"{address} does not show its pictures: {error}")
+
+
 @dataclass
 class Seen:
     """What was seen in all rounds."""
 
     over_mean: list[float] = field(default_factory=list)
     after_adding: list[float] = field(default_factory=list)
+    after_joining: list[float] = field(default_factory=list)
     resumed_s: list[float] = field(default_factory=list)
     restarted_s: list[float] = field(default_factory=list)
     drained_frames: int = 0
-    shown_twice: int = 0
+
+
+@dataclass(frozen=True)
+class Site:
+    """Servers behind Envoy, vehicles that stream to them, and who watches their twins."""
+
+    group: ServerGroup
+    envoy: Envoy
+    fleet: Fleet
+    watch: TwinWatch
+
+    def settled(self) -> float:
+        """Wait until the servers that are there have all streams; return the most over the mean."""
+        there, vehicles = set(self.group.addresses), len(self.fleet.reports)
+        placed = self.envoy.until(
+            lambda seen: set(seen) == there and sum(seen.values()) == vehicles
+        )
+        return max(placed.values()) * len(placed) / vehicles
+
+    def add_server(self) -> None:
+        """Start one more, tell Envoy of it, and wait until it is healthy there."""
+        self.watch.add(self.group.start_server().address)
+        self.group.list_servers()
+        there = set(self.group.addresses)
+        self.envoy.until(lambda seen: set(seen) == there)
 
 
 def moves(job: ScaleJob) -> list[ScaleRow]:
     """Kill, add and drain servers under the vehicles, then restart Envoy; return the rows."""
     setup = EnvoySetup(envoy_binary(), job.config, job.work / "envoy")
     seen = Seen()
-    with ServerGroup(job.published, setup) as group, ExitStack() as stack:
+    with ServerGroup(job.published, setup) as group, ExitStack() as stack, TwinWatch() as watch:
         for _ in range(job.servers):
-            group.start_server()
-        envoy = group.start_envoy()
+            watch.add(group.start_server().address)
         fleet = Fleet(job, job.work / "fleet")
-        fleet.start(stack, envoy.address, job.vehicles, job.hz)
-        seen.over_mean.append(_settled(group, envoy, job))
+        site = Site(group, group.start_envoy(), fleet, watch)
+        fleet.start(stack, site.envoy.address, job.vehicles, job.hz)
+        seen.over_mean.append(site.settled())
         for _ in range(job.rounds):
-            _kill_one(group, envoy, fleet, seen)
-            _drain_one(group, envoy, fleet, seen)
-        _restart_envoy(group, envoy, fleet, seen)
+            _kill_one(site, seen)
+            _drain_one(site, seen)
+        _let_others_join(site, stack, seen)
+        _restart_envoy(site, seen)
         keys = sum(keyframes(lines) for lines in fleet.lines())
+        twice = shown_twice(watch.result())
     at_most = ScaleRow.at_most
     return [
         at_most("placement: most streams over the mean", MOST_OVER_MEAN, max(seen.over_mean)),
@@ -347,95 +459,65 @@ def moves(job: ScaleJob) -> list[ScaleRow]:
             MOST_OVER_MEAN,
             max(seen.after_adding),
         ),
+        at_most(
+            "a server added: most over the mean once others joined",
+            MOST_OVER_MEAN,
+            max(seen.after_joining),
+        ),
         at_most("Envoy restarted: Ack again, p99, s", RESTART_S, p99(seen.restarted_s)),
         at_most("moved: pictures without the render as reference", 0, keys),
-        at_most("moved: vehicles that two servers show", 0, seen.shown_twice),
+        at_most("moved: vehicles that two servers show", 0, twice),
     ]
 
 
-def _settled(group: ServerGroup, envoy: Envoy, job: ScaleJob) -> float:
-    """Wait until the servers that are there have all streams; return the most over the mean."""
-    there = set(group.addresses)
-    placed = envoy.until(lambda seen: set(seen) == there and sum(seen.values()) == job.vehicles)
-    return max(placed.values()) * len(placed) / job.vehicles
-
-
-def _kill_one(group: ServerGroup, envoy: Envoy, fleet: Fleet, seen: Seen) -> None:
-    killed = group.servers.pop(0)
+def _kill_one(site: Site, seen: Seen) -> None:
+    killed = site.group.servers.pop(0)
     since_ns = time.time_ns()
     killed.process.kill()
-    seen.over_mean.append(_settled(group, envoy, fleet.job))
-    fleet.until_acked(time.time_ns())
-    took_s = [resumed_s(lines, since_ns) for lines in fleet.lines()]
+    seen.over_mean.append(site.settled())
+    site.fleet.until_acked(time.time_ns())
+    took_s = [resumed_s(lines, since_ns) for lines in site.fleet.lines()]
     seen.resumed_s += [s for s in took_s if s is not None]
-    seen.shown_twice += _shown_twice(group.addresses)
-    _add_one(group, envoy)
+    site.add_server()
 
 
-def _add_one(group: ServerGroup, envoy: Envoy) -> None:
-    group.start_server()
-    group.list_servers()
-    there = set(group.addresses)
-    envoy.until(lambda seen: set(seen) == there)
-
-
-def _drain_one(group: ServerGroup, envoy: Envoy, fleet: Fleet, seen: Seen) -> None:
+def _drain_one(site: Site, seen: Seen) -> None:
     """Drain the server that has been there for longest; its vehicles fill the one just added."""
-    drained = group.servers.pop(0)
+    drained = site.group.servers.pop(0)
     since_ns = time.time_ns()
     drained.process.send_signal(signal.SIGTERM)
     if drained.process.wait(WAIT_S) != 0:
-        raise RfedgeError(f"{drained.name} did not end well; see {group.setup.folder}")
-    seen.after_adding.append(_settled(group, envoy, fleet.job))
+        raise RfedgeError(f"{drained.name} did not end well; see {site.group.setup.folder}")
+    seen.after_adding.append(site.settled())
     until_ns = time.time_ns()
-    fleet.until_acked(until_ns)
-    seen.drained_frames += sum(failures(lines, since_ns, until_ns) for lines in fleet.lines())
-    seen.shown_twice += _shown_twice(group.addresses)
-    _add_one(group, envoy)
+    site.fleet.until_acked(until_ns)
+    seen.drained_frames += sum(failures(lines, since_ns, until_ns) for lines in site.fleet.lines())
+    site.add_server()
 
 
-def _restart_envoy(group: ServerGroup, envoy: Envoy, fleet: Fleet, seen: Seen) -> None:
+def _let_others_join(site: Site, stack: ExitStack, seen: Seen) -> None:
+    """Start as many vehicles as an even share; the server just added has no stream.
+
+    Envoy does not move streams that are open, so that only who comes later fills it.
+    """
+    job = site.fleet.job
+    share = round(job.vehicles / len(site.group.servers))
+    site.fleet.start(stack, site.envoy.address, max(1, share), job.hz)
+    seen.after_joining.append(site.settled())
+
+
+def _restart_envoy(site: Site, seen: Seen) -> None:
     """End Envoy and start it again at its port, with the same servers."""
-    setup = EnvoySetup(
-        group.setup.binary,
-        group.setup.config,
-        group.setup.folder,
-        int(envoy.address.rpartition(":")[2]),
-    )
-    group.setup = setup
-    envoy.process.kill()
-    envoy.process.wait()
+    group, port = site.group, int(site.envoy.address.rpartition(":")[2])
+    group.setup = replace(group.setup, port=port)
+    site.envoy.process.kill()
+    site.envoy.process.wait()
     since_ns = time.time_ns()
-    again = group.start_envoy()
-    seen.over_mean.append(_settled(group, again, fleet.job))
-    fleet.until_acked(time.time_ns())
-    took_s = [resumed_s(lines, since_ns) for lines in fleet.lines()]
+    again = replace(site, envoy=group.start_envoy())
+    seen.over_mean.append(again.settled())
+    again.fleet.until_acked(time.time_ns())
+    took_s = [resumed_s(lines, since_ns) for lines in again.fleet.lines()]
     seen.restarted_s += [s for s in took_s if s is not None]
-
-
-def _shown_twice(addresses: Sequence[str]) -> int:
-    """Return how many vehicles more than one server shows pictures of within two seconds."""
-    since_ns = time.time_ns()
-    with ThreadPoolExecutor(len(addresses)) as watchers:
-        shown = list(watchers.map(lambda address: _shown(address, since_ns), addresses))
-    return sum(len(vehicles) for vehicles in shown) - len(set[str]().union(*shown))
-
-
-def _shown(address: str, since_ns: int) -> set[str]:
-    """Return the vehicles of which a server shows pictures that were taken from ``since_ns`` on."""
-    vehicles: set[str] = set()
-    wanted = subscription_to_wire(Subscription(encoding=PictureEncoding.NONE))
-    with grpc.insecure_channel(address, CONSUMER_OPTIONS) as channel:
-        watching = twin_pb2_grpc.TwinServiceStub(channel).Watch(wanted, timeout=WATCH_S)
-        try:
-            for response in watching:
-                message = twin_message_from_wire(response)
-                if isinstance(message, TwinPicture) and message.capture_time_ns >= since_ns:
-                    vehicles.add(message.vehicle_id)
-        except grpc.RpcError as error:
-            if error.code() is not grpc.StatusCode.DEADLINE_EXCEEDED:
-                raise RfedgeError(f"{address} does not show its pictures: {error}") from error
-    return vehicles
 
 
 def _added_by_envoy(job: ScaleJob) -> Measured:
