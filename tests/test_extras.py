@@ -246,6 +246,7 @@ DRIVE = f"empty@10={ROOT / 'samples/street/transforms_drive_empty.json'}"
         ),
         ("cv2", "eval", f"eval paper --fields a={FIELD} --drives a={DRIVE.partition('=')[2]}"),
         ("cv2", "localise", f"localise {DRIVE.partition('=')[2]} --field {FIELD}"),
+        ("libsumo", "sumo", f"size --city {ROOT}/samples/sizing/city.toml --sumo x.sumocfg"),
         ("nats", "nats", "watch --nats nats://127.0.0.1:4222"),
         ("psutil", "loadtest", "loadtest"),
         ("scipy", "loadtest", "loadtest"),

@@ -12,8 +12,12 @@ from rfedge.arguments import DATASET, FIELD, FOLDER, SIZE, field_path, parse_siz
 from rfedge.sizing.estimate import Assumptions
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rfedge.sizing.city import City
     from rfedge.sizing.estimate import Demand
     from rfedge.sizing.tables import SizingTables
+    from rfedge.sizing.traffic import TrafficBlock
 
 __all__ = ["Size"]
 
@@ -50,6 +54,8 @@ class Size:
     """Plan this city instead (see samples/sizing/city.toml), of which it says everything."""
     fcd: Annotated[Path | None, arg(metavar="FILE.xml[.gz]")] = None
     """Its vehicles: FCD output of SUMO, in place of the stated demand."""
+    sumo: Annotated[Path | None, arg(metavar="FILE.sumocfg")] = None
+    """Its vehicles: this simulation, run here; needs rfedge[sumo]."""
     step_s: float = 1.0
     """Seconds between the steps of its stated demand."""
     samples: int = 9
@@ -74,8 +80,9 @@ class Size:
         if self.city is not None:
             self._plan_city(self.city)
             return
-        if self.fcd is not None:
-            raise InvalidInput("fcd", f"{self.fcd}: a trace needs its cells; give --city too")
+        for name, path in (("fcd", self.fcd), ("sumo", self.sumo)):
+            if path is not None:
+                raise InvalidInput(name, f"{path}: vehicles need their cells; give --city too")
         width_px, height_px = parse_size(self.size)
         demand = Demand(
             self.cameras, width_px, height_px, self.hz, self.db, self.delay_ms, self.share
@@ -109,20 +116,16 @@ class Size:
         from rfedge.sizing.flow import costs_of
         from rfedge.sizing.report import print_city, write_city
         from rfedge.sizing.tables import shipped_tables
-        from rfedge.sizing.traffic import stated_traffic, trace_traffic
 
         if self.drive is not None or self.field is not None:
             raise InvalidInput("city", "is planned from the shipped tables; leave --drive out")
         check = CheckPlan(self.samples, counted_s=self.sample_s)
         city = read_city(city_path)
         costs = costs_of(city, shipped_tables())
-        if self.fcd is None:
-            traffic = stated_traffic(city, self.step_s)
-        else:
-            traffic = trace_traffic(city, self.fcd)
-        plan = plan_city(city, costs, traffic)
+        plan = plan_city(city, costs, self._traffic(city))
         checks = check_plan(plan, check)
-        made = provenance([path for path in (city_path, self.fcd) if path is not None])
+        inputs = (city_path, self.fcd, self.sumo)
+        made = provenance([path for path in inputs if path is not None])
         result = write_city(self.out, made, city_path.stem, plan, checks)
         if self.json is not None:
             write_result(self.json, result)
@@ -130,3 +133,17 @@ class Size:
         print_city(Console(), plan, checks)
         for name in ("report.html", "city.json"):
             Console().print(f"  {self.out / name}")
+
+    def _traffic(self, city: City) -> Iterator[TrafficBlock]:
+        from rfcore.errors import InvalidInput
+        from rfcore.extras import require
+        from rfedge.sizing.traffic import stated_traffic, sumo_traffic, trace_traffic
+
+        if self.fcd is not None and self.sumo is not None:
+            raise InvalidInput("sumo", "--fcd is a simulation that was run; give one of them")
+        if self.fcd is not None:
+            return trace_traffic(city, self.fcd)
+        if self.sumo is not None:
+            require("sumo", "libsumo")
+            return sumo_traffic(city, self.sumo)
+        return stated_traffic(city, self.step_s)

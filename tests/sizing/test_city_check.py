@@ -155,7 +155,9 @@ def test_a_trace_takes_the_place_of_the_demand(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--fcd", "x.xml"], "give --city too"),
+        (["--fcd", "x.xml"], "fcd: .*give --city too"),
+        (["--sumo", "x.sumocfg"], "sumo: .*give --city too"),
+        (["--city", "CITY", "--fcd", "x.xml", "--sumo", "x.sumocfg"], "give one of them"),
         (["--city", "CITY", "--samples", "-1"], "samples"),
         (["--city", "CITY", "--sample-s", "0"], "sample-s"),
         (["--city", "CITY", "--step-s", "0", "--samples", "0"], "step-s"),
