@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from mec_server.config import IdentityBudget, ServerBudget
 from rfcore.wire.messages import Hello
@@ -188,19 +188,35 @@ def decoders_of(hello: Hello) -> int:
     return sum(-(-count // PIXELS_PER_DECODER) for count in pixels)
 
 
-CGROUP_LIMITS = (
-    Path("/sys/fs/cgroup/memory.max"),
-    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
-)
-"""Of control groups, version 2 and 1; a container sees its own at these paths."""
+CGROUPS, OWN_CGROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
-def memory_limit_bytes() -> int:
-    """Return how much memory this process may use: the machine's, or less in a control group."""
+def memory_limit_bytes(cgroups: Path = CGROUPS, own: Path = OWN_CGROUPS) -> int:
+    """Return how much memory this process may use: the machine's, or less in a control group.
+
+    Every group above its own counts. ``cgroups``: where control groups are mounted, of version 1
+    or 2; in a container its own group may be what is mounted there. ``own``: which they are.
+    """
     limit = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    for path in CGROUP_LIMITS:
+    for path in _limit_files(cgroups, own):
         try:
             limit = min(limit, int(path.read_text()))
         except (OSError, ValueError):  # another version, or "max"
             continue
     return limit
+
+
+def _limit_files(cgroups: Path, own: Path) -> Iterator[Path]:
+    """Yield where limits on memory may be (cgroups(7), "/proc/PID/cgroup")."""
+    try:
+        lines = own.read_text().splitlines()
+    except OSError:
+        lines = []
+    groups = {kinds: group for _, kinds, group in (line.split(":", 2) for line in lines)}
+    for kinds, root, name in (
+        ("", cgroups, "memory.max"),
+        ("memory", cgroups / "memory", "memory.limit_in_bytes"),
+    ):
+        group = PurePosixPath("/", groups.get(kinds, "/"))
+        for each in (group, *group.parents):
+            yield root / each.relative_to("/") / name

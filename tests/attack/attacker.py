@@ -10,6 +10,7 @@ import resource
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import grpc
@@ -19,43 +20,93 @@ from attack import field_attacks as fields
 from attack import packet_attacks as packets
 from attack import rpc_attacks as rpcs
 from attack.target import Target
+from mec_server.ledger.budgets import Limit, Resource
+from rfcore.errors import RejectReason
 from rfcore.wire.tls import TlsFiles
 
-ATTACKS: dict[str, tuple[str, Callable[[Target], Awaitable[None]]]] = {
-    attack.__name__: (identity, attack)
-    for identity, attack in (
-        ("consumer", rpcs.unread_fetches),
-        ("vehicle", rpcs.decoders_for_nothing),
-        ("vehicle", rpcs.bad_crc),
-        ("vehicle", rpcs.junk_slices),
-        ("vehicle", rpcs.greedy_promise),
-        ("vehicle", rpcs.cancelled_hellos),
-        ("vehicle", rpcs.unread_refusals),
-        ("consumer", rpcs.unread_watches),
-        ("vehicle", rpcs.impossible_times),
-        ("vehicle", rpcs.many_streams),
-        ("vehicle", rpcs.compressed_bombs),
-        ("vehicle", rpcs.rapid_resets),
-        ("vehicle", rpcs.foreign_names),
-        ("vehicle", rpcs.refused_frames),
-        ("vehicle", rpcs.unknown_fields),
-        ("vehicle", rpcs.odd_numbers),
-        ("consumer", rpcs.foreign_paths),
-        ("vehicle", rpcs.many_connections),
-        ("vehicle", rpcs.revoked),
-        ("vehicle", packets.flipped_slices),
-        ("vehicle", packets.hung_decoders),
-        ("none", connections.strangers),
-        ("none", connections.silent_connections),
-        ("none", connections.half_requests),
-        ("vehicle", connections.pings),
-        ("vehicle", connections.settings),
-        ("vehicle", connections.resets),
-        ("vehicle", connections.continuations),
-        ("vehicle", connections.repeated_headers),
-        ("none", fields.strange_entries),
-        ("vehicle", fields.malformed_archives),
-        ("vehicle", fields.field_bombs),
+LOG_LINES, OPEN_FILES = "lines of its log", "descriptors it had open at most"
+PROCESSOR_S = "seconds of a processor"
+
+
+@dataclass(frozen=True)
+class Attack:
+    """One attack, with whose certificate, and what shows that it reached the server.
+
+    ``effect`` names what must be more than ``EFFECT`` times as much when the server is attacked as
+    when the decoy is: a counter of the server's metrics ("NAME{LABELS}", the values of its labels
+    in the order of their names), or one of the three above for what no metric counts.
+    """
+
+    identity: str
+    work: Callable[[Target], Awaitable[None]]
+    effect: str
+
+    @property
+    def name(self) -> str:
+        """Return how it is called."""
+        return self.work.__name__
+
+
+EFFECT = {LOG_LINES: 2.0, OPEN_FILES: 1.2, PROCESSOR_S: 1.1}
+"""How many times as much; of counters, which stand still otherwise, ``MUCH``."""
+MUCH = 2.0
+
+
+def limited(limit: Limit) -> str:
+    """Return the counter of calls, streams and frames that a limit refused."""
+    return f"rfedge_server_limited_total{{{limit}}}"
+
+
+def nacked(reason: RejectReason) -> str:
+    """Return the counter of frames refused for a reason."""
+    return f"rfedge_server_frames_total{{{reason} nacked}}"
+
+
+def spent(resource: Resource) -> str:
+    """Return the counter of what identities used."""
+    return f"rfedge_server_spent_total{{{resource}}}"
+
+
+OPENED = "rfedge_server_openings_total{opened}"
+REFUSED_CERTIFICATES = "rfedge_server_refused_certificates_total{}"
+
+ATTACKS = {
+    attack.name: attack
+    for attack in (
+        Attack("consumer", rpcs.unread_fetches, limited(Limit.IDENTITY_FETCHES)),
+        Attack("vehicle", rpcs.decoders_for_nothing, limited(Limit.IDENTITY_DECODERS)),
+        Attack("vehicle", rpcs.decoders_within_budget, OPENED),
+        Attack("vehicle", rpcs.bad_crc, nacked(RejectReason.CRC_MISMATCH)),
+        Attack("vehicle", rpcs.junk_slices, spent(Resource.MESSAGES)),
+        Attack("vehicle", rpcs.greedy_promise, limited(Limit.IDENTITY_DECODERS)),
+        Attack("vehicle", rpcs.greedy_promise_within_budget, OPENED),
+        Attack("vehicle", rpcs.cancelled_hellos, spent(Resource.CALLS)),
+        Attack("vehicle", rpcs.unread_refusals, spent(Resource.MESSAGES)),
+        Attack("consumer", rpcs.unread_watches, limited(Limit.IDENTITY_WATCHES)),
+        Attack("vehicle", rpcs.impossible_times, spent(Resource.MESSAGES)),
+        Attack("vehicle", rpcs.many_streams, limited(Limit.IDENTITY_CALLS)),
+        Attack("vehicle", rpcs.compressed_bombs, spent(Resource.CALLS)),
+        Attack("vehicle", rpcs.rapid_resets, spent(Resource.CALLS)),
+        Attack("vehicle", rpcs.foreign_names, spent(Resource.CALLS)),
+        Attack("vehicle", rpcs.refused_frames, nacked(RejectReason.SEQUENCE_GAP)),
+        Attack("vehicle", rpcs.unknown_fields, spent(Resource.BYTES)),
+        Attack("vehicle", rpcs.odd_numbers, nacked(RejectReason.INVALID_ARGUMENT)),
+        Attack("consumer", rpcs.foreign_paths, spent(Resource.CALLS)),
+        Attack("vehicle", rpcs.many_connections, spent(Resource.CALLS)),
+        Attack("vehicle", rpcs.revoked, REFUSED_CERTIFICATES),
+        Attack("vehicle", packets.flipped_slices, spent(Resource.MESSAGES)),
+        Attack("vehicle", packets.hung_decoders, spent(Resource.MESSAGES)),
+        Attack("none", connections.strangers, PROCESSOR_S),
+        Attack("none", connections.silent_connections, OPEN_FILES),
+        Attack("none", connections.half_requests, OPEN_FILES),
+        Attack("vehicle", connections.pings, PROCESSOR_S),
+        Attack("vehicle", connections.settings, PROCESSOR_S),
+        Attack("vehicle", connections.resets, limited(Limit.IDENTITY_CALLS)),
+        Attack("vehicle", connections.continuations, PROCESSOR_S),
+        Attack("vehicle", connections.repeated_headers, PROCESSOR_S),
+        Attack("none", fields.strange_entries, LOG_LINES),
+        Attack("vehicle", fields.malformed_archives, LOG_LINES),
+        Attack("vehicle", fields.field_bombs, LOG_LINES),
     )
 }
 
@@ -96,7 +147,7 @@ async def main(name: str, seconds: str, target: str, begun: str = "") -> None:
         Path(begun).write_text("begun")
     with suppress(TimeoutError):
         async with asyncio.timeout(float(seconds)):
-            await ATTACKS[name][1](Target(**json.loads(target)))
+            await ATTACKS[name].work(Target(**json.loads(target)))
 
 
 if __name__ == "__main__":

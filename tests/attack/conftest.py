@@ -17,14 +17,18 @@ import sys
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
+from attack.attacker import LOG_LINES, OPEN_FILES, PROCESSOR_S
 from attack.target import Target
 from rfedge.certs.authority import Members, certify, write_certificates
 from scoreboard import Scoreboard
@@ -33,12 +37,15 @@ ROOT = Path(__file__).parents[2]
 FIELD = ROOT / "samples/fields/street.rff"
 ATTACKER = ("-m", "attack.attacker")
 GROUPS = Path("/sys/fs/cgroup")
-MEMORY_BYTES, PIDS, MAX_FIELD_GB = 1 << 30, 128, 0.25
-"""``mem_limit``, ``pids_limit`` and ``--max-field-gb`` of docker-compose.yml."""
+MEMORY_BYTES, PIDS, CPUS, MAX_FIELD_GB = 1 << 30, 128, 1.0, 0.25
+"""``mem_limit``, ``pids_limit``, ``cpus`` and ``--max-field-gb`` of docker-compose.yml."""
+CPU_PERIOD_US = 100_000
+"""Within which a group may use ``CPUS`` of this long; Docker's own."""
 ROUNDS = 2
 """How often calm, control and attack take turns."""
 NICE = 10
 ALLOWANCE_MS = 10.0
+SCRAPE_S = 5.0
 REPORT_S = 30.0
 """Within which the bystander knows how a picture ended: it loses its stream, and opens another."""
 BOARD = Scoreboard("attacks", "make test-attack")
@@ -67,17 +74,27 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 class ControlGroup:
-    """Limits on memory and processes: of version 2 where that has them, else of version 1."""
+    """Limits on memory, processes and processors: of version 2 where that has them, else of 1."""
 
-    def __init__(self, name: str, memory_bytes: int = MEMORY_BYTES) -> None:
+    def __init__(self, name: str, memory_bytes: int = MEMORY_BYTES, cpus: float = CPUS) -> None:
         two = GROUPS / "cgroup.controllers"
-        self._is_2 = two.exists() and {"memory", "pids"} <= set(two.read_text().split())
-        kinds = ("",) if self._is_2 else ("memory", "pids")
+        self._is_2 = two.exists() and {"memory", "pids", "cpu"} <= set(two.read_text().split())
+        kinds = ("",) if self._is_2 else ("memory", "pids", "cpu")
         self._folders = [GROUPS / kind / name for kind in kinds]
         for folder in self._folders:
             folder.mkdir()
         self.limit_memory(memory_bytes)
-        (self._folders[-1] / "pids.max").write_text(str(PIDS))
+        of_pids = self._folders[0 if self._is_2 else 1]
+        (of_pids / "pids.max").write_text(str(PIDS))
+        self._limit_cpus(cpus)
+
+    def _limit_cpus(self, cpus: float) -> None:
+        quota_us = round(cpus * CPU_PERIOD_US)
+        if self._is_2:
+            (self._folders[0] / "cpu.max").write_text(f"{quota_us} {CPU_PERIOD_US}")
+            return
+        (self._folders[-1] / "cpu.cfs_period_us").write_text(str(CPU_PERIOD_US))
+        (self._folders[-1] / "cpu.cfs_quota_us").write_text(str(quota_us))
 
     def limit_memory(self, limit_bytes: int) -> None:
         """Set how much memory its processes may have together."""
@@ -184,15 +201,27 @@ class Scene:
                 await asyncio.sleep(0.05)
         return [x for x, s in zip(lines, captured_s, strict=True) if begin_s <= s <= end_s]
 
+    def counters(self) -> Counter[str]:
+        """Return what the server has counted of everything so far, its log's lines included.
+
+        Nothing of a server that does not answer.
+        """
+        counted = Counter({LOG_LINES: (self.folder / "server.log").read_bytes().count(b"\n")})
+        with suppress(OSError):
+            counted.update(scraped(self.target.metrics))
+        return counted
+
     async def phase(self, attack: str = "", target: Target | None = None) -> "Phase":
         """Let a while pass, attacking or not; return what the bystander had of it."""
+        before = await asyncio.to_thread(self.counters)
         attacker = None if target is None else await self._attacker(attack, target)
-        most_bytes, began_s, lasts_s = 0, time.time(), self.attack_s / ROUNDS
+        most_bytes, most_files, began_s, lasts_s = 0, 0, time.time(), self.attack_s / ROUNDS
         before_s = processor_s(self.server.pid)
         try:
             until_s = time.monotonic() + lasts_s
             while time.monotonic() < until_s and self.server.poll() is None:
                 most_bytes = max(most_bytes, self.group.memory_bytes())
+                most_files = max(most_files, open_files(self.server.pid))
                 if attacker is not None and attacker.poll() is not None:
                     pytest.fail((self.folder / "attacker.log").read_text())
                 await asyncio.sleep(0.05)
@@ -203,7 +232,10 @@ class Scene:
                 attacker.kill()
                 attacker.wait()
         lines = await self._lines(began_s, end_s)
-        return Phase(lines, most_bytes, end_s - began_s, worked_s, attacked_s)
+        grown = await asyncio.to_thread(self.counters)
+        grown.subtract(before)
+        grown.update({OPEN_FILES: most_files, PROCESSOR_S: worked_s})
+        return Phase(lines, most_bytes, end_s - began_s, worked_s, attacked_s, grown)
 
     async def _attacker(self, attack: str, target: Target) -> subprocess.Popen[bytes]:
         """Return the process of an attack that has begun."""
@@ -240,16 +272,40 @@ def processor_s(pid: int) -> float:
     return (int(stat[11]) + int(stat[12])) / TICKS_PER_S
 
 
+def open_files(pid: int) -> int:
+    """Return how many descriptors a process has; 0 if it has ended."""
+    with suppress(OSError):
+        return sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
+    return 0
+
+
+def scraped(metrics: str) -> dict[str, float]:
+    """Return the counters at HOST:PORT, as ``Effect.counter`` names them; raise ``OSError``."""
+    with urlopen(f"http://{metrics}/metrics", timeout=SCRAPE_S) as answer:
+        text = answer.read().decode()
+    families = text_string_to_metric_families(text)
+    return {
+        f"{sample.name}{{{' '.join(label for _, label in sorted(sample.labels.items()))}}}": value
+        for family in families
+        if family.type == "counter"
+        for sample in family.samples
+        for value in [sample.value]
+    }
+
+
 @dataclass(frozen=True)
 class Phase:
     """The bystander's pictures of a while, the most memory the server's group had, for how long
-    of ``lasted_s`` the server had a processor, and for how long the attacker had had one."""
+    of ``lasted_s`` the server had a processor, and for how long the attacker had had one.
+
+    ``grown``: by how much the server's counters grew (``Effect``)."""
 
     lines: list[dict[str, Any]]
     most_bytes: int
     lasted_s: float
     worked_s: float
     attacked_s: float
+    grown: Counter[str]
 
     def __add__(self, other: "Phase") -> "Phase":
         """Return both as one."""
@@ -259,6 +315,7 @@ class Phase:
             self.lasted_s + other.lasted_s,
             self.worked_s + other.worked_s,
             self.attacked_s + other.attacked_s,
+            self.grown + other.grown,
         )
 
     @property

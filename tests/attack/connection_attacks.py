@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from attack.target import VEHICLE, Target, all_of, endpoint, for_ever
+from rfcore.wire.conventions import STREAM_METHOD
 
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 HEADERS, RST_STREAM, SETTINGS, PING, CONTINUATION = 1, 3, 4, 6, 9
@@ -81,7 +82,7 @@ REQUEST = b"".join(
     for name, value in (
         (b":method", b"POST"),
         (b":scheme", b"https"),
-        (b":path", b"/rfedge.v1.EdgeService/Stream"),
+        (b":path", STREAM_METHOD.encode()),
         (b":authority", b"localhost"),
         (b"content-type", b"application/grpc"),
         (b"te", b"trailers"),

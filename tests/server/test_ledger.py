@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -19,6 +20,7 @@ from mec_server.ledger.budgets import (
     Resource,
     budgets_of,
     decoders_that_fit,
+    memory_limit_bytes,
 )
 from mec_server.ledger.ledger import (
     BARRED_S,
@@ -311,6 +313,28 @@ def test_decoders_fit_into_the_memory_there_is() -> None:
     budgets = budgets_of(IdentityBudget(), ServerBudget(decoders=5), 2, GIB)
     assert budgets[Resource.DECODERS] == Budget(2, 5)
     assert PIXELS_PER_DECODER == 1920 * 1088
+
+
+@pytest.mark.parametrize(
+    ("own", "folder", "name"),
+    [
+        ("0::/rsu.slice/mec.service", "rsu.slice/mec.service", "memory.max"),
+        ("0::/rsu.slice/mec.service", "rsu.slice", "memory.max"),
+        ("0::/", "", "memory.max"),
+        ("4:memory:/mec\n1:cpu:/\n0::/", "memory/mec", "memory.limit_in_bytes"),
+        ("4:memory:/docker/ab\n0::/", "memory", "memory.limit_in_bytes"),
+    ],
+)
+def test_memory_is_limited_by_every_control_group_around_the_server(
+    own: str, folder: str, name: str, tmp_path: Path
+) -> None:
+    of_all = memory_limit_bytes(tmp_path, tmp_path / "none")
+    (tmp_path / "own").write_text(own + "\n")
+    (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+    (tmp_path / folder / name).write_text(f"{GIB // 4}\n")
+    assert memory_limit_bytes(tmp_path, tmp_path / "own") == GIB // 4
+    (tmp_path / folder / name).write_text("max\n")
+    assert memory_limit_bytes(tmp_path, tmp_path / "own") == of_all
 
 
 @pytest.mark.parametrize("change", [{"streams": 0}, {"messages_per_s": 0.0}, {"share": 0.0}])
