@@ -18,7 +18,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["ConnectionCap", "source_of"]
+__all__ = ["ConnectionCap", "keep_silent_out", "source_of"]
+
+INTERNET = (socket.AF_INET, socket.AF_INET6)
+SILENT_S = 5
+"""For how long a connection may be silent before gRPC is given it; TCP rounds up."""
 
 V6_NETWORK_BITS = 64
 """What a site has of IPv6 addresses at least, so its addresses count as one (RFC 6177)."""
@@ -73,14 +77,32 @@ class ConnectionCap:
         return cut
 
 
+def keep_silent_out(port: int) -> int:
+    """Have the kernel keep connections to ``port`` to itself until their peer says something.
+
+    A client that speaks TLS or HTTP/2 speaks first. Returns how many listening sockets there are.
+    """
+    listening = 0
+    for descriptor in _descriptors():
+        with suppress(OSError), _duplicate(descriptor) as duplicate:
+            is_own = duplicate.family in INTERNET and duplicate.getsockname()[1] == port
+            if is_own and duplicate.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
+                duplicate.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, SILENT_S)
+                listening += 1
+    return listening
+
+
+def _descriptors() -> Iterator[int]:
+    return (int(entry.name) for entry in Path("/proc/self/fd").iterdir())
+
+
 def _accepted(port: int) -> Iterator[Connection]:
-    for entry in Path("/proc/self/fd").iterdir():
-        descriptor = int(entry.name)
+    for descriptor in _descriptors():
         inode = _inode(descriptor)
         if not inode:
             continue
         with suppress(OSError, ValueError), _duplicate(descriptor) as duplicate:
-            if duplicate.family not in (socket.AF_INET, socket.AF_INET6):
+            if duplicate.family not in INTERNET:
                 continue
             if duplicate.getsockname()[1] == port:  # a listening socket has no peer: OSError
                 yield Connection(descriptor, inode, source_of(duplicate.getpeername()[0]))

@@ -21,7 +21,7 @@ from prometheus_client import CollectorRegistry
 
 from mec_server.access import AccessFile
 from mec_server.config import RecordSettings, ServerConfig
-from mec_server.connection_cap import ConnectionCap
+from mec_server.connection_cap import ConnectionCap, keep_silent_out
 from mec_server.decoding.decoders import Decoders, DecoderSettings
 from mec_server.edge_service import EdgeService
 from mec_server.event_loop import BACKGROUND_NICE, Workers, repeat_forever
@@ -270,6 +270,7 @@ class EdgeServer:
         self._metrics.decoder_started(self._decoders.kind)
         self.address = Address(self.address.host, self._open_port())
         await self._server.start()
+        keep_silent_out(self.address.port)
         self._follow(self.take_up_fields, PUBLICATIONS_EVERY_S, BackgroundTask.PUBLICATIONS)
         self._follow(self._sweep_calls, SWEEP_EVERY_S, BackgroundTask.ACCESS)
         if self._learner is not None:
