@@ -13,7 +13,7 @@ from typing import Protocol
 from mec_server.config import AdmissionLimits
 from mec_server.ledger.budgets import Budget, Limit, Resource, decoders_of
 from mec_server.ledger.ledger import Hold, Ledger, TokenBucket
-from mec_server.ledger.promises import Promises
+from mec_server.ledger.promises import ASSUMED_HZ, Promises
 from rfcore.errors import LimitExceeded
 from rfcore.wire.messages import Frame, Hello
 
@@ -109,6 +109,10 @@ RATE_MARGIN = 1.25
 LEAST_BURST_FRAMES = 8
 """What a camera may send at once: the frames in flight, each captured anew after a Nack."""
 
+UNSTATED_HZ = 30 * ASSUMED_HZ
+"""What a camera may send that stated no rate and was granted none: more than any films, and a
+quarter of what its identity may send."""
+
 RAW_BYTES_PER_PIXEL = 1.5
 """Of an I420 picture; a coded one that is larger tells nothing that this would not."""
 
@@ -116,46 +120,40 @@ RAW_BYTES_PER_PIXEL = 1.5
 class CameraMeter:
     """Frames and bytes that one camera may send: its granted rate, with some margin.
 
-    ``rate_hz`` 0: no limit but its identity's.
+    ``rate_hz`` 0: ``UNSTATED_HZ``.
     """
 
     def __init__(self, pixels: int, rate_hz: float, now: float) -> None:
         self._raw_bytes = RAW_BYTES_PER_PIXEL * pixels
-        self._rate_hz = 0.0
-        self._buckets: tuple[TokenBucket, TokenBucket] | None = None
-        self.grant(rate_hz, now)
+        self._rate_hz = rate_hz or UNSTATED_HZ
+        rate, burst = self._rate_and_burst()
+        raw = self._raw_bytes
+        self._frames = TokenBucket(rate, now, burst)
+        self._sizes = TokenBucket(rate * raw, now, burst * raw)
 
     def grant(self, rate_hz: float, now: float) -> None:
         """Let it send ``rate_hz`` pictures per second from now on."""
-        self._rate_hz = rate_hz
-        if not rate_hz:
-            self._buckets = None
-            return
-        rate = RATE_MARGIN * rate_hz
-        burst = max(rate, float(LEAST_BURST_FRAMES))
-        raw = self._raw_bytes
-        if self._buckets is None:
-            self._buckets = TokenBucket(rate, now, burst), TokenBucket(rate * raw, now, burst * raw)
-            return
-        frames, sizes = self._buckets
-        frames.set_rate(rate, now, burst)
-        sizes.set_rate(rate * raw, now, burst * raw)
+        self._rate_hz = rate_hz or UNSTATED_HZ
+        rate, burst = self._rate_and_burst()
+        self._frames.set_rate(rate, now, burst)
+        self._sizes.set_rate(rate * self._raw_bytes, now, burst * self._raw_bytes)
+
+    def _rate_and_burst(self) -> tuple[float, float]:
+        rate = RATE_MARGIN * self._rate_hz
+        return rate, max(rate, float(LEAST_BURST_FRAMES))
 
     def spend(self, message_bytes: int, now: float) -> None:
         """Count a frame; raise ``LimitExceeded`` if it is one too many."""
-        if self._buckets is None:
-            return
-        frames, sizes = self._buckets
-        if not frames.take(1, now):
-            wait_s = frames.wait_s(now)
+        if not self._frames.take(1, now):
+            wait_s = self._frames.wait_s(now)
             raise LimitExceeded(
                 Limit.CAMERA_FRAMES,
-                f"this camera was granted {self._rate_hz:g} pictures a second; "
+                f"this camera may send {self._rate_hz:g} pictures a second; "
                 f"come again in {wait_s:.3g} s",
                 wait_s,
             )
-        if not sizes.take(message_bytes, now):
-            wait_s = sizes.wait_s(now)
+        if not self._sizes.take(message_bytes, now):
+            wait_s = self._sizes.wait_s(now)
             raise LimitExceeded(
                 Limit.CAMERA_BYTES,
                 f"more bytes than {self._rate_hz:g} pictures a second have uncoded; "
@@ -209,7 +207,9 @@ class StreamAccount:
             raise
         self._cameras = {
             camera.camera_id: CameraMeter(
-                camera.intrinsics.width_px * camera.intrinsics.height_px, rate_hz, now
+                camera.intrinsics.width_px * camera.intrinsics.height_px,
+                rate_hz or max(UNSTATED_HZ, camera.rate_hz),
+                now,
             )
             for camera in hello.cameras
         }

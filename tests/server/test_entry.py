@@ -1,5 +1,6 @@
 """What one stream is charged for, and what it gives back, on a clock the test turns."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -10,13 +11,14 @@ from mec_server.ledger.entry import (
     LEAST_BURST_FRAMES,
     RATE_MARGIN,
     RAW_BYTES_PER_PIXEL,
+    UNSTATED_HZ,
     CameraMeter,
     EntryControl,
 )
 from mec_server.ledger.ledger import LONGER_BURST_S
 from mec_server.ledger.peer_log import LINE_BURST, LINES_PER_S, LogLimiter
 from rfcore.errors import LimitExceeded
-from rfcore.wire.messages import Hello
+from rfcore.wire.messages import Frame, Hello
 
 GIB = 1 << 30
 
@@ -52,7 +54,25 @@ def sent_in(seconds: float, meter: CameraMeter, hz: float, message_bytes: int = 
 
 def test_a_camera_at_its_granted_rate_is_never_refused() -> None:
     assert sent_in(60.0, CameraMeter(640 * 360, 10.0, 0.0), 10.0) == 600
-    assert sent_in(60.0, CameraMeter(640 * 360, 0.0, 0.0), 1000.0) == 60_000, "no limit was set"
+    assert sent_in(60.0, CameraMeter(640 * 360, 0.0, 0.0), UNSTATED_HZ) == 60 * UNSTATED_HZ
+
+
+def test_a_camera_without_a_rate_gets_more_than_any_films_and_no_more() -> None:
+    for meter in (CameraMeter(640 * 360, 0.0, 0.0), CameraMeter(640 * 360, 10.0, 0.0)):
+        meter.grant(0.0, 0.0)
+        passed = sent_in(30.0, meter, 1200.0)
+        assert passed == pytest.approx(31 * UNSTATED_HZ * RATE_MARGIN, rel=0.05)
+
+
+def test_a_camera_may_send_the_rate_that_it_states_where_none_is_granted(
+    hello: Hello, make_frame: Callable[..., Frame]
+) -> None:
+    stated = replace(hello, cameras=(replace(hello.cameras[0], rate_hz=2 * UNSTATED_HZ),))
+    frame = make_frame(0, camera_id=stated.cameras[0].camera_id)
+    account = entry_control(load=0.0).open("s-1", "ipv4:peer", named=False, now=0.0)
+    assert account.enter(stated, Sender(), 0.0) == 0.0, "no limit"
+    for number in range(4 * round(UNSTATED_HZ)):
+        account.spend_frame(frame, 10, number / (2 * UNSTATED_HZ))
 
 
 def test_a_camera_beyond_its_granted_rate_gets_that_and_a_quarter() -> None:
