@@ -1,5 +1,6 @@
 """Writes the first inputs of every target to ``corpus``: ``python tests/fuzz/seeds.py``."""
 
+import gzip
 import struct
 import tempfile
 from pathlib import Path
@@ -13,6 +14,7 @@ from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, FrameChoice
 from rfcore.field import FieldMetadata, SplatField, render_field_view, write_ply
 from rfcore.field.archive import PREFIX, encode_archive
+from rfcore.field.spz import encode_spz
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.raster.gaussians import Gaussians
 from rfcore.wire.conventions import RENDERER_CONTRACT
@@ -28,6 +30,15 @@ from rfcore.wire.messages import (
     RendererContract,
     StageTimes,
 )
+from rfcore.wire.tile_manifest import (
+    MANIFEST,
+    OWN_LIGHT,
+    Publication,
+    TileVersions,
+    VersionLabel,
+    write_publication,
+)
+from rfcore.wire.tiles import Area
 
 CORPUS = Path(__file__).parent / "corpus"
 FIELD_ID = "ab" * 32
@@ -57,7 +68,8 @@ def coded() -> tuple[Hello, list[Frame]]:
         picture = i420_from_rgb(np.full((16, 16, 3), 90 + 40 * number, np.uint8))
         encoded = encoder.encode(state, picture, view, choice=choice)
         state = encoded.state
-        frames.append(Frame("front", 10**9 + number, pose, bytes.fromhex(FIELD_ID), encoded.packet))
+        prefix = bytes.fromhex(FIELD_ID)[:8]
+        frames.append(Frame("front", 10**9 + number, pose, prefix, encoded.packet))
     described = CameraDescription("front", camera, encoder.header)
     return Hello(
         "cav-1", (described,), (FIELD_ID,), RendererContract(RENDERER_CONTRACT, True)
@@ -72,6 +84,9 @@ def put_wire() -> None:
         put("message", name, data)
     ack = Ack(FrameAddress("front", 1, 0), StageTimes(1, 2, 3), bytes(16))
     put("message", "answers", server_messages_to_bytes([ack])[0])
+    for name, frame, data in zip(("frame-0", "frame-1"), frames, messages[1:], strict=True):
+        put("packet", name, data)
+        put("slices", name, frame.packet.payload)
     put("session", "drive", b"".join(struct.pack("<H", len(data)) + data for data in messages))
     header = hello.cameras[0].codec
     payloads = [frame.packet.payload for frame in frames]
@@ -96,6 +111,18 @@ def put_files() -> None:
         write_ply(Path(folder) / "a.ply", field(1).gaussians, antialiased=True)
         data = (Path(folder) / "a.ply").read_bytes()
         put("ply", "binary", data)
+    for name, zipped in {"degree-0": 0, "degree-1": 1}.items():
+        data = encode_spz(field(zipped).gaussians, antialiased=True)
+        put("spz", name, data)
+        put("spz", f"{name}-plain", gzip.decompress(data))
+    label = VersionLabel("dusk", FIELD_ID, 2, 19.5)
+    labels = (OWN_LIGHT, label)
+    times = ("2026-11-01T12:00:00+00:00",) * 2
+    area = Area((-1.0, -2.0), (3.0, 4.0))
+    versions = TileVersions((FIELD_ID, "cd" * 32), times, 1, area, 2.0, labels, {"dusk": 2})
+    with tempfile.TemporaryDirectory() as folder:
+        write_publication(Path(folder), Publication({"west": versions}))
+        put("tiles", "west", (Path(folder) / MANIFEST).read_bytes())
     names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
     properties = "".join(f"property double {name}\n" for name in names.split())
     row = " ".join(["0.5"] * 14)

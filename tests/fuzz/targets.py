@@ -4,6 +4,7 @@
 everything a fuzzer makes, it is repaired first, so that what lies behind it is reached.
 """
 
+import gzip
 import hashlib
 import io
 import json
@@ -12,12 +13,18 @@ import struct
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from mec_server.session import OpenJob, ServerSession
+from rfcore.camera import Camera
+from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.bitstream import split_nals
 from rfcore.codec.h264.parameter_sets import parse_pps, parse_slice_start, parse_sps
+from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.state import DecoderState
 from rfcore.dataset.transforms import read_transforms_source
 from rfcore.errors import (
     FieldFormatError,
@@ -26,21 +33,27 @@ from rfcore.errors import (
     RejectReason,
     RfedgeError,
 )
+from rfcore.field import render_field_view
 from rfcore.field.archive import ALIGN_BYTES, PREFIX, decode_archive
 from rfcore.field.ply import read_open_ply
+from rfcore.field.spz import read_open_spz
 from rfcore.field.store import decode_field
+from rfcore.views import FieldView
 from rfcore.wire.convert import (
     client_message_from_bytes,
     client_message_to_bytes,
 )
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.drive_file import read_drive
+from rfcore.wire.messages import Frame, Hello
+from rfcore.wire.tile_manifest import MANIFEST, read_publication
 
 __all__ = ["TARGETS"]
 
 FEW_BYTES = 1 << 24
 """Memory that a field of a fuzzer may take."""
 FOLDER = Path(tempfile.mkdtemp())
+CORPUS = Path(__file__).parent / "corpus"
 
 
 def message(data: bytes) -> None:
@@ -92,6 +105,55 @@ def bitstream(data: bytes) -> None:
                 parse_slice_start(nal, 4)
 
 
+@dataclass(frozen=True)
+class Receiver:
+    """A decoder that has decoded the first frame of the corpus, and the second frame."""
+
+    decoder: DeltaDecoder
+    state: DecoderState
+    view: FieldView
+    next_packet: DeltaPacket
+
+    def takes(self, packet: DeltaPacket) -> None:
+        """Decode a packet, or refuse it."""
+        with suppress(PacketRejected):
+            self.decoder.decode(self.state, packet, self.view)
+
+
+@cache
+def receiver() -> Receiver:
+    """Return one, with the view of the field that the corpus was coded against."""
+    names = ("hello", "frame-0", "frame-1")
+    hello, first, second = (
+        client_message_from_bytes((CORPUS / "message" / name).read_bytes()) for name in names
+    )
+    assert isinstance(hello, Hello)
+    assert isinstance(first, Frame)
+    assert isinstance(second, Frame)
+    field = decode_field((CORPUS / "archive" / "raw").read_bytes())
+    (camera,) = hello.cameras
+    view = render_field_view(field, Camera(camera.intrinsics, first.pose).rounded())
+    decoder = DeltaDecoder(camera.codec)
+    state = decoder.decode(decoder.start(first.packet.epoch), first.packet, view).state
+    decoder.decode(state, second.packet, view)
+    return Receiver(decoder, state, view, second.packet)
+
+
+def packet(data: bytes) -> None:
+    """A frame of a vehicle for a decoder that waits for it; its CRC is made right."""
+    one = receiver()
+    with suppress(RfedgeError):
+        read = client_message_from_bytes(data)
+        if isinstance(read, Frame):
+            one.takes(read.packet.sealed())
+
+
+def slices(data: bytes) -> None:
+    """The slice of such a frame."""
+    one = receiver()
+    one.takes(replace(one.next_packet, payload=data).sealed())
+
+
 def archive(data: bytes) -> None:
     """A field file as it is, then with its digests made right."""
     with suppress(FieldFormatError):
@@ -123,6 +185,18 @@ def ply(data: bytes) -> None:
         read_open_ply(Path("fuzz.ply"), io.BytesIO(data), None, FEW_BYTES)
 
 
+def spz(data: bytes) -> None:
+    """Splats of other programs, compressed; as they are, then what gzip would hold."""
+    for one in (data, gzip.compress(data, 0)):
+        with suppress(FieldFormatError):
+            read_open_spz(Path("fuzz.spz"), io.BytesIO(one), None, FEW_BYTES)
+
+
+def tiles(data: bytes) -> None:
+    """The manifest of a folder of fields."""
+    _as_file(MANIFEST, data, lambda path: read_publication(path.parent))
+
+
 def transforms(data: bytes) -> None:
     """Posed pictures by nerfstudio's transforms.json."""
     _as_file("transforms.json", data, read_transforms_source)
@@ -143,8 +217,12 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     "message": message,
     "session": session,
     "bitstream": bitstream,
+    "packet": packet,
+    "slices": slices,
     "archive": archive,
     "ply": ply,
+    "spz": spz,
+    "tiles": tiles,
     "transforms": transforms,
     "drive": drive,
 }
