@@ -123,7 +123,7 @@ class EdgeServer:
         self._background = Workers(1, outcome_failed, "background", nice=BACKGROUND_NICE)
         self._workers = Workers(config.workers, outcome_failed, crowded=lambda: promises.is_crowded)
         self._decoders = Decoders(
-            DecoderSettings(config.decoder, not self.address.is_loopback, config.sandbox_as_root),
+            DecoderSettings(config.decoder, self._is_reachable(), config.sandbox_as_root),
             self._metrics.count_lost_decoder,
             self._failed(BackgroundTask.DECODER_START),
             self._log_limiter,
@@ -189,6 +189,10 @@ class EdgeServer:
             self._guard.may_fetch,
         ).register(self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+
+    def _is_reachable(self) -> bool:
+        """Whether packets may come from other machines, by themselves or through a proxy here."""
+        return not self.address.is_loopback or bool(self._config.proxy_identity)
 
     @contextmanager
     def _waiting(self) -> Iterator[None]:

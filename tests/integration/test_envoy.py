@@ -146,7 +146,7 @@ async def test_over_mutual_tls_envoy_says_who_a_vehicle_is_and_nobody_else_can(
     certs = tmp_path / "envoy" / "certs"
     files = ("--tls-cert", "server.pem", "--tls-key", "server.key", "--tls-ca", "ca.pem")
     tls = (word if word.startswith("--") else str(certs / word) for word in files)
-    options = (*tls, "--proxy-identity", "edge-proxy")
+    options = (*tls, "--proxy-identity", "edge-proxy", "--decoder", "in-process")
     setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy-mtls.yaml", tmp_path / "envoy")
     write_certificates(certs, certify(members, datetime.now(UTC), days=30))
     metadata = ((FORWARDED, forwarded_header(certs / "vehicle-cav-raw.pem")),)

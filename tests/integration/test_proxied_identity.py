@@ -2,6 +2,7 @@
 
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -9,22 +10,25 @@ from urllib.parse import quote
 
 import grpc
 import pytest
+import structlog
 
 import mec_server.server
-from mec_server.config import ServerConfig
+from mec_server.config import DecoderKind, ServerConfig
 from mec_server.proxies import FORWARDED
+from mec_server.server import EdgeServer
 from rfcore.errors import InvalidInput
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import Welcome
+from rfcore.wire.settings import TransportSettings
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2, field_pb2_grpc
 from rfedge.certs.authority import Members, certify, write_certificates
 
 Files = Callable[[str], TlsFiles]
 MEMBERS = Members(("cav-raw", "cav-2"), ("desk",), proxies=("edge-proxy",))
-PROXY = {"proxy_identity": ("edge-proxy",)}
+PROXY = {"proxy_identity": ("edge-proxy",), "decoder": DecoderKind.IN_PROCESS}
 
 
 @pytest.fixture
@@ -145,3 +149,20 @@ def test_a_proxy_is_named_only_to_a_server_with_certificates(tmp_path: Path) -> 
         ServerConfig(tmp_path, proxy_identity=("edge-proxy",))
     with pytest.raises(InvalidInput, match="proxy-identity"):
         ServerConfig(tmp_path, proxy_identity=("edge proxy/",))
+
+
+def starts_in_process(config: ServerConfig) -> bool:
+    """Whether a server of ``config`` says that it decodes in its own process."""
+    with structlog.testing.capture_logs() as lines:
+        EdgeServer(config)
+    return any(line["event"] == "decoding in the server's own process" for line in lines)
+
+
+async def test_auto_trusts_nobody_who_comes_through_a_proxy_of_this_machine(
+    certs: Files, tmp_path: Path
+) -> None:
+    files = certs("server")
+    transport = TransportSettings(files.certificate, files.key, files.authority)
+    alone = ServerConfig(tmp_path, "127.0.0.1:0", transport=transport)
+    assert starts_in_process(alone)
+    assert not starts_in_process(replace(alone, proxy_identity=("edge-proxy",)))

@@ -11,7 +11,7 @@ import pytest
 import structlog
 from prometheus_client import CollectorRegistry
 
-from mec_server.config import DecoderKind
+from mec_server.config import DecoderKind, ServerConfig
 from mec_server.decoding import decoders as decoder_kinds
 from mec_server.decoding import pool as decoder_pool
 from mec_server.decoding import process
@@ -21,6 +21,7 @@ from mec_server.decoding.pool import ChildDecoder, DecoderPool
 from mec_server.decoding.process import DecoderLost, LossCause
 from mec_server.ledger.peer_log import LogLimiter
 from mec_server.metrics import ServerMetrics
+from mec_server.server import EdgeServer
 from rfcore.codec.h264.ffmpeg import EncoderOptions, H264Decoder, PictureKind, encode_pictures
 from rfcore.confinement import start
 from rfcore.confinement.confine import Confinement
@@ -316,3 +317,38 @@ def test_a_lost_decoder_is_counted_by_cause(units: Sequence[bytes]) -> None:
     name = "rfedge_server_decoders_lost_total"
     assert registry.get_sample_value(name, {"cause": "signal"}) == 1
     assert registry.get_sample_value(name, {"cause": "timeout"}) == 0
+
+
+async def test_the_kind_in_force_is_in_the_metrics(tmp_path: Path) -> None:
+    landlock = {"decoder": DecoderKind.LANDLOCK, "sandbox_as_root": True}
+    server = EdgeServer(ServerConfig(tmp_path, "127.0.0.1:0", **landlock))
+    await server.start()
+    try:
+        values = {
+            kind: server.registry.get_sample_value("rfedge_server_decoder", {"kind": kind})
+            for kind in DecoderKind
+        }
+        assert values.pop(DecoderKind.LANDLOCK) == 1
+        assert values.pop(DecoderKind.AUTO) is None
+        assert set(values.values()) == {0.0}
+    finally:
+        await server.stop()
+
+
+CONFINED = {"NoNewPrivs": "1", "Seccomp": "2", "CapEff": "0000000000000000"}
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [DecoderKind.LANDLOCK, pytest.param(DecoderKind.BUBBLEWRAP, marks=pytest.mark.slow)],
+)
+def test_the_kernel_says_that_a_decoder_is_confined(kind: DecoderKind) -> None:
+    pool = DecoderPool(decoder_program(kind), lambda _: None, unexpected)
+    process = pool.take()
+    try:
+        lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
+        status = {name: value.strip() for name, _, value in (x.partition(":") for x in lines)}
+        assert {name: status[name] for name in CONFINED} == CONFINED
+    finally:
+        process.close()
+        pool.close()
