@@ -99,6 +99,7 @@ ATTACKS = {
         Attack("none", connections.strangers, PROCESSOR_S),
         Attack("none", connections.silent_connections, OPEN_FILES),
         Attack("none", connections.half_requests, OPEN_FILES),
+        Attack("vehicle", connections.silent_peers, OPEN_FILES),
         Attack("vehicle", connections.pings, PROCESSOR_S),
         Attack("vehicle", connections.settings, PROCESSOR_S),
         Attack("vehicle", connections.resets, limited(Limit.IDENTITY_CALLS)),
@@ -106,6 +107,7 @@ ATTACKS = {
         Attack("vehicle", connections.repeated_headers, PROCESSOR_S),
         Attack("none", fields.strange_entries, LOG_LINES),
         Attack("vehicle", fields.malformed_archives, LOG_LINES),
+        Attack("none", fields.malformed_publications, LOG_LINES),
         Attack("vehicle", fields.field_bombs, LOG_LINES),
     )
 }

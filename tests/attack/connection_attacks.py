@@ -67,6 +67,20 @@ async def held_connections(address: tuple[str, int], count: int, said: bytes) ->
         await asyncio.sleep(0.1)
 
 
+async def silent_peers(target: Target) -> None:
+    """200 connections that shake hands, say that they speak HTTP/2, and then nothing."""
+    context = target.tls_context(f"vehicle-{VEHICLE}")
+
+    async def connection() -> None:
+        with suppress(ssl.SSLError):
+            reader, writer = await asyncio.open_connection(*target.endpoint, ssl=context)
+            writer.write(PREFACE + http2_frame(SETTINGS, 0, 0))
+            await drain(reader)
+            writer.close()
+
+    await all_of(*(for_ever(connection, 0.1) for _ in range(200)))
+
+
 def http2_frame(kind: int, flags: int, stream: int, payload: bytes = b"") -> bytes:
     """Return a frame (RFC 9113, section 4.1)."""
     return struct.pack(">I", len(payload))[1:] + struct.pack(">BBI", kind, flags, stream) + payload

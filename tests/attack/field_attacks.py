@@ -19,6 +19,7 @@ from rfcore.field.archive import Archive, decode_archive, encode_archive
 from rfcore.field.store import encode_field
 from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
+from rfcore.wire.tile_manifest import Publication, TileVersions, write_publication
 
 SHIPPED = Path(__file__).parents[2] / "samples/fields/street.rff"
 
@@ -43,16 +44,28 @@ async def strange_entries(target: Target) -> None:
 
 async def malformed_archives(target: Target) -> None:
     """Archives with right digests and a shape of [0, 2^62], asked for as soon as they are there."""
+    await asked_for(target, malformed_archive)
 
-    def archive(number: int) -> bytes:
-        array = {"name": "means", "dtype": "<f4", "shape": [0, 1 << 62], "offset": 0}
-        digest = {"sha256": hashlib.sha256(b"").hexdigest()}
-        header = {"kind": "splats", "metadata": {"n": number}, "arrays": [array | digest]}
-        raw = json.dumps(header | {"data_bytes": 0}).encode()
-        prefix = struct.pack("<8sII32s16x", b"RFFIELD\0", 1, len(raw), hashlib.sha256(raw).digest())
-        return (prefix + raw).ljust(-(-(len(prefix) + len(raw)) // 64) * 64, b"\0")
 
-    await asked_for(target, archive)
+def malformed_archive(number: int) -> bytes:
+    array = {"name": "means", "dtype": "<f4", "shape": [0, 1 << 62], "offset": 0}
+    digest = {"sha256": hashlib.sha256(b"").hexdigest()}
+    header = {"kind": "splats", "metadata": {"n": number}, "arrays": [array | digest]}
+    raw = json.dumps(header | {"data_bytes": 0}).encode()
+    prefix = struct.pack("<8sII32s16x", b"RFFIELD\0", 1, len(raw), hashlib.sha256(raw).digest())
+    return (prefix + raw).ljust(-(-(len(prefix) + len(raw)) // 64) * 64, b"\0")
+
+
+async def malformed_publications(target: Target) -> None:
+    """A manifest that names one such archive after the other as the current field of a tile."""
+    folder = Path(target.fields)
+    for number in itertools.count():
+        data = malformed_archive(number)
+        field_id = hashlib.sha256(data).hexdigest()
+        (folder / f"{field_id}.rff").write_bytes(data)
+        versions = TileVersions((field_id,), ("2026-11-01T12:00:00+00:00",), 1)
+        write_publication(folder, Publication({"west": versions}))
+        await asyncio.sleep(0.5)
 
 
 async def field_bombs(target: Target) -> None:

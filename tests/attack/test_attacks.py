@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from attack.attacker import ATTACKS, EFFECT, MUCH
-from attack.conftest import ALLOWANCE_MS, MEMORY_BYTES, ROUNDS
+from attack.conftest import ALLOWANCE_MS, CPUS, MEMORY_BYTES, ROUNDS
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
@@ -66,7 +66,8 @@ def judge(scene: Any, calm: Any, control: Any, attacked: Any, after: Any) -> Non
             counts[2] <= most_by_chance(usual),
         )
     cores = " / ".join(f"{p.cores:.2f}" for p in (calm, control, attacked))
-    scene.note("processors that the server kept busy", f"calm / control / attacked {cores}", True)
+    busy = f"processors that the server kept busy, of {CPUS:g} that it may"
+    scene.note(busy, f"calm / control / attacked {cores}", True)
     spent = f"control / attacked {control.attacked_s:.1f} / {attacked.attacked_s:.1f} s"
     scene.note("the attacker's processor time", spent, attacked.attacked_s > 0)
     scene.note("how its frames ended", attacked.told, attacked.count("acked") > 0)
