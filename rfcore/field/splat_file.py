@@ -18,7 +18,7 @@ __all__ = ["SPLAT_SUFFIXES", "check_suffix", "read_open_splat_file", "read_splat
 SPLAT_SUFFIXES = (".ply", ".spz")
 CONVERTED = (".splat", ".ksplat", ".sog")
 """Formats that keep fewer bits than .ply and that splat-transform converts."""
-OTHERS = (".sogs", ".gltf", ".glb")
+OTHERS = (".gltf", ".glb")
 
 
 def read_splat_file(
@@ -54,6 +54,11 @@ def check_suffix(path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix in OTHERS:
         raise FieldFormatError(f"{path}: {suffix} is not read; export the splats as .ply")
+    if suffix == ".sogs":
+        raise FieldFormatError(
+            f"{path}: .sogs is not read; it is a zip: unpack it and convert what it holds (npm "
+            f"package @playcanvas/splat-transform): splat-transform meta.json {path.stem}.ply"
+        )
     if suffix in CONVERTED:
         raise FieldFormatError(
             f"{path}: {suffix} is not read; convert it first (npm package @playcanvas/"

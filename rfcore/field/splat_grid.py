@@ -5,7 +5,7 @@ the same bytes on every machine, without a rounding anywhere (the three small co
 rotation aside, a float32 division by 127 each).
 
 * means: blocks of 256 splats in file order; in a block, ``2^e`` times (base + q), with e chosen so
-  that the step is at most an eighth of the block's smaller widths;
+  that the step is at most an eighth (``MEANS_BITS``) of the block's smaller widths;
 * log scales, opacity logits, SH: one step each (``Steps``);
 * rotations: the largest component becomes +1 and the others, divided by it, multiples of 1/127.
   Renderers normalise; the sign of a quaternion means nothing;
@@ -28,8 +28,11 @@ from rfcore.raster.gaussians import F32, Gaussians
 
 __all__ = [
     "BLOCK",
+    "MEANS_BITS",
     "SplatNumbers",
     "Steps",
+    "colour_numbers",
+    "colours_of",
     "gaussians_of",
     "level_numbers_of",
     "level_of",
@@ -37,6 +40,9 @@ __all__ = [
 ]
 
 BLOCK = 256
+MEANS_BITS = 3
+"""A step of means is this power of two finer than the block's smaller widths, unless a writer
+chooses another; readers find the steps in ``blocks``."""
 ROTATION_STEPS = 127
 EXPONENTS = (-60, 60)
 
@@ -73,9 +79,9 @@ class SplatNumbers:
     sh: Integers
 
 
-def numbers_of(gaussians: Gaussians, steps: Steps) -> SplatNumbers:
+def numbers_of(gaussians: Gaussians, steps: Steps, means_bits: int = MEANS_BITS) -> SplatNumbers:
     """Return the nearest splats on the grid."""
-    blocks, means = _means_numbers(gaussians)
+    blocks, means = _means_numbers(gaussians, means_bits)
     return SplatNumbers(
         blocks=blocks,
         means=means,
@@ -84,7 +90,7 @@ def numbers_of(gaussians: Gaussians, steps: Steps) -> SplatNumbers:
         opacity_logits=_rounded(
             "opacity_logits", gaussians.opacity_logits[:, None], steps.opacity_logits
         ),
-        sh=_sh_numbers(gaussians.sh, steps),
+        sh=colour_numbers(gaussians.sh, steps),
     )
 
 
@@ -95,7 +101,7 @@ def gaussians_of(numbers: SplatNumbers, steps: Steps) -> Gaussians:
         quaternions=_quaternions_of(numbers.rotations),
         log_scales=_scaled(numbers.log_scales, steps.log_scales),
         opacity_logits=_scaled(numbers.opacity_logits, steps.opacity_logits)[:, 0].copy(),
-        sh=_sh_of(numbers.sh, steps),
+        sh=colours_of(numbers.sh, steps),
     )
 
 
@@ -133,10 +139,12 @@ def _scaled(numbers: Integers, bits: int) -> F32:
     return np.ascontiguousarray(np.ldexp(numbers.astype(np.float64), -bits), dtype=np.float32)
 
 
-def _means_numbers(gaussians: Gaussians) -> tuple[Integers, Integers]:
+def _means_numbers(gaussians: Gaussians, means_bits: int) -> tuple[Integers, Integers]:
     n = len(gaussians)
     starts = np.arange(0, n, BLOCK)
-    exponents = np.array([_exponent(gaussians, start) for start in range(0, n, BLOCK)], np.int32)
+    exponents = np.array(
+        [_exponent(gaussians, start, means_bits) for start in range(0, n, BLOCK)], np.int32
+    )
     steps = np.ldexp(1.0, np.repeat(exponents, BLOCK)[:n])
     whole = np.rint(gaussians.means.astype(np.float64) / steps[:, None]).astype(np.int32)
     bases = np.minimum.reduceat(whole, starts, axis=0) if n else np.zeros((0, 3), np.int32)
@@ -144,11 +152,11 @@ def _means_numbers(gaussians: Gaussians) -> tuple[Integers, Integers]:
     return blocks, whole - np.repeat(bases, BLOCK, axis=0)[:n]
 
 
-def _exponent(gaussians: Gaussians, start: int) -> int:
+def _exponent(gaussians: Gaussians, start: int, means_bits: int) -> int:
     """Return e of a block: a fine enough step, no finer than float32 is where the block lies."""
     part = slice(start, start + BLOCK)
     widths = np.sort(gaussians.log_scales[part].astype(np.float64), axis=1)[:, 1]
-    wanted = float(np.quantile(widths, 0.1)) / np.log(2) - 3
+    wanted = float(np.quantile(widths, 0.1)) / np.log(2) - means_bits
     furthest = float(np.abs(gaussians.means[part]).max())
     finest = np.ceil(np.log2(max(furthest, 2.0**-36))) - 23
     return int(np.clip(max(np.floor(wanted), finest), *EXPONENTS))
@@ -188,7 +196,8 @@ def _others(largest: Integers) -> Integers:
     return rest[largest]
 
 
-def _sh_numbers(sh: F32, steps: Steps) -> Integers:
+def colour_numbers(sh: F32, steps: Steps) -> Integers:
+    """Return the nearest numbers [N, 3 K] of colours [N, K, 3]."""
     bits = _bits_of_bands(sh.shape[1], steps)
     q = _rounded("sh", sh, bits[:, None])
     r, g, b = q[..., 0], q[..., 1], q[..., 2]
@@ -198,7 +207,8 @@ def _sh_numbers(sh: F32, steps: Steps) -> Integers:
     return np.hstack([middle + (green >> 1), orange, green])
 
 
-def _sh_of(numbers: Integers, steps: Steps) -> F32:
+def colours_of(numbers: Integers, steps: Steps) -> F32:
+    """Return the colours [N, K, 3] of ``numbers`` [N, 3 K]."""
     coefficients = numbers.shape[1] // 3
     luma, orange, green = (numbers[:, i * coefficients :][:, :coefficients] for i in range(3))
     middle = luma - (green >> 1)

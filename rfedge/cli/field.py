@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from rfcore.camera import Camera, TileOrigin
     from rfcore.field import RadianceField, SplatField
     from rfcore.raster.gaussians import Gaussians
+    from rfcore.train.levels import LevelFitConfig
     from rfcore.views import PosedPicture
     from rfedge.fields.check import Fit
 
@@ -280,15 +281,22 @@ class FieldSlim:
 
     field: Annotated[Path, Positional, FIELD]
     """The archive (.rff), or the field's name."""
-    keep: int
-    """How many splats to keep."""
     out: Annotated[Path, RFF]
     """The archive to write."""
+    keep: int | None = None
+    """How many splats to keep; or --max-mb, --passes or both, which choose that, the steps of every
+    number and the bits of colours, and fit lower levels of detail (with --drive)."""
+    max_mb: float | None = None
+    """At most how many MB the archive may have (10^6 bytes)."""
+    passes: int | None = None
+    """Write the size with the fewest bytes of field and stream over so many passes of --drive:
+    its pictures are coded against every size; of those within --max-mb if both are given."""
     drive: Annotated[Path | None, DATASET] = None
-    """Posed pictures whose cameras the field is to serve; their pixels are not read. Without this,
-    opacity and area decide what matters."""
+    """Posed pictures whose cameras the field is to serve; their pixels are read for --passes alone.
+    Without this, opacity and area decide what matters."""
     iterations: int = 240
-    """Iterations of fitting the survivors to the full field's renders (with --drive)."""
+    """Iterations of fitting the survivors, and lower levels, to the full field's renders (with
+    --drive)."""
     raw: bool = False
     """Write float32 instead of the compressed form."""
     threads: int = 2
@@ -296,15 +304,36 @@ class FieldSlim:
 
     def run(self) -> None:
         """Slim and write."""
+        from rfcore.errors import InvalidInput
         from rfcore.train.levels import LevelFitConfig
         from rfedge.fields.slim import slimmed
 
         _check_out(self.out, ".rff")
+        has_goal = self.max_mb is not None or self.passes is not None
+        if (self.keep is None) != has_goal:
+            raise InvalidInput("keep", "give either --keep, or --max-mb, --passes or both")
         field = open_splats(self.field, threads=self.threads)
-        cameras = _cameras_of(self.drive, field) if self.drive is not None else []
         config = LevelFitConfig(iterations=self.iterations, threads=self.threads)
+        if self.keep is None:
+            _write_reduced(field, self._sized(field, config), self.out, raw=False)
+            return
+        cameras = _cameras_of(self.drive, field) if self.drive is not None else []
         small = slimmed(field, self.keep, cameras, config)
         _write_reduced(field, small, self.out, raw=self.raw)
+
+    def _sized(self, field: SplatField, config: LevelFitConfig) -> SplatField:
+        from rich.console import Console
+
+        from rfcore.dataset import read_dataset
+        from rfcore.errors import InvalidInput
+        from rfedge.training.finish import FieldSizer, size_goal
+
+        if self.drive is None or self.raw:
+            raise InvalidInput("max_mb", "and --passes go with --drive, and not with --raw")
+        origin = field.metadata.tile_origin
+        drive = read_dataset(self.drive, tile_origin=origin).pictures
+        sizer = FieldSizer(drive, drive, config, Console())
+        return sizer.sized(field, size_goal(self.max_mb, self.passes))
 
 
 @dataclass(frozen=True)

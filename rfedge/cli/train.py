@@ -88,6 +88,11 @@ class Train:
     """A name kept in the archive's header."""
     plain: bool = False
     """Write parameters as they were trained: no lower levels of detail, no compression."""
+    max_mb: float | None = None
+    """Write the best field of at most so many MB (10^6 bytes)."""
+    passes: int | None = None
+    """Write the size with the fewest bytes of field and stream over so many passes of the held-out
+    pictures, which are coded against every size; of those within --max-mb if both are given."""
     checkpoint_every: int = 0
     """Write OUT.ckpt every so many iterations; 0: never."""
     resume: bool = False
@@ -141,6 +146,8 @@ class Train:
                 "shows pictures that were not trained on, and none are held out: add --holdout 8 "
                 "(every 8th picture) or --held-out DATASET",
             )
+        if (self.plain or self.kind == "ngp") and (self.max_mb, self.passes) != (None, None):
+            raise InvalidInput("max_mb", "and --passes go with --kind splats, and not with --plain")
         if self.refine_poses and self.kind == "ngp":
             raise InvalidInput("refine_poses", "goes with --kind splats alone")
         job = self.training_job()
@@ -312,13 +319,14 @@ class Train:
     ) -> RadianceField:
         from rfcore.field import SplatField
         from rfcore.train.levels import LevelFitConfig
-        from rfedge.training.finish import finish_field
+        from rfedge.training.finish import finish_field, size_goal
 
         if self.plain or not isinstance(trained, SplatField):
             return trained
+        goal = size_goal(self.max_mb, self.passes)
         held_out = job.held_out.pictures if job.held_out is not None else ()
         levels = LevelFitConfig(threads=self.threads)
-        return finish_field(trained, job.dataset.pictures, held_out, levels, console)
+        return finish_field(trained, job.dataset.pictures, held_out, levels, console, goal)
 
 
 def train_tile(tile: Train, tell: Tell) -> None:

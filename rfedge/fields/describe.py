@@ -19,7 +19,9 @@ from rich.table import Table
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.field import FULL, Quality, RadianceField, SplatField, render_field_view
+from rfcore.field.interface import SPLATS
 from rfcore.field.quality import DETAILS, kept_of
+from rfcore.field.splat_archive import splats_of_archive
 from rfcore.field.store import encode_field
 from rfcore.geodesy import Anchor
 from rfcore.image import I420, Rgb
@@ -149,10 +151,21 @@ def describe_field(field: RadianceField) -> list[tuple[str, str]]:
         rows += [
             ("SH degree", str(field.gaussians.sh_degree)),
             ("antialiased", "yes" if m.antialiased else "no"),
-            ("encoding", "compressed" if "encoding" in field.archive().metadata else "raw"),
+            ("encoding", _encoding(field)),
             ("fitted levels of detail", levels or "none: lower ones are plain prefixes"),
         ]
     return rows
+
+
+def _encoding(field: SplatField) -> str:
+    """Return how the splats are stored, what they take in memory, and how soon they are decoded."""
+    archive = field.archive()
+    kind = "compressed" if "encoding" in archive.metadata else "raw"
+    decoded_mb = sum(array.nbytes for array in vars(field.gaussians).values()) / 1e6
+    if archive.kind != SPLATS:
+        return f"{kind}, on its base; {decoded_mb:.1f} MB when decoded"
+    decode_ms = median_ms(lambda: splats_of_archive(archive), repetitions=3)
+    return f"{kind}; {decoded_mb:.1f} MB when decoded, in {decode_ms:.0f} ms here"
 
 
 def print_levels(

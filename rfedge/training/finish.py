@@ -3,12 +3,17 @@
 Written fields have lower levels of detail, are compressed, and state the held-out quality of the
 field as it will be read, not as it was trained. The JSON has quality, time, size and how to repeat
 the run.
+
+How large a field should be depends on how often it is driven through: ``FieldSizer`` takes one of
+``SIZES``, either the first that fits into so many bytes, or the one that takes the fewest bytes of
+field and stream over so many passes, with the stream coded as a vehicle codes it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +21,214 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from rfcore.camera import Camera
+from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
+from rfcore.field.importance import (
+    contributions,
+    frugal_colours,
+    most_important_first,
+    reordered,
+    seen_directions,
+)
+from rfcore.field.splat_grid import MEANS_BITS, Steps
+from rfcore.field.store import encode_field
+from rfcore.raster.gaussians import Gaussians
 from rfcore.train import held_out_quality
-from rfcore.train.levels import LevelFitConfig, with_levels
+from rfcore.train.levels import LevelFitConfig, fitted, with_levels
+from rfcore.update.passes import SeenFrame, spread
+from rfcore.update.trial import Trial, saved_percent, try_field
 from rfcore.views import PosedPicture
 from rfedge.results import make_result, provenance
 from rfedge.training.refined_poses import PoseRefinement
 from rfedge.training.run import Trained, TrainingJob
 
-__all__ = ["finish_field", "fit_levels", "training_result"]
+__all__ = [
+    "SIZES",
+    "FieldSize",
+    "FieldSizer",
+    "SizeGoal",
+    "finish_field",
+    "fit_levels",
+    "size_goal",
+    "training_result",
+]
+
+MOST_CAMERAS = 60
+"""Cameras that say from where a splat is seen, evenly spread."""
+TRIAL_FRAMES = 8
+"""Consecutive frames that are coded against every size."""
+LEVELS_SHARE = 1.15
+"""What fitted levels add to the bytes of a field, at most: 1.12 on the first sample."""
+
+
+@dataclass(frozen=True)
+class FieldSize:
+    """A size a field can be written in: ``share`` of its splats, on coarser grids.
+
+    ``price`` as in ``frugal_colours``; ``steps`` and ``means_bits`` as in ``compressed_archive``.
+    """
+
+    share: float
+    price: float
+    steps: Steps
+    means_bits: int = MEANS_BITS
+
+
+FINE = Steps(opacity_logits=2)
+COARSE = Steps(opacity_logits=1, sh_dc=4)
+SIZES = (
+    FieldSize(1.0, 0.003, FINE),
+    FieldSize(1.0, 0.01, FINE),
+    FieldSize(1.0, 0.03, COARSE, 2),
+    FieldSize(0.85, 0.03, COARSE, 2),
+    FieldSize(0.7, 0.03, COARSE, 2),
+    FieldSize(0.6, 0.06, COARSE, 2),
+    FieldSize(0.5, 0.06, COARSE, 2),
+    FieldSize(0.4, 0.1, COARSE, 1),
+    FieldSize(0.3, 0.1, COARSE, 1),
+    FieldSize(0.2, 0.1, COARSE, 1),
+)
+"""Each about 0.85 of the bytes of the one before, at the best quality for them."""
+
+
+@dataclass(frozen=True)
+class SizeGoal:
+    """How large a field may be (``max_bytes``), and how often it is driven through (``passes``).
+
+    Without either, the largest of ``SIZES``. Raises ``InvalidInput`` for less than 1.
+    """
+
+    max_bytes: int | None = None
+    passes: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("max_bytes", "passes"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InvalidInput(f"size.{name}", f"{value} is below 1")
+
+
+def size_goal(max_mb: float | None, passes: int | None) -> SizeGoal:
+    """Return the goal of ``--max-mb`` and ``--passes``."""
+    return SizeGoal(round(max_mb * 1e6) if max_mb is not None else None, passes)
+
+
+class FieldSizer:
+    """Writes a field in the size a goal asks for.
+
+    ``views``: where splats are seen from; their pixels are not read. ``drive``: pictures in the
+    order of a pass, which are coded to choose a size for ``SizeGoal.passes``.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[PosedPicture],
+        drive: Sequence[PosedPicture],
+        config: LevelFitConfig,
+        console: Console,
+    ) -> None:
+        self._cameras = [view.camera for view in views]
+        self._seen_from = [view.camera for view in spread(views, MOST_CAMERAS)]
+        self._drive = drive
+        self._config = config
+        self._console = console
+
+    def sized(self, field: SplatField, goal: SizeGoal) -> SplatField:
+        """Return ``field`` in the size that ``goal`` asks for, with levels fitted, compressed.
+
+        Raises ``InvalidInput`` if the smallest size takes more than ``goal.max_bytes``.
+        """
+        start = 0 if goal.passes is None else self._cheapest(field, goal.passes)
+        for size in SIZES[start:]:
+            if size is not SIZES[-1] and not self._may_fit(field, size, goal):
+                continue
+            written = self._frugal(self._with_levels(self._pruned(field, size)), size)
+            if goal.max_bytes is None or _bytes(written) <= goal.max_bytes:
+                return written
+        raise InvalidInput(
+            "max_mb",
+            f"{goal.max_bytes} bytes are too few: the smallest size, {SIZES[-1].share:.0%} of the "
+            f"splats, has {_bytes(written)}; allow more",
+        )
+
+    def _may_fit(self, field: SplatField, size: FieldSize, goal: SizeGoal) -> bool:
+        """Whether a size may have few enough bytes: measured without fitting anything."""
+        if goal.max_bytes is None:
+            return True
+        unfitted = self._frugal(self._pruned(field, size, fit=False), size)
+        return LEVELS_SHARE * _bytes(unfitted) <= goal.max_bytes
+
+    def _cheapest(self, field: SplatField, passes: int) -> int:
+        """Return the number of the size that takes the fewest bytes over ``passes``.
+
+        Sizes are tried from the largest on, until the sum has risen twice.
+        """
+        frames = _trial_frames(self._drive)
+        first: Trial | None = None
+        totals: list[float] = []
+        for size in SIZES:
+            small = self._frugal(self._pruned(field, size), size)
+            trial = try_field(small, frames)
+            first = trial if first is None else first
+            a_pass = _pass_bytes(first, trial, len(self._drive))
+            totals.append(LEVELS_SHARE * _bytes(small) + passes * a_pass)
+            self._console.print(
+                f"  {small.primitives:,} splats, about {LEVELS_SHARE * _bytes(small) / 1e6:.2f} MB,"
+                f" {a_pass / 1e6:.3f} MB a pass: {totals[-1] / 1e6:.2f} MB over {passes} passes"
+            )
+            if len(totals) > 2 and totals[-1] > totals[-2] > totals[-3]:
+                break
+        return totals.index(min(totals))
+
+    def _pruned(self, field: SplatField, size: FieldSize, *, fit: bool = True) -> SplatField:
+        """Return the splats that contribute most, fitted to the renders of all if ``fit``."""
+        keep = math.ceil(size.share * field.primitives)
+        if keep == field.primitives:
+            return field
+        full, config = field.rasterizer(), self._config
+        weights = contributions(
+            field.gaussians, self._cameras, threads=config.threads, antialiased=full.antialiased
+        )
+        kept = reordered(field.gaussians, most_important_first(weights)[:keep])
+        return _of(field, fitted(kept, full, self._cameras, config) if fit else kept)
+
+    def _with_levels(self, field: SplatField) -> SplatField:
+        return fit_levels(field, self._cameras, self._config, self._console)
+
+    def _frugal(self, field: SplatField, size: FieldSize) -> SplatField:
+        """Return the compressed field, its colours frugal where they are not seen."""
+        seen = seen_directions(
+            field.gaussians,
+            self._seen_from,
+            threads=self._config.threads,
+            antialiased=field.metadata.antialiased,
+        )
+        colours = frugal_colours(field.gaussians, seen, size.steps, size.price)
+        return _of(field, colours).compressed(size.steps, size.means_bits)
+
+
+def _of(field: SplatField, gaussians: Gaussians) -> SplatField:
+    """Return the field with other splats, and its levels where it is of as many."""
+    levels = field.levels if len(gaussians) == field.primitives else {}
+    metadata = replace(field.metadata, held_out_psnr_db=None, held_out_ssim=None)
+    return SplatField(gaussians, metadata, levels=levels, threads=field.threads, isa=field.isa)
+
+
+def _trial_frames(drive: Sequence[PosedPicture]) -> list[SeenFrame]:
+    """Return consecutive frames from the middle of the drive."""
+    start = max(0, (len(drive) - TRIAL_FRAMES) // 2)
+    part = drive[start : start + TRIAL_FRAMES]
+    return [SeenFrame(picture.camera.rounded(), picture.read(), 0) for picture in part]
+
+
+def _pass_bytes(first: Trial, trial: Trial, frames: int) -> float:
+    """Return the bytes of ``frames`` at the quality of ``first``'s middle rate."""
+    _, frame_bytes = first.points[0][len(first.points[0]) // 2]
+    return frames * frame_bytes * (1 - saved_percent(first, trial)[0] / 100)
+
+
+def _bytes(field: RadianceField) -> int:
+    return len(encode_field(field))
 
 
 def finish_field(
@@ -33,12 +237,15 @@ def finish_field(
     held_out: Sequence[PosedPicture],
     config: LevelFitConfig,
     console: Console,
+    goal: SizeGoal | None = None,
 ) -> SplatField:
     """Return the field with levels fitted to ``views``' cameras, compressed and measured.
 
+    ``goal`` says how large it may be, over passes like ``held_out``, or ``views`` without any.
     ``held_out`` may be empty: then the header states no quality.
     """
-    small = fit_levels(field, [view.camera for view in views], config, console).compressed()
+    sizer = FieldSizer(views, held_out or views, config, console)
+    small = sizer.sized(field, goal if goal is not None else SizeGoal())
     if not held_out:
         return small
     quality = held_out_quality(small, held_out)

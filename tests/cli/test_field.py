@@ -138,6 +138,7 @@ def test_info_says_what_is_known_and_what_a_frame_takes(
     said = capsys.readouterr().out
     for expected in ("splats", "not measured", "imported", "64x48", "100 %", "10 %", "raw"):
         assert expected in said
+    assert re.search(r"raw; 0\.\d MB when decoded, in \d+ ms here", said)
     assert "dB" not in said
     FieldInfo(here / "a.rff", drive=drive).run()
     assert "dB" in capsys.readouterr().out
@@ -147,10 +148,37 @@ def test_a_field_is_slimmed_with_and_without_cameras(
     here: Path, splats: Gaussians, drive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_field(SplatField(splats), here / "a.rff")
-    FieldSlim(here / "a.rff", 50, here / "b.rff").run()
-    FieldSlim(here / "a.rff", 50, here / "c.rff", drive=drive, iterations=5, raw=True).run()
+    FieldSlim(here / "a.rff", here / "b.rff", 50).run()
+    FieldSlim(here / "a.rff", here / "c.rff", 50, drive=drive, iterations=5, raw=True).run()
     assert capsys.readouterr().out.count("50 of 200 splats") == 2
     assert load_field(here / "b.rff").primitives == load_field(here / "c.rff").primitives == 50
+
+
+def test_a_field_is_slimmed_to_a_size_and_to_a_number_of_passes(
+    here: Path, splats: Gaussians, drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_field(SplatField(splats), here / "a.rff")
+    FieldSlim(here / "a.rff", here / "b.rff", max_mb=0.012, drive=drive, iterations=3).run()
+    assert (here / "b.rff").stat().st_size <= 12_000
+    FieldSlim(here / "a.rff", here / "c.rff", passes=3, drive=drive, iterations=3).run()
+    assert "MB over 3 passes" in capsys.readouterr().out
+    assert load_field(here / "c.rff").primitives <= 200
+
+
+@pytest.mark.parametrize(
+    ("given", "problem"),
+    [
+        ({}, "give either --keep, or"),
+        ({"keep": 50, "passes": 2}, "give either --keep, or"),
+        ({"passes": 2}, "go with --drive"),
+    ],
+)
+def test_a_size_has_one_goal_and_cameras(
+    here: Path, splats: Gaussians, given: dict[str, int], problem: str
+) -> None:
+    save_field(SplatField(splats), here / "a.rff")
+    with pytest.raises(InvalidInput, match=problem):
+        FieldSlim(here / "a.rff", here / "b.rff", **given).run()
 
 
 def test_levels_are_fitted_to_a_drives_cameras(here: Path, splats: Gaussians, drive: Path) -> None:
@@ -191,7 +219,7 @@ def test_a_field_is_looked_at_around_and_along_a_drive(
         (Encode(Path("drive"), Path("no"), Path("o.rfv")), InvalidInput, "'no' is no field"),
         (Render(Path("a.rff"), Path("o.gif")), InvalidInput, r"no \.gif file .*\.mp4"),
         (Decode(Path("a.rfv"), Path("a.rff"), Path("o.MP4")), InvalidInput, "a folder for PNG"),
-        (FieldSlim(Path("a.rff"), 9999, Path("b.rff")), InvalidInput, r"outside 1\.\.200"),
+        (FieldSlim(Path("a.rff"), Path("b.rff"), 9999), InvalidInput, r"outside 1\.\.200"),
         (Render(Path("a.rff"), Path("o"), path="drive"), InvalidInput, "needs --drive"),
         (Render(Path("a.rff"), Path("o"), frames=0), InvalidInput, "frames"),
     ],

@@ -7,10 +7,13 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.field.importance import (
     contributions,
+    frugal_colours,
     most_important_first,
     reordered,
+    seen_directions,
     visible_area,
 )
+from rfcore.field.splat_grid import Steps, colour_numbers, colours_of
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 
@@ -66,3 +69,65 @@ def test_equal_splats_keep_their_order_and_none_gets_lost(make_gaussians) -> Non
 def test_contributions_to_no_camera_are_refused(make_gaussians) -> None:
     with pytest.raises(InvalidInput, match="at least one"):
         contributions(make_gaussians(), [])
+
+
+STEPS = Steps()
+
+
+def seen_error(error: np.ndarray, seen: np.ndarray) -> float:
+    """What errors [N, K, 3] of colours show, by the definition."""
+    return float(np.einsum("nkc,nkl,nlc->", error, seen, error))
+
+
+def test_directions_seen_are_those_of_the_cameras(make_gaussians) -> None:
+    """The constant coefficient is seen as often as the splat contributes, from anywhere."""
+    g = make_gaussians(20, 2)
+    seen = seen_directions(g, [CAMERA, CAMERA])
+    weights = contributions(g, [CAMERA, CAMERA])
+    assert seen.shape == (20, 9, 9)
+    np.testing.assert_allclose(seen[:, 0, 0], weights * 0.28209479**2, rtol=1e-5)
+    np.testing.assert_allclose(seen, seen.transpose(0, 2, 1), rtol=1e-6)
+    ranks = np.linalg.matrix_rank(seen[weights > 0], tol=1e-3 * float(seen.max()))
+    assert ranks.max() == 1, "one place is one direction for each splat"
+
+
+def test_without_a_price_colours_are_no_worse_than_the_nearest_ones(make_gaussians) -> None:
+    g = make_gaussians(40, 3)
+    seen = seen_directions(g, [CAMERA])
+    nearest = colours_of(colour_numbers(g.sh, STEPS), STEPS)
+    free = frugal_colours(g, seen, STEPS, 0.0)
+    assert seen_error(free.sh - g.sh, seen) <= seen_error(nearest - g.sh, seen)
+    assert np.array_equal(colours_of(colour_numbers(free.sh, STEPS), STEPS), free.sh), "on the grid"
+
+
+def test_a_price_trades_what_is_seen_for_zeros(make_gaussians) -> None:
+    g = make_gaussians(200, 3)
+    seen = seen_directions(g, [CAMERA])
+    errors, zeros = [], []
+    for price in (0.001, 0.1, 10.0):
+        found = frugal_colours(g, seen, STEPS, price)
+        errors.append(seen_error(found.sh - g.sh, seen))
+        zeros.append(int((colour_numbers(found.sh, STEPS) == 0).sum()))
+    assert errors == sorted(errors)
+    assert zeros == sorted(set(zeros))
+
+
+def test_colours_that_nobody_sees_cost_nothing_and_seen_ones_stay(make_gaussians) -> None:
+    g = make_gaussians(30, 3)
+    hidden = reordered(g, np.arange(30))
+    hidden.means[:, 2] = -9
+    found = frugal_colours(hidden, seen_directions(hidden, [CAMERA]), STEPS, 0.001)
+    assert not colour_numbers(found.sh[:, 1:], STEPS)[:, 1:15].any()
+    seen = seen_directions(g, [CAMERA])
+    dear = frugal_colours(g, seen, STEPS, 1e-6)
+    before, after = Rasterizer(g).render(CAMERA).colour, Rasterizer(dear).render(CAMERA).colour
+    assert np.abs(after - before).max() < 0.05
+
+
+def test_matrices_of_other_splats_and_negative_prices_are_refused(make_gaussians) -> None:
+    g = make_gaussians(4, 1)
+    seen = seen_directions(g, [CAMERA])
+    with pytest.raises(InvalidInput, match=r"seen: \(3, 4, 4\) is not \(4, 4, 4\)"):
+        frugal_colours(g, seen[:3], STEPS, 0.1)
+    with pytest.raises(InvalidInput, match=r"price: -1\.0 is below 0"):
+        frugal_colours(g, seen, STEPS, -1.0)

@@ -235,6 +235,11 @@ def test_other_formats_of_splats_are_refused_with_the_command_that_converts_them
         read_ply(tmp_path / f"a.{suffix}")
 
 
+def test_a_zip_of_pictures_is_refused_with_what_unpacks_and_converts_it(tmp_path: Path) -> None:
+    with pytest.raises(FieldFormatError, match=r"unpack it .* splat-transform meta\.json a\.ply$"):
+        read_ply(tmp_path / "a.sogs")
+
+
 @pytest.mark.parametrize("suffix", ["gltf", "glb"])
 def test_formats_that_nothing_converts_are_refused_all_the_same(
     tmp_path: Path, suffix: str

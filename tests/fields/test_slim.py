@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.field.importance import most_important_first, reordered, visible_area
+from rfcore.field.store import encode_field
 from rfcore.train.levels import LevelFitConfig
 from rfedge.fields.slim import slimmed
+from rfedge.training.finish import SIZES, FieldSizer, SizeGoal
 
 
 def error(field: SplatField, place) -> float:
@@ -43,3 +46,40 @@ def test_cameras_make_the_choice_better_and_fitting_better_still(place) -> None:
 def test_more_splats_than_there_are_or_none_are_refused(place, keep: int) -> None:
     with pytest.raises(InvalidInput, match=f"keep: {keep} is outside 1..300"):
         slimmed(place.field, keep)
+
+
+def sizer(place) -> FieldSizer:
+    config = LevelFitConfig(iterations=12)
+    return FieldSizer(place.pictures, place.pictures, config, Console(quiet=True))
+
+
+def size_bytes(field: SplatField) -> int:
+    return len(encode_field(field))
+
+
+def test_a_field_is_as_large_as_it_may_be(place) -> None:
+    most = sizer(place).sized(place.field, SizeGoal())
+    assert most.primitives == place.field.primitives
+    assert most.metadata.held_out_psnr_db is None, "it was not measured"
+    limit = size_bytes(most) * 2 // 3
+    small = sizer(place).sized(place.field, SizeGoal(max_bytes=limit))
+    assert limit / 2 < size_bytes(small) <= limit
+    assert set(small.levels) == {0.5, 0.25, 0.1}
+    assert error(most, place) < error(small, place) < 0.1
+
+
+def test_a_limit_no_size_keeps_is_refused_with_the_least_there_is(place) -> None:
+    share = f"{SIZES[-1].share:.0%}"
+    with pytest.raises(InvalidInput, match=f"max_mb: 900 bytes are too few: .* {share} of the"):
+        sizer(place).sized(place.field, SizeGoal(max_bytes=900))
+    with pytest.raises(InvalidInput, match=r"size\.passes: 0 is below 1"):
+        SizeGoal(passes=0)
+
+
+def test_the_more_passes_the_larger_the_field(place) -> None:
+    """One pass of six small frames is worth few splats, a million passes are worth them all."""
+    once, often = (
+        sizer(place).sized(place.field, SizeGoal(passes=passes)) for passes in (1, 1_000_000)
+    )
+    assert size_bytes(once) < size_bytes(often)
+    assert error(often, place) < error(once, place)
