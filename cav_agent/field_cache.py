@@ -2,7 +2,8 @@
 
 A frame can be coded once the field of its tile is prepared. A field that is not in the local store
 is fetched from the server that publishes the tile: resumable, and its digest is checked before
-anything of it is parsed.
+anything of it is parsed. Where the server publishes a preview of the tile, that is fetched first
+and drawn while the tile's own field arrives.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from cav_agent.lights import TileLights
 from cav_agent.server_connection import ServerConnection, retry_after_s
 from rfcore.camera import TileOrigin
 from rfcore.codec.h264.config import CodecConfig
-from rfcore.codec.sender.ladder import Rung, read_ladder
+from rfcore.codec.sender.ladder import MeasuredRung, Rung, read_ladder
 from rfcore.codec.sender.steering import Steering
 from rfcore.dataset import read_dataset
 from rfcore.dataset.rig import read_rig, read_rig_drive
@@ -69,6 +70,9 @@ MAX_REFUSALS = 60
 
 RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL, grpc.StatusCode.CANCELLED)
 
+
+OWN_AGAIN_S = 10.0
+"""From a failure to fetch a tile's own field to the next try, while its preview is drawn."""
 
 MAX_PREPARED = 3
 """Fields kept ready: the previous tile's, the present one's and the next one's."""
@@ -127,6 +131,7 @@ class FieldCache:
         self._observer = observer
         self._prepared: OrderedDict[Tile, asyncio.Task[PreparedField]] = OrderedDict()
         self._fetching: dict[Tile, asyncio.Task[None]] = {}
+        self._fetching_own: set[asyncio.Task[None]] = set()
 
     async def prepared(self, served: ServedTile) -> PreparedField:
         """Return the tile's field, ready to code against; raise ``RfedgeError`` if it cannot be.
@@ -145,19 +150,53 @@ class FieldCache:
     async def close(self) -> None:
         """Stop what is being fetched or prepared."""
         tasks: list[asyncio.Task[Any]] = [*self._prepared.values(), *self._fetching.values()]
+        tasks += self._fetching_own
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _load(self, served: ServedTile) -> PreparedField:
         tile, loop = served.tile, asyncio.get_running_loop()
-        field = await self._opened(served, (tile.field_id,))
+        preview = await self._preview(tile)
+        field = await self._opened(served, preview or (tile.field_id,))
 
         def want() -> None:
             loop.call_soon_threadsafe(self._fetch_lights, served, lights)
 
-        lights = TileLights(field, want if tile.lights else lambda: None)
-        return await asyncio.to_thread(self._prepare, field, lights, tile.renderable_ids)
+        lights = TileLights(field, want if tile.other_lights else lambda: None, tile.field_id)
+        prepared = await asyncio.to_thread(self._prepare, field, lights, tile.renderable_ids)
+        if preview:
+            fetching = asyncio.create_task(self._take_own(served, lights))
+            self._fetching_own.add(fetching)
+            fetching.add_done_callback(self._fetching_own.discard)
+        return prepared
+
+    async def _preview(self, tile: Tile) -> tuple[str, ...]:
+        """Return the archives of the field to begin with; none if the tile's own is here.
+
+        None either where frames are not named by ``TileLights`` (``--localise``), or poses are
+        looked for within the bounds of the field that a drive begins with (a feed's).
+        """
+        config = self._config
+        waits = config.localise or config.feed.source is not None
+        if tile.preview is None or waits:
+            return ()
+        held = await asyncio.to_thread(FieldStore(config.fields.expanduser()).ids)
+        return () if tile.field_id in held else tile.preview.field_ids
+
+    async def _take_own(self, served: ServedTile, lights: TileLights) -> None:
+        """Fetch the tile's own field and have it drawn; try again until it is there."""
+        while True:
+            try:
+                field = await self._opened(served, (served.tile.field_id,))
+                _check_origin(field, lights.own)
+                await asyncio.to_thread(self._prepare_renderers, field)
+            except RfedgeError as error:
+                log.warning("own field not fetched", tile=served.tile.name, problem=str(error))
+                await asyncio.sleep(OWN_AGAIN_S)
+            else:
+                lights.take_own(field)
+                return
 
     async def _opened(self, served: ServedTile, archive_ids: Sequence[str]) -> RadianceField:
         """Return the last of ``archive_ids``, fetching those that are not in the store."""
@@ -191,7 +230,7 @@ class FieldCache:
 
     async def _add_lights(self, served: ServedTile, lights: TileLights) -> None:
         """Fetch and open what is missing, one after the other; the drive goes on without it."""
-        for light in served.tile.lights:
+        for light in served.tile.other_lights:
             if light.field_id in lights.held_ids():
                 continue
             try:
@@ -211,7 +250,7 @@ class FieldCache:
         pictures = self._live or self._recorded(field.metadata.tile_origin)
         cameras = tuple(_prepared_camera(config, camera) for camera in pictures.cameras)
         rungs = self._rungs(field)
-        field.prepare()
+        self._prepare_renderers(field)
         self._observer.field_ready(field, len(pictures))
         return PreparedField(field, pictures, cameras, rungs, lights, field_ids)
 
@@ -223,15 +262,26 @@ class FieldCache:
         rig = read_rig(config.rig)
         return RecordedRig(rig, read_rig_drive(rig, origin), self._instants)
 
+    def _prepare_renderers(self, field: RadianceField) -> None:
+        """Make every renderer that frames may ask for."""
+        field.prepare()
+        for quality in {measured.rung.quality for measured in self._ladder(field)}:
+            field.prepare(quality)
+
+    def _ladder(self, field: RadianceField) -> tuple[MeasuredRung, ...]:
+        """Return the rungs that a deadline chooses from; none without one."""
+        config = self._config
+        if config.deadline_ms is None:
+            return ()
+        kind, coder = field.metadata.kind, config.coding.coder
+        return read_ladder(config.ladder, kind, config.crf, coder, tracking=config.localise)
+
     def _rungs(self, field: RadianceField) -> Rungs:
-        """Return how frames are coded; under a deadline prepare every renderer it may ask for."""
+        """Return how frames are coded."""
         config = self._config
         if config.deadline_ms is None:
             return FixedRung(Rung(effort=config.coding.name))
-        kind, coder = field.metadata.kind, config.coding.coder
-        ladder = read_ladder(config.ladder, kind, config.crf, coder, tracking=config.localise)
-        for quality in {measured.rung.quality for measured in ladder}:
-            field.prepare(quality)
+        ladder = self._ladder(field)
         controller = DeadlineController(ladder, config.deadline_ms)
         log.info(
             "deadline",

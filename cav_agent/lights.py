@@ -6,6 +6,9 @@ noon at dusk. While the field in use fits, nothing else is looked at; when it do
 other lights are asked for, and those that are there are rendered beside it for one frame in
 ``LOOK_EVERY``. Another one is taken if it is clearly nearer, so that two lights between which the
 day is do not take turns.
+
+A vehicle that has not fetched the tile's own field yet may begin with another, the tile's preview;
+``take_own`` puts the tile's own in its place between two frames.
 """
 
 from __future__ import annotations
@@ -35,27 +38,41 @@ LOOK_EVERY = 5
 class TileLights:
     """The fields of one tile that were opened; frames are coded against ``current``.
 
+    ``own_id``: the tile's own field, if it is not ``field``, which is drawn until that is there.
     ``want`` is called, on the thread that codes frames, each time the field in use does not fit and
-    there may be lights that were not fetched. ``add`` may be called on another thread.
+    there may be lights that were not fetched. ``add`` and ``take_own`` may be called on another
+    thread.
     """
 
-    def __init__(self, field: RadianceField, want: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        field: RadianceField,
+        want: Callable[[], None] = lambda: None,
+        own_id: str | None = None,
+    ) -> None:
         self.own = self.current = field
+        self._own_id = field.field_id if own_id is None else own_id
         self._want = want
         self._lock = threading.Lock()
         self._fields: dict[str, RadianceField] = {field.field_id: field}
         self._until_look = 0
+        self._arrived: RadianceField | None = None
 
     @property
     def named_id(self) -> str:
         """The current field's id as frames name it: empty for the tile's own."""
-        return "" if self.current is self.own else self.current.field_id
+        return "" if self.current.field_id == self._own_id else self.current.field_id
 
     def add(self, field: RadianceField) -> None:
         """Offer another light; the next frame that does not fit looks at it."""
         with self._lock:
             self._fields[field.field_id] = field
             self._until_look = 0
+
+    def take_own(self, field: RadianceField) -> None:
+        """Have the next frame drawn from ``field`` in place of the one that was begun with."""
+        with self._lock:
+            self._arrived = field
 
     def held_ids(self) -> frozenset[str]:
         """Return the ids of the fields that were opened."""
@@ -64,7 +81,7 @@ class TileLights:
 
     def view(self, frame: I420, camera: Camera, quality: Quality) -> FieldView:
         """Return what the field that fits shows at a frame's camera."""
-        view = render_field_view(self.current, camera, quality)
+        view = render_field_view(self._taken(), camera, quality)
         if self._until_look > 0:
             self._until_look -= 1
             return view
@@ -74,6 +91,21 @@ class TileLights:
             return view
         self._want()
         return self._nearest(frame, view, difference, quality)
+
+    def _taken(self) -> RadianceField:
+        """Return the current field, after the tile's own took the place of its preview.
+
+        Called on the thread that codes frames, so that none changes between its render and name.
+        """
+        with self._lock:
+            own, before = self._arrived, self.own
+            if own is not None:
+                del self._fields[before.field_id]
+                self._fields[own.field_id] = self.own = own
+                self._arrived, self._until_look = None, 0
+                self.current = own if self.current is before else self.current
+                log.info("own field taken", field=own.field_id, instead_of=before.field_id)
+            return self.current
 
     def _nearest(
         self, frame: I420, view: FieldView, difference: float, quality: Quality

@@ -366,7 +366,7 @@ class TileLearner:
     def _seen_passes(self, files: Sequence[Path], versions: TileVersions) -> Iterator[SeenPass]:
         tile = versions.tile(self.name)
         own = self._open(tile.field_id)
-        fields = {"": own, **{one.name: self._open(one.field_id) for one in tile.lights}}
+        fields = {"": own, **{one.name: self._open(one.field_id) for one in tile.other_lights}}
         for part in readable(files):
             drive = pass_of(part, frozenset(versions.field_ids), own.metadata.tile_origin)
             if len(drive.pictures) >= FEWEST_FRAMES:

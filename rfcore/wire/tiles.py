@@ -14,12 +14,24 @@ from rfcore.errors import InvalidInput
 from rfcore.wire.checks import check_field_id, check_name, check_range
 from rfcore.wire.v1 import field_pb2 as pb
 
-__all__ = ["MAX_LIGHTS", "MAX_TILES", "Area", "Tile", "TileLight", "tile_message", "tile_of"]
+__all__ = [
+    "MAX_LIGHTS",
+    "MAX_TILES",
+    "PREVIEW",
+    "Area",
+    "Tile",
+    "TileLight",
+    "tile_message",
+    "tile_of",
+]
 
 MAX_TILES = 64
 """Tiles one server publishes."""
 MAX_LIGHTS = 7
 """Lights of a tile, beside its own field: what both ends keep open."""
+PREVIEW = "preview"
+"""The light that is none: a small field of the tile's own light, with which vehicles begin while
+they fetch the tile's own."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +118,16 @@ class Tile:
     def renderable_ids(self) -> tuple[str, ...]:
         """The fields that frames may refer to, the tile's own first."""
         return tuple(dict.fromkeys((self.field_id, *(light.field_id for light in self.lights))))
+
+    @property
+    def preview(self) -> TileLight | None:
+        """The small field to begin with, if there is one."""
+        return next((light for light in self.lights if light.name == PREVIEW), None)
+
+    @property
+    def other_lights(self) -> tuple[TileLight, ...]:
+        """The fields under other lights than the tile's own."""
+        return tuple(light for light in self.lights if light.name != PREVIEW)
 
     @property
     def archive_ids(self) -> frozenset[str]:

@@ -95,3 +95,32 @@ def test_vehicles_do_not_look_like_another_light() -> None:
     seen.y[:16] = 235
     assert median_block_mean_difference(seen, grey(100)) == 0
     assert median_block_mean_difference(grey(140), grey(100)) == 40 > FITS_LEVELS
+
+
+def test_the_own_field_takes_the_place_of_its_preview_with_the_next_frame() -> None:
+    """Frames of the preview are named by its id, those of the own field by none."""
+    preview, own, dusk = flat(0.79), flat(0.8), flat(0.4)
+    lights = TileLights(preview, own_id=own.field_id)
+    lights.view(frame_of(own), CAMERA, FULL)
+    assert lights.named_id == preview.field_id
+    lights.take_own(own)
+    assert lights.named_id == preview.field_id, "the frame that is coded was drawn from it"
+    view = lights.view(frame_of(own), CAMERA, FULL)
+    assert lights.named_id == ""
+    assert view.render.digest() == frame_of(own).digest()
+    assert lights.held_ids() == {own.field_id}
+    lights.add(dusk)
+    for _ in range(LOOK_EVERY):
+        lights.view(frame_of(dusk), CAMERA, FULL)
+    assert lights.current is dusk
+
+
+def test_another_light_stays_when_the_own_field_arrives() -> None:
+    preview, own, dusk = flat(0.79), flat(0.8), flat(0.4)
+    lights = TileLights(preview, own_id=own.field_id)
+    lights.add(dusk)
+    lights.view(frame_of(dusk), CAMERA, FULL)
+    lights.take_own(own)
+    lights.view(frame_of(dusk), CAMERA, FULL)
+    assert lights.current is dusk
+    assert lights.held_ids() == {own.field_id, dusk.field_id}

@@ -1,5 +1,7 @@
 """A vehicle drives in another light than the tile's: it fetches the light and codes against it."""
 
+import asyncio
+import itertools
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -8,10 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cav_agent.field_cache import fetch_field
+from rfcore.errors import RfedgeError
 from rfcore.field import FieldStore, SplatField, load_field, save_field
 from rfcore.field.layer import VOXELS_M, ColourLayer, layer_archive, layered_field, voxels_of
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tile_manifest import VersionLabel
+from rfcore.wire.tiles import PREVIEW
+from rfedge.fields.slim import slimmed
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 DUSK = VersionLabel("dusk", passes=2, time_of_day_h=18.5)
@@ -78,6 +84,71 @@ async def test_a_layer_is_fetched_with_its_base(
     assert {f"{day.field_id}.rff", f"{made.field_id}.rff"} <= driving.fields()
     sizes = [path.stat().st_size for path in (tmp_path / "mine").glob("*.rff")]
     assert driving.value("rfedge_agent_field_bytes_total") == sum(sizes)
+
+
+@pytest.fixture
+def own_may_come(street: Any, monkeypatch: pytest.MonkeyPatch) -> asyncio.Event:
+    """Hold the transfer of the tile's own field back until it is set; the first try fails."""
+    may_come, tries = asyncio.Event(), itertools.count()
+
+    async def held(channel: Any, store: Any, field_id: str, folder: Path) -> None:
+        if field_id == street.field_id:
+            if next(tries) == 0:
+                raise RfedgeError("the transfer broke")
+            await may_come.wait()
+        await fetch_field(channel, store, field_id, folder)
+
+    monkeypatch.setattr("cav_agent.field_cache.fetch_field", held)
+    monkeypatch.setattr("cav_agent.field_cache.OWN_AGAIN_S", 0.01)
+    return may_come
+
+
+async def test_a_vehicle_begins_with_the_preview_and_goes_on_with_the_tiles_own_field(
+    street: Any, own_may_come: asyncio.Event, serve: Any, vehicle: Any, tmp_path: Path
+) -> None:
+    """One stream, one epoch, and no frame refused: each is named by the field it was drawn from."""
+    folder, mine = tmp_path / "published", tmp_path / "mine"
+    folder.mkdir()
+    own = load_field(street.store / "street.rff")
+    assert isinstance(own, SplatField)
+    preview_id = save_field(slimmed(own, own.primitives // 2), tmp_path / "preview.rff")
+    publish(folder, "street", street.store / "street.rff", Ground(), NOW)
+    publish(folder, "street", tmp_path / "preview.rff", Ground(), NOW, VersionLabel(PREVIEW))
+    async with (
+        serve(fields=folder) as server,
+        vehicle(server.address, fields=mine, loop=True) as driving,
+    ):
+        await driving.until(lambda: driving.acked() >= 3)
+        assert driving.fields() == {f"{preview_id}.rff"}
+        own_may_come.set()
+        await driving.until(lambda: lit(driving) is None)
+        seen = driving.acked()
+        await driving.until(lambda: driving.acked() >= seen + 3)
+    lines = driving.lines()
+    assert {line["result"] for line in lines} == {"acked"}
+    assert {line["epoch"] for line in lines} == {0}
+    named = [line["light_field"] for line in lines]
+    began = named.count(preview_id)
+    assert named == [preview_id] * began + [None] * (len(lines) - began)
+    assert driving.fields() == {f"{preview_id}.rff", f"{street.field_id}.rff"}
+
+
+async def test_a_vehicle_that_holds_the_field_fetches_no_preview(
+    street: Any, serve: Any, vehicle: Any, tmp_path: Path
+) -> None:
+    folder, mine = tmp_path / "published", tmp_path / "mine"
+    folder.mkdir()
+    preview_id = save_field(slimmed(street.field, 9), tmp_path / "preview.rff")
+    publish(folder, "street", street.store / "street.rff", Ground(), NOW)
+    publish(folder, "street", tmp_path / "preview.rff", Ground(), NOW, VersionLabel(PREVIEW))
+    FieldStore(mine).add(street.store / "street.rff")
+    async with (
+        serve(fields=folder) as server,
+        vehicle(server.address, fields=mine, loop=True) as driving,
+    ):
+        await driving.until(lambda: driving.acked() >= 2)
+    assert f"{preview_id}.rff" not in driving.fields()
+    assert {line["light_field"] for line in driving.lines()} == {None}
 
 
 def lit(driving: Any) -> str | None:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.errors import InvalidInput
-from rfcore.wire.tiles import Area, Tile, tile_message, tile_of
+from rfcore.wire.tiles import PREVIEW, Area, Tile, TileLight, tile_message, tile_of
 from rfcore.wire.v1 import field_pb2 as pb
 
 ID = "ab" * 32
@@ -51,3 +51,12 @@ def test_distance_is_to_the_nearest_point_of_the_area() -> None:
 def test_a_wrong_tile_is_refused_by_name(message: pb.Tile, problem: str) -> None:
     with pytest.raises(InvalidInput, match=problem):
         tile_of(message)
+
+
+def test_a_preview_is_a_light_of_its_own_kind() -> None:
+    small, dusk = TileLight(PREVIEW, "cd" * 32, 2), TileLight("dusk", "ef" * 32, 3)
+    tile = tile_of(tile_message(Tile("west", ID, lights=(small, dusk))))
+    assert tile.preview == small
+    assert tile.other_lights == (dusk,)
+    assert tile.renderable_ids == (ID, small.field_id, dusk.field_id)
+    assert Tile("west", ID, lights=(dusk,)).preview is None
