@@ -28,7 +28,7 @@ from rfcore.train import DensityControl, SplatTrainingConfig
 from rfcore.train.levels import LevelFitConfig
 from rfedge.results import Provenance, make_result, provenance, write_result
 from rfedge.samples import sample_path
-from rfedge.training.finish import finish_field
+from rfedge.training.finish import SizeGoal, finish_field, size_goal
 from rfedge.training.run import TrainingJob, train_field, training_config
 
 __all__ = [
@@ -116,12 +116,15 @@ class MakeSampleField:
     """Density control: let the set grow to so many Gaussians."""
     antialiased: bool = False
     """Draw splats smaller than a pixel fainter; the field says so."""
+    max_mb: float | None = None
+    """Write the best field of at most so many MB (10^6 bytes)."""
 
     def run(self) -> None:
         """Make it; raise ``RfedgeError`` when the sample is damaged or the field too large."""
         verify_manifest(self.sample)
         console, started_s, made = Console(), monotonic(), provenance(command=self._command())
-        field = trained_field(self.sample, self._config(), console)
+        goal = size_goal(self.max_mb, None)
+        field = trained_field(self.sample, self._config(), console, goal)
         seconds = round(monotonic() - started_s)
         size_bytes = write_sample_field(self.sample, field, made, seconds)
         path = sample_field_path(self.sample)
@@ -136,8 +139,10 @@ class MakeSampleField:
         return replace(config, density=DensityControl(limit=self.limit))
 
     def _command(self) -> str:
-        given = {n: getattr(self, n) for n in ("gaussians", "iterations", "limit")}
-        options = " ".join(f"--{n} {v}" for n, v in given.items() if v is not None)
+        given = {n: getattr(self, n) for n in ("gaussians", "iterations", "limit", "max_mb")}
+        options = " ".join(
+            f"--{n.replace('_', '-')} {v}" for n, v in given.items() if v is not None
+        )
         options += " --antialiased" if self.antialiased else ""
         options = options.strip()
         return f'make sample-field ARGS="{options}"' if options else "make sample-field"
@@ -182,14 +187,16 @@ def choose_field(choice: FieldChoice, console: Console) -> Path:
     return path
 
 
-def trained_field(sample: Path, config: SplatTrainingConfig, console: Console) -> SplatField:
-    """Train the field of a sample and finish it: levels, compression, held-out quality."""
+def trained_field(
+    sample: Path, config: SplatTrainingConfig, console: Console, goal: SizeGoal | None = None
+) -> SplatField:
+    """Train the field of a sample and finish it: levels, size, compression, held-out quality."""
     views = read_dataset(sample / "transforms_train.json")
     held_out = read_dataset(sample / "transforms_drive_empty.json")
     job = TrainingJob(name=sample.name, dataset=views, held_out=held_out, config=config, seed=SEED)
     field = train_field(job, console)
     levels = LevelFitConfig(threads=config.threads)
-    return finish_field(field, views.pictures, held_out.pictures, levels, console)
+    return finish_field(field, views.pictures, held_out.pictures, levels, console, goal)
 
 
 def cache_path(sample: Path, cache: Path, config: SplatTrainingConfig) -> Path:
