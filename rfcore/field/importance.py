@@ -78,7 +78,8 @@ def seen_directions(
     """Return, for each splat, how errors of its K coefficients show together, float32 [N, K, K].
 
     The sum over ``cameras`` of the splat's blending weight times ``b b'``, with ``b`` its spherical
-    harmonics in the camera's direction. Raises ``InvalidInput`` when there is no camera.
+    harmonics in the camera's direction: 1 kB a splat of degree 3. Raises ``InvalidInput`` when
+    there is no camera.
     """
     coefficients = gaussians.sh.shape[1]
     seen = np.zeros((len(gaussians), coefficients, coefficients), np.float32)
@@ -86,7 +87,8 @@ def seen_directions(
         shown = np.flatnonzero(weights)
         basis = _harmonics(gaussians.means[shown], camera)[:, :coefficients]
         weighted = basis * weights[shown, None].astype(np.float32)
-        seen[shown] += weighted[:, :, None] * basis[:, None, :]
+        for k in range(coefficients):  # all rows at once would take as much again
+            seen[shown, k] += weighted[:, k, None] * basis
     return seen
 
 
