@@ -101,7 +101,9 @@ class FieldCoder:
 
     ``references``, ``photometric`` and ``relight`` None leave them to the encoder.
 
-    With ``foregrounds``, bool [H, W] a frame, the notes have the luma's squared error there.
+    With ``foregrounds``, bool [H, W] a frame, the notes have the luma's squared error there. They
+    have the references, the bytes of the slice, whether the render was relit (1 or 0), and the
+    digest of the whole message.
     """
 
     def __init__(
@@ -174,6 +176,8 @@ class FieldCoder:
         notes: dict[str, tuple[float | str, ...]] = {
             "references": tuple(references_name(packet.references) for packet in packets),
             "slice_bytes": tuple(len(packet.payload) for packet in packets),
+            "relit": tuple(float(packet.relit) for packet in packets),
+            "message": tuple(_digest_of(_message(frame.arrival)) for frame in coded),
         }
         if self._foregrounds:
             masked = zip(pairs, self._foregrounds, strict=False)
@@ -196,6 +200,14 @@ class FieldCoder:
 
 def message_bytes(arrival: Arrival, quality: Quality = FULL) -> int:
     """Return the size of the whole message that carries the packet from a vehicle."""
+    return len(_message(arrival, quality))
+
+
+def _message(arrival: Arrival, quality: Quality = FULL) -> bytes:
     pose = arrival.view.camera.world_from_cam
     message = Frame(MESSAGE_CAMERA, MESSAGE_TIME_NS, pose, b"", arrival.packet, quality)
-    return len(client_message_to_bytes(message))
+    return client_message_to_bytes(message)
+
+
+def _digest_of(message: bytes) -> str:
+    return hashlib.sha256(message).hexdigest()[:16]

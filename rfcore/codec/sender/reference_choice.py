@@ -36,8 +36,11 @@ GOOD_INTRA_RATIO = 0.9
 """Of the cost of intra prediction: what an adapted render must stay below. Where the light of a
 whole street was changed it reaches 0.75, as in the right light; a field of noon at dusk 1.2."""
 
-NOTICEABLE_LEVELS = 2
-"""Median difference of block means from which a change of light is looked for."""
+NOTICEABLE_LEVELS = 4
+"""Median difference of block means from which a change of light is looked for. In a field's own
+light it is 0 to 1 on the yardstick street and up to 2.5 on the sample drive with vehicles, where
+from 2 levels on the frames that were relit took 2 to 4 % more bytes. Drifting exposure is 22 %
+cheaper than with ``off`` from 4 levels on, 25 % from 2."""
 PHOTOMETRIC_BITS = 12 * 16
 
 Costs = NDArray[np.float64]
