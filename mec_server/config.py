@@ -172,7 +172,8 @@ class RecordSettings:
     """Keep pictures, poses and times as datasets: FOLDER/VEHICLE/CAMERA/PART (docs/data.md);
     nothing without it."""
     max_gb: Annotated[float, arg(name="record-max-gb")] = 10.0
-    """What all recordings in the folder may take, in 10^9 bytes; the oldest parts are deleted."""
+    """What all recordings in the folder may take, in 10^9 bytes; the tile and the vehicle with most
+    give their oldest parts first."""
     max_age_h: Annotated[float, arg(name="record-max-age-h")] = 72.0
     """After how many hours a part is deleted."""
 

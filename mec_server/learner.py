@@ -32,7 +32,7 @@ __all__ = ["Learner", "main"]
 log = structlog.get_logger()
 
 LOWEST_PRIORITY = 19
-EVERY_S = 2.0
+EVERY_S = 0.5
 """From the end of one round to the next."""
 RESTART_S = 30.0
 """A process that ended is started again this long after its start, at the earliest."""

@@ -5,9 +5,11 @@ first epoch's pictures are named by their sequence alone (000007.png); later one
 front (e0003-000007.png), since sequences begin again. A disk that fails ends the recording for
 good, and never the streaming.
 
-How much is kept: by bytes and by age, the oldest part first. ``start`` is when a part was begun,
-milliseconds of the Unix epoch. A part is closed early enough that whole parts can be deleted to
-keep both bounds; a part that is still written is deleted, too, when it must be.
+How much is kept: by age, and by bytes. When they must fall, they do in the tile that has most: a
+vehicle with more than a quarter of them gives its oldest part, and where none has so many, the
+tile's oldest part goes. So one busy vehicle or tile evicts no other. ``start`` is when a part was
+begun, milliseconds of the Unix epoch. A part is closed early enough that whole parts can be deleted
+to keep both bounds; a part that is still written is deleted, too, when it must be.
 """
 
 from __future__ import annotations
@@ -20,13 +22,26 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rfcore.camera import Pose, TileOrigin
-from rfcore.dataset.recorded_session import RECORDING_NAME, RecordedCamera, RecordedPicture
+from rfcore.dataset.recorded_session import (
+    RECORDING_NAME,
+    RecordedCamera,
+    RecordedPicture,
+    read_recorded_part,
+)
+from rfcore.errors import DatasetError
 from rfcore.files import write_whole
 from rfcore.image import I420, png_bytes
 from rfcore.native.yuv import rgb_from_i420
 from rfcore.wire.messages import Frame, Hello
 
-__all__ = ["KeepLimits", "Recorder", "RecordingRoom", "SessionRecording", "picture_name"]
+__all__ = [
+    "KeepLimits",
+    "Recorder",
+    "RecordingRoom",
+    "SessionRecording",
+    "TilesOfFields",
+    "picture_name",
+]
 
 MAX_WAITING = 32
 """Pictures that may wait for the disk; beyond it decoding waits, and with it the vehicle."""
@@ -34,6 +49,8 @@ TIDY_EVERY_S = 60.0
 """How often old parts are looked for while nothing is written."""
 PARTS = 16
 """Parts are closed at this fraction of either bound, so that at least so many fill it."""
+VEHICLE_SHARE = 0.25
+"""Of a tile's bytes: a vehicle with more gives its own pictures first."""
 
 
 @dataclass(frozen=True)
@@ -44,24 +61,39 @@ class KeepLimits:
     max_age_s: float
 
 
+@dataclass(frozen=True)
+class TilesOfFields:
+    """Where the tile of a field is, and what it is called: both by the field's id."""
+
+    origin_of: Callable[[str], TileOrigin]
+    """Raises ``UnknownField`` for a field that is not held."""
+    name_of: Callable[[str], str]
+    """Empty for a field of no published tile."""
+
+
 class RecordingRoom:
     """Counts the bytes of every part under ``root``, also those of earlier runs, and deletes.
 
     Used by one thread. What is in the folder and no part is neither counted nor deleted.
+    ``tile_of`` names the tile of a field: that of a part's first picture is the part's.
     """
 
-    def __init__(self, root: Path, limits: KeepLimits) -> None:
+    def __init__(self, root: Path, limits: KeepLimits, tile_of: Callable[[str], str]) -> None:
         self._root = root
         self._limits = limits
+        self._tile_of = tile_of
         self._begun_ms = 0
         self._bytes: dict[Path, int] = {part: _bytes_of(part) for part in _parts(root)}
+        self._tiles = {part: tile_of(_field_of(part)) for part in self._bytes}
 
-    def begin(self, vehicle_id: str, camera_id: str, session_id: str, now_ms: int) -> Path:
+    def begin(self, camera: RecordedCamera, field_id: str, now_ms: int) -> Path:
         """Make the folder of a new part; no two of this run have the same start."""
         self._begun_ms = max(now_ms, self._begun_ms + 1)
-        part = self._root / vehicle_id / camera_id / f"{self._begun_ms:013}-{session_id}"
+        name = f"{self._begun_ms:013}-{camera.session_id}"
+        part = self._root / camera.vehicle_id / camera.camera_id / name
         part.mkdir(parents=True)
         self._bytes[part] = 0
+        self._tiles[part] = self._tile_of(field_id)
         return part
 
     def is_full(self, part: Path, now_ms: int) -> bool:
@@ -72,18 +104,28 @@ class RecordingRoom:
         return now_ms - _start_ms(part) >= 1e3 * self._limits.max_age_s / PARTS
 
     def make(self, wanted_bytes: int, now_ms: int) -> None:
-        """Delete the oldest parts until ``wanted_bytes`` more fit and none is too old.
+        """Delete parts that are too old, then of the largest share, until the bytes fit.
 
         Raises ``OSError`` where one cannot be.
         """
-        parts = sorted(self._bytes, key=_start_ms)
-        total_bytes = sum(self._bytes.values()) + wanted_bytes
         oldest_ms = now_ms - 1e3 * self._limits.max_age_s
-        for part in parts:
-            if total_bytes <= self._limits.max_bytes and _start_ms(part) > oldest_ms:
-                break
-            shutil.rmtree(part)
-            total_bytes -= self._bytes.pop(part)
+        for part in [part for part in self._bytes if _start_ms(part) <= oldest_ms]:
+            self._delete(part)
+        while self._bytes and sum(self._bytes.values()) + wanted_bytes > self._limits.max_bytes:
+            self._delete(self._most_dispensable())
+
+    def _most_dispensable(self) -> Path:
+        """Return the oldest part of the tile with most bytes, or of who has too many of them."""
+        tile, _ = _largest(self._bytes, self._tiles.__getitem__)
+        parts = {part: n for part, n in self._bytes.items() if self._tiles[part] == tile}
+        vehicle, size_bytes = _largest(parts, _vehicle_of)
+        if size_bytes > VEHICLE_SHARE * sum(parts.values()):
+            parts = {part: n for part, n in parts.items() if _vehicle_of(part) == vehicle}
+        return min(parts, key=_start_ms)
+
+    def _delete(self, part: Path) -> None:
+        shutil.rmtree(part)
+        del self._bytes[part], self._tiles[part]
 
     def add(self, part: Path, written_bytes: int) -> None:
         """Count what was written to a part."""
@@ -113,20 +155,20 @@ class Recorder:
     """Writes pictures on a thread of its own; ``on_failure`` is called with the first error.
 
     After any error the thread goes on emptying its queue, so that no worker waits for it for ever.
-    ``origin_of`` tells where the tile of a field is; ``now_ms`` the time of the Unix epoch.
+    ``now_ms``: the time of the Unix epoch.
     """
 
     def __init__(
         self,
         root: Path,
         limits: KeepLimits,
-        origin_of: Callable[[str], TileOrigin],
+        tiles: TilesOfFields,
         now_ms: Callable[[], int],
         on_failure: Callable[[Exception], None],
     ) -> None:
         self._root = root
         self._limits = limits
-        self._origin_of = origin_of
+        self._tiles = tiles
         self._now_ms = now_ms
         self._on_failure = on_failure
         self._failed = False
@@ -139,11 +181,11 @@ class Recorder:
     def session(self, session_id: str, hello: Hello) -> SessionRecording | None:
         """Return what records a vehicle's session; None for a vehicle that did not agree to it.
 
-        Raises what ``origin_of`` raises for a field.
+        Raises what ``tiles.origin_of`` raises for a field.
         """
         if not hello.allow_recording:
             return None
-        origins = {field_id: self._origin_of(field_id) for field_id in hello.field_ids}
+        origins = {field_id: self._tiles.origin_of(field_id) for field_id in hello.field_ids}
         return SessionRecording(session_id, hello, origins, self._put)
 
     def close(self) -> None:
@@ -171,7 +213,7 @@ class Recorder:
             return
         try:
             if self._room is None:
-                self._room = RecordingRoom(self._root, self._limits)
+                self._room = RecordingRoom(self._root, self._limits, self._tiles.name_of)
             work(self._room)
         except Exception as error:
             self._failed = True
@@ -203,7 +245,7 @@ class Recorder:
             for other, part in self._open.items()
             if not room.is_full(part.folder, now_ms)
         }
-        folder = room.begin(camera.vehicle_id, camera.camera_id, camera.session_id, now_ms)
+        folder = room.begin(camera, waiting.field_id, now_ms)
         write_whole(folder / RECORDING_NAME, camera.line())
         room.add(folder, len(camera.line()))
         return folder
@@ -265,6 +307,27 @@ def _is_start(part: Path) -> bool:
 
 def _start_ms(part: Path) -> int:
     return int(part.name.partition("-")[0])
+
+
+def _vehicle_of(part: Path) -> str:
+    return part.parent.parent.name
+
+
+def _field_of(part: Path) -> str:
+    """Return the field of a part's first picture; empty for one that has none or is damaged."""
+    try:
+        pictures = read_recorded_part(part / RECORDING_NAME).pictures
+    except DatasetError:
+        return ""
+    return pictures[0].field_id if pictures else ""
+
+
+def _largest(bytes_of: Mapping[Path, int], share_of: Callable[[Path], str]) -> tuple[str, int]:
+    """Return the share that has most bytes, and how many."""
+    totals: dict[str, int] = {}
+    for part, size_bytes in bytes_of.items():
+        totals[share_of(part)] = totals.get(share_of(part), 0) + size_bytes
+    return max(totals.items(), key=lambda total: total[1])
 
 
 def _bytes_of(part: Path) -> int:

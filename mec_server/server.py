@@ -37,7 +37,7 @@ from mec_server.metrics import BackgroundTask, ServerMetrics
 from mec_server.peers import ChargeRpcs, Slots
 from mec_server.proxies import Proxies
 from mec_server.reconstruction import OpenCameras, Tools, open_cameras
-from mec_server.recorder import KeepLimits, Recorder
+from mec_server.recorder import KeepLimits, Recorder, TilesOfFields
 from mec_server.stream_decoders import ServerContext
 from mec_server.tile_learning import LearningJob
 from mec_server.twin.metrics import TwinMetrics
@@ -471,7 +471,10 @@ class EdgeServer:
         return Recorder(
             settings.folder,
             limits,
-            lambda field_id: self._shelf.open(field_id).metadata.tile_origin,
+            TilesOfFields(
+                lambda field_id: self._shelf.open(field_id).metadata.tile_origin,
+                lambda field_id: self._published.name_of(field_id),
+            ),
             lambda: time.time_ns() // 1_000_000,
             self._recording_failed,
         )

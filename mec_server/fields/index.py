@@ -23,7 +23,7 @@ from rfcore.field import RadianceField
 from rfcore.field.folder import FIELD_ID, SUFFIX, FieldFolder, FolderListing
 from rfcore.field.store import load_checked
 from rfcore.wire.settings import RenderSettings
-from rfcore.wire.tile_manifest import MANIFEST, read_publication
+from rfcore.wire.tile_manifest import MANIFEST, Publication, read_publication
 from rfcore.wire.tiles import Tile
 
 __all__ = ["FieldIndex", "PublishedFields", "field_loader"]
@@ -141,11 +141,16 @@ class PublishedFields:
         self._folder = folder
         self._open_field = open_field
         self._seen: Stamp = None
+        self._names: Mapping[str, str] = {}
 
     def start(self) -> None:
         """Take what is published; raise ``FieldFormatError`` or ``UnknownField``."""
         self._seen = self._stamp()
-        self._take(read_publication(self._folder).current())
+        self._take(read_publication(self._folder))
+
+    def name_of(self, field_id: str) -> str:
+        """Return the name of the tile that a field is or was published for; empty for no tile's."""
+        return self._names.get(field_id, "")
 
     def look_again(self) -> None:
         """Have the next ``refresh`` follow the manifest though it was not replaced: a field that
@@ -159,19 +164,25 @@ class PublishedFields:
             return False
         self._seen = stamp
         try:
-            self._take(read_publication(self._folder).current())
+            self._take(read_publication(self._folder))
         except (RfedgeError, OSError) as error:
             log.error("publication not taken up", problem=str(error), kept=_named(before))
             return False
         log.info("publication taken up", tiles=_named(self.tiles))
         return self.tiles != before
 
-    def _take(self, tiles: tuple[Tile, ...]) -> None:
+    def _take(self, publication: Publication) -> None:
+        tiles = publication.current()
         ready = {field_id for tile in self.tiles for field_id in tile.renderable_ids}
         for field_id in (field_id for tile in tiles for field_id in tile.renderable_ids):
             if field_id not in ready:
                 self._open_field(field_id)
         self.tiles = tiles
+        self._names = {
+            field_id: name
+            for name, versions in publication.tiles.items()
+            for field_id in versions.field_ids
+        }
 
     def _stamp(self) -> Stamp:
         try:

@@ -6,17 +6,19 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from itertools import count
 
 import numpy as np
 
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
+from rfcore.update.agreement import without_outliers
 from rfcore.update.colours import ColourFit, colour_layer
 from rfcore.update.passes import Pass, SeenFrame, check_passes, split_frames
 from rfcore.update.splats import FineTuning, Progress, fine_tuned
-from rfcore.update.trial import saved_percent, try_field
+from rfcore.update.trial import TRIAL_CRFS, saved_percent, try_field
 
-__all__ = ["LearnAs", "Update", "UpdateSettings", "learn"]
+__all__ = ["LearnAs", "Update", "UpdateSettings", "learn", "learn_from"]
 
 
 class LearnAs(StrEnum):
@@ -58,6 +60,8 @@ class Update:
     frames: int
     refused: str = ""
     """Why it is not to be kept; empty if it is."""
+    dropped: dict[str, int] = field(default_factory=dict)
+    """Frames of each identity that were outliers and taught nothing."""
 
     @property
     def mean_saved_percent(self) -> float:
@@ -71,21 +75,59 @@ def learn(
     settings: UpdateSettings,
     progress: Progress | None = None,
 ) -> Update:
+    """Return what ``passes``, of one light, teach about ``base`` without their outliers.
+
+    Raises as ``learn_from`` does, saying how many frames were dropped where too few are left.
+    """
+    check_passes(passes, settings.min_identities)
+    honest = without_outliers(base, passes)
+    dropped = _dropped(passes, honest)
+    try:
+        check_passes(honest, settings.min_identities)
+    except InvalidInput as error:
+        left_out = ", ".join(f"{count} of {name}" for name, count in dropped.items())
+        raise InvalidInput(
+            "from",
+            f"{error}; left out are frames whose edges lie neither where the field's do nor where "
+            f"another pass has some: {left_out}. Look at them with `rfedge field disagree`",
+        ) from error
+    return replace(learn_from(base, honest, settings, progress), dropped=dropped)
+
+
+def learn_from(
+    base: RadianceField,
+    passes: Sequence[Pass],
+    settings: UpdateSettings,
+    progress: Progress | None = None,
+) -> Update:
     """Return what ``passes``, of one light, teach about ``base``, and whether it pays.
 
-    Raises ``InvalidInput`` for a field that is no splats, or passes of too few vehicles or frames,
-    ``DatasetError`` for a picture that cannot be read.
+    Outliers are not looked for. Raises ``InvalidInput`` for a field that is no splats, or passes of
+    too few vehicles or frames, ``DatasetError`` for a picture that cannot be read.
     """
     if not isinstance(base, SplatField):
         raise InvalidInput("field", f"{base.metadata.kind} cannot be updated, only splats")
     check_passes(passes, settings.min_identities)
     learnt, held_back = split_frames(passes, settings.frames)
     made = _made(base, learnt, settings, progress)
-    before, after = try_field(base, held_back), try_field(made, held_back)
-    saved = saved_percent(before, after)
+    steps, total = count(1), 2 * len(TRIAL_CRFS) * len(held_back)
+
+    def told() -> None:
+        if progress is not None:
+            progress("trial", next(steps), total)
+
+    saved = saved_percent(*(try_field(field, held_back, told) for field in (base, made)))
     named = {f"{n + 1} {passes[n].identity}": percent for n, percent in saved.items()}
     update = Update(made, named, len(learnt) + len(held_back))
     return replace(update, refused=_refusal(update, settings))
+
+
+def _dropped(passes: Sequence[Pass], kept: Sequence[Pass]) -> dict[str, int]:
+    dropped: dict[str, int] = {}
+    for sign, drives in ((1, passes), (-1, kept)):
+        for drive in drives:
+            dropped[drive.identity] = dropped.get(drive.identity, 0) + sign * len(drive.pictures)
+    return {identity: count for identity, count in dropped.items() if count}
 
 
 def _made(

@@ -7,7 +7,7 @@ of light that the encoder chooses by itself, and log(rate) is interpolated over 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -31,6 +31,7 @@ LEAST_ERROR = 0.05
 EPOCH = 1
 Point = tuple[float, float]
 """Luma PSNR, dB, and bytes a frame."""
+Told = Callable[[], None]
 
 
 @dataclass(frozen=True)
@@ -40,12 +41,17 @@ class Trial:
     points: Mapping[int, tuple[Point, ...]]
 
 
-def try_field(field: RadianceField, frames: Sequence[SeenFrame]) -> Trial:
-    """Code ``frames`` against ``field``; raise ``InvalidInput`` if there are none."""
+def try_field(
+    field: RadianceField, frames: Sequence[SeenFrame], told: Told = lambda: None
+) -> Trial:
+    """Code ``frames`` against ``field``; raise ``InvalidInput`` if there are none.
+
+    ``told`` is called before each frame is coded, at each rate.
+    """
     if not frames:
         raise InvalidInput("trial", "no frames are held back: give more")
     by_pass = groupby(frames, lambda frame: frame.pass_number)
-    return Trial({number: _points(field, list(of_pass)) for number, of_pass in by_pass})
+    return Trial({number: _points(field, list(of_pass), told) for number, of_pass in by_pass})
 
 
 def saved_percent(before: Trial, after: Trial) -> dict[int, float]:
@@ -56,7 +62,7 @@ def saved_percent(before: Trial, after: Trial) -> dict[int, float]:
     }
 
 
-def _points(field: RadianceField, frames: Sequence[SeenFrame]) -> tuple[Point, ...]:
+def _points(field: RadianceField, frames: Sequence[SeenFrame], told: Told) -> tuple[Point, ...]:
     views = [render_field_view(field, frame.camera) for frame in frames]
     pictures = [i420_from_rgb(frame.rgb) for frame in frames]
     points = []
@@ -64,6 +70,7 @@ def _points(field: RadianceField, frames: Sequence[SeenFrame]) -> tuple[Point, .
         encoder = DeltaEncoder(CodecConfig(*pictures[0].size_px, crf=crf))
         state, size_bytes, errors = encoder.start(EPOCH), 0, []
         for picture, view in zip(pictures, views, strict=True):
+            told()
             coded = encoder.encode(state, picture, view)
             state = coded.state
             size_bytes += len(coded.packet.payload)

@@ -95,6 +95,12 @@ class FieldUpdate:
 
         base = open_field(self.field, threads=self.threads)
         update = _learnt(base, _passes(self.recordings, base), self._settings(), console)
+        for name, count in update.dropped.items():
+            console.print(
+                f"{name}: {count} frames left out: their edges lie neither where the field's do "
+                "nor where another pass has some",
+                soft_wrap=True,
+            )
         for name, percent in update.saved_percent.items():
             console.print(f"pass {name}: {_change(percent)} on the frames held back")
         if update.refused:

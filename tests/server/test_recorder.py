@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from mec_server import recorder as module
-from mec_server.recorder import KeepLimits, Recorder, SessionRecording, picture_name
+from mec_server.recorder import (
+    KeepLimits,
+    Recorder,
+    SessionRecording,
+    TilesOfFields,
+    picture_name,
+)
 from recorded import recorded, recorded_parts
 from rfcore.camera import TileOrigin
 from rfcore.dataset import read_dataset
@@ -17,7 +23,7 @@ from rfcore.image import I420
 from rfcore.wire.messages import Frame, Hello
 
 MakeFrame = Callable[..., Frame]
-FIELD = "ab" * 32
+FIELD, EAST = "ab" * 32, "cd" * 32
 ORIGIN = TileOrigin(500_000.0, 5_300_000.0, 500.0)
 
 
@@ -47,7 +53,9 @@ def open_recorder(tmp_path: Path, clock: Clock) -> Callable[..., Recorder]:
         max_age_s: float = 1e9,
     ) -> Recorder:
         limits = KeepLimits(max_bytes, max_age_s)
-        return Recorder(tmp_path, limits, {FIELD: ORIGIN}.__getitem__, clock, on_failure)
+        origins, names = {FIELD: ORIGIN, EAST: ORIGIN}, {FIELD: "west", EAST: "east", "": ""}
+        tiles = TilesOfFields(origins.__getitem__, names.__getitem__)
+        return Recorder(tmp_path, limits, tiles, clock, on_failure)
 
     return make
 
@@ -145,6 +153,57 @@ def test_bytes_stay_within_the_bound_and_the_newest_pictures_stay(
     kept = [picture.sequence for picture in recorded(tmp_path)]
     assert 10 < len(kept) < 200
     assert kept == list(range(200 - len(kept), 200))
+
+
+@pytest.mark.parametrize("again", [False, True], ids=["in one run", "after a restart"])
+def test_a_busy_vehicle_evicts_its_own_pictures_and_no_other_vehicles(
+    make_frame: MakeFrame,
+    hello: Hello,
+    open_recorder: Callable[..., Recorder],
+    tmp_path: Path,
+    again: bool,
+) -> None:
+    recorder = open_recorder(max_bytes=20_000)
+    quiet = agreed(recorder, replace(hello, vehicle_id="quiet"), "s1")
+    for sequence in range(5):
+        quiet.save(make_frame(sequence), FIELD, grey(50))
+    if again:
+        recorder.close()
+        recorder = open_recorder(max_bytes=20_000)
+    busy = agreed(recorder, replace(hello, vehicle_id="busy"), "s2")
+    for sequence in range(300):
+        busy.save(make_frame(sequence), FIELD, grey(50))
+    recorder.close()
+    assert len(recorded(tmp_path, "quiet")) == 5
+    assert 10 < len(recorded(tmp_path, "busy")) < 300
+    assert sum(p.stat().st_size for p in tmp_path.rglob("*") if p.is_file()) <= 20_000
+
+
+@pytest.mark.parametrize("again", [False, True], ids=["in one run", "after a restart"])
+def test_a_busy_tile_evicts_no_other_tiles_pictures(
+    make_frame: MakeFrame,
+    hello: Hello,
+    open_recorder: Callable[..., Recorder],
+    tmp_path: Path,
+    again: bool,
+) -> None:
+    """Many vehicles of one tile, each with fewer bytes than the only one of the other."""
+    recorder = open_recorder(max_bytes=20_000)
+    hello = replace(hello, field_ids=(FIELD, EAST))
+    only = agreed(recorder, replace(hello, vehicle_id="only"), "s1")
+    for sequence in range(15):
+        only.save(make_frame(sequence), EAST, grey(50))
+    if again:
+        recorder.close()
+        recorder = open_recorder(max_bytes=20_000)
+    for number in range(40):
+        one = agreed(recorder, replace(hello, vehicle_id=f"v{number}"), f"t{number}")
+        for sequence in range(5):
+            one.save(make_frame(sequence), FIELD, grey(50))
+    recorder.close()
+    assert len(recorded(tmp_path, "only")) == 15
+    assert recorded(tmp_path, "v0") == []
+    assert len(recorded(tmp_path, "v39")) == 5
 
 
 def test_a_recording_that_is_too_old_is_deleted_by_the_next_picture(

@@ -147,4 +147,4 @@ def update(noon: SplatField, dusk: SplatField, make_pass: MakePass) -> Update:
 @pytest.fixture
 def learnt_before(update: Update, monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the worker take what was learnt once: what it does around learning is tested."""
-    monkeypatch.setattr("mec_server.tile_learning.learn", lambda *_: update)
+    monkeypatch.setattr("mec_server.tile_learning.learn_from", lambda *_: update)

@@ -2,9 +2,11 @@
 
 import errno
 import os
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -21,12 +23,14 @@ from mec_server.tile_history import (
     read_histories,
     write_histories,
 )
+from mec_server.tile_learning import WATCH_EVERY_MS, LearningRounds
 from rfcore.errors import InvalidInput
 from rfcore.field import FieldStore, SplatField, save_field
 from rfcore.image import Rgb
 from rfcore.update.agreement import without_outliers
 from rfcore.update.passes import Pass
-from rfcore.update.run import Update
+from rfcore.update.run import Update, UpdateSettings, learn_from
+from rfcore.update.splats import Progress
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.settings import LogForm
 from rfcore.wire.tile_manifest import MANIFEST, VersionLabel
@@ -139,6 +143,68 @@ def test_an_update_that_makes_bits_worse_is_withdrawn_within_50_frames(
     assert read_histories(street.recordings)["west"] == history
 
 
+def published_harm(street: Any, dusk: SplatField, folder: Path) -> str:
+    """Publish dusk as a light that the process has learnt; return the field's id."""
+    bad_id = save_field(dusk, folder / "bad.rff")
+    published = Learnt(bad_id, "h17", street.noon_id, 2, 20.0, NOW_MS)
+    (street.recordings / LEARNING).mkdir(exist_ok=True)
+    write_histories(street.recordings, {"west": TileHistory((published,))})
+    label = VersionLabel("h17", "", 2, 17.0)
+    publish(street.fields, "west", folder / "bad.rff", Ground(), NOW, label)
+    return bad_id
+
+
+def test_a_harm_is_seen_while_another_update_is_tried(
+    at_dusk: Any,
+    noon: SplatField,
+    dusk: SplatField,
+    make_pass: MakePass,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A vehicle meets the bad field when the trial of the next one has begun."""
+    bad_id = published_harm(at_dusk, dusk, tmp_path)
+    now_ms, done = [NOW_MS], []
+
+    def learn_and_tell(
+        base: SplatField, passes: list[Pass], settings: UpdateSettings, progress: Progress
+    ) -> Update:
+        def tell(doing: str, step: int, steps: int) -> None:
+            if doing == "trial" and step == 1:
+                at_dusk.record(make_pass(noon, "c"), bad_id, times=4)
+            now_ms[0] += WATCH_EVERY_MS + 1 if doing == "trial" else 0
+            progress(doing, step, steps)
+            done.append((doing, len(at_dusk.west().tile("west").lights)))
+
+        return learn_from(base, passes, settings, tell)
+
+    monkeypatch.setattr("mec_server.tile_learning.learn_from", learn_and_tell)
+    with capture_logs() as lines:
+        LearningRounds(at_dusk.job, lambda: now_ms[0]).run()
+    assert lines[0]["event"] == "update withdrawn"
+    assert done[-1] == ("trial", 0), "it was withdrawn before the trial was over"
+
+
+def test_a_process_withdraws_within_50_frames_what_makes_bits_worse(
+    street: Any, noon: SplatField, dusk: SplatField, make_pass: MakePass, tmp_path: Path
+) -> None:
+    bad_id = published_harm(street, dusk, tmp_path)
+    street.record(make_pass(noon, "c"), bad_id, times=4)
+    (file,) = street.recordings.glob("c/front/*/recording.jsonl")
+    os.utime(file)
+    assert len(file.read_text().splitlines()) - 1 <= 50
+    learner = Learner(street.job, LogForm.JSON, lambda _: None)
+    learner.start()
+    try:
+        deadline_s = time.monotonic() + 60
+        while not read_histories(street.recordings)["west"].withdrawals:
+            assert time.monotonic() < deadline_s, "nothing was withdrawn"
+            Event().wait(0.05)
+    finally:
+        learner.close()
+    assert street.west().tile("west").lights == ()
+
+
 @pytest.mark.usefixtures("learnt_before")
 def test_an_update_that_helps_stays(at_dusk: Any, dusk: SplatField, make_pass: MakePass) -> None:
     at_dusk.rounds().run()
@@ -154,7 +220,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.usefixtures("learnt_before")
-@pytest.mark.parametrize("step", ["learn", "save_field", "publish", "store", "manifest"])
+@pytest.mark.parametrize("step", ["learn_from", "save_field", "publish", "store", "manifest"])
 def test_a_killed_round_publishes_nothing_half_and_the_next_does_the_work(
     at_dusk: Any, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
@@ -222,7 +288,7 @@ def test_of_two_updates_at_once_one_is_published(
         publish(at_dusk.fields, "west", tmp_path / "other.rff", Ground(), NOW, label)
         return update
 
-    monkeypatch.setattr("mec_server.tile_learning.learn", slowly)
+    monkeypatch.setattr("mec_server.tile_learning.learn_from", slowly)
     with capture_logs() as lines:
         at_dusk.rounds().run()
     assert "published by somebody else" in lines[-1]["problem"]

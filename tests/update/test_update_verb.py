@@ -77,6 +77,41 @@ def test_a_job_on_ray_learns_the_same_bytes(
     assert sorted(path.name for path in tmp_path.glob("*.job")) == []
 
 
+def test_frames_that_agree_with_nobody_are_left_out_and_named(
+    noon: SplatField,
+    dusk: SplatField,
+    make_pass: MakePass,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Two frames of one pass show another place; of another pass all frames do."""
+
+    def somewhere(number: int, _: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+        rng = np.random.default_rng(number)
+        return np.kron(rng.integers(0, 255, (8, 12, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+
+    def sometimes(number: int, rgb: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+        return somewhere(100 + number, rgb) if number in (3, 7) else rgb
+
+    save_field(noon, tmp_path / "noon.rff")
+    a, b, liar = (
+        recorded(tmp_path / drive.identity, drive)
+        for drive in (
+            make_pass(dusk, "a", paint=sometimes),
+            make_pass(dusk, "b", 0.15),
+            make_pass(dusk, "liar", paint=somewhere),
+        )
+    )
+    update = FieldUpdate(tmp_path / "noon.rff", (a, b, liar), tmp_path / "dusk.rff", "colours")
+    update.run()
+    said = capsys.readouterr().out
+    assert f"{a}: 2 frames left out" in said
+    assert f"{liar}: 12 frames left out" in said
+    assert said.count("frames left out") == 2
+    with pytest.raises(InvalidInput, match=r"12 of .*liar.*field disagree"):
+        replace(update, recordings=(b, liar)).run()
+
+
 def test_what_does_not_pay_is_not(noon: SplatField, make_pass: MakePass, tmp_path: Path) -> None:
     save_field(noon, tmp_path / "noon.rff")
     folders = [recorded(tmp_path / name, make_pass(noon, name)) for name in "ab"]
