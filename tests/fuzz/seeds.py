@@ -84,7 +84,7 @@ def put_wire() -> None:
         put("message", name, data)
     ack = Ack(FrameAddress("front", 1, 0), StageTimes(1, 2, 3), bytes(16))
     put("message", "answers", server_messages_to_bytes([ack])[0])
-    for name, frame, data in zip(("frame-0", "frame-1"), frames, messages[1:], strict=True):
+    for name, frame, data in zip(names[1:], frames, messages[1:], strict=True):
         put("packet", name, data)
         put("slices", name, frame.packet.payload)
     put("session", "drive", b"".join(struct.pack("<H", len(data)) + data for data in messages))

@@ -203,6 +203,8 @@ def test_a_simulation_counts_as_its_fcd_output_does(tmp_path: Path, end: str) ->
 
 @pytest.mark.slow
 def test_what_sumo_cannot_run_is_an_error_and_the_next_simulation_runs(tmp_path: Path) -> None:
-    with pytest.raises(InvalidData, match=r"own\.sumocfg: SUMO does not run it, it says why above: Process"):
+    with pytest.raises(
+        InvalidData, match=r"own\.sumocfg: SUMO does not run it, it says why above: Process"
+    ):
         list(sumo_traffic(town(), written(tmp_path, "<configuration/>", "own.sumocfg")))
     assert list(sumo_traffic(town(), CROSSING))
