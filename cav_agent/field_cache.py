@@ -174,8 +174,8 @@ class FieldCache:
     async def _preview(self, tile: Tile) -> tuple[str, ...]:
         """Return the archives of the field to begin with; none if the tile's own is here.
 
-        None either where frames are not named by ``TileLights`` (``--localise``), or poses are
-        looked for within the bounds of the field that a drive begins with (a feed's).
+        None either where a camera is looked for in the field (``--localise``), on another thread
+        than takes a preview's place, or within its bounds (a feed's).
         """
         config = self._config
         waits = config.localise or config.feed.source is not None

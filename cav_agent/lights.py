@@ -22,7 +22,7 @@ from rfcore.camera import Camera
 from rfcore.codec.block_means import median_block_mean_difference
 from rfcore.field import Quality, RadianceField, render_field_view
 from rfcore.image import I420
-from rfcore.views import FieldView
+from rfcore.views import FieldView, View
 
 __all__ = ["TileLights"]
 
@@ -79,9 +79,19 @@ class TileLights:
         with self._lock:
             return frozenset(self._fields)
 
+    def render(self, camera: Camera, quality: Quality) -> View:
+        """Render the field in use: what a camera is found in, on any thread.
+
+        A preview stays in use: its place is taken by ``view`` alone.
+        """
+        return self.current.render(camera, quality)
+
     def view(self, frame: I420, camera: Camera, quality: Quality) -> FieldView:
         """Return what the field that fits shows at a frame's camera."""
-        view = render_field_view(self._taken(), camera, quality)
+        return self.fitting(frame, render_field_view(self._taken(), camera, quality), quality)
+
+    def fitting(self, frame: I420, view: FieldView, quality: Quality) -> FieldView:
+        """Return ``view``, which the field in use shows, or what a light that is nearer does."""
         if self._until_look > 0:
             self._until_look -= 1
             return view

@@ -92,7 +92,8 @@ class PipelineOptions:
     threads: int = 1
     """The encoder's; the renderer has its own."""
     lights: TileLights | None = None
-    """Fields of other lights, of which the nearest is coded against; without ``tracking``."""
+    """Fields of other lights, of which the nearest is coded against; ``tracking`` renders them,
+    too."""
     check_decode: bool = False
     """Decode every slice on the vehicle, too, to see that it is what its coder promised."""
     light: LightChange = LightChange.AUTO
@@ -124,7 +125,7 @@ class Pipeline:
     ) -> None:
         self._renderer = renderer
         self._config = config
-        self._lights = None if options is None or options.tracking else options.lights
+        self._lights = None if options is None else options.lights
         self._clock_ns = clock_ns
         self._options = options = options or PipelineOptions()
         self._rungs = options.rungs or FixedRung(Rung(effort=config.effort))
@@ -197,7 +198,7 @@ class Pipeline:
             return self._placed_on_rig(job.capture, frame, rung, options.on_rig)
         if options.tracking is not None:
             fix = options.tracking.locate(job.capture, frame, rung)
-            return Placed(fix.view, fix)
+            return Placed(self._in_its_light(frame, fix.view, rung.quality), fix)
         camera = picture.camera if options.feed is None else options.feed.camera(job.capture)
         return Placed(self._view(frame, camera, rung.quality))
 
@@ -218,6 +219,14 @@ class Pipeline:
         if self._lights is not None:
             return self._lights.view(frame, camera, quality)
         return render_field_view(self._renderer, camera, quality)
+
+    def _in_its_light(
+        self, frame: I420, view: FieldView | None, quality: Quality
+    ) -> FieldView | None:
+        """Return the view of a camera that was found, or what a light that fits it better shows."""
+        if view is None or self._lights is None:
+            return view
+        return self._lights.fitting(frame, view, quality)
 
     def _choice(self, job: EncodeJob, rung: Rung) -> FrameChoice:
         budget, limit_bytes = job.budget, self._options.limit_bytes

@@ -320,7 +320,7 @@ class StreamFactory:
             rungs=prepared.rungs,
             steering=camera.steering,
             threads=config.render.threads,
-            lights=None if config.localise else prepared.lights,
+            lights=prepared.lights,
             feed=self._poses(field) if is_alone and not config.localise else None,
             tracking=self._tracking(prepared) if is_alone and config.localise else None,
             on_rig=on_rig,
@@ -354,7 +354,7 @@ class StreamFactory:
         field, config = prepared.field, self._config
         poses = self._poses(field)
         return CameraTracking(
-            field,
+            prepared.lights or field,
             prepared.cameras[0].camera.intrinsics,
             poses or DatasetPoses(),
             self._searcher,

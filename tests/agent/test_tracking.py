@@ -1,5 +1,6 @@
 """The agent finds its pose while frames go on: searches run beside, OpenCV comes when asked for."""
 
+import math
 import os
 import subprocess
 import sys
@@ -10,14 +11,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from cav_agent.frames import Capture
+from cav_agent.frames import Capture, EncodeJob
+from cav_agent.lights import TileLights
+from cav_agent.pipeline import Pipeline, PipelineOptions
 from cav_agent.tracking import CameraTracking, DatasetPoses
 from cav_agent.vehicle import SEARCH_NICENESS, yield_to_frames
+from rfcore.camera import Camera
+from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.sender.ladder import FULL_RUNG
 from rfcore.dataset import read_dataset
-from rfcore.field import RadianceField, load_field
+from rfcore.field import RadianceField, SplatField, load_field, render_field_view
+from rfcore.field.layer import SH_DC
 from rfcore.localise.fix import Fix, State
 from rfcore.native.yuv import i420_from_rgb
 
@@ -114,6 +121,49 @@ def test_after_a_jump_the_field_is_used_again_within_three_frames(
     states = states_while_searching(tracking, held, again_at(captures, 13))
     assert states == [State.LOCALISING] * 3 + [State.TRACKING] * (len(states) - 3)
     assert tracking.counts["track_lost"] == 1
+
+
+def dimmed(field: RadianceField, gain: float) -> SplatField:
+    """Return the field in ``gain`` of its light."""
+    assert isinstance(field, SplatField)
+    sh = field.gaussians.sh * np.float32(gain)
+    sh[:, 0] += np.float32((gain - 1) * 0.5 / SH_DC)
+    return SplatField(replace(field.gaussians, sh=sh), field.metadata, threads=2)
+
+
+@pytest.mark.sample
+def test_a_vehicle_that_localises_takes_the_light_that_fits(
+    field: RadianceField, captures: list[Capture]
+) -> None:
+    """It is found in the field of noon, then in the light that arrives: its frames are coded
+    against that one, and name it."""
+    dim = dimmed(field, 0.4)
+    wanted: list[int] = []
+    lights = TileLights(field, lambda: wanted.append(1))
+    intrinsics = captures[0].picture.camera.intrinsics
+    config = CodecConfig(intrinsics.width_px, intrinsics.height_px, effort="fast")
+
+    def darker(capture: Capture) -> Capture:
+        rgb = (0.4 * capture.picture.read()).astype(np.uint8)
+        return replace(capture, picture=replace(capture.picture, read=lambda: rgb))
+
+    made = None
+    with ThreadPoolExecutor(1) as searcher:
+        tracking = CameraTracking(lights, intrinsics, DatasetPoses(), searcher, patient=True)
+        options = PipelineOptions(tracking=tracking, lights=lights)
+        pipeline = Pipeline(field, config, lambda: 0, options)
+        for capture in captures[:3]:
+            made = pipeline.encode(EncodeJob(darker(capture), 0, 1))
+            if wanted and dim.field_id not in lights.held_ids():
+                lights.add(dim)
+    assert made is not None
+    assert made.fix is not None
+    assert made.fix.state is State.TRACKING
+    assert made.field_id == dim.field_id
+    camera = Camera(intrinsics, made.pose)
+    assert made.packet.render_digest == render_field_view(dim, camera).render.digest()
+    true = captures[2].picture.camera.world_from_cam.translation_m
+    assert math.dist(made.pose.translation_m, true) < 0.3
 
 
 @pytest.mark.sample
