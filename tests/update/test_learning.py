@@ -5,11 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
+from rfcore.field.layer import SH_DC
 from rfcore.field.store import decode_field, encode_field
 from rfcore.image import Rgb
+from rfcore.raster.gaussians import Gaussians
 from rfcore.update.agreement import trusted_pixels
 from rfcore.update.colours import ColourFit, colour_layer
 from rfcore.update.passes import Pass, split_frames
@@ -136,3 +139,52 @@ def test_bits_are_compared_at_equal_quality() -> None:
 def test_a_trial_without_frames_is_refused(noon: SplatField) -> None:
     with pytest.raises(InvalidInput, match="no frames are held back"):
         try_field(noon, [])
+
+
+# --- what comes to stay
+
+
+def with_box(field: SplatField) -> SplatField:
+    """A white box of 80 splats, 0.8 by 0.6 m, half a metre before the wall."""
+    rng = np.random.default_rng(3)
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 10), np.linspace(-0.3, 0.3, 8))
+    n = x.size
+    means = np.stack([x.ravel(), y.ravel(), np.full(n, BOX_M)], axis=1)
+    colours = 0.9 + 0.1 * rng.uniform(-1, 1, (n, 3))
+    box = Gaussians(
+        means=means.astype(np.float32),
+        quaternions=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        log_scales=np.tile(np.log(np.float32([0.06, 0.06, 0.02])), (n, 1)),
+        opacity_logits=np.full(n, 3.0, np.float32),
+        sh=((colours - 0.5) / SH_DC).astype(np.float32)[:, None],
+    )
+    parts = (field.gaussians, box)
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return SplatField(Gaussians(**joined))
+
+
+BOX_M = 3.5
+STAYS = FineTuning(300, growth=0.1)
+
+
+def where_the_box_is(gaussians: Gaussians) -> NDArray[np.bool_]:
+    """Tell which splats are seen, from the middle of the drives, within the box's outline."""
+    x, y, z = gaussians.means.T
+    return (np.abs(x / z * BOX_M) < 0.5) & (np.abs(y / z * BOX_M) < 0.4)
+
+
+def test_gaussians_are_added_where_something_has_come_to_stay(
+    noon: SplatField, make_pass: MakePass
+) -> None:
+    """The share of new ones there is several times that of the rest of the wall."""
+    parked = with_box(noon)
+    frames, _ = split_frames([make_pass(parked, "a"), make_pass(parked, "b", 0.15)], 24)
+    learnt = fine_tuned(noon, frames, STAYS)
+    assert noon.primitives < learnt.primitives <= 1.1 * noon.primitives + 1
+    before, after = (where_the_box_is(f.gaussians) for f in (noon, learnt))
+    added_there = after.sum() / before.sum() - 1
+    added_elsewhere = (~after).sum() / (~before).sum() - 1
+    assert added_there > 3 * max(added_elsewhere, 0.02)
+    third = make_pass(parked, "c", -0.1)
+    assert luma_error(learnt, third) < 0.6 * luma_error(noon, third)

@@ -14,7 +14,7 @@ import pytest
 from prometheus_client import CollectorRegistry
 from structlog.testing import capture_logs
 
-from mec_server.learner import RESTART_S, Learner
+from mec_server.learner import LOWEST_PRIORITY, RESTART_S, Learner
 from mec_server.metrics import ServerMetrics
 from mec_server.tile_history import (
     LEARNING,
@@ -320,6 +320,29 @@ def test_a_killed_process_is_started_again_and_ends_with_its_server(street: Any)
     learner.close()
     with pytest.raises(ProcessLookupError):
         os.kill(second, 0)
+
+
+def test_the_process_runs_at_the_lowest_priority(street: Any) -> None:
+    learner = Learner(street.job, LogForm.JSON, lambda _: None)
+    learner.start()
+    try:
+        assert learner.pid is not None
+        deadline_s = time.monotonic() + 60
+        while os.getpriority(os.PRIO_PROCESS, learner.pid) != LOWEST_PRIORITY:
+            assert time.monotonic() < deadline_s, "it was not niced"
+            Event().wait(0.05)
+    finally:
+        learner.close()
+
+
+@pytest.mark.usefixtures("learnt_before")
+@pytest.mark.parametrize(("max_age_s", "lights"), [(30.0, 0), (90.0, 1)])
+def test_recordings_above_the_age_teach_nothing(
+    at_dusk: Any, max_age_s: float, lights: int
+) -> None:
+    """They were added to a minute ago."""
+    at_dusk.rounds(max_age_s=max_age_s).run()
+    assert len(at_dusk.west().tile("west").lights) == lights
 
 
 def test_what_was_learnt_is_shown(street: Any) -> None:
