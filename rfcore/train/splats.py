@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from itertools import islice
 from typing import Any
 
@@ -38,7 +38,7 @@ from rfcore.train.schedule import (
     view_order,
 )
 from rfcore.train.start import gaussians_from_points
-from rfcore.train.targets import ExposureModel, load_targets
+from rfcore.train.targets import ExposureModel, Target, halved, load_targets
 from rfcore.train.trainer import FieldTrainer, HeldOut, settings_of
 from rfcore.views import PointCloud, PosedPicture
 
@@ -61,6 +61,9 @@ class SplatTrainingConfig:
     density: DensityControl = field(default_factory=DensityControl)
     regularisation: Regularisation = field(default_factory=Regularisation)
     bands: Bands = field(default_factory=Bands)
+    halved_until: float = 0.0
+    """Share of the run that looks at pictures of half the width and height: they cost less, and
+    are enough to put Gaussians in place (DashGaussian, Chen et al. 2025, with a fixed share)."""
     antialiased: bool = False
     """Train for the antialiased mode; the field says so."""
     exposure: bool = False
@@ -77,6 +80,8 @@ class SplatTrainingConfig:
             raise InvalidInput("training.iterations", f"{self.iterations} is outside 1..1000000")
         if not 0.01 <= self.initial_scale <= 10:
             raise InvalidInput("training.initial_scale", f"{self.initial_scale} not in 0.01..10")
+        if not 0 <= self.halved_until < 1:
+            raise InvalidInput("training.halved_until", f"{self.halved_until} is not in 0..1")
         if self.refine_poses and self.exposure:
             raise InvalidInput("training.refine_poses", "goes without exposure: learn one of them")
 
@@ -107,6 +112,8 @@ class SplatTrainer(FieldTrainer):
         self._unit_m = float(np.median(np.exp(initial.log_scales.astype(np.float64))))
         digest = _training_digest(pictures_digest, initial, self.config, seed)
         super().__init__(self.config.iterations, digest)
+        is_halved = self.config.halved_until > 0
+        self._halves = [halved(target) for target in self._targets] if is_halved else []
         self._exposure = ExposureModel(len(self._targets)) if self.config.exposure else None
         self._names = [picture.name for picture in pictures]
         cameras = [target.camera for target in self._targets]
@@ -199,7 +206,7 @@ class SplatTrainer(FieldTrainer):
     def _descend(self, progress: float) -> float:
         """Do one step of Adam on the next view; return the loss."""
         view = next(self._order)
-        config, target = self.config, self._targets[view]
+        config, target = self.config, self._target(view, progress)
         rates = config.regularisation.added_to(
             config.rates.at(progress, self._unit_m), len(self._rasterizer)
         )
@@ -217,13 +224,19 @@ class SplatTrainer(FieldTrainer):
             self._exposure.step(view, exposure.gradient, config.rates.factor(progress))
         return loss
 
+    def _target(self, view: int, progress: float) -> Target:
+        """Return what the picture ``view`` is to look like, in the size that is used now."""
+        return (self._halves if progress < self.config.halved_until else self._targets)[view]
+
     def _descend_with_pose(
         self, poses: PoseModel, view: int, rates: LearningRates, progress: float
     ) -> float:
         """Do one step of Adam on the Gaussians and on the picture's pose; return the loss."""
-        camera, rasterizer = poses.camera(view), self._rasterizer
+        target = self._target(view, progress)
+        camera = replace(poses.camera(view), intrinsics=target.camera.intrinsics)
+        rasterizer = self._rasterizer
         rasterizer.forward(camera, sh_degree=self.config.bands.at(progress))
-        loss = rasterizer.loss(self._targets[view].colour())
+        loss = rasterizer.loss(target.colour())
         rasterizer.backward()
         centre_m = camera.world_from_cam.translation_m
         gradient = pose_gradient(self.gaussians(), rasterizer.gradients(), centre_m)

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera
+from rfcore.camera import Camera, Intrinsics
 from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
 from rfcore.ngp.trainable import RayBatch
 from rfcore.raster.trainable import Exposure
 from rfcore.views import PosedPicture
 
-__all__ = ["ExposureModel", "RaySampler", "Target", "load_targets"]
+__all__ = ["ExposureModel", "RaySampler", "Target", "halved", "load_targets"]
 
 F64 = NDArray[np.float64]
 EXPOSURE_RATE = 3e-3
@@ -52,6 +52,22 @@ def load_targets(pictures: Sequence[PosedPicture]) -> tuple[tuple[Target, ...], 
         digest.update(repr(target.camera).encode())
         digest.update(np.ascontiguousarray(target.rgb).data)
     return targets, digest.hexdigest()
+
+
+def halved(target: Target) -> Target:
+    """Return a picture of half the size: means of 2x2 pixels, rounded to nearest, a half up.
+
+    The last row or column of an odd number is left out. Raises ``InvalidInput`` for a picture of
+    one row or column.
+    """
+    k = target.camera.intrinsics
+    width, height = k.width_px // 2, k.height_px // 2
+    if not width or not height:
+        raise InvalidInput("picture", f"{k.width_px}x{k.height_px} px cannot be halved")
+    intrinsics = Intrinsics(width, height, k.fx_px / 2, k.fy_px / 2, k.cx_px / 2, k.cy_px / 2)
+    quads = target.rgb[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)
+    rgb = ((quads.sum(axis=(1, 3), dtype=np.uint16) + 2) // 4).astype(np.uint8)
+    return Target(replace(target.camera, intrinsics=intrinsics), np.ascontiguousarray(rgb))
 
 
 class RaySampler:

@@ -67,6 +67,8 @@ NGP_CELL_BYTES = 5
 """Of the occupancy grid: a float and a bit, twice while it is built anew."""
 NGP_SCRATCH_BYTES = 150 << 20
 """Samples and activations of one batch."""
+TWO_SIZES = 1.25
+"""Pixels of a picture and of the same halved."""
 PICTURE_FLOATS = 9
 """Colour, target, gradient: three channels each."""
 
@@ -78,7 +80,7 @@ def splat_training_bytes(gaussians: int, sh_degree: int, sizes_px: list[tuple[in
     of_gaussians = gaussians * (parameters * (SETS * SLACK + SETS) + SPLAT_BYTES * SLACK)
     of_entries = gaussians * ENTRIES_PER_GAUSSIAN * ENTRY_BYTES * SLACK
     pixels = [width * height for width, height in sizes_px]
-    of_pictures = 3 * sum(pixels) + 4 * PICTURE_FLOATS * max(pixels, default=0)
+    of_pictures = 3 * TWO_SIZES * sum(pixels) + 4 * PICTURE_FLOATS * max(pixels, default=0)
     return BASE_BYTES + int(of_gaussians + of_entries + of_pictures)
 
 

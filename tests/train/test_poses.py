@@ -117,7 +117,8 @@ def test_a_run_goes_on_from_its_arrays():
     assert one.camera(1) == other.camera(1)
 
 
-def test_training_with_wrong_poses_ends_nearer_to_the_right_ones(scene):
+@pytest.mark.parametrize("halved_until", [0.0, 0.5])
+def test_training_with_wrong_poses_ends_nearer_to_the_right_ones(scene, halved_until):
     """Relative to each other: the mean of all corrections is held."""
     field, rng = SplatField(scene), np.random.default_rng(9)
     cameras = [
@@ -130,7 +131,12 @@ def test_training_with_wrong_poses_ends_nearer_to_the_right_ones(scene):
         replace(picture(field, camera, f"{n}.png"), camera=corrected(camera, error))
         for n, (camera, error) in enumerate(zip(cameras, errors, strict=True))
     ]
-    config = SplatTrainingConfig(iterations=400, bands=Bands(0, 0.0), refine_poses=True)
+    config = SplatTrainingConfig(
+        iterations=400,
+        bands=Bands(0, 0.0),
+        halved_until=halved_until,
+        refine_poses=True,
+    )
     trainer = SplatTrainer(taken, scene, config, seed=1)
     assert trainer.depth_m == pytest.approx(typical_depth_m(scene, cameras), rel=0.05)
     for _ in trainer.steps():

@@ -25,6 +25,7 @@ EVERYTHING = replace(
     ),
     regularisation=Regularisation(0.01, 0.01),
     bands=Bands(rise=0.1),
+    halved_until=0.7,
     antialiased=True,
     exposure=True,
 )

@@ -9,7 +9,14 @@ from rfcore.camera import TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.raster.gaussians import Gaussians
-from rfcore.train import DensityControl, HeldOut, SplatTrainer, SplatTrainingConfig, mean_psnr_db
+from rfcore.train import (
+    DensityControl,
+    HeldOut,
+    SplatTrainer,
+    SplatTrainingConfig,
+    TrainingProgress,
+    mean_psnr_db,
+)
 from rfcore.views import PointCloud
 
 SHORT = SplatTrainingConfig(gaussians=300, iterations=60)
@@ -27,6 +34,10 @@ def trained(pictures, points, config=SHORT, seed: int = 0) -> SplatTrainer:
     for _ in trainer.steps():
         pass
     return trainer
+
+
+def trained_losses(pictures, points, config) -> list[TrainingProgress]:
+    return list(SplatTrainer(pictures, points, config).steps())
 
 
 def painted(posed, cameras, points):
@@ -84,6 +95,18 @@ def test_gaussians_near_in_space_are_near_in_memory_from_the_start_and_after_gro
     trainer.step(0.5)
     assert trainer.primitives == 400
     assert hop_m(trainer) < 0.8 * before_m
+
+
+def test_the_first_share_of_a_run_looks_at_halved_pictures(posed, points) -> None:
+    """Halving a picture of 1 px squares leaves one grey: only whole pictures teach the squares."""
+
+    def fine(_: int) -> np.ndarray:
+        y, x = np.mgrid[:24, :40]
+        return np.repeat((255 * ((x + y) % 2))[..., None], 3, axis=2).astype(np.uint8)
+
+    config = replace(SHORT, halved_until=0.5)
+    losses = [progress.loss for progress in trained_losses(posed(fine), points, config)]
+    assert max(losses[25:30]) < 0.25 * min(losses[30:35])
 
 
 def test_another_seed_gives_another_field(posed, points) -> None:
@@ -161,6 +184,8 @@ def test_an_empty_field_against_grey_has_the_closed_form_quality(posed) -> None:
     [
         ({"gaussians": 0}, "training.gaussians: 0"),
         ({"iterations": 0}, "training.iterations: 0"),
+        ({"halved_until": 1.0}, "training.halved_until: 1.0"),
+        ({"halved_until": float("nan")}, "training.halved_until: nan"),
         ({"initial_scale": float("nan")}, "training.initial_scale: nan"),
     ],
 )

@@ -33,7 +33,7 @@ def test_more_of_anything_takes_more() -> None:
     one = splat_training_bytes(1000, 2, [SIZE_PX])
     assert splat_training_bytes(2000, 2, [SIZE_PX]) > one
     assert splat_training_bytes(1000, 3, [SIZE_PX]) > one
-    assert splat_training_bytes(1000, 2, [SIZE_PX] * 2) - one == 3 * 320 * 184
+    assert splat_training_bytes(1000, 2, [SIZE_PX] * 2) - one == 3 * 1.25 * 320 * 184
 
 
 RUN = f"""

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <utility>
 
 #include "raster/portable_math.h"
@@ -186,8 +187,9 @@ uint64_t spread_bits(uint64_t x) {
 std::vector<uint32_t> curve_order(const TrainableBlocks& b) {
     double low[3], side = 0.0;
     for (int k = 0; k < 3; ++k) {
-        double high = low[k] = b.count > 0 ? static_cast<double>(gaussian(b, 0)[kMeanPlane + k]) : 0.0;
-        for (int n = 1; n < b.count; ++n) {
+        double high = std::numeric_limits<double>::lowest();
+        low[k] = std::numeric_limits<double>::max();
+        for (int n = 0; n < b.count; ++n) {
             const double x = static_cast<double>(gaussian(b, n)[kMeanPlane + k]);
             low[k] = std::min(low[k], x);
             high = std::max(high, x);
@@ -201,7 +203,7 @@ std::vector<uint32_t> curve_order(const TrainableBlocks& b) {
         for (int k = 0; k < 3; ++k) {
             const double x = static_cast<double>(gaussian(b, n)[kMeanPlane + k]);
             const double cell = (x - low[k]) / side * kLastCell;
-            const double inside = cell > 0.0 ? std::min(cell, kLastCell) : 0.0;  // 0 when not a number
+            const double inside = cell > 0.0 ? std::min(cell, kLastCell) : 0.0;  // 0 also for NaN
             code |= spread_bits(static_cast<uint64_t>(inside)) << k;
         }
         places[static_cast<size_t>(n)] = {code, static_cast<uint32_t>(n)};
