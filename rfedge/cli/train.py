@@ -33,6 +33,8 @@ TILE_CHECKPOINT_EVERY = 500
 """Iterations: what a killed worker loses, at most."""
 DEFAULT_LIMIT = 250_000
 """Gaussians of a run limited by time: about what two cores train in five minutes."""
+HALVED_UNTIL = 0.25
+"""Share of a run limited by time that looks at halved pictures: see docs/training.md, "Sooner"."""
 
 
 @dataclass(frozen=True)
@@ -306,8 +308,9 @@ class Train:
             return ngp if iterations is None else replace(ngp, iterations=iterations)
         config = training_config(self.gaussians, iterations, self.threads)
         limit = self.limit
-        if limit is None and self.minutes is not None:
-            limit = DEFAULT_LIMIT
+        if self.minutes is not None:
+            limit = DEFAULT_LIMIT if limit is None else limit
+            config = replace(config, halved_until=HALVED_UNTIL)
         if limit is not None:
             config = replace(config, density=DensityControl(limit=limit))
         bands = Bands(self.sh_degree, SH_RISE if self.sh_degree else 0.0)

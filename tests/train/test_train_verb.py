@@ -129,6 +129,15 @@ def test_a_run_may_be_limited_by_time(wall: Path, tmp_path: Path) -> None:
     assert load_field(tmp_path / "a.rff").metadata.held_out_psnr_db is not None
 
 
+def test_only_a_run_short_of_time_begins_with_halved_pictures(wall: Path, tmp_path: Path) -> None:
+    by_time, by_count = (
+        verb(wall, tmp_path / "a.rff", minutes=minutes).training_job().config
+        for minutes in (1.0, None)
+    )
+    assert by_time.halved_until == 0.25
+    assert by_count.halved_until == 0
+
+
 def test_a_hash_grid_is_trained_by_the_same_loop(wall: Path, tmp_path: Path) -> None:
     dataset, held_out = split_every(read_dataset(wall), 4)
     model = NgpModel(L=4, log2_T=10, N_max=64, occupancy=4000)
