@@ -221,8 +221,9 @@ private:
 
     Search search_of(int index, int shape, const Partition& part) const {
         const int x = 8 * (part.block & 1), y = 8 * (part.block >> 1);
+        const int width = 4 * part.width, height = 4 * part.height;
         return {job_.references[index], source_[0].at + y * source_[0].stride + x,
-                source_[0].stride, x_ + x, y_ + y, 4 * part.width, 4 * part.height,
+                source_[0].stride, transformed_.rows(x, y, width), x_ + x, y_ + y, width, height,
                 predicted_vector(field_, shape, part, index), motion_q8_, range_};
     }
 
@@ -249,6 +250,7 @@ private:
     void try_inter() {
         field_.begin(*around_);
         if (try_skip() && free()) return;
+        transformed_.begin(source_[0].at, source_[0].stride);
         Found whole[kMaxReferences];
         const Mv starts[3] = {field_.mv[1][0], field_.mv[0][1], skip_vector_};
         for (int r = 0; r < job_.reference_count; ++r) {
@@ -586,6 +588,7 @@ private:
     const Around* around_ = nullptr;
     int x_ = 0, y_ = 0;
     Plane source_[3];
+    TransformedSource transformed_;
     uint8_t* picture_[3];
     Rates rates_;
     Quality quality_;

@@ -41,20 +41,31 @@ RF_INLINE void mean_of_blocks(const uint8_t* a, const uint8_t* b, ptrdiff_t stri
     }
 }
 
-// The luma prediction of a block at (x, y) by `mv`, 8 or 16 wide: in the reference's planes where
-// no mean is needed, else in `scratch` (stride 16).
-inline Block luma_prediction(const Reference& reference, int x, int y, Mv mv, int width, int height,
-                             uint8_t* scratch) {
+// Where the samples of a luma prediction by `mv` lie: a block, or two to take the mean of.
+struct QuarterSamples {
+    const uint8_t *first, *second;  // second: nullptr where there is none
+    ptrdiff_t stride;
+};
+
+inline QuarterSamples quarter_samples(const Reference& reference, int x, int y, Mv mv) {
     const QuarterPosition& q = kQuarter[4 * (mv.y & 3) + (mv.x & 3)];
     const ptrdiff_t stride = reference.luma[0].stride;
     const ptrdiff_t base = (y + (mv.y >> 2)) * stride + x + (mv.x >> 2);
     const uint8_t* first = reference.luma[q.plane[0]].at + base + q.dy[0] * stride + q.dx[0];
-    if (!q.mean) return {first, stride};
     const uint8_t* second = reference.luma[q.plane[1]].at + base + q.dy[1] * stride + q.dx[1];
+    return {first, q.mean ? second : nullptr, stride};
+}
+
+// The luma prediction of a block at (x, y) by `mv`, 8 or 16 wide: in the reference's planes where
+// no mean is needed, else in `scratch` (stride 16).
+inline Block luma_prediction(const Reference& reference, int x, int y, Mv mv, int width, int height,
+                             uint8_t* scratch) {
+    const QuarterSamples at = quarter_samples(reference, x, y, mv);
+    if (at.second == nullptr) return {at.first, at.stride};
     if (width == 16) {
-        mean_of_blocks<Bytes16>(first, second, stride, height, scratch);
+        mean_of_blocks<Bytes16>(at.first, at.second, at.stride, height, scratch);
     } else {
-        mean_of_blocks<Bytes8>(first, second, stride, height, scratch);
+        mean_of_blocks<Bytes8>(at.first, at.second, at.stride, height, scratch);
     }
     return {scratch, 16};
 }
@@ -76,60 +87,91 @@ void predict_chroma(const Plane& plane, int x, int y, Mv mv, int height, uint8_t
     }
 }
 
-RF_INLINE Short16 swap1(Short16 v) {
-    return __builtin_shuffle(v, Short16{1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14});
-}
-RF_INLINE Short16 swap2(Short16 v) {
-    return __builtin_shuffle(v, Short16{2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13});
-}
-RF_INLINE Short16 signs1() {
-    return Short16{1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1};
-}
-
-// The sum of absolute 4x4 Hadamard coefficients of four rows of differences, lane by lane: the last
-// butterfly of a pair adds up to |a + b| + |a - b| = 2 max(|a|, |b|), found in both its lanes.
+// The sums of absolute 4x4 Hadamard coefficients, in lanes for `columns_of`, of four rows of
+// differences that `begin_transform` was applied to.
 RF_INLINE Short16 hadamard_sums(const Short16* d) {
     const Short16 s0 = d[0] + d[1], s1 = d[0] - d[1], s2 = d[2] + d[3], s3 = d[2] - d[3];
-    const Short16 m[4] = {s0 + s2, s1 + s3, s0 - s2, s1 - s3};
+    return absolute_sums(s0 + s2) + absolute_sums(s1 + s3) + absolute_sums(s0 - s2) +
+           absolute_sums(s1 - s3);
+}
+
+// A macroblock's luma after `begin_transform`, which each prediction is compared with: rows of
+// sixteen samples; and of its left and right half rows of eight, row y + 4 beside row y.
+struct TransformedSource {
+    Short16 wide[16];
+    Short16 half[2][8];
+
+    void begin(const uint8_t* at, ptrdiff_t stride) {
+        for (int y = 0; y < 16; ++y) wide[y] = begin_transform(load_bytes<16>(at + y * stride));
+        for (int i = 0; i < 16; ++i) {
+            const uint8_t* upper = at + (8 * ((i >> 2) & 1) + (i & 3)) * stride + 8 * (i >> 3);
+            half[i >> 3][i & 7] =
+                begin_transform(load_bytes<8>(upper), load_bytes<8>(upper + 4 * stride));
+        }
+    }
+
+    // Of the block at (x, y), 8 or 16 wide.
+    const Short16* rows(int x, int y, int width) const {
+        return width == 16 ? wide + y : half[x >> 3] + y / 2;
+    }
+};
+
+// Sum of absolute transformed differences, half the Hadamard sum, of a block 8 or 16 wide from
+// the rows of a TransformedSource; its height is a multiple of 8. `read` returns samples at a row.
+template <int width, class Read>
+RF_INLINE uint32_t transformed_difference(const Short16* source, int height, Read read) {
+    constexpr int kRows = width == 16 ? 4 : 8;
     Short16 sum{};
-    for (int y = 0; y < 4; ++y) {
-        const Short16 u = swap1(m[y]) + m[y] * signs1();
-        const Short16 v = magnitude(u), w = swap2(v);
-        sum += v > w ? v : w;
+    for (int y = 0; y < height; y += kRows, source += 4) {
+        Short16 d[4];
+        for (int i = 0; i < 4; ++i) {
+            if constexpr (width == 16) {
+                d[i] = source[i] - begin_transform(read(y + i));
+            } else {
+                d[i] = source[i] - begin_transform(read(y + i), read(y + i + 4));
+            }
+        }
+        sum += hadamard_sums(d);
     }
-    return sum;
+    return sum_of_lanes(columns_of(sum));
 }
 
-// Of four rows of a block 16 wide.
-RF_INLINE Short16 hadamard_rows(const uint8_t* a, ptrdiff_t a_stride, const uint8_t* b,
-                                ptrdiff_t b_stride) {
-    Short16 d[4];
-    for (int y = 0; y < 4; ++y) d[y] = difference(a + y * a_stride, b + y * b_stride, Short16{});
-    return hadamard_sums(d);
-}
-
-// Of eight rows of a block 8 wide: the lower four beside the upper.
-RF_INLINE Short16 hadamard_rows8(const uint8_t* a, ptrdiff_t a_stride, const uint8_t* b,
-                                 ptrdiff_t b_stride) {
-    Short16 d[4];
-    for (int y = 0; y < 4; ++y, a += a_stride, b += b_stride) {
-        d[y] = load_shorts(a, a + 4 * a_stride) - load_shorts(b, b + 4 * b_stride);
+// The same from a prediction's samples.
+template <int width>
+uint32_t transformed_difference(const Short16* source, const QuarterSamples& prediction,
+                                int height) {
+    const ptrdiff_t stride = prediction.stride;
+    if (prediction.second == nullptr) {
+        return transformed_difference<width>(source, height, [&](int y) {
+            return load_bytes<width>(prediction.first + y * stride);
+        });
     }
-    return hadamard_sums(d);
+    return transformed_difference<width>(source, height, [&](int y) {
+        return mean_of_bytes(load_bytes<width>(prediction.first + y * stride),
+                             load_bytes<width>(prediction.second + y * stride));
+    });
 }
 
-// Sum of absolute transformed differences, half the Hadamard sum, of a block 8 or 16 wide; its
-// height is a multiple of 8.
+// The same of two blocks of samples.
 template <int width>
 uint32_t transformed_difference(const uint8_t* a, ptrdiff_t a_stride, const uint8_t* b,
                                 ptrdiff_t b_stride, int height) {
     constexpr int kRows = width == 16 ? 4 : 8;
     Short16 sum{};
     for (int y = 0; y < height; y += kRows, a += kRows * a_stride, b += kRows * b_stride) {
-        sum += width == 16 ? hadamard_rows(a, a_stride, b, b_stride)
-                           : hadamard_rows8(a, a_stride, b, b_stride);
+        Short16 d[4];
+        for (int i = 0; i < 4; ++i) {
+            const uint8_t *p = a + i * a_stride, *q = b + i * b_stride;
+            if constexpr (width == 16) {
+                d[i] = begin_transform(load_bytes<16>(p)) - begin_transform(load_bytes<16>(q));
+            } else {
+                d[i] = begin_transform(load_bytes<8>(p), load_bytes<8>(p + 4 * a_stride)) -
+                       begin_transform(load_bytes<8>(q), load_bytes<8>(q + 4 * b_stride));
+            }
+        }
+        sum += hadamard_sums(d);
     }
-    return sum_of_lanes(sum) >> 1;
+    return sum_of_lanes(columns_of(sum));
 }
 
 // The predictions of a block by every mode side by side, mode m from column side * m on.
@@ -147,24 +189,28 @@ template <int side>
 void strip_differences(const uint8_t* source, ptrdiff_t stride, const ModeStrip<side>& strip,
                        uint32_t* differences) {
     using Strip = ModeStrip<side>;
-    alignas(32) uint8_t repeated[side * 16];
+    alignas(16) uint8_t repeated[16];
+    Short16 begun[side];
     for (int y = 0; y < side; ++y) {
         for (int i = 0; i < Strip::kPerVector; ++i) {
-            __builtin_memcpy(repeated + 16 * y + side * i, source + y * stride, side);
+            __builtin_memcpy(repeated + side * i, source + y * stride, side);
         }
+        begun[y] = begin_transform(load_bytes<16>(repeated));
     }
     for (int v = 0; v < Strip::kVectors; ++v) {
         Short16 sum{};
         for (int y = 0; y < side; y += 4) {
-            const uint8_t* predictions = strip.sample + y * Strip::kStride + 16 * v;
-            sum += hadamard_rows(repeated + 16 * y, 16, predictions, Strip::kStride);
-        }
-        for (int i = 0; i < Strip::kPerVector; ++i) {
-            uint32_t total = 0;
-            for (int lane = 0; lane < side; ++lane) {
-                total += static_cast<uint16_t>(sum[side * i + lane]);
+            Short16 d[4];
+            for (int i = 0; i < 4; ++i) {
+                const uint8_t* at = strip.sample + (y + i) * Strip::kStride + 16 * v;
+                d[i] = begun[y + i] - begin_transform(load_bytes<16>(at));
             }
-            differences[Strip::kPerVector * v + i] = total >> 1;
+            sum += hadamard_sums(d);
+        }
+        const Words4 columns = columns_of(sum);
+        for (int i = 0; i < Strip::kPerVector; ++i) {
+            differences[Strip::kPerVector * v + i] =
+                side == 4 ? columns[i] : columns[2 * i] + columns[2 * i + 1];
         }
     }
 }

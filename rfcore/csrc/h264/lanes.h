@@ -6,6 +6,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <type_traits>
 
 #include "simd/inline.h"
 
@@ -25,6 +26,13 @@ typedef uint8_t Bytes8 __attribute__((vector_size(8)));
 typedef uint8_t Bytes4 __attribute__((vector_size(4)));
 typedef uint32_t Words8 __attribute__((vector_size(32)));
 typedef uint32_t Words4 __attribute__((vector_size(16)));
+
+template <int width>
+RF_INLINE auto load_bytes(const uint8_t* at) {
+    std::conditional_t<width == 16, Bytes16, Bytes8> bytes;
+    __builtin_memcpy(&bytes, at, width);
+    return bytes;
+}
 
 RF_INLINE Row8 load_row8(const uint8_t* at) {
 #ifdef RF_H264_X86
@@ -57,20 +65,6 @@ RF_INLINE Short16 load_shorts(const uint8_t* at, Short16) {
     Bytes16 bytes;
     __builtin_memcpy(&bytes, at, 16);
     return __builtin_convertvector(bytes, Short16);
-#endif
-}
-
-// Eight samples from each of two places.
-RF_INLINE Short16 load_shorts(const uint8_t* at, const uint8_t* other) {
-#ifdef RF_H264_X86
-    const __m128i low = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(at));
-    const __m128i high = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(other));
-    return reinterpret_cast<Short16>(_mm256_cvtepu8_epi16(_mm_unpacklo_epi64(low, high)));
-#else
-    uint8_t bytes[16];
-    __builtin_memcpy(bytes, at, 8);
-    __builtin_memcpy(bytes + 8, other, 8);
-    return load_shorts(bytes, Short16{});
 #endif
 }
 
@@ -127,10 +121,25 @@ RF_INLINE uint32_t above(const int32_t* values, int32_t limit) {
 #endif
 }
 
-// (a + b + 1) >> 1 of each lane.
-template <class Bytes>
-RF_INLINE Bytes mean_of_bytes(Bytes a, Bytes b) {
+// (a + b + 1) >> 1 of each lane. (GCC 12 takes the plain form of eight lanes apart, byte by byte.)
+RF_INLINE Bytes16 mean_of_bytes(Bytes16 a, Bytes16 b) {
+#ifdef RF_H264_X86
+    return reinterpret_cast<Bytes16>(
+        _mm_avg_epu8(reinterpret_cast<__m128i>(a), reinterpret_cast<__m128i>(b)));
+#else
     return (a | b) - ((a ^ b) >> 1);
+#endif
+}
+
+RF_INLINE Bytes8 mean_of_bytes(Bytes8 a, Bytes8 b) {
+#ifdef RF_H264_X86
+    const __m128i mean = _mm_avg_epu8(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(&a)),
+                                      _mm_loadl_epi64(reinterpret_cast<const __m128i*>(&b)));
+    _mm_storel_epi64(reinterpret_cast<__m128i*>(&a), mean);
+    return a;
+#else
+    return (a | b) - ((a ^ b) >> 1);
+#endif
 }
 
 // The low byte of each lane.
@@ -198,18 +207,88 @@ RF_INLINE Short difference(const uint8_t* a, const uint8_t* b, Short) {
     return load_shorts(a, Short{}) - load_shorts(b, Short{});
 }
 
-// Sum of absolute differences of a block 8 or 16 wide and at most 16 high.
+// The 4x4 Hadamard transform along rows of sixteen columns, in two halves; between them rows are
+// added up. `begin_transform` is linear, so that differences may be taken after it.
+// `absolute_sums` takes the magnitudes of coefficients, whose pairs come from a last butterfly:
+// |a + b| + |a - b| = 2 max(|a|, |b|). `columns_of` returns half their sum for each four columns.
+// Lanes may be added up in between over sixteen rows of differences of samples.
+#ifdef RF_H264_X86
+// Sums of neighbours in the lower lanes, their differences in the upper.
+RF_INLINE Short16 begin_transform(Bytes16 row) {
+    const __m256i signs = _mm256_set_m128i(_mm_set1_epi16(-255), _mm_set1_epi8(1));  // 1, -1
+    const __m256i twice = _mm256_broadcastsi128_si256(reinterpret_cast<__m128i>(row));
+    return reinterpret_cast<Short16>(_mm256_maddubs_epi16(twice, signs));
+}
+
+// Eight columns of one row, then of another.
+RF_INLINE Short16 begin_transform(Bytes8 row, Bytes8 other) {
+    const __m256i signs = _mm256_broadcastsi128_si256(
+        _mm_unpacklo_epi64(_mm_set1_epi8(1), _mm_set1_epi16(-255)));
+    const auto twice = [](const Bytes8& bytes) {
+        const __m128i low = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(&bytes));
+        return _mm_unpacklo_epi64(low, low);
+    };
+    return reinterpret_cast<Short16>(
+        _mm256_maddubs_epi16(_mm256_set_m128i(twice(other), twice(row)), signs));
+}
+
+RF_INLINE Short16 absolute_sums(Short16 v) {
+    const __m256i size = _mm256_abs_epi16(reinterpret_cast<__m256i>(v));
+    return reinterpret_cast<Short16>(_mm256_max_epi16(size, _mm256_srli_epi32(size, 16)));
+}
+
+// Every other lane holds a maximum. For two rows of eight columns only the total means anything.
+RF_INLINE Words4 columns_of(Short16 sums) {
+    const Words8 words = reinterpret_cast<Words8>(sums) & 0xFFFF;
+    const __m256i w = reinterpret_cast<__m256i>(words);
+    return reinterpret_cast<Words4>(
+        _mm_add_epi32(_mm256_castsi256_si128(w), _mm256_extracti128_si256(w, 1)));
+}
+#else
+RF_INLINE Short16 begin_transform(Bytes16 row) { return __builtin_convertvector(row, Short16); }
+
+RF_INLINE Short16 begin_transform(Bytes8 row, Bytes8 other) {
+    uint8_t bytes[16];
+    __builtin_memcpy(bytes, &row, 8);
+    __builtin_memcpy(bytes + 8, &other, 8);
+    return load_shorts(bytes, Short16{});
+}
+
+RF_INLINE Short16 absolute_sums(Short16 v) {
+    const Short16 signs = {1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1};
+    const Short16 u =
+        v * signs +
+        __builtin_shuffle(v, Short16{1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14});
+    const Short16 size = magnitude(u);
+    const Short16 other = __builtin_shuffle(
+        size, Short16{2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13});
+    return size > other ? size : other;
+}
+
+RF_INLINE Words4 columns_of(Short16 sums) {
+    const Words8 words = reinterpret_cast<Words8>(sums);
+    const Words8 pairs = (words & 0xFFFF) + (words >> 16);
+    return Words4{pairs[0] + pairs[1], pairs[2] + pairs[3], pairs[4] + pairs[5],
+                  pairs[6] + pairs[7]} >> 1;
+}
+#endif
+
+// Sum of absolute differences of a block 8 or 16 wide; its height is a multiple of 4, 16 at most.
 template <int width>
 RF_INLINE uint32_t absolute_difference(const uint8_t* a, ptrdiff_t a_stride, const uint8_t* b,
                                        ptrdiff_t b_stride, int height) {
 #ifdef RF_H264_X86
+    constexpr int kRows = width == 16 ? 1 : 2;  // in sixteen lanes
+    const auto load = [](const uint8_t* at, ptrdiff_t stride) {
+        if (width == 16) return _mm_loadu_si128(reinterpret_cast<const __m128i*>(at));
+        return _mm_unpacklo_epi64(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(at)),
+                                  _mm_loadl_epi64(reinterpret_cast<const __m128i*>(at + stride)));
+    };
     __m128i sum = _mm_setzero_si128();
-    for (int y = 0; y < height; ++y, a += a_stride, b += b_stride) {
-        const __m128i* p = reinterpret_cast<const __m128i*>(a);
-        const __m128i* q = reinterpret_cast<const __m128i*>(b);
-        const __m128i row = width == 16 ? _mm_sad_epu8(_mm_loadu_si128(p), _mm_loadu_si128(q))
-                                        : _mm_sad_epu8(_mm_loadl_epi64(p), _mm_loadl_epi64(q));
-        sum = _mm_add_epi32(sum, row);
+    for (int y = 0; y < height; y += 4) {
+        for (int i = 0; i < 4; i += kRows, a += kRows * a_stride, b += kRows * b_stride) {
+            sum = _mm_add_epi32(sum, _mm_sad_epu8(load(a, a_stride), load(b, b_stride)));
+        }
     }
     return static_cast<uint32_t>(_mm_cvtsi128_si32(sum) + _mm_extract_epi32(sum, 2));
 #else

@@ -121,6 +121,7 @@ struct Search {
     const Reference& reference;
     const uint8_t* source;
     ptrdiff_t source_stride;
+    const Short16* transformed;  // rows of a TransformedSource
     int x, y, width, height;  // of the block in the picture
     Mv predicted;
     uint32_t motion_q8;
@@ -141,12 +142,9 @@ struct Search {
     }
 
     uint32_t exact(Mv v) const {
-        alignas(32) uint8_t scratch[256];
-        const Block block = luma_prediction(reference, x, y, v, width, height, scratch);
-        const uint32_t sum =
-            width == 16
-                ? transformed_difference<16>(source, source_stride, block.at, block.stride, height)
-                : transformed_difference<8>(source, source_stride, block.at, block.stride, height);
+        const QuarterSamples at = quarter_samples(reference, x, y, v);
+        const uint32_t sum = width == 16 ? transformed_difference<16>(transformed, at, height)
+                                         : transformed_difference<8>(transformed, at, height);
         return 256 * sum + vector_cost(v);
     }
 
