@@ -45,7 +45,7 @@ void run(const char* isa, int threads, const char* scene, const char* result) {
     SliceCoder coder(width, height, kernels_for(isa), threads);
     SliceSettings settings = {};
     settings.slice_qp = header[3];
-    settings.effort = {header[4], header[5], header[6] != 0, header[7], header[8], header[9]};
+    settings.effort = {header[4], header[5], header[6], header[7], header[8], header[9]};
     settings.deblocked = header[10] != 0;
     const auto weights = in.read<std::uint32_t>(104);
     std::copy_n(weights.data(), 52, settings.lambda_q8);

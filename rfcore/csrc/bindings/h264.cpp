@@ -47,7 +47,7 @@ public:
         settings.qp = qp.data();
         std::copy_n(lambda_q8.data(), 52, settings.lambda_q8);
         std::copy_n(motion_q8.data(), 52, settings.motion_q8);
-        settings.effort = {effort[0], effort[1], effort[2] != 0, effort[3], effort[4],
+        settings.effort = {effort[0], effort[1], effort[2], effort[3], effort[4],
                            effort[5]};
         settings.deblocked = deblocked;
         settings.forced = forced.data();

@@ -24,6 +24,9 @@ constexpr uint32_t kPcmBits = 256 * (8 * 384 + 16);
 // Added to the cost of a candidate of another mode than the forced one.
 constexpr Cost kForbidden = Cost{1} << 56;
 
+// Cost of a vector in a reference that was left out.
+constexpr uint32_t kNotSearched = UINT32_MAX;
+
 class MacroblockCoder {
 public:
     MacroblockCoder(const SliceJob& job, const Contexts& contexts)
@@ -247,6 +250,28 @@ private:
         return job_.reference_count < 2 ? 0 : motion_q8_ * static_cast<uint32_t>(index + 1);
     }
 
+    bool best_alone() const { return job_.effort.references_reach == 100; }
+
+    int least_of(const Found* found) const {
+        int least = 0;
+        for (int r = 1; r < job_.reference_count; ++r) {
+            if (found[r].cost < found[least].cost) least = r;
+        }
+        return least;
+    }
+
+    // Refines a partition's vectors in the best reference and in those that come near to it.
+    void refine_near(int shape, const Partition& part, Found* found) const {
+        const int best = least_of(found), reach = job_.effort.references_reach;
+        const uint64_t near = uint64_t{found[best].cost} * unsigned(reach) / 100;
+        const uint64_t most = reach == 0 ? kNotSearched : near;
+        for (int r = 0; r < job_.reference_count; ++r) {
+            if (found[r].cost == kNotSearched || found[r].cost > most) continue;
+            if (best_alone() && r != best) continue;
+            found[r] = refined(search_of(r, shape, part), r, found[r]);
+        }
+    }
+
     void try_inter() {
         field_.begin(*around_);
         if (try_skip() && free()) return;
@@ -271,7 +296,7 @@ private:
         int best, second;
         order(best, second);
         for (int r = 0; r < job_.reference_count; ++r) {
-            if (r != best && r != second && !job_.effort.every_reference) continue;
+            if (r != best && r != second && best_alone()) continue;
             whole[r] = refined(search_of(r, 0, kPartitions[0][0]), r, whole[r]);
         }
         order(best, second);
@@ -337,9 +362,9 @@ private:
         for (int p = 0; p < kPartitionCount[shape]; ++p) {
             const Partition& part = kPartitions[shape][p];
             const int last = part.block + (part.width == 4) + 2 * (part.height == 4);
-            Found least = {{0, 0}, UINT32_MAX};
-            int index = 0;
+            Found found[kMaxReferences];
             for (int r = 0; r < job_.reference_count; ++r) {
+                found[r] = {{0, 0}, kNotSearched};
                 if (from && r != from->reference[part.block] && r != from->reference[last]) {
                     continue;
                 }
@@ -349,16 +374,13 @@ private:
                     starts[2] = from->mv[part.block];
                     starts[3] = from->mv[last];
                 }
-                Found found = search.first_of(starts, from ? 4 : 2);
-                if (job_.effort.every_reference) found = search.refined(found, job_.effort);
-                found.cost += reference_cost(r);
-                if (found.cost < least.cost) {
-                    least = found;
-                    index = r;
-                }
+                found[r] = search.first_of(starts, from ? 4 : 2);
+                found[r].cost += reference_cost(r);
             }
+            if (!from || !best_alone()) refine_near(shape, part, found);
+            const int index = least_of(found);
+            const Found least = found[index];
             const Search search = search_of(index, shape, part);
-            if (!from && !job_.effort.every_reference) least = refined(search, index, least);
             const Mv least_predicted = search.predicted;
             set_partition(out, part, index, least.mv, least_predicted);
             field_.fill(part, static_cast<int8_t>(index), least.mv);

@@ -95,18 +95,17 @@ RF_INLINE Short16 hadamard_sums(const Short16* d) {
            absolute_sums(s1 - s3);
 }
 
-// A macroblock's luma after `begin_transform`, which each prediction is compared with: rows of
-// sixteen samples; and of its left and right half rows of eight, row y + 4 beside row y.
+// A macroblock's luma after `begin_transform`, which each prediction is compared with: as rows of
+// sixteen samples, and its left and right half as rows of eight (`load_rows`).
 struct TransformedSource {
     Short16 wide[16];
     Short16 half[2][8];
 
     void begin(const uint8_t* at, ptrdiff_t stride) {
-        for (int y = 0; y < 16; ++y) wide[y] = begin_transform(load_bytes<16>(at + y * stride));
-        for (int i = 0; i < 16; ++i) {
-            const uint8_t* upper = at + (8 * ((i >> 2) & 1) + (i & 3)) * stride + 8 * (i >> 3);
-            half[i >> 3][i & 7] =
-                begin_transform(load_bytes<8>(upper), load_bytes<8>(upper + 4 * stride));
+        for (int y = 0; y < 16; ++y) wide[y] = begin_transform(load_rows<16>(at, stride, y));
+        for (int i = 0; i < 8; ++i) {
+            half[0][i] = begin_transform(load_rows<8>(at, stride, i));
+            half[1][i] = begin_transform(load_rows<8>(at + 8, stride, i));
         }
     }
 
@@ -116,39 +115,33 @@ struct TransformedSource {
     }
 };
 
-// Sum of absolute transformed differences, half the Hadamard sum, of a block 8 or 16 wide from
-// the rows of a TransformedSource; its height is a multiple of 8. `read` returns samples at a row.
-template <int width, class Read>
-RF_INLINE uint32_t transformed_difference(const Short16* source, int height, Read read) {
-    constexpr int kRows = width == 16 ? 4 : 8;
+// Sum of absolute transformed differences, half the Hadamard sum, of a block 8 or 16 wide whose
+// height is a multiple of 8. `difference(i)`: rows as `load_rows` numbers them.
+template <int width, class Difference>
+RF_INLINE uint32_t transformed_sum(int height, Difference difference) {
     Short16 sum{};
-    for (int y = 0; y < height; y += kRows, source += 4) {
-        Short16 d[4];
-        for (int i = 0; i < 4; ++i) {
-            if constexpr (width == 16) {
-                d[i] = source[i] - begin_transform(read(y + i));
-            } else {
-                d[i] = source[i] - begin_transform(read(y + i), read(y + i + 4));
-            }
-        }
+    for (int i = 0; i < height * width / 16; i += 4) {
+        const Short16 d[4] = {difference(i), difference(i + 1), difference(i + 2),
+                              difference(i + 3)};
         sum += hadamard_sums(d);
     }
     return sum_of_lanes(columns_of(sum));
 }
 
-// The same from a prediction's samples.
+// The same of rows of a TransformedSource and a prediction.
 template <int width>
 uint32_t transformed_difference(const Short16* source, const QuarterSamples& prediction,
                                 int height) {
     const ptrdiff_t stride = prediction.stride;
     if (prediction.second == nullptr) {
-        return transformed_difference<width>(source, height, [&](int y) {
-            return load_bytes<width>(prediction.first + y * stride);
+        return transformed_sum<width>(height, [&](int i) {
+            return source[i] - begin_transform(load_rows<width>(prediction.first, stride, i));
         });
     }
-    return transformed_difference<width>(source, height, [&](int y) {
-        return mean_of_bytes(load_bytes<width>(prediction.first + y * stride),
-                             load_bytes<width>(prediction.second + y * stride));
+    return transformed_sum<width>(height, [&](int i) {
+        const Bytes16 mean = mean_of_bytes(load_rows<width>(prediction.first, stride, i),
+                                           load_rows<width>(prediction.second, stride, i));
+        return source[i] - begin_transform(mean);
     });
 }
 
@@ -156,22 +149,10 @@ uint32_t transformed_difference(const Short16* source, const QuarterSamples& pre
 template <int width>
 uint32_t transformed_difference(const uint8_t* a, ptrdiff_t a_stride, const uint8_t* b,
                                 ptrdiff_t b_stride, int height) {
-    constexpr int kRows = width == 16 ? 4 : 8;
-    Short16 sum{};
-    for (int y = 0; y < height; y += kRows, a += kRows * a_stride, b += kRows * b_stride) {
-        Short16 d[4];
-        for (int i = 0; i < 4; ++i) {
-            const uint8_t *p = a + i * a_stride, *q = b + i * b_stride;
-            if constexpr (width == 16) {
-                d[i] = begin_transform(load_bytes<16>(p)) - begin_transform(load_bytes<16>(q));
-            } else {
-                d[i] = begin_transform(load_bytes<8>(p), load_bytes<8>(p + 4 * a_stride)) -
-                       begin_transform(load_bytes<8>(q), load_bytes<8>(q + 4 * b_stride));
-            }
-        }
-        sum += hadamard_sums(d);
-    }
-    return sum_of_lanes(columns_of(sum));
+    return transformed_sum<width>(height, [&](int i) {
+        return begin_transform(load_rows<width>(a, a_stride, i)) -
+               begin_transform(load_rows<width>(b, b_stride, i));
+    });
 }
 
 // The predictions of a block by every mode side by side, mode m from column side * m on.
@@ -195,15 +176,16 @@ void strip_differences(const uint8_t* source, ptrdiff_t stride, const ModeStrip<
         for (int i = 0; i < Strip::kPerVector; ++i) {
             __builtin_memcpy(repeated + side * i, source + y * stride, side);
         }
-        begun[y] = begin_transform(load_bytes<16>(repeated));
+        begun[y] = begin_transform(load_rows<16>(repeated, 0, 0));
     }
     for (int v = 0; v < Strip::kVectors; ++v) {
         Short16 sum{};
         for (int y = 0; y < side; y += 4) {
             Short16 d[4];
             for (int i = 0; i < 4; ++i) {
-                const uint8_t* at = strip.sample + (y + i) * Strip::kStride + 16 * v;
-                d[i] = begun[y + i] - begin_transform(load_bytes<16>(at));
+                const Bytes16 row =
+                    load_rows<16>(strip.sample + 16 * v, Strip::kStride, y + i);
+                d[i] = begun[y + i] - begin_transform(row);
             }
             sum += hadamard_sums(d);
         }

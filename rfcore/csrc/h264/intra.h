@@ -179,8 +179,10 @@ void predict_block(int mode, const Edge<side>& edge, const EdgeMeans<side>& mean
             take_rows<side>(means.two(1), 1, out, 2 * stride, side / 2);
             return take_rows<side>(means.three(2), 1, out + stride, 2 * stride, side / 2);
         case kHorizontalUp: return predict_horizontal_up(edge, means, out, stride);
-        default:
-            for (int y = 0; y < side; ++y) __builtin_memset(out + y * stride, block_dc(edge), side);
+        default: {
+            const int dc = block_dc(edge);
+            for (int y = 0; y < side; ++y) __builtin_memset(out + y * stride, dc, side);
+        }
     }
 }
 

@@ -6,7 +6,6 @@
 
 #include <cstddef>
 #include <cstdint>
-#include <type_traits>
 
 #include "simd/inline.h"
 
@@ -27,11 +26,27 @@ typedef uint8_t Bytes4 __attribute__((vector_size(4)));
 typedef uint32_t Words8 __attribute__((vector_size(32)));
 typedef uint32_t Words4 __attribute__((vector_size(16)));
 
+// Rows of a block as sixteen columns: of one 16 wide row i, of one 8 wide two rows, four apart: 0
+// and 4, 1 and 5, 2 and 6, 3 and 7, 8 and 12 and so on.
 template <int width>
-RF_INLINE auto load_bytes(const uint8_t* at) {
-    std::conditional_t<width == 16, Bytes16, Bytes8> bytes;
-    __builtin_memcpy(&bytes, at, width);
+RF_INLINE Bytes16 load_rows(const uint8_t* at, ptrdiff_t stride, int i) {
+    Bytes16 bytes;
+    if (width == 16) {
+        __builtin_memcpy(&bytes, at + i * stride, 16);
+        return bytes;
+    }
+    at += (i + (i & ~3)) * stride;
+#ifdef RF_H264_X86
+    const __m128i first = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(at));
+    return reinterpret_cast<Bytes16>(_mm_unpacklo_epi64(
+        first, _mm_loadl_epi64(reinterpret_cast<const __m128i*>(at + 4 * stride))));
+#else
+    uint8_t both[16];
+    __builtin_memcpy(both, at, 8);
+    __builtin_memcpy(both + 8, at + 4 * stride, 8);
+    __builtin_memcpy(&bytes, both, 16);
     return bytes;
+#endif
 }
 
 RF_INLINE Row8 load_row8(const uint8_t* at) {
@@ -220,24 +235,12 @@ RF_INLINE Short16 begin_transform(Bytes16 row) {
     return reinterpret_cast<Short16>(_mm256_maddubs_epi16(twice, signs));
 }
 
-// Eight columns of one row, then of another.
-RF_INLINE Short16 begin_transform(Bytes8 row, Bytes8 other) {
-    const __m256i signs = _mm256_broadcastsi128_si256(
-        _mm_unpacklo_epi64(_mm_set1_epi8(1), _mm_set1_epi16(-255)));
-    const auto twice = [](const Bytes8& bytes) {
-        const __m128i low = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(&bytes));
-        return _mm_unpacklo_epi64(low, low);
-    };
-    return reinterpret_cast<Short16>(
-        _mm256_maddubs_epi16(_mm256_set_m128i(twice(other), twice(row)), signs));
-}
-
 RF_INLINE Short16 absolute_sums(Short16 v) {
     const __m256i size = _mm256_abs_epi16(reinterpret_cast<__m256i>(v));
     return reinterpret_cast<Short16>(_mm256_max_epi16(size, _mm256_srli_epi32(size, 16)));
 }
 
-// Every other lane holds a maximum. For two rows of eight columns only the total means anything.
+// Every other lane holds a maximum.
 RF_INLINE Words4 columns_of(Short16 sums) {
     const Words8 words = reinterpret_cast<Words8>(sums) & 0xFFFF;
     const __m256i w = reinterpret_cast<__m256i>(words);
@@ -246,13 +249,6 @@ RF_INLINE Words4 columns_of(Short16 sums) {
 }
 #else
 RF_INLINE Short16 begin_transform(Bytes16 row) { return __builtin_convertvector(row, Short16); }
-
-RF_INLINE Short16 begin_transform(Bytes8 row, Bytes8 other) {
-    uint8_t bytes[16];
-    __builtin_memcpy(bytes, &row, 8);
-    __builtin_memcpy(bytes + 8, &other, 8);
-    return load_shorts(bytes, Short16{});
-}
 
 RF_INLINE Short16 absolute_sums(Short16 v) {
     const Short16 signs = {1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1};

@@ -64,8 +64,9 @@ struct Neighbour {
 struct Effort {
     int search_steps;      // of the integer motion search
     int subsample_steps;   // of the half- and quarter-sample search
-    bool every_reference;  // each partition's vector is refined in all references, else in the
-                           // best of them (of 16x16: the best two)
+    int references_reach;  // partitions' vectors are refined in the references where they cost at
+                           // most this many percent of the best before; 0: in all; 100: in the
+                           // best alone (of 16x16: the best two), and those of halves not at all
     int intra_reach;       // intra modes are tried where the transformed difference of 16x16
                            // ones is at most this many quarters of inter prediction's; 0: always
     int halves_reach;      // halves are tried where 8x8 blocks cost at most this many percent of
