@@ -50,8 +50,9 @@ from rfedge.loadtest.envoy import (
 )
 from rfedge.loadtest.planning import PlannedLoad, PlannedRow, compare_with_plan
 from rfedge.loadtest.run import TestBed
-from rfedge.results import provenance
+from rfedge.results import provenance, read_result, rows_of
 from rfedge.samples import sample_path
+from rfedge.sizing.city_check import CheckRow, largest_differences
 
 __all__ = [
     "Case",
@@ -192,7 +193,17 @@ def _city_rows(city: Path, job: ScaleJob) -> Measured:
     took_s = time.monotonic() - begin_s
     if done.returncode != 0:
         raise RfedgeError(f"{city} was not planned: {done.stderr[-500:]}")
-    return Measured([ScaleRow.at_most(f"{city.stem} planned, s", CITY_S, took_s)])
+    checks = rows_of(CheckRow, read_result(out / "city.json", "city")["checks"])
+    at_most = ScaleRow.at_most
+    return Measured(
+        [
+            at_most(f"{city.stem} planned, s", CITY_S, took_s),
+            *(
+                at_most(f"{city.stem}, flow against sessions: {figure}, % off", _bound(figure), off)
+                for figure, _, off in largest_differences(checks)
+            ),
+        ]
+    )
 
 
 def planned_load(job: ScaleJob) -> PlannedLoad:
@@ -217,9 +228,13 @@ def planned_load(job: ScaleJob) -> PlannedLoad:
 
 
 def _planned_row(plan: PlannedRow) -> ScaleRow:
-    bound = PLANNED_AGE_PERCENT if plan.figure.startswith("age") else PLANNED_PERCENT
     case = f"planned {plan.vehicles} vehicles: {plan.figure}, % off"
-    return ScaleRow.at_most(case, bound, abs(plan.difference_percent))
+    return ScaleRow.at_most(case, _bound(plan.figure), abs(plan.difference_percent))
+
+
+def _bound(figure: str) -> float:
+    """Return by how many percent a figure of a plan may be off."""
+    return PLANNED_AGE_PERCENT if figure.startswith("age") else PLANNED_PERCENT
 
 
 def resumed_s(lines: Lines, since_ns: int) -> float | None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import signal
+import time
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack, suppress
 from datetime import UTC, datetime
@@ -12,6 +13,7 @@ from urllib.parse import quote
 import grpc
 import pytest
 import yaml
+from grpc_health.v1 import health_pb2
 from rich.console import Console
 
 from cav_agent.config import AgentLimits, PaceKind
@@ -31,8 +33,9 @@ from rfedge.loadtest.envoy import (
     ServerGroup,
     check_config,
     envoy_binary,
+    run_envoy,
 )
-from rfedge.loadtest.scale import ScaleJob, run_scale
+from rfedge.loadtest.scale import ScaleJob, resumed_s, run_scale
 from rfedge.results import read_result, rows_of
 
 pytestmark = pytest.mark.slow
@@ -134,6 +137,80 @@ async def test_envoy_places_streams_and_moves_them_when_a_server_dies_or_drains(
         if line["result"] == "acked":
             assert line["server_digest"] == line["reconstruction_digest"], "the same bytes"
             assert "render" in line["references"], "never a keyframe"
+
+
+BACK_S = 15.0
+"""Envoy gives a silent connection up after 3 s, and a busy machine takes its time; without that
+vehicles here would wait for ``PATIENT.answer_s``."""
+
+
+async def test_vehicles_of_a_server_that_hangs_stream_again_elsewhere(
+    street: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stopped process keeps its connections open and answers nothing."""
+    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
+    publish_street(street, tmp_path)
+    setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy.yaml", tmp_path / "envoy")
+    async with AsyncExitStack() as stack:
+        site = stack.enter_context(ServerGroup(tmp_path / "published", setup))
+        hung, other = site.start_server(), site.start_server()
+        envoy = site.start_envoy()
+        vehicles = [await stack.enter_async_context(
+            vehicle(
+                envoy.address, vehicle=f"cav-{i}", fields=tmp_path / f"mine{i}",
+                pace=PaceKind.REALTIME, rate=4.0, loop=True, limits=PATIENT,
+                report=tmp_path / f"{i}.jsonl",
+            )
+        ) for i in range(4)]  # fmt: skip
+        await all_go_on(vehicles)
+        even = {hung.address: 2, other.address: 2}
+        await settled(envoy, lambda seen: seen == even)
+        since_ns = time.time_ns()
+        hung.process.send_signal(signal.SIGSTOP)
+        stack.callback(hung.process.send_signal, signal.SIGCONT)  # it has to end
+        await settled(envoy, lambda seen: seen == {other.address: 4})
+        await all_go_on(vehicles)
+        back_s = [resumed_s(one.lines(), since_ns) for one in vehicles]
+    moved_s = [each for each in back_s if each is not None]
+    assert len(moved_s) == 2, "those of the other server kept their streams"
+    assert max(moved_s) <= BACK_S
+    assert all(
+        "render" in line["references"] for line in of_all(vehicles) if line["result"] == "acked"
+    )
+
+
+async def test_a_server_that_says_not_serving_keeps_its_vehicles_and_gets_no_more(
+    street: Any, vehicle: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
+    publish_street(street, tmp_path)
+    setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy.yaml", tmp_path)
+
+    def start(name: str) -> Any:
+        return vehicle(
+            envoy.address, vehicle=name, fields=tmp_path / name, loop=True, limits=PATIENT,
+            report=tmp_path / f"{name}.jsonl",
+        )  # fmt: skip
+
+    async with AsyncExitStack() as stack:
+        servers = [
+            await stack.enter_async_context(serve(fields=tmp_path / "published")) for _ in range(2)
+        ]
+        addresses = [str(server.address) for server in servers]
+        running = run_envoy(setup, addresses)
+        envoy = await asyncio.to_thread(running.__enter__)
+        stack.callback(running.__exit__, None, None, None)
+        first = await stack.enter_async_context(start("first"))
+        placed = await settled(envoy, lambda seen: sum(seen.values()) == 1)
+        sick, well = sorted(addresses, key=lambda address: -placed[address])
+        await servers[addresses.index(sick)]._set_health(health_pb2.HealthCheckResponse.NOT_SERVING)
+        await settled(envoy, lambda seen: set(seen) == {well})
+        others = [await stack.enter_async_context(start(f"other{i}")) for i in range(2)]
+        await all_go_on([first, *others])
+        assert (await settled(envoy, lambda seen: sum(seen.values()) == 2)) == {well: 2}
+        reports = [one.lines() for one in (first, *others)]
+    assert {line["result"] for lines in reports for line in lines} == {"acked"}
+    assert len({line["epoch"] for line in reports[0]}) == 1, "its stream was left alone"
 
 
 async def test_over_mutual_tls_envoy_says_who_a_vehicle_is_and_nobody_else_can(
