@@ -238,6 +238,40 @@ def test_the_host_is_described_without_a_clock() -> None:
     assert results.host() == results.host()
 
 
+MUST_SHOW = (
+    "placement: most streams over the mean",
+    "a server killed: Ack from another, p99, s",
+    "a server drained: frames lost",
+    "a server added: most over the mean once others moved",
+    "Envoy restarted: Ack again, p99, s",
+    "moved: pictures without the render as reference",
+    "moved: vehicles that two servers show",
+    "Envoy between: p99 of a frame's way, ms more",
+    "NATS restarted under load: s until the twin is back",
+    "NATS away or restarted: pictures lost or refused",
+    "Ray: tiles with other bytes",
+    "Ray, a worker killed: tiles with other bytes",
+    "Ray: longer than its jobs, % (start-up apart)",
+    "metropolis planned, s",
+    *(
+        f"planned {vehicles} vehicles: {figure}, % off"
+        for vehicles in (12, 24, 48)
+        for figure in ("cores", "uplink_mbps", "age_p99_ms")
+    ),
+)
+
+
+def test_several_servers_show_what_they_must_and_whether_it_held() -> None:
+    result = read_result(ROOT / "results/scale.json", "scale")
+    rows = {row["case"]: row for row in result["rows"]}
+    assert set(MUST_SHOW) <= set(rows)
+    assert {
+        row["case"] for row in rows.values() if row["held"] != (row["measured"] <= row["bound"])
+    } == set()
+    told = [case for run in result["runs"] for case in run["cases"]]
+    assert sorted(told) == sorted(rows), "each row is of one run"
+
+
 def test_a_make_target_that_writes_results_says_so_in_its_help() -> None:
     """A target's recipe names the file after an option that writes, as --out or --record."""
     lines = (ROOT / "Makefile").read_text().splitlines()

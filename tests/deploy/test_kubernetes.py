@@ -83,6 +83,25 @@ def test_selectors_find_pods_and_names_what_they_name() -> None:
         assert {p.get("httpGet", p.get("tcpSocket"))["port"] for p in probes} <= ports
 
 
+def test_the_adapter_offers_the_metric_that_servers_are_scaled_by() -> None:
+    (rule,) = yaml.safe_load((ROOT / "deploy/prometheus/adapter.yaml").read_text())["rules"]
+    (metric,) = the("HorizontalPodAutoscaler", "mec-server")["spec"]["metrics"]
+    name = metric["pods"]["metric"]["name"]
+    assert rule["name"]["as"] == name
+    assert rule["seriesQuery"].partition("{")[0] == name
+
+
+def test_servers_may_reach_nats_and_names_and_nothing_else() -> None:
+    egress = the("NetworkPolicy", "servers")["spec"]["egress"]
+    reached = {
+        (to["namespaceSelector"]["matchLabels"]["kubernetes.io/metadata.name"], port["port"])
+        for rule in egress
+        for to in rule["to"]
+        for port in rule["ports"]
+    }
+    assert reached == {("nats", 4222), ("kube-system", 53)}
+
+
 def test_servers_are_started_with_options_that_there_are(tmp_path: Path) -> None:
     import tyro
 
