@@ -1,6 +1,9 @@
 """Lists of jobs: what is done is skipped, what fails is named, and does not stop the rest."""
 
+import os
 import re
+import signal
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +27,11 @@ def refuse(tell: Tell) -> None:
 def break_down(tell: Tell) -> None:
     tell("about to")
     raise ZeroDivisionError("by hand")
+
+
+def die(tell: Tell) -> None:
+    tell("dying")
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def forget(tell: Tell) -> None:
@@ -93,6 +101,34 @@ def test_failures_are_listed_at_the_end_and_stop_nobody(tmp_path: Path) -> None:
     with pytest.raises(RfedgeError, match=r"^3 of 4 jobs failed"):
         run_jobs(jobs, told.append)
     assert "good: done before" in told
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_on_ray_jobs_that_fail_or_whose_workers_die_are_listed_and_stop_nobody(
+    tmp_path: Path,
+) -> None:
+    told: list[str] = []
+    jobs = [
+        failing(tmp_path, "bad", refuse),
+        failing(tmp_path, "worse", break_down),
+        failing(tmp_path, "dying", die),
+        replace(job(tmp_path, "huge"), memory_bytes=1 << 60),
+        job(tmp_path, "good"),
+    ]
+    with pytest.raises(RfedgeError) as raised:
+        run_jobs(jobs, told.append, "local")
+    first, *failed = str(raised.value).splitlines()
+    assert first.startswith("4 of 5 jobs failed")
+    said = {name: text for name, _, text in (line.strip().partition(": ") for line in failed)}
+    assert said["bad"] == "pictures: 3 are too few"
+    assert said["worse"] == "ZeroDivisionError: by hand"
+    assert said["dying"].startswith("begun 4 times at most, then given up")
+    assert said["huge"].startswith("needs 1 cores and 1073741824.0 GiB on one machine")
+    assert (tmp_path / "good.txt").read_text() == "text"
+    assert "good: done" in told
+    dying = {line.split()[2] for line in told if line.startswith("dying, process")}
+    assert len(dying) >= 2, "begun again elsewhere; a last line may die with its process"
 
 
 def test_a_job_that_fails_is_no_longer_taken_for_done(tmp_path: Path) -> None:
