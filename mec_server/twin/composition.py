@@ -11,6 +11,9 @@ A camera's word weighs, beside angle, resolution and distance, by
 * age: 1 at capture, 0 at the age from which pictures vouch for nothing, and
 * trust: 1 less the share of the picture that disagrees with the field.
 
+Pictures of one vehicle share its word where several of them vouch: a rig has no more to say than
+one camera.
+
 Things that stand or move in the street and are not in the field come as patches at their own depth
 (``mec_server.twin.patches``), once they were found (``mec_server.twin.contacts``).
 
@@ -22,7 +25,8 @@ nothing standing.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -35,6 +39,7 @@ from rfcore.image import I420, Rgb
 from rfcore.native.live_view import (
     ABSOLUTE_DEPTH_M,
     COVERED,
+    LEAST_COSINE,
     MOST_DISTANCE_M,
     NEAREST_M,
     NOBODY,
@@ -64,8 +69,10 @@ __all__ = [
 
 T = TypeVar("T")
 
-MOST_CAMERAS = 4
-"""Live pictures carried to one view: those nearest to it."""
+MOST_CAMERAS, MOST_OF_ONE = 4, 2
+"""Live pictures carried to one view, and how many of one vehicle if there are others."""
+LOOKED_AT_M = (3.0, 6.0, 12.0, 24.0)
+"""How far away on a view's axis that is which pictures are compared by."""
 
 MOST_DISAGREEMENT = 0.5
 """Share of a picture; one that differs in more is taken to be somewhere else."""
@@ -208,18 +215,26 @@ def compose(
     view: View,
     pictures: Sequence[tuple[LivePicture, float]],
     max_age_s: float,
+    vehicles: Sequence[Hashable] = (),
 ) -> ComposedView:
     """Return ``view``, the field's render at ``camera``, with live pictures of the given age (s)
-    carried to it. Pictures as old as ``max_age_s`` vouch for nothing."""
+    carried to it. Pictures as old as ``max_age_s`` vouch for nothing.
+
+    ``vehicles``: whose each picture is; without them every picture is of a vehicle of its own.
+    """
+    owners = vehicles or range(len(pictures))
+    numbers = {owner: number for number, owner in enumerate(dict.fromkeys(owners))}
     ages_s = [max(0.0, age_s) for _, age_s in pictures]
     sources = []
-    for (picture, _), age_s in zip(pictures, ages_s, strict=True):
+    for (picture, _), age_s, owner in zip(pictures, ages_s, owners, strict=True):
         youth = max(0.0, 1.0 - age_s / max_age_s)
         fade = min(1.0, 2.0 * youth)
-        source = LiveSource(
-            picture.camera, picture.difference, picture.depth, youth * picture.trust, fade
+        weight = youth * picture.trust
+        sources.append(
+            LiveSource(
+                picture.camera, picture.difference, picture.depth, weight, fade, numbers[owner]
+            )
         )
-        sources.append(source)
     rgb, chosen = carry_to_view(camera, view, sources)
     depth, things = view.depth, list(_standing(pictures, sources))
     if things:
@@ -242,17 +257,46 @@ def _standing(
                 yield replace(each, source=number, weight=source.weight, fade=source.fade)
 
 
-def nearest(pictures: Sequence[T], camera: Camera, pose_of: Callable[[T], Pose | None]) -> list[T]:
-    """Return the pictures of known pose that were taken nearest to ``camera``, within reach."""
-
-    def distance_m(picture: T) -> float:
+def nearest(
+    pictures: Sequence[T],
+    camera: Camera,
+    pose_of: Callable[[T], Pose | None],
+    vehicle_of: Callable[[T], Hashable] = id,
+) -> list[T]:
+    """Return the pictures of known pose that see most of what ``camera`` sees, the best first; of
+    equal ones, and of those that see nothing of it, the nearest. Of one vehicle there are at most
+    ``MOST_OF_ONE`` while others are left."""
+    ranked = []
+    for order, picture in enumerate(pictures):
         pose = pose_of(picture)
         if pose is None:
-            return math.inf
-        return math.dist(pose.translation_m, camera.world_from_cam.translation_m)
+            continue
+        distance_m = math.dist(pose.translation_m, camera.world_from_cam.translation_m)
+        if distance_m < 2 * MOST_DISTANCE_M:
+            ranked.append((-_overlap(camera.world_from_cam, pose), distance_m, order))
+    taken: list[T] = []
+    spare: list[T] = []
+    counts: Counter[Hashable] = Counter()
+    for *_, order in sorted(ranked):
+        vehicle = vehicle_of(pictures[order])
+        counts[vehicle] += 1
+        (taken if counts[vehicle] <= MOST_OF_ONE else spare).append(pictures[order])
+    return [*taken, *spare][:MOST_CAMERAS]
 
-    near = [picture for picture in pictures if distance_m(picture) < 2 * MOST_DISTANCE_M]
-    return sorted(near, key=distance_m)[:MOST_CAMERAS]
+
+def _overlap(view: Pose, live: Pose) -> float:
+    """Return how well a camera at ``live`` vouches for what one at ``view`` looks at, 0 to 1: the
+    mean over points on its axis, as ``rfcore.native.live_view`` weighs, whatever hides them."""
+    cam_from_view, weights = live.inverse().compose(view), []
+    origin_m = np.array(cam_from_view.translation_m)
+    for ahead_m in LOOKED_AT_M:
+        at_m = np.array(cam_from_view.apply((0.0, 0.0, ahead_m)))
+        range_m = float(np.linalg.norm(at_m))
+        ray_m = at_m - origin_m
+        cosine = float(at_m @ ray_m) / max(range_m * ahead_m, 1e-9)
+        seen = LEAST_COSINE * range_m < at_m[2] < MOST_DISTANCE_M and cosine > LEAST_COSINE
+        weights.append(cosine**4 * (1 - at_m[2] / MOST_DISTANCE_M) if seen else 0.0)
+    return float(np.mean(weights))
 
 
 def _light_of(rgb: Rgb, view: View, covered: Mask) -> Light:

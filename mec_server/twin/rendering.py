@@ -223,10 +223,12 @@ class TwinViews:
         check_inside(camera, field)
         view = field.render(camera, request.quality)
         check_outside_of_walls(view)
-        seen = nearest(sorted(recent, key=lambda it: it.key), camera, lambda it: it.frame.pose)
+        by_key = sorted(recent, key=lambda it: it.key)
+        seen = nearest(by_key, camera, lambda it: it.frame.pose, lambda it: it.vehicle_id)
         now = time.monotonic()
         live = [(self._looked_at(each, field).live, each.age_s(now)) for each in seen]
-        composed = compose(camera, view, live, request.max_age_s)
+        vehicles = [each.vehicle_id for each in seen]
+        composed = compose(camera, view, live, request.max_age_s, vehicles)
         cameras = tuple(
             LiveCamera(each.vehicle_id, each.frame.camera_id, age_s, share, picture.trust == 0)
             for each, (picture, age_s), share in zip(seen, live, composed.shares, strict=True)

@@ -26,9 +26,11 @@ between P and T has a cosine c > ``LEAST_COSINE``, and it sees the surface with 
 of the view's resolution, ``r = fx' / fx * z / Pz``. Its weight is the source's times
 ``c**4 * min(r, 1) * (1 - Pz / MOST_DISTANCE_M)``.
 
-Its change is taken at (u, v) bilinearly, times the source's ``fade``. Of several that vouch, the
-weighted median by the sum of the three channels counts: one that is alone with its opinion is
-outvoted by two. The picture is ``level(colour)`` plus that, rounded and clamped likewise.
+Its change is taken at (u, v) bilinearly, times the source's ``fade``. Several of one ``owner`` that
+vouch for a pixel share their weight there: each counts divided by how many they are. Of several
+that vouch, the weighted median by the sum of the three channels counts: one that is alone with its
+opinion is outvoted by two. The picture is ``level(colour)`` plus that, rounded and clamped
+likewise.
 
 *Patches* (``draw_patch``). With the ray of a pixel as above, and R, t mapping points of the view's
 axes into those of the patch's camera::
@@ -108,13 +110,15 @@ OWN_LIGHT = Light((1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
 @dataclass(frozen=True, eq=False)
 class LiveSource:
     """A live picture's ``difference`` (float32 [H, W, 3]) and the field's ``depth`` (float32
-    [H, W], metres) at its ``camera``; ``weight`` and ``fade`` are of the whole picture."""
+    [H, W], metres) at its ``camera``; ``weight`` and ``fade`` are of the whole picture; ``owner``:
+    a number of the vehicle, 0 to 2**24 (exact in float32)."""
 
     camera: Camera
     difference: F32
     depth: F32
     weight: float
     fade: float
+    owner: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +249,8 @@ def draw_patch(
 def _numbers(source: LiveSource, camera: Camera) -> tuple[F32, F32, list[float]]:
     motion = source.camera.cam_from_world().compose(camera.world_from_cam)
     numbers = [value for row in motion.rotation_matrix() for value in row]
-    numbers += [*motion.translation_m, *_pinhole(source.camera), source.weight, source.fade]
+    numbers += [*motion.translation_m, *_pinhole(source.camera)]
+    numbers += [source.weight, source.fade, float(source.owner)]
     depth, difference = map(np.ascontiguousarray, (source.depth, source.difference))
     return difference, depth, numbers
 

@@ -1,6 +1,7 @@
 """The kernels of live views compute, to the bit, what their module defines."""
 
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -135,16 +136,18 @@ def defined_view(
     change = np.zeros(view.colour.shape, F)
     each = [defined_source(source, at, view) for source in sources]
     for y, x in np.ndindex(*view.depth.shape):
-        means = {}
+        means, weights = {}, {}
         for i, (weight, changes) in enumerate(each):
             if weight[y, x] > 0:
                 red, green, blue = changes[y, x]
-                means[i] = red + green + blue
+                means[i], weights[i] = red + green + blue, weight[y, x]
+        owners = Counter(sources[i].owner for i in means)
+        shares = {i: weights[i] / F(owners[sources[i].owner]) for i in means}
         order = sorted(means, key=lambda i: (means[i], i))
-        total = sum((each[i][0][y, x] for i in means), F(0))
+        total = sum(shares.values(), F(0))
         reached = F(0)
         for i in order:
-            reached += each[i][0][y, x]
+            reached += shares[i]
             if reached >= total / F(2) or i == order[-1]:
                 chosen[y, x], change[y, x] = i, each[i][1][y, x]
                 break
@@ -172,6 +175,7 @@ def test_a_view_is_what_is_defined(seed: int, count: int, width: int, height: in
                 source_view.depth,
                 rng.choice([0.0, 0.4, 1.0]),
                 rng.choice([0.5, 1.0]),
+                int(rng.integers(0, 3)),
             )
         )
     rgb, chosen = carry_to_view(at, view, sources)
@@ -184,7 +188,7 @@ def test_a_source_at_the_view_itself_is_taken_where_the_field_has_a_surface() ->
     rng = np.random.default_rng(4)
     view, at = random_view(rng, 40, 30), camera(40, 30)
     difference = np.full(view.colour.shape, 9.0, F)
-    rgb, chosen = carry_to_view(at, view, [LiveSource(at, difference, view.depth, 1.0, 1.0)])
+    rgb, chosen = carry_to_view(at, view, [LiveSource(at, difference, view.depth, 1.0, 1.0, 0)])
     inside = np.zeros(chosen.shape, bool)
     inside[1:-1, 1:-1] = True
     covered = (view.opacity > COVERED) & inside
@@ -198,9 +202,9 @@ def test_pictures_that_do_not_fit_are_refused() -> None:
     view = random_view(np.random.default_rng(1), 8, 6)
     with pytest.raises(InvalidInput, match="beside a view"):
         live_difference(np.zeros((6, 9, 3), np.uint8), view, OWN_LIGHT)
-    source = LiveSource(camera(8, 6), np.zeros((6, 8, 3), F), view.depth, 1.0, 1.0)
+    source = LiveSource(camera(8, 6), np.zeros((6, 8, 3), F), view.depth, 1.0, 1.0, 0)
     with pytest.raises(InvalidInput, match="more than 16"):
         carry_to_view(camera(8, 6), view, [source] * (MOST_SOURCES + 1))
-    short = LiveSource(camera(8, 6), np.zeros((6, 8, 3), F), view.depth[:5], 1.0, 1.0)
+    short = LiveSource(camera(8, 6), np.zeros((6, 8, 3), F), view.depth[:5], 1.0, 1.0, 0)
     with pytest.raises(ValueError, match="do not fit"):
         carry_to_view(camera(8, 6), view, [short])

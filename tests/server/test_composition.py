@@ -1,11 +1,12 @@
 """Live pictures carried to another view: what changed comes along, nothing else does."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mec_server.twin.composition import LivePicture, compose, live_picture, shrunk
+from mec_server.twin.composition import LivePicture, compose, live_picture, nearest, shrunk
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_rgb
@@ -145,6 +146,46 @@ def test_two_cameras_that_see_nothing_outvote_one_that_sees_something() -> None:
     composed = compose(at(0.0), STREET.render(at(0.0)), pictures, MAX_S)
     assert np.array_equal(composed.rgb[24:36, 34:56], picture(STREET, at(0.0))[24:36, 34:56])
     assert composed.shares[0] < 0.5
+
+
+def test_the_cameras_of_a_rig_have_one_word_and_an_honest_vehicle_is_heard() -> None:
+    """Three cameras of a rig see something at the same pixels, and another vehicle does not."""
+    rgb = picture(STREET, at(0.0))
+    rgb[20:40, 30:60] = 250
+    liar = live(STREET, at(0.0), rgb)
+    liar = replace(liar, trust=0.8)
+    honest = live(STREET, at(0.05), picture(STREET, at(0.05)))
+    pictures = [*[(liar, LIVE_S)] * 3, (honest, LIVE_S)]
+    view, inside = STREET.render(at(0.0)), (slice(24, 36), slice(34, 56))
+    composed = compose(at(0.0), view, pictures, MAX_S, ["rig", "rig", "rig", "cav-2"])
+    assert np.array_equal(composed.rgb[inside], picture(STREET, at(0.0))[inside])
+    apart = compose(at(0.0), view, pictures, MAX_S)
+    assert np.abs(apart.rgb[inside].astype(int) - 250).max() <= 1, "three vehicles outvote one"
+
+
+def turned(x_m: float, yaw_rad: float = 0.0) -> Pose:
+    return at(x_m, yaw_rad).world_from_cam
+
+
+def test_the_pictures_that_see_most_of_a_view_are_taken() -> None:
+    """Those that look the other way are nearer; a vehicle of many cameras leaves room."""
+    poses = {
+        ("other way", 0): turned(0.1, math.pi),
+        ("aside", 0): turned(0.2, math.pi / 2),
+        ("rig", 0): turned(0.3),
+        ("rig", 1): turned(0.4),
+        ("rig", 2): turned(0.5),
+        ("far", 0): turned(3.0),
+        ("further", 0): turned(4.0),
+        ("lost", 0): None,
+    }
+    found = nearest(list(poses), at(0.0), poses.get, lambda it: it[0])
+    assert found == [("rig", 0), ("rig", 1), ("far", 0), ("further", 0)]
+    alone = [key for key in poses if key[0] == "rig"]
+    assert nearest(alone, at(0.0), poses.get, lambda it: it[0]) == alone
+    assert nearest([("other way", 0)], at(0.0), poses.get) == [("other way", 0)]
+    away = Pose((0.0, 0.0, -81.0), (1.0, 0.0, 0.0, 0.0))
+    assert nearest([("away", 0)], at(0.0), lambda _: away) == []
 
 
 def test_another_light_is_no_change() -> None:

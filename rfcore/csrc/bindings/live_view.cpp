@@ -24,7 +24,7 @@ using InSamples = nb::ndarray<const float, nb::shape<-1, -1, 4>, nb::c_contig, n
 using InPlane = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using OutPlane = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using OutBytes = nb::ndarray<std::uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-// Difference, depth, and 18 numbers: rotation 9, translation 3, fx, fy, cx, cy, weight, fade.
+// Difference, depth, and 19 numbers: rotation 9, translation 3, fx, fy, cx, cy, weight, fade, owner.
 using Source = std::tuple<InColour, InPlane, std::vector<float>>;
 
 template <typename Array>
@@ -48,10 +48,10 @@ PinholeCamera camera_of(const float* numbers) { return {numbers[0], numbers[1], 
 
 LiveSource source_of(const Source& from) {
     const auto& [difference, depth, numbers] = from;
-    require_count(numbers, 18);
+    require_count(numbers, 19);
     require_size(depth, size_of(difference));
     LiveSource source{difference.data(), depth.data(), size_of(difference), camera_of(&numbers[12]), {}, {},
-                      numbers[16], numbers[17]};
+                      numbers[16], numbers[17], static_cast<int>(numbers[18])};
     std::copy_n(numbers.begin(), 9, source.rotation);
     std::copy_n(numbers.begin() + 9, 3, source.translation);
     return source;

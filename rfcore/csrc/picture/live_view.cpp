@@ -166,6 +166,35 @@ void sample_row(const LiveSource& s, const VouchLimits& limits, int width, Carri
     }
 }
 
+// Divides what a source weighs at a pixel among those of its owner that weigh anything there.
+void share_weights(const LiveSource* sources, std::vector<Carried>& rows, int width) {
+    const int count = static_cast<int>(rows.size());
+    for (int s = 0; s < count; ++s) {
+        int first = 0;
+        while (sources[first].owner != sources[s].owner) ++first;
+        if (first < s) continue;
+        for (int x = 0; x < width; ++x) {
+            float vouching = 0.0f;
+            for (int other = s; other < count; ++other) {
+                vouching += sources[other].owner == sources[s].owner && rows[other].weight[x] > 0.0f;
+            }
+            if (!(vouching > 1.0f)) continue;
+            for (int other = s; other < count; ++other) {
+                if (sources[other].owner == sources[s].owner) rows[other].weight[x] /= vouching;
+            }
+        }
+    }
+}
+
+bool share_owners(const LiveSource* sources, int count) {
+    for (int s = 1; s < count; ++s) {
+        for (int other = 0; other < s; ++other) {
+            if (sources[other].owner == sources[s].owner) return true;
+        }
+    }
+    return false;
+}
+
 // Which of the sources that weigh anything at x is the weighted median by mean change.
 std::uint8_t median_at(const std::vector<Carried>& rows, int x) {
     int order[kMostSources], found = 0;
@@ -227,6 +256,7 @@ void carry_to_view(const FieldPicture& view, const LiveSource* sources, int coun
     std::vector<RayColumns> columns;
     for (int s = 0; s < count; ++s) columns.emplace_back(sources[s], view);
     std::vector<Carried> rows(count, Carried(width));
+    const bool shared = share_owners(sources, count);
     std::vector<float> change(3 * static_cast<std::size_t>(width));
     for (int y = 0; y < view.size.height_px; ++y) {
         for (int s = 0; s < count; ++s) {
@@ -235,6 +265,7 @@ void carry_to_view(const FieldPicture& view, const LiveSource* sources, int coun
                        row.weight.data());
             sample_row(sources[s], limits, width, row);
         }
+        if (shared) share_weights(sources, rows, width);
         const std::size_t start = static_cast<std::size_t>(y) * width;
         for (int x = 0; x < width; ++x) {
             const std::uint8_t source = median_at(rows, x);

@@ -36,6 +36,8 @@ struct LiveSource {
     // Of points in the view's axes into those of the live camera; rotation row-major.
     float rotation[9], translation[3];
     float weight, fade;
+    // Sources of one owner share one weight at each pixel.
+    int owner;
 };
 
 struct FieldPicture {
