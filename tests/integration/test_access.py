@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from contextlib import AsyncExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,12 @@ from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import Welcome
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import Subscription, subscription_to_wire, twin_message_from_wire
-from rfcore.wire.twin_render import ViewRequest, view_request_to_wire
+from rfcore.wire.twin_render import (
+    ObjectsRequest,
+    ViewRequest,
+    objects_request_to_wire,
+    view_request_to_wire,
+)
 from rfcore.wire.v1 import field_pb2, field_pb2_grpc, twin_pb2_grpc
 from rfedge.certs.authority import Members, certify, write_certificates
 
@@ -290,3 +296,35 @@ async def test_calls_of_methods_that_there_are_not_are_charged_for(
 def limited_calls(server: Any) -> float:
     labels = {"limit": "identity_calls"}
     return float(server.registry.get_sample_value("rfedge_server_limited_total", labels))
+
+
+async def test_objects_are_told_to_whom_the_tile_and_the_pictures_are_granted(
+    certs: Files, serve: Any, coded: Any, street: Any, tmp_path: Path
+) -> None:
+    """A vehicle may have the field, and so may ask, but sees nobody else's pictures."""
+    access = tmp_path / "access.toml"
+    access.write_text('[consumers.desk]\nvehicles = ["cav-raw"]')
+    request = objects_request_to_wire(ObjectsRequest(field_id=street.field_id))
+    async with AsyncExitStack() as stack:
+        server = await stack.enter_async_context(serve(tls=certs("server"), access=access))
+
+        async def objects(name: str) -> Any:
+            channel = await stack.enter_async_context(channel_to(server.address, certs(name)))
+            return twin_pb2_grpc.TwinServiceStub(channel).Objects(request)
+
+        for name in ("consumer-desk", "consumer-other"):
+            call = await objects(name)
+            assert await call.code() is grpc.StatusCode.PERMISSION_DENIED
+            assert "may not see that tile" in await call.details()
+        granted, other = await objects("operator-op"), await objects("vehicle-cav-2")
+        for call in (granted, other):
+            await call.initial_metadata()
+        channel = channel_to(server.address, certs("vehicle-cav-raw"))
+        async with channel:
+            stream = await open_stream(channel, coded.hello)
+            await stream.write(client_message_to_bytes(coded.frames[0]))
+            await stream.read()
+            assert (await granted.read()).field_id == street.field_id
+        assert (await granted.read()).field_id == street.field_id, "once more when it has left"
+        await server.stop()
+        assert await other.read() is grpc.aio.EOF

@@ -23,6 +23,7 @@ from rfcore.native.yuv import field_view_from_view
 from rfcore.wire.messages import Ack, Frame, Hello
 from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
 from rfcore.wire.publish import Ground, publish
+from rfcore.wire.tile_manifest import VersionLabel
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
@@ -118,8 +119,13 @@ async def driving(vehicle: Vehicle) -> AsyncIterator[None]:
         await task
 
 
-async def test_an_agent_hands_on_that_its_tile_has_another_map(
-    street: Any, serve: Any, tmp_path: Path
+@pytest.mark.parametrize(
+    ("light", "kind"),
+    [("", FieldChangeKind.MAP), ("dusk", FieldChangeKind.LIGHT)],
+    ids=["map", "light"],
+)
+async def test_an_agent_hands_on_that_its_tile_has_another_map_or_light(
+    street: Any, serve: Any, tmp_path: Path, light: str, kind: FieldChangeKind
 ) -> None:
     folder, path = tmp_path / "fields", tmp_path / "notices"
     folder.mkdir()
@@ -142,9 +148,12 @@ async def test_an_agent_hands_on_that_its_tile_has_another_map(
             reader, writer = await asyncio.open_unix_connection(path)
             while server._edge.notice_takers() == []:
                 await asyncio.sleep(0.01)
-            new = publish(folder, "west", street.other_store / "other.rff", Ground(), NOW)
+            label = VersionLabel(light)
+            new = publish(folder, "west", street.other_store / "other.rff", Ground(), NOW, label)
             line = json.loads(await reader.readline())
             writer.close()
-    assert (line["kind"], line["tile"], line["field_id"]) == ("map", "west", new.field_id)
-    change = FieldChange(FieldChangeKind.MAP, "west", new.field_id, 2)
+    field_id = new.lights[0].field_id if light else new.field_id
+    assert field_id == street.other_id
+    assert (line["kind"], line["tile"], line["field_id"]) == (str(kind), "west", field_id)
+    change = FieldChange(kind, "west", field_id, 2, light)
     assert [notice.subject for notice in taken] == [change]

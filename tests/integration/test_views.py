@@ -5,6 +5,7 @@ import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -12,8 +13,11 @@ import numpy as np
 import pytest
 
 from mec_server.config import ServerBudget, SessionLimits
+from mec_server.ledger.budgets import Limit, Resource
 from mec_server.twin import contacts, rendering
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.errors import LimitExceeded
+from rfcore.field import save_field
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.twin import PictureEncoding
 from rfcore.wire.twin_render import (
@@ -27,6 +31,7 @@ from rfcore.wire.twin_render import (
     view_request_to_wire,
 )
 from rfcore.wire.v1 import twin_pb2, twin_pb2_grpc
+from wall_scene import WALL_M, wall_field
 
 INTRINSICS = Intrinsics(76, 52, 50.0, 50.0, 38.0, 26.0)
 ORIGIN = Camera(INTRINSICS, Pose.identity())
@@ -106,6 +111,22 @@ async def test_a_viewpoint_outside_of_the_field_is_refused(street: Any, serve: A
         code, details = await refusal(stub.Render(view_request_to_wire(asked(street, FAR))))
     assert code is grpc.StatusCode.INVALID_ARGUMENT
     assert "pose.z_m: -40 is more than 5 m outside of the field" in details
+
+
+async def test_a_viewpoint_inside_of_a_wall_is_refused(serve: Any, tmp_path: Path) -> None:
+    """25 cm before a wall that is 8 m wide; from 2 m away it is a view like any other."""
+    field_id = save_field(wall_field(0.5), tmp_path / "wall.rff")
+    near, away = (
+        Camera(INTRINSICS, Pose((0.0, 0.0, WALL_M - distance_m), (1.0, 0.0, 0.0, 0.0)))
+        for distance_m in (0.25, 2.0)
+    )
+    async with serve(fields=tmp_path) as server, stub_of(server) as stub:
+        ask = lambda camera: view_request_to_wire(ViewRequest(camera, field_id=field_id))  # noqa: E731
+        code, details = await refusal(stub.Render(ask(near)))
+        view = rendered_view_from_wire(await stub.Render(ask(away)), INTRINSICS)
+    assert code is grpc.StatusCode.INVALID_ARGUMENT
+    assert "pose: 100% of the view is nearer than 0.3 m: the viewpoint is inside" in details
+    assert view.depth[26, 38] == pytest.approx(2.0, abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -296,6 +317,35 @@ async def test_objects_are_what_the_vehicle_sees_and_the_field_does_not_have(
     assert 0 < thing.confidence <= 1
     assert thing.unseen_s > 0, "it is told of as of now, not as of the picture's capture"
     assert 2 < thing.at_m[2] < 9, "on the surface behind the box: the field is a cloud at 2 to 8 m"
+
+
+async def test_objects_without_worker_time_miss_pictures_and_go_on(
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first two pictures find the consumer's worker time spent, the third does not."""
+    async with serve() as server, stub_of(server) as stub:
+        check, refused = server._entry.ledger.check, []
+
+        def spent(identity: str, resource: Any, now: float) -> None:
+            if resource is Resource.WORKER_SECONDS and len(refused) < 2:
+                refused.append(identity)
+                raise LimitExceeded(Limit.IDENTITY_WORKER_SECONDS, "spent", 1.0)
+            check(identity, resource, now)
+
+        monkeypatch.setattr(server._entry.ledger, "check", spent)
+        call = stub.Objects(objects_request_to_wire(ObjectsRequest(field_id=street.field_id)))
+        await call.initial_metadata()
+        async with raw_vehicle(server.address) as vehicle:
+            await vehicle.greet(coded.hello)
+            for number, frame in enumerate(coded.frames[:3], start=1):
+                assert await vehicle.told(frame) == ("ack", number - 1), "ingest goes on"
+                async with asyncio.timeout(20):
+                    while len(refused) < min(number, 2):
+                        await asyncio.sleep(0.001)
+            told = objects_from_wire(await call.read())
+        assert told.field_id == street.field_id
+        assert not call.done()
+        assert len(set(refused)) == 1
 
 
 @pytest.mark.parametrize(
