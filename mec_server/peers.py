@@ -20,12 +20,22 @@ import structlog
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Hold, Ledger
 from mec_server.ledger.peer_log import LogLimiter, PeerLog
-from rfcore.errors import LimitExceeded, RfedgeError
+from rfcore.errors import (
+    AccessDenied,
+    BackendUnavailable,
+    CodecError,
+    InvalidData,
+    InvalidInput,
+    LimitExceeded,
+    PacketRejected,
+    ProtocolError,
+    RfedgeError,
+    UnknownField,
+)
 from rfcore.wire.conventions import RETRY_AFTER
 from rfcore.wire.identity import peer_identity
-from rfcore.wire.status import status_of
 
-__all__ = ["ChargeRpcs", "Slots", "abort", "peer_account", "peer_log"]
+__all__ = ["ChargeRpcs", "Slots", "abort", "peer_account", "peer_log", "status_of"]
 
 log = structlog.get_logger()
 
@@ -34,6 +44,28 @@ FAILED = "the server failed in this call, and has logged why"
 Context = grpc.aio.ServicerContext[Any, Any]
 if TYPE_CHECKING:
     Handler = grpc.RpcMethodHandler[Any, Any]
+
+
+STATUS_OF: tuple[tuple[type[RfedgeError], grpc.StatusCode], ...] = (
+    (InvalidInput, grpc.StatusCode.INVALID_ARGUMENT),
+    (UnknownField, grpc.StatusCode.NOT_FOUND),
+    (InvalidData, grpc.StatusCode.DATA_LOSS),
+    (PacketRejected, grpc.StatusCode.ABORTED),
+    (ProtocolError, grpc.StatusCode.FAILED_PRECONDITION),
+    (AccessDenied, grpc.StatusCode.PERMISSION_DENIED),
+    (LimitExceeded, grpc.StatusCode.RESOURCE_EXHAUSTED),
+    (BackendUnavailable, grpc.StatusCode.UNIMPLEMENTED),
+    (CodecError, grpc.StatusCode.INTERNAL),
+)
+"""Which gRPC status each of our errors becomes."""
+
+
+def status_of(error: RfedgeError) -> grpc.StatusCode:
+    """Return the status that tells a peer about ``error``."""
+    for kind, status in STATUS_OF:
+        if isinstance(error, kind):
+            return status
+    return grpc.StatusCode.INTERNAL
 
 
 def peer_account(context: Context) -> tuple[str, bool]:

@@ -27,7 +27,6 @@ from mec_server.twin.state import Covers, Mailbox, Twin, TwinView
 from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded, RfedgeError
 from rfcore.image import I420, jpeg_bytes, png_bytes
 from rfcore.native.yuv import rgb_from_i420
-from rfcore.wire.status import status_of
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
@@ -168,7 +167,7 @@ class TwinService(twin_pb2_grpc.TwinServiceServicer):
             sight = self._sight(context)
             sight.check_vehicles(subscription.vehicle_ids)
         except (InvalidInput, AccessDenied) as error:
-            await context.abort(status_of(error), str(error))
+            await abort(context, error)
         try:
             held = self._slots.hold(context)
         except LimitExceeded as error:

@@ -88,7 +88,11 @@ async def test_an_object_is_told_of_with_a_picture_that_shows_it(
     picture = Mock(key=("other", "front"), captured_s=NOW - 0.1, field_id=FIELD)
     shown = thing(1, 20.0)
     seen_before = replace(thing(2, 10.0), last_s=NOW - 0.3)
-    tracker = Mock(confirmed=lambda _: [shown, seen_before])
+    doubtful = thing(3, 15.0)
+    pictures = [Mock(detection=Mock(trust=0.3), instant=Mock(vehicle_id="other"))]
+    doubtful._sightings = pictures  # type: ignore[assignment]
+    assert doubtful.is_doubtful
+    tracker = Mock(confirmed=lambda _: [shown, seen_before, doubtful])
     monkeypatch.setattr(notices, "ObjectTracker", lambda: tracker)
     monkeypatch.setattr(notices.time, "monotonic", lambda: NOW)
     twin = Mock(cameras_of=lambda _: [[view(None), view(HERE)], [view(None, camera_id="rear")]])

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import grpc
 import pytest
 
+from mec_server.peers import status_of
 from rfcore import errors
 from rfcore.errors import (
     InvalidInput,
@@ -21,7 +22,6 @@ from rfcore.wire.conventions import (
     SERVER_OPTIONS,
     STREAM_METHOD,
 )
-from rfcore.wire.status import status_of
 from rfcore.wire.v1 import edge_pb2
 
 

@@ -486,7 +486,7 @@ class StreetObject(_message.Message):
     """Since it was first seen, and since it was last."""
     unseen_ms: _builtins.int
     doubtful: _builtins.bool
-    """Whether only pictures show it that disagree with the field in many places, as with a wrong pose."""
+    """Whether only vehicles show it whose pictures fit the field badly, as with a wrong pose."""
     @_builtins.property
     def seen_by(self) -> _containers.RepeatedCompositeFieldContainer[Global___Sighting]:
         """Those that saw it within the last second."""
