@@ -12,7 +12,7 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 
@@ -34,7 +34,7 @@ from mec_server.twin.contacts import Detection, find
 from mec_server.twin.ground import FieldGround
 from mec_server.twin.objects import Lacks
 from mec_server.twin.state import CameraKey, Covers, Twin, TwinView
-from rfcore.camera import Camera
+from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import AccessDenied, InvalidInput
 from rfcore.field import RadianceField
 from rfcore.field.quality import FULL
@@ -70,14 +70,20 @@ INSIDE_M, INSIDE_SHARE = 0.3, 0.9
 
 @dataclass(frozen=True)
 class Place:
-    """A field to draw, and every field that pictures of the same ground may be coded against."""
+    """A field to draw, and every field that pictures of the same ground may be coded against.
+    ``world``: what poses and objects are relative to, None for the field's origin."""
 
     field_id: str
     field_ids: frozenset[str]
+    world: TileOrigin | None = None
 
 
 def place_of(request: ViewRequest | ObjectsRequest, tiles: Sequence[Tile]) -> Place:
-    """Return what ``request`` names; raise ``InvalidInput`` for a tile that is not published."""
+    """Return what ``request`` names; raise ``InvalidInput`` for a tile that is not published, or a
+    place that is on none."""
+    if request.place is not None:
+        tile = _tile_at(request.place, tiles)
+        return Place(tile.field_id, tile.archive_ids, request.place)
     for tile in tiles:
         if request.tile == tile.name or request.field_id in tile.archive_ids:
             return Place(request.field_id or tile.field_id, tile.archive_ids)
@@ -87,13 +93,37 @@ def place_of(request: ViewRequest | ObjectsRequest, tiles: Sequence[Tile]) -> Pl
     raise InvalidInput("tile", f"{shown(request.tile)} is not published here; published: {here}")
 
 
+def _tile_at(place: TileOrigin, tiles: Sequence[Tile]) -> Tile:
+    """Return the tile whose area a place is in, or else the nearest whose margin reaches it."""
+    at = (place.east_m, place.north_m)
+    reaching = [tile for tile in tiles if tile.reaches(*at)]
+    if not reaching:
+        here = ", ".join(map(_area_of, tiles)) or "none; name a field_id"
+        raise InvalidInput(
+            "place",
+            f"east {at[0]:.10g} m, north {at[1]:.10g} m is on no tile published here: {here}",
+        )
+    return min(reaching, key=lambda tile: (tile.distance_m(*at), tile.area is None))
+
+
+def _area_of(tile: Tile) -> str:
+    if tile.area is None:
+        return f"{tile.name} (everywhere)"
+    (west, south), (east, north) = tile.area.low_m, tile.area.high_m
+    return (
+        f"{tile.name} (east {west:.10g} to {east:.10g} m, north {south:.10g} to {north:.10g} m, "
+        f"and {tile.margin_m:g} m around)"
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Glance:
     """What a picture says of things that the field does not have: those it shows, and of which it
-    says that they are not there."""
+    says that they are not there. ``origin_m``: of the field, relative to the place's ``world``."""
 
     detections: list[Detection]
     lacks: Lacks = lambda _at_m, _width_m, _height_m: False
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,17 +177,23 @@ class TwinViews:
 
         Raises ``LimitExceeded`` while ``identity`` has spent its worker time, ``AccessDenied`` for
         a field that it may not have (``may_draw``), ``UnknownField``, and ``InvalidInput`` for a
-        viewpoint outside of the field or inside of a wall. A caller that is cancelled costs at most
-        the view that has begun.
+        viewpoint outside of the field or inside of a wall, or a moment of which the pictures are
+        not there. A caller that is cancelled costs at most the view that has begun.
         """
         place = self.place(request, may_draw)
         now = time.monotonic()
-        recent = [
+        ago_s = _ago_s(request, time.time_ns(), self._twin.reach_s(now))
+        if request.time_ns:
+            known = self._twin.at(now - ago_s, request.max_age_s)
+        else:
+            known = self._twin.recent(now, request.max_age_s)
+        pictures = [
             seen
-            for seen in self._twin.recent(now, request.max_age_s)
+            for seen in known
             if seen.field_id in place.field_ids and covers(seen.vehicle_id, seen.field_id)
         ]
-        return await self._on_thread(identity, partial(self._composed, request, place, recent))
+        work = partial(self._composed, request, place, pictures, now - ago_s)
+        return await self._on_thread(identity, work)
 
     async def glance(self, seen: TwinView, place: Place, identity: str) -> Glance:
         """Return what a picture shows that the field of ``place`` does not have; nothing for one
@@ -217,16 +253,23 @@ class TwinViews:
             result = error
         return time.monotonic() - started, result
 
-    def _composed(self, request: ViewRequest, place: Place, recent: list[TwinView]) -> RenderedView:
+    def _composed(
+        self, request: ViewRequest, place: Place, pictures: list[TwinView], moment_s: float
+    ) -> RenderedView:
+        """Return the view at ``moment_s`` (monotonic), or at the time of composing it if the
+        request is for now."""
         field = self._open_field(place.field_id)
-        camera = request.camera
+        camera = _in_tile(request.camera, place, field)
         check_inside(camera, field)
         view = field.render(camera, request.quality)
         check_outside_of_walls(view)
-        by_key = sorted(recent, key=lambda it: it.key)
+        by_key = sorted(pictures, key=lambda it: it.key)
         seen = nearest(by_key, camera, lambda it: it.frame.pose, lambda it: it.vehicle_id)
         now = time.monotonic()
-        live = [(self._looked_at(each, field).live, each.age_s(now)) for each in seen]
+        past = request.time_ns != 0
+        ages_s = [moment_s - it.captured_s if past else it.age_s(now) for it in seen]
+        pairs = zip(seen, ages_s, strict=True)
+        live = [(self._looked_at(each, field).live, age_s) for each, age_s in pairs]
         vehicles = [each.vehicle_id for each in seen]
         composed = compose(camera, view, live, request.max_age_s, vehicles)
         cameras = tuple(
@@ -235,7 +278,7 @@ class TwinViews:
         )
         return RenderedView(
             number=request.number,
-            time_ns=time.time_ns(),
+            time_ns=request.time_ns or time.time_ns(),
             field_id=place.field_id,
             encoding=request.encoding,
             picture=_encoded(composed.rgb, request.encoding),
@@ -245,8 +288,9 @@ class TwinViews:
         )
 
     def _detected(self, seen: TwinView, place: Place) -> Glance:
-        looked = self._looked_at(seen, self._open_field(place.field_id))
-        return Glance(looked.detections, looked.live.lacks)
+        field = self._open_field(place.field_id)
+        looked = self._looked_at(seen, field)
+        return Glance(looked.detections, looked.live.lacks, _origin_m(place, field))
 
     def _ground(self, field: RadianceField) -> FieldGround:
         """Return the ground of ``field``; what of it was drawn is kept."""
@@ -273,6 +317,38 @@ class TwinViews:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return kept
+
+
+def _ago_s(request: ViewRequest, now_ns: int, reach_s: float) -> float:
+    """Return how long ago the moment is that a request is for; raise ``InvalidInput`` for one that
+    has not come, or longer ago than ``reach_s``."""
+    ago_s = (now_ns - request.time_ns) / 1e9 if request.time_ns else 0.0
+    if not 0 <= ago_s <= reach_s:
+        when = f"{ago_s:.3f} s ago" if ago_s > 0 else f"{-ago_s:.3f} s ahead"
+        raise InvalidInput(
+            "time_ns",
+            f"{request.time_ns} is {when} by this server's clock ({now_ns}); ask for a moment that "
+            f"is 0 to {reach_s:.3g} s ago, or with 0 for now",
+        )
+    return ago_s
+
+
+def _origin_m(place: Place, field: RadianceField) -> tuple[float, float, float]:
+    """Return where the field's origin is, relative to what ``place`` says poses are."""
+    if place.world is None:
+        return (0.0, 0.0, 0.0)
+    origin, world = field.metadata.tile_origin, place.world
+    return (
+        origin.east_m - world.east_m,
+        origin.north_m - world.north_m,
+        origin.up_m - world.up_m,
+    )
+
+
+def _in_tile(camera: Camera, place: Place, field: RadianceField) -> Camera:
+    """Return a camera that is relative to ``place`` relative to the field's origin."""
+    shift = TileOrigin(*_origin_m(place, field))
+    return replace(camera, world_from_cam=shift.localise(camera.world_from_cam))
 
 
 def check_inside(camera: Camera, field: RadianceField) -> None:

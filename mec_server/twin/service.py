@@ -38,6 +38,7 @@ from rfcore.wire.twin import (
 from rfcore.wire.twin_render import (
     ObjectsSeen,
     RenderedView,
+    StreetObject,
     objects_request_from_wire,
     objects_to_wire,
     rendered_view_to_wire,
@@ -326,6 +327,7 @@ class _ObjectsConsumer(_Mailed):
         self._metrics = metrics
         self._place = place
         self._told = ToldObjects()
+        self._origin_m = (0.0, 0.0, 0.0)
         self._identity, _ = peer_account(context)
 
     def _next(self, mailbox: Mailbox) -> Coroutine[None, None, None] | None:
@@ -345,15 +347,19 @@ class _ObjectsConsumer(_Mailed):
             except LimitExceeded:  # out of worker time: it is missed, as by a slow consumer
                 mailbox.skipped[entry.key] += 1
                 return
-            seen_s = entry.captured_s
+            self._origin_m, seen_s = glance.origin_m, entry.captured_s
             self._told.tracker.take(glance.detections, entry.key, seen_s, glance.lacks)
         await self._tell()
 
     async def _tell(self) -> None:
-        objects = self._told.now(time.monotonic())
+        objects = tuple(self._from_place(each) for each in self._told.now(time.monotonic()))
         message = objects_to_wire(ObjectsSeen(time.time_ns(), self._place.field_id, objects))
         await self._context.write(message)
         self._metrics.bytes.inc(message.ByteSize())
+
+    def _from_place(self, each: StreetObject) -> StreetObject:
+        x_m, y_m, z_m = (at + shift for at, shift in zip(each.at_m, self._origin_m, strict=True))
+        return replace(each, at_m=(x_m, y_m, z_m))
 
 
 def picture_message(

@@ -225,6 +225,21 @@ class Twin:
             if view.session_id == session_id
         ]
 
+    def reach_s(self, now: float) -> float:
+        """Return how long ago a moment may be, of those that ``at`` knows all pictures of."""
+        return max(0.0, min(PAST_S, now - self._past.whole_from_s))
+
+    def at(self, moment_s: float, max_age_s: float) -> list[TwinView]:
+        """Return the picture of every camera that it had captured last at a moment (monotonic), if
+        it was no older than ``max_age_s`` then."""
+        views = []
+        for key in {**self._views, **self._departed, **dict.fromkeys(self._past.cameras())}:
+            newest = (views_of.get(key) for views_of in (self._departed, self._views))
+            known = (*self._past.of(key), *(view for view in newest if view is not None))
+            before = [v for v in known if 0 <= moment_s - v.captured_s <= max_age_s]
+            views += sorted(before, key=lambda view: view.captured_s)[-1:]
+        return views
+
     def recent(self, now: float, max_age_s: float) -> list[TwinView]:
         """Return the newest picture of every camera that is no older than ``max_age_s``, also of
         cameras that left; those of them that are older than ``MAX_AGE_S`` are forgotten."""

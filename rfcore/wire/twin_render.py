@@ -5,14 +5,14 @@ What comes from a peer is checked here, as in ``rfcore.wire.twin``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Final
 
 import grpc
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera, Intrinsics
+from rfcore.camera import Camera, Intrinsics, TileOrigin
 from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.field.quality import FULL, Quality
 from rfcore.image import I420, Rgb, rgb_from_bytes
@@ -61,6 +61,8 @@ MAX_AGE_S: Final = 10.0
 """How old a picture may be that still vouches for pixels."""
 NO_AGE: Final = 65535
 """Where no live picture vouches, in ``RenderResponse.age_ms``."""
+MOST_PLACE_M: Final = 1e8
+"""Of the world: more than the equator from end to end."""
 RENDER_TIMEOUT_S: Final = 30.0
 
 Vec3 = tuple[float, float, float]
@@ -68,10 +70,12 @@ Vec3 = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """One viewpoint of a published ``tile``, or of a field by its id; exactly one is given.
+    """One viewpoint of a published ``tile``, of a field by its id, or of the tile at a ``place`` of
+    the world; exactly one is given.
 
-    ``camera`` is relative to the origin of the tile. Pictures older than ``max_age_s`` vouch for
-    nothing. Raises ``InvalidInput`` for a camera no one could look through.
+    ``camera`` is relative to the origin of the tile, or to the place. Pictures older than
+    ``max_age_s`` vouch for nothing. ``time_ns``: the moment to show, by the server's clock; 0: now.
+    Raises ``InvalidInput`` for a camera no one could look through.
     """
 
     camera: Camera
@@ -81,9 +85,12 @@ class ViewRequest:
     encoding: PictureEncoding = PictureEncoding.JPEG
     max_age_s: float = DEFAULT_AGE_S
     number: int = 0
+    place: TileOrigin | None = None
+    time_ns: int = 0
 
     def __post_init__(self) -> None:
-        _check_place(self.tile, self.field_id)
+        _check_place(self.tile, self.field_id, self.place)
+        check_range("time_ns", self.time_ns, 0, 2**63 - 1)
         check_range("max_age_ms", 1e3 * self.max_age_s, 1, 1e3 * MAX_AGE_S)
         _check_camera(self.camera.intrinsics)
 
@@ -137,13 +144,15 @@ class RenderedView:
 
 @dataclass(frozen=True)
 class ObjectsRequest:
-    """Where to look for objects: a published ``tile``, or a field by its id; exactly one."""
+    """Where to look for objects: a published ``tile``, a field by its id, or the tile at a
+    ``place`` of the world, to which objects are relative then; exactly one."""
 
     tile: str = ""
     field_id: str = ""
+    place: TileOrigin | None = None
 
     def __post_init__(self) -> None:
-        _check_place(self.tile, self.field_id)
+        _check_place(self.tile, self.field_id, self.place)
 
 
 @dataclass(frozen=True)
@@ -195,6 +204,8 @@ def view_request_to_wire(request: ViewRequest) -> pb.RenderRequest:
         encoding=encoding_to_wire(request.encoding),
         max_age_ms=round(1e3 * request.max_age_s),
         number=request.number,
+        place=_place_to_wire(request.place),
+        time_ns=request.time_ns,
     )
 
 
@@ -213,6 +224,8 @@ def view_request_from_wire(request: pb.RenderRequest) -> ViewRequest:
         PictureEncoding.JPEG if jpeg else encoding_from_wire(request.encoding),
         (request.max_age_ms / 1e3) or DEFAULT_AGE_S,
         request.number,
+        _place_from_wire(request),
+        request.time_ns,
     )
 
 
@@ -275,12 +288,13 @@ def _live_camera(camera: pb.LiveCamera) -> LiveCamera:
 
 def objects_request_to_wire(request: ObjectsRequest) -> pb.ObjectsRequest:
     """Return a request as protobuf."""
-    return pb.ObjectsRequest(tile=request.tile, field_id=request.field_id)
+    place = _place_to_wire(request.place)
+    return pb.ObjectsRequest(tile=request.tile, field_id=request.field_id, place=place)
 
 
 def objects_request_from_wire(request: pb.ObjectsRequest) -> ObjectsRequest:
     """Return what a consumer asks for; raise ``InvalidInput``."""
-    return ObjectsRequest(request.tile, request.field_id)
+    return ObjectsRequest(request.tile, request.field_id, _place_from_wire(request))
 
 
 def objects_to_wire(seen: ObjectsSeen) -> pb.ObjectsResponse:
@@ -349,13 +363,28 @@ def _object_from_wire(each: pb.StreetObject) -> StreetObject:
     )
 
 
-def _check_place(tile: str, field_id: str) -> None:
-    if bool(tile) == bool(field_id):
-        raise InvalidInput("tile", "name either a published tile or a field_id")
+def _place_to_wire(place: TileOrigin | None) -> pb.WorldPlace | None:
+    if place is None:
+        return None
+    return pb.WorldPlace(east_m=place.east_m, north_m=place.north_m, up_m=place.up_m)
+
+
+def _place_from_wire(request: pb.RenderRequest | pb.ObjectsRequest) -> TileOrigin | None:
+    if not request.HasField("place"):
+        return None
+    return TileOrigin(request.place.east_m, request.place.north_m, request.place.up_m)
+
+
+def _check_place(tile: str, field_id: str, place: TileOrigin | None) -> None:
+    if bool(tile) + bool(field_id) + (place is not None) != 1:
+        raise InvalidInput("tile", "name either a published tile, a field_id or a place")
     if tile:
         check_name("tile", tile)
-    else:
+    elif field_id:
         check_field_id("field_id", field_id)
+    elif place is not None:
+        for name, value in asdict(place).items():
+            check_range(f"place.{name}", value, -MOST_PLACE_M, MOST_PLACE_M)
 
 
 def _check_camera(k: Intrinsics) -> None:

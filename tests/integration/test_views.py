@@ -2,9 +2,11 @@
 
 import asyncio
 import threading
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,12 @@ import pytest
 from mec_server.config import ServerBudget, SessionLimits
 from mec_server.ledger.budgets import Limit, Resource
 from mec_server.twin import contacts, rendering
-from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.errors import LimitExceeded
 from rfcore.field import save_field
 from rfcore.wire.conventions import CONSUMER_OPTIONS
+from rfcore.wire.publish import Ground, publish
+from rfcore.wire.tiles import Area
 from rfcore.wire.twin import PictureEncoding
 from rfcore.wire.twin_render import (
     NO_AGE,
@@ -113,6 +117,73 @@ async def test_a_viewpoint_outside_of_the_field_is_refused(street: Any, serve: A
     assert "pose.z_m: -40 is more than 5 m outside of the field" in details
 
 
+async def test_a_place_of_the_world_names_its_tile_and_is_where_the_pose_is_relative_to(
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
+    for name in ("LEAST_PX", "LEAST_COLUMNS", "LEAST_WIDTH_M", "LEAST_MARKED_M"):
+        monkeypatch.setattr(contacts, name, 0)  # of a picture of 76x52
+    monkeypatch.setattr(contacts, "MOST_SLOPE", 1.0)
+    ground = Ground(Area((-50.0, -50.0), (50.0, 50.0)), 5.0)
+    publish(tmp_path, "west", street.store / "street.rff", ground, datetime.now(UTC))
+    place = TileOrigin(10.0, 20.0, 1.0)
+    there = Camera(INTRINSICS, Pose((-10.0, -20.0, -1.0), (1.0, 0.0, 0.0, 0.0)))
+    request = ViewRequest(there, place=place, encoding=PictureEncoding.PNG)
+    beyond = replace(request, place=TileOrigin(500.0, 20.0))
+    async with serve(fields=tmp_path) as server, stub_of(server) as stub:
+        view = rendered_view_from_wire(await stub.Render(view_request_to_wire(request)), INTRINSICS)
+        code, details = await refusal(stub.Render(view_request_to_wire(beyond)))
+        calls = [
+            stub.Objects(objects_request_to_wire(asked))
+            for asked in (ObjectsRequest(tile="west"), ObjectsRequest(place=place))
+        ]
+        for call in calls:
+            await call.initial_metadata()
+        async with raw_vehicle(server.address) as vehicle:
+            await vehicle.greet(coded.hello)
+            for frame in coded.frames[:4]:
+                await vehicle.told(frame)
+                told = [objects_from_wire(await call.read()) for call in calls]
+    assert view.field_id == street.field_id
+    assert np.array_equal(view.rgb, field_picture(street, ORIGIN))
+    by_tile, by_place = (each.objects[0].at_m for each in told)
+    assert np.subtract(by_tile, by_place) == pytest.approx((10.0, 20.0, 1.0), abs=0.5)
+    assert code is grpc.StatusCode.INVALID_ARGUMENT
+    assert (
+        "place: east 500 m, north 20 m is on no tile published here: "
+        "west (east -50 to 50 m, north -50 to 50 m, and 5 m around)"
+    ) in details
+
+
+async def test_a_view_of_a_moment_ago_shows_what_was_there_then(
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any
+) -> None:
+    async with serve() as server, stub_of(server) as stub, raw_vehicle(server.address) as vehicle:
+
+        async def look(**changes: Any) -> Any:
+            request = view_request_to_wire(asked(street, **changes))
+            return rendered_view_from_wire(await stub.Render(request), INTRINSICS)
+
+        await vehicle.greet(coded.hello)
+        await vehicle.told(coded.frames[0])
+        then_ns = time.time_ns()
+        first = await look()
+        for frame in coded.frames[1:4]:
+            await vehicle.told(frame)
+        last, again = await look(), await look(time_ns=then_ns)
+        refused = [
+            await refusal(stub.Render(view_request_to_wire(asked(street, time_ns=moment_ns))))
+            for moment_ns in (time.time_ns() + 10**10, time.time_ns() - 10**10)
+        ]
+    assert np.array_equal(again.rgb, first.rgb)
+    assert not np.array_equal(last.rgb, first.rgb)
+    assert again.time_ns == then_ns
+    assert again.cameras[0].age_s < first.cameras[0].age_s, "as old as it was then"
+    for (code, details), when in zip(refused, ("s ahead by", "s ago by"), strict=True):
+        assert code is grpc.StatusCode.INVALID_ARGUMENT
+        assert when in details
+        assert "ask for a moment that is 0 to 5 s ago" in details
+
+
 async def test_a_viewpoint_inside_of_a_wall_is_refused(serve: Any, tmp_path: Path) -> None:
     """25 cm before a wall that is 8 m wide; from 2 m away it is a view like any other."""
     field_id = save_field(wall_field(0.5), tmp_path / "wall.rff")
@@ -156,6 +227,7 @@ async def test_absurd_intrinsics_are_refused(
     ("change", "code", "problem"),
     [
         ({"field_id": ""}, "INVALID_ARGUMENT", "tile: name either"),
+        ({"tile": "west"}, "INVALID_ARGUMENT", "tile: name either"),
         ({"field_id": "", "tile": "west"}, "INVALID_ARGUMENT", "'west' is not published here"),
         ({"field_id": "ab" * 32}, "NOT_FOUND", "is not on this server"),
         ({"max_age_ms": 10_001}, "INVALID_ARGUMENT", "max_age_ms: 10001.0 is outside 1..10000"),
@@ -319,6 +391,9 @@ async def test_objects_are_what_the_vehicle_sees_and_the_field_does_not_have(
     assert 2 < thing.at_m[2] < 9, "on the surface behind the box: the field is a cloud at 2 to 8 m"
 
 
+NOWHERE = twin_pb2.ObjectsRequest(place=twin_pb2.WorldPlace(east_m=float("nan")))
+
+
 async def test_objects_without_worker_time_miss_pictures_and_go_on(
     street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -354,6 +429,8 @@ async def test_objects_without_worker_time_miss_pictures_and_go_on(
         (twin_pb2.ObjectsRequest(), grpc.StatusCode.INVALID_ARGUMENT),
         (twin_pb2.ObjectsRequest(tile="west"), grpc.StatusCode.INVALID_ARGUMENT),
         (twin_pb2.ObjectsRequest(field_id="../x"), grpc.StatusCode.INVALID_ARGUMENT),
+        (twin_pb2.ObjectsRequest(place=twin_pb2.WorldPlace()), grpc.StatusCode.INVALID_ARGUMENT),
+        (NOWHERE, grpc.StatusCode.INVALID_ARGUMENT),
     ],
 )
 async def test_objects_of_no_place_are_refused(

@@ -8,11 +8,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mec_server.twin.state import KEPT_EVERY_S, KEPT_S, Mailbox, PastViews, Twin, TwinView
-from rfcore.camera import Intrinsics
+from mec_server.twin.rendering import place_of
+from mec_server.twin.state import (
+    KEPT_EVERY_S,
+    KEPT_S,
+    PAST_S,
+    Mailbox,
+    PastViews,
+    Twin,
+    TwinView,
+)
+from rfcore.camera import Intrinsics, TileOrigin
+from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.wire.messages import Frame
+from rfcore.wire.tiles import Area, Tile
 from rfcore.wire.twin import Subscription
+from rfcore.wire.twin_render import ObjectsRequest
 
 PICTURE = I420(*(np.zeros(size, np.uint8) for size in ((2, 2), (1, 1), (1, 1))))
 INTRINSICS = Intrinsics(2, 2, 1.0, 1.0, 1.0, 1.0)
@@ -211,6 +223,42 @@ def test_pictures_before_the_newest_are_kept_one_in_a_while_and_not_for_ever(
     assert (gaps_s >= KEPT_EVERY_S - 1e-9).all()
     assert gaps_s.max() < KEPT_EVERY_S + 0.1
     assert twin.cameras_of("s-2") == []
+
+
+def test_a_moment_has_the_picture_that_each_camera_had_captured_last(view: MakeView) -> None:
+    twin = Twin()
+    for number in range(20):
+        twin.show(replace(view("cav-1", "s-1", number), reconstructed_s=10.25 + 0.5 * number))
+    twin.show(replace(view("cav-2", "s-2"), reconstructed_s=18.25))
+    twin.leave("s-2")
+    numbers = lambda moment_s, age_s=2.0: sorted(  # noqa: E731
+        (it.vehicle_id, it.frame.packet.sequence) for it in twin.at(moment_s, age_s)
+    )
+    assert numbers(19.5) == [("cav-1", 19), ("cav-2", 0)]
+    assert numbers(18.2) == [("cav-1", 16), ("cav-2", 0)]
+    assert numbers(17.9) == [("cav-1", 15)], "what was captured later was not there"
+    assert numbers(20.5, 0.6) == [], "nothing new was captured for 1 s"
+    assert twin.reach_s(20.0) == PAST_S
+
+
+def test_places_are_in_the_tile_of_their_area_or_else_the_nearest_that_reaches_them() -> None:
+    west = Tile("west", "ab" * 32, area=Area((0.0, 0.0), (100.0, 50.0)), margin_m=30.0)
+    east = Tile("east", "cd" * 32, area=Area((100.0, 0.0), (200.0, 50.0)), margin_m=30.0)
+    everywhere = Tile("all", "ef" * 32)
+
+    def tile_at(east_m: float, north_m: float, *tiles: Tile) -> str:
+        place = place_of(ObjectsRequest(place=TileOrigin(east_m, north_m)), tiles)
+        return next(tile.name for tile in tiles if tile.field_id == place.field_id)
+
+    assert tile_at(99.0, 25.0, east, west) == "west"
+    assert tile_at(101.0, 25.0, east, west) == "east"
+    assert tile_at(120.0, -20.0, west, east) == "east"
+    assert tile_at(50.0, 25.0, everywhere, west) == "west", "an area says more than none"
+    assert tile_at(1e6, 25.0, everywhere, west) == "all"
+    with pytest.raises(InvalidInput, match=r"east 1000 m, north 25 m is on no .*: west .*east"):
+        tile_at(1000.0, 25.0, west, east)
+    with pytest.raises(InvalidInput, match="published here: none; name a field_id"):
+        tile_at(0.0, 0.0)
 
 
 def test_the_past_of_all_cameras_has_a_limit_and_says_from_when_on_it_is_whole(

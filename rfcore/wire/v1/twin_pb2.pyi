@@ -217,6 +217,36 @@ class Departure(_message.Message):
 Global___Departure: _TypeAlias = Departure  # noqa: Y015
 
 @_typing.final
+class WorldPlace(_message.Message):
+    """A point in the global frame of the tiles' areas and origins. It names the published tile whose
+    area it is in, or the nearest of those whose margin reaches it; what goes with it is relative to it
+    instead of to the tile's origin, along the same axes.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    EAST_M_FIELD_NUMBER: _builtins.int
+    NORTH_M_FIELD_NUMBER: _builtins.int
+    UP_M_FIELD_NUMBER: _builtins.int
+    east_m: _builtins.float
+    north_m: _builtins.float
+    up_m: _builtins.float
+    def __init__(
+        self,
+        *,
+        east_m: _builtins.float = ...,
+        north_m: _builtins.float = ...,
+        up_m: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["east_m", b"east_m", "north_m", b"north_m", "up_m", b"up_m"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___WorldPlace: _TypeAlias = WorldPlace  # noqa: Y015
+
+@_typing.final
 class RenderRequest(_message.Message):
     """One viewpoint."""
 
@@ -230,23 +260,33 @@ class RenderRequest(_message.Message):
     ENCODING_FIELD_NUMBER: _builtins.int
     MAX_AGE_MS_FIELD_NUMBER: _builtins.int
     NUMBER_FIELD_NUMBER: _builtins.int
+    PLACE_FIELD_NUMBER: _builtins.int
+    TIME_NS_FIELD_NUMBER: _builtins.int
     tile: _builtins.str
-    """A tile that the server publishes. Empty: `field_id` says which field."""
+    """A tile that the server publishes. Empty: `field_id` or `place` says which field."""
     field_id: _builtins.str
-    """Lower-case hexadecimal sha256 of a field that the server holds; empty beside a tile."""
+    """Lower-case hexadecimal sha256 of a field that the server holds; empty beside a tile or place."""
     encoding: Global___PictureEncoding.ValueType
     max_age_ms: _builtins.int
     """Pictures that were captured longer ago vouch for nothing. 0: 2000; at most 10000."""
     number: _builtins.int
     """The answer has the same number."""
+    time_ns: _builtins.int
+    """The moment to show, by the server's clock: at most 5 s ago. 0: now."""
     @_builtins.property
-    def pose(self) -> _edge_pb2.Pose: ...
+    def pose(self) -> _edge_pb2.Pose:
+        """Relative to the tile's origin, or to `place`."""
+
     @_builtins.property
     def intrinsics(self) -> _edge_pb2.Intrinsics:
         """At most 1920 x 1088 pixels."""
 
     @_builtins.property
     def quality(self) -> _edge_pb2.Quality: ...
+    @_builtins.property
+    def place(self) -> Global___WorldPlace:
+        """In place of a tile or a field."""
+
     def __init__(
         self,
         *,
@@ -258,10 +298,12 @@ class RenderRequest(_message.Message):
         encoding: Global___PictureEncoding.ValueType = ...,
         max_age_ms: _builtins.int = ...,
         number: _builtins.int = ...,
+        place: Global___WorldPlace | None = ...,
+        time_ns: _builtins.int = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["intrinsics", b"intrinsics", "pose", b"pose", "quality", b"quality"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["intrinsics", b"intrinsics", "place", b"place", "pose", b"pose", "quality", b"quality"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["encoding", b"encoding", "field_id", b"field_id", "intrinsics", b"intrinsics", "max_age_ms", b"max_age_ms", "number", b"number", "pose", b"pose", "quality", b"quality", "tile", b"tile"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["encoding", b"encoding", "field_id", b"field_id", "intrinsics", b"intrinsics", "max_age_ms", b"max_age_ms", "number", b"number", "place", b"place", "pose", b"pose", "quality", b"quality", "tile", b"tile", "time_ns", b"time_ns"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -284,7 +326,7 @@ class RenderResponse(_message.Message):
     skipped: _builtins.int
     """Requests before this one that got no answer of their own, so far; of a stream."""
     time_ns: _builtins.int
-    """When the view was composed, by the server's clock."""
+    """The moment it shows, by the server's clock: what was asked for, or when it was composed."""
     field_id: _builtins.str
     """Lower-case hexadecimal sha256 of the field that was drawn."""
     encoding: Global___PictureEncoding.ValueType
@@ -399,18 +441,22 @@ class ObjectsRequest(_message.Message):
 
     TILE_FIELD_NUMBER: _builtins.int
     FIELD_ID_FIELD_NUMBER: _builtins.int
+    PLACE_FIELD_NUMBER: _builtins.int
     tile: _builtins.str
-    """As in RenderRequest: one of the two."""
+    """As in RenderRequest: one of the three."""
     field_id: _builtins.str
+    @_builtins.property
+    def place(self) -> Global___WorldPlace: ...
     def __init__(
         self,
         *,
         tile: _builtins.str = ...,
         field_id: _builtins.str = ...,
+        place: Global___WorldPlace | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["place", b"place"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["field_id", b"field_id", "tile", b"tile"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["field_id", b"field_id", "place", b"place", "tile", b"tile"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -469,7 +515,9 @@ class StreetObject(_message.Message):
     object_id: _builtins.int
     """Within the stream."""
     x_m: _builtins.float
-    """Where it stands, relative to the tile's origin: the side that the cameras see, at its foot."""
+    """Where it stands, relative to the tile's origin, or to the request's place: the side that the
+    cameras see, at its foot.
+    """
     y_m: _builtins.float
     z_m: _builtins.float
     velocity_x_mps: _builtins.float
