@@ -42,7 +42,7 @@ from mec_server.stream_decoders import ServerContext
 from mec_server.tile_learning import LearningJob
 from mec_server.twin.metrics import TwinMetrics
 from mec_server.twin.notices import StreetNotices
-from mec_server.twin.rendering import TwinViews
+from mec_server.twin.rendering import Classify, TwinViews
 from mec_server.twin.service import Sight, TwinService
 from mec_server.twin.state import Twin
 from rfcore.errors import RfedgeError
@@ -102,10 +102,17 @@ SERVICES = ("", *(f"rfcore.wire.v1.{name}Service" for name in ("Edge", "Field", 
 class EdgeServer:
     """Serves the fields of ``config.fields``; ``start``, then ``stop``.
 
-    ``open_decoders`` makes the decoders of a Hello; a load test replaces it.
+    ``open_decoders`` makes the decoders of a Hello; a load test replaces it. ``classify`` names
+    what cameras see and the field does not have (``StreetObject.label``): for programs that embed
+    the server and have a detector.
     """
 
-    def __init__(self, config: ServerConfig, open_decoders: OpenCameras = open_cameras) -> None:
+    def __init__(
+        self,
+        config: ServerConfig,
+        open_decoders: OpenCameras = open_cameras,
+        classify: Classify | None = None,
+    ) -> None:
         self.registry = CollectorRegistry()
         self.address = Address.parse("listen", config.listen)
         self._tls = config.transport.tls()
@@ -150,7 +157,7 @@ class EdgeServer:
         self._edge = EdgeService(self._context(twin, open_decoders))
         consumer_failed = self._failed(BackgroundTask.CONSUMER)
         ledger, limited = self._entry.ledger, self._metrics.count_limited
-        self._views = self._twin_views(twin)
+        self._views = self._twin_views(twin, classify)
         twin_metrics = self._nats_metrics = self._twin_metrics(twin)
         self._notices = StreetNotices(
             twin,
@@ -231,7 +238,7 @@ class EdgeServer:
         self._metrics.observe_ledger(entry, self._log_limiter)
         return entry
 
-    def _twin_views(self, twin: Twin) -> TwinViews:
+    def _twin_views(self, twin: Twin, classify: Classify | None) -> TwinViews:
         """Return what composes views: with one thread, and fields that nobody else renders."""
         render = replace(self._config.render, threads=1)
         load = field_loader(self._index, render, opened=lambda _: None)
@@ -241,6 +248,7 @@ class EdgeServer:
             lambda: self._published.tiles,
             self._entry.ledger,
             self._failed(BackgroundTask.OUTCOME),
+            classify,
         )
 
     def _twin_metrics(self, twin: Twin) -> TwinMetrics:

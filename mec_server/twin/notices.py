@@ -257,6 +257,7 @@ def _object_ahead(
         age_s=max(0.0, now - each.first_s),
         unseen_s=max(0.0, now - each.last_s),
         vehicles=vehicles,
+        label=each.label,
     )
 
 
@@ -340,7 +341,7 @@ class StreetNotices:
         except LimitExceeded:
             return
         tracker = self._trackers.setdefault(place.field_ids, ObjectTracker())
-        tracker.take(glance.detections, seen.key, seen.captured_s, glance.lacks)
+        tracker.take(glance.detections, seen.key, seen.captured_s, glance.lacks, glance.labels)
         now = time.monotonic()
         objects = [
             each

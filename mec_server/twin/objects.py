@@ -93,7 +93,8 @@ class _Seen:
 @dataclass
 class FollowedObject:
     """A thing over time. ``seen``: instants that showed it; ``cameras``: when each saw it last;
-    ``marked_px``: of how many marked pixels it is in all of them."""
+    ``marked_px``: of how many marked pixels it is in all of them; ``labels``: how often a detector
+    called it what."""
 
     object_id: int
     at_m: Vec3
@@ -105,6 +106,7 @@ class FollowedObject:
     seen: int = 0
     cameras: dict[CameraKey, float] = field(default_factory=dict)
     marked_px: int = 0
+    labels: Counter[str] = field(default_factory=Counter)
     _sightings: list[_Seen] = field(default_factory=list, init=False)
     _looks: deque[_Look] = field(default_factory=lambda: deque(maxlen=LOOKS), init=False)
 
@@ -131,6 +133,11 @@ class FollowedObject:
         agreed = 1.0 - missed / max(1, len(self._looks))
         return fresh * agreed * min(1.0, self.seen / SURE_BY)
 
+    @property
+    def label(self) -> str:
+        """What it was called most often, empty where nobody said."""
+        return max(sorted(self.labels), key=lambda label: self.labels[label], default="")
+
     def seen_by(self, now: float) -> list[CameraKey]:
         """Return the cameras that saw it lately, sorted."""
         return sorted(key for key, at_s in self.cameras.items() if now - at_s <= SEEN_BY_S)
@@ -156,6 +163,7 @@ class FollowedObject:
             unseen_s=max(0.0, now - self.last_s),
             seen_by=tuple(self.seen_by(now)),
             is_doubtful=self.is_doubtful,
+            label=self.label,
         )
 
     def take(self, detection: Detection, camera: CameraKey, time_s: float) -> None:
@@ -236,9 +244,10 @@ class ObjectTracker:
         camera: CameraKey,
         time_s: float,
         lacks: Lacks = lambda _at_m, _width_m, _height_m: False,
+        labels: Sequence[str] = (),
     ) -> None:
-        """Take in what one picture of ``camera``, captured at ``time_s``, shows, and of which
-        things it says that they are not there (``lacks``)."""
+        """Take in what one picture of ``camera``, captured at ``time_s``, shows, of which things it
+        says that they are not there (``lacks``), and what a detector calls each that it shows."""
         self._objects = [each for each in self._objects if time_s - each.last_s <= FORGOTTEN_S]
         pairs = sorted(
             (distance_m, each.object_id, index)
@@ -251,13 +260,16 @@ class ObjectTracker:
         free = set(range(len(detections)))
         for _, object_id, index in pairs:
             if object_id in by_id and index in free:
-                by_id.pop(object_id).take(detections[index], camera, time_s)
+                each = by_id.pop(object_id)
+                each.take(detections[index], camera, time_s)
+                each.labels.update(filter(None, labels[index : index + 1]))
                 free.discard(index)
         for each in by_id.values():
             if lacks(each.at(time_s), each.width_m, each.height_m):
                 each.miss(camera, time_s)
         for index in sorted(free):
-            self._begin(detections[index], camera, time_s)
+            begun = self._begin(detections[index], camera, time_s)
+            begun.labels.update(filter(None, labels[index : index + 1]))
 
     def confirmed(self, now: float) -> list[FollowedObject]:
         """Return the confirmed objects that are not forgotten, sorted by id."""
@@ -265,7 +277,7 @@ class ObjectTracker:
             each for each in self._objects if each.is_confirmed and now - each.last_s <= FORGOTTEN_S
         ]
 
-    def _begin(self, detection: Detection, camera: CameraKey, time_s: float) -> None:
+    def _begin(self, detection: Detection, camera: CameraKey, time_s: float) -> FollowedObject:
         begun = FollowedObject(
             self._next_id,
             detection.at_m,
@@ -278,6 +290,7 @@ class ObjectTracker:
         begun.take(detection, camera, time_s)
         self._objects.append(begun)
         self._next_id += 1
+        return begun
 
 
 class ToldObjects:

@@ -41,7 +41,7 @@ from rfcore.field.quality import FULL
 from rfcore.image import Rgb, jpeg_bytes, png_bytes
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import View
-from rfcore.wire.checks import shown
+from rfcore.wire.checks import check_label, shown
 from rfcore.wire.tiles import Tile
 from rfcore.wire.twin import PictureEncoding
 from rfcore.wire.twin_render import (
@@ -52,9 +52,13 @@ from rfcore.wire.twin_render import (
     ViewRequest,
 )
 
-__all__ = ["Glance", "Place", "TwinViews", "check_inside", "place_of"]
+__all__ = ["Classify", "Glance", "Place", "TwinViews", "check_inside", "place_of"]
 
 R = TypeVar("R")
+
+Classify = Callable[[Rgb], str]
+"""A detector: returns what the thing in a cut-out of a picture, uint8 [H, W, 3], is called: a name
+of at most 64 letters, digits, '.', '_' or '-', or nothing."""
 
 MOST_KEPT = 16
 """Live pictures whose difference from the field is kept for the next view."""
@@ -119,11 +123,13 @@ def _area_of(tile: Tile) -> str:
 @dataclass(frozen=True, eq=False)
 class Glance:
     """What a picture says of things that the field does not have: those it shows, and of which it
-    says that they are not there. ``origin_m``: of the field, relative to the place's ``world``."""
+    says that they are not there. ``origin_m``: of the field, relative to the place's ``world``;
+    ``labels``: what a detector calls each of them, none without one."""
 
     detections: list[Detection]
     lacks: Lacks = lambda _at_m, _width_m, _height_m: False
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    labels: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +145,8 @@ class TwinViews:
     """Composes views of ``twin``.
 
     ``open_field`` opens a field that only these views use; ``tiles`` are those published now.
-    ``failed`` is called with what a callback of the thread raised.
+    ``failed`` is called with what a callback of the thread raised. ``classify`` names the things of
+    pictures, on the thread.
     """
 
     def __init__(
@@ -149,8 +156,10 @@ class TwinViews:
         tiles: Callable[[], tuple[Tile, ...]],
         ledger: Ledger,
         failed: Callable[[Exception], None],
+        classify: Classify | None = None,
     ) -> None:
         self._twin = twin
+        self._classify = classify
         self._open_field = open_field
         self._tiles = tiles
         self._ledger = ledger
@@ -290,7 +299,8 @@ class TwinViews:
     def _detected(self, seen: TwinView, place: Place) -> Glance:
         field = self._open_field(place.field_id)
         looked = self._looked_at(seen, field)
-        return Glance(looked.detections, looked.live.lacks, _origin_m(place, field))
+        labels = () if self._classify is None else _labels(self._classify, looked)
+        return Glance(looked.detections, looked.live.lacks, _origin_m(place, field), labels)
 
     def _ground(self, field: RadianceField) -> FieldGround:
         """Return the ground of ``field``; what of it was drawn is kept."""
@@ -317,6 +327,18 @@ class TwinViews:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return kept
+
+
+def _labels(classify: Classify, looked: _LookedAt) -> tuple[str, ...]:
+    """Return what ``classify`` calls each thing of a picture, by the box of its outline."""
+    rgb, _ = shrunk(looked.seen.picture, looked.seen.intrinsics)
+    labels = []
+    for thing in looked.live.things:
+        patch = thing.patch
+        height, width = patch.samples.shape[:2]
+        box = rgb[patch.top : patch.top + height, patch.left : patch.left + width]
+        labels.append(check_label("label", classify(np.ascontiguousarray(box))))
+    return tuple(labels)
 
 
 def _ago_s(request: ViewRequest, now_ns: int, reach_s: float) -> float:

@@ -348,7 +348,8 @@ class _ObjectsConsumer(_Mailed):
                 mailbox.skipped[entry.key] += 1
                 return
             self._origin_m, seen_s = glance.origin_m, entry.captured_s
-            self._told.tracker.take(glance.detections, entry.key, seen_s, glance.lacks)
+            taken = (glance.detections, entry.key, seen_s, glance.lacks, glance.labels)
+            self._told.tracker.take(*taken)
         await self._tell()
 
     async def _tell(self) -> None:

@@ -67,6 +67,11 @@ def check_name(field: str, name: str) -> str:
     return name
 
 
+def check_label(field: str, label: str) -> str:
+    """Return what an object is called: a name, or nothing."""
+    return check_name(field, label) if label else ""
+
+
 def check_field_id(field: str, field_id: str) -> str:
     """Return a field id."""
     if not FIELD_ID.fullmatch(field_id):

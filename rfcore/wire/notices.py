@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from rfcore.errors import InvalidInput, ProtocolError
-from rfcore.wire.checks import check_field_id, check_name, check_range
+from rfcore.wire.checks import check_field_id, check_label, check_name, check_range
 from rfcore.wire.v1 import edge_pb2 as pb
 
 __all__ = [
@@ -37,7 +37,8 @@ class ObjectAhead:
 
     ``at_m``: its foot, ``velocity_mps``: both in the axes of the tile of field ``field_id``.
     ``confidence``: 0 to 1. ``age_s``: since it was first seen; ``unseen_s``: since the capture of
-    the picture that showed it last. ``vehicles``: of how many vehicles cameras see it.
+    the picture that showed it last. ``vehicles``: of how many vehicles cameras see it. ``label``:
+    what it is, empty where the server has no detector that says.
     """
 
     field_id: str
@@ -50,6 +51,7 @@ class ObjectAhead:
     age_s: float
     unseen_s: float
     vehicles: int
+    label: str = ""
 
 
 class FieldChangeKind(StrEnum):
@@ -163,6 +165,7 @@ def _object_to_wire(ahead: ObjectAhead) -> pb.ObjectAhead:
         age_ms=_milliseconds(ahead.age_s),
         unseen_ms=_milliseconds(ahead.unseen_s),
         vehicles=ahead.vehicles,
+        label=ahead.label,
     )
 
 
@@ -184,6 +187,7 @@ def _object_from_wire(message: pb.ObjectAhead) -> ObjectAhead:
         message.age_ms / 1e3,
         message.unseen_ms / 1e3,
         message.vehicles,
+        check_label("label", message.label),
     )
 
 

@@ -17,7 +17,13 @@ from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.field.quality import FULL, Quality
 from rfcore.image import I420, Rgb, rgb_from_bytes
 from rfcore.native.yuv import rgb_from_i420
-from rfcore.wire.checks import check_bytes, check_field_id, check_name, check_range
+from rfcore.wire.checks import (
+    check_bytes,
+    check_field_id,
+    check_label,
+    check_name,
+    check_range,
+)
 from rfcore.wire.convert import quality_of, quality_to_wire
 from rfcore.wire.twin import (
     PictureEncoding,
@@ -159,7 +165,8 @@ class ObjectsRequest:
 class StreetObject:
     """A thing that the field does not have: see twin.proto. ``at_m`` is the foot of the side that
     is seen, relative to the tile's origin; ``seen_by``: (vehicle id, camera id). ``is_doubtful``:
-    only pictures show it that disagree with the field in many places, as with a wrong pose."""
+    only vehicles show it whose pictures fit the field badly, as with a wrong pose. ``label``: what
+    it is, empty where no detector says."""
 
     object_id: int
     at_m: Vec3
@@ -171,6 +178,7 @@ class StreetObject:
     unseen_s: float
     seen_by: tuple[tuple[str, str], ...]
     is_doubtful: bool = False
+    label: str = ""
 
 
 @dataclass(frozen=True)
@@ -335,6 +343,7 @@ def _object_to_wire(each: StreetObject) -> pb.StreetObject:
         unseen_ms=round(1e3 * each.unseen_s),
         seen_by=[pb.Sighting(vehicle_id=v, camera_id=c) for v, c in each.seen_by],
         doubtful=each.is_doubtful,
+        label=each.label,
     )
 
 
@@ -360,6 +369,7 @@ def _object_from_wire(each: pb.StreetObject) -> StreetObject:
             for s in each.seen_by
         ),
         each.doubtful,
+        check_label("object.label", each.label),
     )
 
 

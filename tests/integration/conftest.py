@@ -184,11 +184,15 @@ def serve(street: Street) -> Callable[..., Any]:
     """Return a context manager that runs a server in this process."""
 
     @asynccontextmanager
-    async def run(opened: OpenCameras = open_cameras, **changes: Any) -> AsyncIterator[EdgeServer]:
+    async def run(
+        opened: OpenCameras = open_cameras,
+        classify: Callable[[Any], str] | None = None,
+        **changes: Any,
+    ) -> AsyncIterator[EdgeServer]:
         if "record" in changes:
             changes["record"] = RecordSettings(changes["record"])
         config = replace(ServerConfig(street.store, "127.0.0.1:0"), **secured(changes))
-        server = EdgeServer(config, opened)
+        server = EdgeServer(config, opened, classify)
         await server.start()
         try:
             yield server

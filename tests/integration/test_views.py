@@ -368,7 +368,12 @@ async def test_objects_are_what_the_vehicle_sees_and_the_field_does_not_have(
     for name in ("LEAST_PX", "LEAST_COLUMNS", "LEAST_WIDTH_M", "LEAST_MARKED_M"):
         monkeypatch.setattr(contacts, name, 0)  # of a picture of 76x52
     monkeypatch.setattr(contacts, "MOST_SLOPE", 1.0)  # the field is a cloud, without ground
-    async with serve() as server, stub_of(server) as stub:
+
+    def classify(crop: np.ndarray) -> str:
+        red, green, blue = crop.reshape(-1, 3).mean(axis=0)
+        return "red-box" if red > 1.5 * max(green, blue) else ""
+
+    async with serve(classify=classify) as server, stub_of(server) as stub:
         call = stub.Objects(objects_request_to_wire(ObjectsRequest(field_id=street.field_id)))
         await call.initial_metadata()
         async with raw_vehicle(server.address) as vehicle:
@@ -387,6 +392,7 @@ async def test_objects_are_what_the_vehicle_sees_and_the_field_does_not_have(
     thing = told[3].objects[0]
     assert thing.seen_by == (("cav-raw", "front"),)
     assert 0 < thing.confidence <= 1
+    assert "red-box" in {each.label for each in told[3].objects}, "as the detector calls it"
     assert thing.unseen_s > 0, "it is told of as of now, not as of the picture's capture"
     assert 2 < thing.at_m[2] < 9, "on the surface behind the box: the field is a cloud at 2 to 8 m"
 

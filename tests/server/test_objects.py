@@ -318,3 +318,12 @@ def test_objects_are_told_of_as_of_now_and_again_until_none_is_left() -> None:
         counts.append(len(told.now(now)))
         now = told.again_s
     assert counts == [1, 0], f"forgotten {FORGOTTEN_S} s after its last picture"
+
+
+def test_a_thing_is_called_what_a_detector_calls_it_most_often() -> None:
+    tracker = ObjectTracker()
+    names = ["", "van", "car", "car", ""]
+    for step, name in enumerate(names):
+        tracker.take([at(-4.0), at(4.0)], FRONT, 0.1 * step, labels=["", name])
+    unknown, car_ = tracker.confirmed(0.4)
+    assert (unknown.told(0.4).label, car_.told(0.4).label) == ("", "car")

@@ -34,6 +34,7 @@ objects = st.builds(
     milliseconds,
     milliseconds,
     st.integers(0, 1000),
+    st.sampled_from(["", "car"]),
 )
 changes = st.builds(
     FieldChange,
@@ -54,7 +55,9 @@ def test_a_notice_survives_the_wire(notice: StreetNotice) -> None:
 
 
 def sent(**changes: Any) -> bytes:
-    ahead = ObjectAhead(FIELD, (1.0, 2.0, 0.0), (0.0, 0.0, 0.0), 1.8, 1.4, 20.0, 1.0, 2.0, 0.1, 1)
+    ahead = ObjectAhead(
+        FIELD, (1.0, 2.0, 0.0), (0.0, 0.0, 0.0), 1.8, 1.4, 20.0, 1.0, 2.0, 0.1, 1, "car"
+    )
     message = notice_to_wire(StreetNotice(1, 1.0, ahead))
     for name, value in changes.items():
         setattr(message.object, name, value)
@@ -70,6 +73,7 @@ def sent(**changes: Any) -> bytes:
         ({"distance_m": 1e10}, "1000000000"),
         ({"confidence": 1.5}, "confidence"),
         ({"field_id": "../x"}, "field_id"),
+        ({"label": "a car\n"}, "label"),
     ],
 )
 def test_an_impossible_object_is_refused(change: dict[str, Any], problem: str) -> None:

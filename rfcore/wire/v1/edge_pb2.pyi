@@ -861,6 +861,7 @@ class ObjectAhead(_message.Message):
     AGE_MS_FIELD_NUMBER: _builtins.int
     UNSEEN_MS_FIELD_NUMBER: _builtins.int
     VEHICLES_FIELD_NUMBER: _builtins.int
+    LABEL_FIELD_NUMBER: _builtins.int
     field_id: _builtins.str
     """The field whose tile's origin the position is relative to: its sha256 in hexadecimal."""
     x_m: _builtins.float
@@ -881,6 +882,8 @@ class ObjectAhead(_message.Message):
     unseen_ms: _builtins.int
     vehicles: _builtins.int
     """Of how many vehicles cameras saw it within the last second."""
+    label: _builtins.str
+    """As in twin.proto's StreetObject."""
     def __init__(
         self,
         *,
@@ -898,10 +901,11 @@ class ObjectAhead(_message.Message):
         age_ms: _builtins.int = ...,
         unseen_ms: _builtins.int = ...,
         vehicles: _builtins.int = ...,
+        label: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ms", b"age_ms", "confidence", b"confidence", "distance_m", b"distance_m", "field_id", b"field_id", "height_m", b"height_m", "unseen_ms", b"unseen_ms", "vehicles", b"vehicles", "velocity_x_mps", b"velocity_x_mps", "velocity_y_mps", b"velocity_y_mps", "velocity_z_mps", b"velocity_z_mps", "width_m", b"width_m", "x_m", b"x_m", "y_m", b"y_m", "z_m", b"z_m"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ms", b"age_ms", "confidence", b"confidence", "distance_m", b"distance_m", "field_id", b"field_id", "height_m", b"height_m", "label", b"label", "unseen_ms", b"unseen_ms", "vehicles", b"vehicles", "velocity_x_mps", b"velocity_x_mps", "velocity_y_mps", b"velocity_y_mps", "velocity_z_mps", b"velocity_z_mps", "width_m", b"width_m", "x_m", b"x_m", "y_m", b"y_m", "z_m", b"z_m"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

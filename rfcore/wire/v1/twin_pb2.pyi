@@ -512,6 +512,7 @@ class StreetObject(_message.Message):
     UNSEEN_MS_FIELD_NUMBER: _builtins.int
     SEEN_BY_FIELD_NUMBER: _builtins.int
     DOUBTFUL_FIELD_NUMBER: _builtins.int
+    LABEL_FIELD_NUMBER: _builtins.int
     object_id: _builtins.int
     """Within the stream."""
     x_m: _builtins.float
@@ -535,6 +536,8 @@ class StreetObject(_message.Message):
     unseen_ms: _builtins.int
     doubtful: _builtins.bool
     """Whether only vehicles show it whose pictures fit the field badly, as with a wrong pose."""
+    label: _builtins.str
+    """What it is, where the server was given a detector that says so; else empty."""
     @_builtins.property
     def seen_by(self) -> _containers.RepeatedCompositeFieldContainer[Global___Sighting]:
         """Those that saw it within the last second."""
@@ -556,10 +559,11 @@ class StreetObject(_message.Message):
         unseen_ms: _builtins.int = ...,
         seen_by: _abc.Iterable[Global___Sighting] | None = ...,
         doubtful: _builtins.bool = ...,
+        label: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ms", b"age_ms", "confidence", b"confidence", "doubtful", b"doubtful", "height_m", b"height_m", "object_id", b"object_id", "seen_by", b"seen_by", "unseen_ms", b"unseen_ms", "velocity_x_mps", b"velocity_x_mps", "velocity_y_mps", b"velocity_y_mps", "velocity_z_mps", b"velocity_z_mps", "width_m", b"width_m", "x_m", b"x_m", "y_m", b"y_m", "z_m", b"z_m"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["age_ms", b"age_ms", "confidence", b"confidence", "doubtful", b"doubtful", "height_m", b"height_m", "label", b"label", "object_id", b"object_id", "seen_by", b"seen_by", "unseen_ms", b"unseen_ms", "velocity_x_mps", b"velocity_x_mps", "velocity_y_mps", b"velocity_y_mps", "velocity_z_mps", b"velocity_z_mps", "width_m", b"width_m", "x_m", b"x_m", "y_m", b"y_m", "z_m", b"z_m"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
