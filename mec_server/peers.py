@@ -134,7 +134,9 @@ async def _unknown_method(requests: AsyncIterator[bytes], context: Context) -> N
     await context.abort(grpc.StatusCode.UNIMPLEMENTED, "this server has no such method")
 
 
-UNKNOWN_METHOD: grpc.RpcMethodHandler[bytes, bytes] = grpc.stream_stream_rpc_method_handler(_unknown_method)
+UNKNOWN_METHOD: grpc.RpcMethodHandler[bytes, bytes] = grpc.stream_stream_rpc_method_handler(
+    _unknown_method
+)
 
 
 class ChargeRpcs(grpc.aio.ServerInterceptor):
