@@ -17,7 +17,8 @@ from rfcore.codec.state import DecoderState
 from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.field import Renderer
 from rfcore.image import I420
-from rfcore.views import FieldView
+from rfcore.native.yuv import field_view_from_view
+from rfcore.views import FieldView, View
 from rfcore.wire.messages import CameraDescription, StageTimes
 
 __all__ = [
@@ -50,10 +51,15 @@ class Tools:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A frame, identical to the one in the vehicle's closed loop, and its ``outcome``."""
+    """A frame, identical to the one in the vehicle's closed loop, and its ``outcome``.
+
+    ``render``: what the field shows there, at the frame's quality; ``None`` where nothing was
+    rendered, as for a camera that is lost.
+    """
 
     picture: I420
     outcome: DecodeOutcome
+    render: View | None = None
 
 
 class Decoder(Protocol):
@@ -98,7 +104,8 @@ class CameraDecoder:
 
     def _reconstruct(self, job: DecodeJob) -> Reconstruction:
         started_ns = self._clock_ns()
-        view = self._render(job)
+        render = self._render(job)
+        view = self._field_view(job, render)
         rendered_ns = self._clock_ns()
         packet = job.frame.packet
         state = self._state
@@ -113,11 +120,25 @@ class CameraDecoder:
         )
         digest = decoded.state.kept[0].digest
         outcome = DecodeOutcome(digest, times, decoded.exact)
-        return Reconstruction(decoded.frame, outcome)
+        return Reconstruction(decoded.frame, outcome, render)
 
-    def _render(self, job: DecodeJob) -> FieldView:
+    def _render(self, job: DecodeJob) -> View | None:
+        """Return what the field shows at the frame's pose, ``None`` if the camera is lost."""
+        camera = job.frame.camera(self._camera.intrinsics)
+        if camera is None:
+            return None
         try:
-            return job.frame.view(self._renderers[job.field_id], self._camera.intrinsics)
+            return self._renderers[job.field_id].render(camera, job.frame.quality)
+        except InvalidInput as error:
+            raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
+
+    def _field_view(self, job: DecodeJob, render: View | None) -> FieldView:
+        """Return the render as the codec holds it; nothing if the camera is lost."""
+        camera = job.frame.camera(self._camera.intrinsics)
+        if render is None or camera is None:
+            return FieldView.nothing(self._camera.intrinsics)
+        try:
+            return field_view_from_view(render, camera)
         except InvalidInput as error:
             raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
 

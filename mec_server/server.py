@@ -239,12 +239,12 @@ class EdgeServer:
         return entry
 
     def _twin_views(self, twin: Twin, classify: Classify | None) -> TwinViews:
-        """Return what composes views: with one thread, and fields that nobody else renders."""
+        """Return what composes views: each render by one thread, of fields nobody else renders."""
         render = replace(self._config.render, threads=1)
         load = field_loader(self._index, render, opened=lambda _: None)
         return TwinViews(
             twin,
-            FieldShelf(self._index, load, MAX_VIEWED_FIELDS).open,
+            lambda: FieldShelf(self._index, load, MAX_VIEWED_FIELDS).open,
             lambda: self._published.tiles,
             self._entry.ledger,
             self._failed(BackgroundTask.OUTCOME),

@@ -405,20 +405,19 @@ class Stream:
         hello, session = self._session.hello, self._session
         if hello is None or session.closed is not None:
             return
-        self._server.twin.show(
-            TwinView(
-                vehicle_id=hello.vehicle_id,
-                session_id=session.session_id,
-                frame=job.frame,
-                intrinsics=self._intrinsics[job.frame.camera_id],
-                field_id=job.field_id,
-                picture=reconstruction.picture,
-                digest=reconstruction.outcome.reconstruction_digest,
-                reconstructed_s=now,
-                latency_s=latency_s,
-                opened_time_ns=self._opened_time_ns,
-            )
+        shown = TwinView(
+            vehicle_id=hello.vehicle_id,
+            session_id=session.session_id,
+            frame=job.frame,
+            intrinsics=self._intrinsics[job.frame.camera_id],
+            field_id=job.field_id,
+            picture=reconstruction.picture,
+            digest=reconstruction.outcome.reconstruction_digest,
+            reconstructed_s=now,
+            latency_s=latency_s,
+            opened_time_ns=self._opened_time_ns,
         )
+        self._server.twin.show(shown, reconstruction.render)
 
 
 def _agent_process(context: Context) -> str:

@@ -12,9 +12,10 @@ pictures: one whose pictures have no pose is told nothing of objects. Ahead is w
 the last ``LEAST_WAY_M`` of its way; for one that stands, where its camera ``front`` looks, or else
 the first camera of its Hello.
 
-Pictures are looked at only while a vehicle takes notices, by the thread that composes views: at the
-lowest priority, newest picture first, and charged like a consumer to ``NOTICES_IDENTITY``, so that
-the time it may take is bounded; what it cannot look at is missed, and delays nothing.
+Pictures are looked at only while a vehicle takes notices, by the thread that finds things
+(``mec_server.twin.rendering``): it gives way to decoding, waits for no view, takes the newest
+picture first, and is charged like a consumer to ``NOTICES_IDENTITY``, so that the time it may take
+is bounded; what it cannot look at is missed, and delays nothing.
 """
 
 from __future__ import annotations

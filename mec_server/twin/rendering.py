@@ -1,9 +1,14 @@
 """Views of the twin for consumers: which pictures may enter them, where they are computed, and what
 that is charged.
 
-Views are computed on one thread of the lowest priority, with fields of its own: neither event loop
-nor the workers that decode, nor the renderers these share, wait for it. Identities take turns, and
+Views are composed on one thread of the lowest priority, and the things in pictures are found, for
+notices and for whoever asks for objects, on another that gives way to decoding alone: what a
+vehicle is to be told does not wait for views. Each has fields of its own: neither event loop nor
+the workers that decode, nor the renderers these share, wait for them. Identities take turns, and
 pay with worker time, the same as vehicles.
+
+What a picture changes in a field is found once, by whichever thread comes first. The field's view
+of its pose is the decoder's own render, where that is still there and of the same field and size.
 """
 
 from __future__ import annotations
@@ -14,11 +19,12 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from threading import Lock
 from typing import TypeVar
 
 import numpy as np
 
-from mec_server.event_loop import LOWEST_NICE, Workers
+from mec_server.event_loop import BACKGROUND_NICE, LOWEST_NICE, Workers
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Ledger
 from mec_server.twin.composition import (
@@ -55,6 +61,7 @@ from rfcore.wire.twin_render import (
 __all__ = ["Classify", "Glance", "Place", "TwinViews", "check_inside", "place_of"]
 
 R = TypeVar("R")
+OpenField = Callable[[str], RadianceField]
 
 Classify = Callable[[Rgb], str]
 """A detector: returns what the thing in a cut-out of a picture, uint8 [H, W, 3], is called: a name
@@ -141,18 +148,60 @@ class _LookedAt:
     detections: list[Detection]
 
 
-class TwinViews:
-    """Composes views of ``twin``.
+class _FieldThread:
+    """One thread, and the fields that it alone renders, which ``open_field`` opens."""
 
-    ``open_field`` opens a field that only these views use; ``tiles`` are those published now.
-    ``failed`` is called with what a callback of the thread raised. ``classify`` names the things of
-    pictures, on the thread.
+    def __init__(self, worker: Workers, open_field: OpenField) -> None:
+        self.worker = worker
+        self.open_field = open_field
+        self._grounds: OrderedDict[str, FieldGround] = OrderedDict()
+
+    def ground(self, field: RadianceField) -> FieldGround:
+        """Return the ground of ``field``; what of it was drawn is kept."""
+        ground = self._grounds.pop(field.field_id, None) or FieldGround(field.render)
+        self._grounds[field.field_id] = ground
+        if len(self._grounds) > MOST_GROUNDS:
+            self._grounds.popitem(last=False)
+        return ground
+
+
+class _KeptLooks:
+    """What the newest pictures change in fields, for all threads."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[tuple[CameraKey, str], _LookedAt] = OrderedDict()
+        self._lock = Lock()
+
+    def of(self, seen: TwinView, field_id: str) -> _LookedAt | None:
+        """Return what was kept of ``seen``, None if nothing was."""
+        with self._lock:
+            kept = self._kept.get((seen.key, field_id))
+            if kept is None or kept.seen is not seen:
+                return None
+            self._kept.move_to_end((seen.key, field_id))
+        return kept
+
+    def keep(self, looked_at: _LookedAt, field_id: str) -> None:
+        """Keep what was found, in place of what its camera showed before."""
+        with self._lock:
+            self._kept[looked_at.seen.key, field_id] = looked_at
+            self._kept.move_to_end((looked_at.seen.key, field_id))
+            if len(self._kept) > MOST_KEPT:
+                self._kept.popitem(last=False)
+
+
+class TwinViews:
+    """Composes views of ``twin``, and finds the things in its pictures.
+
+    ``open_fields`` returns, for each thread, what opens fields that only this thread uses;
+    ``tiles`` are those published now. ``failed`` is called with what a callback of a thread raised.
+    ``classify`` names the things of pictures, on the thread that finds them.
     """
 
     def __init__(
         self,
         twin: Twin,
-        open_field: Callable[[str], RadianceField],
+        open_fields: Callable[[], OpenField],
         tiles: Callable[[], tuple[Tile, ...]],
         ledger: Ledger,
         failed: Callable[[Exception], None],
@@ -160,16 +209,18 @@ class TwinViews:
     ) -> None:
         self._twin = twin
         self._classify = classify
-        self._open_field = open_field
         self._tiles = tiles
         self._ledger = ledger
-        self._worker = Workers(1, failed, "views", nice=LOWEST_NICE)
-        self._kept: OrderedDict[tuple[CameraKey, str], _LookedAt] = OrderedDict()
-        self._grounds: OrderedDict[str, FieldGround] = OrderedDict()
+        views = Workers(1, failed, "views", nice=LOWEST_NICE)
+        looks = Workers(1, failed, "looks", nice=BACKGROUND_NICE)
+        self._composing = _FieldThread(views, open_fields())
+        self._looking = _FieldThread(looks, open_fields())
+        self._kept = _KeptLooks()
 
     def close(self) -> None:
-        """Stop the thread."""
-        self._worker.close()
+        """Stop the threads."""
+        self._composing.worker.close()
+        self._looking.worker.close()
 
     def spend_message(self, identity: str) -> None:
         """Charge a message of a stream; raise ``LimitExceeded``."""
@@ -202,7 +253,7 @@ class TwinViews:
             if seen.field_id in place.field_ids and covers(seen.vehicle_id, seen.field_id)
         ]
         work = partial(self._composed, request, place, pictures, now - ago_s)
-        return await self._on_thread(identity, work)
+        return await self._on_thread(self._composing, identity, work)
 
     async def glance(self, seen: TwinView, place: Place, identity: str) -> Glance:
         """Return what a picture shows that the field of ``place`` does not have; nothing for one
@@ -212,7 +263,8 @@ class TwinViews:
         """
         if seen.frame.pose is None:
             return Glance([])
-        return await self._on_thread(identity, partial(self._detected, seen, place))
+        compute = partial(self._detected, seen, place)
+        return await self._on_thread(self._looking, identity, compute)
 
     def place(
         self, request: ViewRequest | ObjectsRequest, may_draw: Callable[[str], bool]
@@ -223,11 +275,11 @@ class TwinViews:
             raise AccessDenied("this certificate may not see that tile; ask the operator")
         return place
 
-    async def _on_thread(self, identity: str, compute: Callable[[], R]) -> R:
+    async def _on_thread(self, thread: _FieldThread, identity: str, compute: Callable[[], R]) -> R:
         self._ledger.check(identity, Resource.WORKER_SECONDS, time.monotonic())
         answer: asyncio.Future[R] = asyncio.get_running_loop().create_future()
         work = partial(self._timed, compute, answer)
-        self._worker.submit(identity, work, partial(self._finish, identity, answer))
+        thread.worker.submit(identity, work, partial(self._finish, identity, answer))
         return await answer
 
     def _finish(
@@ -247,7 +299,7 @@ class TwinViews:
         else:
             answer.set_result(result)
 
-    # --- on the thread
+    # --- on the threads
 
     def _timed(
         self, compute: Callable[[], R], answer: asyncio.Future[R]
@@ -267,7 +319,7 @@ class TwinViews:
     ) -> RenderedView:
         """Return the view at ``moment_s`` (monotonic), or at the time of composing it if the
         request is for now."""
-        field = self._open_field(place.field_id)
+        field = self._composing.open_field(place.field_id)
         camera = _in_tile(request.camera, place, field)
         check_inside(camera, field)
         view = field.render(camera, request.quality)
@@ -278,7 +330,7 @@ class TwinViews:
         past = request.time_ns != 0
         ages_s = [moment_s - it.captured_s if past else it.age_s(now) for it in seen]
         pairs = zip(seen, ages_s, strict=True)
-        live = [(self._looked_at(each, field).live, age_s) for each, age_s in pairs]
+        live = [(self._looked_at(each, field, self._composing).live, age) for each, age in pairs]
         vehicles = [each.vehicle_id for each in seen]
         composed = compose(camera, view, live, request.max_age_s, vehicles)
         cameras = tuple(
@@ -297,36 +349,34 @@ class TwinViews:
         )
 
     def _detected(self, seen: TwinView, place: Place) -> Glance:
-        field = self._open_field(place.field_id)
-        looked = self._looked_at(seen, field)
+        field = self._looking.open_field(place.field_id)
+        looked = self._looked_at(seen, field, self._looking)
         labels = () if self._classify is None else _labels(self._classify, looked)
         return Glance(looked.detections, looked.live.lacks, _origin_m(place, field), labels)
 
-    def _ground(self, field: RadianceField) -> FieldGround:
-        """Return the ground of ``field``; what of it was drawn is kept."""
-        ground = self._grounds.pop(field.field_id, None) or FieldGround(field.render)
-        self._grounds[field.field_id] = ground
-        if len(self._grounds) > MOST_GROUNDS:
-            self._grounds.popitem(last=False)
-        return ground
-
-    def _looked_at(self, seen: TwinView, field: RadianceField) -> _LookedAt:
-        """Return what a picture changes in ``field``; found once for each picture."""
-        key = (seen.key, field.field_id)
-        kept = self._kept.get(key)
-        if kept is None or kept.seen is not seen:
-            assert seen.frame.pose is not None
-            rgb, intrinsics = shrunk(seen.picture, seen.intrinsics)
-            camera = Camera(intrinsics, seen.frame.pose)
-            live = live_picture(camera, rgb, field.render(camera, FULL))
-            found = find(live, self._ground(field))
-            live = with_things(live, [each.outline for each in found])
-            kept = _LookedAt(seen, live, [each.detection for each in found])
-            self._kept[key] = kept
-            if len(self._kept) > MOST_KEPT:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
+    def _looked_at(self, seen: TwinView, field: RadianceField, thread: _FieldThread) -> _LookedAt:
+        """Return what a picture changes in ``field``, which is one of ``thread``."""
+        kept = self._kept.of(seen, field.field_id)
+        if kept is None:
+            kept = self._look_at(seen, field, thread.ground(field))
+            self._kept.keep(kept, field.field_id)
         return kept
+
+    def _look_at(self, seen: TwinView, field: RadianceField, ground: FieldGround) -> _LookedAt:
+        assert seen.frame.pose is not None
+        rgb, intrinsics = shrunk(seen.picture, seen.intrinsics)
+        camera = Camera(intrinsics, seen.frame.pose)
+        live = live_picture(camera, rgb, self._field_view(seen, camera, field))
+        found = find(live, ground)
+        live = with_things(live, [each.outline for each in found])
+        return _LookedAt(seen, live, [each.detection for each in found])
+
+    def _field_view(self, seen: TwinView, camera: Camera, field: RadianceField) -> View:
+        """Return what ``field`` shows at the ``camera`` of a picture: the decoder's render if that
+        is of this field and size."""
+        render = self._twin.renders.of(seen)
+        same = seen.field_id == field.field_id and camera.intrinsics == seen.intrinsics
+        return field.render(camera, FULL) if render is None or not same else render
 
 
 def _labels(classify: Classify, looked: _LookedAt) -> tuple[str, ...]:

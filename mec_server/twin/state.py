@@ -12,17 +12,31 @@ import math
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from threading import Lock
 
 from rfcore.camera import Intrinsics
+from rfcore.field.quality import FULL
 from rfcore.image import I420
+from rfcore.views import View
 from rfcore.wire.messages import Frame
 from rfcore.wire.twin import Departure, Subscription
 from rfcore.wire.twin_render import DEFAULT_AGE_S, MAX_AGE_S
 
-__all__ = ["PAST_S", "CameraKey", "Covers", "Mailbox", "PastViews", "Twin", "TwinView"]
+__all__ = [
+    "PAST_S",
+    "CameraKey",
+    "Covers",
+    "KeptRenders",
+    "Mailbox",
+    "PastViews",
+    "Twin",
+    "TwinView",
+]
 
 MAX_DEPARTED = 32
 """Last pictures kept of cameras that left."""
+RENDERS_BYTES = 96 * 2**20
+"""Of renders that are kept: those of 21 cameras of 640x360."""
 
 PAST_S = 5.0
 """How long ago a moment may be of which the pictures are still there."""
@@ -181,18 +195,66 @@ class PastViews:
         return oldest.captured_s + KEPT_EVERY_S
 
 
+class KeptRenders:
+    """What decoders rendered of fields for the newest pictures, at full quality, so that whoever
+    looks at a picture does not render its pose again. Those that were kept longest make room.
+
+    May be used by several threads.
+    """
+
+    def __init__(self, most_bytes: int = RENDERS_BYTES) -> None:
+        self._most_bytes = most_bytes
+        self._bytes = 0
+        self._kept: OrderedDict[CameraKey, tuple[TwinView, View]] = OrderedDict()
+        self._lock = Lock()
+
+    def keep(self, picture: TwinView, render: View) -> None:
+        """Keep ``render``, of the field and pose of ``picture``, in place of its camera's last."""
+        with self._lock:
+            self._drop(picture.key)
+            if picture.frame.quality == FULL:
+                self._kept[picture.key] = picture, render
+                self._bytes += _bytes_of(render)
+            while self._bytes > self._most_bytes:
+                self._drop(next(iter(self._kept)))
+
+    def of(self, picture: TwinView) -> View | None:
+        """Return the render of ``picture``, None if it is not kept."""
+        with self._lock:
+            kept = self._kept.get(picture.key)
+        return kept[1] if kept is not None and kept[0] is picture else None
+
+    def drop(self, key: CameraKey) -> None:
+        """Forget that of a camera."""
+        with self._lock:
+            self._drop(key)
+
+    def _drop(self, key: CameraKey) -> None:
+        kept = self._kept.pop(key, None)
+        if kept is not None:
+            self._bytes -= _bytes_of(kept[1])
+
+
+def _bytes_of(render: View) -> int:
+    return render.colour.nbytes + render.depth.nbytes + render.opacity.nbytes
+
+
 class Twin:
     """The newest picture of every camera of every vehicle, and some before it."""
 
     def __init__(self) -> None:
         self._past = PastViews()
+        self.renders = KeptRenders()
         self._views: dict[CameraKey, TwinView] = {}
         self._departed: OrderedDict[CameraKey, TwinView] = OrderedDict()
         self._mailboxes: list[Mailbox] = []
         self.missed = 0
 
-    def show(self, view: TwinView) -> None:
-        """Take in a picture, unless another stream of its vehicle has sent a newer one."""
+    def show(self, view: TwinView, render: View | None = None) -> None:
+        """Take in a picture, unless another stream of its vehicle has sent a newer one.
+
+        ``render``: what its field shows there, None where that is not known.
+        """
         newest = self._views.get(view.key)
         if (
             newest is not None
@@ -205,6 +267,9 @@ class Twin:
             self._past.keep(replaced, view.captured_s)
         self._views[view.key] = view
         self._departed.pop(view.key, None)
+        self.renders.drop(view.key)
+        if render is not None:
+            self.renders.keep(view, render)
         self._tell(view.key, view)
 
     def leave(self, session_id: str) -> None:
@@ -213,6 +278,7 @@ class Twin:
             if view.session_id == session_id:
                 del self._views[key]
                 self._departed[key] = view
+                self.renders.drop(key)
                 if len(self._departed) > MAX_DEPARTED:
                     self._departed.popitem(last=False)
                 self._tell(key, Departure(*key))

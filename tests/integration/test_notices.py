@@ -2,13 +2,15 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
+import threading
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import grpc
 import pytest
 
 from cav_agent.config import AgentConfig, PaceKind
@@ -20,10 +22,13 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.h264.config import CoderSettings
 from rfcore.codec.packet import DeltaPacket
 from rfcore.native.yuv import field_view_from_view
+from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.messages import Ack, Frame, Hello
 from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tile_manifest import VersionLabel
+from rfcore.wire.twin_render import ViewRequest, view_request_to_wire
+from rfcore.wire.v1 import twin_pb2_grpc
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
@@ -60,6 +65,25 @@ async def heard(vehicle: Any, notices: list[StreetNotice]) -> Ack:
             return message
 
 
+async def shown_and_looked_at(
+    vehicle: Any, frames: Sequence[Frame], looked_at: list[LivePicture]
+) -> None:
+    """Send frames, each once the one before was looked at; one of another vehicle was already."""
+    for count, frame in enumerate(frames, start=2):
+        await vehicle.say(frame)
+        assert isinstance(await vehicle.hear(), Ack), "who takes no notices gets none"
+        while len(looked_at) < count:
+            await asyncio.sleep(0.001)
+
+
+async def heard_notice(vehicle: Any, notices: list[StreetNotice]) -> None:
+    """Return when there is a notice."""
+    while not notices:
+        message = await vehicle.hear()
+        assert isinstance(message, StreetNotice)
+        notices.append(message)
+
+
 @pytest.fixture
 def looked_at(monkeypatch: pytest.MonkeyPatch) -> list[LivePicture]:
     """What the server has looked at so far."""
@@ -89,15 +113,8 @@ async def test_what_one_vehicle_sees_another_is_told(
             await second.say(bare_frame(street, coded.hello, behind))
             await heard(second, notices)
             async with asyncio.timeout(20):
-                for count, frame in enumerate(coded.frames, start=2):
-                    await first.say(frame)
-                    assert isinstance(await first.hear(), Ack), "who takes no notices gets none"
-                    while len(looked_at) < count:
-                        await asyncio.sleep(0.001)
-                while not notices:
-                    message = await second.hear()
-                    assert isinstance(message, StreetNotice)
-                    notices.append(message)
+                await shown_and_looked_at(first, coded.frames, looked_at)
+                await heard_notice(second, notices)
         value = server.registry.get_sample_value
         assert value("rfedge_twin_notices_total", {"kind": "object"}) >= 1
         assert value("rfedge_twin_notice_age_seconds_count") >= 1
@@ -107,6 +124,46 @@ async def test_what_one_vehicle_sees_another_is_told(
     assert isinstance(ahead, ObjectAhead)
     assert (ahead.field_id, ahead.vehicles) == (street.field_id, 1)
     assert ahead.at_m[2] > 1
+
+
+async def test_a_view_that_takes_long_holds_no_notice_back(
+    street: Any,
+    coded: Any,
+    serve: Any,
+    raw_vehicle: Any,
+    looked_at: list[LivePicture],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gate, begun, compose = threading.Event(), threading.Event(), rendering.compose
+
+    def held_back(*args: Any) -> Any:
+        begun.set()
+        assert gate.wait(30)
+        return compose(*args)
+
+    monkeypatch.setattr(rendering, "compose", held_back)
+    notices: list[StreetNotice] = []
+    behind = Pose((0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0))
+    camera = Camera(coded.hello.cameras[0].intrinsics, behind)
+    request = view_request_to_wire(ViewRequest(camera, field_id=street.field_id))
+    async with (
+        serve() as server,
+        grpc.aio.insecure_channel(str(server.address), options=CONSUMER_OPTIONS) as channel,
+        raw_vehicle(server.address) as first,
+        raw_vehicle(server.address) as second,
+        asyncio.timeout(30),
+    ):
+        view = twin_pb2_grpc.TwinServiceStub(channel).Render(request)
+        assert await asyncio.to_thread(begun.wait, 30)
+        await second.greet(as_vehicle(coded.hello, "second", takes=True))
+        await first.greet(as_vehicle(coded.hello, "first", takes=False))
+        await second.say(bare_frame(street, coded.hello, behind))
+        await heard(second, notices)
+        await shown_and_looked_at(first, coded.frames, looked_at)
+        await heard_notice(second, notices)
+        assert not view.done()
+        gate.set()
+        await view
 
 
 @asynccontextmanager

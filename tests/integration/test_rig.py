@@ -25,6 +25,7 @@ from rfcore.camera import Pose, camera_on_rig
 from rfcore.dataset.rig import read_rig, read_rig_drive
 from rfcore.errors import PacketRejected, RejectReason
 from rfcore.image import Rgb
+from rfcore.views import View
 from tests.integration.conftest import FRAMES, Street, write_rig_drives
 
 CAMERA = "[camera]\nwidth_px = 76\nheight_px = 52\nfx_px = 50.0\ncx_px = 38.0\ncy_px = 26.0\n"
@@ -42,9 +43,9 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[TwinView]:
     views: list[TwinView] = []
     show = Twin.show
 
-    def keep(twin: Twin, view: TwinView) -> None:
+    def keep(twin: Twin, view: TwinView, *render: View) -> None:
         views.append(view)
-        show(twin, view)
+        show(twin, view, *render)
 
     monkeypatch.setattr(Twin, "show", keep)
     return views

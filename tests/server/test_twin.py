@@ -13,6 +13,7 @@ from mec_server.twin.state import (
     KEPT_EVERY_S,
     KEPT_S,
     PAST_S,
+    KeptRenders,
     Mailbox,
     PastViews,
     Twin,
@@ -20,7 +21,9 @@ from mec_server.twin.state import (
 )
 from rfcore.camera import Intrinsics, TileOrigin
 from rfcore.errors import InvalidInput
+from rfcore.field.quality import Quality
 from rfcore.image import I420
+from rfcore.views import View
 from rfcore.wire.messages import Frame
 from rfcore.wire.tiles import Area, Tile
 from rfcore.wire.twin import Subscription
@@ -273,3 +276,45 @@ def test_the_past_of_all_cameras_has_a_limit_and_says_from_when_on_it_is_whole(
     counts = {key: len(list(past.of(key))) for key in past.cameras()}
     assert counts == {("cav-1", "front"): 5, ("cav-2", "front"): 5}
     assert past.whole_from_s == 0.25 * 25
+
+
+def render(size_px: int = 2) -> View:
+    """A view of 20 bytes a pixel."""
+    one = np.zeros((size_px, size_px), np.float32)
+    return View(np.zeros((size_px, size_px, 3), np.float32), one, one)
+
+
+def test_the_render_of_a_picture_is_kept_until_its_camera_shows_another(view: MakeView) -> None:
+    twin, first, second, third = Twin(), view(sequence=1), view(sequence=2), view(sequence=3)
+    shown = render()
+    twin.show(first, shown)
+    assert twin.renders.of(first) is shown
+    twin.show(second, render())
+    assert twin.renders.of(first) is None, "of another picture than is asked for"
+    assert twin.renders.of(second) is not None
+    twin.show(third)
+    assert twin.renders.of(second) is twin.renders.of(third) is None
+    twin.show(second, render())
+    twin.leave("s-1")
+    assert twin.renders.of(second) is None
+
+
+def test_a_render_of_lower_quality_is_not_kept(view: MakeView) -> None:
+    """Whoever looks at a picture compares it with all that the field has."""
+    twin, full = Twin(), view()
+    coarse = replace(full, frame=replace(full.frame, quality=Quality(detail=0.25)))
+    twin.show(full, render())
+    twin.show(coarse, render())
+    assert twin.renders.of(coarse) is twin.renders.of(full) is None
+
+
+def test_renders_are_kept_as_far_as_their_bytes_go_the_newest_longest(view: MakeView) -> None:
+    renders, shown = KeptRenders(most_bytes=200), [view(f"cav-{i}") for i in range(4)]
+    for each in shown[:3]:
+        renders.keep(each, render())
+    assert [renders.of(each) is None for each in shown[:3]] == [True, False, False]
+    renders.keep(shown[1], render())
+    renders.keep(shown[3], render())
+    assert [renders.of(each) is None for each in shown] == [True, False, True, False]
+    renders.keep(shown[0], render(size_px=4))
+    assert all(renders.of(each) is None for each in shown), "larger than all that may be kept"
