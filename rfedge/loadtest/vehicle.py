@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import ssl
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import grpc
@@ -18,6 +19,7 @@ from rfcore.wire.conventions import STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.convert_answers import server_messages_from_bytes
 from rfcore.wire.messages import Hello, Welcome
+from rfcore.wire.notices import StreetNotice
 from rfedge.loadtest.grpc_call import GrpcCall, Status
 from rfedge.loadtest.prerecorded import PrerecordedDrive, Replay, Schedule
 
@@ -30,7 +32,8 @@ CODES = {code.value[0]: code.name for code in grpc.StatusCode}
 class PrerecordedVehicle(asyncio.Protocol):
     """``met`` is set when the server has answered Hello, ``over`` when nothing more will happen.
 
-    ``tls``: how it proves who it is and speaks HTTP/2 (ALPN); None: without TLS.
+    ``tls``: how it proves who it is and speaks HTTP/2 (ALPN); None: without TLS. ``on_notice`` is
+    called with what it is told of the street, if its Hello takes that.
     """
 
     def __init__(
@@ -46,6 +49,7 @@ class PrerecordedVehicle(asyncio.Protocol):
         self.granted_hz = 0.0
         self.met = asyncio.Event()
         self.over = asyncio.Event()
+        self.on_notice: Callable[[StreetNotice], None] = lambda _: None
         self._address, self._tls = address, tls
         self._hello = replace(hello, vehicle_id=name)
         self.replays = [Replay(c.camera_id, drive, _wall_ns) for c in hello.cameras]
@@ -140,7 +144,9 @@ class PrerecordedVehicle(asyncio.Protocol):
         for message in server_messages_from_bytes(data):
             for replay in self.replays:
                 replay.receive(message, now)
-            if isinstance(message, Welcome):
+            if isinstance(message, StreetNotice):
+                self.on_notice(message)
+            elif isinstance(message, Welcome):
                 self.granted_hz = message.rate_hz
                 self.met.set()
 

@@ -29,6 +29,9 @@ from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tile_manifest import VersionLabel
 from rfcore.wire.twin_render import ViewRequest, view_request_to_wire
 from rfcore.wire.v1 import twin_pb2_grpc
+from rfedge.loadtest.prerecorded import PrerecordedDrive
+from rfedge.loadtest.world import EvalWorld
+from rfedge.loadtest.world.run import _ages_told_ms
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
@@ -214,3 +217,18 @@ async def test_an_agent_hands_on_that_its_tile_has_another_map_or_light(
     assert (line["kind"], line["tile"], line["field_id"]) == (str(kind), "west", field_id)
     change = FieldChange(kind, "west", field_id, 2, light)
     assert [notice.subject for notice in taken] == [change]
+
+
+async def test_prerecorded_vehicles_tell_how_old_a_notice_is_when_it_arrives(
+    street: Any, coded: Any, serve: Any, tmp_path: Path
+) -> None:
+    """The picture is sent at once, so that its age is that of a real vehicle's less its coding."""
+    frames = tuple(coded.frames)
+    bare = (bare_frame(street, coded.hello, Pose((0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0))),)
+    seeing = PrerecordedDrive(coded.hello, frames, frames)
+    told = PrerecordedDrive(coded.hello, bare, bare)
+    asked = EvalWorld(work=tmp_path, notices_hz=4.0, seconds=3.0)
+    async with serve() as server, asyncio.timeout(30):
+        ages_ms = await _ages_told_ms(asked, str(server.address), seeing, told)
+    assert ages_ms
+    assert all(0 < age_ms < 3000 for age_ms in ages_ms)

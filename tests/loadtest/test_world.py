@@ -23,7 +23,7 @@ from rfedge.loadtest.world.objects import (
     followed,
     noisy,
 )
-from rfedge.loadtest.world.run import _gains_db, run_world
+from rfedge.loadtest.world.run import _gains_db, age_on_arrival_s, run_world
 from rfedge.loadtest.world.truth import Drive, Footprint, SceneTruth, VisibleVehicle, aside
 from rfedge.street.geometry.mesh import Label
 from rfedge.street.shots import Split, shots_of
@@ -133,6 +133,27 @@ def test_dusk_is_the_same_drive_in_another_light_and_is_taught_beside_it() -> No
     assert math.dist(first.translation_m, beside.translation_m) == pytest.approx(0.5)
     assert len(shots[1]) >= FEWEST_FRAMES
     assert len({scene.name for scene in (scenes.empty, scenes.teacher, scenes.vehicles)}) == 3
+
+
+@pytest.mark.parametrize(
+    ("arrived_s", "unseen_s", "age_s"),
+    [
+        (10.15, 0.13, 0.15),
+        (10.45, 0.13, 0.25),
+        (10.45, 0.33, 0.45),
+        (10.2, 0.2, 0.2),
+    ],
+)
+def test_the_age_of_a_notice_is_that_of_its_picture_when_it_arrives(
+    arrived_s: float, unseen_s: float, age_s: float
+) -> None:
+    """Captures every 0.2 s: what it says of its age when sent tells of which picture it is."""
+    assert age_on_arrival_s(arrived_s, unseen_s, [10.0, 10.2, 10.4]) == pytest.approx(age_s)
+
+
+def test_a_notice_of_a_picture_that_was_never_taken_has_no_age() -> None:
+    with pytest.raises(InvalidInput, match=r"unseen_s: 0\.5 s is before the first capture"):
+        age_on_arrival_s(10.2, 0.5, [10.0])
 
 
 @pytest.mark.slow

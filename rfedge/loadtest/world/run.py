@@ -15,14 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from cav_agent.config import AgentConfig
-from cav_agent.vehicle import Vehicle
 from mec_server.twin.composition import LivePicture, compose, live_picture, with_things
 from mec_server.twin.contacts import find
 from mec_server.twin.ground import FieldGround
 from rfcore.camera import Camera
-from rfcore.codec.h264.config import CoderSettings
-from rfcore.errors import InvalidInput
+from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField, load_field
 from rfcore.metrics import psnr
 from rfcore.wire.conventions import CONSUMER_OPTIONS
@@ -30,7 +27,10 @@ from rfcore.wire.notices import ObjectAhead, StreetNotice
 from rfcore.wire.twin import PictureEncoding
 from rfcore.wire.twin_render import ViewRequest, render_view
 from rfedge.loadtest.cases import WorldRow, print_world
+from rfedge.loadtest.fleet import CONNECT_S, DRAIN_S, SETTLE_S
 from rfedge.loadtest.live.showing import TwinBed, ingest_latencies_ms
+from rfedge.loadtest.prerecorded import PrerecordedDrive, Schedule, prerecorded_drive
+from rfedge.loadtest.vehicle import PrerecordedVehicle
 from rfedge.loadtest.world import EvalWorld
 from rfedge.loadtest.world.objects import dusk_rows, object_rows
 from rfedge.loadtest.world.truth import Drive, SceneTruth, aside
@@ -48,6 +48,8 @@ __all__ = ["run_world"]
 MAX_AGE_S = 2.0
 LIVE_AGE_S = 0.1
 """How old the picture is that a view is composed of."""
+LEAST_TOLD_S = 1e-3
+"""To this a notice's ``unseen_s`` is rounded."""
 
 
 def run_world(asked: EvalWorld) -> None:
@@ -206,16 +208,23 @@ def _timed(seconds: list[float]) -> Iterator[None]:
 
 
 def notice_rows(asked: EvalWorld) -> list[WorldRow]:
-    """Return how old what a vehicle is told is: since the capture of the picture that shows it."""
-    vehicles, empty = (Path(d.split(",")[1]) for d in (asked.vehicles, asked.empty))
-    bed = TwinBed(asked.field, vehicles, asked.work, asked.notices_hz, asked.seconds)
-    with bed.server() as server, bed.vehicles(server.address, 1):
-        ages_ms = asyncio.run(_told(asked, server.address, empty))
+    """Return how old what a vehicle is told is when it arrives: since the capture of the picture
+    that shows it. Both vehicles are prerecorded: the cores are the server's."""
+    field = load_field(asked.field)
+    drives = [
+        PrerecordedDrive.read(
+            prerecorded_drive(Path(given.split(",")[1]), field, asked.work / "cache")
+        )
+        for given in (asked.vehicles, asked.empty)
+    ]
+    bed = TwinBed(asked.field, Path(asked.vehicles.split(",")[1]), asked.work, 0.0, 0.0)
+    with bed.server() as server:
+        ages_ms = asyncio.run(_ages_told_ms(asked, server.address, *drives))
     p50, p99 = np.percentile(ages_ms, (50, 99)) if ages_ms else (np.nan, np.nan)
     return [
         WorldRow(
             "notices",
-            f"age at the other vehicle, {asked.notices_hz:g} Hz, p99",
+            f"age on arrival at the other vehicle, {asked.notices_hz:g} Hz, p99",
             "<= 200 ms",
             f"{p99:.0f} ms (median {p50:.0f}) of {len(ages_ms)}",
             bool(p99 <= 200),
@@ -223,29 +232,48 @@ def notice_rows(asked: EvalWorld) -> list[WorldRow]:
     ]
 
 
-async def _told(asked: EvalWorld, address: str, drive: Path) -> list[float]:
-    """Drive the empty street for a while; return the ages of the objects told, in ms."""
-    ages_ms: list[float] = []
+async def _ages_told_ms(
+    asked: EvalWorld, address: str, seeing: PrerecordedDrive, told: PrerecordedDrive
+) -> list[float]:
+    """Drive both for a while; return the age of each object told, in ms.
 
-    def take(notice: StreetNotice) -> None:
+    Raises ``RfedgeError`` if the server does not take one of them.
+    """
+    heard: list[tuple[float, float]] = []
+
+    def hear(notice: StreetNotice) -> None:
         if isinstance(notice.subject, ObjectAhead):
-            ages_ms.append(1e3 * notice.subject.unseen_s)
+            heard.append((time.monotonic(), notice.subject.unseen_s))
 
-    config = AgentConfig(
-        address,
-        drive,
-        asked.field.parent,
-        loop=True,
-        rate=asked.notices_hz,
-        vehicle="told",
-        coding=CoderSettings(effort="fast"),
-    )
-    vehicle = Vehicle(config, take)
-    driving = asyncio.create_task(vehicle.run())
-    await asyncio.wait({driving}, timeout=asked.seconds)
-    vehicle.stop()
-    await driving
-    return ages_ms
+    first = PrerecordedVehicle("seeing", address, seeing.hello, seeing)
+    second = PrerecordedVehicle("told", address, replace(told.hello, take_notices=True), told)
+    second.on_notice = hear
+    await asyncio.gather(*(each.connect(CONNECT_S) for each in (first, second)))
+    start_s, period_s = time.monotonic() + SETTLE_S, 1 / asked.notices_hz
+    for number, vehicle in enumerate((first, second)):
+        end_s = start_s + asked.seconds
+        schedule = Schedule(start_s + number * period_s / 2, end_s, asked.notices_hz)
+        vehicle.depart(schedule, end_s + DRAIN_S)
+    await asyncio.gather(*(each.over.wait() for each in (first, second)))
+    for each in (first, second):
+        if problem := each.refused or each.failed:
+            raise RfedgeError(f"a vehicle of the notices lost its stream: {problem}")
+    captured_s = [shot.due_s for replay in first.replays for shot in replay.shots]
+    return [1e3 * age_on_arrival_s(*each, captured_s) for each in heard]
+
+
+def age_on_arrival_s(arrived_s: float, unseen_s: float, captured_s: Sequence[float]) -> float:
+    """Return the age of a notice that arrived, which said ``unseen_s`` when it was sent: since the
+    newest capture that can have been so old then.
+
+    Right unless the notice was on its way for longer than from one capture to the next; one clock.
+    Raises ``InvalidInput`` if there was no capture that early.
+    """
+    seen_by_s = arrived_s - unseen_s + LEAST_TOLD_S
+    earlier_s = [at_s for at_s in captured_s if at_s <= seen_by_s]
+    if not earlier_s:
+        raise InvalidInput("unseen_s", f"{unseen_s:g} s is before the first capture")
+    return arrived_s - max(earlier_s)
 
 
 def ingest_rows(asked: EvalWorld) -> list[WorldRow]:
