@@ -18,20 +18,14 @@ from rfcore.camera import Intrinsics
 from rfcore.dataset import read_dataset
 from rfcore.field import load_field
 from rfcore.wire.conventions import CONSUMER_OPTIONS
-from rfedge.twin.simulation import Place, RecordedStreet, ServedStreet, TwinDrive, place_of
-
-LOOKS_AHEAD_M = 6.0
-
-
-def steer_towards(place, way):
-    """Return -1 to 1: pure pursuit of the first point of the way that is far enough ahead."""
-    for x_m, y_m in way:
-        dx, dy = x_m - place.x_m, y_m - place.y_m
-        ahead = dx * math.cos(place.heading_rad) + dy * math.sin(place.heading_rad)
-        if ahead >= LOOKS_AHEAD_M:
-            left = dy * math.cos(place.heading_rad) - dx * math.sin(place.heading_rad)
-            return max(-1.0, min(1.0, 4 * left / math.hypot(dx, dy)))
-    return 0.0
+from rfedge.twin.simulation import (
+    Place,
+    RecordedStreet,
+    ServedStreet,
+    TwinDrive,
+    place_of,
+    steering_towards,
+)
 
 
 def recorded(field_path, datasets):
@@ -80,7 +74,7 @@ def drive(car, place, way, asked):
     for step in range(steps):
         before = seen.place
         throttle = 0.5 if before.speed_mps < 5 else 0.0
-        seen = car.step(steer_towards(before, way), throttle)
+        seen = car.step(steering_towards(before, way), throttle)
         driven_m += math.dist((before.x_m, before.y_m), (seen.place.x_m, seen.place.y_m))
         if asked.out:
             frames.append(seen.picture)

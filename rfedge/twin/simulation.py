@@ -10,6 +10,7 @@ nothing stops it but the end of the field.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from contextlib import suppress
@@ -57,6 +58,7 @@ __all__ = [
     "Street",
     "TwinDrive",
     "place_of",
+    "steering_towards",
 ]
 
 RATE_HZ = 10.0
@@ -64,6 +66,7 @@ WHEELBASE_M = 2.7
 MOST_STEERING_RAD = 0.6
 ACCELERATION_MPS2, BRAKING_MPS2 = 3.0, 8.0
 MOST_SPEED_MPS = 15.0
+LOOKS_AHEAD_M = 6.0
 MAX_AGE_S = 2.0
 """As a server's views: older pictures vouch for nothing."""
 
@@ -127,6 +130,23 @@ class Observation:
     live: NDArray[np.bool_]
     objects: tuple[StreetObject, ...]
     ended: bool = False
+
+    def digest(self) -> bytes:
+        """Return the SHA-256 of picture, depth and objects."""
+        seen = hashlib.sha256(self.picture.tobytes() + self.depth.tobytes())
+        seen.update(repr(self.objects).encode())
+        return seen.digest()
+
+
+def steering_towards(place: Place, way: Sequence[Sequence[float]]) -> float:
+    """Return -1 to 1: pure pursuit of the first point of ``way`` (x, y) that is ``LOOKS_AHEAD_M``
+    ahead, 0 where there is none (Coulter, CMU-RI-TR-92-01)."""
+    cos, sin = math.cos(place.heading_rad), math.sin(place.heading_rad)
+    for x_m, y_m in way:
+        dx, dy = x_m - place.x_m, y_m - place.y_m
+        if dx * cos + dy * sin >= LOOKS_AHEAD_M:
+            return max(-1.0, min(1.0, 4 * (dy * cos - dx * sin) / math.hypot(dx, dy)))
+    return 0.0
 
 
 class Street(Protocol):

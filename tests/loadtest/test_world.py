@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mec_server.twin.composition import live_picture
+from mec_server.twin.objects import FollowedObject
 from rfcore.camera import Camera, Intrinsics
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
@@ -22,8 +23,9 @@ from rfedge.loadtest.world.objects import (
     empty_minute,
     followed,
     noisy,
+    received,
 )
-from rfedge.loadtest.world.run import _gains_db, age_on_arrival_s, run_world
+from rfedge.loadtest.world.run import TruePictures, age_on_arrival_s, gain_of, run_world
 from rfedge.loadtest.world.truth import Drive, Footprint, SceneTruth, VisibleVehicle, aside
 from rfedge.street.geometry.mesh import Label
 from rfedge.street.shots import Split, shots_of
@@ -65,13 +67,25 @@ def test_a_live_picture_betters_the_pixels_that_changed() -> None:
         return np.rint(street.render(camera).colour.clip(0, 1) * 255).astype(np.uint8)
 
     live = live_picture(here, picture(here), FIELD.render(here))
-    gain_db, changed_db = _gains_db(FIELD, beside, live, picture(beside))
-    assert gain_db > 0.5
-    assert changed_db is not None
-    assert changed_db > 2
-    view = FIELD.render(here)
-    bare = live_picture(here, np.rint(view.colour * 255).astype(np.uint8), view)
-    assert _gains_db(FIELD, beside, bare, picture(beside)) == (0.0, None)
+    true = TruePictures(beside, picture(beside), picture_of(FIELD, beside))
+    gain = gain_of(FIELD, live, true)
+    assert gain.all_db > 0.5
+    assert gain.changed_db is not None
+    assert gain.changed_db > 2
+    unchanged = TruePictures(beside, true.empty, true.empty)
+    assert gain_of(FIELD, live, unchanged).changed_db is None, "by the truth nothing changed"
+    assert gain_of(FIELD, live, unchanged).all_db < -0.5, "the car is not there"
+
+
+def test_what_changed_is_what_the_truth_says_and_not_what_was_composed() -> None:
+    """A picture that shows nothing new betters nothing, and the car counts all the same."""
+    street = joined(STREET, car(0.8, 10.0))
+    here, beside = camera_at(), camera_at(-0.5)
+    bare = live_picture(here, picture_of(FIELD, here), FIELD.render(here))
+    true = TruePictures(beside, picture_of(street, beside), picture_of(FIELD, beside))
+    gain = gain_of(FIELD, bare, true)
+    assert (gain.all_db, gain.changed_db) == (0.0, 0.0)
+    assert 0.002 < true.changed.mean() < 0.2
 
 
 def picture_of(field: SplatField, camera: Camera) -> np.ndarray:
@@ -106,9 +120,39 @@ def test_what_is_followed_is_compared_with_the_vehicles_that_are_seen() -> None:
 def test_what_is_far_from_every_vehicle_is_false() -> None:
     elsewhere = VisibleVehicle(0, SQUARE, pixels=5000, nearest_m=2.0)
     found = followed(approach(joined(STREET, car(0.8, 10.0)), (elsewhere,)), 0.0)
-    assert (found.found, found.errors_m) == (0, [])
+    assert found.found == 0
     assert len(found.false) == 1
+    assert found.errors_m == pytest.approx([9.0] * len(found.errors_m), abs=0.5), "none is left out"
+    assert len(found.errors_m) >= 5
     assert followed(approach(FIELD, ()), 0.0) == Found()
+
+
+def test_one_object_is_one_vehicle() -> None:
+    """Two vehicles within reach of one object: it finds the nearer one."""
+    near = VisibleVehicle(0, SQUARE, pixels=5000, nearest_m=9.0)
+    beside = VisibleVehicle(1, Footprint(SQUARE.outline_m + np.float32([2.5, 0])), 5000, 9.0)
+    street = FIELD
+    picture = SeenPicture(
+        camera_at(), 0.0, np.zeros((1, 1, 3), np.uint8), street.render(camera_at()), (near, beside)
+    )
+
+    def thing(number: int, x_m: float) -> FollowedObject:
+        zero = (0.0, 0.0, 0.0)
+        return FollowedObject(number, (x_m, 0.5, 0.0), zero, 1.8, 1.5, 0.0, 0.0)
+
+    one, two = Found(), Found()
+    one.take(picture, [thing(1, 2.2)])
+    assert (one.to_find, one.found) == (2, 1)
+    two.take(picture, [thing(1, 2.2), thing(2, 2.4)])
+    assert (two.to_find, two.found) == (2, 2)
+
+
+def test_pictures_are_looked_at_as_they_are_decoded() -> None:
+    drive = approach(joined(STREET, car(0.8, 10.0)), ())
+    sent = [picture.rgb for picture in drive.pictures]
+    decoded = list(received(drive.pictures, sent))
+    errors = [float(np.abs(a.astype(int) - b).mean()) for a, b in zip(sent, decoded, strict=True)]
+    assert all(0.05 < error < 4 for error in errors), "coded with loss"
 
 
 def test_the_empty_minute_is_a_minute_with_noise_of_its_own_each_time() -> None:
@@ -118,7 +162,7 @@ def test_the_empty_minute_is_a_minute_with_noise_of_its_own_each_time() -> None:
         tuple(replace(each, time_s=40 * each.time_s) for each in drive.pictures[:2]), GROUND
     )
     row = empty_minute(longer)
-    assert row.case.endswith("8 times the drive of 8.0 s, noise 3 of seeds 1 to 8")
+    assert row.case.endswith("8 times the drive of 8.0 s and 2 pictures, noise 3 of seeds 1 to 8")
     assert (row.measured, row.held) == ("0 in 64 s", True)
 
 

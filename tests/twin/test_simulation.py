@@ -23,12 +23,12 @@ from rfedge.twin import simulation
 from rfedge.twin.simulation import (
     MOST_SPEED_MPS,
     WHEELBASE_M,
-    Observation,
     Place,
     RecordedStreet,
     ServedStreet,
     TwinDrive,
     place_of,
+    steering_towards,
 )
 from server.test_objects import FIELD, INTRINSICS, STREET, camera_at, car, joined
 
@@ -51,10 +51,6 @@ def passing_car() -> list[PosedPicture]:
 @pytest.fixture(scope="module")
 def recording() -> list[PosedPicture]:
     return passing_car()
-
-
-def digest(seen: Observation) -> tuple[bytes, bytes, Any]:
-    return seen.picture.tobytes(), seen.depth.tobytes(), seen.objects
 
 
 def test_a_place_is_where_its_camera_stands_and_looks() -> None:
@@ -85,6 +81,21 @@ def test_a_car_that_keeps_its_wheel_drives_the_circle_of_its_wheelbase() -> None
         assert math.dist((place.x_m, place.y_m), (0.0, radius_m)) == pytest.approx(radius_m, 1e-4)
 
 
+@pytest.mark.parametrize(
+    ("way", "steer"),
+    [
+        ([(1.0, 0.0), (20.0, 0.0)], 0.0),
+        ([(1.0, 0.0), (10.0, 1.0)], 4 / math.hypot(10, 1)),
+        ([(10.0, -30.0)], -1.0),
+        ([(-10.0, 3.0), (5.9, 3.0)], 0.0),
+    ],
+)
+def test_a_driver_steers_towards_the_first_point_that_is_far_enough_ahead(
+    way: list[tuple[float, float]], steer: float
+) -> None:
+    assert steering_towards(Place(0.0, 0.0, 1.6, 0.0), way) == pytest.approx(steer)
+
+
 def test_a_recorded_car_is_seen_and_found_from_beside(recording: list[PosedPicture]) -> None:
     drive = TwinDrive(RecordedStreet(FIELD, [recording]), INTRINSICS)
     seen = drive.reset(replace(START, x_m=-0.5))
@@ -105,12 +116,22 @@ def test_the_same_recording_and_actions_give_the_same_bytes(
 ) -> None:
     def driven() -> list[Any]:
         drive = TwinDrive(RecordedStreet(FIELD, [recording]), INTRINSICS)
-        seen = [digest(drive.reset(START))]
-        return [*seen, *(digest(drive.step(0.3 * math.sin(i), 0.5)) for i in range(8))]
+        seen = [drive.reset(START).digest()]
+        return [*seen, *(drive.step(0.3 * math.sin(i), 0.5).digest() for i in range(8))]
 
     first, second = driven(), driven()
     assert first == second
-    assert len({picture for picture, _, _ in first}) == len(first), "it moves"
+    assert len(set(first)) == len(first), "it moves"
+
+
+def test_a_digest_tells_of_picture_depth_and_objects(recording: list[PosedPicture]) -> None:
+    seen = TwinDrive(RecordedStreet(FIELD, [recording]), INTRINSICS).reset(START)
+    others = [
+        replace(seen, picture=seen.picture ^ 1),
+        replace(seen, depth=seen.depth + 1),
+        replace(seen, objects=(*seen.objects, Mock())),
+    ]
+    assert len({each.digest() for each in (seen, *others)}) == 4
 
 
 def test_a_recording_fades_and_begins_again(recording: list[PosedPicture]) -> None:

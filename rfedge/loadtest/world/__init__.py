@@ -33,6 +33,8 @@ class EvalWorld:
         f"{sample_path('street/transforms_drive_vehicles.json')}"
     )
     """SCENE.toml,DATASET of the drive through the street with vehicles."""
+    long_empty: str = ""
+    """SCENE.toml,DATASET of a longer drive through the unchanged street, for the empty minute."""
     aside_m: tuple[float, ...] = (1.0, 2.0, 3.0)
     """How far beside the drive views are compared, to its left."""
     every: int = 6
@@ -44,8 +46,8 @@ class EvalWorld:
     rounds: int = 3
     """How often ingest is measured without and with a live view, in turn."""
     only: tuple[str, ...] = ()
-    """Of objects, dusk, views, cost, notices, ingest: those; all without it. Rows of the others are
-    kept if the result file is of this revision."""
+    """Of objects, dusk, views, simulation, cost, notices, ingest: those; all without it. Rows of
+    the others are kept if the result file is of this revision."""
     work: Path = Path("out/eval/world")
     """Folder of logs, prerecorded drives and the pictures of dusk, which take minutes to render."""
     out: Path = Path("out/eval/world.json")

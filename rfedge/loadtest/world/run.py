@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event, Thread
 
@@ -21,7 +21,9 @@ from mec_server.twin.ground import FieldGround
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import RadianceField, load_field
+from rfcore.image import Rgb
 from rfcore.metrics import psnr
+from rfcore.views import PosedPicture
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.notices import ObjectAhead, StreetNotice
 from rfcore.wire.twin import PictureEncoding
@@ -32,7 +34,7 @@ from rfedge.loadtest.live.showing import TwinBed, ingest_latencies_ms
 from rfedge.loadtest.prerecorded import PrerecordedDrive, Schedule, prerecorded_drive
 from rfedge.loadtest.vehicle import PrerecordedVehicle
 from rfedge.loadtest.world import EvalWorld
-from rfedge.loadtest.world.objects import dusk_rows, object_rows
+from rfedge.loadtest.world.objects import SeenPicture, dusk_rows, object_rows, received
 from rfedge.loadtest.world.truth import Drive, SceneTruth, aside
 from rfedge.results import (
     as_json,
@@ -42,6 +44,7 @@ from rfedge.results import (
     rows_of,
     write_result,
 )
+from rfedge.twin.simulation import RATE_HZ, RecordedStreet, TwinDrive, place_of, steering_towards
 
 __all__ = ["run_world"]
 
@@ -50,6 +53,10 @@ LIVE_AGE_S = 0.1
 """How old the picture is that a view is composed of."""
 LEAST_TOLD_S = 1e-3
 """To this a notice's ``unseen_s`` is rounded."""
+CHANGED_LEVELS, LEAST_CHANGED = 16, 0.002
+"""Pixels of which the truth differs by more from that of the empty street, and the share of a view
+from which on they count."""
+SIMULATED_S = 60.0
 
 
 def run_world(asked: EvalWorld) -> None:
@@ -60,6 +67,7 @@ def run_world(asked: EvalWorld) -> None:
         "objects": lambda: object_rows(asked, field),
         "dusk": lambda: dusk_rows(asked, field),
         "views": lambda: view_rows(asked, field),
+        "simulation": lambda: simulation_rows(asked, field),
         "cost": lambda: cost_rows(asked, field),
         "notices": lambda: notice_rows(asked),
         "ingest": lambda: ingest_rows(asked),
@@ -91,65 +99,152 @@ def _kept(out: Path, revision: str) -> dict[str, list[WorldRow]]:
 # --- views
 
 
+@dataclass(frozen=True)
+class Gain:
+    """By how much a live picture betters a view: everywhere, and in the pixels that changed by the
+    truth, None where hardly any did."""
+
+    all_db: float
+    changed_db: float | None
+
+
 def view_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
     """Return how close views from beside the drives come to the generator's pictures."""
-    rows = []
-    given = (
-        ("unchanged street", asked.empty, False),
-        ("vehicles", asked.vehicles, True),
-    )
-    for name, text, changes in given:
-        drive = Drive.given(text)
-        truth, gains, changed_gains = SceneTruth(drive.scene), [], []
-        ground = FieldGround(field.render)
-        for index in range(0, len(drive.pictures), asked.every):
-            picture, time_s = drive.pictures[index], drive.time_s(index)
-            seen = live_picture(picture.camera, picture.read(), field.render(picture.camera))
-            live = with_things(seen, [each.outline for each in find(seen, ground)])
-            for left_m in asked.aside_m:
-                camera = aside(picture.camera, left_m)
-                gain_db, changed_db = _gains_db(field, camera, live, truth.picture(camera, time_s))
-                gains.append(gain_db)
-                if changes and changed_db is not None:
-                    changed_gains.append(changed_db)
-        rows += _rows_of_gains(name, gains, changed_gains)
-    return rows
+    empty, vehicles = Drive.given(asked.empty), Drive.given(asked.vehicles)
+    nothing, changed = SceneTruth(empty.scene), SceneTruth(vehicles.scene)
+    unchanged_gains = list(_gains(asked, field, empty, nothing, nothing))
+    gains = list(_gains(asked, field, vehicles, changed, nothing))
+    return [*_unchanged_rows(unchanged_gains), *_changed_rows(gains)]
 
 
-def _rows_of_gains(name: str, gains: Sequence[float], changed: Sequence[float]) -> list[WorldRow]:
-    worst_db, median_db = min(gains), float(np.median(gains))
-    if not changed:
-        told = f"{worst_db:+.3f} dB (median {median_db:+.3f})"
-        case = f"{name}, worst gain of {len(gains)}"
-        return [WorldRow("views", case, ">= -0.1 dB", told, worst_db >= -0.1)]
-    told = f"{median_db:+.2f} dB (worst {worst_db:+.2f})"
-    changed_db = float(np.median(changed))
+def _gains(
+    asked: EvalWorld, field: RadianceField, drive: Drive, truth: SceneTruth, empty: SceneTruth
+) -> Iterator[Gain]:
+    """Yield the gain of each view beside every so-manieth picture of a drive."""
+    ground = FieldGround(field.render)
+    for index, seen in enumerate(_received(drive, field)):
+        if index % asked.every:
+            continue
+        live = with_things(seen, [each.outline for each in find(seen, ground)])
+        for left_m in asked.aside_m:
+            camera, time_s = aside(seen.camera, left_m), drive.time_s(index)
+            true = truth.picture(camera, time_s)
+            unchanged = true if truth is empty else empty.picture(camera, time_s)
+            yield gain_of(field, live, TruePictures(camera, true, unchanged))
+
+
+def _received(drive: Drive, field: RadianceField) -> Iterator[LivePicture]:
+    """Yield what a server makes of a drive's pictures."""
+    pictures = []
+    for index, picture in enumerate(drive.pictures):
+        camera = picture.camera.rounded()
+        view = field.render(camera)
+        pictures.append(SeenPicture(camera, drive.time_s(index), picture.read(), view, ()))
+    for each, rgb in zip(pictures, received(pictures, [p.rgb for p in pictures]), strict=True):
+        yield live_picture(each.camera, rgb, each.view)
+
+
+def _unchanged_rows(gains: Sequence[Gain]) -> list[WorldRow]:
+    all_db = [gain.all_db for gain in gains]
+    told = f"{min(all_db):+.3f} dB (median {np.median(all_db):+.3f})"
+    case = f"unchanged street, worst gain of {len(gains)}"
+    return [WorldRow("views", case, ">= -0.1 dB", told, min(all_db) >= -0.1)]
+
+
+def _changed_rows(gains: Sequence[Gain]) -> list[WorldRow]:
+    all_db = [gain.all_db for gain in gains]
+    changed_db = [gain.changed_db for gain in gains if gain.changed_db is not None] or [np.nan]
+    median_db, changed_median_db = float(np.median(all_db)), float(np.median(changed_db))
+    name = "vehicles"
     return [
-        WorldRow("views", f"{name}, median gain of {len(gains)}", "> 0 dB", told, median_db > 0),
         WorldRow(
             "views",
-            f"{name}, median gain in the changed pixels",
+            f"{name}, median gain of {len(gains)}",
+            "> 0 dB",
+            f"{median_db:+.2f} dB",
+            median_db > 0,
+        ),
+        WorldRow(
+            "views", f"{name}, worst gain of {len(gains)}", "", f"{min(all_db):+.2f} dB", None
+        ),
+        WorldRow(
+            "views",
+            f"{name}, median gain in the pixels that differ from the empty street",
             ">= +2 dB",
-            f"{changed_db:+.2f} dB",
-            changed_db >= 2,
+            f"{changed_median_db:+.2f} dB",
+            changed_median_db >= 2,
+        ),
+        WorldRow(
+            "views",
+            f"{name}, worst gain in the pixels that differ from the empty street",
+            "",
+            f"{min(changed_db):+.2f} dB",
+            None,
         ),
     ]
 
 
-def _gains_db(
-    field: RadianceField, camera: Camera, live: LivePicture, true: NDArray[np.uint8]
-) -> tuple[float, float | None]:
-    """Return by how much a live picture betters a view: everywhere, and where the street is not as
-    the field has it and the live camera vouches."""
-    view = field.render(camera)
-    alone = compose(camera, view, [], MAX_AGE_S)
-    composed = compose(camera, view, [(live, LIVE_AGE_S)], MAX_AGE_S)
-    gain_db = psnr(composed.rgb, true) - psnr(alone.rgb, true)
-    changed = (alone.rgb != composed.rgb).any(axis=2)
-    if changed.mean() < 0.002:
-        return gain_db, None
-    before, after = (((v.rgb.astype(float) - true)[changed] ** 2).mean() for v in (alone, composed))
-    return gain_db, float(10 * np.log10(before / max(after, 1e-9)))
+@dataclass(frozen=True, eq=False)
+class TruePictures:
+    """What ``camera`` would see, by the generator: now, and of the empty street."""
+
+    camera: Camera
+    now: Rgb
+    empty: Rgb
+
+    @property
+    def changed(self) -> NDArray[np.bool_]:
+        """Return where the street is not as it was, [H, W]."""
+        difference = np.abs(self.now.astype(np.int16) - self.empty).max(axis=2)
+        return np.asarray(difference > CHANGED_LEVELS)
+
+
+def gain_of(field: RadianceField, live: LivePicture, true: TruePictures) -> Gain:
+    """Return by how much ``live`` betters the view of the field where ``true`` was taken."""
+    view = field.render(true.camera)
+    alone = compose(true.camera, view, [], MAX_AGE_S)
+    composed = compose(true.camera, view, [(live, LIVE_AGE_S)], MAX_AGE_S)
+    all_db = psnr(composed.rgb, true.now) - psnr(alone.rgb, true.now)
+    changed = true.changed
+    if changed.mean() < LEAST_CHANGED:
+        return Gain(all_db, None)
+    before, after = (
+        ((each.rgb.astype(float) - true.now)[changed] ** 2).mean() for each in (alone, composed)
+    )
+    return Gain(all_db, float(10 * np.log10(before / max(after, 1e-9))))
+
+
+# --- simulation
+
+
+def simulation_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
+    """Return whether a minute in the recorded street is the same twice, to the byte."""
+    pictures = Drive.given(asked.vehicles).pictures
+    first, second = (_simulated(field, pictures) for _ in range(2))
+    same = sum(one == other for one, other in zip(first, second, strict=True))
+    return [
+        WorldRow(
+            "simulation",
+            f"{SIMULATED_S:g} s driven twice: pictures, depths and objects that are the same",
+            "all",
+            f"{same} of {len(first)}, {len(set(first))} different ones",
+            same == len(first),
+        )
+    ]
+
+
+def _simulated(field: RadianceField, pictures: Sequence[PosedPicture]) -> list[bytes]:
+    """Return a digest of each step of a drive along the recording's way."""
+    way = [picture.camera.world_from_cam.translation_m[:2] for picture in pictures]
+    place = place_of(pictures[0].camera.world_from_cam)
+    drive = TwinDrive(RecordedStreet(field, [pictures]), pictures[0].camera.intrinsics)
+    seen = drive.reset(place)
+    digests = []
+    for _ in range(round(SIMULATED_S * RATE_HZ)):
+        before = drive.reset(place).place if seen.ended else seen.place
+        seen = drive.step(steering_towards(before, way), 0.5 if before.speed_mps < 5 else 0.0)
+        digests.append(seen.digest())
+    return digests
 
 
 # --- cost
