@@ -8,6 +8,7 @@ The driver keeps to where the recording's camera went: it steers towards the poi
 """
 
 import argparse
+import hashlib
 import math
 from contextlib import ExitStack
 from pathlib import Path
@@ -31,16 +32,23 @@ from rfedge.twin.simulation import (
 def recorded(field_path, datasets):
     """Return the street, where to begin, and the way of its first camera."""
     field = load_field(Path(field_path))
-    cameras = [read_dataset(Path(path)).pictures for path in datasets]
-    poses = [picture.camera.world_from_cam for picture in cameras[0]]
+    if Path(datasets[0]).is_dir():
+        street = RecordedStreet.of_recording(field, Path(datasets[0]))
+    else:
+        street = RecordedStreet(field, [read_dataset(Path(path)).pictures for path in datasets])
+    poses = [picture.camera.world_from_cam for picture in street.cameras[0]]
     way = [pose.translation_m[:2] for pose in poses]
-    return RecordedStreet(field, cameras), place_of(poses[0]), way
+    return street, place_of(poses[0]), way
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("field", nargs="?", help="field archive (.rff), for a recording")
-    parser.add_argument("recording", nargs="*", help="a dataset for each recorded camera")
+    parser.add_argument(
+        "recording",
+        nargs="*",
+        help="a dataset for each recorded camera, or the folder of mec-server --record",
+    )
     parser.add_argument("--server", help="HOST:PORT of a mec-server, instead of a recording")
     parser.add_argument("--tile", default="", help="tile of the server")
     parser.add_argument("--start", help="x,y,z,heading: metres and degrees")
@@ -70,11 +78,13 @@ def main():
 def drive(car, place, way, asked):
     """Drive on until the time is over or the field ends; begin again there."""
     frames, driven_m, steps = [], 0.0, round(asked.seconds * 10)
+    all_seen = hashlib.sha256()
     seen = car.reset(place)
     for step in range(steps):
         before = seen.place
         throttle = 0.5 if before.speed_mps < 5 else 0.0
         seen = car.step(steering_towards(before, way), throttle)
+        all_seen.update(seen.digest())
         driven_m += math.dist((before.x_m, before.y_m), (seen.place.x_m, seen.place.y_m))
         if asked.out:
             frames.append(seen.picture)
@@ -87,6 +97,7 @@ def drive(car, place, way, asked):
         from rfedge.video import write_mp4
 
         write_mp4(asked.out, frames, 10)
+    print(f"SHA-256 of pictures, depths and objects: {all_seen.hexdigest()}")
     return driven_m
 
 

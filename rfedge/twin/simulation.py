@@ -12,9 +12,12 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from threading import Thread
 from typing import Protocol
 
@@ -33,7 +36,15 @@ from mec_server.twin.contacts import find
 from mec_server.twin.ground import FieldGround
 from mec_server.twin.objects import ObjectTracker
 from mec_server.twin.rendering import check_inside, check_outside_of_walls
-from rfcore.camera import Camera, Intrinsics, Pose
+from mec_server.twin.state import CameraKey
+from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
+from rfcore.dataset.picture_file import read_picture
+from rfcore.dataset.recorded_session import (
+    RecordedPart,
+    RecordedPicture,
+    read_recorded_part,
+    recordings_under,
+)
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
 from rfcore.image import Rgb
@@ -71,6 +82,9 @@ MAX_AGE_S = 2.0
 """As a server's views: older pictures vouch for nothing."""
 
 SAME_TIME_S = 1e-6
+MOST_CLOCK_ERROR_S = 2.0
+"""Of a recorded vehicle: one whose pictures were recorded that much before or after they say they
+were taken is timed by the server's clock."""
 
 F32 = NDArray[np.float32]
 
@@ -207,10 +221,23 @@ class TwinDrive:
 class RecordedStreet:
     """A street as recorded cameras saw it; it begins again when its recording ends.
 
-    ``cameras``: each one's pictures in the order of time, on one clock (``time_ns``).
+    ``cameras``: each one's pictures in the order of time, on one clock (``time_ns``). ``keys``:
+    which vehicle and camera each is, by which objects say who sees them; without it they are
+    numbered.
     """
 
-    def __init__(self, field: RadianceField, cameras: Sequence[Sequence[PosedPicture]]) -> None:
+    def __init__(
+        self,
+        field: RadianceField,
+        cameras: Sequence[Sequence[PosedPicture]],
+        keys: Sequence[CameraKey] = (),
+    ) -> None:
+        self.cameras = tuple(tuple(camera) for camera in cameras)
+        self._keys = tuple(keys) or tuple(
+            ("recorded", f"camera-{number}") for number in range(len(cameras))
+        )
+        if len(self._keys) != len(cameras):
+            raise InvalidInput("keys", f"{len(self._keys)} are not one for {len(cameras)} cameras")
         pictures = [(p.time_ns, n, p) for n, camera in enumerate(cameras) for p in camera]
         self._pictures = sorted(pictures, key=lambda it: it[:2])
         if not pictures:
@@ -221,6 +248,25 @@ class RecordedStreet:
         self._ground = FieldGround(field.render)
         self._live: dict[int, tuple[float, LivePicture]] = {}
         self.begin()
+
+    @staticmethod
+    def of_recording(field: RadianceField, folder: Path) -> RecordedStreet:
+        """Return what ``mec-server --record`` kept in ``folder``, in the tile of ``field``.
+
+        The parts of a camera are joined in the order of time. A vehicle whose clock was wrong is
+        timed by the server's (``MOST_CLOCK_ERROR_S``). Pictures of cameras that were lost are left
+        out. Raises ``DatasetError`` for a damaged recording, ``InvalidInput`` for none.
+        """
+        pictures: dict[CameraKey, list[PosedPicture]] = {}
+        for file in recordings_under(folder):
+            part = read_recorded_part(file)
+            key = (part.camera.vehicle_id, part.camera.camera_id)
+            pictures.setdefault(key, []).extend(_posed(part, field.metadata.tile_origin))
+        cameras = {key: sorted(of, key=lambda it: it.time_ns) for key, of in pictures.items() if of}
+        if not cameras:
+            raise InvalidInput("recording", f"{folder} has no pictures with a pose")
+        keys = sorted(cameras)
+        return RecordedStreet(field, [cameras[key] for key in keys], keys)
 
     @property
     def lasts_s(self) -> float:
@@ -270,26 +316,64 @@ class RecordedStreet:
             live = live_picture(picture.camera, picture.read(), self._field.render(picture.camera))
             found = find(live, self._ground)
             self._live[number] = (taken_s, with_things(live, [each.outline for each in found]))
-            self._tracker.take([each.detection for each in found], _key(number), taken_s)
+            self._tracker.take([each.detection for each in found], self._keys[number], taken_s)
 
     def _objects(self) -> tuple[StreetObject, ...]:
         now_s = self._now_s
         return tuple(each.told(now_s) for each in self._tracker.confirmed(now_s))
 
 
-def _key(number: int) -> tuple[str, str]:
-    return ("recorded", f"camera-{number}")
+def _posed(part: RecordedPart, origin: TileOrigin) -> Iterator[PosedPicture]:
+    """Yield the pictures of a part that have a pose, in a tile of ``origin``."""
+    offset_ns = _clock_offset_ns(part)
+    for picture in part.pictures:
+        if picture.world_from_cam is not None:
+            camera = Camera(part.camera.intrinsics, origin.localise(picture.world_from_cam))
+            yield PosedPicture(
+                picture.file,
+                camera,
+                partial(_read, part, picture),
+                picture.capture_time_ns + offset_ns,
+            )
+
+
+def _read(part: RecordedPart, picture: RecordedPicture) -> Rgb:
+    return read_picture(part.path(picture), part.camera.intrinsics)
+
+
+def _clock_offset_ns(part: RecordedPart) -> int:
+    """Return what a vehicle's clock lacks, 0 for one that is about right.
+
+    The folder of a part is named by when it was begun, on the server's clock: right after its first
+    picture was taken. One that is not named so is taken to be right.
+    """
+    start, _, _ = part.file.parent.name.partition("-")
+    if not (start.isascii() and start.isdigit() and part.pictures):
+        return 0
+    offset_ns = int(start) * 10**6 - part.pictures[0].capture_time_ns
+    return 0 if abs(offset_ns) <= MOST_CLOCK_ERROR_S * 1e9 else offset_ns
 
 
 class ServedStreet:
     """The street as a server sees it now, while it is entered; ``tile`` or ``field_id`` says which.
 
-    Time passes by itself: ``pass_time`` waits for nothing, and a caller that wants to keep real
-    time has to wait. Objects are those of the newest picture of any vehicle.
+    Time passes by itself, on the clock ``now``: ``pass_time`` waits (``sleep``) for the next tick,
+    so that steps follow each other at a fixed rate; after a step that took longer than one, the
+    next follows at once, and what was late stays late. Objects are those of the newest picture of
+    any vehicle.
     """
 
-    def __init__(self, channel: grpc.Channel, tile: str = "", field_id: str = "") -> None:
+    def __init__(
+        self,
+        channel: grpc.Channel,
+        tile: str = "",
+        field_id: str = "",
+        now: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
         self._channel = channel
+        self._now, self._sleep = now, sleep
+        self._tick_s = now()
         self._place = ObjectsRequest(tile, field_id)
         self._number = 0
         self._objects: tuple[StreetObject, ...] = ()
@@ -307,10 +391,15 @@ class ServedStreet:
         self._reading.join()
 
     def begin(self) -> None:
-        """Nothing: the street is as it is."""
+        """Count ticks from now on: the street is as it is."""
+        self._tick_s = self._now()
 
     def pass_time(self, seconds: float) -> None:
-        """Nothing: time passes."""
+        """Return ``seconds`` after the last tick, at once if that is past."""
+        due_s, now_s = self._tick_s + seconds, self._now()
+        if due_s > now_s:
+            self._sleep(due_s - now_s)
+        self._tick_s = max(due_s, now_s)
 
     def look(self, camera: Camera) -> tuple[Rgb, F32, NDArray[np.bool_], tuple[StreetObject, ...]]:
         """Return what a camera would see now.

@@ -136,10 +136,29 @@ def test_a_recording_is_driven_through(
     out = tmp_path / "drive.mp4"
     options = ("--seconds", 2, "--size", "160x90", "--out", out)
     driven(monkeypatch, sample_path(field), drive, *options)
-    lines = capsys.readouterr().out.splitlines()
+    *lines, digest = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["1.0", "2.0"]
     assert float(lines[-1].split()[2]) > 1
+    assert digest.startswith("SHA-256 of pictures, depths and objects: ")
     assert out.stat().st_size > 1000
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.timeout(600)
+def test_a_minute_in_a_recording_repeats_to_the_byte(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive, field = sample_path("street/transforms_drive_vehicles.json"), "fields/street.rff"
+    said = []
+    for _ in range(2):
+        driven(monkeypatch, sample_path(field), drive, "--seconds", 60, "--size", "160x90")
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1]
+    *lines, _ = said[0].splitlines()
+    assert len(lines) == 60
+    assert float(lines[-1].split()[2]) > 200, "metres"
+    assert any("0 objects" not in line for line in lines)
 
 
 async def test_a_server_is_driven_through(

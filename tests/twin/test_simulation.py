@@ -1,7 +1,10 @@
 """A car of one's own in the twin: how it moves, what it sees, and that a recording repeats."""
 
+from __future__ import annotations
+
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
@@ -11,14 +14,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfcore.camera import Camera, Intrinsics
-from rfcore.dataset import read_dataset
+from rfcore.camera import Camera, TileOrigin
+from rfcore.dataset.recorded_session import RECORDING_NAME, RecordedCamera, RecordedPicture
 from rfcore.errors import InvalidInput
-from rfcore.field import load_field
+from rfcore.field import SplatField
+from rfcore.image import write_png
 from rfcore.views import PosedPicture
 from rfcore.wire.twin_render import ObjectsSeen, StreetObject, objects_to_wire
 from rfcore.wire.v1 import twin_pb2_grpc
-from rfedge.samples import sample_path
 from rfedge.twin import simulation
 from rfedge.twin.simulation import (
     MOST_SPEED_MPS,
@@ -183,25 +186,98 @@ def test_what_cannot_be_driven_through_is_refused(recording: list[PosedPicture])
         TwinDrive(RecordedStreet(FIELD, [recording]), INTRINSICS, rate_hz=0.0)
 
 
-@pytest.mark.slow
-@pytest.mark.sample
-def test_a_minute_in_the_sample_street_repeats_to_the_byte() -> None:
-    field = load_field(sample_path("fields/street.rff"))
-    pictures = read_dataset(sample_path("street/transforms_drive_vehicles.json")).pictures[::3]
-    intrinsics = Intrinsics(160, 90, 80.0, 80.0, 80.0, 45.0)
-    place = place_of(pictures[0].camera.world_from_cam)
+HOUR_NS = 3600 * 10**9
+BEGUN_NS = 1_767_225_600 * 10**9
 
-    def driven() -> list[bytes]:
-        drive = TwinDrive(RecordedStreet(field, [pictures]), intrinsics)
-        seen, pictures_seen = drive.reset(place), []
-        for _ in range(600):
-            seen = drive.reset(place) if seen.ended else drive.step(0.0, 0.2)
-            pictures_seen.append(seen.picture.tobytes())
-        return pictures_seen
 
-    first = driven()
-    assert first == driven()
-    assert len(set(first)) > 100, "it begins anew where the field ends"
+def record(folder: Path, key: tuple[str, str], part: Part) -> None:
+    """Write pictures as a server does that was told to record them."""
+    vehicle, camera = key
+    where = folder / vehicle / camera / f"{part.begun_ns // 10**6:013}-{part.session}"
+    where.mkdir(parents=True)
+    whose = RecordedCamera(vehicle, camera, part.session, INTRINSICS)
+    lines = [whose.line()]
+    for number, picture in enumerate(part.pictures):
+        name = f"{number:06}.png"
+        write_png(where / name, picture.read())
+        pose = part.origin.globalise(picture.camera.world_from_cam)
+        time_ns = part.first_ns + picture.time_ns - part.pictures[0].time_ns
+        shown = RecordedPicture(name, time_ns, 0, number, "ab" * 32, pose, "00")
+        lines += [shown.line(), replace(shown, world_from_cam=None, sequence=99).line()]
+    (where / RECORDING_NAME).write_text("".join(lines))
+
+
+@dataclass(frozen=True)
+class Part:
+    """Pictures of a session, begun at ``begun_ns`` by the server, ``first_ns`` by the vehicle."""
+
+    session: str
+    pictures: list[PosedPicture]
+    begun_ns: int
+    first_ns: int
+    origin: TileOrigin = TileOrigin(0.0, 0.0, 0.0)
+
+
+def test_what_a_server_recorded_is_driven_through(
+    recording: list[PosedPicture], tmp_path: Path
+) -> None:
+    """One vehicle's pictures in two parts, and one of another whose clock is an hour ahead: as if
+    all had been given by themselves, under their names."""
+    half_ns = BEGUN_NS + 500_000_000
+    record(tmp_path, ("cav-1", "front"), Part("b", recording[5:], half_ns + 10**8, half_ns))
+    record(tmp_path, ("cav-1", "front"), Part("a", recording[:5], BEGUN_NS + 10**8, BEGUN_NS))
+    late = Part("c", recording[2:4], BEGUN_NS + 2 * 10**8, BEGUN_NS + 2 * 10**8 + HOUR_NS)
+    record(tmp_path, ("cav-2", "rear"), late)
+    street = RecordedStreet.of_recording(FIELD, tmp_path)
+    assert [len(camera) for camera in street.cameras] == [10, 2]
+    assert street.lasts_s == pytest.approx(0.9), "two clocks, an hour apart, are one"
+    given = RecordedStreet(FIELD, [recording, recording[2:4]])
+    seen, expected = (TwinDrive(each, INTRINSICS) for each in (street, given))
+    places = [replace(START, x_m=-0.5)] * 2
+    first, second = seen.reset(places[0]), expected.reset(places[1])
+    for _ in range(8):
+        assert first.picture.tobytes() == second.picture.tobytes()
+        first, second = seen.step(0.0, 0.0), expected.step(0.0, 0.0)
+    (thing,) = first.objects
+    assert ("cav-1", "front") in thing.seen_by
+
+
+def test_a_recording_is_put_into_the_fields_own_tile(
+    recording: list[PosedPicture], tmp_path: Path
+) -> None:
+    origin = TileOrigin(1000.0, -500.0, 20.0)
+    record(tmp_path, ("cav-1", "front"), Part("a", recording, BEGUN_NS, BEGUN_NS, origin))
+    field = replace(FIELD.metadata, tile_origin=origin)
+    street = RecordedStreet.of_recording(SplatField(STREET, metadata=field), tmp_path)
+    pose = street.cameras[0][0].camera.world_from_cam
+    assert pose.translation_m == pytest.approx(recording[0].camera.world_from_cam.translation_m)
+
+
+def test_a_folder_without_recordings_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match=r"recording: .* has no pictures with a pose"):
+        RecordedStreet.of_recording(FIELD, tmp_path)
+
+
+def test_keys_are_one_for_each_camera(recording: list[PosedPicture]) -> None:
+    with pytest.raises(InvalidInput, match="keys: 2 are not one for 1 cameras"):
+        RecordedStreet(FIELD, [recording], [("a", "b"), ("c", "d")])
+
+
+def test_a_served_street_keeps_to_its_ticks() -> None:
+    """Ticks of 0.1 s; the second look takes 0.25 s: what is late stays late, and is not made up."""
+    now_s, slept_s = [5.0], []
+
+    def sleep(seconds: float) -> None:
+        slept_s.append(seconds)
+        now_s[0] += seconds
+
+    with grpc.insecure_channel("127.0.0.1:1") as channel:
+        street = ServedStreet(channel, "west", now=lambda: now_s[0], sleep=sleep)
+        street.begin()
+        for look_s in (0.03, 0.25, 0.0, 0.04):
+            now_s[0] += look_s
+            street.pass_time(0.1)
+    assert slept_s == pytest.approx([0.07, 0.1, 0.06])
 
 
 def test_a_served_street_keeps_no_objects_beyond_its_stream(
