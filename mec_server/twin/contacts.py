@@ -12,6 +12,11 @@ with the ground when
 
 Left out thereby is mostly the field's own error, at the edges of facades, trees and roofs.
 
+A thing also changes the ground before it, by its shadow: all colours are darkened alike, to
+``SHADOW`` of what the field has, within ``SHADOW_TINT`` of each other. (Under a vehicle it is
+darker than that.) A contact in a shadow is moved up to where that ends, if that is no more than
+``SHADOW_M`` of ground further away.
+
 A contact is as far away as the ray through it meets the ground (``mec_server.twin.ground``). Where
 the field's surface is not near that, its depth counts.
 
@@ -31,6 +36,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +52,10 @@ BELOW_PX, GROUND_PX = 2, 6
 """How far below a contact the ground is looked at, and how much further its slope."""
 MOST_SLOPE = 0.4
 """Sine of the steepest way from there to the contact."""
+SHADOW, SHADOW_TINT, SHADOW_M, BORDER_PX = (0.4, 0.9), 0.12, 2.0, 3
+"""On the sample's drive among vehicles, and on another arrangement of them, the 95th percentile of
+what objects are off falls from 1.5 and 1.7 m to 1.1 and 1.3 m; least values of 0.2 to 0.4 differ
+little."""
 REACH_M = 32.0
 LOOKED_AT_M, LEAST_MARKED_M = 1.5, 0.3
 TALL_M = 2.2
@@ -55,7 +65,9 @@ NEAR_GROUND_M = 0.4
 
 LINK_PX, LINK_M, LINK_PER_M = 6, 0.3, 0.04
 LONG_M, PIECE_M = 5.5, 4.5
-LEAST_PX, LEAST_COLUMNS, LEAST_WIDTH_M = 200, 4, 0.15
+LEAST_PX, LEAST_COLUMNS, LEAST_WIDTH_M = 200, 4, 0.4
+"""What is narrower is mostly a piece of a vehicle between others, off by metres: with 0.15 m the
+95th percentile is 0.2 m more on both drives, and not one more vehicle is found."""
 NEAR_SHARE, SAME_SIDE = 0.1, 1.1
 """The near side: the nearest tenth of a thing's contacts, and those up to so many times as far."""
 MIDDLE_SHARE = 0.5
@@ -168,8 +180,13 @@ def _contacts(picture: LivePicture, ground: FieldGround) -> Contacts:
     surface_m = points_of(camera, rows + BELOW_PX, columns, below_m)
     level = _is_level(picture, rows, columns, surface_m) & (below_m > 0)
     rows, columns = rows[level], columns[level]
-    z_m = _ground_z_m(picture, ground, rows, columns, surface_m[level], below_m[level])
+    place = partial(_ground_z_m, picture, ground)
+    z_m = place(rows, columns, surface_m[level], below_m[level])
     height_m = _marked_m(marked, rows, columns, z_m, camera.intrinsics.fy_px)
+    above = _above_shadow(picture, marked, rows, columns)
+    above_m = place(above, columns, surface_m[level], below_m[level])
+    shadow = (above_m > z_m) & (above_m - z_m <= SHADOW_M)
+    rows, z_m = np.where(shadow, above, rows), np.where(shadow, above_m, z_m)
     at_m = points_of(camera, rows, columns, z_m)
     good = (z_m > 0) & (z_m <= REACH_M) & (height_m >= LEAST_MARKED_M)
     contacts = Contacts(rows, columns, z_m, height_m, at_m)[good]
@@ -186,6 +203,23 @@ def _feet(marked: Mask) -> tuple[Index, Index]:
     feet[-BELOW_PX - 1 :] = False
     rows, columns = np.nonzero(feet)
     return rows, columns
+
+
+def _above_shadow(picture: LivePicture, marked: Mask, rows: Index, columns: Index) -> Index:
+    """Return the row of each contact or, where that is in a shadow, of the lowest marked pixel
+    above the shadow [N]; between both at most ``BORDER_PX`` are unmarked."""
+    height = len(marked)
+    level = (picture.colour * np.float32(255)).clip(1, 255)
+    left = (level + picture.difference) / level
+    least, most = left.min(axis=2), left.max(axis=2)
+    shadow = (least >= SHADOW[0]) & (most <= SHADOW[1]) & (most - least <= SHADOW_TINT)
+    row = np.arange(height)[:, None]
+    solid = np.maximum.accumulate(np.where(marked & ~shadow, row, -1), axis=0)
+    above = solid[rows, columns]
+    unmarked = np.zeros((height + 1, marked.shape[1]), np.int32)
+    np.cumsum(~marked, axis=0, out=unmarked[1:])
+    between = unmarked[rows + 1, columns] - unmarked[above, columns]
+    return np.asarray(np.where((above >= 0) & (between <= BORDER_PX), above, rows))
 
 
 def _is_level(picture: LivePicture, rows: Index, columns: Index, surface_m: F64) -> Mask:

@@ -92,6 +92,47 @@ def test_a_car_is_found_where_it_stands(z_m: float, sigma: float, gain: float) -
     assert found.height_m == pytest.approx(1.4, rel=0.35)
 
 
+def box(x_m: float, z_m: float, width_m: float, level: float) -> Gaussians:
+    """A side 1.6 m high that faces the camera."""
+    x, y = grid((x_m - width_m / 2, x_m + width_m / 2), (CAMERA_M - 1.6, CAMERA_M))
+    return surface(np.stack([x, y, np.full_like(x, z_m)], 1), level, 2, 1)
+
+
+def shadow(x_m: float, nearest_m: float, furthest_m: float) -> Gaussians:
+    """Ground 1.8 m wide with little more than half of its light."""
+    x, z = grid((x_m - 0.9, x_m + 0.9), (nearest_m, furthest_m))
+    return surface(np.stack([x, np.full_like(x, CAMERA_M - 0.02), z], 1), 0.25, 1, 2)
+
+
+@pytest.mark.parametrize("z_m", [8.0, 11.0])
+def test_a_shadow_before_a_car_is_not_its_foot(z_m: float) -> None:
+    shaded = joined(STREET, shadow(0.8, z_m - 1.4, z_m)).gaussians
+    (found,) = seen(joined(shaded, car(0.8, z_m)), camera_at())
+    assert math.dist(found.at_m, (0.8, z_m, -CAMERA_M)) < 0.5
+
+
+def test_what_is_dark_as_a_shadow_all_over_stands_where_it_does() -> None:
+    (found,) = seen(joined(STREET, box(0.8, 9.0, 1.8, 0.25)), camera_at())
+    assert math.dist(found.at_m, (0.8, 9.0, -CAMERA_M)) < 0.8
+
+
+def test_a_shadow_that_is_long_moves_nothing() -> None:
+    """What lies further than ``SHADOW_M`` before a thing may be another one."""
+    shaded = joined(STREET, shadow(0.8, 7.0, 12.0)).gaussians
+    (found,) = seen(joined(shaded, car(0.8, 12.0)), camera_at())
+    assert math.dist(found.at_m, (0.8, 7.0, -CAMERA_M)) < 0.8
+
+
+@pytest.mark.parametrize(("width_px", "things"), [(6, 0), (20, 1)])
+def test_a_person_is_an_object_and_a_sliver_is_none(width_px: int, things: int) -> None:
+    """0.18 and 0.6 m wide, 1.6 m high, at 8 m."""
+    camera = camera_at()
+    view = FIELD.render(camera)
+    rgb = np.rint(view.colour.clip(0, 1) * 255).astype(np.uint8)
+    rgb[77:129, 180 : 180 + width_px] = 230
+    assert len(detect(live_picture(camera, rgb, view), GROUND)) == things
+
+
 def test_two_cameras_find_the_same_place() -> None:
     field = joined(STREET, car(0.8, 10.0))
     (a,), (b,) = seen(field, camera_at(-1.0)), seen(field, camera_at(1.5, 0.05))
