@@ -316,7 +316,8 @@ class RecordedStreet:
             live = live_picture(picture.camera, picture.read(), self._field.render(picture.camera))
             found = find(live, self._ground)
             self._live[number] = (taken_s, with_things(live, [each.outline for each in found]))
-            self._tracker.take([each.detection for each in found], self._keys[number], taken_s)
+            detections = [each.detection for each in found]
+            self._tracker.take(detections, self._keys[number], taken_s, live.lacks)
 
     def _objects(self) -> tuple[StreetObject, ...]:
         now_s = self._now_s

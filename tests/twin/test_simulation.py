@@ -304,3 +304,16 @@ def test_a_served_street_keeps_no_objects_beyond_its_stream(
         street._reading.join(10)
         assert [each.object_id for each in seen[0]] == [1]
         assert street.look(camera_at())[3] == ()
+
+
+def test_a_recorded_picture_that_lacks_a_thing_says_so() -> None:
+    """A car that is there for half a second and then is not: half a second after it was seen last,
+    half of its confidence would be left for that alone."""
+    shown = [picture(camera_at(), joined(STREET, car(0.8, 10.0)), i / 10) for i in range(5)]
+    bare = [picture(camera_at(), FIELD, i / 10) for i in range(5, 10)]
+    drive = TwinDrive(RecordedStreet(FIELD, [[*shown, *bare]]), INTRINSICS)
+    drive.reset(START)
+    seen = [drive.step(0.0, 0.0).objects for _ in range(9)]
+    assert seen[3][0].confidence == pytest.approx(1.0)
+    assert seen[-1][0].unseen_s == pytest.approx(0.5)
+    assert seen[-1][0].confidence < 0.4

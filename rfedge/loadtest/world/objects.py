@@ -200,7 +200,7 @@ def followed(drive: SeenDrive, sigma: float, seed: int = NOISE_SEED) -> Found:
     sent = [noisy(picture.rgb, sigma, rng) for picture in drive.pictures]
     for picture, rgb in zip(drive.pictures, received(drive.pictures, sent), strict=True):
         live = live_picture(picture.camera, rgb, picture.view)
-        tracker.take(detect(live, drive.ground), CAMERA, picture.time_s)
+        tracker.take(detect(live, drive.ground), CAMERA, picture.time_s, live.lacks)
         found.take(picture, tracker.confirmed(picture.time_s))
     return found
 
