@@ -30,7 +30,8 @@ from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadat
 from rfcore.field.quality import DETAILS, LevelOfDetail, LevelsOfDetail, kept_of
 from rfcore.field.splat_grid import (
     BLOCK,
-    MEANS_BITS,
+    FINEST,
+    Grain,
     SplatNumbers,
     Steps,
     gaussians_of,
@@ -71,17 +72,17 @@ def compressed_archive(
     levels: LevelsOfDetail,
     metadata: FieldMetadata,
     steps: Steps | None = None,
-    means_bits: int = MEANS_BITS,
+    grain: Grain = FINEST,
 ) -> Archive:
     """Return the archive of the nearest splats on the grid.
 
-    A step of means is at most ``2^-means_bits`` of the smaller widths around.
+    ``grain``: how finely they are placed.
 
     Raises ``InvalidInput`` for values no grid holds; such a field is saved uncompressed.
     """
     chosen = steps if steps is not None else Steps()
     order = _local_order(gaussians)
-    numbers = numbers_of(reordered(gaussians, order), chosen, means_bits)
+    numbers = numbers_of(reordered(gaussians, order), chosen, grain)
     parts: dict[str, Integers] = {f.name: getattr(numbers, f.name) for f in fields(numbers)}
     for detail in DETAILS[1:]:
         if detail in levels:

@@ -5,7 +5,7 @@ the same bytes on every machine, without a rounding anywhere (the three small co
 rotation aside, a float32 division by 127 each).
 
 * means: blocks of 256 splats in file order; in a block, ``2^e`` times (base + q), with e chosen so
-  that the step is at most an eighth (``MEANS_BITS``) of the block's smaller widths;
+  that the step is at most an eighth of the block's smaller widths;
 * log scales, opacity logits, SH: one step each (``Steps``);
 * rotations: the largest component becomes +1 and the others, divided by it, multiples of 1/127.
   Renderers normalise; the sign of a quaternion means nothing;
@@ -28,7 +28,8 @@ from rfcore.raster.gaussians import F32, Gaussians
 
 __all__ = [
     "BLOCK",
-    "MEANS_BITS",
+    "FINEST",
+    "Grain",
     "SplatNumbers",
     "Steps",
     "colour_numbers",
@@ -40,9 +41,6 @@ __all__ = [
 ]
 
 BLOCK = 256
-MEANS_BITS = 3
-"""A step of means is this power of two finer than the block's smaller widths, unless a writer
-chooses another; readers find the steps in ``blocks``."""
 ROTATION_STEPS = 127
 EXPONENTS = (-60, 60)
 
@@ -63,6 +61,29 @@ class Steps:
 
 
 @dataclass(frozen=True)
+class Grain:
+    """How finely a writer places splats; readers need not know, for the format has room for finer.
+
+    A step of means is at most ``2^-means_bits`` of the block's smaller widths; rotations are
+    multiples of ``rotation`` of their steps.
+    """
+
+    means_bits: int = 3
+    rotation: int = 1
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.means_bits <= 16 and 1 <= self.rotation <= ROTATION_STEPS):
+            raise InvalidInput(
+                "grain",
+                f"{self.means_bits} bits and {self.rotation} steps are outside 0..16 and "
+                f"1..{ROTATION_STEPS}",
+            )
+
+
+FINEST = Grain()
+
+
+@dataclass(frozen=True)
 class SplatNumbers:
     """The whole numbers of N splats in B blocks, int32.
 
@@ -79,13 +100,13 @@ class SplatNumbers:
     sh: Integers
 
 
-def numbers_of(gaussians: Gaussians, steps: Steps, means_bits: int = MEANS_BITS) -> SplatNumbers:
+def numbers_of(gaussians: Gaussians, steps: Steps, grain: Grain = FINEST) -> SplatNumbers:
     """Return the nearest splats on the grid."""
-    blocks, means = _means_numbers(gaussians, means_bits)
+    blocks, means = _means_numbers(gaussians, grain.means_bits)
     return SplatNumbers(
         blocks=blocks,
         means=means,
-        rotations=_rotation_numbers(gaussians.quaternions),
+        rotations=_rotation_numbers(gaussians.quaternions, grain.rotation),
         log_scales=_rounded("log_scales", gaussians.log_scales, steps.log_scales),
         opacity_logits=_rounded(
             "opacity_logits", gaussians.opacity_logits[:, None], steps.opacity_logits
@@ -170,13 +191,15 @@ def _means_of(numbers: SplatNumbers) -> F32:
     return np.ascontiguousarray(np.ldexp(whole, exponents), dtype=np.float32)
 
 
-def _rotation_numbers(quaternions: F32) -> Integers:
+def _rotation_numbers(quaternions: F32, multiple: int) -> Integers:
     q = quaternions.astype(np.float64)
     largest = np.abs(q).argmax(axis=1)
     divisor = np.take_along_axis(q, largest[:, None], axis=1)
     unit = np.where(divisor == 0, [[1.0, 0, 0, 0]], q / np.where(divisor == 0, 1, divisor))
     others = np.take_along_axis(unit, _others(largest), axis=1)
-    return np.hstack([largest[:, None], np.rint(others * ROTATION_STEPS)]).astype(np.int32)
+    most = ROTATION_STEPS // multiple
+    steps = np.clip(np.rint(others * ROTATION_STEPS / multiple), -most, most) * multiple
+    return np.hstack([largest[:, None], steps]).astype(np.int32)
 
 
 def _quaternions_of(rotations: Integers) -> F32:

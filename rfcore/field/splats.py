@@ -20,7 +20,7 @@ from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadat
 from rfcore.field.quality import FULL, LevelsOfDetail, Quality, check_levels, splats_at_detail
 from rfcore.field.scale import colour_at_scale, view_at_scale
 from rfcore.field.splat_archive import compressed_archive, splat_archive, splats_of_compressed
-from rfcore.field.splat_grid import MEANS_BITS, Steps
+from rfcore.field.splat_grid import FINEST, Grain, Steps
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer, check_renderer
 from rfcore.views import View
@@ -86,7 +86,7 @@ class SplatField:
             return self._archive
         return splat_archive(self.gaussians, self.levels, self.metadata)
 
-    def compressed(self, steps: Steps | None = None, means_bits: int = MEANS_BITS) -> SplatField:
+    def compressed(self, steps: Steps | None = None, grain: Grain = FINEST) -> SplatField:
         """Return the field that a compressed archive of this one holds; of such a one, itself.
 
         It differs a little and is another field. Raises ``InvalidInput`` for values that a
@@ -94,7 +94,7 @@ class SplatField:
         """
         if "encoding" in self.archive().metadata:
             return self
-        archive = compressed_archive(self.gaussians, self.levels, self.metadata, steps, means_bits)
+        archive = compressed_archive(self.gaussians, self.levels, self.metadata, steps, grain)
         gaussians, levels = splats_of_compressed(archive)
         return self._like(gaussians, self.metadata, levels, archive)
 

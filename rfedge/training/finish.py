@@ -30,7 +30,7 @@ from rfcore.field.importance import (
     reordered,
     seen_directions,
 )
-from rfcore.field.splat_grid import MEANS_BITS, Steps
+from rfcore.field.splat_grid import FINEST, Grain, Steps
 from rfcore.field.store import encode_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.train import held_out_quality
@@ -65,30 +65,32 @@ LEVELS_SHARE = 1.15
 class FieldSize:
     """A size a field can be written in: ``share`` of its splats, on coarser grids.
 
-    ``price`` as in ``frugal_colours``; ``steps`` and ``means_bits`` as in ``compressed_archive``.
+    ``price`` as in ``frugal_colours``; ``steps`` and ``grain`` as in ``compressed_archive``.
     """
 
     share: float
     price: float
     steps: Steps
-    means_bits: int = MEANS_BITS
+    grain: Grain = FINEST
 
 
 FINE = Steps(opacity_logits=2)
+MIDDLE = Steps(opacity_logits=2, sh_dc=4)
 COARSE = Steps(opacity_logits=1, sh_dc=4)
 SIZES = (
     FieldSize(1.0, 0.003, FINE),
-    FieldSize(1.0, 0.01, FINE),
-    FieldSize(1.0, 0.03, COARSE, 2),
-    FieldSize(0.85, 0.03, COARSE, 2),
-    FieldSize(0.7, 0.03, COARSE, 2),
-    FieldSize(0.6, 0.06, COARSE, 2),
-    FieldSize(0.5, 0.06, COARSE, 2),
-    FieldSize(0.4, 0.1, COARSE, 1),
-    FieldSize(0.3, 0.1, COARSE, 1),
-    FieldSize(0.2, 0.1, COARSE, 1),
+    FieldSize(1.0, 0.01, MIDDLE, Grain(2)),
+    FieldSize(1.0, 0.03, COARSE, Grain(2, 2)),
+    FieldSize(0.85, 0.03, COARSE, Grain(2, 2)),
+    FieldSize(0.7, 0.03, COARSE, Grain(2, 2)),
+    FieldSize(0.6, 0.06, COARSE, Grain(2, 2)),
+    FieldSize(0.5, 0.06, COARSE, Grain(2, 2)),
+    FieldSize(0.4, 0.1, COARSE, Grain(1, 4)),
+    FieldSize(0.3, 0.1, COARSE, Grain(1, 4)),
+    FieldSize(0.2, 0.1, COARSE, Grain(1, 4)),
 )
-"""Each about 0.85 of the bytes of the one before, at the best quality for them."""
+"""From the largest to the smallest, each 0.75 to 0.9 of the bytes of the one before. The second and
+third are measured on the sample field (docs/fields.md); those with fewer splats are not yet."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ class FieldSizer:
             antialiased=field.metadata.antialiased,
         )
         colours = frugal_colours(field.gaussians, seen, size.steps, size.price)
-        return _of(field, colours).compressed(size.steps, size.means_bits)
+        return _of(field, colours).compressed(size.steps, size.grain)
 
 
 def _of(field: SplatField, gaussians: Gaussians) -> SplatField:
