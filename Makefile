@@ -157,8 +157,8 @@ load-overload: build-full  ## twice of that load-full, admission on; writes resu
 
 # The revision whose figures results/loadtest.json had when the server was reworked for isolation.
 BASE ?= 83ce11fb3ba2
-load-ratio: build-full  ## vehicles that the full loop carries now and at BASE, in turn, 3 runs each (10 min)
-	$(BIN)/python tests/loadtest/limit_ratio.py $(BASE) out/loadtest/ratio.json
+load-ratio: build-full  ## vehicles that the full loop carries now and at BASE, in turn, 3 runs each (10 min); writes results/load-ratio.json
+	$(BIN)/python tests/loadtest/limit_ratio.py $(BASE) results/load-ratio.json
 
 MINUTES ?= 30
 soak: build-full  ## half load for MINUTES (30): memory, descriptors and threads must not grow

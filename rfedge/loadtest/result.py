@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import matplotlib as mpl
@@ -37,10 +38,12 @@ from rfedge.results import (
 
 __all__ = [
     "Command",
+    "LimitRow",
     "LoadResult",
     "latency_chart",
     "load_section",
     "print_runs",
+    "ratio_section",
     "record",
     "uplink_chart",
     "write_load_result",
@@ -333,6 +336,33 @@ def load_section(path: Path, result: Result) -> str:
     cells = [[_shown(row, column) for column in COLUMNS] for row in rows]
     notes = "\n".join(_note(row) for row in rows)
     return "\n\n".join([heading(path, result), table(COLUMNS, cells), notes, ""])
+
+
+@dataclass(frozen=True)
+class LimitRow:
+    """How many vehicles the code of a revision held, run by run, and what one costs its server."""
+
+    code: str
+    vehicles: tuple[int, ...]
+    server_ms_a_frame: float
+
+
+def ratio_section(path: Path, result: Result) -> str:
+    """Return what two revisions carry, measured in turn, and the ratios of the second to the
+    first."""
+    rows = rows_of(LimitRow, result["rows"])
+    before, now = rows
+    cells = [
+        (row.code, ", ".join(map(str, row.vehicles)), f"{row.server_ms_a_frame:.2f}")
+        for row in rows
+    ]
+    held = median(now.vehicles) / max(1, median(before.vehicles))
+    spent = before.server_ms_a_frame / now.server_ms_a_frame
+    told = f"{held:.2f} times as many vehicles (medians); {spent:.2f} times as many frames a second"
+    columns = ("code", "vehicles held", "server, ms a frame")
+    return "\n\n".join(
+        [heading(path, result), table(columns, cells), f"{told} of the server's processor.", ""]
+    )
 
 
 def _shown(row: LoadRow, column: str) -> str:

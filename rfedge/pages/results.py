@@ -27,7 +27,7 @@ from rfedge.experiments.robust.report import robust_section, write_robust_figure
 from rfedge.experiments.slice_coder.report import slice_coder_section
 from rfedge.loadtest.cases import scale_section, world_section
 from rfedge.loadtest.live.report import live_section
-from rfedge.loadtest.result import load_section
+from rfedge.loadtest.result import load_section, ratio_section
 from rfedge.loadtest.rig.report import rig_section
 from rfedge.report.tables import heading
 from rfedge.results import Result, read_result, rows_of
@@ -56,6 +56,7 @@ SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
     "latency": latency_section,
     "live": live_section,
     "loadtest": load_section,
+    "load-ratio": ratio_section,
     "localise": localise_section,
     "never-worse": never_worse_section,
     "paper": paper_section,

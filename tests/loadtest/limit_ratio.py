@@ -17,6 +17,8 @@ from statistics import median
 TESTS = Path(__file__).parents[1]
 sys.path.insert(0, str(TESTS))
 from history import ROOT, code_of, git  # noqa: E402
+from rfedge.loadtest.result import LimitRow  # noqa: E402
+from rfedge.results import make_result, provenance, write_result  # noqa: E402
 
 SEARCH = ("--mode", "full", "--hz", "10", "--vehicles", "1", "--find-limit", "--duration", "10")
 
@@ -54,19 +56,14 @@ def main(revision: str, out: str, runs: str = "3") -> None:
         for _ in range(int(runs)):
             for name, code in codes.items():
                 found[name].append(search(code, works[name]))
-    limits = {name: [held for held, _ in every] for name, every in found.items()}
-    spent = {name: median(ms for _, ms in every) for name, every in found.items()}
-    then = commit[:12]
-    result = {
-        "search": " ".join(SEARCH),
-        "vehicles": limits,
-        "server_ms_a_frame": spent,
-        "ratio_of_limits": median(limits["now"]) / max(1, median(limits[then])),
-        "ratio_of_processor_time": spent[then] / spent["now"],
-    }
-    Path(out).parent.mkdir(parents=True, exist_ok=True)
-    Path(out).write_text(json.dumps(result, indent=1) + "\n")
-    print(json.dumps(result, indent=1))
+    rows = [
+        LimitRow(name, tuple(held for held, _ in every), median(ms for _, ms in every))
+        for name, every in found.items()
+    ]
+    made = provenance(command=f"make load-ratio BASE={commit[:12]}")
+    result = make_result("load-ratio", made, {"rows": rows, "search": " ".join(SEARCH)})
+    write_result(Path(out), result)
+    print(json.dumps(result["rows"], indent=1))
 
 
 if __name__ == "__main__":

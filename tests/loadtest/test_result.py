@@ -14,10 +14,12 @@ from rich.console import Console
 from rfcore.errors import InvalidInput
 from rfedge.loadtest.plan import Load, Mode, Vehicles
 from rfedge.loadtest.result import (
+    LimitRow,
     LoadResult,
     latency_chart,
     load_section,
     print_runs,
+    ratio_section,
     record,
     uplink_chart,
     write_load_result,
@@ -185,6 +187,15 @@ def test_the_section_names_what_was_not_kept_and_its_command() -> None:
         section
     )
     assert section.count("Not kept: 97.25 % on time, below 99 %.") == 1
+
+
+def test_the_ratio_of_two_revisions_is_made_from_their_rows(tmp_path: Path) -> None:
+    rows = [LimitRow("0123456789ab", (2, 3, 2), 30.0), LimitRow("now", (6, 5, 6), 12.0)]
+    path = tmp_path / "load-ratio.json"
+    write_result(path, make_result("load-ratio", replace(MADE, host=HOST), {"rows": rows}))
+    section = ratio_section(path, read_result(path, "load-ratio"))
+    assert "| 0123456789ab | 2, 3, 2 | 30.00 |" in section
+    assert "3.00 times as many vehicles (medians); 2.50 times as many frames a second" in section
 
 
 # --- charts
