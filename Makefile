@@ -161,8 +161,9 @@ load-ratio: build-full  ## vehicles that the full loop carries now and at BASE, 
 	$(BIN)/python tests/loadtest/limit_ratio.py $(BASE) results/load-ratio.json
 
 MINUTES ?= 30
-soak: build-full  ## half load for MINUTES (30): memory, descriptors and threads must not grow
-	$(BIN)/python -m rfedge.loadtest.soak --minutes $(MINUTES) $(ARGS)
+soak: build-full  ## half load for MINUTES (30): memory, descriptors and threads must not grow; writes results/soak.json
+	$(BIN)/python -m rfedge.loadtest.soak --minutes $(MINUTES) $(ARGS); ended=$$?; \
+		cp out/soak/soak.json results/soak.json && exit $$ended
 
 soak-short: build-full  ## five minutes of it
 	$(BIN)/python -m rfedge.loadtest.soak --minutes 5

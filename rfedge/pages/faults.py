@@ -6,7 +6,7 @@ python -m rfedge.pages.faults results/faults.json > docs/reliability.md
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,19 +72,21 @@ KINDS = {
 """Kinds of fault (F) and load (L) that this project holds itself against."""
 
 ELSEWHERE = {
-    "L1": "`make load-transport`",
-    "L2": "`make load-receiver`",
-    "L3": "`make load-full`",
-    "L4": "`make load-links`",
-    "L6": "`make load-overload`",
-    "L7": "`make soak`",
+    "L1": "load-transport",
+    "L2": "load-receiver",
+    "L3": "load-full",
+    "L4": "load-links",
+    "L6": "load-overload",
+    "L7": "soak",
 }
-"""Loads are measured by these commands, not by the fault suite."""
+"""Loads are measured by these targets of make, not by the fault suite."""
+SOAK = "L7"
 
 
 OPENING = """# What happens when things break
 
-Generated from `results/faults.json` by `make figures`; do not edit.
+Generated from `results/faults.json`, of loads from `loadtest.json` and `soak.json`, by
+`make figures`; do not edit.
 
 What is promised, and no more:
 
@@ -123,19 +125,38 @@ def faults_page(path: Path) -> str:
         f"## Scoreboard\n\n{passed} of {len(rows)} hold. `{result['command']}` at "
         f"`{result['revision']}`; {machine['cpu']}, {machine['cores']} cores, {machine['isa']}.\n"
     )
-    return "\n".join([OPENING, score, *_kinds(rows), *_sections(rows)])
+    loads = {kind: _runs_held(kind, path.parent) for kind in ELSEWHERE}
+    return "\n".join([OPENING, score, *_kinds(rows, loads), *_sections(rows)])
 
 
-def _kinds(rows: list[FaultRow]) -> Iterator[str]:
+def _runs_held(kind: str, folder: Path) -> list[bool]:
+    """Return which of the runs of a load held that results in ``folder`` have, of the newest
+    measurement: in ``soak.json`` or ``loadtest.json``, by the folder that its command names."""
+    path = folder / ("soak.json" if kind == SOAK else "loadtest.json")
+    if not path.exists():
+        return []
+    rows = read_result(path, path.stem)["rows"]
+    if kind == SOAK:
+        return [bool(row["held"]) for row in rows]
+    out = f"out/loadtest/{ELSEWHERE[kind].removeprefix('load-')}"
+    rows = [row for row in rows if row["command"].split()[-1] == out]
+    numbered = [row for row in rows if row.get("run") is not None]
+    return [bool(row["held"]) for row in numbered or rows]
+
+
+def _kinds(rows: list[FaultRow], loads: Mapping[str, list[bool]]) -> Iterator[str]:
     """Yield the table of kinds, each with the rows that test it; results before it have none."""
     if not any(row.covers for row in rows):
         return
     cells = []
     for kind, what in KINDS.items():
         tested = [row for row in rows if kind in (row.covers or "").split()]
-        by = ", ".join(row.fault for row in tested) or ELSEWHERE.get(kind, "**not tested**")
-        held = sum(row.passed for row in tested)
-        cells.append((kind, what, by, f"{held} of {len(tested)}" if tested else ""))
+        by = ", ".join(row.fault for row in tested) or "**not tested**"
+        held = [row.passed for row in tested]
+        if not tested and kind in ELSEWHERE:
+            by, held = f"`make {ELSEWHERE[kind]}`", loads[kind]
+        told = f"{sum(held)} of {len(held)}" if held else "**not recorded**"
+        cells.append((kind, what, by, told if tested or kind in ELSEWHERE else ""))
     yield table(("kind", "fault", "tested by", "hold"), cells)
     yield ""
 

@@ -64,6 +64,7 @@ SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
     "robust": robust_section,
     "scale": scale_section,
     "slice-coder": slice_coder_section,
+    "soak": lambda path, result: _reference(path, result, "soaks", "reliability"),
     "stability": lambda path, result: _reference(path, result, "cases", "stability"),
     "world": world_section,
 }

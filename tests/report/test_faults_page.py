@@ -1,6 +1,7 @@
 """The committed page of faults is what the committed scoreboard says."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,23 @@ def test_a_row_shows_each_bound_beside_its_figure_and_a_miss_as_such(tmp_path: P
     assert "0 of 1 hold. `make test-fault` at `abc`; C, 2 cores, avx2." in page
     assert "### it breaks: **does not hold**" in page
     assert "| back <= 1 s | 2.5 s |\n| told so | yes |" in page
+
+
+def test_loads_are_counted_from_the_results_of_their_own_commands(tmp_path: Path) -> None:
+    def run(name: str, held: bool, number: int | None) -> dict[str, Any]:
+        command = f"rfedge loadtest --mode x --out out/loadtest/{name}"
+        return {"command": command, "held": held, "run": number}
+
+    rows = [run("full", True, None), run("full", True, 1), run("full", False, 2)]
+    scoreboard(tmp_path / "loadtest.json", *rows, run("links", True, None), kind="loadtest")
+    scoreboard(tmp_path / "soak.json", {"held": False}, kind="soak")
+    fault = replace(ROW, covers="F1")
+    page = faults_page(scoreboard(tmp_path / "faults.json", fault))
+    assert "| L3 | load: full loop | `make load-full` | 1 of 2 |" in page
+    assert "| `make load-links` | 1 of 1 |" in page
+    assert "| `make load-overload` | **not recorded** |" in page
+    assert "| L7 | soak | `make soak` | 0 of 1 |" in page
+    assert "| F2 | vehicle killed | **not tested** |  |" in page
 
 
 def test_every_row_appears_once_and_those_that_hold_are_counted(tmp_path: Path) -> None:
