@@ -145,11 +145,15 @@ class _Header:
     flags: int
 
     @property
-    def block_bytes(self) -> tuple[int, ...]:
-        """Positions, opacities, colours, scales, rotations, other bands."""
+    def splat_bytes(self) -> tuple[int, ...]:
+        """Of one splat: position, opacity, colour, scale, rotation, other bands."""
         rotation = 3 if self.version == 2 else 4
-        bands = 3 * ((self.sh_degree + 1) ** 2 - 1)
-        return tuple(self.count * size for size in (9, 1, 3, 3, rotation, bands))
+        return (9, 1, 3, 3, rotation, 3 * ((self.sh_degree + 1) ** 2 - 1))
+
+    @property
+    def block_bytes(self) -> tuple[int, ...]:
+        """Of all of them, block by block."""
+        return tuple(self.count * size for size in self.splat_bytes)
 
 
 def read_open_spz(
@@ -234,7 +238,8 @@ def _exactly(stream: _Stream, size: int) -> U8:
 
 def _gaussians(header: _Header, blocks: list[U8], origin: TileOrigin) -> Gaussians:
     means, opacities, colours, scales, rotations, bands = (
-        block.reshape(header.count, -1) for block in blocks
+        block.reshape(header.count, size)
+        for block, size in zip(blocks, header.splat_bytes, strict=True)
     )
     shares = np.clip(opacities[:, 0] / 255.0, 0.5 / 255.0, 254.5 / 255.0)
     decode = _from_xyz if header.version == 2 else _from_smallest_three
@@ -244,7 +249,7 @@ def _gaussians(header: _Header, blocks: list[U8], origin: TileOrigin) -> Gaussia
         decode(rotations),
         scales / 16.0 - 10.0,
         np.log(shares / (1.0 - shares)),
-        sh.reshape(header.count, -1, 3),
+        sh.reshape(header.count, (header.sh_degree + 1) ** 2, 3),
     )
     return Gaussians(*(np.ascontiguousarray(array, dtype=np.float32) for array in arrays))
 

@@ -134,6 +134,12 @@ def test_what_is_written_is_read_within_its_steps(seed: int, degree: int, reach_
 
 
 @pytest.mark.parametrize("degree", range(4))
+def test_a_file_without_splats_is_read(degree: int) -> None:
+    empty, _ = decoded(encode_spz(random_gaussians(1, 0, degree, 1.0), antialiased=False))
+    assert empty.sh.shape == (0, (degree + 1) ** 2, 3)
+
+
+@pytest.mark.parametrize("degree", range(4))
 def test_reading_is_exact_once_the_splats_are_in_steps(degree: int) -> None:
     once, antialiased = decoded(encode_spz(random_gaussians(5, 40, degree, 9.0), antialiased=True))
     twice, _ = decoded(encode_spz(once, antialiased=antialiased))
