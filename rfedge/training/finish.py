@@ -30,6 +30,7 @@ from rfcore.field.importance import (
     reordered,
     seen_directions,
 )
+from rfcore.field.quality import LevelsOfDetail
 from rfcore.field.splat_grid import FINEST, Grain, Steps
 from rfcore.field.store import encode_field
 from rfcore.raster.gaussians import Gaussians
@@ -183,16 +184,19 @@ class FieldSizer:
         return totals.index(min(totals))
 
     def _pruned(self, field: SplatField, size: FieldSize, *, fit: bool = True) -> SplatField:
-        """Return the splats that contribute most, fitted to the renders of all if ``fit``."""
+        """Return the splats that contribute most, fitted to the renders of all if ``fit``.
+
+        Without levels, which are fitted to what is kept.
+        """
         keep = math.ceil(size.share * field.primitives)
         if keep == field.primitives:
-            return field
+            return _of(field, field.gaussians, {})
         full, config = field.rasterizer(), self._config
         weights = contributions(
             field.gaussians, self._cameras, threads=config.threads, antialiased=full.antialiased
         )
         kept = reordered(field.gaussians, most_important_first(weights)[:keep])
-        return _of(field, fitted(kept, full, self._cameras, config) if fit else kept)
+        return _of(field, fitted(kept, full, self._cameras, config) if fit else kept, {})
 
     def _with_levels(self, field: SplatField) -> SplatField:
         return fit_levels(field, self._cameras, self._config, self._console)
@@ -206,12 +210,11 @@ class FieldSizer:
             antialiased=field.metadata.antialiased,
         )
         colours = frugal_colours(field.gaussians, seen, size.steps, size.price)
-        return _of(field, colours).compressed(size.steps, size.grain)
+        return _of(field, colours, field.levels).compressed(size.steps, size.grain)
 
 
-def _of(field: SplatField, gaussians: Gaussians) -> SplatField:
-    """Return the field with other splats, and its levels where it is of as many."""
-    levels = field.levels if len(gaussians) == field.primitives else {}
+def _of(field: SplatField, gaussians: Gaussians, levels: LevelsOfDetail) -> SplatField:
+    """Return the field with other splats and levels, not measured."""
     metadata = replace(field.metadata, held_out_psnr_db=None, held_out_ssim=None)
     return SplatField(gaussians, metadata, levels=levels, threads=field.threads, isa=field.isa)
 

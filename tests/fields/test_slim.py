@@ -8,7 +8,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.field.importance import most_important_first, reordered, visible_area
 from rfcore.field.store import encode_field
-from rfcore.train.levels import LevelFitConfig
+from rfcore.train.levels import LevelFitConfig, with_levels
 from rfedge.fields.slim import slimmed
 from rfedge.training.finish import SIZES, FieldSizer, SizeGoal
 
@@ -66,6 +66,19 @@ def test_a_field_is_as_large_as_it_may_be(place) -> None:
     assert limit / 2 < size_bytes(small) <= limit
     assert set(small.levels) == {0.5, 0.25, 0.1}
     assert error(most, place) < error(small, place) < 0.1
+
+
+def test_levels_that_a_field_has_already_are_not_counted_twice(place) -> None:
+    """They are fitted anew, so that a field is sized as the same splats without levels are."""
+    leveled = with_levels(
+        place.field, [p.camera for p in place.pictures], LevelFitConfig(iterations=2)
+    )
+    full = size_bytes(sizer(place).sized(place.field, SizeGoal()))
+    bare = SplatField(leveled.gaussians, leveled.metadata)
+    for share in range(70, 130, 4):
+        goal = SizeGoal(max_bytes=full * share // 100)
+        kept = [sizer(place).sized(field, goal).primitives for field in (leveled, bare)]
+        assert kept[0] == kept[1]
 
 
 def test_a_limit_no_size_keeps_is_refused_with_the_least_there_is(place) -> None:
