@@ -24,7 +24,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mec_server.event_loop import BACKGROUND_NICE, LOWEST_NICE, Workers
+from mec_server.event_loop import LOWEST_NICE, Workers
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Ledger
 from mec_server.twin.composition import (
@@ -67,6 +67,9 @@ Classify = Callable[[Rgb], str]
 """A detector: returns what the thing in a cut-out of a picture, uint8 [H, W, 3], is called: a name
 of at most 64 letters, digits, '.', '_' or '-', or nothing."""
 
+LOOKS_NICE = 5
+"""Of the thread that finds things, for objects and notices, which are worth nothing when they are
+late: at 10 it found nothing for seconds where others kept the processors busy."""
 MOST_KEPT = 16
 """Live pictures whose difference from the field is kept for the next view."""
 
@@ -212,7 +215,7 @@ class TwinViews:
         self._tiles = tiles
         self._ledger = ledger
         views = Workers(1, failed, "views", nice=LOWEST_NICE)
-        looks = Workers(1, failed, "looks", nice=BACKGROUND_NICE)
+        looks = Workers(1, failed, "looks", nice=LOOKS_NICE)
         self._composing = _FieldThread(views, open_fields())
         self._looking = _FieldThread(looks, open_fields())
         self._kept = _KeptLooks()

@@ -20,6 +20,8 @@ typedef int32_t Row8 __attribute__((vector_size(32)));
 typedef int32_t Row4 __attribute__((vector_size(16)));
 typedef int16_t Short16 __attribute__((vector_size(32)));
 typedef int16_t Short8 __attribute__((vector_size(16)));
+typedef uint16_t UShort16 __attribute__((vector_size(32)));
+typedef uint16_t UShort8 __attribute__((vector_size(16)));
 typedef uint8_t Bytes16 __attribute__((vector_size(16)));
 typedef uint8_t Bytes8 __attribute__((vector_size(8)));
 typedef uint8_t Bytes4 __attribute__((vector_size(4)));
@@ -197,8 +199,8 @@ RF_INLINE void add_squares(Words8& sum, Short16 v) {
     const __m256i w = reinterpret_cast<__m256i>(v);
     sum += reinterpret_cast<Words8>(_mm256_madd_epi16(w, w));
 #else
-    const Short16 square = v * v;  // at most 65025: without sign
-    const Words8 pairs = reinterpret_cast<Words8>(square);
+    const UShort16 u = reinterpret_cast<UShort16>(v);  // squares are at most 65025: without sign
+    const Words8 pairs = reinterpret_cast<Words8>(UShort16(u * u));
     sum += (pairs & 0xFFFF) + (pairs >> 16);
 #endif
 }
@@ -208,8 +210,8 @@ RF_INLINE void add_squares(Words4& sum, Short8 v) {
     const __m128i w = reinterpret_cast<__m128i>(v);
     sum += reinterpret_cast<Words4>(_mm_madd_epi16(w, w));
 #else
-    const Short8 square = v * v;
-    const Words4 pairs = reinterpret_cast<Words4>(square);
+    const UShort8 u = reinterpret_cast<UShort8>(v);
+    const Words4 pairs = reinterpret_cast<Words4>(UShort8(u * u));
     sum += (pairs & 0xFFFF) + (pairs >> 16);
 #endif
 }
