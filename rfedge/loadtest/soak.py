@@ -14,7 +14,7 @@ import json
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,11 @@ from rfcore.errors import InvalidInput, RfedgeError
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.run import Run, TestBed, run_load
 from rfedge.loadtest.usage import Sample, slope_per_minute
-from rfedge.results import make_result, provenance, write_result
+from rfedge.report.tables import cell, heading, table
+from rfedge.results import Result, make_result, provenance, rows_of, write_result
 from rfedge.samples import sample_path
 
-__all__ = ["MAX_SLOPE_MB", "SoakRow", "SoakSettings", "soak", "what_grew"]
+__all__ = ["MAX_SLOPE_MB", "SoakRow", "SoakSettings", "soak", "soak_section", "what_grew"]
 
 MAX_SLOPE_MB = 1.0
 """Per minute."""
@@ -103,6 +104,13 @@ def soak(settings: SoakSettings) -> dict[str, Any]:
     if problems:
         raise RfedgeError(f"soak: {'; '.join(problems)} (see {settings.out})")
     return result
+
+
+def soak_section(path: Path, result: Result) -> str:
+    """Return a table of the soaks."""
+    columns = [each.name for each in fields(SoakRow)]
+    rows = [[*map(cell, astuple(row))] for row in rows_of(SoakRow, result["rows"])]
+    return "\n\n".join([heading(path, result), table(columns, rows), ""])
 
 
 def _command() -> str:

@@ -29,6 +29,7 @@ from rfedge.loadtest.cases import scale_section, world_section
 from rfedge.loadtest.live.report import live_section
 from rfedge.loadtest.result import load_section, ratio_section
 from rfedge.loadtest.rig.report import rig_section
+from rfedge.loadtest.soak import soak_section
 from rfedge.report.tables import heading
 from rfedge.results import Result, read_result, rows_of
 from rfedge.training.report import training_section
@@ -64,7 +65,7 @@ SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
     "robust": robust_section,
     "scale": scale_section,
     "slice-coder": slice_coder_section,
-    "soak": lambda path, result: _reference(path, result, "soaks", "reliability"),
+    "soak": soak_section,
     "stability": lambda path, result: _reference(path, result, "cases", "stability"),
     "world": world_section,
 }
