@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import io
 import os
+import socket
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -28,6 +29,7 @@ from rich.console import Console
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.extras import needs
 from rfcore.files import write_whole
+from rfcore.wire.address import Address
 
 __all__ = ["Job", "Tell", "console_of", "run_jobs"]
 
@@ -37,6 +39,7 @@ LOCAL = "local"
 RETRIES = 3
 """How often a job is begun again whose process was killed."""
 POLL_S = 0.2
+REACHED_WITHIN_S = 10.0
 OBJECT_STORE_BYTES = 100 << 20
 """Of a Ray started here: jobs hand over files, not objects."""
 LINE_COLUMNS = 200
@@ -228,9 +231,27 @@ def _ray() -> Any:
         return import_module("ray")
 
 
+def _check_reachable(address: str) -> None:
+    """Raise ``RfedgeError`` where nobody listens: Ray itself would go on trying for minutes.
+
+    ``local`` and ``auto`` name no machine.
+    """
+    if ":" not in address:
+        return
+    place = Address.parse("ray", address.removeprefix("ray://"))
+    try:
+        socket.create_connection((place.host, place.port), REACHED_WITHIN_S).close()
+    except OSError as error:
+        raise RfedgeError(
+            f"no Ray at {address}: {error.strerror or error}; give the HOST:PORT that `ray start "
+            f"--head` says, or {LOCAL}"
+        ) from error
+
+
 @contextmanager
 def _connected(address: str) -> Iterator[Any]:
     """Connect to a Ray, or start one here; raise ``RfedgeError`` if there is none."""
+    _check_reachable(address)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ray = _ray()
     settings: dict[str, Any] = {"address": address}
@@ -242,7 +263,7 @@ def _connected(address: str) -> Iterator[Any]:
         }
     try:
         ray.init(**settings, log_to_driver=False, logging_level="ERROR")
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except (ConnectionError, ValueError, RuntimeError, ray.exceptions.RayError) as error:
         raise RfedgeError(f"no Ray at {address}: {error}") from error
     try:
         yield ray

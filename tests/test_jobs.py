@@ -131,6 +131,14 @@ def test_on_ray_jobs_that_fail_or_whose_workers_die_are_listed_and_stop_nobody(
     assert len(dying) >= 2, "begun again elsewhere; a last line may die with its process"
 
 
+def test_a_ray_that_nobody_runs_is_an_error_at_once(tmp_path: Path, free_port: int) -> None:
+    address = f"127.0.0.1:{free_port}"
+    with pytest.raises(RfedgeError, match=f"^no Ray at {address}: Connection refused; give the"):
+        run_jobs([job(tmp_path, "a")], print, address)
+    with pytest.raises(InvalidInput, match=r"^ray: .*must be HOST:PORT"):
+        run_jobs([job(tmp_path, "a")], print, "ray://:")
+
+
 def test_a_job_that_fails_is_no_longer_taken_for_done(tmp_path: Path) -> None:
     good = job(tmp_path, "a")
     run_jobs([good], lambda _: None)
