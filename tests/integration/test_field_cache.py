@@ -3,10 +3,14 @@
 import asyncio
 import json
 import shutil
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from prometheus_client import CollectorRegistry
 
@@ -15,11 +19,17 @@ from cav_agent.field_cache import MAX_PREPARED, FieldCache, read_drive
 from cav_agent.frame_log import DriveObserver
 from cav_agent.handover import ServedTile
 from cav_agent.metrics import AgentMetrics
-from cav_agent.server_connection import server_connections
+from cav_agent.server_connection import ServerConnection, server_connections
+from mec_server.fields.shelf import CHUNK_BYTES, read_chunk
 from rfcore.camera import TileOrigin
 from rfcore.codec.h264.config import CoderSettings
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.field import FieldMetadata, FieldStore, SplatField, save_field
+from rfcore.field.quality import FULL
+from rfcore.image import I420
+from rfcore.raster.gaussians import Gaussians
+from rfcore.wire.publish import Ground, publish
+from rfcore.wire.tile_manifest import VersionLabel
 from rfcore.wire.tiles import Tile
 
 
@@ -32,11 +42,15 @@ def config(street: Any) -> AgentConfig:
     return replace(config, limits=replace(config.limits, give_up_s=0.05))
 
 
-def cache_of(config: AgentConfig) -> FieldCache:
+def cache_and_connections(config: AgentConfig) -> tuple[FieldCache, Sequence[ServerConnection]]:
     servers = server_connections(config)
     addresses = [server.address for server in servers]
     observer = DriveObserver(AgentMetrics(CollectorRegistry()), addresses)
-    return FieldCache(config, servers, observer)
+    return FieldCache(config, servers, observer), servers
+
+
+def cache_of(config: AgentConfig) -> FieldCache:
+    return cache_and_connections(config)[0]
 
 
 def served(field_id: str, name: str = "street") -> ServedTile:
@@ -62,9 +76,7 @@ async def test_a_field_that_is_here_needs_no_server(street: Any, config: AgentCo
 
 async def test_a_failure_is_not_kept(street: Any, config: AgentConfig, tmp_path: Path) -> None:
     config = replace(config, fields=tmp_path)
-    servers = server_connections(config)
-    observer = DriveObserver(AgentMetrics(CollectorRegistry()), [s.address for s in servers])
-    cache = FieldCache(config, servers, observer)
+    cache, servers = cache_and_connections(config)
     async with servers[0]:
         with pytest.raises(RfedgeError, match=r"no server at 127\.0\.0\.1:1 within 0\.05 s"):
             await cache.prepared(served(street.field_id))
@@ -118,3 +130,99 @@ def test_a_drive_of_two_cameras_is_refused_with_the_picture_named(
     (drive / "transforms.json").write_text(json.dumps(description))
     with pytest.raises(InvalidInput, match=r"003\.png has other intrinsics than .*000\.png"):
         read_drive(replace(config, drive=drive), TileOrigin())
+
+
+class BreakingRelay:
+    """Hands bytes on between a vehicle and a server; breaks connections when told to."""
+
+    def __init__(self) -> None:
+        self._writers: list[asyncio.StreamWriter] = []
+
+    @asynccontextmanager
+    async def to(self, port: int) -> AsyncIterator[int]:
+        """Listen on a free port, which is returned, for connections to the server at ``port``."""
+
+        async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            there_reader, there_writer = await asyncio.open_connection("127.0.0.1", port)
+            self._writers += [writer, there_writer]
+            await asyncio.gather(_pumped(reader, there_writer), _pumped(there_reader, writer))
+
+        listening = await asyncio.start_server(connected, "127.0.0.1", 0)
+        async with listening:
+            yield int(listening.sockets[0].getsockname()[1])
+            self.break_connections()
+
+    def break_connections(self) -> None:
+        """Close every connection there is at once; others may be made."""
+        for writer in self._writers:
+            writer.transport.abort()
+        self._writers.clear()
+
+
+async def _pumped(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    try:
+        while data := await reader.read(1 << 16):
+            writer.write(data)
+            await writer.drain()
+    except OSError:
+        pass  # the other end is gone
+    finally:
+        writer.transport.abort()
+
+
+def dark_field(field: SplatField) -> SplatField:
+    """The splats of a field many times over, in another light: an archive of several chunks."""
+    arrays = {
+        name: np.repeat(getattr(field.gaussians, name), 10, axis=0)
+        for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    }
+    rng = np.random.default_rng(5)
+    arrays["means"] = arrays["means"] + rng.normal(0, 0.1, arrays["means"].shape)
+    arrays["sh"] = arrays["sh"] * 0.3 - 0.5
+    return SplatField(Gaussians(**{n: a.astype(np.float32) for n, a in arrays.items()}))
+
+
+async def test_a_light_goes_on_where_its_transfer_broke(
+    street: Any, serve: Any, config: AgentConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, mine, now = tmp_path / "fields", tmp_path / "mine", datetime(2026, 1, 1, tzinfo=UTC)
+    folder.mkdir()
+    dusk_id = save_field(dark_field(street.field), tmp_path / "dusk.rff")
+    publish(folder, "west", street.store / "street.rff", Ground(), now)
+    tile = publish(folder, "west", tmp_path / "dusk.rff", Ground(), now, VersionLabel("dusk"))
+    relay, loop = BreakingRelay(), asyncio.get_running_loop()
+    offsets: list[int] = []
+
+    async def break_once_some_arrived() -> None:
+        partial = mine / f".{dusk_id}.part"
+        while not partial.exists() or partial.stat().st_size < CHUNK_BYTES:
+            await asyncio.sleep(0.001)
+        relay.break_connections()
+
+    def noted_chunk(path: Path, offset_bytes: int) -> bytes:
+        if path.stem == dusk_id:
+            offsets.append(offset_bytes)
+            if offsets == [0, CHUNK_BYTES, 2 * CHUNK_BYTES]:
+                asyncio.run_coroutine_threadsafe(break_once_some_arrived(), loop).result(20)
+        return read_chunk(path, offset_bytes)
+
+    monkeypatch.setattr("mec_server.fields.service.read_chunk", noted_chunk)
+    async with (
+        serve(fields=folder) as server,
+        relay.to(server.address.port) as port,
+        asyncio.timeout(30),
+    ):
+        config = replace(config, server=f"127.0.0.1:{port}", fields=mine)
+        config = replace(config, limits=replace(config.limits, give_up_s=10.0))
+        cache, (connection,) = cache_and_connections(config)
+        async with connection:
+            lights = (await cache.prepared(ServedTile(0, tile))).lights
+            black = I420(np.full((52, 76), 16, np.uint8), *[np.full((26, 38), 128, np.uint8)] * 2)
+            lights.view(black, read_drive(config, TileOrigin())[0].camera, FULL)
+            while dusk_id not in lights.held_ids():
+                await asyncio.sleep(0.001)
+            await cache.close()
+    resumed = offsets[3]
+    assert resumed in (CHUNK_BYTES, 2 * CHUNK_BYTES)
+    assert offsets[3:5] == [resumed, resumed + CHUNK_BYTES]
+    assert FieldStore(mine).path(dusk_id).read_bytes() == (tmp_path / "dusk.rff").read_bytes()
