@@ -5,7 +5,9 @@ street's own render from the true pose plus seeded texture and boxes the field h
 the P picture has something to code; the camera drives 20 cm a frame. Each size is coded against one
 reference (the render) and against three (previous frame, render, correction), by our slice coder
 and by x264 medium: every frame by all of them, one after another, so that what disturbs the machine
-disturbs them alike. On every frame the receiver's picture must equal the sender's closed loop.
+disturbs them alike. On every frame the receiver's picture must equal the sender's closed loop. The
+stage ``relight`` is what an end takes beside its total where the light is not the field's: these
+frames are in its light, so the render is mapped to that of the frame before for the time alone.
 
 ``decoder_rows`` times the decoder in this process, in a child process, and in a child inside a
 sandbox. Every frame of the sample drive (640x360, the references that the encoder chose) is decoded
@@ -41,6 +43,7 @@ from rfcore.errors import CodecError, RfedgeError
 from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
 from rfcore.metrics import psnr
+from rfcore.native.warp import relight_i420
 from rfcore.native.yuv import field_view_from_view, i420_from_rgb
 from rfcore.raster.native import Rasterizer
 from rfcore.views import FieldView
@@ -159,6 +162,7 @@ class Coding:
 
     def code(self, frame: I420, view: FieldView, render_ms: float, choice: FrameChoice) -> None:
         """Code and decode one frame, and note its times."""
+        past = self._sent.past
         total_ms, encoded = _timed(lambda: self._encoder.encode(self._sent, frame, view, choice))
         decode_ms, decoded = _timed(
             lambda: self._decoder.decode(self._received, encoded.packet, view)
@@ -168,6 +172,12 @@ class Coding:
         self._sent, self._received = encoded.state, decoded.state
         _note(self._sender, render_ms, total_ms, encoded.stage_ns)
         _note(self._receiver, render_ms, decode_ms, decoded.stage_ns)
+        if past is not None:
+            relight_ms, _ = _timed(
+                lambda: relight_i420(past.picture, past.field_render, view.render)
+            )
+            for series in (self._sender, self._receiver):
+                series.setdefault("relight", []).append(relight_ms)
         self._payload_bytes.append(len(encoded.packet.payload))
         self._psnr_db.append(psnr(decoded.frame.y, frame.y))
 

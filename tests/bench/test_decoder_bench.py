@@ -54,3 +54,4 @@ def test_every_coder_has_its_row_at_each_number_of_references(
         assert row.psnr_db > 25
         assert row.sender_ms["total"] > row.sender_ms["render"] > 0
         assert row.receiver_ms["total"] > 0
+        assert row.sender_ms["relight"] == row.receiver_ms["relight"] > 0
