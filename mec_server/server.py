@@ -6,7 +6,7 @@ import asyncio
 import re
 import socket
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -39,6 +39,7 @@ from mec_server.proxies import Proxies
 from mec_server.reconstruction import OpenCameras, Tools, open_cameras
 from mec_server.recorder import KeepLimits, Recorder, TilesOfFields
 from mec_server.stream_decoders import ServerContext
+from mec_server.tile_history import TileHistory
 from mec_server.tile_learning import LearningJob
 from mec_server.twin.metrics import TwinMetrics
 from mec_server.twin.notices import StreetNotices
@@ -188,13 +189,14 @@ class EdgeServer:
         )
         self._edge.register(self._server)
         self._twin_service.register(self._server)
-        FieldService(
+        self._field_service = FieldService(
             self._index,
             lambda: self._published.tiles,
             Slots(ledger, Resource.FETCHES, limited, self._log_limiter),
             config.limits.stalled_s,
             self._guard.may_fetch,
-        ).register(self._server)
+        )
+        self._field_service.register(self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
 
     def _is_reachable(self) -> bool:
@@ -502,7 +504,13 @@ class EdgeServer:
             quiet_s=settings.quiet_s,
             max_field_bytes=config.render.max_field_bytes,
         )
-        return Learner(job, config.log, self._metrics.show_learnt)
+        return Learner(job, config.log, self._show_learnt)
+
+    def _show_learnt(self, histories: Mapping[str, TileHistory]) -> None:
+        self._metrics.show_learnt(histories)
+        self._field_service.show_learnt(
+            one for name, history in histories.items() for one in history.newest(name)
+        )
 
     def _recording_failed(self, error: Exception) -> None:
         self._metrics.recording.set(0)

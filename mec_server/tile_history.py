@@ -8,13 +8,14 @@ for its metrics.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
+from rfcore.wire.tiles import LearntLight
 
 __all__ = ["LEARNING", "Learnt", "TileHistory", "read_histories", "write_histories"]
 
@@ -48,6 +49,14 @@ class TileHistory:
     checked: Mapping[str, int] = field(default_factory=dict)
     cpu: tuple[tuple[int, float], ...] = ()
     """When CPU time was spent on learning, and seconds of it, of the last hour."""
+
+    def newest(self, tile: str) -> Iterator[LearntLight]:
+        """Yield what was learnt last of each light of ``tile``, whose history this is."""
+        for one in {one.light: one for one in self.learnt}.values():
+            saved_ratio = one.saved_percent / 100
+            yield LearntLight(
+                tile, one.light, one.field_id, one.passes, one.time_ms, saved_ratio, one.withdrawn
+            )
 
     @property
     def withdrawals(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,7 +16,7 @@ from mec_server.ledger.peer_log import PeerLog
 from mec_server.peers import Slots, abort
 from rfcore.errors import AccessDenied, LimitExceeded, RfedgeError, UnknownField
 from rfcore.wire.checks import check_field_id
-from rfcore.wire.tiles import Tile, tile_message
+from rfcore.wire.tiles import LearntLight, Tile, learnt_message, tile_message
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1 import field_pb2_grpc
 
@@ -46,6 +46,11 @@ class FieldService(field_pb2_grpc.FieldServiceServicer):
         self._slots = slots
         self._stalled_s = stalled_s
         self._may_fetch = may_fetch
+        self._learnt: tuple[LearntLight, ...] = ()
+
+    def show_learnt(self, learnt: Iterable[LearntLight]) -> None:
+        """List this from now on as what the server learnt."""
+        self._learnt = tuple(learnt)
 
     def register(self, server: grpc.aio.Server) -> None:
         """Add the service to a server that has not started."""
@@ -58,14 +63,16 @@ class FieldService(field_pb2_grpc.FieldServiceServicer):
     ) -> pb.ListFieldsResponse:
         """List the ids of the fields here, and the tiles, as far as the peer may have them."""
         held = await asyncio.to_thread(self._store.ids)
-        tiles = self._tiles()
+        tiles = [
+            tile
+            for tile in self._tiles()
+            if self._may_fetch(context, self._tiles_of(tile.field_id))
+        ]
+        names = {tile.name for tile in tiles}
         return pb.ListFieldsResponse(
             field_ids=[name for name in held if self._may_fetch(context, self._tiles_of(name))],
-            tiles=[
-                tile_message(tile)
-                for tile in tiles
-                if self._may_fetch(context, self._tiles_of(tile.field_id))
-            ],
+            tiles=[tile_message(tile) for tile in tiles],
+            learnt=[learnt_message(one) for one in self._learnt if one.tile in names],
         )
 
     def _tiles_of(self, field_id: str) -> frozenset[str]:

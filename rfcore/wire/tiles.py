@@ -19,8 +19,11 @@ __all__ = [
     "MAX_TILES",
     "PREVIEW",
     "Area",
+    "LearntLight",
     "Tile",
     "TileLight",
+    "learnt_message",
+    "learnt_of",
     "tile_message",
     "tile_of",
 ]
@@ -141,6 +144,48 @@ class Tile:
     def reaches(self, east_m: float, north_m: float) -> bool:
         """Whether the field may be used there: in the area or in the margin around it."""
         return self.distance_m(east_m, north_m) <= self.margin_m
+
+
+@dataclass(frozen=True)
+class LearntLight:
+    """What a server learnt last of light ``light`` of a tile, empty for the tile's own.
+
+    ``time_ms``: when, milliseconds of the Unix epoch; ``saved_ratio``: share of the bits that it
+    saved on frames held back; ``withdrawn``: it made somebody's bits more.
+    """
+
+    tile: str
+    light: str
+    field_id: str
+    passes: int
+    time_ms: int
+    saved_ratio: float
+    withdrawn: bool = False
+
+    def __post_init__(self) -> None:
+        check_name("learnt.tile", self.tile)
+        if self.light:
+            check_name("learnt.light", self.light)
+        check_field_id("learnt.field_id", self.field_id)
+        check_range("learnt.saved_ratio", self.saved_ratio, -1e6, 1.0)
+
+
+def learnt_message(learnt: LearntLight) -> pb.LearntLight:
+    """Return what was learnt as protobuf."""
+    return pb.LearntLight(**asdict(learnt))
+
+
+def learnt_of(message: pb.LearntLight) -> LearntLight:
+    """Return what a server says it learnt; raise ``InvalidInput`` naming what is wrong with it."""
+    return LearntLight(
+        message.tile,
+        message.light,
+        message.field_id,
+        message.passes,
+        message.time_ms,
+        message.saved_ratio,
+        message.withdrawn,
+    )
 
 
 def tile_message(tile: Tile) -> pb.Tile:

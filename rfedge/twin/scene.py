@@ -22,7 +22,7 @@ __all__ = ["CameraKey", "PlacedField", "SeenPicture", "TwinScene"]
 
 CameraKey = tuple[str, str]
 """(vehicle, camera)"""
-CONNECTION, FIELDS = ("connection",), ("fields",)
+CONNECTION, FIELDS, TILES = ("connection",), ("fields",), ("tiles",)
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,7 @@ class TwinScene:
         self._notes: dict[str, str] = {}
         self._newest: dict[CameraKey, SeenPicture] = {}
         self._origin: TileOrigin | None = None
+        self._tiles: Mapping[str, Any] = {}
 
     @property
     def newest(self) -> Mapping[CameraKey, SeenPicture]:
@@ -166,6 +167,13 @@ class TwinScene:
         }
         key = ("comparison", picture.key)
         self._board.post(key, Message(header, now_s, (picture.jpeg, *parts)))
+
+    def show_tiles(self, rows: Sequence[Mapping[str, Any]], now_s: float) -> None:
+        """Show these rows as the table of tiles and their lights; nothing if they are shown."""
+        header = {"kind": "tiles", "rows": list(rows)}
+        if header != self._tiles:
+            self._tiles = header
+            self._board.post(TILES, Message(header, now_s))
 
     def show_objects(
         self, field_id: str, objects: Sequence[StreetObject], now_s: float, problem: str = ""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
 from rfcore.field import FieldStore
 from rfcore.wire.address import Address
 from rfcore.wire.conventions import CONSUMER_OPTIONS
+from rfcore.wire.tiles import LearntLight, Tile, TileLight, learnt_of, tile_of
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.twin import (
     Departure,
@@ -48,7 +49,7 @@ from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 from rfedge.twin.board import Message
 from rfedge.twin.scene import CameraKey, PlacedField, SeenPicture, TwinScene
 
-__all__ = ["LiveView", "ServerSource", "ServerTarget", "seen_picture", "view_message"]
+__all__ = ["LiveView", "ServerSource", "ServerTarget", "seen_picture", "tile_rows", "view_message"]
 
 log = structlog.get_logger()
 
@@ -224,12 +225,23 @@ class ServerSource:
             try:
                 request = field_pb2.ListFieldsRequest()
                 listed = await stub.ListFields(request, wait_for_ready=True)
+                self._show_tiles(listed)
                 tiles = {tile.name: tile.field_id for tile in listed.tiles}
                 for tile, field_id in (tiles or {i[:8]: i for i in listed.field_ids}).items():
                     await self._bring(channel, tile, field_id)
             except grpc.aio.AioRpcError as error:
                 log.info("fields cannot be listed", problem=error.details())
             await asyncio.sleep(FIELDS_EVERY_S)
+
+    def _show_tiles(self, listed: field_pb2.ListFieldsResponse) -> None:
+        """Have the page show which lights the tiles have, and what was learnt of them."""
+        try:
+            tiles, learnt = map(tile_of, listed.tiles), map(learnt_of, listed.learnt)
+            rows = tile_rows(tuple(tiles), tuple(learnt))
+        except InvalidInput as error:
+            log.warning("tiles cannot be shown", problem=str(error))
+            return
+        self._scene.show_tiles(rows, self._clock())
 
     async def _bring(self, channel: grpc.aio.Channel, tile: str, field_id: str) -> None:
         if self._scene.field(field_id) is not None:
@@ -314,6 +326,43 @@ class LiveView:
 
     def _refused(self, problem: str) -> None:
         self._tell(Message({"kind": "view_refused", "problem": problem}, self._clock()))
+
+
+def tile_rows(tiles: Sequence[Tile], learnt: Sequence[LearntLight]) -> list[dict[str, Any]]:
+    """Return one row of the page's table for each light of each tile, the tile's own first.
+
+    ``passes`` 0: not stated. ``learnt_ms``: when the server learnt by itself what is current, or
+    what it has withdrawn since, of the Unix epoch, and ``saved_ratio`` the share of bits that this
+    saves; null for what was published by hand.
+    """
+    newest = {(one.tile, one.light): one for one in learnt}
+    return [
+        _tile_row(tile, light, newest.get((tile.name, light.name if light else "")))
+        for tile in tiles
+        for light in (None, *tile.lights)
+    ]
+
+
+def _tile_row(tile: Tile, light: TileLight | None, learnt: LearntLight | None) -> dict[str, Any]:
+    current = light or tile
+    row = {
+        "tile": tile.name,
+        "light": light.name if light else "",
+        "version": current.version,
+        "time_of_day_h": light.time_of_day_h if light else None,
+        "passes": light.passes if light else 0,
+        "learnt_ms": None,
+        "saved_ratio": None,
+        "withdrawn": False,
+    }
+    if learnt is None:
+        return row
+    if learnt.withdrawn:
+        return {**row, "learnt_ms": learnt.time_ms, "saved_ratio": 0.0, "withdrawn": True}
+    if learnt.field_id != current.field_id:
+        return row
+    passes, saved_ratio = learnt.passes, learnt.saved_ratio
+    return {**row, "passes": passes, "learnt_ms": learnt.time_ms, "saved_ratio": saved_ratio}
 
 
 def view_message(view: RenderedView, now_s: float) -> Message:

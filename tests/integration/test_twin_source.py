@@ -7,14 +7,18 @@ import zlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from mec_server.tile_history import Learnt, TileHistory
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.image import rgb_from_bytes
+from rfcore.wire.publish import Ground, publish
+from rfcore.wire.tile_manifest import VersionLabel
 from rfcore.wire.twin_render import ViewRequest
 from rfedge.twin import server_source
 from rfedge.twin.board import Board, Message
@@ -104,6 +108,32 @@ async def test_a_live_view_follows_its_user_says_what_is_refused_and_goes_on(
         view.look(near)
         assert (await browser.view()).header["kind"] == "view"
         view.look(None)
+
+
+async def test_the_operator_sees_the_lights_of_a_tile_and_what_was_learnt(
+    street: Any, serve: Any, tmp_path: Path
+) -> None:
+    fields, now = tmp_path / "fields", datetime(2026, 1, 1, tzinfo=UTC)
+    fields.mkdir()
+    publish(fields, "west", street.store / "street.rff", Ground(), now)
+    label = VersionLabel("dusk", passes=2, time_of_day_h=18.5)
+    publish(fields, "west", street.other_store / "other.rff", Ground(), now, label)
+    learnt = Learnt(street.other_id, "dusk", street.field_id, 2, 53.0, 1_767_290_400_000)
+    async with serve(fields=fields) as server:
+        server._show_learnt({"west": TileHistory((learnt,)), "gone": TileHistory((learnt,))})
+        board = Board()
+        browser = Browser(board)
+        target = ServerTarget(str(server.address), tmp_path / "mine")
+        running = asyncio.create_task(ServerSource(target, TwinScene(board)).run())
+        rows = (await browser.next("tiles"))["rows"]
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+    assert [(row["tile"], row["light"], row["version"]) for row in rows] == [
+        ("west", "", 1),
+        ("west", "dusk", 2),
+    ]
+    assert (rows[1]["passes"], rows[1]["time_of_day_h"], rows[1]["saved_ratio"]) == (2, 18.5, 0.53)
+    assert rows[1]["learnt_ms"] == 1_767_290_400_000
 
 
 async def test_a_view_without_a_server_says_so(tmp_path: Path) -> None:

@@ -1,24 +1,35 @@
 """The page in a real browser: a server, two vehicles, headless Chromium (software WebGL)."""
 
+import asyncio
 import base64
 import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service as Driver
+from selenium.webdriver.common.keys import Keys
 
 from rfcore.dataset import read_dataset
 from rfcore.field import load_field
 from rfcore.image import rgb_from_bytes
 from rfcore.metrics import ssim
+from rfcore.wire.address import Address
+from rfcore.wire.tiles import LearntLight, Tile, TileLight
 from rfedge.demo.processes import command_of, service
 from rfedge.samples import sample_path
+from rfedge.twin.board import Board
+from rfedge.twin.comparing import Comparer
+from rfedge.twin.scene import TwinScene
+from rfedge.twin.server_source import tile_rows
+from rfedge.twin.web import TwinWeb, WebSettings
 
 pytestmark = [pytest.mark.slow, pytest.mark.sample]
 
@@ -213,3 +224,40 @@ def wall_and_slider_work(page: webdriver.Chrome) -> None:
     reconstruction, difference = (page.execute_script(show, value) for value in (1, 0))
     assert reconstruction != difference
     page.execute_script("document.getElementById('inspect-close').click()")
+
+
+async def test_the_table_of_tiles_opens_by_keyboard() -> None:
+    dusk = TileLight("h18", "b" * 64, 2, passes=2, time_of_day_h=18.5)
+    learnt = LearntLight("west", "h18", "b" * 64, 2, 1_767_290_400_000, 0.53)
+    board = Board()
+    scene = TwinScene(board)
+    scene.show_tiles(tile_rows([Tile("west", "a" * 64, lights=(dusk,))], [learnt]), 0.0)
+    web = TwinWeb(
+        WebSettings(Address("127.0.0.1", 0)), board, scene, Comparer(scene, Mock(Executor))
+    )
+    address = await web.start()
+    try:
+        with browser() as page:
+            await asyncio.to_thread(opens_by_keyboard, page, address)
+    finally:
+        await web.stop()
+
+
+def opens_by_keyboard(page: webdriver.Chrome, address: str) -> None:
+    """Reach the table with Tab alone, open it with Enter, and read its rows."""
+    page.get(address)
+    rows = "return [...document.querySelectorAll('#tiles tbody tr')].map((row) => row.innerText)"
+    until(lambda: page.execute_script("return document.querySelectorAll('#tiles tr').length") == 3)
+    is_reached = "return document.activeElement.parentElement?.id === 'tiles'"
+    for _ in range(40):
+        webdriver.ActionChains(page).send_keys(Keys.TAB).perform()
+        if page.execute_script(is_reached):
+            break
+    assert page.execute_script(is_reached)
+    assert page.execute_script("return document.getElementById('tiles').open") is False
+    webdriver.ActionChains(page).send_keys(Keys.ENTER).perform()
+    until(lambda: page.execute_script("return document.getElementById('tiles').open"))
+    own, at_dusk = (row.split("\t") for row in page.execute_script(rows))
+    assert own[:3] == ["west", "own", "1"]
+    assert at_dusk[:4] == ["west", "h18, 18:30 UTC", "2", "2"]
+    assert at_dusk[5] == "53 %"

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1arfcore/wire/v1/field.proto\x12\x0erfcore.wire.v1\"\x13\n\x11ListFieldsRequest\"L\n\x12ListFieldsResponse\x12\x11\n\tfield_ids\x18\x01 \x03(\t\x12#\n\x05tiles\x18\x02 \x03(\x0b\x32\x14.rfcore.wire.v1.Tile\"\x98\x01\n\x04Tile\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x10\n\x08\x66ield_id\x18\x02 \x01(\t\x12\x0f\n\x07version\x18\x03 \x01(\r\x12\"\n\x04\x61rea\x18\x04 \x01(\x0b\x32\x14.rfcore.wire.v1.Area\x12\x10\n\x08margin_m\x18\x05 \x01(\x01\x12)\n\x06lights\x18\x06 \x03(\x0b\x32\x19.rfcore.wire.v1.TileLight\"\x91\x01\n\tTileLight\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x10\n\x08\x66ield_id\x18\x02 \x01(\t\x12\x0f\n\x07version\x18\x03 \x01(\r\x12\x15\n\rbase_field_id\x18\x04 \x01(\t\x12\x0e\n\x06passes\x18\x05 \x01(\r\x12\x1a\n\rtime_of_day_h\x18\x06 \x01(\x01H\x00\x88\x01\x01\x42\x10\n\x0e_time_of_day_h\"H\n\x04\x41rea\x12\x0e\n\x06west_m\x18\x01 \x01(\x01\x12\x0f\n\x07south_m\x18\x02 \x01(\x01\x12\x0e\n\x06\x65\x61st_m\x18\x03 \x01(\x01\x12\x0f\n\x07north_m\x18\x04 \x01(\x01\"&\n\x12GetManifestRequest\x12\x10\n\x08\x66ield_id\x18\x01 \x01(\t\"K\n\x13GetManifestResponse\x12\x10\n\x08\x66ield_id\x18\x01 \x01(\t\x12\x12\n\nsize_bytes\x18\x02 \x01(\x04\x12\x0e\n\x06sha256\x18\x03 \x01(\x0c\";\n\x11\x46\x65tchFieldRequest\x12\x10\n\x08\x66ield_id\x18\x01 \x01(\t\x12\x14\n\x0coffset_bytes\x18\x02 \x01(\x04\"9\n\x12\x46\x65tchFieldResponse\x12\x14\n\x0coffset_bytes\x18\x01 \x01(\x04\x12\r\n\x05\x63hunk\x18\x02 \x01(\x0c\x32\x92\x02\n\x0c\x46ieldService\x12S\n\nListFields\x12!.rfcore.wire.v1.ListFieldsRequest\x1a\".rfcore.wire.v1.ListFieldsResponse\x12V\n\x0bGetManifest\x12\".rfcore.wire.v1.GetManifestRequest\x1a#.rfcore.wire.v1.GetManifestResponse\x12U\n\nFetchField\x12!.rfcore.wire.v1.FetchFieldRequest\x1a\".rfcore.wire.v1.FetchFieldResponse0\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1arfcore/wire/v1/field.proto\x12\x0erfcore.wire.v1\"\x13\n\x11ListFieldsRequest\"y\n\x12ListFieldsResponse\x12\x11\n\tfield_ids\x18\x01 \x03(\t\x12#\n\x05tiles\x18\x02 \x03(\x0b\x32\x14.rfcore.wire.v1.Tile\x12+\n\x06learnt\x18\x03 \x03(\x0b\x32\x1b.rfcore.wire.v1.LearntLight\"\x85\x01\n\x0bLearntLight\x12\x0c\n\x04tile\x18\x01 \x01(\t\x12\r\n\x05light\x18\x02 \x01(\t\x12\x10\n\x08\x66ield_id\x18\x03 \x01(\t\x12\x0e\n\x06passes\x18\x04 \x01(\r\x12\x0f\n\x07time_ms\x18\x05 \x01(\x04\x12\x13\n\x0bsaved_ratio\x18\x06 \x01(\x01\x12\x11\n\twithdrawn\x18\x07 \x01(\x08\"\x98\x01\n\x04Tile\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x10\n\x08\x66ield_id\x18\x02 \x01(\t\x12\x0f\n\x07version\x18\x03 \x01(\r\x12\"\n\x04\x61rea\x18\x04 \x01(\x0b\x32\x14.rfcore.wire.v1.Area\x12\x10\n\x08margin_m\x18\x05 \x01(\x01\x12)\n\x06lights\x18\x06 \x03(\x0b\x32\x19.rfcore.wire.v1.TileLight\"\x91\x01\n\tTileLight\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x10\n\x08\x66ield_id\x18\x02 \x01(\t\x12\x0f\n\x07version\x18\x03 \x01(\r\x12\x15\n\rbase_field_id\x18\x04 \x01(\t\x12\x0e\n\x06passes\x18\x05 \x01(\r\x12\x1a\n\rtime_of_day_h\x18\x06 \x01(\x01H\x00\x88\x01\x01\x42\x10\n\x0e_time_of_day_h\"H\n\x04\x41rea\x12\x0e\n\x06west_m\x18\x01 \x01(\x01\x12\x0f\n\x07south_m\x18\x02 \x01(\x01\x12\x0e\n\x06\x65\x61st_m\x18\x03 \x01(\x01\x12\x0f\n\x07north_m\x18\x04 \x01(\x01\"&\n\x12GetManifestRequest\x12\x10\n\x08\x66ield_id\x18\x01 \x01(\t\"K\n\x13GetManifestResponse\x12\x10\n\x08\x66ield_id\x18\x01 \x01(\t\x12\x12\n\nsize_bytes\x18\x02 \x01(\x04\x12\x0e\n\x06sha256\x18\x03 \x01(\x0c\";\n\x11\x46\x65tchFieldRequest\x12\x10\n\x08\x66ield_id\x18\x01 \x01(\t\x12\x14\n\x0coffset_bytes\x18\x02 \x01(\x04\"9\n\x12\x46\x65tchFieldResponse\x12\x14\n\x0coffset_bytes\x18\x01 \x01(\x04\x12\r\n\x05\x63hunk\x18\x02 \x01(\x0c\x32\x92\x02\n\x0c\x46ieldService\x12S\n\nListFields\x12!.rfcore.wire.v1.ListFieldsRequest\x1a\".rfcore.wire.v1.ListFieldsResponse\x12V\n\x0bGetManifest\x12\".rfcore.wire.v1.GetManifestRequest\x1a#.rfcore.wire.v1.GetManifestResponse\x12U\n\nFetchField\x12!.rfcore.wire.v1.FetchFieldRequest\x1a\".rfcore.wire.v1.FetchFieldResponse0\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -34,21 +34,23 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_LISTFIELDSREQUEST']._serialized_start=46
   _globals['_LISTFIELDSREQUEST']._serialized_end=65
   _globals['_LISTFIELDSRESPONSE']._serialized_start=67
-  _globals['_LISTFIELDSRESPONSE']._serialized_end=143
-  _globals['_TILE']._serialized_start=146
-  _globals['_TILE']._serialized_end=298
-  _globals['_TILELIGHT']._serialized_start=301
-  _globals['_TILELIGHT']._serialized_end=446
-  _globals['_AREA']._serialized_start=448
-  _globals['_AREA']._serialized_end=520
-  _globals['_GETMANIFESTREQUEST']._serialized_start=522
-  _globals['_GETMANIFESTREQUEST']._serialized_end=560
-  _globals['_GETMANIFESTRESPONSE']._serialized_start=562
-  _globals['_GETMANIFESTRESPONSE']._serialized_end=637
-  _globals['_FETCHFIELDREQUEST']._serialized_start=639
-  _globals['_FETCHFIELDREQUEST']._serialized_end=698
-  _globals['_FETCHFIELDRESPONSE']._serialized_start=700
-  _globals['_FETCHFIELDRESPONSE']._serialized_end=757
-  _globals['_FIELDSERVICE']._serialized_start=760
-  _globals['_FIELDSERVICE']._serialized_end=1034
+  _globals['_LISTFIELDSRESPONSE']._serialized_end=188
+  _globals['_LEARNTLIGHT']._serialized_start=191
+  _globals['_LEARNTLIGHT']._serialized_end=324
+  _globals['_TILE']._serialized_start=327
+  _globals['_TILE']._serialized_end=479
+  _globals['_TILELIGHT']._serialized_start=482
+  _globals['_TILELIGHT']._serialized_end=627
+  _globals['_AREA']._serialized_start=629
+  _globals['_AREA']._serialized_end=701
+  _globals['_GETMANIFESTREQUEST']._serialized_start=703
+  _globals['_GETMANIFESTREQUEST']._serialized_end=741
+  _globals['_GETMANIFESTRESPONSE']._serialized_start=743
+  _globals['_GETMANIFESTRESPONSE']._serialized_end=818
+  _globals['_FETCHFIELDREQUEST']._serialized_start=820
+  _globals['_FETCHFIELDREQUEST']._serialized_end=879
+  _globals['_FETCHFIELDRESPONSE']._serialized_start=881
+  _globals['_FETCHFIELDRESPONSE']._serialized_end=938
+  _globals['_FIELDSERVICE']._serialized_start=941
+  _globals['_FIELDSERVICE']._serialized_end=1215
 # @@protoc_insertion_point(module_scope)

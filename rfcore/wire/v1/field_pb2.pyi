@@ -39,6 +39,7 @@ class ListFieldsResponse(_message.Message):
 
     FIELD_IDS_FIELD_NUMBER: _builtins.int
     TILES_FIELD_NUMBER: _builtins.int
+    LEARNT_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def field_ids(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]: ...
     @_builtins.property
@@ -47,19 +48,68 @@ class ListFieldsResponse(_message.Message):
         change while vehicles drive: a FieldNotice says so.
         """
 
+    @_builtins.property
+    def learnt(self) -> _containers.RepeatedCompositeFieldContainer[Global___LearntLight]:
+        """The newest field of each of their lights that the server learnt by itself; for operators."""
+
     def __init__(
         self,
         *,
         field_ids: _abc.Iterable[_builtins.str] | None = ...,
         tiles: _abc.Iterable[Global___Tile] | None = ...,
+        learnt: _abc.Iterable[Global___LearntLight] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["field_ids", b"field_ids", "tiles", b"tiles"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["field_ids", b"field_ids", "learnt", b"learnt", "tiles", b"tiles"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___ListFieldsResponse: _TypeAlias = ListFieldsResponse  # noqa: Y015
+
+@_typing.final
+class LearntLight(_message.Message):
+    """What a server learnt last of one light of a tile."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    TILE_FIELD_NUMBER: _builtins.int
+    LIGHT_FIELD_NUMBER: _builtins.int
+    FIELD_ID_FIELD_NUMBER: _builtins.int
+    PASSES_FIELD_NUMBER: _builtins.int
+    TIME_MS_FIELD_NUMBER: _builtins.int
+    SAVED_RATIO_FIELD_NUMBER: _builtins.int
+    WITHDRAWN_FIELD_NUMBER: _builtins.int
+    tile: _builtins.str
+    light: _builtins.str
+    """Empty: the tile's own."""
+    field_id: _builtins.str
+    passes: _builtins.int
+    """How many passes of vehicles it was learnt from."""
+    time_ms: _builtins.int
+    """When, by the server's clock: milliseconds of the Unix epoch."""
+    saved_ratio: _builtins.float
+    """Share of the bits that it saved on frames held back."""
+    withdrawn: _builtins.bool
+    """It made somebody's bits more, so that the one before is current again."""
+    def __init__(
+        self,
+        *,
+        tile: _builtins.str = ...,
+        light: _builtins.str = ...,
+        field_id: _builtins.str = ...,
+        passes: _builtins.int = ...,
+        time_ms: _builtins.int = ...,
+        saved_ratio: _builtins.float = ...,
+        withdrawn: _builtins.bool = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["field_id", b"field_id", "light", b"light", "passes", b"passes", "saved_ratio", b"saved_ratio", "tile", b"tile", "time_ms", b"time_ms", "withdrawn", b"withdrawn"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___LearntLight: _TypeAlias = LearntLight  # noqa: Y015
 
 @_typing.final
 class Tile(_message.Message):

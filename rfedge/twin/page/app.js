@@ -5,6 +5,7 @@ import { Inspector } from "/page/inspect.js";
 import { Plots } from "/page/plots.js";
 import { LiveView } from "/page/live.js";
 import { StreetObjects } from "/page/objects.js";
+import { showTiles } from "/page/tiles.js";
 
 const RECONNECT_MS = 500;
 const AGES_KEPT = 20000;
@@ -83,6 +84,7 @@ const handlers = {
     showObjects();
     live.again();
   },
+  tiles({ rows }) { showTiles(element("tiles"), rows); },
   objects(header) { if (element("objects").checked) objects.set(header); },
   async view(header, parts) {
     const bitmap = await picture(parts[0]);
