@@ -27,7 +27,8 @@ HISTORIES = "tiles.json"
 class Learnt:
     """One field that was learnt; written before it is published, so that none goes unwatched.
 
-    ``replaced_id``: what vehicles took before, and take again if it is withdrawn.
+    ``replaced_id``: what vehicles took before, and take again if it is withdrawn. ``identities``:
+    of how many vehicles the passes were; 0 in histories of before, which do not say.
     """
 
     field_id: str
@@ -37,6 +38,7 @@ class Learnt:
     saved_percent: float
     time_ms: int
     withdrawn: bool = False
+    identities: int = 0
 
 
 @dataclass(frozen=True)

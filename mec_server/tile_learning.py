@@ -244,7 +244,7 @@ class TileLearner:
         if refused:
             lines.info("update not kept", reason=refused)
         else:
-            self._publish(tile, light, replaced_id, update, group, len(honest))
+            self._publish(tile, light, replaced_id, update, group, honest)
         self._tried(group)
 
     def _refused_beside(
@@ -311,14 +311,23 @@ class TileLearner:
         replaced_id: str,
         update: Update,
         group: Sequence[SeenPass],
-        passes: int,
+        honest: Sequence[Pass],
     ) -> None:
+        passes, identities = len(honest), len(_identities(honest))
         hour = float(np.mean([hour_of(one.first_ns) for one in group]))
         archive = self._job.recordings / LEARNING / f"{tile.name}.rff"
         field_id = save_field(update.learnt, archive)
         self._check_room(archive.stat().st_size)
         now_ms = self._now_ms()
-        saved = Learnt(field_id, light, replaced_id, passes, update.mean_saved_percent, now_ms)
+        saved = Learnt(
+            field_id,
+            light,
+            replaced_id,
+            passes,
+            update.mean_saved_percent,
+            now_ms,
+            identities=identities,
+        )
         self._keep(learnt=(*self.history.learnt, saved))
         label = VersionLabel(light, "", passes, hour if light else None)
         now = datetime.fromtimestamp(now_ms / 1e3, UTC)
@@ -332,6 +341,7 @@ class TileLearner:
             light=light,
             field=field_id,
             passes=passes,
+            identities=identities,
             saved_percent=round(update.mean_saved_percent, 1),
         )
 

@@ -145,6 +145,8 @@ def test_a_case_names_its_drive_fields_and_variants() -> None:
     assert case.variants == {"learnt": Path("g.rff"), "layer": Path("l.rff")}
     assert AdaptCase.parse("a@5=d,field=f").noon is None
     taught = AdaptCase.parse("a@5=d,field=f,learnt:3=g.rff,layer=l.rff")
+    fleet = AdaptCase.parse("a@5=d,field=f,learnt:3/2=g.rff")
+    assert (fleet.passes, fleet.identities) == ({"learnt": 3}, {"learnt": 2})
     assert taught.passes == {"learnt": 3}
     assert list(taught.variants) == ["learnt", "layer"]
     assert AdaptCase.parse("a@5=d,field=f,empty=e.json").empty == Path("e.json")
@@ -160,6 +162,7 @@ def test_a_case_names_its_drive_fields_and_variants() -> None:
         ("dusk@10=d.json,field=f,field=g", "'field=g' is not KEY=PATH"),
         ("dusk@10=d.json,field=f,off=g", "'off=g' is not KEY=PATH"),
         ("dusk@10=d.json,field=f,learnt:0=g", "'learnt:0=g' is not KEY=PATH"),
+        ("dusk@10=d.json,field=f,learnt:2/3=g", "passes of more vehicles than passes"),
         ("dusk@10=d.json,field=f,noon:2=g", "'noon' is not learnt from passes"),
     ],
 )
@@ -177,7 +180,7 @@ def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(
     thumbnail: Any, tmp_path: Path
 ) -> None:
     """Another name for the same field changes no bit; at noon a tool that is not used neither."""
-    text = f"{thumbnail.drive},field={thumbnail.field},again:2={thumbnail.field}"
+    text = f"{thumbnail.drive},field={thumbnail.field},again:2/1={thumbnail.field}"
     text += f",noon={thumbnail.drive.partition('=')[2]}"
     job = AdaptJob(
         (AdaptCase.parse(text),), "fast", "ultrafast", tmp_path / "a.json", tmp_path / "cells", True
@@ -192,7 +195,7 @@ def test_a_run_has_a_row_for_every_variant_and_goes_on_from_its_cells(
     assert rows["auto"]["extra_ms"] > 0
     assert rows["again"]["extra_ms"] is None
     assert "passes" not in rows["off"]
-    assert rows["again"]["passes"] == 2
+    assert (rows["again"]["passes"], rows["again"]["identities"]) == (2, 1)
     assert "drives_to_break_even" not in rows["again"], "it saves nothing"
     assert rows["auto"]["messages_differ"] == rows["auto"]["noon_messages_differ"] == 0
     assert "messages_differ" not in rows["again"]

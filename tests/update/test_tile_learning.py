@@ -97,9 +97,12 @@ def test_poisoned_passes_are_dropped_and_make_no_identity(
     street.rounds().run()
     assert len(street.west().field_ids) == 1
     street.record(make_pass(dusk, "b", 0.15))
+    street.record(make_pass(dusk, "b", 0.3))
     street.rounds().run()
     (light,) = street.west().tile("west").lights
-    assert light.passes == 2
+    (learnt,) = read_histories(street.recordings)["west"].learnt
+    assert light.passes == learnt.passes == 3
+    assert learnt.identities == 2
 
 
 def test_single_frames_that_nobody_confirms_are_dropped(

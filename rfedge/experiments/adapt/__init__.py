@@ -25,7 +25,8 @@ class EvalAdapt:
     cases: Annotated[tuple[str, ...], Positional, arg(metavar="NAME@HZ=DRIVE,KEY=PATH...")]
     """A drive; then field= (the field both ends hold), noon= (the same drive in the field's light),
     empty= (the same drive without what the field has not seen), and any name with the field or
-    layer of another variant, as in learnt=dusk.rff, or learnt:2=dusk.rff if from two passes."""
+    layer of another variant, as in learnt=dusk.rff, or learnt:2=dusk.rff if from two passes,
+    learnt:3/2=dusk.rff if from three passes of two vehicles."""
     effort: str = DEFAULT_EFFORT
     """Of ours: fast, default, thorough; x264-PRESET codes ours with x264, too."""
     preset: Preset = "medium"

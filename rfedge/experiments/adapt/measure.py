@@ -113,6 +113,8 @@ class AdaptRow:
     recovered_36db_percent: float | None = None
     passes: int | None = None
     """From how many passes the variant's field was learnt."""
+    identities: int | None = None
+    """Of how many vehicles those were."""
     drives_to_break_even: float | None = None
     """Of this drive, until the bits saved at 33 dB are those of the field or layer."""
     messages_differ: int | None = None
@@ -130,7 +132,8 @@ class AdaptCase:
     """A drive in some light, the field of another one, and variants by name.
 
     ``noon``: the same drive in the field's light; ``empty``: without what the field has not seen;
-    ``passes``: how many passes a variant's field was learnt from, where the case says so.
+    ``passes``: how many passes a variant's field was learnt from, ``identities``: of how many
+    vehicles those were, where the case says so.
     """
 
     drive: DriveName
@@ -139,34 +142,48 @@ class AdaptCase:
     empty: Path | None = None
     variants: Mapping[str, Path] = with_factory(default_factory=dict)
     passes: Mapping[str, int] = with_factory(default_factory=dict)
+    identities: Mapping[str, int] = with_factory(default_factory=dict)
 
     @staticmethod
     def parse(text: str) -> AdaptCase:
-        """Read ``NAME@HZ=DRIVE,KEY[:PASSES]=PATH...``; raise ``InvalidInput`` for another form."""
+        """Read ``NAME@HZ=DRIVE,KEY[:PASSES[/VEHICLES]]=PATH...``.
+
+        Raises ``InvalidInput`` for another form.
+        """
         drive, *pairs = text.split(",")
         named: dict[str, Path] = {}
         passes: dict[str, int] = {}
+        identities: dict[str, int] = {}
         for pair in pairs:
-            found = re.fullmatch(r"([^:=]+)(?::([1-9]\d*))?=(.+)", pair)
+            found = re.fullmatch(r"([^:=]+)(?::([1-9]\d*)(?:/([1-9]\d*))?)?=(.+)", pair)
             if found is None or found[1] in named or found[1] in TOOLS:
                 raise InvalidInput(
                     "cases", f"{pair!r} is not KEY=PATH or KEY:PASSES=PATH with a key of its own"
                 )
-            named[found[1]] = Path(found[3])
+            named[found[1]] = Path(found[4])
             if found[2] is not None:
                 passes[found[1]] = int(found[2])
+            if found[3] is not None:
+                identities[found[1]] = _vehicles(pair, int(found[3]), int(found[2]))
         own, noon, empty = (named.pop(key, None) for key in OWN_KEYS)
         if own is None:
             raise InvalidInput("cases", f"{text!r} names no field=")
         unlearnt = sorted(set(passes) & set(OWN_KEYS))
         if unlearnt:
             raise InvalidInput("cases", f"{unlearnt[0]!r} is not learnt from passes: leave out :N")
-        return AdaptCase(DriveName.parse(drive), own, noon, empty, named, passes)
+        return AdaptCase(DriveName.parse(drive), own, noon, empty, named, passes, identities)
 
     @property
     def files(self) -> list[Path]:
         """Everything the case reads as one file."""
         return [self.field, *self.variants.values()]
+
+
+def _vehicles(pair: str, vehicles: int, passes: int) -> int:
+    """Return how many vehicles a field was learnt from; raise ``InvalidInput`` if it cannot be."""
+    if vehicles > passes:
+        raise InvalidInput("cases", f"{pair!r} has passes of more vehicles than passes")
+    return vehicles
 
 
 @dataclass(frozen=True)
@@ -273,6 +290,7 @@ class _Measured:
                     kbit_at(FINER_DB, done),
                 ),
                 passes=case.passes.get(variant),
+                identities=case.identities.get(variant),
                 drives_to_break_even=drives_to_break_even(
                     side_bytes, off_kbit, enough, len(drive.frames)
                 ),
@@ -419,6 +437,7 @@ LATER_COLUMNS: Mapping[str, Callable[[AdaptRow], object]] = {
     "kbit at 36 dB": lambda row: row.kbit_36db,
     "recovered at 36 dB %": lambda row: row.recovered_36db_percent,
     "passes": lambda row: row.passes,
+    "vehicles": lambda row: row.identities,
     "drives to break even": lambda row: row.drives_to_break_even,
     "messages that differ": lambda row: row.messages_differ,
     "at noon": lambda row: row.noon_messages_differ,
