@@ -49,6 +49,8 @@ from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 if TYPE_CHECKING:
     from rfcore.wire.v1.field_pb2_grpc import FieldServiceAsyncStub
 
+Metadata = tuple[tuple[str, str], ...]
+
 __all__ = [
     "MAX_FIELD_BYTES",
     "FieldCache",
@@ -208,7 +210,7 @@ class FieldCache:
                 server = self._servers[served.server]
                 channel = await server.require(config.limits.give_up_s or None)
                 try:
-                    await fetch_field(channel, store, field_id, folder)
+                    await fetch_field(channel, store, field_id, folder, server.metadata)
                     size_bytes = (await asyncio.to_thread(store.path, field_id)).stat().st_size
                     self._observer.field_fetched(size_bytes)
                 except UnknownField:
@@ -339,25 +341,27 @@ def _with_rounded_pose(picture: PosedPicture) -> PosedPicture:
     return replace(picture, camera=rounded)
 
 
-async def fetch_field(channel: grpc.aio.Channel, store: Store, field_id: str, folder: Path) -> None:
+async def fetch_field(
+    channel: grpc.aio.Channel, store: Store, field_id: str, folder: Path, metadata: Metadata = ()
+) -> None:
     """Put field ``field_id`` of the server into ``store``; what arrived before is not sent again.
 
-    The partial file lies in ``folder``. Raises ``UnknownField`` when the server lacks the field,
+    The partial file lies in ``folder``; ``metadata`` goes with each call. Raises ``UnknownField`` when the server lacks the field,
     ``FieldFormatError`` when what arrives is not the field, ``RfedgeError`` when it does not come.
     """
     stub = FieldServiceStub(channel)
     partial = folder / f".{field_id}.part"
-    size_bytes = await _size(stub, field_id)
+    size_bytes = await _size(stub, field_id, metadata)
     log.info("fetching field", field=field_id, size_bytes=size_bytes)
-    await _receive_all(stub, field_id, partial, size_bytes)
+    await _receive_all(stub, field_id, partial, size_bytes, metadata)
     await asyncio.to_thread(_check_and_add, store, field_id, partial)
     log.info("field fetched", field=field_id)
 
 
-async def _size(stub: FieldServiceAsyncStub, field_id: str) -> int:
+async def _size(stub: FieldServiceAsyncStub, field_id: str, metadata: Metadata) -> int:
     request = pb.GetManifestRequest(field_id=field_id)
     try:
-        manifest = await stub.GetManifest(request, wait_for_ready=True)
+        manifest = await stub.GetManifest(request, metadata=metadata, wait_for_ready=True)
     except grpc.aio.AioRpcError as error:
         if error.code() is grpc.StatusCode.NOT_FOUND:
             raise UnknownField(f"{error.details()} (asked for {field_id})") from error
@@ -370,13 +374,17 @@ async def _size(stub: FieldServiceAsyncStub, field_id: str) -> int:
 
 
 async def _receive_all(
-    stub: FieldServiceAsyncStub, field_id: str, partial: Path, size_bytes: int
+    stub: FieldServiceAsyncStub,
+    field_id: str,
+    partial: Path,
+    size_bytes: int,
+    metadata: Metadata,
 ) -> None:
     """Receive what is missing; resume where it broke, and come again to a server that is busy."""
     resumes = refusals = 0
     while True:
         try:
-            await _receive(stub, field_id, partial, size_bytes)
+            await _receive(stub, field_id, partial, size_bytes, metadata)
             return
         except grpc.aio.AioRpcError as error:
             is_refused = error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
@@ -390,14 +398,18 @@ async def _receive_all(
 
 
 async def _receive(
-    stub: FieldServiceAsyncStub, field_id: str, partial: Path, size_bytes: int
+    stub: FieldServiceAsyncStub,
+    field_id: str,
+    partial: Path,
+    size_bytes: int,
+    metadata: Metadata,
 ) -> None:
     have_bytes = partial.stat().st_size if partial.exists() else 0
     if have_bytes >= size_bytes:
         return
     request = pb.FetchFieldRequest(field_id=field_id, offset_bytes=have_bytes)
     with partial.open("ab") as file:
-        async for response in stub.FetchField(request, wait_for_ready=True):
+        async for response in stub.FetchField(request, metadata=metadata, wait_for_ready=True):
             end_bytes = response.offset_bytes + len(response.chunk)
             if response.offset_bytes != have_bytes or end_bytes > size_bytes:
                 raise FieldFormatError(

