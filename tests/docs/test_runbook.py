@@ -3,31 +3,39 @@
 import asyncio
 import os
 import shlex
+import shutil
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import AsyncExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import grpc
+import numpy as np
 import pytest
 import tyro
 
 from cav_agent.config import AgentConfig, AgentLimits
 from docs.pages import Page
 from integration.conftest import serve, street, vehicle
+from integration.test_envoy import Groups, part_of_drive
 from mec_server.config import ServerConfig
 from rfcore.errors import FieldFormatError, InvalidData, RfedgeError
+from rfcore.wire.conventions import VEHICLE
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.settings import OPTIONS
 from rfcore.wire.tile_manifest import read_publication
 from rfcore.wire.tiles import Area
+from rfcore.wire.v1 import field_pb2 as pb
+from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 from rfedge.cli import parse
 from rfedge.demo.processes import command_of, service
+from rfedge.loadtest.envoy import CLUSTER
 
 __all__ = ["serve", "street", "vehicle"]
 
 PAGE = Page("runbook.md")
-SERVE, ROLL, CANARY, PUBLISH, EVERYWHERE, ROLLBACK, BACKUP, RESTORE = PAGE.blocks("sh")
+SERVE, ROLL, CANARY, PUBLISH, *SHARE, EVERYWHERE, ROLLBACK, BACKUP, RESTORE = PAGE.blocks("sh")
 PATIENT = AgentLimits(answer_s=60.0)
 """A busy machine is not a server that is lost."""
 
@@ -43,7 +51,10 @@ class Operator:
     Servers are processes, or in this one with ``serve``; vehicles are in this one.
     """
 
-    def __init__(self, stack: AsyncExitStack, vehicle: Any, serve: Any = None) -> None:
+    def __init__(
+        self, stack: AsyncExitStack, vehicle: Any, serve: Any = None, envoy_admin: str = ""
+    ) -> None:
+        self._envoy_admin = envoy_admin
         self.vehicles: list[Any] = []
         self.servers: list[Any] = []
         self._stack, self._vehicle, self._serve = stack, vehicle, serve
@@ -63,6 +74,7 @@ class Operator:
         elif words[0] == "mec-server":
             await self._start(words[1:], line.partition("echo $! > ")[2])
         else:
+            line = line.replace("127.0.0.1:9901", self._envoy_admin)
             shell = await asyncio.create_subprocess_exec("bash", "-euc", line)
             assert await shell.wait() == 0, line
             if words[0] == "kill":
@@ -191,6 +203,75 @@ async def test_a_canary_shows_that_bytes_rose_and_is_taken_back(
     versions = {name: read_publication(Path(name)).tiles["street"] for name in ("canary", "fields")}
     assert (versions["canary"].current, len(versions["canary"].field_ids)) == (1, 2)
     assert versions["fields"].field_ids == (street.field_id,), "the others noticed nothing"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("desk")
+async def test_a_share_of_a_tiles_vehicles_tries_a_field_behind_envoy_and_is_taken_back(
+    street: Any, vehicle: Any, stack: AsyncExitStack, tmp_path: Path
+) -> None:
+    """The field that the page calls better is one of another place: bytes have to rise."""
+    start, share, take_back = SHARE
+    groups = await asyncio.to_thread(Groups, street, tmp_path, stack)
+    shutil.rmtree("fields")
+    Path("fields").symlink_to(tmp_path / "all")
+    operator = Operator(stack, vehicle, envoy_admin=groups.envoy.admin)
+    await operator.types(start)
+    (canary,) = operator.servers
+    groups.site[CLUSTER].setup.list_servers([canary.address], "canary")
+    await asyncio.to_thread(groups.envoy.until, lambda seen: canary.address in seen)
+    await operator.types(share)
+    await canary_lists(groups.envoy.address, street.other_id)
+    names = await names_by_choice(groups.envoy.address, street.other_id)
+    assert 2 <= len(names[True]) <= 25, "10 of 100"
+    driving = {}
+    for tries in (True, False):
+        drive = part_of_drive(street, tmp_path / f"drive-{tries}", 2)
+        driving[tries] = await stack.enter_async_context(
+            vehicle(
+                groups.envoy.address, vehicle=names[tries][0], drive=drive, limits=PATIENT,
+                fields=tmp_path / f"cached-{tries}", loop=True, report=tmp_path / f"{tries}.jsonl",
+            )
+        )  # fmt: skip
+    for one in driving.values():
+        await one.until(lambda one=one: one.acked() >= FRAMES)
+    assert {canary.address, groups.address("east")} == {
+        address for address, calls in groups.envoy.streams().items() if calls
+    }
+    assert driving[True].fields() == {f"{street.other_id}.rff"}
+    assert driving[False].fields() == {f"{street.field_id}.rff"}
+    assert payload_bytes(driving[True]) > MOST_MORE_BYTES * payload_bytes(driving[False])
+
+    await operator.types(take_back)
+    there = driving[True].acked()
+    await driving[True].until(lambda: driving[True].acked() >= there + FRAMES)
+    placed = await asyncio.to_thread(groups.envoy.until, lambda seen: sum(seen.values()) == 2)
+    assert placed[groups.address("east")] == 2
+    assert payload_bytes(driving[True]) < MOST_MORE_BYTES * payload_bytes(driving[False])
+    assert all(every_result(one) == {"acked"} for one in driving.values())
+
+
+def payload_bytes(driving: Any) -> float:
+    """Return the mean payload of the vehicle's last pictures."""
+    return float(np.mean([line["payload_bytes"] for line in driving.lines()[-2:]]))
+
+
+async def canary_lists(address: str, field_id: str) -> None:
+    """Wait until some vehicle's list has the field: the canary has taken it up."""
+    async with asyncio.timeout(60):
+        while not (await names_by_choice(address, field_id))[True]:
+            await asyncio.sleep(0.1)
+
+
+async def names_by_choice(address: str, field_id: str) -> dict[bool, list[str]]:
+    """Ask for the tiles as 100 vehicles; return those that are told of the field, and others."""
+    names: dict[bool, list[str]] = {True: [], False: []}
+    async with grpc.aio.insecure_channel(address) as channel:
+        stub = FieldServiceStub(channel)
+        for name in (f"cav-{number}" for number in range(100)):
+            listed = await stub.ListFields(pb.ListFieldsRequest(), metadata=((VEHICLE, name),))
+            names[field_id in {tile.field_id for tile in listed.tiles}].append(name)
+    return names
 
 
 async def one_round(server: Any, driving: Any, moved: int) -> float:
