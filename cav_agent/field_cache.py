@@ -346,8 +346,9 @@ async def fetch_field(
 ) -> None:
     """Put field ``field_id`` of the server into ``store``; what arrived before is not sent again.
 
-    The partial file lies in ``folder``; ``metadata`` goes with each call. Raises ``UnknownField`` when the server lacks the field,
-    ``FieldFormatError`` when what arrives is not the field, ``RfedgeError`` when it does not come.
+    The partial file lies in ``folder``; ``metadata`` goes with each call. Raises ``UnknownField``
+    when the server lacks the field, ``FieldFormatError`` when what arrives is not the field,
+    ``RfedgeError`` when it does not come.
     """
     stub = FieldServiceStub(channel)
     partial = folder / f".{field_id}.part"

@@ -27,6 +27,8 @@ from rfcore.wire.publish import Ground, publish
 from rfcore.wire.settings import TransportSettings
 from rfcore.wire.tiles import Area
 from rfcore.wire.tls import TlsFiles
+from rfcore.wire.v1 import field_pb2 as pb
+from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 from rfedge.certs.authority import Members, certify, write_certificates
 from rfedge.loadtest.cases import ScaleRow
 from rfedge.loadtest.envoy import (
@@ -264,6 +266,7 @@ def forwarded_header(certificate: Path) -> str:
     return f'Cert="{quote(certificate.read_bytes())}";URI=spiffe://rfedge/{role}/{name}'
 
 
+LIST = pb.ListFieldsRequest()
 GROUPS = ("west", "east", "canary")
 GROUNDS = {
     name: Ground(Area((low, -5.0), (high, 5.0)), 0.0)
@@ -313,6 +316,14 @@ class Groups:
         return address
 
 
+async def until_listed(address: str, field_id: str) -> None:
+    """Wait until the default group lists the field: all of its servers have taken it up."""
+    async with grpc.aio.insecure_channel(address) as channel, asyncio.timeout(60):
+        ask = FieldServiceStub(channel).ListFields
+        while field_id not in {tile.field_id for tile in (await ask(LIST)).tiles}:
+            await asyncio.sleep(0.05)
+
+
 async def test_each_group_takes_the_vehicles_of_its_tiles_and_none_falls_with_another(
     street: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -332,6 +343,12 @@ async def test_each_group_takes_the_vehicles_of_its_tiles_and_none_falls_with_an
         await all_go_on(list(driving.values()))
         even = dict.fromkeys((groups.address(name) for name in (CLUSTER, "west", "east")), 1)
         assert await settled(groups.envoy, lambda seen: sum(seen.values()) == 3) == even
+
+        for folder in ("all", "west"):
+            archive = street.other_store / "other.rff"
+            publish(tmp_path / folder, "west", archive, GROUNDS["west"], datetime.now(UTC))
+            await until_listed(groups.envoy.address, street.other_id)
+        await driving["west"].until(lambda: f"{street.other_id}.rff" in driving["west"].fields())
 
         groups.site["east"].servers[0].process.kill()
         await settled(groups.envoy, lambda seen: groups.address("east") not in seen)
