@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,12 +22,14 @@ from rfcore.wire.nats import NatsServers
 from rfcore.wire.twin import PictureEncoding, Subscription, TwinPicture
 from rfedge.demo.processes import command_of, service
 from rfedge.loadtest.cases import Measured, ScaleRow
-from rfedge.loadtest.scale import Fleet, ScaleJob, failures
+from rfedge.loadtest.scale import Fleet, Lines, ScaleJob, failures, p99
 from rfedge.twin.nats_source import NatsPictures
 
-__all__ = ["NatsServer", "nats_binary", "nats_rows"]
+__all__ = ["NatsServer", "nats_binary", "nats_rows", "undisturbed"]
 
 BACK_S = 2.0
+WAY_TIMES, WAY_MORE_MS = 1.2, 10.0
+"""How much longer a frame may take from sending to Ack than before: times, and added to that."""
 AWAY_S = 2.0
 """How long NATS is away before it is started again."""
 START_S = 30.0
@@ -142,17 +144,43 @@ def nats_rows(job: ScaleJob) -> Measured:
         watched = _watch(stack, nats.url)
         since_ns = time.time_ns()
         _until(lambda: len(watched.newest_s) == job.vehicles, "shows every vehicle")
+        quiet_ns = time.time_ns()
+        time.sleep(job.seconds)
+        killed_ns = time.time_ns()
         back_s = [_restart(nats, watched, job.vehicles) for _ in range(job.rounds)]
         until_ns = time.time_ns()
         fleet.until_acked(until_ns)
-        lost = sum(failures(lines, since_ns, until_ns) for lines in fleet.lines())
+        told = fleet.lines()
+        lost = sum(failures(lines, since_ns, until_ns) for lines in told)
     at_most = ScaleRow.at_most
     return Measured(
         [
             at_most("NATS restarted under load: s until the twin is back", BACK_S, max(back_s)),
             at_most("NATS away or restarted: pictures lost or refused", 0, lost),
+            undisturbed(told, quiet_ns, killed_ns, until_ns),
         ]
     )
+
+
+def undisturbed(told: Iterable[Lines], quiet_ns: int, killed_ns: int, until_ns: int) -> ScaleRow:
+    """Return the row that compares the p99 of frames' way before NATS was killed and after that.
+
+    A frame's way is the time from sending to Ack, the server's work included. Frames are told apart
+    by when they were captured: from ``quiet_ns``, and from ``killed_ns`` until ``until_ns``. Raises
+    ``InvalidInput`` where one of the two has none that was acknowledged.
+    """
+    lines = [line for each in told for line in each]
+    before_ms = p99(_ways_ms(lines, quiet_ns, killed_ns))
+    bound_ms = WAY_TIMES * before_ms + WAY_MORE_MS
+    measured_ms = p99(_ways_ms(lines, killed_ns, until_ns))
+    case = "NATS away or restarted: p99 of a frame's way, ms"
+    return ScaleRow.at_most(case, bound_ms, measured_ms)
+
+
+def _ways_ms(lines: Lines, since_ns: int, until_ns: int) -> Iterator[float]:
+    for line in lines:
+        if line["result"] == "acked" and since_ns <= line["capture_time_ns"] < until_ns:
+            yield line["stage_ms"]["link"] + line["stage_ms"]["server_total"]
 
 
 def _command(job: ScaleJob, name: str, url: str) -> list[str]:

@@ -418,6 +418,7 @@ def test_the_case_is_measured_with_servers_and_vehicles_as_processes(
     except RfedgeError as error:
         if not str(error).startswith("not held: "):  # a bound in time, on a busy machine
             raise
-    back, lost = rows_of(ScaleRow, read_result(job.out)["rows"])
+    back, lost, way = rows_of(ScaleRow, read_result(job.out)["rows"])
     assert 0 < back.measured < 60
+    assert way.measured > 0
     assert lost.held, lost

@@ -19,6 +19,7 @@ from rfedge.loadtest.cases import (
     scale_section,
 )
 from rfedge.loadtest.envoy import EnvoySetup
+from rfedge.loadtest.nats import undisturbed
 from rfedge.loadtest.planning import PlannedRow
 from rfedge.loadtest.scale import (
     ScaleJob,
@@ -41,6 +42,28 @@ def line(at_s: float, epoch: int, result: str = "acked", **more: Any) -> dict[st
     """A picture taken so many seconds after the beginning of time, answered 100 ms later."""
     told = {"capture_time_ns": round(at_s * S), "epoch": epoch, "result": result}
     return {**told, "latency_ms": 100.0, "references": ["warp", "render"], **more}
+
+
+def sent(at_s: float, way_ms: float, result: str = "acked") -> dict[str, Any]:
+    """A picture that took so long from sending to Ack, a quarter of it at the server."""
+    stage_ms = {"link": 0.75 * way_ms, "server_total": 0.25 * way_ms, "encode": 500.0}
+    return line(at_s, 1, result, stage_ms=stage_ms)
+
+
+@pytest.mark.parametrize(("way_ms", "held"), [(58.0, True), (58.5, False)])
+def test_frames_may_take_little_longer_while_nats_is_away(way_ms: float, held: bool) -> None:
+    told = [
+        [sent(9.0, 900.0), sent(10.0, 40.0), sent(12.0, way_ms), sent(15.0, 900.0)],
+        [sent(11.0, 30.0), sent(11.5, 900.0, "lost"), sent(13.0, 20.0)],
+    ]
+    row = undisturbed(told, 10 * S, 12 * S, 15 * S)
+    assert row.bound == pytest.approx(1.2 * 40.0 + 10.0)
+    assert (row.measured, row.held) == (pytest.approx(way_ms), held)
+
+
+def test_without_frames_before_nothing_is_compared() -> None:
+    with pytest.raises(InvalidInput, match="nothing"):
+        undisturbed([[sent(12.0, 40.0)]], 10 * S, 12 * S, 15 * S)
 
 
 def test_a_vehicle_is_back_with_the_first_ack_on_another_stream() -> None:
