@@ -32,7 +32,7 @@ AGENT_PROCESS: Final = "agent-process"
 server lets two processes never send the same camera; without it the connection stands for it."""
 
 VEHICLE: Final = "rfedge-vehicle"
-"""Metadata of a stream: the vehicle's id, as in its Hello."""
+"""Metadata of a stream and of calls for lists and archives: the vehicle's id, as in its Hello."""
 
 TILE: Final = "rfedge-tile"
 """Metadata of a stream: the name of the tile it is for. A proxy may place streams by this and by

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rfcore.field import RadianceField
     from rfcore.update.passes import Pass
     from rfcore.update.run import Update, UpdateSettings
+    from rfcore.update.splats import Progress
     from rfedge.jobs import Job, Tell
 
 __all__ = ["FieldDisagree", "FieldUpdate"]
@@ -176,12 +177,27 @@ def _learnt(
 ) -> Update:
     from rfcore.update.run import learn
 
+    if not console.is_terminal:
+        return learn(base, passes, settings, _in_lines(console))
     with console.status("learning") as status:
 
         def told(doing: str, done: int, total: int) -> None:
             status.update(f"{doing}: {done} of {total}")
 
         return learn(base, passes, settings, told)
+
+
+def _in_lines(console: Console) -> Progress:
+    """Return what prints a line at the first step of what is being done, and at every tenth."""
+    printed: dict[str, int] = {}
+
+    def told(doing: str, done: int, total: int) -> None:
+        tenths = 10 * done // total
+        if tenths != printed.get(doing):
+            printed[doing] = tenths
+            console.print(f"{doing}: {done} of {total}")
+
+    return told
 
 
 def _change(saved_percent: float) -> str:

@@ -164,7 +164,8 @@ class EvalScale:
     pairs: int = 5
     """Pairs of runs of one vehicle, straight to a server and through Envoy; 0: none."""
     seconds: float = 30.0
-    """Counted seconds of each of these runs, at 10 Hz, and of each planned load."""
+    """Counted seconds of each of these runs, at 10 Hz, of each planned load, and of frames before
+    NATS is restarted."""
     planned: tuple[int, ...] = ()
     """Numbers of prerecorded vehicles, such as 12 24 48, whose cores, bytes and ages are compared
     with what the flow model of `rfedge size --city` says."""

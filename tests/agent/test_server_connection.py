@@ -10,6 +10,7 @@ from cav_agent.config import AgentConfig
 from cav_agent.server_connection import ServerConnection, server_connections
 from rfcore.errors import InvalidInput, RfedgeError, UnknownField
 from rfcore.wire.address import Address
+from rfcore.wire.conventions import VEHICLE
 from rfcore.wire.tiles import MAX_TILES
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceServicer, add_FieldServiceServicer_to_server
@@ -23,15 +24,18 @@ class ListedFields(FieldServiceServicer):
 
     def __init__(self, listed: pb.ListFieldsResponse) -> None:
         self.listed = listed
+        self.asked_as: list[str] = []
 
     async def ListFields(self, request, context):  # type: ignore[no-untyped-def]  # noqa: N802, ARG002
+        self.asked_as.append(dict(context.invocation_metadata())[VEHICLE])
         return self.listed
 
 
 async def published_by(listed: pb.ListFieldsResponse) -> object:
     """Return what a connection says a server publishes that lists this."""
     server = grpc.aio.server()
-    add_FieldServiceServicer_to_server(ListedFields(listed), server)
+    fields = ListedFields(listed)
+    add_FieldServiceServicer_to_server(fields, server)
     port = server.add_insecure_port("127.0.0.1:0")
     await server.start()
     try:
@@ -39,6 +43,7 @@ async def published_by(listed: pb.ListFieldsResponse) -> object:
             return await connection.published_tiles(10.0)
     finally:
         await server.stop(None)
+        assert fields.asked_as == ["cav-1"], "a proxy can place the call by the vehicle"
 
 
 def tile(name: str) -> pb.Tile:

@@ -1,5 +1,6 @@
 """``rfedge field update`` and ``disagree`` on recordings of two vehicles."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +52,12 @@ def test_what_pays_is_written(
         learn_as,  # type: ignore[arg-type]
         iterations=120,
     ).run()
-    assert "% fewer bits" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "% fewer bits" in said
+    lines = [line for line in said.splitlines() if re.fullmatch(r"[a-z -]+: \d+ of \d+", line)]
+    for doing in {line.partition(":")[0] for line in lines}:
+        assert sum(line.startswith(f"{doing}:") for line in lines) <= 11, "a line a tenth"
+    assert any(line.startswith("trial:") for line in lines)
     assert load_field(out).field_id != noon.field_id
 
 
@@ -73,7 +79,9 @@ def test_a_job_on_ray_learns_the_same_bytes(
     update.run()
     replace(update, out=Path("job.rff"), ray="local").run()
     assert Path("job.rff").read_bytes() == Path("here.rff").read_bytes()
-    assert "update-job: done" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "update-job: done" in said
+    assert re.search(r"^update-job\b.*fine-tuning: 60 of 60$", said, flags=re.MULTILINE)
     assert sorted(path.name for path in tmp_path.glob("*.job")) == []
 
 
