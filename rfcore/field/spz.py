@@ -210,6 +210,8 @@ def _zstandard_blocks(path: Path, file: BinaryIO, header: _Header, start: bytes)
     with needs("spz"):
         from zstandard import ZstdDecompressor, ZstdError
 
+    if len(start) < HEADER_4_BYTES:
+        raise FieldFormatError(f"{path}: ends within its header of {HEADER_4_BYTES} bytes")
     count, table_at = struct.unpack_from("<BI", start, HEADER.size - 1)
     if count not in (5, 6) or table_at != HEADER_4_BYTES:
         raise FieldFormatError(f"{path}: {count} streams from byte {table_at} on are no .spz")
