@@ -87,9 +87,8 @@ const handlers = {
   tiles({ rows }) { showTiles(element("tiles"), rows); },
   objects(header) { if (element("objects").checked) objects.set(header); },
   async view(header, parts) {
-    const bitmap = await picture(parts[0]);
-    if (live.isOpen) await live.show(header, bitmap, parts[1]);
-    else bitmap.close();
+    const answer = live.arrive();
+    await live.show(answer, header, await picture(parts[0]), parts[1]);
   },
   view_refused(header) { live.refuse(header.problem); },
   departure(header) {

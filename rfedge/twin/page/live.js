@@ -49,6 +49,7 @@ export class LiveView {
     this.overlay = document.createElement("canvas");
     this.picture = null;
     this.shown = 0;  // views, since the page was opened
+    this.arrived = this.latest = 0;  // answers of the server, and which of them is shown
     this.asked = null;
     this.choice.onchange = () => this.draw();
     find("live-close").onclick = () => this.close();
@@ -89,8 +90,16 @@ export class LiveView {
     this.follow();
   }
 
-  async show(header, bitmap, deflated) {
+  // The number of an answer, taken when it arrives: pictures take long to decode, a refusal does not.
+  arrive() { return ++this.arrived; }
+
+  async show(answer, header, bitmap, deflated) {
     const freshness = await inflated(deflated);
+    if (!this.isOpen || answer < this.latest) {
+      bitmap.close();
+      return;
+    }
+    this.latest = answer;
     this.picture?.bitmap.close();
     this.picture = { header, bitmap, freshness };
     this.shown += 1;
@@ -99,7 +108,10 @@ export class LiveView {
     this.draw();
   }
 
-  refuse(problem) { this.say(problem, true); }
+  refuse(problem) {
+    this.latest = this.arrive();
+    this.say(problem, true);
+  }
 
   say(text, isRefused) {
     this.state.textContent = text;
