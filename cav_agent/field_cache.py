@@ -192,7 +192,7 @@ class FieldCache:
             try:
                 field = await self._opened(served, (served.tile.field_id,))
                 _check_origin(field, lights.own)
-                await asyncio.to_thread(self._prepare_renderers, field)
+                await asyncio.to_thread(_prepare_renderers, field, self._ladder(field))
             except RfedgeError as error:
                 log.warning("own field not fetched", tile=served.tile.name, problem=str(error))
                 await asyncio.sleep(OWN_AGAIN_S)
@@ -251,8 +251,9 @@ class FieldCache:
         config = self._config
         pictures = self._live or self._recorded(field.metadata.tile_origin)
         cameras = tuple(_prepared_camera(config, camera) for camera in pictures.cameras)
-        rungs = self._rungs(field)
-        self._prepare_renderers(field)
+        ladder = self._ladder(field)
+        rungs = self._rungs(ladder)
+        _prepare_renderers(field, ladder)
         self._observer.field_ready(field, len(pictures))
         return PreparedField(field, pictures, cameras, rungs, lights, field_ids)
 
@@ -264,12 +265,6 @@ class FieldCache:
         rig = read_rig(config.rig)
         return RecordedRig(rig, read_rig_drive(rig, origin), self._instants)
 
-    def _prepare_renderers(self, field: RadianceField) -> None:
-        """Make every renderer that frames may ask for."""
-        field.prepare()
-        for quality in {measured.rung.quality for measured in self._ladder(field)}:
-            field.prepare(quality)
-
     def _ladder(self, field: RadianceField) -> tuple[MeasuredRung, ...]:
         """Return the rungs that a deadline chooses from; none without one."""
         config = self._config
@@ -278,12 +273,11 @@ class FieldCache:
         kind, coder = field.metadata.kind, config.coding.coder
         return read_ladder(config.ladder, kind, config.crf, coder, tracking=config.localise)
 
-    def _rungs(self, field: RadianceField) -> Rungs:
+    def _rungs(self, ladder: tuple[MeasuredRung, ...]) -> Rungs:
         """Return how frames are coded."""
         config = self._config
         if config.deadline_ms is None:
             return FixedRung(Rung(effort=config.coding.name))
-        ladder = self._ladder(field)
         controller = DeadlineController(ladder, config.deadline_ms)
         log.info(
             "deadline",
@@ -333,6 +327,13 @@ def read_drive(config: AgentConfig, origin: TileOrigin) -> tuple[PosedPicture, .
                 "one stream is one camera",
             )
     return tuple(map(_with_rounded_pose, pictures))
+
+
+def _prepare_renderers(field: RadianceField, ladder: Sequence[MeasuredRung]) -> None:
+    """Make every renderer that frames may ask for."""
+    field.prepare()
+    for quality in {measured.rung.quality for measured in ladder}:
+        field.prepare(quality)
 
 
 def _with_rounded_pose(picture: PosedPicture) -> PosedPicture:

@@ -25,14 +25,13 @@ Without clock or sockets. ``AccessList`` decides, ``Guard`` keeps track of calls
 
 from __future__ import annotations
 
-import os
-import stat
 import tomllib
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
 from rfcore.errors import AccessDenied, InvalidInput, RfedgeError
+from rfcore.files import is_regular, open_at_once
 from rfcore.wire.checks import check_name, shown
 from rfcore.wire.identity import PeerIdentity, Role, parse_identity
 
@@ -155,9 +154,9 @@ def read_access(path: Path) -> AccessList:
 
 
 def _text_of(path: Path) -> str:
-    """Return what a file holds that is one; a pipe nobody writes to would keep its reader."""
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+    """Return what a file holds, if it is one."""
+    with open_at_once(path) as file:
+        if not is_regular(file):
             raise InvalidInput("access", "is no file, but a pipe, a folder or a device")
         data = file.read(MAX_ACCESS_BYTES + 1)
     if len(data) > MAX_ACCESS_BYTES:

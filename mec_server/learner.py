@@ -21,6 +21,7 @@ from pathlib import Path
 
 import structlog
 
+from mec_server.event_loop import LOWEST_NICE
 from mec_server.tile_history import LEARNING, TileHistory, read_histories
 from mec_server.tile_learning import LearningJob, LearningRounds
 from rfcore.errors import RfedgeError
@@ -31,7 +32,6 @@ __all__ = ["Learner", "main"]
 
 log = structlog.get_logger()
 
-LOWEST_PRIORITY = 19
 EVERY_S = 0.5
 """From the end of one round to the next."""
 RESTART_S = 30.0
@@ -102,7 +102,7 @@ class Learner:
 def main() -> None:
     """Be the learning process: ``mec_server.learner JOB LOG_FORM``."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(LOWEST_PRIORITY)
+    os.nice(LOWEST_NICE)
     job = _job(json.loads(sys.argv[1]))
     configure_logs(sys.stderr, LogForm(sys.argv[2]))
     threading.Thread(target=_end_with_the_server, daemon=True).start()

@@ -104,8 +104,7 @@ class CameraDecoder:
 
     def _reconstruct(self, job: DecodeJob) -> Reconstruction:
         started_ns = self._clock_ns()
-        render = self._render(job)
-        view = self._field_view(job, render)
+        render, view = self._render(job)
         rendered_ns = self._clock_ns()
         packet = job.frame.packet
         state = self._state
@@ -122,23 +121,15 @@ class CameraDecoder:
         outcome = DecodeOutcome(digest, times, decoded.exact)
         return Reconstruction(decoded.frame, outcome, render)
 
-    def _render(self, job: DecodeJob) -> View | None:
-        """Return what the field shows at the frame's pose, ``None`` if the camera is lost."""
+    def _render(self, job: DecodeJob) -> tuple[View | None, FieldView]:
+        """Return what the field shows at the frame's pose, and that as the codec holds it; nothing
+        of either if the camera is lost."""
         camera = job.frame.camera(self._camera.intrinsics)
         if camera is None:
-            return None
+            return None, FieldView.nothing(self._camera.intrinsics)
         try:
-            return self._renderers[job.field_id].render(camera, job.frame.quality)
-        except InvalidInput as error:
-            raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
-
-    def _field_view(self, job: DecodeJob, render: View | None) -> FieldView:
-        """Return the render as the codec holds it; nothing if the camera is lost."""
-        camera = job.frame.camera(self._camera.intrinsics)
-        if render is None or camera is None:
-            return FieldView.nothing(self._camera.intrinsics)
-        try:
-            return field_view_from_view(render, camera)
+            render = self._renderers[job.field_id].render(camera, job.frame.quality)
+            return render, field_view_from_view(render, camera)
         except InvalidInput as error:
             raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
 

@@ -4,24 +4,48 @@ The content goes to ``NAME.part`` beside the file, which is renamed over it at t
 fails the part is removed and what stood there before is untouched. A file is on the disk before it
 gets its name, and the name before the function returns, so that a power cut leaves the old file or
 the new one. A folder is not replaced: it must not exist before.
+
+``open_at_once`` reads what others put into folders, which need not be a file.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["DECODED_BYTES", "whole_file", "whole_folder", "write_whole"]
+__all__ = [
+    "DECODED_BYTES",
+    "is_regular",
+    "open_at_once",
+    "whole_file",
+    "whole_folder",
+    "write_whole",
+]
 
 
 DECODED_BYTES = 2 << 30
 """Memory that what a file holds may take, decoded, unless told: 9 million splats of SH degree 3."""
+
+
+def open_at_once(path: Path) -> BufferedReader:
+    """Open a file for reading; a pipe that nobody writes to would keep ``open`` waiting for ever.
+
+    Raises ``OSError``.
+    """
+    return os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
+
+
+def is_regular(file: BinaryIO) -> bool:
+    """Return whether an open file is one, and no pipe, folder or device."""
+    return stat.S_ISREG(os.fstat(file.fileno()).st_mode)
 
 
 @contextmanager

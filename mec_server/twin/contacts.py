@@ -41,10 +41,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mec_server.twin.composition import LivePicture, Outline
+from mec_server.twin.composition import LivePicture, Outline, with_things
 from mec_server.twin.ground import FieldGround, points_of, rays_of
 
-__all__ = ["Detection", "Found", "detect", "find"]
+__all__ = ["Detection", "Found", "cut_out", "detect", "find"]
 
 THING_LEVELS = 30.0
 """On the sample's empty drive one picture in 12 has a contact at all."""
@@ -149,6 +149,13 @@ def find(picture: LivePicture, ground: FieldGround) -> list[Found]:
 def detect(picture: LivePicture, ground: FieldGround) -> list[Detection]:
     """Return the things alone."""
     return [each.detection for each in find(picture, ground)]
+
+
+def cut_out(picture: LivePicture, ground: FieldGround) -> tuple[LivePicture, list[Detection]]:
+    """Return ``picture`` with its things as patches (``with_things``), and where they stand."""
+    found = find(picture, ground)
+    things = with_things(picture, [each.outline for each in found])
+    return things, [each.detection for each in found]
 
 
 def _outline(picture: LivePicture, thing: Contacts, detection: Detection) -> Outline:

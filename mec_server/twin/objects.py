@@ -33,7 +33,7 @@ from mec_server.twin.state import CameraKey
 from mec_server.twin.triangulation import Sighting, placed
 from rfcore.wire.twin_render import StreetObject
 
-__all__ = ["FollowedObject", "Lacks", "ObjectTracker", "ToldObjects"]
+__all__ = ["FollowedObject", "Lacks", "ObjectTracker", "ToldObjects", "lacks_nothing"]
 
 GATE_M = 1.5
 GATE_PER_M = 0.1
@@ -58,6 +58,11 @@ poses at most ``composition.MISPLACED_TRUST``."""
 Vec3 = tuple[float, float, float]
 Lacks = Callable[[Vec3, float, float], bool]
 """Whether a picture should show a thing of a width and height (metres) at a place, and does not."""
+
+
+def lacks_nothing(_at_m: Vec3, _width_m: float, _height_m: float) -> bool:
+    """Say of nothing that it is not there."""
+    return False
 
 
 @dataclass(frozen=True)
@@ -243,7 +248,7 @@ class ObjectTracker:
         detections: Sequence[Detection],
         camera: CameraKey,
         time_s: float,
-        lacks: Lacks = lambda _at_m, _width_m, _height_m: False,
+        lacks: Lacks = lacks_nothing,
         labels: Sequence[str] = (),
     ) -> None:
         """Take in what one picture of ``camera``, captured at ``time_s``, shows, of which things it

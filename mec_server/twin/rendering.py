@@ -34,11 +34,10 @@ from mec_server.twin.composition import (
     live_picture,
     nearest,
     shrunk,
-    with_things,
 )
-from mec_server.twin.contacts import Detection, find
+from mec_server.twin.contacts import Detection, cut_out
 from mec_server.twin.ground import FieldGround
-from mec_server.twin.objects import Lacks
+from mec_server.twin.objects import Lacks, lacks_nothing
 from mec_server.twin.state import CameraKey, Covers, Twin, TwinView
 from rfcore.camera import Camera, TileOrigin
 from rfcore.errors import AccessDenied, InvalidInput
@@ -137,7 +136,7 @@ class Glance:
     ``labels``: what a detector calls each of them, none without one."""
 
     detections: list[Detection]
-    lacks: Lacks = lambda _at_m, _width_m, _height_m: False
+    lacks: Lacks = lacks_nothing
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     labels: tuple[str, ...] = ()
 
@@ -370,9 +369,7 @@ class TwinViews:
         rgb, intrinsics = shrunk(seen.picture, seen.intrinsics)
         camera = Camera(intrinsics, seen.frame.pose)
         live = live_picture(camera, rgb, self._field_view(seen, camera, field))
-        found = find(live, ground)
-        live = with_things(live, [each.outline for each in found])
-        return _LookedAt(seen, live, [each.detection for each in found])
+        return _LookedAt(seen, *cut_out(live, ground))
 
     def _field_view(self, seen: TwinView, camera: Camera, field: RadianceField) -> View:
         """Return what ``field`` shows at the ``camera`` of a picture: the decoder's render if that

@@ -23,7 +23,6 @@ import hashlib
 import json
 import math
 import os
-import stat
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -35,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import FieldFormatError, InvalidInput
-from rfcore.files import DECODED_BYTES
+from rfcore.files import DECODED_BYTES, is_regular, open_at_once
 
 __all__ = [
     "RAISE_LIMIT",
@@ -104,13 +103,13 @@ def read_file(path: Path, max_bytes: int = DECODED_BYTES) -> bytes:
     that is, or is no file, before any of it is read, and for one that cannot be read.
     """
     try:
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-            status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode):
+        with open_at_once(path) as file:
+            if not is_regular(file):
                 raise FieldFormatError(f"{path}: is no file, but a pipe, a folder or a device")
-            if status.st_size > max_bytes + MAX_HEADER_BYTES:
+            size_bytes = os.fstat(file.fileno()).st_size
+            if size_bytes > max_bytes + MAX_HEADER_BYTES:
                 raise FieldFormatError(
-                    f"{path}: {status.st_size / 1e9:.3g} GB are over the limit of "
+                    f"{path}: {size_bytes / 1e9:.3g} GB are over the limit of "
                     f"{max_bytes / 1e9:.3g} GB; {RAISE_LIMIT}"
                 )
             return file.read(max_bytes + MAX_HEADER_BYTES)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rfcore.field.archive import MAGIC
+from rfcore.files import open_at_once
 
 __all__ = ["FIELD_ID", "MAX_ARCHIVE_BYTES", "SUFFIX", "FieldFolder", "FolderListing"]
 
@@ -100,8 +101,7 @@ def _examined(path: Path, status: os.stat_result, stamp: Stamp) -> _Entry:
             stamp, problem=f"has {status.st_size} bytes, above {MAX_ARCHIVE_BYTES}: not listed"
         )
     try:
-        # A pipe put there since would block an ordinary open() for ever.
-        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:  # noqa: PTH123
+        with open_at_once(path) as file:  # a pipe may have been put there since
             if file.read(len(MAGIC)) != MAGIC:
                 return _Entry(stamp, problem="is no field archive: its first bytes are others")
             if FIELD_ID.fullmatch(path.stem):

@@ -11,7 +11,7 @@ import math
 from dataclasses import asdict, dataclass
 
 from rfcore.errors import InvalidInput
-from rfcore.wire.checks import check_field_id, check_name, check_range
+from rfcore.wire.checks import check_field_id, check_label, check_name, check_range
 from rfcore.wire.v1 import field_pb2 as pb
 
 __all__ = [
@@ -164,8 +164,7 @@ class LearntLight:
 
     def __post_init__(self) -> None:
         check_name("learnt.tile", self.tile)
-        if self.light:
-            check_name("learnt.light", self.light)
+        check_label("learnt.light", self.light)
         check_field_id("learnt.field_id", self.field_id)
         check_range("learnt.saved_ratio", self.saved_ratio, -1e6, 1.0)
 

@@ -25,14 +25,8 @@ import grpc
 import numpy as np
 from numpy.typing import NDArray
 
-from mec_server.twin.composition import (
-    LivePicture,
-    compose,
-    live_picture,
-    nearest,
-    with_things,
-)
-from mec_server.twin.contacts import find
+from mec_server.twin.composition import LivePicture, compose, live_picture, nearest
+from mec_server.twin.contacts import cut_out
 from mec_server.twin.ground import FieldGround
 from mec_server.twin.objects import ObjectTracker
 from mec_server.twin.rendering import check_inside, check_outside_of_walls
@@ -314,9 +308,8 @@ class RecordedStreet:
                 return
             self._next += 1
             live = live_picture(picture.camera, picture.read(), self._field.render(picture.camera))
-            found = find(live, self._ground)
-            self._live[number] = (taken_s, with_things(live, [each.outline for each in found]))
-            detections = [each.detection for each in found]
+            live, detections = cut_out(live, self._ground)
+            self._live[number] = (taken_s, live)
             self._tracker.take(detections, self._keys[number], taken_s, live.lacks)
 
     def _objects(self) -> tuple[StreetObject, ...]:

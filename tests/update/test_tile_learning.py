@@ -14,7 +14,8 @@ import pytest
 from prometheus_client import CollectorRegistry
 from structlog.testing import capture_logs
 
-from mec_server.learner import LOWEST_PRIORITY, RESTART_S, Learner
+from mec_server.event_loop import LOWEST_NICE
+from mec_server.learner import RESTART_S, Learner
 from mec_server.metrics import ServerMetrics
 from mec_server.tile_history import (
     LEARNING,
@@ -331,7 +332,7 @@ def test_the_process_runs_at_the_lowest_priority(street: Any) -> None:
     try:
         assert learner.pid is not None
         deadline_s = time.monotonic() + 60
-        while os.getpriority(os.PRIO_PROCESS, learner.pid) != LOWEST_PRIORITY:
+        while os.getpriority(os.PRIO_PROCESS, learner.pid) != LOWEST_NICE:
             assert time.monotonic() < deadline_s, "it was not niced"
             Event().wait(0.05)
     finally:

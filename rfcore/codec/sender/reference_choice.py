@@ -108,10 +108,7 @@ def choose_photometric(costs: FrameCosts, render: I420, crf: float) -> Photometr
     """
     found = solve(costs.frame, render)
     at_crf = RateDistortion.at(crf)
-    as_it_is, adapted, intra = (
-        _total(at_crf.coded_or_copied(blocks))
-        for blocks in (costs.against(render), costs.against(adapt(render, found)), costs.intra)
-    )
+    as_it_is, adapted, intra = _totals(costs, render, adapt(render, found), at_crf)
     pays = as_it_is - adapted > at_crf.bit_price * PHOTOMETRIC_BITS
     return found if pays and adapted < GOOD_INTRA_RATIO * intra else ()
 
@@ -124,12 +121,19 @@ def relighting_pays(costs: FrameCosts, render: I420, relit: I420, crf: float) ->
     blurred copy of the earlier frame, which is a reference already. At dusk with a field of noon
     the cost is 0.86 to 0.93 of intra prediction's, from a wrong pose 1.14 and more.
     """
-    at_crf = RateDistortion.at(crf)
-    as_it_is, adapted, intra = (
-        _total(at_crf.coded_or_copied(blocks))
-        for blocks in (costs.against(render), costs.against(relit), costs.intra)
-    )
+    as_it_is, adapted, intra = _totals(costs, render, relit, RateDistortion.at(crf))
     return adapted < min((1 - MIN_SAVING) * as_it_is, intra)
+
+
+def _totals(
+    costs: FrameCosts, render: I420, adapted: I420, at_crf: RateDistortion
+) -> tuple[float, float, float]:
+    """Return what all blocks cost against the render as it is, in another light, and intra."""
+    as_it_is, in_light, intra = (
+        _total(at_crf.coded_or_copied(blocks))
+        for blocks in (costs.against(render), costs.against(adapted), costs.intra)
+    )
+    return as_it_is, in_light, intra
 
 
 def _total(costs: Costs) -> float:

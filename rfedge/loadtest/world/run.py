@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from mec_server.twin.composition import LivePicture, compose, live_picture, with_things
-from mec_server.twin.contacts import find
+from mec_server.twin.composition import LivePicture, compose, live_picture
+from mec_server.twin.contacts import cut_out, find
 from mec_server.twin.ground import FieldGround
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput, RfedgeError
@@ -125,7 +125,7 @@ def _gains(
     for index, seen in enumerate(_received(drive, field)):
         if index % asked.every:
             continue
-        live = with_things(seen, [each.outline for each in find(seen, ground)])
+        live, _ = cut_out(seen, ground)
         for left_m in asked.aside_m:
             camera, time_s = aside(seen.camera, left_m), drive.time_s(index)
             true = truth.picture(camera, time_s)
@@ -258,7 +258,7 @@ def cost_rows(asked: EvalWorld, field: RadianceField) -> list[WorldRow]:
     camera = aside(pictures[-1].camera, 1.0)
     rgb, own = pictures[-1].read(), field.render(pictures[-1].camera)
     ground = FieldGround(field.render)
-    lives = [with_things(live, [each.outline for each in find(live, ground)]) for live in lives]
+    lives = [cut_out(live, ground)[0] for live in lives]
     times: dict[str, list[float]] = {"render": [], "compose": [], "take up": [], "find": []}
     for _ in range(20):
         with _timed(times["render"]):
