@@ -27,11 +27,14 @@ help:  ## show the targets
 demo: build  ## run the main job: two processes, one field, two drives; writes out/demo
 	$(BIN)/rfedge demo
 
+# So many processes run tests, each file as a whole in one of them; 0: all in this one, one by one.
+WORKERS ?= $(shell nproc | awk '{print $$1 < 4 ? $$1 : 4}')
+PARALLEL := -n $(WORKERS) --dist loadfile
 test: build-full  ## run the fast tests (four minutes of two cores)
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" $(PARALLEL)
 
 test-slow: build-full test-system-packages  ## run the tests that take more than ten seconds each
-	$(BIN)/python -m pytest -m "slow and not compose and not fault and not attack and not nightly" --timeout 600
+	$(BIN)/python -m pytest -m "slow and not compose and not fault and not attack and not nightly" $(PARALLEL) --timeout 600
 
 test-slices: build-full  ## compare a million macroblocks of the slice coder with FFmpeg; fuzz it and packets
 	$(BIN)/python -m pytest tests/codec/test_slice_conformance.py tests/bench/test_fuzz.py -m nightly --timeout 1800

@@ -91,14 +91,14 @@ async def heard_notice(vehicle: Any, notices: list[StreetNotice]) -> None:
 def looked_at(monkeypatch: pytest.MonkeyPatch) -> list[LivePicture]:
     """What the server has looked at so far."""
     pictures: list[LivePicture] = []
-    find = rendering.find
+    cut_out = rendering.cut_out
 
     def noted(picture: LivePicture, ground: FieldGround) -> Any:
-        found = find(picture, ground)
+        found = cut_out(picture, ground)
         pictures.append(picture)
         return found
 
-    monkeypatch.setattr(rendering, "find", noted)
+    monkeypatch.setattr(rendering, "cut_out", noted)
     return pictures
 
 
