@@ -282,6 +282,13 @@ class Fleet:
     job: ScaleJob
     folder: Path
     reports: list[Path] = field(default_factory=list)
+    left: list[Path] = field(default_factory=list)
+    """Reports of vehicles that are gone."""
+
+    def leave(self, vehicles: int) -> None:
+        """Count only the first ``vehicles``; the others were ended."""
+        self.left += self.reports[vehicles:]
+        del self.reports[vehicles:]
 
     def start(self, stack: ExitStack, address: str, vehicles: int, hz: float) -> None:
         """Start vehicles and wait until each has had two pictures acknowledged."""
@@ -460,9 +467,9 @@ def moves(job: ScaleJob) -> list[ScaleRow]:
         for _ in range(job.rounds):
             _kill_one(site, seen)
             _drain_one(site, seen)
-        _let_others_join(site, stack, seen)
+        _let_others_join(site, seen)
         _restart_envoy(site, seen)
-        keys = sum(keyframes(lines) for lines in fleet.lines())
+        keys = sum(keyframes(_read(report)) for report in (*fleet.reports, *fleet.left))
         twice = shown_twice(watch.result())
     at_most = ScaleRow.at_most
     return [
@@ -510,15 +517,17 @@ def _drain_one(site: Site, seen: Seen) -> None:
     site.add_server()
 
 
-def _let_others_join(site: Site, stack: ExitStack, seen: Seen) -> None:
-    """Start as many vehicles as an even share; the server just added has no stream.
+def _let_others_join(site: Site, seen: Seen) -> None:
+    """Start as many vehicles as an even share, and end them; the server just added has no stream.
 
     Envoy does not move streams that are open, so that only who comes later fills it.
     """
     job = site.fleet.job
     share = round(job.vehicles / len(site.group.servers))
-    site.fleet.start(stack, site.envoy.address, max(1, share), job.hz)
-    seen.after_joining.append(site.settled())
+    with ExitStack() as joined:
+        site.fleet.start(joined, site.envoy.address, max(1, share), job.hz)
+        seen.after_joining.append(site.settled())
+    site.fleet.leave(job.vehicles)
 
 
 def _restart_envoy(site: Site, seen: Seen) -> None:
