@@ -1,8 +1,8 @@
 """Where things stand that one picture shows and the field does not have.
 
 A pixel is *marked* when it belongs to a change (``rfcore.native.live_view``) and differs by more
-than ``THING_LEVELS`` itself. The lowest pixel of a run of marked ones in a column is a *contact*
-with the ground when
+than ``THING_LEVELS``, times the field's ``brightness``, itself. The lowest pixel of a run of marked
+ones in a column is a *contact* with the ground when
 
 * the field's surface just below it is level ground (z is up) within ``REACH_M``,
 * of the ``LOOKED_AT_M`` above it at least ``LEAST_MARKED_M`` are marked, at its distance: a thing
@@ -180,7 +180,8 @@ def _outline(picture: LivePicture, thing: Contacts, detection: Detection) -> Out
 
 def _contacts(picture: LivePicture, ground: FieldGround) -> Contacts:
     red, green, blue = (np.abs(picture.difference[..., channel]) for channel in range(3))
-    marked = picture.changed & (np.maximum(np.maximum(red, green), blue) > THING_LEVELS)
+    least_levels = picture.brightness * THING_LEVELS
+    marked = picture.changed & (np.maximum(np.maximum(red, green), blue) > least_levels)
     rows, columns = _feet(marked)
     camera, depth = picture.camera, picture.depth
     below_m = depth[rows + BELOW_PX, columns].astype(np.float64)

@@ -9,8 +9,9 @@ difference from the field's render, in the light of the field, is
 ``(picture - offset) / gain - level(colour)`` for red, green and blue, where ``level`` is
 ``round(clip(255 c, 0, 255))``, halves to even. The mean difference over 7x7 pixels (the edge
 repeated; rows summed from above, then columns from the left), of the channel where it is largest,
-below ``NOISE_LEVELS`` is noise, from ``CHANGE_LEVELS`` on a change; between, that share of the
-difference is kept. Without a surface of the field (opacity of at most ``COVERED``) none is.
+below ``NOISE_LEVELS`` is noise, from ``CHANGE_LEVELS`` on a change, both times ``brightness``;
+between, that share of the difference is kept. Without a surface of the field (opacity of at most
+``COVERED``) none is.
 
 *Carrying* (``carry_to_view``). Pixel (x, y) of the view, of depth z, has the ray
 ((x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy, 1). With R, t mapping points of the view's axes into
@@ -150,11 +151,14 @@ class Canvas:
     nearest_m: F32
 
 
-def live_difference(rgb: Rgb, view: View, light: Light) -> tuple[F32, F32]:
+def live_difference(
+    rgb: Rgb, view: View, light: Light, brightness: float = 1.0
+) -> tuple[F32, F32]:
     """Return what ``rgb``, uint8 [H, W, 3], changes in the field that shows ``view`` there.
 
-    The first is the change in levels, float32 [H, W, 3]; the second, float32 [H, W], what share of
-    the difference it is. Raises ``InvalidInput`` for a picture of another size than the view.
+    ``brightness``: of the field's light; 1 is a day's. The first is the change in levels, float32
+    [H, W, 3]; the second, float32 [H, W], what share of the difference it is. Raises
+    ``InvalidInput`` for a picture of another size than the view.
     """
     if rgb.shape != view.colour.shape or rgb.dtype != np.uint8:
         raise InvalidInput(
@@ -166,7 +170,7 @@ def live_difference(rgb: Rgb, view: View, light: Light) -> tuple[F32, F32]:
         np.ascontiguousarray(view.colour),
         np.ascontiguousarray(view.opacity),
         [*light.gain, *light.offset],
-        [NOISE_LEVELS, CHANGE_LEVELS, COVERED],
+        [brightness * NOISE_LEVELS, brightness * CHANGE_LEVELS, COVERED],
         difference,
         share,
     )

@@ -57,7 +57,9 @@ def level(values: F32) -> F32:
     return np.rint(values.clip(0, 255))
 
 
-def defined_difference(rgb: NDArray[np.uint8], view: View, light: Light) -> tuple[F32, F32]:
+def defined_difference(
+    rgb: NDArray[np.uint8], view: View, light: Light, brightness: float
+) -> tuple[F32, F32]:
     gain, offset = F(light.gain), F(light.offset)
     difference = (rgb.astype(F) - offset) / gain - level(view.colour * F(255))
     half = WINDOW // 2
@@ -68,20 +70,24 @@ def defined_difference(rgb: NDArray[np.uint8], view: View, light: Light) -> tupl
     for j in range(1, WINDOW):
         sums += down[:, j : j + width]
     change = np.abs(sums).max(axis=2) / F(WINDOW**2)
-    share = ((change - F(NOISE_LEVELS)) / F(CHANGE_LEVELS - NOISE_LEVELS)).clip(0, 1)
+    noise, least = F(brightness * NOISE_LEVELS), F(brightness * CHANGE_LEVELS)
+    share = ((change - noise) / (least - noise)).clip(0, 1)
     share[view.opacity <= COVERED] = 0
     return difference * share[:, :, None], share
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (2, 9), (33, 17), (64, 48)])
 @pytest.mark.parametrize("light", [OWN_LIGHT, Light((0.5, 1.3, 2.0), (3.0, -8.5, 0.1))])
-def test_a_change_is_what_is_defined(width: int, height: int, light: Light) -> None:
+@pytest.mark.parametrize("brightness", [1.0, 0.62])
+def test_a_change_is_what_is_defined(
+    width: int, height: int, light: Light, brightness: float
+) -> None:
     rng = np.random.default_rng(width)
     view = random_view(rng, width, height)
     near = level(view.colour * F(255)) + rng.normal(scale=25, size=view.colour.shape)
     rgb = near.clip(0, 255).astype(np.uint8)
-    difference, share = live_difference(rgb, view, light)
-    expected, expected_share = defined_difference(rgb, view, light)
+    difference, share = live_difference(rgb, view, light, brightness)
+    expected, expected_share = defined_difference(rgb, view, light, brightness)
     assert difference.tobytes() == expected.tobytes()
     assert share.tobytes() == expected_share.tobytes()
 

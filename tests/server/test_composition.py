@@ -11,6 +11,7 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.raster.gaussians import Gaussians
+from rfcore.views import View
 
 INTRINSICS = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
 LIVE_S = 0.1
@@ -188,6 +189,21 @@ def test_the_pictures_that_see_most_of_a_view_are_taken() -> None:
     assert nearest([("away", 0)], at(0.0), lambda _: away) == []
 
 
+@pytest.mark.parametrize(("levels", "changes"), [(100.0, False), (86.0, False), (60.0, True)])
+def test_where_the_field_is_darker_a_smaller_difference_is_a_change(
+    levels: float, changes: bool
+) -> None:
+    """Of 20 levels, in a twentieth of the picture."""
+    noise = np.random.default_rng(5).uniform(-20, 20, (64, 96, 3))
+    colour = ((levels + noise) / 255).astype(np.float32)
+    flat = np.ones((64, 96), np.float32)
+    rgb = np.rint(colour * 255).astype(np.uint8)
+    rgb[20:36, 40:60] += 20
+    seen = live_picture(at(0.0), rgb, View(colour, 4 * flat, flat))
+    assert seen.changed[24:32, 44:56].all() == changes
+    assert seen.changed[:16].sum() == 0, "nothing is different there"
+
+
 def test_another_light_is_no_change() -> None:
     camera = at(0.0)
     rgb = np.rint(picture(STREET, camera) * 0.5 + 12).astype(np.uint8)
@@ -198,9 +214,7 @@ def test_another_light_is_no_change() -> None:
 
 def test_a_camera_vouches_for_nothing_far_away_or_from_the_side() -> None:
     seen = live(STREET, at(0.0), picture(STREET, at(0.0)))
-    far = LivePicture(
-        seen.camera, seen.difference, seen.depth * np.float32(12), 1.0, seen.changed, seen.colour
-    )
+    far = replace(seen, depth=seen.depth * np.float32(12), trust=1.0)
     view = STREET.render(at(0.0))
     view = type(view)(view.colour, view.depth * np.float32(12), view.opacity)
     composed = compose(at(0.0), view, [(far, LIVE_S)], MAX_S)
