@@ -42,6 +42,9 @@ PATIENT = AgentLimits(answer_s=60.0)
 GROUND = Ground(Area((-5.0, -5.0), (5.0, 5.0)), 0.0)
 FRAMES = 6
 MOST_MORE_BYTES = 1.02
+OTHER_PLACE = 2.0
+"""Against the field of another place a picture takes four times the bytes; what a picture before it
+was left out for takes some more, too."""
 """From there on the page takes a version back."""
 
 
@@ -240,20 +243,21 @@ async def test_a_share_of_a_tiles_vehicles_tries_a_field_behind_envoy_and_is_tak
     }
     assert driving[True].fields() == {f"{street.other_id}.rff"}
     assert driving[False].fields() == {f"{street.field_id}.rff"}
-    assert payload_bytes(driving[True]) > MOST_MORE_BYTES * payload_bytes(driving[False])
+    assert payload_bytes(driving[True]) > OTHER_PLACE * payload_bytes(driving[False])
 
     await operator.types(take_back)
     there = driving[True].acked()
     await driving[True].until(lambda: driving[True].acked() >= there + FRAMES)
     placed = await asyncio.to_thread(groups.envoy.until, lambda seen: sum(seen.values()) == 2)
     assert placed[groups.address("east")] == 2
-    assert payload_bytes(driving[True]) < MOST_MORE_BYTES * payload_bytes(driving[False])
+    assert payload_bytes(driving[True]) < payload_bytes(driving[False]) * OTHER_PLACE / 1.5
     assert all(every_result(one) == {"acked"} for one in driving.values())
 
 
 def payload_bytes(driving: Any) -> float:
-    """Return the mean payload of the vehicle's last pictures."""
-    return float(np.mean([line["payload_bytes"] for line in driving.lines()[-2:]]))
+    """Return the mean payload of the drive's pictures, each as it was sent last."""
+    last = {line["index"]: line["payload_bytes"] for line in driving.lines()}
+    return float(np.mean(list(last.values())))
 
 
 async def canary_lists(address: str, field_id: str) -> None:

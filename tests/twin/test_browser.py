@@ -44,7 +44,7 @@ OPTIONS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
-    "--window-size=1100,700",
+    "--window-size=640,480",
 )
 
 
