@@ -204,9 +204,10 @@ class WorldRow:
 def world_section(path: Path, result: Result) -> str:
     """Return the table."""
     notes = (
-        "Objects and views of the twin against the generator's truth. *Distance from the outline*: "
-        "of a vehicle on the ground, to where an object is told of. *Found*: by an object within "
-        "2 m of the outline, a vehicle's first pictures included. *The empty minute*: the drive "
+        "Objects and views of the twin against the generator's truth, of pictures as a server "
+        "decodes them. *Distance from the outline*: of every confirmed object to the nearest "
+        "vehicle on the ground, however far that is. *Found*: by an object of its own within 2 m "
+        "of the outline, a vehicle's first pictures included. *The empty minute*: the drive "
         "through the empty street again and again, each time with other noise. *Dusk*: the "
         "generator's evening, in the light that the field learnt from another pass. *Gain*: PSNR "
         "of a view less that of the field alone."
