@@ -151,9 +151,7 @@ class Canvas:
     nearest_m: F32
 
 
-def live_difference(
-    rgb: Rgb, view: View, light: Light, brightness: float = 1.0
-) -> tuple[F32, F32]:
+def live_difference(rgb: Rgb, view: View, light: Light, brightness: float = 1.0) -> tuple[F32, F32]:
     """Return what ``rgb``, uint8 [H, W, 3], changes in the field that shows ``view`` there.
 
     ``brightness``: of the field's light; 1 is a day's. The first is the change in levels, float32
