@@ -60,7 +60,7 @@ SYSTEM_PROGRAMS := aarch64-linux-gnu-g++ qemu-aarch64 promtool prometheus ip tc 
 	bwrap nft chromium chromedriver nats-server
 test-system-packages:  ## install the programs that test-slow uses (root, Debian)
 	@if (for name in $(SYSTEM_PROGRAMS); do command -v $$name >/dev/null || exit 1; done) && \
-		[ -e /etc/OpenCL/vendors/pocl.icd ] && ldconfig -p | grep -q libLLVM.*19; then :; \
+		[ -e /etc/OpenCL/vendors/pocl.icd ] && ldconfig -p | grep -q 'libLLVM.*19'; then :; \
 	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 		apt-get -qq update && \
 		DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends $(SYSTEM_PACKAGES); \

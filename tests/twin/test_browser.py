@@ -83,7 +83,7 @@ def until(holds: Callable[[], Any], timeout_s: float = 60.0) -> Any:
 def few_splats(folder: Path) -> Path:
     """Return a folder with the sample's splats that are seen most: software WebGL takes seconds to
     draw all of them."""
-    field = load_field(sample_path("fields/street.rff"))
+    field = load_field(FIELDS / "street.rff")
     assert isinstance(field, SplatField)
     order = most_important_first(visible_area(field.gaussians))[:SPLATS]
     fields = folder / "few"
