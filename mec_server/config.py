@@ -189,8 +189,8 @@ class LearnSettings:
     """What is learnt of recordings: other lights of the tiles, and what changed on the street."""
 
     on: Annotated[bool, arg(name="learn")] = False
-    """Learn from what is recorded (--record), in a process of its own at the lowest priority, and
-    publish what makes bits fall into the folder of fields (docs/fields.md)."""
+    """Learn from what is recorded (--record), in a process of its own while a processor is idle,
+    and publish what makes bits fall into the folder of fields (docs/fields.md)."""
     learn_as: Annotated[LearnAs, arg(name="learn-as")] = LearnAs.COLOURS
     """Another light as colours (a layer on the tile's field) or as all (a field of its own)."""
     min_identities: Annotated[int, arg(name="learn-min-identities")] = 2

@@ -1,6 +1,6 @@
 """The learning process (``mec_server.tile_learning``) and the server's hold on it.
 
-The process runs at the lowest priority and on one core; it ends with the server, whose end of a
+The process runs on one core, while a processor is idle; it ends with the server, whose end of a
 pipe it reads. One that ends by itself, or is killed, is started again. A second process on the same
 recordings waits until the first is gone.
 """
@@ -21,7 +21,7 @@ from pathlib import Path
 
 import structlog
 
-from mec_server.event_loop import LOWEST_NICE
+from mec_server.event_loop import work_when_idle
 from mec_server.tile_history import LEARNING, TileHistory, read_histories
 from mec_server.tile_learning import LearningJob, LearningRounds
 from rfcore.errors import RfedgeError
@@ -102,7 +102,7 @@ class Learner:
 def main() -> None:
     """Be the learning process: ``mec_server.learner JOB LOG_FORM``."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(LOWEST_NICE)
+    work_when_idle()
     job = _job(json.loads(sys.argv[1]))
     configure_logs(sys.stderr, LogForm(sys.argv[2]))
     threading.Thread(target=_end_with_the_server, daemon=True).start()

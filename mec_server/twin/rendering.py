@@ -1,11 +1,11 @@
 """Views of the twin for consumers: which pictures may enter them, where they are computed, and what
 that is charged.
 
-Views are composed on one thread of the lowest priority, and the things in pictures are found, for
-notices and for whoever asks for objects, on another that gives way to decoding alone: what a
-vehicle is to be told does not wait for views. Each has fields of its own: neither event loop nor
-the workers that decode, nor the renderers these share, wait for them. Identities take turns, and
-pay with worker time, the same as vehicles.
+Views are composed on one thread that works while a processor is idle, and the things in pictures
+are found, for notices and for whoever asks for objects, on another that gives way to decoding
+alone: what a vehicle is to be told does not wait for views. Each has fields of its own: neither
+event loop nor the workers that decode, nor the renderers these share, wait for them. Identities
+take turns, and pay with worker time, the same as vehicles.
 
 What a picture changes in a field is found once, by whichever thread comes first. The field's view
 of its pose is the decoder's own render, where that is still there and of the same field and size.
@@ -24,7 +24,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mec_server.event_loop import LOWEST_NICE, Workers
+from mec_server.event_loop import Workers
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Ledger
 from mec_server.twin.composition import (
@@ -213,7 +213,7 @@ class TwinViews:
         self._classify = classify
         self._tiles = tiles
         self._ledger = ledger
-        views = Workers(1, failed, "views", nice=LOWEST_NICE)
+        views = Workers(1, failed, "views", idle=True)
         looks = Workers(1, failed, "looks", nice=LOOKS_NICE)
         self._composing = _FieldThread(views, open_fields())
         self._looking = _FieldThread(looks, open_fields())

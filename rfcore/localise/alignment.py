@@ -175,6 +175,19 @@ class Template:
             self.chosen[number] = self._level(number)
         return self.chosen[number]
 
+    def moved_px(self, motion: Pose, number: int = 0) -> float:
+        """Return how far a motion of the camera moves the pixels of level ``number``: root mean
+        square, in pixels of the finest level. Near pixels move further than those far away."""
+        level = self.level(number)
+        if not level.points.size:
+            return 0.0
+        turn = np.array(motion.rotation_matrix(), np.float32)
+        moved = turn @ level.points + np.array(motion.translation_m, np.float32)[:, None]
+        k, z = level.intrinsics, np.maximum(moved[2], TINY)
+        across = (moved[0] / z - level.points[0] / level.points[2]) * np.float32(k.fx_px)
+        down = (moved[1] / z - level.points[1] / level.points[2]) * np.float32(k.fy_px)
+        return float(2**number * np.sqrt(np.mean(across**2 + down**2)))
+
     def _level(self, number: int) -> _Level:
         plane, k, step = self.structures[number], self.view.camera.intrinsics, 2**number
         height, width = plane.shape

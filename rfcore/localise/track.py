@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Intrinsics, Pose, Vec3
+from rfcore.camera import Pose, Vec3
 from rfcore.localise.agreement import agreement_on_track, near_on_the_spot
 from rfcore.localise.alignment import Aligned, Expected, Template, align
 from rfcore.localise.structure import Pyramid
@@ -32,7 +32,6 @@ __all__ = [
     "TrackSettings",
     "begun",
     "followed",
-    "moved_px",
 ]
 
 F64 = NDArray[np.float64]
@@ -70,16 +69,24 @@ class TrackSettings:
     settled_of_depth: float = 0.003
     """How far a pose that was rendered at is expected to be off, one sigma."""
     settled_deg: float = 0.05
-    redraw_px: float = 0.2
-    """A correction that moves pixels of middling depth by more is worth another render."""
-    most_px: float = 1.5
+    redraw_px: float = 0.4
+    """A correction that moves the pixels that were aligned by more is worth another render."""
+    most_px: float = 3.0
     """A pose that is still off by more was not found."""
+    first_step_renders: int = 2
+    """Renders more for the first picture after a track began, at least: it has not seen yet how the
+    camera moves, so the pose found may be far from the one to be found."""
     unknown_speed_m_s: float = 10.0
     """While only one pose is known, the next one may be this far."""
     fine_levels: int = 1
     """At so many of the finest levels that take part the pose that was rendered at is corrected."""
     longest_gap_s: float = 1.5
     """Over longer times no motion is predicted."""
+
+    def expected(self, template: Template) -> Expected:
+        """Return how far a prediction is off."""
+        metres = self.expected_of_depth * template.median_depth
+        return Expected(metres, math.radians(self.expected_deg))
 
 
 @dataclass(frozen=True)
@@ -123,7 +130,8 @@ class Track:
     metres and radians in the camera's axes, by the residuals alone. ``motion``: ``None`` while only
     one pose is known. ``correction_px``: how far off the pose sent is. ``renders``: made for it.
     ``motion_scale``: how much longer movements are than aligning with the view before says: as much
-    as the field's depth is wrong there, by which it measures them.
+    as the field's depth is wrong there, by which it measures them. ``steps``: pictures that it was
+    followed to since it began.
     """
 
     time_ns: int
@@ -136,6 +144,7 @@ class Track:
     correction_px: float
     renders: int
     motion_scale: float = 1.0
+    steps: int = 0
 
     def predicted(self, time_ns: int, odometry: Pose | None = None) -> Pose:
         """Return where the camera is expected at a later time; without motion, where it was."""
@@ -196,6 +205,8 @@ def followed(
     ``odometry``: the later camera's pose in the axes of the earlier, where a sensor measured it.
     """
     seconds = (time_ns - track.time_ns) / 1e9
+    if track.steps == 0:
+        effort = replace(effort, renders=max(effort.renders, settings.first_step_renders))
     predicted = track.predicted(time_ns, odometry)
     expected = _expected(track, predicted, seconds, settings)
     drawn = track.view.camera.world_from_cam
@@ -212,7 +223,8 @@ def followed(
     if anew is None:
         return None
     made = replace(anew, before=(track, seconds))
-    return _checked(made, picture, render_at, settings, replace(effort, renders=0))
+    left = effort.renders - 1 if made.is_first_step else 0
+    return _checked(made, picture, render_at, settings, replace(effort, renders=left))
 
 
 def _aligned_from(
@@ -264,9 +276,7 @@ def _aligned_anew(
     """Return where a picture was taken, by a render near there; None where nothing agrees."""
     view = render_at(near)
     template = Template.of(view)
-    if expected is None:
-        metres = settings.expected_of_depth * template.median_depth
-        expected = Expected(metres, math.radians(settings.expected_deg))
+    expected = expected or settings.expected(template)
     aligned = align(template, picture, Pose.identity(), expected, finest=finest)
     if aligned is None:
         return None
@@ -284,6 +294,11 @@ class _Candidate:
     renders: int
     before: tuple[Track, float] | None = None
     followed_to: Pose | None = None
+
+    @property
+    def is_first_step(self) -> bool:
+        """Whether it was predicted from a track that has just begun, and no motion seen by it."""
+        return self.before is not None and self.before[0].steps == 0
 
     def motion_scale(self, pose: Pose) -> float:
         """Return the scale of motions, once the camera was found to be at a pose."""
@@ -322,23 +337,29 @@ def _checked(
     settings: TrackSettings,
     effort: Effort,
 ) -> Track | None:
-    """Return the candidate as a track if the render there resembles the picture."""
+    """Return the candidate as a track if the render there resembles the picture.
+
+    The first step of a track is predicted so loosely that alignment may have ended where what is
+    far away agrees and what is near was taken for something that the field does not have: it is
+    settled from coarse to fine, and must stay where it is. Hypothesis found a pose 0.2 m off, whose
+    finest level alone still moved it by 0.6 px; all levels move it by 2.3, to the right one.
+    """
     view, renders = render_at(made.world_from_cam), made.renders + 1
     template = Template.of(view)
     agrees = agreement_on_track(picture[HALF], template.structures[HALF], view)
     if agrees < made.least_agreement(settings):
         return None
-    aligned = _settled(template, picture, settings, effort.finest)
+    aligned = _settled(template, picture, settings, effort.finest, coarsely=made.is_first_step)
     if aligned is None:
         return None
-    off_px = moved_px(aligned.motion, template.median_depth, view.camera.intrinsics)
+    off_px = template.moved_px(aligned.motion, effort.finest)
     if off_px > settings.redraw_px and effort.renders > 0:
         there = view.camera.world_from_cam.compose(aligned.motion.inverse())
         again = replace(made, world_from_cam=there, renders=renders)
         return _checked(
             again, picture, render_at, settings, replace(effort, renders=effort.renders - 1)
         )
-    if off_px > settings.most_px:
+    if off_px > (settings.redraw_px if made.is_first_step else settings.most_px):
         return None
     pose = view.camera.world_from_cam.compose(aligned.motion.inverse())
     return Track(
@@ -352,13 +373,22 @@ def _checked(
         off_px,
         renders,
         made.motion_scale(pose),
+        0 if made.before is None else made.before[0].steps + 1,
     )
 
 
 def _settled(
-    template: Template, picture: Pyramid, settings: TrackSettings, finest: int
+    template: Template,
+    picture: Pyramid,
+    settings: TrackSettings,
+    finest: int,
+    *,
+    coarsely: bool,
 ) -> Aligned | None:
-    """Return what still moves a picture against the render at its own pose."""
+    """Return what still moves a picture against the render at its own pose; ``coarsely``: as if
+    that were but a prediction."""
+    if coarsely:
+        return align(template, picture, Pose.identity(), settings.expected(template), None, finest)
     expected = Expected(
         settings.settled_of_depth * template.median_depth, math.radians(settings.settled_deg)
     )
@@ -375,18 +405,6 @@ def _expected(track: Track, predicted: Pose, seconds: float, settings: TrackSett
         metres += settings.unknown_speed_m_s * seconds
     radians = math.radians(settings.expected_deg) + settings.drift_of_motion * turned
     return Expected(metres, radians)
-
-
-def moved_px(motion: Pose, median_depth: float, k: Intrinsics) -> float:
-    """Return about how far a motion moves pixels of middling depth, root mean square.
-
-    Along the optical axis and about it a pixel moves by as much as it is away from the middle.
-    """
-    depth = max(median_depth, 1e-9)
-    x, y, z = (metres / depth for metres in motion.translation_m)
-    a, b, c = rotation_vector(motion.rotation)
-    radius_px = math.sqrt((k.width_px**2 + k.height_px**2) / 12)
-    return math.hypot(k.fx_px * (x + b), k.fx_px * (y - a), radius_px * z, radius_px * c)
 
 
 def _covariance(aligned: Aligned) -> F64:

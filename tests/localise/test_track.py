@@ -3,46 +3,51 @@
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from localise.planes import INTRINSICS, Planes, picture
-from rfcore.camera import Camera, Intrinsics, Pose
+from localise.planes import INTRINSICS, WALL_M, Planes, picture
+from rfcore.camera import Camera, Pose
 from rfcore.field import FULL, Quality, render_field_view
+from rfcore.localise.alignment import Template
 from rfcore.localise.structure import Pyramid
-from rfcore.localise.track import Effort, TrackSettings, begun, followed, moved_px
-from rfcore.motion import quaternion_from_vector
+from rfcore.localise.track import Effort, TrackSettings, begun, followed
+from rfcore.motion import quaternion_from_vector, rotation_vector
 from rfcore.views import FieldView, View
 
-K = Intrinsics(64, 36, 32.0, 32.0, 32.0, 18.0)
-DEPTH_M = 10.0
-SMALL = st.floats(-1e-3, 1e-3)
+TEMPLATE = Template.of(render_field_view(Planes(), Camera(INTRINSICS, Pose.identity())))
+METRES = st.floats(-0.3, 0.3)
+RADIANS = st.floats(-0.02, 0.02)
 
 
-def projected_px(motion: Pose) -> float:
-    """Return the root mean square displacement of the projections of all pixels at one depth."""
-    v, u = np.mgrid[: K.height_px, : K.width_px] + 0.5
-    points = np.stack([(u - K.cx_px) / K.fx_px, (v - K.cy_px) / K.fy_px, np.ones_like(u)]) * DEPTH_M
-    turn, shift = np.array(motion.rotation_matrix()), np.array(motion.translation_m)
-    x, y, z = np.tensordot(turn, points, axes=1) + shift[:, None, None]
-    du, dv = K.fx_px * x / z + K.cx_px - u, K.fy_px * y / z + K.cy_px - v
-    return math.sqrt(float((du**2 + dv**2).mean()))
+def projected_px(motion: Pose, level: int) -> float:
+    """Return by how much a motion moves the projections of a level's points (OpenCV)."""
+    k, points = INTRINSICS, TEMPLATE.level(level).points.T.astype(np.float64)
+    matrix = np.array([[k.fx_px, 0, k.cx_px], [0, k.fy_px, k.cy_px], [0, 0, 1]])
+    turn, shift = np.array(rotation_vector(motion.rotation)), np.array(motion.translation_m)
+    before, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, None)
+    after, _ = cv2.projectPoints(points, turn, shift, matrix, None)
+    return math.sqrt(float(((after - before) ** 2).sum(axis=(1, 2)).mean()))
 
 
-@given(SMALL, SMALL, SMALL, SMALL)
-def test_of_translations_and_roll_it_is_the_mean_of_the_projection(
-    x: float, y: float, z: float, roll: float
+@given(METRES, METRES, METRES, RADIANS, RADIANS, RADIANS, st.integers(0, 2))
+def test_a_motion_moves_pixels_as_far_as_opencv_projects_them(
+    x: float, y: float, z: float, a: float, b: float, c: float, level: int
 ) -> None:
-    motion = Pose((DEPTH_M * x, DEPTH_M * y, DEPTH_M * z), quaternion_from_vector((0.0, 0.0, roll)))
-    assert moved_px(motion, DEPTH_M, K) == pytest.approx(projected_px(motion), rel=0.01, abs=1e-4)
+    motion = Pose((x, y, z), quaternion_from_vector((a, b, c)))
+    expected_px = pytest.approx(projected_px(motion, level), rel=1e-3, abs=1e-3)
+    assert TEMPLATE.moved_px(motion, level) == expected_px
 
 
-def test_a_turn_to_the_side_that_a_step_undoes_moves_little() -> None:
-    turn = quaternion_from_vector((0.0, 1e-3, 0.0))
-    undone = Pose((-1e-3 * DEPTH_M, 0.0, 0.0), turn)
-    assert moved_px(undone, DEPTH_M, K) < 1e-6 < moved_px(Pose((0.0, 0.0, 0.0), turn), DEPTH_M, K)
+def test_what_a_turn_undoes_far_away_still_moves_what_is_near() -> None:
+    down_m = 0.19
+    turn = quaternion_from_vector((down_m / WALL_M, 0.0, 0.0))
+    at_the_wall = Pose((0.0, down_m, 0.0), turn)
+    assert TEMPLATE.moved_px(at_the_wall) > 1.0
+    assert TEMPLATE.moved_px(Pose.identity()) == 0.0
 
 
 class Shallow:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from localise.planes import INTRINSICS, Planes, picture
@@ -214,7 +214,25 @@ PICTURES = st.sampled_from(["next", "next", "next", "same place", "noise", "jump
 ANSWERS = st.sampled_from(["right", "right", "wrong", "lost", "never"])
 
 
+LOOSELY_PREDICTED = [
+    ("good", kind, answer)
+    for kind, answer in (
+        ("jump", "wrong"),
+        ("jump", "lost"),
+        ("jump", "lost"),
+        ("next", "right"),
+        ("jump", "right"),
+        ("jump", "right"),
+        ("jump", "right"),
+        ("next", "right"),
+    )
+]
+"""Its last picture is the first after a track began: a pose 0.2 m off was claimed, at which the
+wall agrees and the ground before the camera is 5 px off."""
+
+
 @settings(max_examples=25, deadline=None)
+@example(events=LOOSELY_PREDICTED)
 @given(events=st.lists(st.tuples(SENSOR_EVENTS, PICTURES, ANSWERS), min_size=3, max_size=9))
 def test_no_feed_and_no_answer_makes_it_claim_what_the_picture_does_not_show(
     events: list[tuple[str, str, str]],

@@ -146,6 +146,21 @@ def test_threads_of_background_work_give_way_and_no_other_thread_does() -> None:
         assert asyncio.run(niceness(Workers(1, unexpected, nice=nice))) == expected
 
 
+def test_threads_of_idle_work_are_of_the_kernels_idle_class_and_no_other_thread_is() -> None:
+    async def policy(workers: Workers) -> int:
+        found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        workers.submit("cav-1", lambda: os.sched_getscheduler(0), found.set_result)
+        try:
+            return await asyncio.wait_for(found, 30)
+        finally:
+            await asyncio.to_thread(workers.close)
+
+    own = os.sched_getscheduler(0)
+    assert asyncio.run(policy(Workers(1, unexpected))) == own
+    assert asyncio.run(policy(Workers(1, unexpected, idle=True))) == os.SCHED_IDLE
+    assert os.sched_getscheduler(0) == own
+
+
 def test_while_others_come_one_owner_leaves_them_a_worker_and_all_its_work_is_done() -> None:
     async def run() -> tuple[int, int]:
         workers = Workers(3, unexpected, crowded=lambda: True)
