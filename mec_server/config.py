@@ -298,6 +298,9 @@ class ServerConfig:
     address_connections: int = 256
     """Connections that one address (of IPv6, one /64) may hold, whoever is behind them; newer ones
     are closed within a quarter of a second. 0: any number."""
+    identity_connections: int = 32
+    """Connections that one certificate's identity may hold; newer ones are closed, and their
+    address may open none for ten seconds. 0: any number."""
     max_connection_age_s: float = 86_400.0
     """After how many seconds a connection is renewed, open streams in it after half a minute more;
     0: never."""
@@ -317,6 +320,10 @@ class ServerConfig:
         if not 0 <= self.address_connections <= 65_536:
             raise InvalidInput(
                 "address-connections", f"{self.address_connections} is outside 0..65536"
+            )
+        if not 0 <= self.identity_connections <= 65_536:
+            raise InvalidInput(
+                "identity-connections", f"{self.identity_connections} is outside 0..65536"
             )
         if not (self.max_connection_age_s == 0 or 1 <= self.max_connection_age_s <= 1e6):
             raise InvalidInput(

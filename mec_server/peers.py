@@ -8,16 +8,19 @@ peer learns no more than that it failed.
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import grpc
 import structlog
 
-from mec_server.ledger.budgets import Resource
+from mec_server.connections import MOST_HEADER_BYTES, Connections
+from mec_server.ledger.budgets import Limit, Resource
 from mec_server.ledger.ledger import Hold, Ledger
 from mec_server.ledger.peer_log import LogLimiter, PeerLog
 from rfcore.errors import (
@@ -66,6 +69,10 @@ def status_of(error: RfedgeError) -> grpc.StatusCode:
         if isinstance(error, kind):
             return status
     return grpc.StatusCode.INTERNAL
+
+
+CALL_BYTES = 1024
+"""Of a call that is let in, beside the messages of a vehicle's stream: headers and a request."""
 
 
 def peer_account(context: Context) -> tuple[str, bool]:
@@ -152,20 +159,39 @@ class ChargeRpcs(grpc.aio.ServerInterceptor):
         limited: Callable[[str], None],
         limiter: LogLimiter,
         payer: Callable[[Context], Context],
+        connections: Connections,
     ) -> None:
         self._ledger = ledger
         self._limited = limited
         self._limiter = limiter
         self._payer = payer
+        self._connections = connections
 
     async def intercept_service(
         self,
         continuation: Callable[[grpc.HandlerCallDetails], Awaitable[Handler | None]],
         handler_call_details: grpc.HandlerCallDetails,
     ) -> Handler:
-        """Return the method's handler, charged for; of an unknown method, one that says so."""
+        """Return the method's handler, charged for; of an unknown method, or a call of too large
+        headers, one that says so."""
+        headers = handler_call_details.invocation_metadata
+        header_bytes = sum(len(name) + len(value) for name, value in headers)
+        if header_bytes > MOST_HEADER_BYTES:
+            refusal = partial(self._too_large, header_bytes)
+            return self._charged(grpc.stream_stream_rpc_method_handler(refusal))
         handler = await continuation(handler_call_details)
         return self._charged(UNKNOWN_METHOD if handler is None else handler)
+
+    async def _too_large(
+        self, header_bytes: int, requests: AsyncIterator[bytes], context: Context
+    ) -> None:
+        """Refuse a call of such headers, and its connection: no client of ours sends them."""
+        del requests
+        limit = f"{header_bytes} bytes of headers; at most {MOST_HEADER_BYTES} are taken"
+        self._connections.offend(context.peer(), Limit.HEADER_BYTES, time.monotonic())
+        with suppress(grpc.aio.InternalError):  # of a connection that is gone
+            await abort(context, LimitExceeded(Limit.HEADER_BYTES, limit))
+        raise asyncio.CancelledError
 
     def _charged(self, handler: Any) -> Handler:
         """Return ``handler`` with its one behaviour wrapped (see grpc.RpcMethodHandler)."""
@@ -201,11 +227,20 @@ class ChargeRpcs(grpc.aio.ServerInterceptor):
                 await context.abort(grpc.StatusCode.INTERNAL, FAILED)
 
     async def _hold(self, context: Context) -> Hold:
-        identity, _ = peer_account(self._payer(context))
+        paying, peer = self._payer(context), context.peer()
+        identity, is_named = peer_account(paying)
+        if paying is not context:
+            self._connections.exempt(peer)
+        elif is_named:
+            self._connections.claim(peer, identity)
         now = time.monotonic()
         try:
             self._ledger.spend(identity, Resource.CALLS, 1, now)
-            return self._ledger.hold(identity, Resource.RPCS, now)
+            hold = self._ledger.hold(identity, Resource.RPCS, now)
         except LimitExceeded as error:
             self._limited(error.limit)
+            if error.limit in (Limit.IDENTITY_CALLS, Limit.IDENTITY_RPCS):
+                self._connections.refuse(peer)
             await abort(context, error)
+        self._connections.explain(peer, CALL_BYTES)
+        return hold

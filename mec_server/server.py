@@ -21,7 +21,7 @@ from prometheus_client import CollectorRegistry
 
 from mec_server.access import AccessFile
 from mec_server.config import RecordSettings, ServerConfig
-from mec_server.connection_cap import ConnectionCap, keep_silent_out
+from mec_server.connections import Connections
 from mec_server.decoding.decoders import Decoders, DecoderSettings
 from mec_server.edge_service import EdgeService
 from mec_server.event_loop import BACKGROUND_NICE, Workers, repeat_forever
@@ -30,7 +30,7 @@ from mec_server.fields.service import FieldService
 from mec_server.fields.shelf import FieldShelf
 from mec_server.guard import Guard
 from mec_server.learner import Learner
-from mec_server.ledger.budgets import Limit, Resource, budgets_of, memory_limit_bytes
+from mec_server.ledger.budgets import Resource, budgets_of, memory_limit_bytes
 from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.peer_log import LogLimiter, PeerLog
 from mec_server.metrics import BackgroundTask, ServerMetrics
@@ -126,6 +126,7 @@ class EdgeServer:
         outcome_failed = self._failed(BackgroundTask.OUTCOME)
         self._log_limiter = LogLimiter()
         self._entry = self._entry_control()
+        self._connections = Connections(config.address_connections, config.identity_connections)
         promises = self._entry.promises
         self._opener = Workers(1, outcome_failed, "opener")
         self._background = Workers(1, outcome_failed, "background", nice=BACKGROUND_NICE)
@@ -181,7 +182,9 @@ class EdgeServer:
         self._exchange: FieldExchange | None = None
         self._server = grpc.aio.server(
             interceptors=(
-                ChargeRpcs(ledger, limited, self._log_limiter, self._guard.payer),
+                ChargeRpcs(
+                    ledger, limited, self._log_limiter, self._guard.payer, self._connections
+                ),
                 self._guard,
             ),
             options=_options(config),
@@ -225,6 +228,7 @@ class EdgeServer:
             limits=config.limits,
             entry=self._entry,
             log_limiter=self._log_limiter,
+            connections=self._connections,
             twin=twin,
             open_cameras=open_decoders,
             recorder=self._recorder,
@@ -284,7 +288,7 @@ class EdgeServer:
         self._metrics.decoder_started(self._decoders.kind)
         self.address = Address(self.address.host, self._open_port())
         await self._server.start()
-        keep_silent_out(self.address.port)
+        self._connections.listen(self.address.port)
         self._follow(self.take_up_fields, PUBLICATIONS_EVERY_S, BackgroundTask.PUBLICATIONS)
         self._follow(self._sweep_calls, SWEEP_EVERY_S, BackgroundTask.ACCESS)
         if self._learner is not None:
@@ -293,7 +297,7 @@ class EdgeServer:
         self._follow(self.index_fields, FIELDS_EVERY_S, BackgroundTask.FIELDS)
         if self._config.notices:
             self._follow(self._notices.follow, NOTICES_EVERY_S, BackgroundTask.NOTICES)
-        self._cap_connections()
+        self._follow_connections()
         self._publish_over_nats()
         await self._set_health(health_pb2.HealthCheckResponse.SERVING)
         if self._config.ready_file is not None:
@@ -429,17 +433,19 @@ class EdgeServer:
         self._guard.sweep()
         self._edge.end_stalled(time.monotonic())
 
-    def _cap_connections(self) -> None:
-        most = self._config.address_connections
-        if not most:
-            return
-        cap = ConnectionCap(self.address.port, most)
-
+    def _follow_connections(self) -> None:
         async def sweep() -> None:
-            for source, cut in (await asyncio.to_thread(cap.sweep)).items():
-                self._metrics.count_limited(Limit.ADDRESS_CONNECTIONS, cut)
-                lines = PeerLog(log, self._log_limiter, source, time.monotonic)
-                lines.warning("connections closed", address=source, connections=cut, limit=most)
+            now = time.monotonic()
+            for cut in await asyncio.to_thread(self._connections.sweep, now):
+                self._metrics.count_limited(cut.limit, cut.count)
+                lines = PeerLog(log, self._log_limiter, cut.source, time.monotonic)
+                lines.warning(
+                    "connections closed",
+                    address=cut.source,
+                    connections=cut.count,
+                    reason=cut.limit,
+                    barred=cut.barred,
+                )
 
         self._follow(sweep, CONNECTIONS_EVERY_S, BackgroundTask.CONNECTIONS)
 

@@ -87,7 +87,8 @@ class Stream:
         self._intrinsics: dict[str, Intrinsics] = {}
         self._fault: Exception | None = None
         self._metrics = server.metrics.of(UNKNOWN_VEHICLE)
-        lines = log.bind(session=session_id, peer=context.peer())
+        self._peer = context.peer()
+        lines = log.bind(session=session_id, peer=self._peer)
         self._log = PeerLog(lines, server.log_limiter, account.identity, time.monotonic)
         self._session = ServerSession(
             session_id,
@@ -264,6 +265,7 @@ class Stream:
 
     def _receive(self, data: bytes, now: float) -> None:
         """Take one message; whatever it is, it is charged."""
+        self._server.connections.explain(self._peer, len(data))
         excess = self._excess(lambda: self._account.spend_message(len(data), now))
         try:
             message = client_message_from_bytes(data)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from mec_server.config import SessionLimits
+from mec_server.connections import Connections
 from mec_server.event_loop import Workers
 from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.ledger import Hold
@@ -43,6 +44,7 @@ class ServerContext:
     limits: SessionLimits
     entry: EntryControl
     log_limiter: LogLimiter
+    connections: Connections
     twin: Twin
     open_cameras: OpenCameras
     recorder: Recorder | None = None

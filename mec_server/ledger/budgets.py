@@ -105,6 +105,9 @@ class Limit(StrEnum):
     UNUSABLE_FRAMES = "unusable_frames"
     UNREAD_ANSWERS = "unread_answers"
     ADDRESS_CONNECTIONS = "address_connections"
+    IDENTITY_CONNECTIONS = "identity_connections"
+    CONNECTION_BYTES = "connection_bytes"
+    HEADER_BYTES = "header_bytes"
 
 
 @dataclass(frozen=True)

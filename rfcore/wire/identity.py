@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
+from functools import lru_cache
 
 from rfcore.errors import AccessDenied, InvalidData, InvalidInput
 from rfcore.wire.checks import check_name, shown
@@ -22,6 +23,8 @@ from rfcore.wire.checks import check_name, shown
 __all__ = ["PeerIdentity", "Role", "identity_uri", "parse_identity", "peer_identity"]
 
 PREFIX = "spiffe://rfedge/"
+CERTIFICATES = 512
+"""Certificates that are not read again at each of their calls."""
 
 
 class Role(StrEnum):
@@ -86,6 +89,7 @@ def peer_identity(auth_context: Mapping[str, Iterable[bytes]]) -> PeerIdentity |
     return PeerIdentity(names)
 
 
+@lru_cache(CERTIFICATES)
 def _serial_and_end(pem: bytes) -> tuple[int, datetime]:
     """Return serial number and notAfter of a certificate; raise ``InvalidData``."""
     try:

@@ -26,6 +26,7 @@ from rfcore.wire.tls import TlsFiles
 
 LOG_LINES, OPEN_FILES = "lines of its log", "descriptors it had open at most"
 PROCESSOR_S = "seconds of a processor"
+DEFERRED = "connections that the kernel keeps until they say something"
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Attack:
 
     ``effect`` names what must be more than ``EFFECT`` times as much when the server is attacked as
     when the decoy is: a counter of the server's metrics ("NAME{LABELS}", the values of its labels
-    in the order of their names), or one of the three above for what no metric counts.
+    in the order of their names), or one of the four above for what no metric counts.
     """
 
     identity: str
@@ -92,19 +93,19 @@ ATTACKS = {
         Attack("vehicle", rpcs.unknown_fields, spent(Resource.BYTES)),
         Attack("vehicle", rpcs.odd_numbers, nacked(RejectReason.INVALID_ARGUMENT)),
         Attack("consumer", rpcs.foreign_paths, spent(Resource.CALLS)),
-        Attack("vehicle", rpcs.many_connections, spent(Resource.CALLS)),
+        Attack("vehicle", rpcs.many_connections, limited(Limit.IDENTITY_CONNECTIONS)),
         Attack("vehicle", rpcs.revoked, REFUSED_CERTIFICATES),
         Attack("vehicle", packets.flipped_slices, spent(Resource.MESSAGES)),
         Attack("vehicle", packets.hung_decoders, spent(Resource.MESSAGES)),
         Attack("none", connections.strangers, PROCESSOR_S),
-        Attack("none", connections.silent_connections, OPEN_FILES),
+        Attack("none", connections.silent_connections, DEFERRED),
         Attack("none", connections.half_requests, OPEN_FILES),
         Attack("vehicle", connections.silent_peers, OPEN_FILES),
         Attack("vehicle", connections.pings, PROCESSOR_S),
         Attack("vehicle", connections.settings, PROCESSOR_S),
         Attack("vehicle", connections.resets, limited(Limit.IDENTITY_CALLS)),
-        Attack("vehicle", connections.continuations, PROCESSOR_S),
-        Attack("vehicle", connections.repeated_headers, PROCESSOR_S),
+        Attack("vehicle", connections.continuations, limited(Limit.CONNECTION_BYTES)),
+        Attack("vehicle", connections.repeated_headers, limited(Limit.HEADER_BYTES)),
         Attack("none", fields.strange_entries, LOG_LINES),
         Attack("vehicle", fields.malformed_archives, LOG_LINES),
         Attack("none", fields.malformed_publications, LOG_LINES),

@@ -28,7 +28,7 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from attack.attacker import LOG_LINES, OPEN_FILES, PROCESSOR_S
+from attack.attacker import DEFERRED, LOG_LINES, OPEN_FILES, PROCESSOR_S
 from attack.target import Target
 from rfedge.certs.authority import Members, certify, write_certificates
 from scoreboard import Scoreboard
@@ -206,7 +206,8 @@ class Scene:
 
         Nothing of a server that does not answer.
         """
-        counted = Counter({LOG_LINES: (self.folder / "server.log").read_bytes().count(b"\n")})
+        lines = (self.folder / "server.log").read_bytes().count(b"\n")
+        counted = Counter({LOG_LINES: lines, DEFERRED: kernel_count("TCPDeferAcceptDrop")})
         with suppress(OSError):
             counted.update(scraped(self.target.metrics))
         return counted
@@ -277,6 +278,16 @@ def open_files(pid: int) -> int:
     with suppress(OSError):
         return sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
     return 0
+
+
+def kernel_count(name: str) -> int:
+    """Return what the kernel has counted of TCP under a name (netstat -s)."""
+    names, values = (
+        line.split()
+        for line in Path("/proc/net/netstat").read_text().splitlines()
+        if line.startswith("TcpExt:")
+    )
+    return int(dict(zip(names, values, strict=True))[name])
 
 
 def scraped(metrics: str) -> dict[str, float]:

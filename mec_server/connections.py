@@ -1,0 +1,435 @@
+"""Connections of the server's own process: how many there may be, and what each may cost.
+
+gRPC limits connections in total and the time of a handshake. It knows no limit by address, and of
+what happens below a call (pings, settings, headers without end, calls that are reset, headers that
+are named ten thousand times) it tells nobody; by the time a call is seen its headers are in memory.
+So the sockets of this process are looked at a few times a second, and shut down where
+
+* one address has too many of them, or one identity;
+* more bytes came in than became messages (``explain``): what a peer sends beyond that it sends to
+  keep the server busy. A call that its budget refused counts as some of these bytes;
+* a call's headers are larger than any client's (``offend``).
+
+Who did one of these but the first is *barred*: for some seconds the kernel drops what its address
+sends to the listening socket, so that it costs nothing to come again; connections that others have
+from there stay as they are. An address is a source of packets, not an identity: vehicles that come
+anew through the same translator of addresses wait for as long. Peers that are known to be proxies
+are exempt. A kernel's firewall does more (``deploy/nftables/mec-server.nft``), where there is one.
+Linux only: it lists ``/proc/self/fd``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import ipaddress
+import os
+import socket
+import struct
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from ipaddress import IPv4Address, IPv6Network
+from pathlib import Path
+from threading import Lock
+from urllib.parse import quote, unquote
+
+from mec_server.ledger.budgets import Limit
+
+__all__ = ["MOST_HEADER_BYTES", "Connections", "Cut", "keep_silent_out", "source_of"]
+
+INTERNET = (socket.AF_INET, socket.AF_INET6)
+SILENT_S = 5
+"""For how long a connection may be silent before gRPC is given it; TCP rounds up."""
+
+V6_NETWORK_BITS = 64
+"""What a site has of IPv6 addresses at least, so its addresses count as one (RFC 6177)."""
+
+MOST_HEADER_BYTES = 16_384
+"""Of a call, names and values; ours have a few hundred."""
+
+UNEXPLAINED_BYTES = 2 << 20
+"""What a connection may have sent that became no message: more than HTTP/2's windows hold of a
+message that is not whole yet, or waits to be read."""
+UNEXPLAINED_BYTES_PER_S = 64 << 10
+"""By so much that becomes less: acknowledgements, pings, headers, consumers' requests."""
+OVERHEAD = 1.1
+"""Bytes of TLS and HTTP/2 for each of a message, at most; of short ones ``MESSAGE_OVERHEAD``."""
+MESSAGE_OVERHEAD = 256
+REFUSED_CALL_BYTES = 64 << 10
+"""What a call counts as that a budget refused: 32 of them, and one more each second, pass."""
+
+BARRED_S = 10.0
+MOST_BARRED = 60
+"""Addresses at once, the newest: jumps of the kernel's filter reach 255 instructions."""
+
+BYTES_RECEIVED = struct.Struct("128xQ")
+"""``tcpi_bytes_received`` in ``struct tcp_info`` (linux/tcp.h)."""
+SO_ATTACH_FILTER, SO_DETACH_FILTER = 26, 27
+
+
+@dataclass(frozen=True)
+class Connection:
+    """An accepted connection: our descriptor, the kernel's name of the socket, its source, its peer
+    as gRPC names it, and how many bytes came in so far."""
+
+    descriptor: int
+    inode: str
+    source: str
+    peer: str
+    received_bytes: int
+
+
+def source_of(address: str) -> str:
+    """Return what connections from ``address`` are counted under: an IPv4 address, or the /64 of
+    an IPv6 address.
+
+    Raises ``ValueError`` for what is no address.
+    """
+    ip = ipaddress.ip_address(address.partition("%")[0])
+    if ip.version == 4:
+        return str(ip)
+    if ip.ipv4_mapped is not None:
+        return str(ip.ipv4_mapped)
+    return str(ipaddress.ip_network((ip, V6_NETWORK_BITS), strict=False))
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Connections of one source that were shut down for one reason; ``barred``: its address."""
+
+    source: str
+    limit: Limit
+    count: int
+    barred: bool
+
+
+@dataclass
+class Account:
+    """One connection's: what is known of it, and what it sent that became no message."""
+
+    inode: str
+    received_bytes: int = 0
+    unexplained_bytes: float = 0.0
+
+
+@dataclass
+class Notes:
+    """What calls told of a connection since the last look at it."""
+
+    explained_bytes: float = 0.0
+    identity: str = ""
+    is_exempt: bool = False
+    offences: dict[Limit, bool] = field(default_factory=dict)
+    """And whether a sweep has told of it."""
+
+
+class Connections:
+    """Lets each address hold ``of_address`` connections, and each identity ``of_identity`` (0: any
+    number); the newest beyond are cut, and those that cost too much. ``listen`` says to which port.
+
+    ``explain``, ``refuse``, ``claim``, ``exempt`` and ``offend`` are called by calls, with their
+    peer as gRPC names it, and cost nothing to speak of; ``sweep`` by one thread of its own.
+    """
+
+    def __init__(self, of_address: int, of_identity: int) -> None:
+        self._of_address = of_address
+        self._of_identity = of_identity
+        self._port = 0
+        self._accounts: dict[str, Account] = {}
+        """By peer, oldest first."""
+        self._notes: defaultdict[str, Notes] = defaultdict(Notes)
+        self._absent: set[str] = set()
+        self._barred_s: dict[str, float] = {}
+        self._swept_s: float | None = None
+        self._lock = Lock()
+
+    def listen(self, port: int) -> None:
+        """Have the connections to ``port`` looked after from now on; silent ones are the kernel's.
+
+        Before it is called there is nothing to sweep.
+        """
+        self._port = port
+        keep_silent_out(port)
+
+    def explain(self, peer: str, message_bytes: int) -> None:
+        """Note that bytes of a connection became a message, or a call that was answered."""
+        with self._lock:
+            notes = self._notes[peer]
+            notes.explained_bytes += OVERHEAD * message_bytes + MESSAGE_OVERHEAD
+
+    def refuse(self, peer: str) -> None:
+        """Note that a call was refused for a budget."""
+        with self._lock:
+            self._notes[peer].explained_bytes -= REFUSED_CALL_BYTES
+
+    def claim(self, peer: str, identity: str) -> None:
+        """Note whose connection it is."""
+        with self._lock:
+            self._notes[peer].identity = identity
+
+    def exempt(self, peer: str) -> None:
+        """Never cut this connection: it is a proxy's, and carries others' calls."""
+        with self._lock:
+            self._notes[peer].is_exempt = True
+
+    def offend(self, peer: str, limit: Limit, now: float) -> None:
+        """Cut a connection and bar its address at once. ``peer``: empty for one that is gone.
+
+        About 10 us a connection: not for what may happen often.
+        """
+        if not peer:
+            return
+        with self._lock:
+            notes = self._notes[peer]
+            if notes.is_exempt or limit in notes.offences:
+                return
+            notes.offences[limit] = False
+            self._bar([_source_of_peer(peer)], now)
+        for connection in _accepted(self._port):
+            if connection.peer == peer:
+                _shut(connection)
+
+    def sweep(self, now: float) -> list[Cut]:
+        """Cut what is too much, bar where it came from, and return what was cut.
+
+        Not for the event loop: it takes about 10 us a connection.
+        """
+        found = {connection.peer: connection for connection in _accepted(self._port)}
+        with self._lock:
+            reasons = self._judge(found, now)
+        cut: defaultdict[tuple[str, Limit], int] = defaultdict(int)
+        for peer, limit in reasons.items():
+            # One that offended may be gone by now; its source is still to be barred.
+            cut[_source_of_peer(peer), limit] += peer not in found or _shut(found[peer])
+        cuts = [
+            Cut(source, limit, count, limit is not Limit.ADDRESS_CONNECTIONS)
+            for (source, limit), count in cut.items()
+            if count
+        ]
+        with self._lock:
+            self._bar([each.source for each in cuts if each.barred], now)
+        return cuts
+
+    def _judge(self, found: dict[str, Connection], now: float) -> dict[str, Limit]:
+        """Bring the accounts up to date; return which connections are too much, and why."""
+        passed_s = 0.0 if self._swept_s is None else now - self._swept_s
+        self._swept_s = now
+        offended: dict[str, Limit] = {}
+        for peer, notes in self._notes.items():
+            for limit, is_told in notes.offences.items():
+                if not is_told:
+                    offended[peer] = limit
+            notes.offences = dict.fromkeys(notes.offences, True)
+        absent = self._notes.keys() - found.keys()
+        for peer in absent & self._absent:  # twice: a new one may not have been listed yet
+            del self._notes[peer]
+        self._absent = absent
+        known = {
+            peer: account
+            for peer, account in self._accounts.items()
+            if peer in found and found[peer].inode == account.inode
+        }
+        self._accounts = known | {
+            peer: known.get(peer) or Account(each.inode) for peer, each in found.items()
+        }
+        for peer, account in self._accounts.items():
+            self._update(account, found[peer], self._notes.get(peer), passed_s)
+        exempt = {peer for peer, notes in self._notes.items() if notes.is_exempt}
+        reasons = {**self._too_many(found), **self._too_dear(), **offended}
+        return {peer: limit for peer, limit in reasons.items() if peer not in exempt}
+
+    @staticmethod
+    def _update(
+        account: Account, connection: Connection, notes: Notes | None, passed_s: float
+    ) -> None:
+        came = connection.received_bytes - account.received_bytes
+        explained = 0.0
+        if notes is not None:
+            explained, notes.explained_bytes = notes.explained_bytes, 0.0
+        allowed = UNEXPLAINED_BYTES_PER_S * passed_s
+        left = account.unexplained_bytes + came - explained - allowed
+        account.received_bytes, account.unexplained_bytes = (
+            connection.received_bytes,
+            max(0.0, left),
+        )
+
+    def _too_dear(self) -> dict[str, Limit]:
+        return {
+            peer: Limit.CONNECTION_BYTES
+            for peer, account in self._accounts.items()
+            if account.unexplained_bytes > UNEXPLAINED_BYTES
+        }
+
+    def _too_many(self, found: dict[str, Connection]) -> dict[str, Limit]:
+        of_address: defaultdict[str, int] = defaultdict(int)
+        of_identity: defaultdict[str, int] = defaultdict(int)
+        reasons = {}
+        for peer in self._accounts:
+            notes = self._notes.get(peer)
+            if notes is not None and notes.identity:
+                of_identity[notes.identity] += 1
+                if 0 < self._of_identity < of_identity[notes.identity]:
+                    reasons[peer] = Limit.IDENTITY_CONNECTIONS
+            of_address[found[peer].source] += 1
+            if 0 < self._of_address < of_address[found[peer].source]:
+                reasons[peer] = Limit.ADDRESS_CONNECTIONS
+        return reasons
+
+    def _bar(self, sources: list[str], now: float) -> None:
+        """Have the kernel drop what comes from ``sources``, and take earlier ones in again."""
+        barred_s = {source: s for source, s in self._barred_s.items() if s > now}
+        for source in sources:
+            barred_s.pop(source, None)
+            barred_s[source] = now + BARRED_S
+        barred_s = dict(list(barred_s.items())[-MOST_BARRED:])
+        if barred_s.keys() != self._barred_s.keys():
+            for listening in _listening(self._port):
+                bar(listening, barred_s)
+        self._barred_s = barred_s
+
+
+def bar(listening: socket.socket, sources: Iterable[str]) -> None:
+    """Have the kernel drop packets for a listening socket that come from ``sources``.
+
+    Sources are as ``source_of`` names them. Connections that were accepted before keep what was in
+    force then. Needs no privilege (socket(7), SO_ATTACH_FILTER).
+    """
+    networks = [ipaddress.ip_network(source) for source in sources]
+    if not networks:
+        with suppress(FileNotFoundError):  # nobody was barred before
+            listening.setsockopt(socket.SOL_SOCKET, SO_DETACH_FILTER, 0)
+        return
+    program = _program(
+        [network.network_address for network in networks if network.version == 4],
+        [network for network in networks if network.version == 6],
+    )
+    code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *each) for each in program))
+    filter_ = struct.pack("HP", len(program), ctypes.addressof(code))
+    listening.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, filter_)
+
+
+Instruction = tuple[int, int, int, int]
+"""Of the classic BPF machine: operation, jump if true, jump if false, operand."""
+LOAD_WORD, LOAD_BYTE, SHIFT_RIGHT, JUMP_IF_EQUAL, RETURN = 0x20, 0x30, 0x74, 0x15, 0x06
+NETWORK_HEADER = 0xFFF00000
+"""``SKF_NET_OFF``: offsets from here on are into the IP header (linux/filter.h)."""
+WHOLE, NOTHING = 0xFFFFFFFF, 0
+
+
+def _program(fours: list[IPv4Address], sixes: list[IPv6Network]) -> list[Instruction]:
+    """Return the filter that drops packets of these sources: at most 60 of each."""
+    drop_4 = [_drop_unless_other(int(each)) for each in fours]
+    four = [(LOAD_WORD, 0, 0, NETWORK_HEADER + 12), *(x for pair in drop_4 for x in pair)]
+    six: list[Instruction] = []
+    for each in sixes:
+        high, low = divmod(int(each.network_address) >> 64, 1 << 32)
+        six += [
+            (LOAD_WORD, 0, 0, NETWORK_HEADER + 8),
+            (JUMP_IF_EQUAL, 0, 3, high),
+            (LOAD_WORD, 0, 0, NETWORK_HEADER + 12),
+            *_drop_unless_other(low),
+        ]
+    kept = (RETURN, 0, 0, WHOLE)
+    return [
+        (LOAD_BYTE, 0, 0, NETWORK_HEADER),
+        (SHIFT_RIGHT, 0, 0, 4),
+        (JUMP_IF_EQUAL, 0, len(four) + 1, 4),
+        *four,
+        kept,
+        *six,
+        kept,
+    ]
+
+
+def _drop_unless_other(word: int) -> tuple[Instruction, Instruction]:
+    return (JUMP_IF_EQUAL, 0, 1, word), (RETURN, 0, 0, NOTHING)
+
+
+def keep_silent_out(port: int) -> int:
+    """Have the kernel keep connections to ``port`` to itself until their peer says something.
+
+    A client that speaks TLS or HTTP/2 speaks first. Returns how many listening sockets there are.
+    """
+    listening = 0
+    for each in _listening(port):
+        each.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, SILENT_S)
+        listening += 1
+    return listening
+
+
+def _listening(port: int) -> Iterator[socket.socket]:
+    for descriptor in _descriptors():
+        with suppress(OSError), _duplicate(descriptor) as duplicate:
+            is_own = duplicate.family in INTERNET and duplicate.getsockname()[1] == port
+            if is_own and duplicate.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
+                yield duplicate
+
+
+def _descriptors() -> Iterator[int]:
+    return (int(entry.name) for entry in Path("/proc/self/fd").iterdir())
+
+
+def _accepted(port: int) -> Iterator[Connection]:
+    for descriptor in _descriptors():
+        inode = _inode(descriptor)
+        if not inode:
+            continue
+        with suppress(OSError, ValueError), _duplicate(descriptor) as duplicate:
+            if duplicate.family not in INTERNET:
+                continue
+            if duplicate.getsockname()[1] == port:
+                host, source_port = duplicate.getpeername()[:2]  # of a listening socket: OSError
+                info = duplicate.getsockopt(
+                    socket.IPPROTO_TCP, socket.TCP_INFO, BYTES_RECEIVED.size
+                )
+                (received,) = BYTES_RECEIVED.unpack(info)
+                yield Connection(
+                    descriptor, inode, source_of(host), peer_name(host, source_port), received
+                )
+
+
+def peer_name(host: str, port: int) -> str:
+    """Return the peer of a connection as gRPC's contexts name it: ``ipv4:192.0.2.7:4711``, or
+    ``ipv6:%5B2001:db8::1%5D:4711``."""
+    ip = ipaddress.ip_address(host.partition("%")[0])
+    mapped = ip if isinstance(ip, IPv4Address) else ip.ipv4_mapped
+    return f"ipv6:%5B{quote(host, ':')}%5D:{port}" if mapped is None else f"ipv4:{mapped}:{port}"
+
+
+def _source_of_peer(peer: str) -> str:
+    host = unquote(peer).partition(":")[2].rpartition(":")[0]
+    return source_of(host.strip("[]"))
+
+
+def _shut(connection: Connection) -> bool:
+    """End a connection, unless its descriptor is another socket's by now; say whether it was.
+
+    What came in and was not read yet is thrown away: the kernel would still hand it out.
+    """
+    is_ended = False
+    with suppress(OSError), _duplicate(connection.descriptor) as duplicate:
+        if _inode(duplicate.fileno()) == connection.inode:
+            duplicate.shutdown(socket.SHUT_RDWR)
+            is_ended = True
+            while duplicate.recv(UNEXPLAINED_BYTES, socket.MSG_DONTWAIT | socket.MSG_TRUNC):
+                pass
+    return is_ended
+
+
+def _inode(descriptor: int) -> str:
+    """Return the kernel's name of the socket ("socket:[4711]"); empty for what is none."""
+    with suppress(OSError):
+        name = str(Path(f"/proc/self/fd/{descriptor}").readlink())
+        return name if name.startswith("socket:") else ""
+    return ""
+
+
+def _duplicate(descriptor: int) -> socket.socket:
+    """Return the socket under a descriptor of our own: closing it closes nothing of gRPC's."""
+    own = os.dup(descriptor)
+    try:
+        return socket.socket(fileno=own)
+    except OSError:
+        os.close(own)
+        raise
