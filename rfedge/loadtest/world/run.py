@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from mec_server.event_loop import work_when_idle
 from mec_server.twin.composition import LivePicture, compose, live_picture
 from mec_server.twin.contacts import cut_out, find
 from mec_server.twin.ground import FieldGround
@@ -28,6 +30,7 @@ from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.notices import ObjectAhead, StreetNotice
 from rfcore.wire.twin import PictureEncoding
 from rfcore.wire.twin_render import ViewRequest, render_view
+from rfedge.demo.processes import command_of
 from rfedge.loadtest.cases import WorldRow, print_world
 from rfedge.loadtest.fleet import CONNECT_S, DRAIN_S, SETTLE_S
 from rfedge.loadtest.live.showing import TwinBed, ingest_latencies_ms
@@ -372,7 +375,8 @@ def age_on_arrival_s(arrived_s: float, unseen_s: float, captured_s: Sequence[flo
 
 
 def ingest_rows(asked: EvalWorld) -> list[WorldRow]:
-    """Return the p99 of ingest without and with a live view that is asked for again and again."""
+    """Return the p99 of ingest alone, and beside what is done while a processor is idle: live views
+    that are asked for again and again, and learning."""
     drive = Drive.given(asked.vehicles)
     path = Path(asked.vehicles.split(",")[1])
     bed = TwinBed(asked.field, path, asked.work, asked.notices_hz, asked.seconds / 3)
@@ -383,6 +387,7 @@ def ingest_rows(asked: EvalWorld) -> list[WorldRow]:
     )
     alone_ms: list[float] = []
     viewed_ms: list[float] = []
+    learning_ms: list[float] = []
     views = 0
     with bed.server() as server:
         for _ in range(asked.rounds):
@@ -390,17 +395,56 @@ def ingest_rows(asked: EvalWorld) -> list[WorldRow]:
             with _viewing(server.address, request) as seen:
                 viewed_ms += ingest_latencies_ms(bed, server)
             views += len(seen)
-    alone, viewed = (float(np.percentile(values, 99)) for values in (alone_ms, viewed_ms))
-    bound_ms = max(1.1 * alone, alone + 5)
+            with _learning(asked, path):
+                learning_ms += ingest_latencies_ms(bed, server)
     return [
-        WorldRow(
-            "ingest",
-            "p99 with a live view asked for again and again",
-            f"<= {bound_ms:.0f} ms (+10 % or +5 ms)",
-            f"{alone:.0f} -> {viewed:.0f} ms, {views} views",
-            viewed <= bound_ms,
+        _beside(
+            alone_ms, viewed_ms, "with a live view asked for again and again", f", {views} views"
         ),
+        _beside(alone_ms, learning_ms, "while a field is learnt from the drive", ""),
     ]
+
+
+def _beside(
+    alone_ms: Sequence[float], beside_ms: Sequence[float], what: str, told: str
+) -> WorldRow:
+    alone, beside = (float(np.percentile(values, 99)) for values in (alone_ms, beside_ms))
+    bound_ms = max(1.1 * alone, alone + 5)
+    return WorldRow(
+        "ingest",
+        f"p99 {what}",
+        f"<= {bound_ms:.0f} ms (+10 % or +5 ms)",
+        f"{alone:.0f} -> {beside:.0f} ms{told}",
+        beside <= bound_ms,
+    )
+
+
+@contextmanager
+def _learning(asked: EvalWorld, drive: Path) -> Iterator[None]:
+    """Learn from a drive as the server's learning process does, on one core and while it is idle;
+    raise ``RfedgeError`` if it ended with an error before the block did."""
+    out, log = asked.work / "learnt.rff", asked.work / "learning.log"
+    update = (
+        "field",
+        "update",
+        asked.field,
+        "--from",
+        drive,
+        "--min-identities",
+        "1",
+        "--out",
+        out,
+    )
+    command = [*command_of("rfedge"), *map(str, update)]
+    with log.open("wb") as file:
+        learning = subprocess.Popen(command, stdout=file, stderr=file, preexec_fn=work_when_idle)
+    try:
+        yield
+        if learning.poll():
+            raise RfedgeError(f"learning failed; see {log}")
+    finally:
+        learning.kill()
+        learning.wait()
 
 
 @contextmanager
