@@ -437,13 +437,14 @@ class EdgeServer:
         async def sweep() -> None:
             now = time.monotonic()
             for cut in await asyncio.to_thread(self._connections.sweep, now):
-                self._metrics.count_limited(cut.limit, cut.count)
+                limit = cut.limit
+                self._metrics.count_limited(limit, cut.count)
                 lines = PeerLog(log, self._log_limiter, cut.source, time.monotonic)
                 lines.warning(
                     "connections closed",
                     address=cut.source,
                     connections=cut.count,
-                    reason=cut.limit,
+                    reason=limit,
                     barred=cut.barred,
                 )
 

@@ -2,7 +2,6 @@
 
 import asyncio
 import threading
-from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from mec_server.config import AdmissionLimits, DecoderKind, LearnSettings, NatsSettings
-from mec_server.connection_cap import ConnectionCap
+from mec_server.connections import Connections, Cut
 from mec_server.metrics import BackgroundTask
 from mec_server.peers import FAILED
 from mec_server.reconstruction import Decoder, FieldSource, Reconstruction, Tools, open_cameras
@@ -314,11 +313,12 @@ async def fields_fail(scene: Scene) -> Any:
 
 
 async def connections_fail(scene: Scene) -> Any:
-    sweep, looked = "mec_server.connection_cap.ConnectionCap.sweep", threading.Event()
+    sweep, looked = "mec_server.connections.Connections.sweep", threading.Event()
 
-    def seen(_: ConnectionCap) -> Counter[str]:
+    def seen(_: Connections, now: float) -> list[Cut]:
+        del now
         looked.set()
-        return Counter()
+        return []
 
     async with scene.serve() as server:
         scene.patch.setattr(sweep, surprise)

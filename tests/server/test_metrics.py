@@ -10,6 +10,7 @@ import pytest
 from prometheus_client import CollectorRegistry
 
 import mec_server
+from mec_server import connections
 from mec_server.decoding.process import LossCause
 from mec_server.ledger.budgets import Limit, Resource
 from mec_server.metrics import STAGES, BackgroundTask, OpeningResult, ServerMetrics
@@ -182,7 +183,13 @@ def test_every_limit_the_server_raises_is_one_of_the_enumeration() -> None:
     assert composed in raised, "the ledger makes its limits of two enumerations"
     named = {name.removeprefix("Limit.") for name in raised if name.startswith("Limit.")}
     assert set(raised) - {f"Limit.{name}" for name in named} <= {composed, "limit", *COUNTED_AGAIN}
+    cuts = ast.walk(ast.parse(Path(connections.__file__).read_text()))
+    of_connections = {
+        node.attr
+        for node in cuts
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "Limit"
+    }
     of_ledger = {
         f"{scope}_{resource}".upper() for scope in ("identity", "server") for resource in Resource
     }
-    assert named | of_ledger == {limit.name for limit in Limit}
+    assert named | of_connections | of_ledger == {limit.name for limit in Limit}
