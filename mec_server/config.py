@@ -270,8 +270,9 @@ class ServerConfig:
     record: RecordSettings = RecordSettings()
     learn: LearnSettings = LearnSettings()
     nats: NatsSettings = NatsSettings()
-    workers: int = 2
-    """Frames reconstructed at once."""
+    workers: int | None = None
+    """Frames reconstructed at once; by itself as many as there are processors, or as a container's
+    limit grants."""
     decoder: DecoderKind = DecoderKind.AUTO
     """Where packets are decoded. bubblewrap: in sandboxes, one a camera. landlock: in processes
     that give up files, network and most system calls. child: in processes with limits alone.
@@ -315,7 +316,7 @@ class ServerConfig:
     limits: Annotated[SessionLimits, Suppress] = SessionLimits()
 
     def __post_init__(self) -> None:
-        if not 1 <= self.workers <= 256:
+        if self.workers is not None and not 1 <= self.workers <= 256:
             raise InvalidInput("workers", f"{self.workers} is outside 1..256")
         if not 0 <= self.address_connections <= 65_536:
             raise InvalidInput(

@@ -30,7 +30,12 @@ from mec_server.fields.service import FieldService
 from mec_server.fields.shelf import FieldShelf
 from mec_server.guard import Guard
 from mec_server.learner import Learner
-from mec_server.ledger.budgets import Resource, budgets_of, memory_limit_bytes
+from mec_server.ledger.budgets import (
+    Resource,
+    budgets_of,
+    memory_limit_bytes,
+    usable_processors,
+)
 from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.peer_log import LogLimiter, PeerLog
 from mec_server.metrics import BackgroundTask, ServerMetrics
@@ -121,7 +126,8 @@ class EdgeServer:
             self.address.require_private("listen", config.transport.allow_insecure)
         self._config = config
         self._metrics = ServerMetrics(self.registry, per_vehicle=config.metrics.per_vehicle)
-        self._metrics.workers.set(config.workers)
+        self._worker_count = config.workers or usable_processors()
+        self._metrics.workers.set(self._worker_count)
         self._metrics_endpoint: MetricsEndpoint | None = None
         outcome_failed = self._failed(BackgroundTask.OUTCOME)
         self._log_limiter = LogLimiter()
@@ -130,7 +136,9 @@ class EdgeServer:
         promises = self._entry.promises
         self._opener = Workers(1, outcome_failed, "opener")
         self._background = Workers(1, outcome_failed, "background", nice=BACKGROUND_NICE)
-        self._workers = Workers(config.workers, outcome_failed, crowded=lambda: promises.is_crowded)
+        self._workers = Workers(
+            self._worker_count, outcome_failed, crowded=lambda: promises.is_crowded
+        )
         self._decoders = Decoders(
             DecoderSettings(config.decoder, self._is_reachable(), config.sandbox_as_root),
             self._metrics.count_lost_decoder,
@@ -237,10 +245,11 @@ class EdgeServer:
     def _entry_control(self) -> EntryControl:
         config = self._config
         budgets = budgets_of(
-            config.identity_budget, config.server_budget, config.workers, memory_limit_bytes()
+            config.identity_budget, config.server_budget, self._worker_count, memory_limit_bytes()
         )
         share = config.identity_budget.share
-        entry = EntryControl(budgets, config.admission, config.workers, share, time.monotonic())
+        workers = self._worker_count
+        entry = EntryControl(budgets, config.admission, workers, share, time.monotonic())
         self._metrics.observe_ledger(entry, self._log_limiter)
         return entry
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path, PurePosixPath
@@ -28,6 +29,7 @@ __all__ = [
     "decoders_of",
     "decoders_that_fit",
     "memory_limit_bytes",
+    "usable_processors",
 ]
 
 
@@ -201,25 +203,45 @@ def memory_limit_bytes(cgroups: Path = CGROUPS, own: Path = OWN_CGROUPS) -> int:
     or 2; in a container its own group may be what is mounted there. ``own``: which they are.
     """
     limit = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    for path in _limit_files(cgroups, own):
-        try:
-            limit = min(limit, int(path.read_text()))
-        except (OSError, ValueError):  # another version, or "max"
-            continue
+    for folder in _own_folders("memory", cgroups, own):
+        for name in ("memory.max", "memory.limit_in_bytes"):
+            with suppress(OSError, ValueError):  # another version, or "max"
+                limit = min(limit, int((folder / name).read_text()))
     return limit
 
 
-def _limit_files(cgroups: Path, own: Path) -> Iterator[Path]:
-    """Yield where limits on memory may be (cgroups(7), "/proc/PID/cgroup")."""
+def usable_processors(cgroups: Path = CGROUPS, own: Path = OWN_CGROUPS) -> int:
+    """Return how many processors this process may keep busy, at least 1: those that it may run on,
+    or what a control group grants it of them, a part of one counted as one.
+
+    Arguments as of ``memory_limit_bytes``.
+    """
+    processors = float(len(os.sched_getaffinity(0)))
+    for folder in _own_folders("cpu", cgroups, own):
+        with suppress(OSError, ValueError):
+            quota, period = (folder / "cpu.max").read_text().split()
+            processors = min(processors, int(quota) / int(period))
+        with suppress(OSError, ValueError):
+            quota_us, period_us = (
+                int((folder / f"cpu.cfs_{name}_us").read_text()) for name in ("quota", "period")
+            )
+            if quota_us > 0:  # -1: none
+                processors = min(processors, quota_us / period_us)
+    return max(1, math.ceil(processors))
+
+
+def _own_folders(controller: str, cgroups: Path, own: Path) -> Iterator[Path]:
+    """Yield where limits of a controller may be, of version 2 or 1: its own group's folders, and
+    those above (cgroups(7), "/proc/PID/cgroup")."""
     try:
         lines = own.read_text().splitlines()
     except OSError:
         lines = []
-    groups = {kinds: group for _, kinds, group in (line.split(":", 2) for line in lines)}
-    for kinds, root, name in (
-        ("", cgroups, "memory.max"),
-        ("memory", cgroups / "memory", "memory.limit_in_bytes"),
-    ):
-        group = PurePosixPath("/", groups.get(kinds, "/"))
+    groups = {"": "/", controller: "/"}
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        groups |= {name: path for name in controllers.split(",") if name in groups}
+    for name, path in groups.items():
+        group = PurePosixPath("/", path)
         for each in (group, *group.parents):
-            yield root / each.relative_to("/") / name
+            yield cgroups / name / each.relative_to("/")

@@ -4,8 +4,9 @@ The shipped field, 640x360 at 10 Hz, coded beforehand (``attack.bystander``): a 
 a machine of its own. The bystander's latencies during the attack are compared with calm ones and
 with a *control*: the same attacker, as long, aimed at a decoy that reads everything and answers
 nothing. The three take turns, so that what else the machine does meets all of them. Attacker and
-decoy are niced, also where the kernel shares the processor out by sessions (sched(7), "The
-autogroup feature"). Control groups (v1 or v2) need root, no docker.
+decoy have a processor while it is idle (SCHED_IDLE), also where the kernel shares it out by
+sessions (sched(7), "The autogroup feature"): theirs would be another machine. Control groups (v1 or
+v2) need root, no docker.
 """
 
 import asyncio
@@ -43,7 +44,7 @@ CPU_PERIOD_US = 100_000
 """Within which a group may use ``CPUS`` of this long; Docker's own."""
 ROUNDS = 2
 """How often calm, control and attack take turns."""
-NICE = 10
+AUTOGROUP_NICE = 10
 ALLOWANCE_MS = 10.0
 SCRAPE_S = 5.0
 REPORT_S = 30.0
@@ -251,17 +252,17 @@ class Scene:
                 env=ENVIRONMENT,
                 start_new_session=True,
             )
-        be_nice(attacker.pid)
+        leave_the_processor(attacker.pid)
         await appears(begun, attacker, log)
         return attacker
 
 
-def be_nice(pid: int) -> None:
+def leave_the_processor(pid: int) -> None:
     """Let a session's leader, and what it starts, have the processor when others leave it."""
-    os.setpriority(os.PRIO_PROCESS, pid, NICE)
+    os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
     autogroup = Path(f"/proc/{pid}/autogroup")
     if autogroup.exists():
-        autogroup.write_text(str(NICE))
+        autogroup.write_text(str(AUTOGROUP_NICE))
 
 
 def processor_s(pid: int) -> float:
@@ -438,7 +439,7 @@ async def scene(
             limited=True,
         )
         decoy, decoy_log = start("decoy", *ATTACKER, "--decoy", tmp_path / "decoy", certificates)
-        be_nice(decoy.pid)
+        leave_the_processor(decoy.pid)
         address = await appears(tmp_path / "ready", server, server_log)
         told = await appears(tmp_path / "decoy", decoy, decoy_log)
         root = str(certificates)

@@ -21,6 +21,7 @@ from mec_server.ledger.budgets import (
     budgets_of,
     decoders_that_fit,
     memory_limit_bytes,
+    usable_processors,
 )
 from mec_server.ledger.ledger import (
     BARRED_S,
@@ -335,6 +336,45 @@ def test_memory_is_limited_by_every_control_group_around_the_server(
     assert memory_limit_bytes(tmp_path, tmp_path / "own") == GIB // 4
     (tmp_path / folder / name).write_text("max\n")
     assert memory_limit_bytes(tmp_path, tmp_path / "own") == of_all
+
+
+@pytest.mark.parametrize(
+    ("own", "folder", "limits", "processors"),
+    [
+        ("0::/rsu.slice/mec.service", "rsu.slice", {"cpu.max": "100000 100000"}, 1),
+        ("0::/", "", {"cpu.max": "50000 100000"}, 1),
+        ("0::/", "", {"cpu.max": "140000 100000"}, 2),
+        ("0::/", "", {"cpu.max": "max 100000"}, 3),
+        ("0::/", "", {"cpu.max": "900000 100000"}, 3),
+        (
+            "4:cpu,cpuacct:/mec\n0::/",
+            "cpu/mec",
+            {"cpu.cfs_quota_us": "150000", "cpu.cfs_period_us": "100000"},
+            2,
+        ),
+        (
+            "4:cpu,cpuacct:/mec\n0::/",
+            "cpu",
+            {"cpu.cfs_quota_us": "-1", "cpu.cfs_period_us": "100000"},
+            3,
+        ),
+    ],
+)
+def test_processors_are_those_that_a_control_group_grants(
+    own: str,
+    folder: str,
+    limits: dict[str, str],
+    processors: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1, 5})
+    assert usable_processors(tmp_path, tmp_path / "none") == 3
+    (tmp_path / "own").write_text(own + "\n")
+    (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+    for name, value in limits.items():
+        (tmp_path / folder / name).write_text(value + "\n")
+    assert usable_processors(tmp_path, tmp_path / "own") == processors
 
 
 @pytest.mark.parametrize("change", [{"streams": 0}, {"messages_per_s": 0.0}, {"share": 0.0}])
