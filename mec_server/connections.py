@@ -48,16 +48,16 @@ V6_NETWORK_BITS = 64
 MOST_HEADER_BYTES = 16_384
 """Of a call, names and values; ours have a few hundred."""
 
-UNEXPLAINED_BYTES = 2 << 20
-"""What a connection may have sent that became no message: more than HTTP/2's windows hold of a
-message that is not whole yet, or waits to be read."""
+UNEXPLAINED_BYTES = 4 << 20
+"""What a connection may have sent that became no message: more than waits to be read of a rig of 18
+cameras, two large frames each, while the server is too busy to read."""
 UNEXPLAINED_BYTES_PER_S = 64 << 10
 """By so much that becomes less: acknowledgements, pings, headers, consumers' requests."""
 OVERHEAD = 1.1
 """Bytes of TLS and HTTP/2 for each of a message, at most; of short ones ``MESSAGE_OVERHEAD``."""
 MESSAGE_OVERHEAD = 256
-REFUSED_CALL_BYTES = 64 << 10
-"""What a call counts as that a budget refused: 32 of them, and one more each second, pass."""
+REFUSED_CALL_BYTES = 128 << 10
+"""What a call counts as that a budget refused: 32 of them, and one more in two seconds, pass."""
 
 BARRED_S = 10.0
 MOST_BARRED = 60
