@@ -24,8 +24,11 @@ $(OUT)/%/transforms_drive.json:
 
 # --- fields and layers that were learnt from a drive: base, drive, all or colours
 
+# A layer is looked for beside its base.
+$(OUT)/street.rff: $(SAMPLE)
+	cp $< $@
 define learnt
-$(OUT)/$1.rff: $3 $(filter $(OUT)/%,$2)
+$(OUT)/$1.rff: $3 $(filter $(OUT)/%,$2) | $(OUT)/street.rff
 	$(RFEDGE) field update $2 --from $3 --min-identities 1 --as $4 --out $$@
 endef
 $(eval $(call learnt,dusk,$(SAMPLE),$(call drive,passes-5),all))
