@@ -67,28 +67,31 @@ $(OUT)/city.rff:      ; $(call train,$(CITY))
 train = $(RFEDGE) train $1/transforms_train.json --points $1/points.ply --antialiased --limit 200000 \
 	--iterations 3000 --threads 1 --out $@
 
-# Some pictures of a drive, in a file beside the result: DRIVE START STOP STEP.
-part = python3 -c "import json, os; path, out = '$1', '$@'; drive = json.load(open(path)); \
-	drive.pop('ply_file_path', None); drive['frames'] = drive['frames'][$2:$3:$4]; \
-	[frame.update(file_path=os.path.relpath(os.path.join(os.path.dirname(path), frame['file_path']), os.path.dirname(out))) \
-	for frame in drive['frames']]; os.makedirs(os.path.dirname(out), exist_ok=True); json.dump(drive, open(out, 'w'))"
-$(OUT)/dusk_even.json:  $(YARD)/transforms_drive_dusk.json  ; $(call part,$<,0,24,2)
-$(OUT)/dusk_odd.json:   $(YARD)/transforms_drive_dusk.json  ; $(call part,$<,1,24,2)
-$(OUT)/noon_odd.json:   $(YARD)/transforms_drive_empty.json ; $(call part,$<,1,24,2)
-$(OUT)/city_first.json: $(CITY)/transforms_drive.json       ; $(call part,$<,0,30,1)
-$(OUT)/city_second.json: $(CITY)/transforms_drive.json      ; $(call part,$<,30,60,1)
-$(eval $(call learnt,yardstick-dusk,$(OUT)/yardstick.rff,$(OUT)/dusk_even.json,all))
-$(eval $(call learnt,yardstick-dusk-layer,$(OUT)/yardstick.rff,$(OUT)/dusk_even.json,colours))
+# Some pictures of a drive, copied beside the others: DRIVE, then START:STOP:STEP.
+part = python3 -c "import json, os, shutil; path, out = '$1', '$(@D)'; drive = json.load(open(path)); \
+	drive.pop('ply_file_path', None); drive['frames'] = drive['frames'][$2]; names = [f['file_path'] for f in drive['frames']]; \
+	[os.makedirs(os.path.dirname(os.path.join(out, name)), exist_ok=True) for name in names]; \
+	[shutil.copy(os.path.join(os.path.dirname(path), name), os.path.join(out, name)) for name in names]; \
+	json.dump(drive, open('$@', 'w'))"
+$(call drive,dusk-even):   $(YARD)/transforms_drive_dusk.json  ; $(call part,$<,0:24:2)
+$(call drive,dusk-odd):    $(YARD)/transforms_drive_dusk.json  ; $(call part,$<,1:24:2)
+$(call drive,noon-odd):    $(YARD)/transforms_drive_empty.json ; $(call part,$<,1:24:2)
+$(call drive,city-first):  $(CITY)/transforms_drive.json       ; $(call part,$<,0:30)
+$(call drive,city-second): $(CITY)/transforms_drive.json       ; $(call part,$<,30:60)
+$(eval $(call learnt,yardstick-dusk,$(OUT)/yardstick.rff,$(call drive,dusk-even),all))
+$(eval $(call learnt,yardstick-dusk-layer,$(OUT)/yardstick.rff,$(call drive,dusk-even),colours))
 # Learning that saves nothing writes nothing and says why; then there is no such variant.
-$(OUT)/city-first.txt: $(OUT)/city_first.json $(OUT)/city.rff
-	$(RFEDGE) field update $(OUT)/city.rff --from $< --min-identities 1 --out $(OUT)/city-first.rff >$@ 2>&1 || cat $@
+$(OUT)/city-first.txt: $(call drive,city-first) $(OUT)/city.rff
+	$(RFEDGE) field update $(OUT)/city.rff --from $< --min-identities 1 --out $(OUT)/city-first.rff >$@.part 2>&1 || \
+		grep -q 'nothing is written' $@.part
+	mv $@.part $@
 
 YARDSTICK := \
 	dusk@10=$(YARD)/transforms_drive_dusk.json,field=$(OUT)/yardstick.rff,noon=$(YARD)/transforms_drive_empty.json \
-	odd-dusk@5=$(OUT)/dusk_odd.json,field=$(OUT)/yardstick.rff,noon=$(OUT)/noon_odd.json,learnt=$(OUT)/yardstick-dusk.rff,layer=$(OUT)/yardstick-dusk-layer.rff \
+	odd-dusk@5=$(call drive,dusk-odd),field=$(OUT)/yardstick.rff,noon=$(call drive,noon-odd),learnt=$(OUT)/yardstick-dusk.rff,layer=$(OUT)/yardstick-dusk-layer.rff \
 	noon-yardstick-vehicles@10=$(YARD)/transforms_drive_vehicles.json,field=$(OUT)/yardstick.rff \
 	noon-yardstick-vehicles@30=$(YARD)/transforms_drive30_vehicles.json,field=$(OUT)/yardstick.rff
-REAL = city-second-half@5=$(OUT)/city_second.json,field=$(OUT)/city.rff$(if $(wildcard $(OUT)/city-first.rff),$(COMMA)learnt=$(OUT)/city-first.rff)
+REAL = city-second-half@5=$(call drive,city-second),field=$(OUT)/city.rff$(if $(wildcard $(OUT)/city-first.rff),$(COMMA)learnt=$(OUT)/city-first.rff)
 COMMA := ,
 $(OUT)/REAL.json: $(OUT)/city-first.txt
 GROUPS += YARDSTICK REAL
