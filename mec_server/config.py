@@ -318,14 +318,10 @@ class ServerConfig:
     def __post_init__(self) -> None:
         if self.workers is not None and not 1 <= self.workers <= 256:
             raise InvalidInput("workers", f"{self.workers} is outside 1..256")
-        if not 0 <= self.address_connections <= 65_536:
-            raise InvalidInput(
-                "address-connections", f"{self.address_connections} is outside 0..65536"
-            )
-        if not 0 <= self.identity_connections <= 65_536:
-            raise InvalidInput(
-                "identity-connections", f"{self.identity_connections} is outside 0..65536"
-            )
+        for name in ("address", "identity"):
+            most = getattr(self, f"{name}_connections")
+            if not 0 <= most <= 65_536:
+                raise InvalidInput(f"{name}-connections", f"{most} is outside 0..65536")
         if not (self.max_connection_age_s == 0 or 1 <= self.max_connection_age_s <= 1e6):
             raise InvalidInput(
                 "max_connection_age_s", f"{self.max_connection_age_s:g} is neither 0 nor 1..1e6"

@@ -249,10 +249,8 @@ class Connections:
             explained, notes.explained_bytes = notes.explained_bytes, 0.0
         allowed = UNEXPLAINED_BYTES_PER_S * passed_s
         left = account.unexplained_bytes + came - explained - allowed
-        account.received_bytes, account.unexplained_bytes = (
-            connection.received_bytes,
-            max(0.0, left),
-        )
+        account.received_bytes = connection.received_bytes
+        account.unexplained_bytes = max(0.0, left)
 
     def _too_dear(self) -> dict[str, Limit]:
         return {

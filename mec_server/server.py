@@ -248,8 +248,8 @@ class EdgeServer:
             config.identity_budget, config.server_budget, self._worker_count, memory_limit_bytes()
         )
         share = config.identity_budget.share
-        workers = self._worker_count
-        entry = EntryControl(budgets, config.admission, workers, share, time.monotonic())
+        now = time.monotonic()
+        entry = EntryControl(budgets, config.admission, self._worker_count, share, now)
         self._metrics.observe_ledger(entry, self._log_limiter)
         return entry
 

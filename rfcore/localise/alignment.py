@@ -88,6 +88,12 @@ class _Level:
     points: F32
     jacobian: F32
 
+    def moved(self, motion: Pose) -> F32:
+        """Return where ``motion`` puts the points [3, N]."""
+        turn = np.array(motion.rotation_matrix(), np.float32)
+        moved: F32 = turn @ self.points + np.array(motion.translation_m, np.float32)[:, None]
+        return moved
+
 
 @dataclass(frozen=True)
 class _Scale:
@@ -181,8 +187,7 @@ class Template:
         level = self.level(number)
         if not level.points.size:
             return 0.0
-        turn = np.array(motion.rotation_matrix(), np.float32)
-        moved = turn @ level.points + np.array(motion.translation_m, np.float32)[:, None]
+        moved = level.moved(motion)
         k, z = level.intrinsics, np.maximum(moved[2], TINY)
         across = (moved[0] / z - level.points[0] / level.points[2]) * np.float32(k.fx_px)
         down = (moved[1] / z - level.points[1] / level.points[2]) * np.float32(k.fy_px)
@@ -306,8 +311,7 @@ def _sampled(picture: F32, level: _Level, motion: Pose) -> tuple[F32, NDArray[np
     What lies outside reads the top-left pixel.
     """
     k, (height, width) = level.intrinsics, picture.shape
-    turn = np.array(motion.rotation_matrix(), np.float32)
-    moved = turn @ level.points + np.array(motion.translation_m, np.float32)[:, None]
+    moved = level.moved(motion)
     in_front = moved[2] > TINY
     z = np.where(in_front, moved[2], np.float32(1))
     u = np.float32(k.fx_px) * moved[0] / z + np.float32(k.cx_px - 0.5)

@@ -37,12 +37,11 @@ Generated from `results/attacks.json` by `make test-attack`; do not edit.
 A real server with certificates, under the limits of `docker-compose.yml` (by a control group; an
 attack's table says which), and a bystander at street size: the shipped field, 640x360, 10 Hz, its
 packets coded beforehand, as a vehicle codes on a machine of its own; latencies from the time a
-picture is due to its Ack. One attack after the other, each from a process that has a
-processor while it is idle. *Control* is the
-same attacker aimed at a decoy that reads everything and answers nothing: what the bystander suffers
-then is the machine's doing. Calm, control and attack take turns; of what a slow machine drops in
-calm, as much may be dropped under attack, and of what it does not drop, nothing. See
-[SECURITY.md](../SECURITY.md).
+picture is due to its Ack. One attack after the other, each from a process that has a processor
+while it is idle. *Control* is the same attacker aimed at a decoy that reads everything and answers
+nothing: what the bystander suffers then is the machine's doing. Calm, control and attack take
+turns; of what a slow machine drops in calm, as much may be dropped under attack, and of what it
+does not drop, nothing. See [SECURITY.md](../SECURITY.md).
 """
 
 

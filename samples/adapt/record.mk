@@ -8,6 +8,7 @@ RESULT ?= results/adapt.json
 RFEDGE ?= .venv/bin/rfedge
 DATA   ?=
 SAMPLE := samples/fields/street.rff
+COMMA  := ,
 NOON   := samples/street/transforms_drive_empty.json
 
 .DELETE_ON_ERROR:
@@ -92,15 +93,13 @@ YARDSTICK := \
 	noon-yardstick-vehicles@10=$(YARD)/transforms_drive_vehicles.json,field=$(OUT)/yardstick.rff \
 	noon-yardstick-vehicles@30=$(YARD)/transforms_drive30_vehicles.json,field=$(OUT)/yardstick.rff
 REAL = city-second-half@5=$(call drive,city-second),field=$(OUT)/city.rff$(if $(wildcard $(OUT)/city-first.rff),$(COMMA)learnt=$(OUT)/city-first.rff)
-COMMA := ,
 $(OUT)/REAL.json: $(OUT)/city-first.txt
 GROUPS += YARDSTICK REAL
 endif
 
 # Groups of cases are coded side by side; the file is then made of their cells.
-SPLIT := = ,
 EVERY = $(foreach group,$(GROUPS),$($(group)))
-made  = $(filter $(OUT)/%,$(subst $(lastword $(SPLIT)), ,$(subst $(firstword $(SPLIT)), ,$($1))))
+made  = $(filter $(OUT)/%,$(subst $(COMMA), ,$(subst =, ,$($1))))
 define coded
 $(OUT)/$1.json: $(call made,$1)
 	$(RFEDGE) eval adapt $$($1) --cells $(OUT)/cells --out $$@
