@@ -28,7 +28,7 @@ from rfcore.errors import RfedgeError
 from rfcore.update.run import LearnAs
 from rfcore.wire.settings import LogForm, configure_logs
 
-__all__ = ["Learner", "main"]
+__all__ = ["ONE_THREAD", "Learner", "main"]
 
 log = structlog.get_logger()
 

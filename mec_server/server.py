@@ -52,6 +52,7 @@ from mec_server.twin.rendering import Classify, TwinViews
 from mec_server.twin.service import Sight, TwinService
 from mec_server.twin.state import Twin
 from rfcore.errors import RfedgeError
+from rfcore.field import RadianceField
 from rfcore.files import write_whole
 from rfcore.wire.address import Address
 from rfcore.wire.checks import MAX_FIELDS
@@ -82,7 +83,7 @@ SWEEP_EVERY_S = 1.0
 """How often the access file is checked for a change, and open calls for certificates that are no
 longer good."""
 
-NOTICES_EVERY_S = 0.25
+NOTICES_EVERY_S = 0.05
 """How soon it is noticed that a vehicle takes notices."""
 
 CONNECTIONS_EVERY_S = 0.25
@@ -238,6 +239,7 @@ class EdgeServer:
             log_limiter=self._log_limiter,
             connections=self._connections,
             twin=twin,
+            expect_picture=lambda field_id, camera: self._notices.expect(field_id, camera),
             open_cameras=open_decoders,
             recorder=self._recorder,
         )
@@ -254,9 +256,15 @@ class EdgeServer:
         return entry
 
     def _twin_views(self, twin: Twin, classify: Classify | None) -> TwinViews:
-        """Return what composes views: each render by one thread, of fields nobody else renders."""
+        """Return what composes views: each render by one thread, with renderers that nobody else
+        uses; of fields that are open for decoding the numbers are shared."""
         render = replace(self._config.render, threads=1)
-        load = field_loader(self._index, render, opened=lambda _: None)
+        load_anew = field_loader(self._index, render, opened=lambda _: None)
+
+        def load(field_id: str) -> RadianceField:
+            opened = self._shelf.opened(field_id)
+            return load_anew(field_id) if opened is None else opened.with_threads(1)
+
         return TwinViews(
             twin,
             lambda: FieldShelf(self._index, load, MAX_VIEWED_FIELDS).open,

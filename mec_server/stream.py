@@ -135,10 +135,11 @@ class Stream:
         hello = self._session.hello
         return () if hello is None else tuple(camera.camera_id for camera in hello.cameras)
 
-    def uses(self, field_ids: frozenset[str]) -> bool:
-        """Whether the vehicle codes against one of these fields."""
+    @property
+    def field_ids(self) -> frozenset[str]:
+        """The fields that its vehicle codes against."""
         hello = self._session.hello
-        return hello is not None and not field_ids.isdisjoint(hello.field_ids)
+        return frozenset() if hello is None else frozenset(hello.field_ids)
 
     def tell(self, notice: StreetNotice) -> None:
         """Pass on what concerns the vehicle on its way."""
@@ -209,6 +210,7 @@ class Stream:
             if isinstance(job, DecodeJob):
                 expected_s, doubtful = self._account.expected_s(), self._account.is_doubtful(now)
                 self._decoders.submit(job, expected_s, self._finished, in_background=doubtful)
+                self._expect(job)
             else:
                 self._opening = self._tasks.create_task(self._open(job))
         for frame, error in self._session.take_damaged():
@@ -337,6 +339,11 @@ class Stream:
             self._log.info("vehicle welcomed", fields=job.hello.field_ids, exact=job.exact)
             self._session.opened(job, time.monotonic())
         self._wake.set()
+
+    def _expect(self, job: DecodeJob) -> None:
+        camera = job.frame.camera(self._intrinsics[job.frame.camera_id])
+        if camera is not None:
+            self._server.expect_picture(job.field_id, camera)
 
     # --- outcomes of frames, on the event loop
 

@@ -19,6 +19,7 @@ from mec_server.reconstruction import Decoder, FieldSource, OpenCameras, Reconst
 from mec_server.recorder import Recorder, SessionRecording
 from mec_server.session import DecodeJob, OpenJob, RenderTooLate
 from mec_server.twin.state import Twin
+from rfcore.camera import Camera
 from rfcore.codec.h264.splice import PictureDecoder
 from rfcore.errors import PacketRejected, RfedgeError
 
@@ -46,6 +47,8 @@ class ServerContext:
     log_limiter: LogLimiter
     connections: Connections
     twin: Twin
+    expect_picture: Callable[[str, Camera], None]
+    """Called when the decoding of a picture with a pose begins: with its field's id and camera."""
     open_cameras: OpenCameras
     recorder: Recorder | None = None
 

@@ -56,6 +56,11 @@ class FieldShelf:
             self._open.move_to_end(field_id)
             return self._open[field_id]
 
+    def opened(self, field_id: str) -> RadianceField | None:
+        """Return a field if it is open, ``None`` otherwise; waits for one that is being opened."""
+        with self._lock:
+            return self._open.get(field_id)
+
     def warm_up(self) -> int:
         """Open fields in advance, so that the first vehicle waits for none; return how many.
 

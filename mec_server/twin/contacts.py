@@ -219,7 +219,9 @@ def _above_shadow(picture: LivePicture, marked: Mask, rows: Index, columns: Inde
     height = len(marked)
     level = (picture.colour * np.float32(255)).clip(1, 255)
     left = (level + picture.difference) / level
-    least, most = left.min(axis=2), left.max(axis=2)
+    red, green, blue = (left[..., channel] for channel in range(3))
+    least = np.minimum(np.minimum(red, green), blue)  # min(axis=2) takes 20 times as long
+    most = np.maximum(np.maximum(red, green), blue)
     shadow = (least >= SHADOW[0]) & (most <= SHADOW[1]) & (most - least <= SHADOW_TINT)
     row = np.arange(height)[:, None]
     solid = np.maximum.accumulate(np.where(marked & ~shadow, row, -1), axis=0)

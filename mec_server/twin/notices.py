@@ -35,7 +35,7 @@ from mec_server.twin.metrics import TwinMetrics
 from mec_server.twin.objects import FollowedObject, ObjectTracker
 from mec_server.twin.rendering import Place, TwinViews, place_of
 from mec_server.twin.state import Twin, TwinView
-from rfcore.camera import Pose
+from rfcore.camera import Camera, Pose
 from rfcore.errors import LimitExceeded
 from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
 from rfcore.wire.tiles import Tile
@@ -91,8 +91,9 @@ class NoticeTaker(Protocol):
     def camera_ids(self) -> tuple[str, ...]:
         """The cameras of its Hello, in their order."""
 
-    def uses(self, field_ids: frozenset[str]) -> bool:
-        """Whether the vehicle codes against one of these fields."""
+    @property
+    def field_ids(self) -> frozenset[str]:
+        """The fields that its vehicle codes against."""
 
     def tell(self, notice: StreetNotice) -> None:
         """Pass a notice on."""
@@ -300,6 +301,7 @@ class StreetNotices:
         self._metrics = metrics
         self._streams: dict[str, StreamNotices] = {}
         self._trackers: dict[frozenset[str], ObjectTracker] = {}
+        self._is_looking = False
 
     async def follow(self) -> None:
         """Look at pictures until nobody takes notices."""
@@ -308,6 +310,10 @@ class StreetNotices:
         arrived = asyncio.Event()
         every = Subscription(encoding=PictureEncoding.NONE)
         mailbox = self._twin.watch(every, arrived.set, counts_misses=False)
+        self._is_looking = True
+        for taker in self._takers():
+            for field_id in taker.field_ids:
+                self._views.prepare_glances(self._place_of(field_id), NOTICES_IDENTITY)
         try:
             while self._takers():
                 entry = mailbox.take()
@@ -319,21 +325,30 @@ class StreetNotices:
                         async with asyncio.timeout(LOOK_AGAIN_S):
                             await arrived.wait()
         finally:
+            self._is_looking = False
             self._twin.unwatch(mailbox)
             self._streams.clear()
             self._trackers.clear()
+
+    def expect(self, field_id: str, camera: Camera) -> None:
+        """Prepare for a picture of ``camera``, coded against a field, that is being decoded."""
+        if self._is_looking:
+            self._views.expect_glance(camera, self._place_of(field_id), NOTICES_IDENTITY)
+
+    def _place_of(self, field_id: str) -> Place:
+        return place_of(ObjectsRequest(field_id=field_id), self._tiles())
 
     def fields_changed(self, before: Sequence[Tile], after: Sequence[Tile]) -> None:
         """Tell the vehicles of a tile that it has a new field."""
         for tile, change in field_changes(before, after):
             for taker in self._takers():
-                if taker.uses(tile.archive_ids):
+                if taker.field_ids & tile.archive_ids:
                     self._tell(taker, self._stream(taker).about_field(change))
 
     async def _look_at(self, seen: TwinView) -> None:
         """Find what a picture shows, and tell those whom it concerns."""
-        place = place_of(ObjectsRequest(field_id=seen.field_id), self._tiles())
-        takers = [taker for taker in self._takers() if taker.uses(place.field_ids)]
+        place = self._place_of(seen.field_id)
+        takers = [taker for taker in self._takers() if taker.field_ids & place.field_ids]
         if not takers:
             self._trackers.pop(place.field_ids, None)
             return

@@ -17,7 +17,7 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from threading import Lock
 from typing import TypeVar
@@ -40,7 +40,7 @@ from mec_server.twin.ground import FieldGround
 from mec_server.twin.objects import Lacks, lacks_nothing
 from mec_server.twin.state import CameraKey, Covers, Twin, TwinView
 from rfcore.camera import Camera, TileOrigin
-from rfcore.errors import AccessDenied, InvalidInput
+from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded
 from rfcore.field import RadianceField
 from rfcore.field.quality import FULL
 from rfcore.image import Rgb, jpeg_bytes, png_bytes
@@ -72,6 +72,8 @@ late: at 10 it found nothing for seconds where others kept the processors busy."
 MOST_KEPT = 16
 """Live pictures whose difference from the field is kept for the next view."""
 
+MOST_AHEAD = 2
+"""Drawings that wait for pictures which are not there yet."""
 MOST_GROUNDS = 2
 """Fields whose ground is kept, and which are open for it."""
 
@@ -218,6 +220,7 @@ class TwinViews:
         self._composing = _FieldThread(views, open_fields())
         self._looking = _FieldThread(looks, open_fields())
         self._kept = _KeptLooks()
+        self._ahead = 0
 
     def close(self) -> None:
         """Stop the threads."""
@@ -267,6 +270,33 @@ class TwinViews:
             return Glance([])
         compute = partial(self._detected, seen, place)
         return await self._on_thread(self._looking, identity, compute)
+
+    def prepare_glances(self, place: Place, identity: str) -> None:
+        """Open the field of ``place`` and draw it once, so that the first glance is not late."""
+        self._look_ahead(partial(self._warmed_up, place), identity)
+
+    def expect_glance(self, camera: Camera, place: Place, identity: str) -> None:
+        """Draw what a glance at a picture of ``camera`` will need of the field's ground, while the
+        picture is being decoded: a place that was not looked at takes as long as that."""
+        self._look_ahead(partial(self._ground_ahead, camera, place), identity)
+
+    def _look_ahead(self, draw: Callable[[], object], identity: str) -> None:
+        """Draw, unless ``MOST_AHEAD`` wait or ``identity`` has spent its worker time."""
+        if self._ahead >= MOST_AHEAD:
+            return
+        try:
+            self._ledger.check(identity, Resource.WORKER_SECONDS, time.monotonic())
+        except LimitExceeded:
+            return
+        self._ahead += 1
+        work = partial(_seconds_of, draw)
+        self._looking.worker.submit(identity, work, partial(self._looked_ahead, identity))
+
+    def _looked_ahead(self, identity: str, outcome: float | Exception) -> None:
+        self._ahead -= 1
+        if isinstance(outcome, Exception):
+            raise outcome
+        self._ledger.charge(identity, Resource.WORKER_SECONDS, outcome, time.monotonic())
 
     def place(
         self, request: ViewRequest | ObjectsRequest, may_draw: Callable[[str], bool]
@@ -356,6 +386,15 @@ class TwinViews:
         labels = () if self._classify is None else _labels(self._classify, looked)
         return Glance(looked.detections, looked.live.lacks, _origin_m(place, field), labels)
 
+    def _warmed_up(self, place: Place) -> None:
+        field = self._looking.open_field(place.field_id)
+        x_m, y_m, z_m = (sum(ends) / 2 for ends in zip(*astuple(field.bounds), strict=True))
+        self._looking.ground(field).warm_up((x_m, y_m, z_m))
+
+    def _ground_ahead(self, camera: Camera, place: Place) -> None:
+        field = self._looking.open_field(place.field_id)
+        self._looking.ground(field).ahead_of(camera)
+
     def _looked_at(self, seen: TwinView, field: RadianceField, thread: _FieldThread) -> _LookedAt:
         """Return what a picture changes in ``field``, which is one of ``thread``."""
         kept = self._kept.of(seen, field.field_id)
@@ -377,6 +416,12 @@ class TwinViews:
         render = self._twin.renders.of(seen)
         same = seen.field_id == field.field_id and camera.intrinsics == seen.intrinsics
         return field.render(camera, FULL) if render is None or not same else render
+
+
+def _seconds_of(work: Callable[[], object]) -> float:
+    started = time.monotonic()
+    work()
+    return time.monotonic() - started
 
 
 def _labels(classify: Classify, looked: _LookedAt) -> tuple[str, ...]:

@@ -147,6 +147,10 @@ class RadianceField(Protocol):
     def archive(self) -> Archive:
         """Return what the field's file holds."""
 
+    def with_threads(self, threads: int) -> RadianceField:
+        """Return the same field with a renderer of its own, of so many threads, which waits for no
+        other; the numbers are shared."""
+
 
 def render_field_view(renderer: Renderer, camera: Camera, quality: Quality = FULL) -> FieldView:
     """Render what ``camera`` sees, as both ends of the codec hold it.

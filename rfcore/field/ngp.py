@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from copy import copy
 from functools import cached_property
 from threading import Lock
 from typing import Any
@@ -193,6 +194,13 @@ class NgpField:
     def archive(self) -> Archive:
         """Return what the field's file holds."""
         return ngp_archive(self.numbers, self.metadata)
+
+    def with_threads(self, threads: int) -> NgpField:
+        """Return the same field with a renderer of its own, of so many threads."""
+        own = copy(self)
+        own.isa, own._threads = check_backend(threads, self.isa), threads
+        own._renderer, own._lock = None, Lock()
+        return own
 
     def prepare(self, quality: Quality = FULL) -> None:  # noqa: ARG002 - one renderer for all
         """Make the renderer; without this the first picture makes it."""

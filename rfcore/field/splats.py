@@ -7,6 +7,7 @@ What its archive holds is in ``rfcore.field.splat_archive``, which splats a qual
 from __future__ import annotations
 
 import hashlib
+from copy import copy
 from functools import cached_property
 from threading import Lock
 
@@ -115,6 +116,16 @@ class SplatField:
     ) -> SplatField:
         """Return the field ``archive`` that has ``gaussians`` and this one's levels of detail."""
         return self._like(gaussians, metadata, self.levels, archive)
+
+    def with_threads(self, threads: int) -> SplatField:
+        """Return the same field with renderers of its own, of so many threads."""
+        own = copy(self)
+        own.isa, own._threads = check_renderer(threads, self.isa), threads
+        with self._lock:
+            made = self._rasterizers.items()
+            own._rasterizers = {detail: each.with_threads(threads) for detail, each in made}
+        own._lock = Lock()
+        return own
 
     def prepare(self, quality: Quality = FULL) -> None:
         """Make the renderer of ``quality``; without this the first picture makes it."""

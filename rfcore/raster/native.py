@@ -12,6 +12,7 @@ shorter than 1e-12 counts as no rotation.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from threading import Lock
 from typing import TYPE_CHECKING
@@ -142,6 +143,22 @@ class Rasterizer:
             self._move_to_device()
         else:
             self._cpu = self._native_rasterizer(gaussians, self.isa)
+
+    def with_threads(self, threads: int) -> Rasterizer:
+        """Return what draws the same Gaussians with so many threads, and waits for no other.
+
+        On the CPU they are shared, on an OpenCL device copied. Raises ``InvalidInput`` for another
+        number than 1..256.
+        """
+        isa = check_renderer(threads, self.isa)
+        if self._gaussians is not None:
+            return Rasterizer(
+                self._gaussians, threads=threads, isa=isa, antialiased=self.antialiased
+            )
+        own = copy(self)
+        own.threads, own._lock = threads, Lock()
+        own._cpu = self._on_cpu().with_threads(threads)
+        return own
 
     def render(self, camera: Camera, *, sh_degree: int | None = None) -> View:
         """Render colour, depth and opacity with the bands up to ``sh_degree`` (default: all)."""

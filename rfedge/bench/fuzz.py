@@ -151,7 +151,7 @@ def fuzz(stream: FuzzStream, packets: int, seed: int = 0) -> Counter[str]:
 
 
 def _try(decoder: DeltaDecoder, frame: SentFrame, packet: DeltaPacket) -> str:
-    started_s = time.process_time()
+    started_s = time.thread_time()  # decoding has no threads; other ones are none of its
     try:
         shown = decoder.decode(frame.before, packet, frame.view).frame
     except PacketRejected as rejection:
@@ -160,7 +160,7 @@ def _try(decoder: DeltaDecoder, frame: SentFrame, packet: DeltaPacket) -> str:
         outcome = "shown"
         if shown.digest() != frame.packet.reconstruction_digest:
             raise CodecError(f"a damaged packet was shown as another picture: {packet}")
-    spent_ms = (time.process_time() - started_s) * 1e3
+    spent_ms = (time.thread_time() - started_s) * 1e3
     if spent_ms > MAX_CPU_MS:
         raise CodecError(f"a damaged packet took {spent_ms:.0f} ms: {packet}")
     return outcome

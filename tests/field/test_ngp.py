@@ -46,6 +46,16 @@ def test_a_saved_field_is_read_back_whole(field: NgpField, camera: Camera, tmp_p
     assert read.render_colour(camera).tobytes() == field.render_colour(camera).tobytes()
 
 
+def test_a_field_with_other_threads_shares_the_numbers(field: NgpField, camera: Camera) -> None:
+    field.prepare()
+    own = field.with_threads(2)
+    assert own.numbers is field.numbers
+    assert (own.field_id, own.metadata) == (field.field_id, field.metadata)
+    assert own.renderer() is not field.renderer()
+    assert own.renderer().threads == 2
+    assert own.render_colour(camera).tobytes() == field.render_colour(camera).tobytes()
+
+
 def test_the_field_is_what_its_file_can_hold(field: NgpField) -> None:
     table = field.numbers.table
     assert np.array_equal(table, table.astype(np.float16).astype(np.float32))

@@ -10,6 +10,7 @@ from rfcore.errors import BackendUnavailable, FieldFormatError, InvalidInput
 from rfcore.field import FieldMetadata, SplatField, load_field, save_field
 from rfcore.field.archive import Archive, encode_archive
 from rfcore.field.interface import Bounds
+from rfcore.field.quality import FULL, Quality
 from rfcore.field.store import encode_field
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
@@ -30,6 +31,21 @@ def test_a_field_survives_its_file(make_gaussians, tmp_path: Path, n: int, sh_de
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_array_equal(getattr(back.gaussians, name), getattr(field.gaussians, name))
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_field_with_other_threads_shares_the_numbers(make_gaussians) -> None:
+    camera = Camera(Intrinsics(19, 11, 12.0, 12.0, 9.5, 5.5), Pose((0, 0, -5), (1.0, 0, 0, 0)))
+    field = SplatField(make_gaussians(), METADATA)
+    field.prepare()
+    own = field.with_threads(2)
+    assert own.gaussians is field.gaussians
+    assert (own.field_id, own.metadata) == (field.field_id, field.metadata)
+    assert (own.threads, own.rasterizer().threads, field.rasterizer().threads) == (2, 2, 1)
+    half = Quality(detail=0.5)
+    for quality in (FULL, half):
+        assert own.render(camera, quality).depth.tobytes() == (
+            field.render(camera, quality).depth.tobytes()
+        )
 
 
 def test_an_unmeasured_field_says_so(make_gaussians, tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ import grpc
 import numpy as np
 import pytest
 
-from mec_server.config import ServerBudget, SessionLimits
+from mec_server.config import RenderSettings, ServerBudget, SessionLimits
+from mec_server.fields import index
 from mec_server.ledger.budgets import Limit, Resource
 from mec_server.twin import contacts, rendering
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
@@ -140,6 +141,28 @@ async def test_a_picture_is_compared_with_the_decoders_own_render(
     expected = street.field.render(camera)
     for name in ("colour", "depth", "opacity"):
         assert np.array_equal(getattr(view, name), getattr(expected, name)), name
+
+
+async def test_views_share_the_field_that_pictures_are_decoded_against(
+    street: Any, coded: Any, serve: Any, raw_vehicle: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[Path] = []
+    load_checked = index.load_checked
+
+    def noted(path: Path, *rest: Any, **changes: Any) -> Any:
+        read.append(path)
+        return load_checked(path, *rest, **changes)
+
+    monkeypatch.setattr(index, "load_checked", noted)
+    async with (
+        serve(render=RenderSettings(threads=3)) as server,
+        stub_of(server) as stub,
+        raw_vehicle(server.address) as vehicle,
+    ):
+        await vehicle.greet(coded.hello)
+        rendered = await stub.Render(view_request_to_wire(asked(street)))
+    assert len(read) == 1
+    assert rendered.field_id == street.field_id
 
 
 def turned_away(**changes: Any) -> Camera:

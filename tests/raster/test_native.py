@@ -65,6 +65,19 @@ def test_pictures_drawn_at_the_same_time_are_those_drawn_one_by_one(
     assert together == one_by_one * 10
 
 
+def test_another_thread_count_of_the_same_gaussians_outlives_the_first(
+    scene: SceneMaker, camera: CameraMaker, threads: int, antialiased: bool
+) -> None:
+    first = Rasterizer(scene(700), threads=3, antialiased=antialiased)
+    definition = view_bytes(first.render(camera()))
+    own = first.with_threads(threads)
+    del first
+    assert (own.threads, own.antialiased) == (threads, antialiased)
+    assert view_bytes(own.render(camera())) == definition
+    with pytest.raises(InvalidInput, match="threads"):
+        own.with_threads(0)
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("size_px", [(67, 45), (16, 16), (1, 1), (3, 50)])
 def test_colour_depth_and_opacity_follow_the_float64_definition(

@@ -148,6 +148,17 @@ def test_an_opened_device_is_named_with_its_driver(scene: SceneMaker) -> None:
 
 
 @slow
+def test_another_thread_count_of_a_device_is_drawn_by_it_too(
+    scene: SceneMaker, camera: CameraMaker
+) -> None:
+    first = Rasterizer(scene(3), isa=POCL)
+    own = first.with_threads(2)
+    assert own.isa == POCL
+    assert own._device is not first._device
+    assert view_bytes(own.render(camera())) == view_bytes(first.render(camera()))
+
+
+@slow
 def test_a_device_that_is_not_there_is_refused_by_name(scene: SceneMaker) -> None:
     with pytest.raises(BackendUnavailable, match=r"'voodoo'.*there is 0: Portable"):
         Rasterizer(scene(3), isa="opencl:voodoo")

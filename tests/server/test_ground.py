@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mec_server.twin.ground import FieldGround, GroundPlane, points_of, rays_of
+from mec_server.twin.ground import STEPS, FieldGround, GroundPlane, points_of, rays_of
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.views import View
 from server.test_objects import CAMERA_M, FIELD, camera_at
@@ -79,6 +79,15 @@ def test_each_place_is_drawn_once() -> None:
     assert views.renders == drawn
     plane_of(ground, along_x(x_m=4.0))
     assert views.renders == drawn + 1
+
+
+def test_a_place_that_was_drawn_to_warm_up_is_not_drawn_again() -> None:
+    views = Views(0.0)
+    ground = FieldGround(views.render)
+    ground.warm_up((0.0, 0.0, 0.0))
+    assert views.renders == 1
+    plane_of(ground, along_x())
+    assert views.renders == STEPS
 
 
 def test_a_field_without_ground_has_none() -> None:

@@ -4,6 +4,7 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/unique_ptr.h>
 #include <nanobind/stl/vector.h>
 
 #include <memory>
@@ -80,6 +81,11 @@ void bind_rasterizer(nb::module_& m) {
              "means"_a, "quaternions"_a, "log_scales"_a, "opacity_logits"_a, "sh"_a, "threads"_a,
              "isa"_a, "antialiased"_a)
         .def_prop_ro("isa", [](const Rasterizer& self) { return self.kernels().isa; })
+        .def("with_threads",
+             [](const Rasterizer& self, int threads) {
+                 return std::make_unique<Rasterizer>(self, threads);
+             },
+             "threads"_a)
         .def("render",
              [](Rasterizer& self, const Camera& camera, int degree, const FloatsOut& colour,
                 const FloatsOut& depth, const FloatsOut& opacity) {

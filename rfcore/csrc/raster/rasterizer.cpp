@@ -53,18 +53,28 @@ Rasterizer::Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, 
     AlignedBuffer<float> parameters;
     parameters.reserve(static_cast<size_t>(blocks_) * stride);
     pack_parameters(gaussians, parameters.data());
-    geometry_.reserve(static_cast<size_t>(blocks_) * kGeometryPlanes * kLanes);
-    harmonics_.reserve(static_cast<size_t>(blocks_) * sh_size);
+    const auto prepared = std::make_shared<Prepared>();
+    prepared->geometry.reserve(static_cast<size_t>(blocks_) * kGeometryPlanes * kLanes);
+    prepared->harmonics.reserve(static_cast<size_t>(blocks_) * sh_size);
     workplace()->pool.run(threads, [&](int part) {
         const int begin = share_begin(blocks_, part, threads);
         const int end = share_begin(blocks_, part + 1, threads);
-        kernels_.prepare(parameters.data(), planes, geometry_.data(), begin, end);
+        kernels_.prepare(parameters.data(), planes, prepared->geometry.data(), begin, end);
     });
     for (size_t b = 0; b < static_cast<size_t>(blocks_); ++b) {
-        std::memcpy(harmonics_.data() + b * sh_size,
+        std::memcpy(prepared->harmonics.data() + b * sh_size,
                     parameters.data() + b * stride + kShPlane * kLanes, sh_size * sizeof(float));
     }
+    prepared_ = prepared;
 }
+
+Rasterizer::Rasterizer(const Rasterizer& other, int threads)
+    : kernels_(other.kernels_),
+      threads_(threads),
+      blocks_(other.blocks_),
+      degree_(other.degree_),
+      antialiased_(other.antialiased_),
+      prepared_(other.prepared_) {}
 
 Kept<Rasterizer::Workplace>::Loan Rasterizer::workplace() {
     return workplaces_.take([this] { return std::make_unique<Workplace>(threads_); });
@@ -73,8 +83,8 @@ Kept<Rasterizer::Workplace>::Loan Rasterizer::workplace() {
 void Rasterizer::run_front_end(Workplace& at, const Camera& camera, int degree) const {
     ProjectJob job{};
     job.camera = &camera;
-    job.geometry = geometry_.data();
-    job.harmonics = harmonics_.data();
+    job.geometry = prepared_->geometry.data();
+    job.harmonics = prepared_->harmonics.data();
     job.stored_degree = degree_;
     job.degree = degree;
     job.antialiased = antialiased_;

@@ -38,6 +38,8 @@ class Rasterizer {
   public:
     Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads,
                bool antialiased);
+    // The Gaussians of `other`, drawn with `threads` threads and memory of its own.
+    Rasterizer(const Rasterizer& other, int threads);
 
     // Render colour [H, W, 3] with the first `degree` bands; with depth and opacity [H, W] both
     // or neither.
@@ -54,13 +56,17 @@ class Rasterizer {
         ThreadPool pool;
         FrontEnd front_end;
     };
+    // Of all Gaussians, what drawing reads.
+    struct Prepared {
+        AlignedBuffer<float> geometry, harmonics;
+    };
     Kept<Workplace>::Loan workplace();
     void run_front_end(Workplace& at, const Camera& camera, int degree) const;
 
     const Kernels& kernels_;
     int threads_, blocks_, degree_;
     bool antialiased_;
-    AlignedBuffer<float> geometry_, harmonics_;
+    std::shared_ptr<const Prepared> prepared_;
     Kept<Workplace> workplaces_;
 };
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from mec_server.event_loop import work_when_idle
+from mec_server.learner import ONE_THREAD
 from mec_server.twin.composition import LivePicture, compose, live_picture
 from mec_server.twin.contacts import cut_out, find
 from mec_server.twin.ground import FieldGround
@@ -437,7 +439,13 @@ def _learning(asked: EvalWorld, drive: Path) -> Iterator[None]:
     )
     command = [*command_of("rfedge"), *map(str, update)]
     with log.open("wb") as file:
-        learning = subprocess.Popen(command, stdout=file, stderr=file, preexec_fn=work_when_idle)
+        learning = subprocess.Popen(
+            command,
+            stdout=file,
+            stderr=file,
+            env={**os.environ, **ONE_THREAD},
+            preexec_fn=work_when_idle,
+        )
     try:
         yield
         if learning.poll():
