@@ -114,7 +114,7 @@ class AgentSession:
         self.state = LinkState.DISCONNECTED
         self.session_id = ""
         self.exact: bool | None = None
-        self.relights = False
+        self.relights = self.takes_light = False
         self.is_sent_away = False
         self.rate_limit_hz = 0.0
         self.failed: RfedgeError | None = None
@@ -193,10 +193,11 @@ class AgentSession:
     def receive(self, message: ServerMessage, now: float) -> None:
         """Take one message of the server."""
         match message:
-            case Welcome(session_id, exact, rate_hz, relights):
+            case Welcome(session_id, exact, rate_hz, relights, takes_light):
                 self.state = LinkState.STREAMING
                 self.session_id, self.exact = session_id, exact
-                self.rate_limit_hz, self.relights = rate_hz, relights
+                self.rate_limit_hz = rate_hz
+                self.relights, self.takes_light = relights, takes_light
             case Credit(camera_id, frames) if camera_id in self._cameras:
                 camera = self._cameras[camera_id]
                 camera.granted = max(camera.granted, frames)
@@ -278,6 +279,7 @@ class AgentSession:
             base,
             exact=exact,
             relights=self.relights,
+            takes_light=self.takes_light,
             budget=budget,
             started_s=now,
         )

@@ -210,7 +210,7 @@ def prediction_of(packet: DeltaPacket, view: FieldView, past: Past | None) -> Pr
     if not packet.relit:
         return Prediction.under_light(view, packet.photometric, past)
     try:
-        return Prediction.relit(view, past)
+        return Prediction.relit(view, past, light=packet.light)
     except InvalidInput as error:
         raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from rfcore.codec.block_means import BLOCK_MEANS_BYTES
-from rfcore.codec.photometric import Photometric, check_photometric
+from rfcore.codec.photometric import MOST_LIGHT_BYTES, Photometric, check_photometric
 from rfcore.codec.references import RENDER_ONLY, References, check_references, is_temporal
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 
@@ -37,7 +37,8 @@ class DeltaPacket:
     ``base_digest`` names the earlier frame that ``references`` call for by the first bytes of its
     reconstruction digest (4 as we write it, up to all 16), and is empty when they call for none;
     ``photometric`` changes the render before it is used. A frame that is ``relit`` has its render
-    mapped to the light of the frame ``base_digest`` names (``rfcore.native.warp.relight_i420``).
+    mapped to ``light`` (``rfcore.codec.photometric``) or, where that is empty, to the light of the
+    frame ``base_digest`` names (``rfcore.native.warp.relight_i420``).
     ``crc32`` covers all other fields (``expected_crc32``): a damaged sequence number would
     otherwise make every later packet look stale.
     """
@@ -53,6 +54,7 @@ class DeltaPacket:
     base_digest: bytes = b""
     photometric: Photometric = ()
     relit: bool = False
+    light: bytes = b""
 
     def __post_init__(self) -> None:
         _require_number("epoch", self.epoch, _UINT64)
@@ -63,6 +65,10 @@ class DeltaPacket:
             check_photometric(self.photometric)
             if self.relit:
                 raise InvalidInput("packet.relit", "photometric already changes the render")
+        if self.light:
+            if not self.relit:
+                raise InvalidInput("packet.light", "of a frame that is not relit")
+            _require_length("light", self.light, range(2, MOST_LIGHT_BYTES + 1))
         base_lengths = _BASE if self.needs_base else _NOTHING
         _require_length("render_digest", self.render_digest, _DIGEST)
         _require_length("render_block_means", self.render_block_means, _BLOCK_MEANS)
@@ -72,12 +78,12 @@ class DeltaPacket:
     @property
     def needs_base(self) -> bool:
         """Whether an earlier frame is needed, which ``base_digest`` names."""
-        return self.relit or is_temporal(self.references)
+        return (self.relit and not self.light) or is_temporal(self.references)
 
     def expected_crc32(self) -> int:
         """Return zlib.crc32 of epoch and sequence (8 bytes each, big-endian), the digests in the
         order of the fields, the payload, a byte for each reference, the base digest, the
-        photometric numbers (2 bytes each), and a byte 1 if the frame is relit."""
+        photometric numbers (2 bytes each), and if the frame is relit a byte 1 and the light."""
         head = (
             self.epoch.to_bytes(8, "big"),
             self.sequence.to_bytes(8, "big"),
@@ -90,6 +96,7 @@ class DeltaPacket:
             self.base_digest,
             *(number.to_bytes(2, "big", signed=True) for number in self.photometric),
             b"\x01" if self.relit else b"",
+            self.light,
         )
         crc = zlib.crc32(self.payload, zlib.crc32(b"".join(head)))
         return zlib.crc32(b"".join(tail), crc)

@@ -1,18 +1,29 @@
 """The photometric side channel: a render under another light, computed alike by both ends.
 
-When the scene is lit otherwise than the field was, the sender finds the matrix M [3, 4] that maps
-the render's (Y, U, V, 1) closest to the frame's (Y, U, V), and sends it in 12 numbers. Both ends
-apply it to the render before it becomes a reference. Any change of light that scales and mixes RGB
-channels linearly and adds to them is such a matrix, as YUV is linear in RGB.
+When the scene is lit otherwise than the field was, the sender says how the render's samples change.
+Both ends apply that to the render before it becomes a reference. There are two ways:
 
-In integers, so that both ends get the same bytes: coefficients are in 1/4096 (columns Y, U, V), the
-last column in levels / 16. Chroma rows see the rounded mean of the 2x2 luma samples; luma rows see
-the chroma sample of their block; a last odd row or column counts twice. Y, U and V enter without
-their offsets (16, 128, 128), sums are rounded half up, and samples clamped to 1..255.
+* A *matrix* M [3, 4] that maps the render's (Y, U, V, 1) closest to the frame's (Y, U, V), in 12
+  numbers: any change of light that scales and mixes RGB channels linearly and adds to them, as YUV
+  is linear in RGB.
+* A *light*, for a frame without an earlier one to learn it from (``rfcore.native.warp``): a
+  bilateral grid by place and luma, in at most ``MOST_LIGHT_BYTES``.
+
+The matrix is applied in integers, so that both ends get the same bytes: coefficients are in 1/4096
+(columns Y, U, V), the last column in levels / 16. Chroma rows see the rounded mean of the 2x2 luma
+samples; luma rows see the chroma sample of their block; a last odd row or column counts twice. Y, U
+and V enter without their offsets (16, 128, 128), sums are rounded half up, and samples clamped to
+1..255.
+
+A light is written as a byte, the step S in levels, and a raw deflate stream (RFC 1951) of one byte
+for each plane, bin, row and column of the grid, in this order: by how many steps samples change
+there, int8, less the median of what is to the left, above, and their sum less what is above to the
+left, modulo 256; what is beyond the first row or column is as its neighbour, and in the corner 0.
 """
 
 from __future__ import annotations
 
+import zlib
 from typing import Any
 
 import numpy as np
@@ -20,8 +31,18 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
+from rfcore.native.warp import apply_light, light_shape, solve_light
 
-__all__ = ["COEFFICIENTS", "Photometric", "adapt", "check_photometric", "solve"]
+__all__ = [
+    "COEFFICIENTS",
+    "MOST_LIGHT_BYTES",
+    "Photometric",
+    "adapt",
+    "check_photometric",
+    "lit_by",
+    "sent_light",
+    "solve",
+]
 
 COEFFICIENTS = 12
 LIMIT = 1 << 15
@@ -30,6 +51,14 @@ _LEVEL_BITS = 4
 _BLACK = (16, 128, 128)
 _ROUNDS = 3
 _SAMPLES_PER_SIDE = 90
+
+MOST_LIGHT_BYTES = 1024
+LIGHT_STEPS = (4, 8, 16, 32)
+"""Levels. At dusk with a field of noon a light of the yardstick's first frame takes 509 bytes with
+4 levels, with which the frame takes the fewest bits; with 1 level 791, with 8 levels 385."""
+_LEVEL = 1 << 8
+"""Of what ``rfcore.native.warp`` counts in."""
+_RAW_DEFLATE = -zlib.MAX_WBITS
 
 Photometric = tuple[int, ...]
 """Nothing, or M row by row."""
@@ -81,6 +110,75 @@ def solve(frame: I420, render: I420) -> Photometric:
     scale = np.array([1 << _FRACTION_BITS] * 3 + [1 << _LEVEL_BITS])
     numbers = np.rint(solution.T * scale).clip(-LIMIT, LIMIT - 1).astype(int)
     return tuple(numbers.ravel().tolist())
+
+
+def sent_light(frame: I420, render: I420) -> bytes:
+    """Return the light that maps ``render`` to ``frame``, as it is sent; nothing where it would be
+    longer than ``MOST_LIGHT_BYTES``."""
+    changes = solve_light(frame, render)
+    for step in LIGHT_STEPS:
+        unit = step * _LEVEL
+        steps = ((changes + unit // 2) // unit).clip(-128, 127)
+        deflate = zlib.compressobj(9, zlib.DEFLATED, _RAW_DEFLATE, 9, zlib.Z_FILTERED)
+        data = _residuals(steps.transpose(3, 2, 0, 1)).astype(np.uint8).tobytes()
+        light = bytes((step,)) + deflate.compress(data) + deflate.flush()
+        if len(light) <= MOST_LIGHT_BYTES:
+            return light
+    return b""
+
+
+def lit_by(render: I420, light: bytes) -> I420:
+    """Return ``render`` under a light that was sent; raise ``InvalidInput`` for one that is none of
+    a picture of that size."""
+    rows, columns, bins, planes = shape = light_shape(render.size_px)
+    if not 1 < len(light) <= MOST_LIGHT_BYTES:
+        raise InvalidInput("light", f"{len(light)} bytes where 2..{MOST_LIGHT_BYTES} are expected")
+    if light[0] not in LIGHT_STEPS:
+        raise InvalidInput("light", f"a step of {light[0]} levels is none of {LIGHT_STEPS}")
+    count, inflate = planes * bins * rows * columns, zlib.decompressobj(_RAW_DEFLATE)
+    try:
+        data = inflate.decompress(light[1:], count + 1)
+    except zlib.error as error:
+        raise InvalidInput("light", f"is not deflated: {error}") from error
+    if len(data) != count or not inflate.eof or inflate.unused_data:
+        raise InvalidInput("light", f"does not hold {count} numbers, of a grid of shape {shape}")
+    residuals = np.frombuffer(data, np.uint8).reshape(planes, bins, rows, columns)
+    steps = _summed(residuals).astype(np.int8).astype(np.int32)
+    return apply_light(render, steps.transpose(2, 3, 1, 0) * (light[0] * _LEVEL))
+
+
+def _residuals(steps: I32) -> I32:
+    """Return steps [..., rows, columns] less what is expected by those before, modulo 256."""
+    expected = np.zeros_like(steps)
+    left, above, corner = steps[..., 1:, :-1], steps[..., :-1, 1:], steps[..., :-1, :-1]
+    expected[..., 1:, 1:] = _median(left, above, left + above - corner)
+    expected[..., 0, 1:] = steps[..., 0, :-1]
+    expected[..., 1:, 0] = steps[..., :-1, 0]
+    return np.asarray((steps - expected) & 0xFF, np.int32)
+
+
+def _summed(residuals: NDArray[np.uint8]) -> I32:
+    """Return the steps of residuals [planes, bins, rows, columns], int8 values as int32."""
+    steps = np.zeros(residuals.shape, np.int32)
+    _, _, rows, columns = residuals.shape
+    for row in range(rows):
+        for column in range(columns):
+            expected = _expected(steps, row, column)
+            steps[..., row, column] = ((residuals[..., row, column] + expected + 128) & 0xFF) - 128
+    return steps
+
+
+def _expected(steps: I32, row: int, column: int) -> I32:
+    if not row and not column:
+        return np.zeros_like(steps[..., 0, 0])
+    left, above = steps[..., row, column - 1], steps[..., row - 1, column]
+    if not row or not column:
+        return above if row else left
+    return _median(left, above, left + above - steps[..., row - 1, column - 1])
+
+
+def _median(a: I32, b: I32, c: I32) -> I32:
+    return np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
 
 
 def _samples(picture: I420) -> F64:

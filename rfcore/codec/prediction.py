@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from rfcore.codec.photometric import Photometric, adapt
+from rfcore.codec.photometric import Photometric, adapt, lit_by
 from rfcore.codec.references import Reference, References
 from rfcore.codec.state import Past
 from rfcore.errors import InvalidInput
@@ -33,7 +33,8 @@ class Prediction:
     photometric: Photometric = ()
     """How the light of the render of ``view`` was changed by numbers."""
     is_relit: bool = False
-    """Whether its light was learnt from the frame in ``past``."""
+    """Whether it is under ``light`` or, without one, that learnt from the frame in ``past``."""
+    light: bytes = b""
     plain_render: I420 | None = None
     """The render of the field, where that of ``view`` is under another light."""
 
@@ -48,16 +49,23 @@ class Prediction:
         return Prediction(lit, past, threads, photometric, plain_render=view.render)
 
     @staticmethod
-    def relit(view: FieldView, past: Past | None, threads: int = 1) -> Prediction:
-        """Return the prediction with the render of ``view`` under the light ``past`` was seen in.
+    def relit(
+        view: FieldView, past: Past | None, threads: int = 1, light: bytes = b""
+    ) -> Prediction:
+        """Return the prediction with the render of ``view`` under ``light`` or, without one, under
+        that which ``past`` was seen in.
 
-        Raises ``InvalidInput`` without an earlier frame, or for one of another size.
+        Raises ``InvalidInput`` for a light that is none, without either, or for an earlier frame of
+        another size.
         """
-        if past is None:
+        if light:
+            render = lit_by(view.render, light)
+        elif past is not None:
+            render = relight_i420(past.picture, past.field_render, view.render)
+        else:
             raise InvalidInput("relit", "there is no earlier frame to learn the light from")
-        render = relight_i420(past.picture, past.field_render, view.render)
         lit = replace(view, render=render)
-        return Prediction(lit, past, threads, is_relit=True, plain_render=view.render)
+        return Prediction(lit, past, threads, (), True, light, view.render)
 
     def past_of(self, picture: I420, digest: bytes | None = None) -> Past:
         """Return what later frames predict from once this frame was decoded to ``picture``.

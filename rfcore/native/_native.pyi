@@ -158,6 +158,10 @@ class NgpTrainer:
 _U8 = NDArray[np.uint8]
 
 def block_costs(frame: _U8, reference: _U8, satd: _I32, ssd: _I32) -> None: ...
+def solve_light(
+    frame: tuple[_U8, _U8, _U8], render: tuple[_U8, _U8, _U8], changes: _I32
+) -> None: ...
+def apply_light(changes: _I32, render: tuple[_U8, _U8, _U8], y: _U8, u: _U8, v: _U8) -> None: ...
 def relight_i420(
     seen: tuple[_U8, _U8, _U8],
     seen_render: tuple[_U8, _U8, _U8],

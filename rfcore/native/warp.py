@@ -50,6 +50,10 @@ both clamped to -2**16..2**16. What a sample's luma makes of each of the four ce
 1/32 level and interpolated between bins, is interpolated between them in 1/32 of their distance,
 rounded half up, added, and clamped to 1..255. Chroma is mapped by the rounded 2x2 mean of luma.
 
+A light can be sent (``rfcore.codec.photometric``) where no earlier frame is there to learn it from:
+the vertices of the level with 4x4 cells, solved as above from the frame itself, of each by how much
+samples change in the middle of its bin, in levels / 2**8: their offsets, and no gain.
+
 Lanczos-3 was chosen over a bicubic filter because a picture is resampled again and again along a
 drive, and every pass of a softer filter takes away detail that has to be sent again.
 """
@@ -70,9 +74,12 @@ from rfcore.views import FieldView
 __all__ = [
     "BLOCK_PX",
     "BlockCosts",
+    "apply_light",
     "block_costs",
     "correct_i420",
+    "light_shape",
     "relight_i420",
+    "solve_light",
     "warp_i420",
     "warp_numbers",
 ]
@@ -85,6 +92,8 @@ with all of it 72, 394, 199, 207. The warp has 92, 411, 206, 226."""
 
 MOST_RELIT_PX = 1 << 24
 """The sums of a larger picture could exceed 64 bits."""
+
+LIGHT_CELL_PX, LIGHT_BINS, LIGHT_PLANES, MOST_CHANGE = 64, 8, 3, 1 << 16
 
 Plane = NDArray[np.uint8]
 FLOAT32_MAX = float(np.finfo(np.float32).max)
@@ -154,15 +163,57 @@ def relight_i420(seen: I420, seen_render: I420, render: I420) -> I420:
 
     Raises ``InvalidInput`` for pictures of another size, without samples, or above 2**24 px.
     """
-    width_px, height_px = size_px = render.size_px
-    if not 0 < width_px * height_px <= MOST_RELIT_PX:
-        raise InvalidInput("relight.render", f"{size_px} px must be 1 to {MOST_RELIT_PX} px in all")
+    size_px = _check_relit(render)
     for name, picture in (("seen", seen), ("seen_render", seen_render)):
         if picture.size_px != size_px:
             raise InvalidInput(f"relight.{name}", f"{picture.size_px} px of a render of {size_px}")
     out = I420(*(np.empty(plane.shape, np.uint8) for plane in render.planes))
     _native.relight_i420(_dense(seen), _dense(seen_render), _dense(render), *out.planes)
     return out
+
+
+def light_shape(size_px: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return the shape of a light that is sent: rows, columns, bins and planes."""
+    width_px, height_px = size_px
+    return -(-height_px // LIGHT_CELL_PX), -(-width_px // LIGHT_CELL_PX), LIGHT_BINS, LIGHT_PLANES
+
+
+def solve_light(frame: I420, render: I420) -> NDArray[np.int32]:
+    """Return the light that maps ``render`` to ``frame``: changes in levels / 2**8, int32
+    (``light_shape``), within 2**16.
+
+    Raises ``InvalidInput`` for pictures of different sizes, without samples, or above 2**24 px.
+    """
+    size_px = _check_relit(render)
+    if frame.size_px != size_px:
+        raise InvalidInput("light.frame", f"{frame.size_px} px of a render of {size_px}")
+    changes = np.empty(light_shape(size_px), np.int32)
+    _native.solve_light(_dense(frame), _dense(render), changes)
+    return changes
+
+
+def apply_light(render: I420, changes: NDArray[np.int32]) -> I420:
+    """Return ``render`` under a light: ``changes`` as ``solve_light`` returns them.
+
+    Raises ``InvalidInput`` for changes of another shape or beyond 2**16, and for pictures without
+    samples or above 2**24 px.
+    """
+    shape = light_shape(_check_relit(render))
+    if changes.shape != shape or np.abs(changes).max() > MOST_CHANGE:
+        raise InvalidInput("light", f"must be of shape {shape} and within 2**16")
+    out = I420(*(np.empty(plane.shape, np.uint8) for plane in render.planes))
+    dense = np.ascontiguousarray(changes, np.int32)
+    _native.apply_light(dense, _dense(render), *out.planes)
+    return out
+
+
+def _check_relit(render: I420) -> tuple[int, int]:
+    width_px, height_px = render.size_px
+    if not 0 < width_px * height_px <= MOST_RELIT_PX:
+        raise InvalidInput(
+            "relight.render", f"{render.size_px} px must be 1 to {MOST_RELIT_PX} px in all"
+        )
+    return width_px, height_px
 
 
 def warp_numbers(before: Camera, now: Camera) -> list[float]:

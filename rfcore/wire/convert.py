@@ -281,6 +281,7 @@ def _packet_from_wire(frame: pb.Frame) -> DeltaPacket:
             base_digest=frame.base_digest,
             photometric=tuple(frame.photometric),
             relit=frame.relit,
+            light=frame.light,
         )
     except InvalidInput as error:
         raise InvalidInput(error.field.replace("packet.", "frame.", 1), error.problem) from error
@@ -311,6 +312,7 @@ def _frame_to_wire(frame: Frame) -> pb.Frame:
         base_digest=packet.base_digest,
         photometric=packet.photometric,
         relit=packet.relit,
+        light=packet.light,
         capture_clock=clock_to_wire(frame.clock),
         localisation=localisation_to_wire(frame.localisation),
         instant=frame.instant,

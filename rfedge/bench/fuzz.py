@@ -230,7 +230,8 @@ def exchange_references(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     """Name other references, in another order."""
     count = int(rng.integers(4))
     order = [Reference(int(n)) for n in rng.permutation(4)[:count] + 1]
-    needs = packet.relit or any(reference is not Reference.RENDER for reference in order)
+    learns = packet.relit and not packet.light
+    needs = learns or any(reference is not Reference.RENDER for reference in order)
     base = (packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)) if needs else b""
     return replace(packet, references=tuple(order), base_digest=base)
 
@@ -242,7 +243,7 @@ def relight(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     photometric = matrix if not relit and rng.integers(4) else ()
     base = packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)
     needed = base if relit or is_temporal(packet.references) else b""
-    return replace(packet, photometric=photometric, base_digest=needed, relit=relit)
+    return replace(packet, photometric=photometric, base_digest=needed, relit=relit, light=b"")
 
 
 def switch_relit(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
@@ -250,7 +251,15 @@ def switch_relit(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     relit = not packet.relit
     base = packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)
     needed = base if relit or is_temporal(packet.references) else b""
-    return replace(packet, photometric=(), base_digest=needed, relit=relit)
+    return replace(packet, photometric=(), base_digest=needed, relit=relit, light=b"")
+
+
+def damage_light(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
+    """Relight the render by a light that is damaged or, where none was sent, made up."""
+    light = flip_bits(packet.light, rng) if packet.light else b"\x04" + rng.bytes(60)
+    base = packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)
+    needed = base if is_temporal(packet.references) else b""
+    return replace(packet, photometric=(), base_digest=needed, relit=True, light=light)
 
 
 def exchange_base(packet: DeltaPacket, rng: Rng, digests: Sequence[bytes]) -> DeltaPacket:
@@ -258,7 +267,7 @@ def exchange_base(packet: DeltaPacket, rng: Rng, digests: Sequence[bytes]) -> De
     base = digests[int(rng.integers(len(digests)))][:BASE_DIGEST_BYTES]
     if packet.needs_base:
         return replace(packet, base_digest=base)
-    return replace(packet, photometric=(), base_digest=base, relit=True)
+    return replace(packet, photometric=(), base_digest=base, relit=True, light=b"")
 
 
 MUTATIONS: dict[str, Mutation] = {

@@ -132,7 +132,8 @@ class FieldCoder:
         first = references
         if references is not None and is_temporal(references):  # from the second frame on
             first = INTRA if references == WITHOUT_FIELD else None
-        self._first_choice = FrameChoice(first, photometric=photometric, relight=False)
+        relight = None if relight is None else False
+        self._first_choice = FrameChoice(first, photometric=photometric, relight=relight)
         self._renders = references != WITHOUT_FIELD
 
     @cached_property

@@ -211,6 +211,7 @@ def _numbered(packet: DeltaPacket, epoch: int, sequence: int) -> DeltaPacket:
             packet.base_digest,
             packet.photometric,
             packet.relit,
+            packet.light,
         )
 
     return numbered(numbered(0).expected_crc32())

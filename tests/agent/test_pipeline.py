@@ -15,7 +15,7 @@ from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig, LightChange
 from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.references import Reference
-from rfcore.codec.sender.ladder import Rung
+from rfcore.codec.sender.ladder import FULL_RUNG, Rung
 from rfcore.codec.sender.steering import Steering
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, render_field_view
@@ -98,6 +98,9 @@ def test_the_light_is_changed_as_the_server_and_the_settings_allow(
     second = pipeline.encode(EncodeJob(seen[1], 0, 1, base, relights=relights))
     assert not first.packet.relit
     assert second.packet.relit == relit
+    for takes_light in (True, False):
+        job = EncodeJob(seen[0], 1, 1, relights=relights, takes_light=takes_light)
+        assert pipeline._choice(job, FULL_RUNG).may_send_light == takes_light
     assert changed or not (first.packet.photometric or second.packet.photometric)
 
 

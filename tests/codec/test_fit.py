@@ -88,7 +88,13 @@ def test_what_no_crf_makes_fit_comes_back_too_long(noise: PictureMaker, view_of:
         encoder.start(0),
         frame,
         view,
-        choice=FrameChoice(made.packet.references, crf=51, photometric=made.packet.photometric),
+        choice=FrameChoice(
+            made.packet.references,
+            crf=51,
+            photometric=made.packet.photometric,
+            relight=made.packet.relit,
+            light=made.packet.light,
+        ),
     )
     assert made.packet.payload == at_the_highest.packet.payload
 

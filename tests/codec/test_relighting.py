@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.photometric import sent_light
 from rfcore.codec.references import RENDER_ONLY, Reference
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice, without_field
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
@@ -51,16 +52,57 @@ def coded(encoder: DeltaEncoder, street: Street, choice: FrameChoice) -> list[En
 def test_frames_under_another_light_are_relit_and_decode_as_promised(street: Street) -> None:
     encoder = encoder_of()
     relit, plain = (coded(encoder, street, choice) for choice in (FrameChoice(), NEVER))
-    assert [made.packet.relit for made in relit] == [False] + [True] * (FRAMES - 1)
+    assert [bool(made.packet.light) for made in relit] == [True] + [False] * (FRAMES - 1)
+    assert all(made.packet.relit for made in relit)
     assert not any(made.packet.relit for made in plain)
-    for made, without in zip(relit[1:], plain[1:], strict=True):
-        assert len(made.packet.payload) < 0.9 * len(without.packet.payload)
+    for made, without in zip(relit, plain, strict=True):
+        told = len(made.packet.payload) + len(made.packet.light)
+        assert told < 0.9 * len(without.packet.payload)
     decoder = DeltaDecoder(encoder.header)
     state = decoder.start(1)
     for index, made in enumerate(relit):
         decoded = decoder.decode(state, made.packet, street(index)[1])
         assert decoded.frame.digest() == made.reconstruction.digest()
         state = decoded.state
+
+
+def test_a_receiver_of_an_older_release_gets_no_light(street: Street) -> None:
+    made = coded(encoder_of(), street, FrameChoice(may_send_light=False))
+    assert [each.packet.relit for each in made] == [False] + [True] * (FRAMES - 1)
+    assert not any(each.packet.light for each in made)
+
+
+def test_no_light_is_sent_for_a_field_of_something_else(
+    street: Street, noise: Callable[..., I420]
+) -> None:
+    frame, view = street(0)
+    encoder = encoder_of()
+    elsewhere = replace(view, render=noise(*SIZE_PX, 3))
+    assert not encoder.encode(encoder.start(1), frame, elsewhere).packet.light
+
+
+def test_a_light_is_of_a_relit_frame_and_under_its_crc(street: Street) -> None:
+    encoder = encoder_of()
+    packet = encoder.encode(encoder.start(1), *street(0)).packet
+    with pytest.raises(InvalidInput, match=r"packet\.light"):
+        replace(packet, relit=False)
+    with pytest.raises(InvalidInput, match=r"packet\.light.*1025 bytes"):
+        replace(packet, light=bytes(1025))
+    with pytest.raises(InvalidInput, match="light"):
+        FrameChoice(light=packet.light)
+    decoder = DeltaDecoder(encoder.header)
+    darker = sent_light(street(0)[1].render, street(0)[0])
+    for light, reason in (
+        (darker, RejectReason.RECONSTRUCTION_MISMATCH),
+        (b"\x04\x00", RejectReason.INVALID_ARGUMENT),
+    ):
+        damaged = replace(packet, light=light)
+        for sealed, expected in ((False, RejectReason.CRC_MISMATCH), (True, reason)):
+            with pytest.raises(PacketRejected) as refused:
+                decoder.decode(
+                    decoder.start(1), damaged.sealed() if sealed else damaged, street(0)[1]
+                )
+            assert refused.value.reason is expected
 
 
 def test_the_right_light_costs_nothing(pair: PairMaker) -> None:

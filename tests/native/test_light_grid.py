@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfcore.native.warp import relight_i420
+from rfcore.native.warp import apply_light, light_shape, relight_i420, solve_light
 
 I64 = NDArray[np.int64]
 BINS = 8
@@ -76,21 +76,26 @@ def coarser(sums: I64, level: int) -> I64:
     return sums
 
 
-def vertices_of(sums: I64) -> I64:
+def vertices_of(sums: I64, last: int = 1) -> I64:
     whole = sums.sum((1, 2))
     per_bin = solved(whole, solved(whole.sum(1), np.zeros(6, np.int64))[:, None])
     found = None
-    for level in (16, 4, 1):
+    for level in (16, 4, 1)[: 3 if last == 1 else 2]:
         total = coarser(sums, level)
         if found is None:
             prior = np.broadcast_to(per_bin[:, None, None], (6, *total.shape[1:]))
         else:
-            prior = found.repeat(4, 1).repeat(4, 2)[:, : total.shape[1], : total.shape[2]]
-            for axis in (1, 2):
-                prior = (smoothed(prior, axis) + 2) >> 2
+            prior = finer(found, total.shape[1:3])
         found = solved(total, prior)
     assert found is not None
     return found
+
+
+def finer(vertices: I64, shape: tuple[int, ...]) -> I64:
+    repeated = vertices.repeat(4, 1).repeat(4, 2)[:, : shape[0], : shape[1]]
+    for axis in (1, 2):
+        repeated = (smoothed(repeated, axis) + 2) >> 2
+    return repeated
 
 
 def tables_of(offset: I64, gain: I64) -> I64:
@@ -116,13 +121,31 @@ def mapped(plane: I64, luma: I64, tables: I64, cell: int) -> NDArray[np.uint8]:
 
 
 def definition(seen: I420, seen_render: I420, render: I420) -> I420:
-    vertices = vertices_of(accumulated(seen, seen_render))
+    return under(vertices_of(accumulated(seen, seen_render)), render)
+
+
+def under(vertices: I64, render: I420) -> I420:
     tables = [tables_of(vertices[2 * p], vertices[2 * p + 1]) for p in range(3)]
     y, u, v = (plane.astype(np.int64) for plane in render.planes)
     means = halved(y)
     return I420(
         mapped(y, y, tables[0], 16), mapped(u, means, tables[1], 8), mapped(v, means, tables[2], 8)
     )
+
+
+def light_definition(frame: I420, render: I420) -> I64:
+    """[rows, columns, 8, 3] in levels / 2**8."""
+    vertices = vertices_of(accumulated(frame, render), last=4)
+    x = 32 * np.arange(BINS) + 16 - 128
+    changes = [(vertices[2 * p] * 128 + vertices[2 * p + 1] * x + 64) >> 7 for p in range(3)]
+    return np.stack(changes, axis=-1).clip(-MOST, MOST)
+
+
+def lit_definition(render: I420, changes: I64) -> I420:
+    width, height = render.size_px
+    none = np.zeros(changes.shape[:3], np.int64)
+    vertices = np.stack([each for p in range(3) for each in (changes[..., p], none)])
+    return under(finer(vertices, (-(-height // 16), -(-width // 16))), render)
 
 
 def picture(size_px: tuple[int, int], seed: int, low: int = 0, high: int = 256) -> I420:
@@ -164,6 +187,39 @@ def test_the_kernel_equals_the_definition_at_the_ends_of_the_range(
 ) -> None:
     seen, shown = (picture(size_px, 1, *ends) for ends in levels)
     require_definition(seen, shown, picture(size_px, 2))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    size_px=st.tuples(st.integers(1, 150), st.integers(1, 140)),
+    seed=st.integers(0, 2**32 - 1),
+    seen=LEVELS,
+    shown=LEVELS,
+)
+def test_a_light_that_is_sent_equals_its_definition(
+    size_px: tuple[int, int], seed: int, seen: tuple[int, int], shown: tuple[int, int]
+) -> None:
+    frame, render = (picture(size_px, seed + n, *levels) for n, levels in enumerate((seen, shown)))
+    changes = solve_light(frame, render)
+    assert changes.shape == light_shape(size_px)
+    np.testing.assert_array_equal(changes, light_definition(frame, render))
+    any_changes = np.random.default_rng(seed).integers(-MOST, MOST + 1, changes.shape, np.int32)
+    for light in (changes, any_changes):
+        found, expected = apply_light(render, light), lit_definition(render, light.astype(np.int64))
+        for ours, theirs in zip(found.planes, expected.planes, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def test_changes_that_are_no_light_are_refused() -> None:
+    render = picture((65, 64), 1)
+    changes = np.zeros((1, 2, 8, 3), np.int32)
+    apply_light(render, changes)
+    changes[0, 1, 7, 2] = MOST + 1
+    for wrong in (changes, changes[:, :1], np.zeros((2, 1, 8, 3), np.int32)):
+        with pytest.raises(InvalidInput, match=r"light: must be of shape \(1, 2, 8, 3\)"):
+            apply_light(render, wrong)
+    with pytest.raises(InvalidInput, match=r"light\.frame"):
+        solve_light(picture((64, 64), 1), render)
 
 
 def test_the_right_light_changes_nothing() -> None:

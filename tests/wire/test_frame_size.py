@@ -81,6 +81,13 @@ def test_the_light_of_an_earlier_frame_adds_three_bytes() -> None:
     assert budget_bytes(replace(frame, packet=packet)) == BUDGET_BYTES | {"relit": 3}
 
 
+def test_a_light_that_is_sent_adds_its_length_and_four_bytes() -> None:
+    frame = frame_of(TURN.rounded())
+    packet = replace(frame.packet, relit=True, light=bytes(509))
+    budget = budget_bytes(replace(frame, packet=packet))
+    assert (budget["relit"], budget["light"]) == (3, 4 + 509)
+
+
 def test_a_new_light_adds_at_most_three_bytes_a_number() -> None:
     frame = frame_of(TURN.rounded())
     worst = replace(frame.packet, photometric=(-(1 << 15),) * 12)

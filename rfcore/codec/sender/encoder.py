@@ -24,7 +24,7 @@ from rfcore.codec.h264.pcm_picture import without_zeros
 from rfcore.codec.h264.qp_map import QpMap, check_qp_map
 from rfcore.codec.h264.splice import SpliceDecoder
 from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket
-from rfcore.codec.photometric import Photometric
+from rfcore.codec.photometric import Photometric, sent_light
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.references import (
     INTRA,
@@ -41,6 +41,7 @@ from rfcore.codec.sender.reference_choice import (
     choose_references,
     light_differs,
     relighting_pays,
+    sending_light_pays,
 )
 from rfcore.codec.state import EncoderState, Past
 from rfcore.errors import CodecError, InvalidInput
@@ -70,6 +71,11 @@ class FrameChoice:
     relight: bool | None = None
     """Map the render to the light of the earlier frame; ``None`` leaves it to the encoder where
     ``photometric`` does. Receivers of older releases cannot."""
+    light: bytes = b""
+    """With ``relight``: map the render to this light instead (``rfcore.codec.photometric``)."""
+    may_send_light: bool = True
+    """Whether the encoder may send a light where it may relight and has no earlier frame. Receivers
+    of older releases do not take it."""
     pose_only: bool = False
     """Send no slice: the frame is its only reference."""
     max_references: int = DEFAULT_REFERENCES
@@ -102,6 +108,8 @@ class FrameChoice:
             )
         if self.relight and self.photometric:
             raise InvalidInput("relight", "photometric already changes the render")
+        if self.light and not self.relight:
+            raise InvalidInput("light", "of a frame that is not to be relit")
         if self.pose_only and (self.references is None or len(self.references) != 1):
             raise InvalidInput("references", "a pose-only packet names exactly one reference")
 
@@ -148,7 +156,8 @@ class _Plan:
     @property
     def needs_base(self) -> bool:
         """Whether the receiver needs the earlier frame."""
-        return self.prediction.is_relit or is_temporal(self.references)
+        learns_light = self.prediction.is_relit and not self.prediction.light
+        return learns_light or is_temporal(self.references)
 
 
 class DeltaEncoder:
@@ -226,6 +235,7 @@ class DeltaEncoder:
             base_digest=_base_digest(state.past) if plan.needs_base else b"",
             photometric=plan.prediction.photometric,
             relit=plan.prediction.is_relit,
+            light=plan.prediction.light,
         ).sealed()
         stage_ns = {
             "references": chosen_ns - started_ns,
@@ -261,16 +271,31 @@ class DeltaEncoder:
         crf: float,
     ) -> Prediction:
         """Return the prediction under the light that ``choice`` names, or that pays."""
+        past = state.past
         if choice.relight:
-            return Prediction.relit(view, state.past, self._threads)
-        photometric: Photometric = choice.photometric or ()
-        if choice.photometric is None and light_differs(costs.frame, view.render):
-            if state.past is not None and _may_relight(choice):
-                relit = Prediction.relit(view, state.past, self._threads)
-                if relighting_pays(costs, view.render, relit.render, crf):
-                    return relit
-            photometric = choose_photometric(costs, view.render, crf)
-        return Prediction.under_light(view, photometric, state.past, self._threads)
+            return Prediction.relit(view, past, self._threads, choice.light)
+        if choice.photometric is not None or not light_differs(costs.frame, view.render):
+            return Prediction.under_light(view, choice.photometric or (), past, self._threads)
+        if past is not None and _may_learn_light(choice):
+            relit = Prediction.relit(view, past, self._threads)
+            if relighting_pays(costs, view.render, relit.render, crf):
+                return relit
+        photometric = choose_photometric(costs, view.render, crf)
+        changed = Prediction.under_light(view, photometric, past, self._threads)
+        if past is None and choice.relight is None and choice.may_send_light:
+            return self._under_sent_light(changed, view, costs, crf)
+        return changed
+
+    def _under_sent_light(
+        self, changed: Prediction, view: FieldView, costs: FrameCosts, crf: float
+    ) -> Prediction:
+        """Return the prediction under a light that is sent, or ``changed`` if that is cheaper."""
+        light = sent_light(costs.frame, view.render)
+        if not light:
+            return changed
+        relit = Prediction.relit(view, None, self._threads, light)
+        pays = sending_light_pays(costs, changed, relit, crf)
+        return relit if pays else changed
 
     def _first_crf(self, choice: FrameChoice) -> float:
         """Return the CRF that references are chosen for: with a target, about the one to come."""
@@ -323,7 +348,7 @@ class DeltaEncoder:
         return decoded
 
 
-def _may_relight(choice: FrameChoice) -> bool:
+def _may_learn_light(choice: FrameChoice) -> bool:
     """A frame that is to need its render alone has no earlier one to learn the light from."""
     return choice.relight is None and (choice.references is None or is_temporal(choice.references))
 

@@ -21,6 +21,8 @@ using InPlane = nb::ndarray<const std::uint8_t, nb::ndim<2>, nb::c_contig, nb::d
 using OutPlane = nb::ndarray<std::uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using InDepth = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Picture = std::tuple<InPlane, InPlane, InPlane>;
+using InLight = nb::ndarray<const std::int32_t, nb::ndim<4>, nb::c_contig, nb::device::cpu>;
+using OutLight = nb::ndarray<std::int32_t, nb::ndim<4>, nb::c_contig, nb::device::cpu>;
 using OutCosts = nb::ndarray<std::int32_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 template <typename Plane>
@@ -28,6 +30,15 @@ void require_shape(const Plane& plane, int height, int width) {
     if (plane.shape(0) != static_cast<std::size_t>(height) ||
         plane.shape(1) != static_cast<std::size_t>(width)) {
         throw nb::value_error("arrays do not fit the picture");
+    }
+}
+
+template <typename Light>
+void require_light(PictureSize size, const Light& light) {
+    const auto cells = [](int px) { return static_cast<std::size_t>((px - 1) / kLightCellPx + 1); };
+    if (light.shape(0) != cells(size.height_px) || light.shape(1) != cells(size.width_px) ||
+        light.shape(2) != kLightBins || light.shape(3) != kLightPlanes) {
+        throw nb::value_error("changes do not fit the picture");
     }
 }
 
@@ -110,6 +121,28 @@ void bind_warp(nb::module_& m) {
         },
         nb::arg("seen"), nb::arg("seen_render"), nb::arg("render"), nb::arg("y"), nb::arg("u"),
         nb::arg("v"));
+    m.def(
+        "solve_light",
+        [](const Picture& frame, const Picture& render, OutLight changes) {
+            const PictureSize size = size_of(std::get<0>(frame));
+            require_picture(size, frame);
+            require_picture(size, render);
+            require_light(size, changes);
+            const nb::gil_scoped_release released;
+            solve_light(planes_of(frame), planes_of(render), size, changes.data());
+        },
+        nb::arg("frame"), nb::arg("render"), nb::arg("changes"));
+    m.def(
+        "apply_light",
+        [](InLight changes, const Picture& render, OutPlane y, OutPlane u, OutPlane v) {
+            const PictureSize size = size_of(y);
+            require_i420(size, y, u, v);
+            require_picture(size, render);
+            require_light(size, changes);
+            const nb::gil_scoped_release released;
+            apply_light(changes.data(), planes_of(render), size, {y.data(), u.data(), v.data()});
+        },
+        nb::arg("changes"), nb::arg("render"), nb::arg("y"), nb::arg("u"), nb::arg("v"));
     m.def(
         "block_costs",
         [](InPlane frame, InPlane reference, OutCosts satd, OutCosts ssd) {

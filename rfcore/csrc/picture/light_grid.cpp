@@ -10,18 +10,20 @@
 namespace rfcore {
 namespace {
 
-constexpr int kBins = 8, kBinLevels = 32, kBinUnits = 16;
+constexpr int kBins = kLightBins, kBinLevels = 32, kBinUnits = 16;
 constexpr int kCellSamples = 8;                     // a side of a cell, in chroma samples
 constexpr int kPlaces = 32;                         // positions from one vertex to the next
 constexpr std::int64_t kOffsetWeight = 160, kGainWeight = 16000;
 constexpr int kOffsetBits = 8, kGainBits = 15, kMeanBits = 11, kTableBits = 5;
 constexpr std::int64_t kMostOffset = 1 << 16, kMostGain = 1 << 16;
 constexpr std::array<int, 3> kLevels = {16, 4, 1};  // cells a side, coarse to fine
+constexpr int kSentLevel = 4;
+static_assert(kSentLevel * 2 * kCellSamples == kLightCellPx);
 constexpr int kLuma = 256;
 
 // Of a vertex: weight, x, x^2; then of each plane d and x d. x is the render's luma - 128, d what
 // the frame's plane differs by.
-constexpr int kPlanes = 3, kSums = 3 + 2 * kPlanes;
+constexpr int kPlanes = kLightPlanes, kSums = 3 + 2 * kPlanes;
 using Sums = std::array<std::int64_t, kSums>;
 
 // What a vertex adds to a plane at luma x + 128: offset / 2^8 + x gain / 2^15.
@@ -219,12 +221,18 @@ std::vector<Vertex> finer(const std::vector<Vertex>& vertices, GridSize grid, Gr
     return repeated;
 }
 
-std::vector<Vertex> solved_grid(const std::vector<Sums>& sums, GridSize grid) {
+GridSize size_at(GridSize grid, int level) {
+    return {ceil_div(grid.rows, level), ceil_div(grid.columns, level)};
+}
+
+// The vertices of the level whose cells have `last` cells of `grid` a side.
+std::vector<Vertex> solved_grid(const std::vector<Sums>& sums, GridSize grid, int last) {
     const auto whole = solved_whole(sums);
     std::vector<Vertex> vertices;
     GridSize before{0, 0};
     for (const int level : kLevels) {
-        const GridSize size{ceil_div(grid.rows, level), ceil_div(grid.columns, level)};
+        if (level < last) break;
+        const GridSize size = size_at(grid, level);
         auto level_sums = coarser(sums, grid, level, size);
         smooth_sums(level_sums, size);
         if (before.rows != 0) {
@@ -246,6 +254,14 @@ using Table = std::array<std::int16_t, kLuma>;
 // What a vertex adds to samples of plane p, in levels / 2^15.
 inline std::int32_t added_by(const Vertex& vertex, int p, int luma) {
     return vertex[2 * p] * (1 << (kGainBits - kOffsetBits)) + vertex[2 * p + 1] * (luma - 128);
+}
+
+// What a vertex adds to samples of plane p in the middle of its bin, in levels / 2^8.
+std::int32_t change_at_middle(const Vertex& vertex, int p, std::size_t bin) {
+    const int luma = static_cast<int>(bin) * kBinLevels + kBinLevels / 2;
+    constexpr int shift = kGainBits - kOffsetBits;
+    const std::int32_t change = (added_by(vertex, p, luma) + (1 << (shift - 1))) >> shift;
+    return std::clamp<std::int32_t>(change, -kMostOffset, kMostOffset);
 }
 
 // What a cell's centre adds to samples of plane p, by luma, in 1/32 levels.
@@ -320,18 +336,42 @@ void relight_plane(const Target& target, const std::vector<Table>& tables, GridS
     }
 }
 
-}  // namespace
-
-void relight_i420(ConstI420Planes seen, ConstI420Planes seen_render, ConstI420Planes render,
-                  PictureSize size, I420Planes out) {
-    const GridSize grid = grid_of(size);
-    const auto vertices = solved_grid(accumulated(seen, seen_render, size, grid), grid);
+void relight(const std::vector<Vertex>& vertices, GridSize grid, ConstI420Planes render,
+             PictureSize size, I420Planes out) {
     const auto means = halved(render.y, size);
     const PictureSize half = half_of(size);
     const Target targets[kPlanes] = {{render.y, render.y, size, 2 * kCellSamples, out.y},
                                      {means.data(), render.u, half, kCellSamples, out.u},
                                      {means.data(), render.v, half, kCellSamples, out.v}};
     for (int p = 0; p < kPlanes; ++p) relight_plane(targets[p], tables_of(vertices, p), grid);
+}
+
+}  // namespace
+
+void solve_light(ConstI420Planes frame, ConstI420Planes render, PictureSize size,
+                 std::int32_t* changes) {
+    const GridSize grid = grid_of(size);
+    const auto found = solved_grid(accumulated(frame, render, size, grid), grid, kSentLevel);
+    for (std::size_t i = 0; i < found.size(); ++i) {
+        for (int p = 0; p < kPlanes; ++p) *changes++ = change_at_middle(found[i], p, i % kBins);
+    }
+}
+
+void apply_light(const std::int32_t* changes, ConstI420Planes render, PictureSize size,
+                 I420Planes out) {
+    const GridSize grid = grid_of(size), sent = size_at(grid, kSentLevel);
+    std::vector<Vertex> vertices(sent.vertices(), Vertex{});
+    for (Vertex& vertex : vertices) {
+        for (int p = 0; p < kPlanes; ++p) vertex[2 * p] = *changes++;
+    }
+    relight(finer(vertices, sent, grid), grid, render, size, out);
+}
+
+void relight_i420(ConstI420Planes seen, ConstI420Planes seen_render, ConstI420Planes render,
+                  PictureSize size, I420Planes out) {
+    const GridSize grid = grid_of(size);
+    const auto sums = accumulated(seen, seen_render, size, grid);
+    relight(solved_grid(sums, grid, 1), grid, render, size, out);
 }
 
 }  // namespace rfcore

@@ -520,6 +520,7 @@ class Frame(_message.Message):
     CAPTURE_CLOCK_FIELD_NUMBER: _builtins.int
     LOCALISATION_FIELD_NUMBER: _builtins.int
     RELIT_FIELD_NUMBER: _builtins.int
+    LIGHT_FIELD_NUMBER: _builtins.int
     camera_id: _builtins.str
     epoch: _builtins.int
     """A new epoch starts the state of both ends afresh; sequences count from 0 in it."""
@@ -553,6 +554,10 @@ class Frame(_message.Message):
     """Whether the render's light is mapped to that of the frame base_digest names, before it is a
     reference (rfcore.native.warp). For servers whose Welcome says that they relight; others find a
     wrong crc32.
+    """
+    light: _builtins.bytes
+    """The light of a relit frame (rfcore.codec.photometric), at most 1 KiB; empty: that of the frame
+    base_digest names. For servers whose Welcome says that they take it.
     """
     @_builtins.property
     def pose(self) -> Global___Pose:
@@ -603,10 +608,11 @@ class Frame(_message.Message):
         capture_clock: Global___CaptureClock.ValueType = ...,
         localisation: Global___Localisation.ValueType = ...,
         relit: _builtins.bool = ...,
+        light: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["pose", b"pose", "quality", b"quality"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "camera_id", b"camera_id", "capture_clock", b"capture_clock", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "instant", b"instant", "localisation", b"localisation", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "quality", b"quality", "reconstruction_digest", b"reconstruction_digest", "references", b"references", "relit", b"relit", "render_block_means", b"render_block_means", "render_digest", b"render_digest", "sequence", b"sequence"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "camera_id", b"camera_id", "capture_clock", b"capture_clock", "capture_time_ns", b"capture_time_ns", "crc32", b"crc32", "epoch", b"epoch", "field_id_prefix", b"field_id_prefix", "instant", b"instant", "light", b"light", "localisation", b"localisation", "payload", b"payload", "photometric", b"photometric", "pose", b"pose", "pose_f32", b"pose_f32", "quality", b"quality", "reconstruction_digest", b"reconstruction_digest", "references", b"references", "relit", b"relit", "render_block_means", b"render_block_means", "render_digest", b"render_digest", "sequence", b"sequence"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -620,6 +626,7 @@ class Welcome(_message.Message):
     EXACT_FIELD_NUMBER: _builtins.int
     RATE_HZ_FIELD_NUMBER: _builtins.int
     RELIGHTS_FIELD_NUMBER: _builtins.int
+    TAKES_LIGHT_FIELD_NUMBER: _builtins.int
     session_id: _builtins.str
     """Distinguishes this session in the logs of both ends."""
     exact: _builtins.bool
@@ -630,6 +637,8 @@ class Welcome(_message.Message):
     """
     relights: _builtins.bool
     """Whether the server takes frames whose render is relit."""
+    takes_light: _builtins.bool
+    """Whether the server takes a light that is sent with a relit frame."""
     def __init__(
         self,
         *,
@@ -637,10 +646,11 @@ class Welcome(_message.Message):
         exact: _builtins.bool = ...,
         rate_hz: _builtins.float = ...,
         relights: _builtins.bool = ...,
+        takes_light: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["exact", b"exact", "rate_hz", b"rate_hz", "relights", b"relights", "session_id", b"session_id"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["exact", b"exact", "rate_hz", b"rate_hz", "relights", b"relights", "session_id", b"session_id", "takes_light", b"takes_light"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -192,8 +192,12 @@ def _slice_bytes(frame: I420, coding: _Coding, made: Encoded, kinds: NDArray[np.
     else:
         prediction = prediction_of(packet, coding.view, coding.state.past)
         reference = prediction.picture(packet.references[-1])
-        light = packet.photometric
-        choice = FrameChoice(packet.references, photometric=light, relight=packet.relit)
+        choice = FrameChoice(
+            packet.references,
+            photometric=packet.photometric,
+            relight=packet.relit,
+            light=packet.light,
+        )
         for kind in np.unique(kinds):
             without = composed(reference, frame, kinds == kind)
             spared[kind] = max(0, whole - len(coding.of(without, choice).packet.payload))
