@@ -3,6 +3,9 @@
 The process runs on one core, while a processor is idle; it ends with the server, whose end of a
 pipe it reads. One that ends by itself, or is killed, is started again. A second process on the same
 recordings waits until the first is gone.
+
+What vehicles show that are not recorded never reaches it: the server tries learnt fields on that
+itself (``UnrecordedTrials``), in memory, and tells the process how many bits more they took.
 """
 
 from __future__ import annotations
@@ -15,20 +18,36 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import structlog
 
-from mec_server.event_loop import work_when_idle
+from mec_server.event_loop import Workers, work_when_idle
 from mec_server.tile_history import LEARNING, TileHistory, read_histories
-from mec_server.tile_learning import LearningJob, LearningRounds
+from mec_server.tile_learning import (
+    CHECK_EVERY,
+    CHECK_FRAMES,
+    Harm,
+    LearningJob,
+    LearningRounds,
+    percent_worse,
+)
+from mec_server.twin.state import CameraKey, TwinView
+from rfcore.camera import Camera
 from rfcore.errors import RfedgeError
+from rfcore.field import RadianceField
+from rfcore.native.yuv import rgb_from_i420
+from rfcore.update.passes import Pass
 from rfcore.update.run import LearnAs
+from rfcore.views import PosedPicture
 from rfcore.wire.settings import LogForm, configure_logs
 
-__all__ = ["ONE_THREAD", "Learner", "main"]
+__all__ = ["ONE_THREAD", "Learner", "UnrecordedTrials", "main"]
 
 log = structlog.get_logger()
 
@@ -37,6 +56,8 @@ EVERY_S = 0.5
 RESTART_S = 30.0
 """A process that ended is started again this long after its start, at the earliest."""
 STOP_S = 5.0
+MOST_PAUSE_S = 2.0
+"""Between two pictures of one trial: who pauses for longer makes room for another."""
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
 Command = tuple[str, ...]
 
@@ -85,6 +106,13 @@ class Learner:
             self.start()
         self._show(read_histories(self._job.recordings))
 
+    def report(self, harm: Harm) -> None:
+        """Tell the process what was found; nothing if there is none now."""
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(BrokenPipeError):
+                self._process.stdin.write(json.dumps(asdict(harm)).encode() + b"\n")
+                self._process.stdin.flush()
+
     def close(self) -> None:
         """End the process."""
         process = self._process
@@ -99,18 +127,109 @@ class Learner:
             process.wait()
 
 
+@dataclass(frozen=True)
+class _Watched:
+    """A learnt field that vehicles take now."""
+
+    tile: str
+    replaced_id: str
+
+
+class UnrecordedTrials:
+    """Tries learnt fields on what vehicles show that are not recorded.
+
+    Of one camera at a time the pictures of ``CHECK_FRAMES`` frames in a row stay in memory until
+    they were coded against the learnt field and against what it replaced, on a thread that works
+    while a processor is idle; how many bits more the one took is all that is told (``report``). A
+    camera's turn comes again after ``CHECK_EVERY`` frames. ``open_field`` opens fields for that
+    thread alone; ``failed`` is called with what went wrong there.
+    """
+
+    def __init__(
+        self,
+        open_field: Callable[[str], RadianceField],
+        failed: Callable[[Exception], None],
+        report: Callable[[Harm], None],
+    ) -> None:
+        self._open_field, self._report = open_field, report
+        self._worker = Workers(1, failed, "trials", idle=True)
+        self._watched: Mapping[str, _Watched] = {}
+        self._rested: Counter[tuple[CameraKey, str]] = Counter()
+        self._taken: list[TwinView] = []
+        self._is_trying = False
+
+    def close(self) -> None:
+        """Stop the thread."""
+        self._worker.close()
+
+    def watch(self, histories: Mapping[str, TileHistory]) -> None:
+        """Try what these tell of, unless it was withdrawn."""
+        self._watched = {
+            one.field_id: _Watched(tile, one.replaced_id)
+            for tile, history in histories.items()
+            for one in history.learnt
+            if not one.withdrawn
+        }
+
+    def saw(self, view: TwinView) -> None:
+        """Take a picture of a vehicle that is not recorded; called on the event loop."""
+        watched = self._watched.get(view.field_id)
+        if watched is None or view.frame.pose is None:
+            return
+        turn = (view.key, view.field_id)
+        self._rested[turn] = max(0, self._rested[turn] - 1)
+        if self._is_trying:
+            return
+        if self._taken and view.reconstructed_s - self._taken[-1].reconstructed_s > MOST_PAUSE_S:
+            self._taken = []
+        if not self._taken and self._rested[turn] == 0:
+            self._taken = [view]
+        elif self._taken and (self._taken[0].key, self._taken[0].field_id) == turn:
+            self._taken.append(view)
+        if len(self._taken) == CHECK_FRAMES:
+            views, self._taken, self._is_trying = self._taken, [], True
+            self._rested[turn] = CHECK_EVERY - CHECK_FRAMES
+            self._worker.submit(
+                view.vehicle_id, partial(self._tried, watched, views), self._finished
+            )
+
+    def left(self, vehicle_id: str) -> None:
+        """Forget a vehicle that is gone."""
+        self._taken = [view for view in self._taken if view.vehicle_id != vehicle_id]
+        for turn in [turn for turn in self._rested if turn[0][0] == vehicle_id]:
+            del self._rested[turn]
+
+    def _finished(self, outcome: Harm | Exception) -> None:
+        self._is_trying = False
+        if isinstance(outcome, Exception):
+            raise outcome
+        self._report(outcome)
+
+    def _tried(self, watched: _Watched, views: Sequence[TwinView]) -> Harm:
+        field_id, vehicle_id = views[0].field_id, views[0].vehicle_id
+        before, after = self._open_field(watched.replaced_id), self._open_field(field_id)
+        drive = Pass(vehicle_id, tuple(map(_posed, views)))
+        return Harm(watched.tile, field_id, vehicle_id, percent_worse(before, after, drive))
+
+
+def _posed(view: TwinView) -> PosedPicture:
+    assert view.frame.pose is not None
+    camera = Camera(view.intrinsics, view.frame.pose)
+    return PosedPicture(view.frame.camera_id, camera, partial(rgb_from_i420, view.picture))
+
+
 def main() -> None:
     """Be the learning process: ``mec_server.learner JOB LOG_FORM``."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     work_when_idle()
     job = _job(json.loads(sys.argv[1]))
     configure_logs(sys.stderr, LogForm(sys.argv[2]))
-    threading.Thread(target=_end_with_the_server, daemon=True).start()
+    rounds = LearningRounds(job, lambda: time.time_ns() // 1_000_000)
+    threading.Thread(target=_follow_the_server, args=(rounds,), daemon=True).start()
     folder = job.recordings / LEARNING
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        rounds = LearningRounds(job, lambda: time.time_ns() // 1_000_000)
         while True:
             _try(rounds)
             time.sleep(EVERY_S)
@@ -123,8 +242,10 @@ def _try(rounds: LearningRounds) -> None:
         log.error("learning failed", problem=str(error))
 
 
-def _end_with_the_server() -> None:
-    sys.stdin.buffer.read()
+def _follow_the_server(rounds: LearningRounds) -> None:
+    """Take what the server reports, a line each, and end with it."""
+    for line in sys.stdin.buffer:
+        rounds.report(Harm(**json.loads(line)))
     os._exit(0)
 
 

@@ -29,7 +29,7 @@ from mec_server.fields.index import FieldIndex, PublishedFields, field_loader
 from mec_server.fields.service import FieldService
 from mec_server.fields.shelf import FieldShelf
 from mec_server.guard import Guard
-from mec_server.learner import Learner
+from mec_server.learner import Learner, UnrecordedTrials
 from mec_server.ledger.budgets import (
     Resource,
     budgets_of,
@@ -153,6 +153,7 @@ class EdgeServer:
         self._shelf = FieldShelf(self._index, load)
         self._recorder = self._open_recorder(config.record)
         self._learner = self._open_learner(config)
+        self._trials = None if self._learner is None else self._open_trials(self._learner)
         self._published = PublishedFields(config.fields, self._shelf.open)
         self._following: list[asyncio.Task[None]] = []
         self._access = AccessFile(config.access)
@@ -242,6 +243,7 @@ class EdgeServer:
             expect_picture=lambda field_id, camera: self._notices.expect(field_id, camera),
             open_cameras=open_decoders,
             recorder=self._recorder,
+            trials=self._trials,
         )
 
     def _entry_control(self) -> EntryControl:
@@ -367,6 +369,8 @@ class EdgeServer:
         await asyncio.to_thread(self._views.close)
         if self._learner is not None:
             await asyncio.to_thread(self._learner.close)
+        if self._trials is not None:
+            await asyncio.to_thread(self._trials.close)
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
         if self._metrics_endpoint is not None:
@@ -530,8 +534,16 @@ class EdgeServer:
         )
         return Learner(job, config.log, self._show_learnt)
 
+    def _open_trials(self, learner: Learner) -> UnrecordedTrials:
+        def open_field(field_id: str) -> RadianceField:
+            return self._shelf.open(field_id).with_threads(1)
+
+        return UnrecordedTrials(open_field, self._failed(BackgroundTask.LEARNING), learner.report)
+
     def _show_learnt(self, histories: Mapping[str, TileHistory]) -> None:
         self._metrics.show_learnt(histories)
+        if self._trials is not None:
+            self._trials.watch(histories)
         self._field_service.show_learnt(
             one for name, history in histories.items() for one in history.newest(name)
         )

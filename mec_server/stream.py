@@ -173,6 +173,8 @@ class Stream:
         self._timer.cancel()
         self._decoders.close()
         self._server.twin.leave(self._session.session_id)
+        if self._server.trials is not None:
+            self._server.trials.left(self.vehicle_id)
         self._metrics.forget()
         self._account.ended(time.monotonic())
         self._account.leave()
@@ -427,6 +429,8 @@ class Stream:
             opened_time_ns=self._opened_time_ns,
         )
         self._server.twin.show(shown, reconstruction.render)
+        if self._server.trials is not None and not hello.allow_recording:
+            self._server.trials.saw(shown)
 
 
 def _agent_process(context: Context) -> str:

@@ -11,6 +11,7 @@ from functools import partial
 from mec_server.config import SessionLimits
 from mec_server.connections import Connections
 from mec_server.event_loop import Workers
+from mec_server.learner import UnrecordedTrials
 from mec_server.ledger.entry import EntryControl
 from mec_server.ledger.ledger import Hold
 from mec_server.ledger.peer_log import LogLimiter
@@ -51,6 +52,7 @@ class ServerContext:
     """Called when the decoding of a picture with a pose begins: with its field's id and camera."""
     open_cameras: OpenCameras
     recorder: Recorder | None = None
+    trials: UnrecordedTrials | None = None
 
 
 class OpeningCancelled(RfedgeError):

@@ -3,7 +3,8 @@
 Files: the recordings of ``mec_server.recorder``, the folder of fields, and RECORDINGS/.learning/:
 ``tiles.json``, what was learnt, tried and withdrawn of each tile (``TileHistory``), and a lock that
 one process holds. A round first checks what was published (``withdraw_worse``): the newest frames
-that vehicles coded against a learnt field are coded again against it and against what it replaced.
+that vehicles coded against a learnt field are coded again against it and against what it replaced;
+of vehicles that are not recorded the server does that, and says what it found (``report``).
 Then it learns (``learn_tile``): passes that are over and were not used before, sorted by light,
 without outliers; tried on frames held back; published as ``rfedge field publish --light`` does.
 What is published is one rename of the manifest, so a round may end anywhere. An identity is the id
@@ -18,6 +19,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -45,7 +47,14 @@ from rfcore.wire.publish import Ground, publish, roll_back
 from rfcore.wire.tile_manifest import TileVersions, VersionLabel, read_publication
 from rfcore.wire.tiles import Tile
 
-__all__ = ["LearningJob", "LearningRounds"]
+__all__ = [
+    "CHECK_EVERY",
+    "CHECK_FRAMES",
+    "Harm",
+    "LearningJob",
+    "LearningRounds",
+    "percent_worse",
+]
 
 log = structlog.get_logger()
 
@@ -89,6 +98,27 @@ class LearningJob:
         )
 
 
+@dataclass(frozen=True)
+class Harm:
+    """How many percent more bits a vehicle that is not recorded took for a field that was learnt
+    than it would have for what this replaced; below 0: fewer."""
+
+    tile: str
+    field_id: str
+    vehicle: str
+    percent: float
+
+
+def percent_worse(before: RadianceField, after: RadianceField, drive: Pass) -> float:
+    """Return how many percent more bits the newest ``CHECK_FRAMES`` of a pass take ``after`` than
+    ``before``; 0 for fewer frames, or for such as agree with no field."""
+    newest = Pass(drive.identity, drive.pictures[-CHECK_FRAMES:])
+    if len(newest.pictures) < CHECK_FRAMES or not without_outliers(after, [newest]):
+        return 0.0
+    frames = [SeenFrame(one.camera.rounded(), one.read(), 0) for one in newest.pictures]
+    return -saved_percent(try_field(before, frames), try_field(after, frames))[0]
+
+
 class BudgetSpent(Exception):
     """The CPU time of this hour is spent; the round goes on when there is more."""
 
@@ -99,6 +129,11 @@ class LearningRounds:
     def __init__(self, job: LearningJob, now_ms: Callable[[], int]) -> None:
         self._job, self._now_ms = job, now_ms
         self._learners: dict[str, TileLearner] = {}
+        self._reports: SimpleQueue[Harm] = SimpleQueue()
+
+    def report(self, harm: Harm) -> None:
+        """Take what the server found; may be called by another thread than ``run``."""
+        self._reports.put(harm)
 
     def run(self) -> None:
         """Withdraw what made bits worse, then learn what there is to learn.
@@ -118,6 +153,11 @@ class LearningRounds:
             _attempt(learner, partial(learner.learn, self._watch))
 
     def _watch(self) -> None:
+        while not self._reports.empty():
+            harm = self._reports.get()
+            if harm.tile in self._learners:
+                learner = self._learners[harm.tile]
+                _attempt(learner, partial(learner.withdraw_reported, harm))
         for learner in self._learners.values():
             _attempt(learner, learner.withdraw_worse)
 
@@ -156,12 +196,24 @@ class TileLearner:
 
     def withdraw_worse(self) -> None:
         """Withdraw each current field that was learnt and costs somebody bits; count it."""
+        for one in self._current():
+            self._check(one)
+
+    def withdraw_reported(self, harm: Harm) -> None:
+        """Withdraw a current field that costs a vehicle bits which is not recorded; count it."""
+        if harm.percent > self._job.settings().max_loss_percent:
+            for one in self._current():
+                if one.field_id == harm.field_id:
+                    self._withdraw(one, harm.vehicle, harm.percent)
+
+    def _current(self) -> Iterator[Learnt]:
+        """Yield what was learnt and is published."""
         versions = self._versions()
         for light in ("", *versions.lights):
             number = versions.lights[light] if light else versions.current
             for one in self.history.learnt:
                 if one.field_id == versions.field_ids[number - 1] and not one.withdrawn:
-                    self._check(one)
+                    yield one
 
     def _check(self, one: Learnt) -> None:
         for part in readable(self._recordings.files(FRESH_S)):
@@ -173,20 +225,11 @@ class TileLearner:
             self._keep(checked={**self.history.checked, key: len(pictures)})
             origin = self._open(one.replaced_id).metadata.tile_origin
             drive = pass_of(part, {one.field_id}, origin)
-            worse = self._percent_worse(one, drive)
+            before, after = self._open(one.replaced_id), self._open(one.field_id)
+            worse = percent_worse(before, after, drive)
             if worse > self._job.settings().max_loss_percent:
                 self._withdraw(one, drive.identity, worse)
                 return
-
-    def _percent_worse(self, one: Learnt, drive: Pass) -> float:
-        before, after = self._open(one.replaced_id), self._open(one.field_id)
-        newest = Pass(drive.identity, drive.pictures[-CHECK_FRAMES:])
-        if len(newest.pictures) < CHECK_FRAMES or not without_outliers(after, [newest]):
-            return 0.0
-        frames = [
-            SeenFrame(picture.camera.rounded(), picture.read(), 0) for picture in newest.pictures
-        ]
-        return -saved_percent(try_field(before, frames), try_field(after, frames))[0]
 
     def _withdraw(self, one: Learnt, identity: str, worse_percent: float) -> None:
         versions = self._versions()

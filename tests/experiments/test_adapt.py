@@ -19,6 +19,7 @@ from rfedge.experiments.adapt.measure import (
     AdaptRow,
     adapt_section,
     drives_to_break_even,
+    first_kbit_at,
     kbit_at,
     messages_differ,
     most_kbit,
@@ -77,6 +78,14 @@ def test_bits_at_a_quality_are_those_of_the_curve_and_none_are_made_up_outside_i
     assert kbit_at(30.0, done) == pytest.approx(8 * 0.5)
     assert kbit_at(29.9, done) is None
     assert kbit_at(40.1, done) is None
+
+
+def test_the_first_frame_has_a_curve_of_its_own() -> None:
+    done = coded_at(*((40.0 - 2 * n, 1000 - 100 * n) for n in range(6)))
+    for clip in done.clips:
+        clip.frame_bytes[0] = 5 * clip.frame_bytes[1]
+    assert first_kbit_at(36.0, done) == pytest.approx(5 * 8 * 0.8)
+    assert first_kbit_at(40.1, done) is None
 
 
 def test_above_33_db_the_fewest_bits_are_an_upper_bound() -> None:

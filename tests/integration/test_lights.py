@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 
 from cav_agent.field_cache import fetch_field
+from mec_server.config import LearnSettings
+from mec_server.learner import UnrecordedTrials
+from mec_server.twin.state import TwinView
 from rfcore.errors import RfedgeError
 from rfcore.field import FieldStore, SplatField, load_field, save_field
 from rfcore.field.layer import VOXELS_M, ColourLayer, layer_archive, layered_field, voxels_of
@@ -155,3 +158,22 @@ def lit(driving: Any) -> str | None:
     """Return the field of another light that the last picture was coded against."""
     lines = driving.lines()
     return lines[-1]["light_field"] if lines else None
+
+
+async def test_learnt_fields_are_tried_on_vehicles_that_are_not_recorded(
+    coded: Any, serve: Any, raw_vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[TwinView] = []
+    left: list[str] = []
+    monkeypatch.setattr(UnrecordedTrials, "saw", lambda _, view: seen.append(view))
+    monkeypatch.setattr(UnrecordedTrials, "left", lambda _, name: left.append(name))
+    async with serve(record=tmp_path, learn=LearnSettings(on=True)) as server:
+        for name, consents in (("recorded", True), ("private", False)):
+            hello = replace(coded.hello, vehicle_id=name, allow_recording=consents)
+            async with raw_vehicle(server.address) as vehicle:
+                await vehicle.greet(hello)
+                assert await vehicle.told(coded.frames[0]) == ("ack", 0)
+    assert [view.vehicle_id for view in seen] == ["private"]
+    assert seen[0].digest == coded.frames[0].packet.reconstruction_digest
+    assert left == ["recorded", "private"]
+    assert not list(tmp_path.rglob("private"))

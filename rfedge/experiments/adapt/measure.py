@@ -38,6 +38,7 @@ from rfedge.experiments.cells import CellStore, program_version
 from rfedge.experiments.clips import Drive, DriveName, read_drive
 from rfedge.experiments.field_coder import FieldCoder, render_clip
 from rfedge.experiments.performance import Performance, perform
+from rfedge.experiments.rate_curve import rate_curve
 from rfedge.experiments.rivals import x264_for_psnr
 from rfedge.report.tables import heading, print_table, table
 from rfedge.results import (
@@ -67,6 +68,7 @@ __all__ = [
 
 AT_DB = 33.0
 FINER_DB = 36.0
+FIRST = slice(0, 1)
 POINTS = (18.0, 22.0, 26.0, 30.0, 34.0, 38.0, 42.0)
 QUICK_FRAMES = 6
 OWN_KEYS = ("field", "noon", "empty")
@@ -122,9 +124,12 @@ class AdaptRow:
     noon_messages_differ: int | None = None
     """The same in the field's own light."""
     relit_frames: int | None = None
-    """Frames under the light of the one before, at the rate nearest to 33 dB."""
+    """Frames under the light of the one before, or under one that was sent, at the rate nearest to
+    33 dB."""
     switches: int | None = None
     """How often frames begin or cease to be relit there."""
+    first_kbit_33db: float | None = None
+    """Kilobits of the first frame where it has 33 dB itself."""
 
 
 @dataclass(frozen=True)
@@ -302,6 +307,7 @@ class _Measured:
                 ),
                 relit_frames=int(sum(map(float, chosen))),
                 switches=int(np.count_nonzero(np.diff([float(relit) for relit in chosen]))),
+                first_kbit_33db=first_kbit_at(AT_DB, done),
             )
 
     def _tool_ms(self, drive: Drive) -> Mapping[str, float]:
@@ -418,6 +424,14 @@ def kbit_at(psnr_db: float, done: Performance) -> float | None:
     return 8e-3 * done.steady.bytes_at(psnr_db)
 
 
+def first_kbit_at(psnr_db: float, done: Performance) -> float | None:
+    """Return the kilobits of the first frame at a luma PSNR of its own; None outside the curve."""
+    reached_db = [clip.psnr_db(FIRST) for clip in done.clips]
+    if not min(reached_db) <= psnr_db <= max(reached_db):
+        return None
+    return 8e-3 * rate_curve(done.clips, FIRST).bytes_at(psnr_db)
+
+
 COLUMNS = (
     "case",
     "drive",
@@ -443,6 +457,7 @@ LATER_COLUMNS: Mapping[str, Callable[[AdaptRow], object]] = {
     "at noon": lambda row: row.noon_messages_differ,
     "relit frames": lambda row: row.relit_frames,
     "switches": lambda row: row.switches,
+    "first kbit at 33 dB": lambda row: row.first_kbit_33db,
 }
 """Left out of the page where no row has them, as in results of before."""
 
