@@ -1,9 +1,9 @@
 """A dataset of any format, recognised by the files that are there.
 
-``transforms.json`` (nerfstudio, instant-ngp), a COLMAP model, a KITTI odometry sequence, INRIA's
-``cameras.json``, ``camera.toml`` for a recording of one's own, or what servers recorded: one
-``recording.jsonl``, or a folder that they lie below, together in order of time. A folder with more
-than one of the others is ambiguous: the file itself is to be named.
+``transforms.json`` (nerfstudio, instant-ngp), a COLMAP model, a KITTI odometry sequence or raw
+drive, INRIA's ``cameras.json``, ``camera.toml`` for a recording of one's own, or what servers
+recorded: one ``recording.jsonl``, or a folder that they lie below, together in order of time. A
+folder with more than one of the others is ambiguous: the file itself is to be named.
 
 ``read_inria_source`` reads the ``cameras.json`` of the INRIA 3D Gaussian Splatting code: each entry
 has ``img_name``, ``width``, ``height``, ``fx``, ``fy`` in pixels, ``position`` in the
@@ -23,7 +23,7 @@ from rfcore.camera import Intrinsics, TileOrigin
 from rfcore.dataset.assemble import Dataset, Distortion, ReadOptions, assemble
 from rfcore.dataset.colmap import colmap_model_folder, read_colmap_source
 from rfcore.dataset.keys import load_json, pose_of_rows, table_at
-from rfcore.dataset.kitti import read_kitti_source
+from rfcore.dataset.kitti import OXTS, read_kitti_raw_source, read_kitti_source
 from rfcore.dataset.picture_file import check_size, find_picture, read_picture
 from rfcore.dataset.recorded_session import RECORDING_NAME, read_recorded_source, recordings_under
 from rfcore.dataset.recording import read_recording_source
@@ -100,8 +100,8 @@ def _camera(where: str, keys: Table) -> SourceCamera:
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp")
 EXPECTED = (
-    "transforms.json, sparse/0 of COLMAP, calib.txt of KITTI, cameras.json of INRIA, camera.toml, "
-    "recording.jsonl of a server"
+    "transforms.json, sparse/0 of COLMAP, calib.txt or oxts of KITTI, cameras.json of INRIA, "
+    "camera.toml, recording.jsonl of a server"
 )
 
 
@@ -123,7 +123,7 @@ def read_dataset(
 def read_source(path: Path) -> Source:
     """Read what is there, with its lenses and its own world."""
     if path.is_dir():
-        return _read_folder(path)
+        return read_kitti_raw_source(path.parent) if path.name == OXTS else _read_folder(path)
     if not path.exists():
         raise DatasetError(f"{path}: cannot be read (it does not exist)")
     refuse_video(path)
@@ -174,6 +174,8 @@ def _candidates(folder: Path) -> list[Path]:
     found = [file for file in named if file.is_file()]
     transforms = transforms_file(folder)
     model = colmap_model_folder(folder)
+    if (folder / OXTS / "data").is_dir():
+        found.append(folder / OXTS)
     if transforms is not None:
         found.append(transforms)
     if model is not None:
