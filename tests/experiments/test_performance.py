@@ -12,10 +12,12 @@ from rfedge.experiments.clips import Clip, CodedClip
 from rfedge.experiments.performance import (
     TIMED_FRAMES,
     TIMED_REPEATS,
+    CpuTime,
     Performance,
     perform,
     seconds_left,
     spanning_points,
+    time_in_turns,
 )
 
 PLANE = np.zeros((2, 2), np.uint8)
@@ -125,6 +127,14 @@ def test_processor_time_is_that_of_the_least_disturbed_run(store):
     made = perform(CLIP, coder, store)
     assert coder.times_ms == []
     assert made.cpu_ms_per_frame == 4.0 / len(CLIP.frames)
+
+
+def test_processor_time_in_turns_is_that_of_the_median_round(store):
+    coder = Timed([1.0, 99.0, 4.0, 5.0, 3.0, 8.0])
+    coded = [(coder, perform(CLIP, coder, store, timed=False))]
+    (timed,) = time_in_turns(CLIP, coded, store, (32.0, 35.0))
+    count = len(CLIP.frames)
+    assert timed.cpu == CpuTime(5.0 / count, None, 3.0 / count, 99.0 / count)
 
 
 def test_processor_time_is_taken_over_the_beginning_of_a_long_clip(store):
