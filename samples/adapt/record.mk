@@ -41,10 +41,20 @@ $(eval $(call learnt,noon,$(SAMPLE),$(NOON),all))
 $(eval $(call learnt,days-1,$(SAMPLE),$(call drive,days-1),all))
 $(eval $(call learnt,days-3,$(SAMPLE),$(call drive,days-3),all))
 
+# --- a drive at the poses that are found in a learnt field, from starts as far off as GNSS is
+
+FOUND := $(OUT)/passes-5/camera.toml
+$(OUT)/passes-5/found.tum: $(call drive,passes-5) $(OUT)/dusk-beside.rff
+	$(RFEDGE) localise $< --field $(OUT)/dusk-beside.rff --start-error 1.5m:1.5deg --out $@
+$(FOUND): $(OUT)/passes-5/found.tum
+	printf '%s\n' [camera] 'width_px = 640' 'height_px = 360' 'fx_px = 320.0' [pictures] 'folder = "drive"' \
+		'rate_hz = 10.0' [trajectory] 'file = "found.tum"' 'outside = "drop"' >$@
+
 # --- cases: NAME@HZ=DRIVE,KEY=PATH... as `rfedge eval adapt` takes them
 
 STREET := \
 	street-dusk@10=$(call drive,passes-5),field=$(SAMPLE),noon=$(NOON),learnt=$(OUT)/dusk-beside.rff,layer=$(OUT)/dusk-beside-layer.rff \
+	street-dusk-found@10=$(FOUND),field=$(SAMPLE),noon=$(NOON),learnt=$(OUT)/dusk-beside.rff,layer=$(OUT)/dusk-beside-layer.rff \
 	street-dusk-beside@10=$(call drive,passes-2),field=$(SAMPLE),noon=$(call drive,passes-1),learnt=$(OUT)/dusk.rff,layer=$(OUT)/dusk-layer.rff \
 	parked@10=$(call drive,passes-4),field=$(SAMPLE),empty=$(call drive,passes-1),learnt=$(OUT)/parked.rff \
 	noon-beside@10=$(call drive,passes-1),field=$(SAMPLE),learnt=$(OUT)/noon.rff \
