@@ -30,6 +30,7 @@ SPECIAL = {
     "size_px": (320, 180),
     "along_m": (3.0,),
     "oncoming_m": (5.0,),
+    "crossing_m": (7.0,),
     "rate_hz": 60.0,
     "rig": "mid_front,mid_back",
     "cameras": 17,

@@ -64,7 +64,7 @@ def test_effects_run_in_the_registrys_order(tmp_path: Path) -> None:
         ),
         (START + "[drive]\nsize_px = [640, 9]\n", r"line 4: drive.size_px\[1\]: is 9, outside 16"),
         (START + "[drive]\nthinned_hz = [7]\n", r"line 4: drive.thinned_hz: 7 does not divide"),
-        (START + "[effects.nose]\n", r"line 3: effects.nose: is none of auto_exposure, dusk"),
+        (START + "[effects.nose]\n", r"line 3: effects.nose: is none of auto_exposure, cyclists"),
         (START + "[effects.noise]\nread_e = 'x'\n", r"line 4: effects.noise.read_e: is 'x', not a"),
         (START + "[effects]\nnoise = 3\n", r"line 4: effects.noise: is 3, not a table"),
         (START + "[drive\n", r"s\.toml: .*line 3"),

@@ -13,21 +13,25 @@ import pytest
 from rfcore.errors import InvalidInput
 from rfcore.native import _native
 from rfedge.street import load_scene
-from rfedge.street.effects import EFFECTS, EffectKind, load_effect
+from rfedge.street.effects import EFFECTS, EffectKind, load_effect, rng_of
+from rfedge.street.effects.cyclists import Cyclists
 from rfedge.street.effects.dusk import Dusk
 from rfedge.street.effects.evening import Evening, daylight
 from rfedge.street.effects.overcast import Overcast
 from rfedge.street.effects.parked import ParkedVehicles
 from rfedge.street.effects.passing_cloud import PassingCloud
+from rfedge.street.effects.pedestrians import Pedestrians
 from rfedge.street.effects.traffic import Traffic
 from rfedge.street.effects.tunnel import Tunnel
 from rfedge.street.effects.wet_road import WetRoad
 from rfedge.street.effects.works import Works
-from rfedge.street.geometry.layout import Geometry, Layout
+from rfedge.street.geometry.cyclist import Cyclist, riding
+from rfedge.street.geometry.layout import FACADE_M, PAVEMENT_UP_M, Geometry, Layout
 from rfedge.street.geometry.mesh import Label, Mesh, placed
+from rfedge.street.geometry.person import Person, walking
 from rfedge.street.geometry.road import road
 from rfedge.street.geometry.sky import DUSK, NOON, Daylight, sunny_sky
-from rfedge.street.geometry.world import Sky, World
+from rfedge.street.geometry.world import Mover, Sky, World
 from rfedge.street.shots import Split, shots_of
 
 ROOT = Path(__file__).parents[2]
@@ -219,6 +223,129 @@ def test_no_camera_of_the_ready_made_traffic_is_inside_a_vehicle(
             assert abs(x) > 4.0 or abs(y) > 1.6
 
 
+WALKING_PARTS, RIDING_PARTS = len(walking(Person(), 0.0, 0.0)), len(riding(Cyclist(), 0.0))
+
+
+def bodies_at(movers: tuple[Mover, ...], time_s: float, parts: int) -> list[np.ndarray]:
+    """Return the vertices of each person at a time, world."""
+    placed_parts = [
+        np.concatenate([placed(m, mover.world_from_mover(time_s)).vertices for m in mover.meshes])
+        for mover in movers
+    ]
+    starts = range(0, len(placed_parts), parts)
+    return [np.concatenate(placed_parts[start : start + parts]) for start in starts]
+
+
+def test_people_walk_on_the_pavements_past_posts_and_trees(street: World) -> None:
+    people = Pedestrians((-10.0, 4.0), (7.0, -3.0), crossing_m=()).change(street, rng())
+    assert people.meshes == street.meshes
+    found = {}
+    for time_s in (0.0, 3.1):
+        bodies = bodies_at(people.movers, time_s, WALKING_PARTS)
+        assert len(bodies) == 4
+        for body in bodies:
+            assert body[:, 2].min() == pytest.approx(PAVEMENT_UP_M, abs=2e-3)
+            across = np.abs(body[:, 1])
+            assert across.min() > 8.0, "lamps and trees stand nearer to the road"
+            assert across.max() < FACADE_M - 0.2
+        found[time_s] = np.array([body.mean(axis=0) for body in bodies])
+    assert (found[0.0][:, 1] < 0).tolist() == [True, False] * 2, "on both pavements"
+    moved = found[3.1][:, 0] - found[0.0][:, 0]
+    np.testing.assert_allclose(moved, 3.1 * 1.4 * np.array([1, 1, -1, -1]), atol=0.12)
+
+
+def test_who_crosses_goes_from_kerb_to_kerb_and_comes_back(street: World) -> None:
+    """At 1 m/s: 6.6 m to the middle of the road, 8.8 m more to where they turn."""
+    people = Pedestrians((), (), crossing_m=(3.0, 9.0), speed_mps=1.0).change(street, rng())
+    hips = people.movers[0], people.movers[WALKING_PARTS]
+    for mover, side, x_m in zip(hips, (-1, 1), (3.0, 9.0), strict=True):
+        for time_s, y_m in ((0.0, 6.6), (6.6, 0.0), (15.4, -8.8), (24.2, 0.0), (33.0, 8.8)):
+            pose = mover.world_from_mover(time_s)
+            assert pose[:2, 3] == pytest.approx([x_m, side * y_m])
+        steps = np.linspace(0, 36, 400)
+        poses = [mover.world_from_mover(t) for t in steps]
+        y_m = np.array([pose[1, 3] for pose in poses])
+        ahead = np.array([pose[1, 0] for pose in poses])[:-1]
+        assert (np.sign(np.diff(y_m)) == np.sign(ahead)).mean() > 0.98, "they look where they go"
+    for time_s in np.linspace(0.0, 20.0, 41):
+        for body in bodies_at(people.movers, time_s, WALKING_PARTS):
+            assert body[:, 2].min() > -1e-3
+            assert body[:, 2].min() < PAVEMENT_UP_M + 2e-3
+
+
+def test_cyclists_keep_between_the_lane_and_the_bays(street: World) -> None:
+    riders = Cyclists((-10.0,), (10.0,), speed_mps=4.0).change(street, rng())
+    for time_s in (0.0, 1.3):
+        along, oncoming = bodies_at(riders.movers, time_s, RIDING_PARTS)
+        for body, direction, start in ((along, 1, -10.0), (oncoming, -1, 10.0)):
+            assert body[:, 2].min() == pytest.approx(0.0, abs=1.5e-3), "a tyre has 36 sides"
+            across = -direction * body[:, 1]
+            assert across.min() > 3.1
+            assert across.max() < 4.1
+            middle_m = 0.5 * (body[:, 0].min() + body[:, 0].max())
+            assert middle_m == pytest.approx(start + direction * 4.0 * time_s, abs=0.2)
+
+
+def test_people_change_nothing_else_in_the_street(street: World) -> None:
+    """What was there stays the same object, and vehicles are those of the same street without."""
+    for effect in (Pedestrians(), Cyclists()):
+        with_people = effect.change(street, rng())
+        assert with_people.meshes is street.meshes or with_people.meshes == street.meshes
+        assert with_people.sky is street.sky
+        assert all(with_people.materials[name] is m for name, m in street.materials.items())
+        one, other = (ParkedVehicles().change(world, rng()) for world in (street, with_people))
+        assert [m.vertices.tobytes() for m in one.meshes] == [
+            m.vertices.tobytes() for m in other.meshes
+        ]
+
+
+@pytest.mark.parametrize("name", ["street-people", "samples/street/people.toml"])
+def test_nobody_of_the_ready_made_people_is_inside_a_vehicle_or_at_the_camera(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The middle of a body against vehicles of 5 by 2.2 m, cyclists and the camera."""
+    monkeypatch.chdir(ROOT)
+    scene = load_scene(name)
+    sky = Sky(np.full((16, 32, 3), 0.5, np.float32))
+    world = World(Layout(scene.geometry), sky)
+    movers, parked = {}, []
+    for effect in EFFECTS:
+        if effect.name in scene.effects:
+            made = scene.effects[effect.name].change(world, rng_of(effect, scene.geometry.seed, 0))
+            movers[effect.name] = made.movers
+            parked += [mesh.vertices for mesh in made.meshes]
+    walkers = movers["pedestrians"][::WALKING_PARTS]
+    riders = movers["cyclists"][::RIDING_PARTS]
+    standing = np.concatenate(parked)[:, :2]
+    for shot in shots_of(scene, Split.DRIVE)[::4]:
+        now = shot.time_s
+        people = np.array([m.world_from_mover(now)[:2, 3] for m in (*walkers, *riders)])
+        for mover in movers["traffic"]:
+            pose = mover.world_from_mover(now)
+            apart = np.abs((people - pose[:2, 3]) @ pose[:2, :2])
+            assert ((apart[:, 0] > 2.8) | (apart[:, 1] > 1.2)).all()
+        on_foot, riding_m = people[: len(walkers)], people[len(walkers) :]
+        for place in riding_m:
+            apart = np.abs(on_foot - place)
+            assert ((apart[:, 0] > 1.2) | (apart[:, 1] > 0.6)).all()
+        near = np.linalg.norm(standing[:, None] - people[None], axis=2)
+        assert near.min() > 0.3
+        eye = np.array(shot.camera.world_from_cam.translation_m)[:2]
+        assert np.linalg.norm(people - eye, axis=1).min() > 1.3
+
+
+def test_people_out_of_range_are_refused_with_line_and_limit(tmp_path: Path) -> None:
+    head = 'name = "x"\nfield = "x"\n'
+    for text, said in (
+        ("[effects.pedestrians]\nspeed_mps = 4.0\n", r"line 4: .*speed_mps: is 4.0, outside 0..3"),
+        ("[effects.cyclists]\nalong_m = [0.0, 2000.0]\n", r"line 4: .*is 2000.0, outside -1000"),
+        ("[effects.cyclists]\ncrossing_m = [1.0]\n", r"line 4: .*crossing_m"),
+    ):
+        (tmp_path / "s.toml").write_text(head + text)
+        with pytest.raises(InvalidInput, match=said):
+            load_scene(str(tmp_path / "s.toml"))
+
+
 def test_dusk_and_overcast_change_only_the_light(street: World) -> None:
     for effect in (Dusk(cover=0.0), Overcast()):
         changed = effect.change(street, rng())
@@ -283,8 +410,8 @@ print(Path(rfedge.__file__).parents[1])
 """
 SMALL = 'name = "x"\nfield = "x"\n[geometry]\nlength_m = 40\ntrees = false\n'
 PARTS = (
-    ("parked", "works", "overcast", "haze", "lens", "exposure"),
-    ("traffic", "dusk", "wet_road", "rain", "rolling_shutter", "noise"),
+    ("parked", "works", "pedestrians", "overcast", "haze", "lens", "exposure"),
+    ("traffic", "cyclists", "dusk", "wet_road", "rain", "rolling_shutter", "noise"),
     ("tunnel", "evening", "passing_cloud", "auto_exposure"),
 )
 

@@ -51,6 +51,8 @@ EFFECTS = (
     Effect("works", EffectKind.GEOMETRY, "Works", "a building site stands beside the lane"),
     Effect("parked", EffectKind.GEOMETRY, "ParkedVehicles", "vehicles stand in the parking bays"),
     Effect("traffic", EffectKind.GEOMETRY, "Traffic", "vehicles drive on both lanes"),
+    Effect("pedestrians", EffectKind.GEOMETRY, "Pedestrians", "people walk, some across the road"),
+    Effect("cyclists", EffectKind.GEOMETRY, "Cyclists", "people ride at the edges of the road"),
     Effect("dusk", EffectKind.LIGHT, "Dusk", "the sun is low"),
     Effect("evening", EffectKind.LIGHT, "Evening", "the sun sinks from noon to dusk"),
     Effect("overcast", EffectKind.LIGHT, "Overcast", "clouds hide the sun"),

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from rfcore.tables import Range
-from rfedge.street.geometry.layout import BEYOND_M, LANE_M
+from rfedge.street.geometry.layout import BEYOND_M, LANE_M, Course
 from rfedge.street.geometry.mesh import F64
 from rfedge.street.geometry.vehicle import Vehicle, vehicle, world_from_vehicle
 from rfedge.street.geometry.vehicle_trim import vehicle_materials
@@ -42,18 +42,6 @@ class Traffic:
         return world.plus(Part((), vehicle_materials(), tuple(movers)))
 
 
-@dataclass(frozen=True)
-class Course:
-    """Along which lane, from where at time 0, how fast; at ``reach_m`` it begins again."""
-
-    start_m: float
-    direction: int
-    speed_mps: float
-    reach_m: float
-
-
 def _pose(course: Course, time_s: float) -> F64:
-    driven_m = course.start_m + course.direction * course.speed_mps * time_s
-    x_m = (driven_m + course.reach_m) % (2 * course.reach_m) - course.reach_m
-    heading_rad = 0.0 if course.direction > 0 else np.pi
-    return world_from_vehicle(x_m, -course.direction * LANE_M, heading_rad)
+    y_m = -course.direction * LANE_M
+    return world_from_vehicle(course.x_m(time_s), y_m, course.heading_rad)

@@ -28,6 +28,7 @@ __all__ = [
     "ROAD_HALF_M",
     "SIDES",
     "Closure",
+    "Course",
     "Geometry",
     "Layout",
     "Place",
@@ -119,6 +120,30 @@ class Closure:
     side: int
     start_m: float
     end_m: float
+
+
+@dataclass(frozen=True)
+class Course:
+    """Where something that moves along the street began, which way it goes and how fast.
+
+    ``start_m`` is its x at time 0; at ``reach_m`` from the middle of the street it begins again at
+    the other end.
+    """
+
+    start_m: float
+    direction: int
+    speed_mps: float
+    reach_m: float
+
+    def x_m(self, time_s: float) -> float:
+        """Return where it is."""
+        moved_m = self.start_m + self.direction * self.speed_mps * time_s
+        return (moved_m + self.reach_m) % (2 * self.reach_m) - self.reach_m
+
+    @property
+    def heading_rad(self) -> float:
+        """Return where it looks, from x towards y."""
+        return 0.0 if self.direction > 0 else float(np.pi)
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,8 @@ class Label(IntEnum):
     POLE = 9
     WIRE = 10
     OBJECT = 11
+    PERSON = 12
+    BICYCLE = 13
 
 
 @dataclass(frozen=True, eq=False)

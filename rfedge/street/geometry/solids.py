@@ -1,4 +1,4 @@
-"""The simple bodies that streets are made of: rectangles, boxes, tubes and discs.
+"""The simple bodies that streets are made of: rectangles, boxes, tubes, lofts and discs.
 
 Texture coordinates are metres over ``tile_m``, the side of a texture on the wall, so that bricks
 are of one size everywhere.
@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rfcore.errors import InvalidInput
 from rfedge.street.geometry.mesh import F32, I32, Label, Mesh
 
-__all__ = ["Stuff", "boxes", "disc", "quads", "tube"]
+__all__ = ["Stuff", "boxes", "disc", "loft", "quads", "tube"]
 
 BOX_SIDES = np.array(
     [
@@ -90,6 +91,44 @@ def tube(stuff: Stuff, path: ArrayLike, radius_m: ArrayLike, sides: int = 10) ->
         label=stuff.label,
         normals=_flat(normals, 3),
     )
+
+
+def loft(stuff: Stuff, sections: ArrayLike, sides: int = 12) -> Mesh:
+    """Return a smooth body of level elliptical sections [N, 4], from the lowest to the highest.
+
+    A section is (height, middle along x, half width along x, half width along y); the body is open
+    where its first or last section has a width. Raises ``InvalidInput`` unless heights rise.
+    """
+    rings = np.asarray(sections, np.float64)
+    if (np.diff(rings[:, 0]) <= 0).any():
+        raise InvalidInput("loft.sections", f"heights {rings[:, 0].tolist()} do not rise")
+    turn = np.linspace(0, 2 * np.pi, sides + 1)
+    points = _ellipses(rings, turn)
+    up = _ellipses(np.gradient(rings, rings[:, 0], axis=0), turn)
+    width, depth = rings[:, 2, None], rings[:, 3, None]
+    round_ = np.stack(
+        np.broadcast_arrays(-width * np.sin(turn), depth * np.cos(turn), 0.0), axis=-1
+    )
+    normals = np.cross(round_, up)
+    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
+    uv = np.stack(
+        np.broadcast_arrays(turn[None] / (2 * np.pi), rings[:, :1] / stuff.tile_m), axis=-1
+    )
+    return Mesh(
+        vertices=_flat(points, 3),
+        faces=_grid_faces(len(rings), sides + 1),
+        uv=_flat(uv, 2),
+        material=stuff.material,
+        label=stuff.label,
+        normals=_flat(normals, 3),
+    )
+
+
+def _ellipses(rings: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Points [N, T, 3] of sections [N, 4] as ``loft`` has them."""
+    height, middle, half_x, half_y = (rings[:, i, None] for i in range(4))
+    x, y = middle + half_x * np.cos(turn), half_y * np.sin(turn)
+    return np.stack(np.broadcast_arrays(x, y, height), axis=-1)
 
 
 def disc(
