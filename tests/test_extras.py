@@ -244,6 +244,7 @@ DRIVE = f"empty@10={ROOT / 'samples/street/transforms_drive_empty.json'}"
         ("torch", "reference", "bench train"),
         ("torch", "reference", "bench ngp"),
         ("pyopencl", "opencl", "bench raster --isa opencl"),
+        ("scipy", "eval", f"eval classes {FIELD} {DRIVE}"),
         ("scipy", "eval", f"eval compare {FIELD} {DRIVE}"),
         ("scipy", "eval", f"eval never-worse {FIELD} {DRIVE}"),
         ("scipy", "eval", f"eval robust {FIELD} {DRIVE}"),

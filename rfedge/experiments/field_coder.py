@@ -32,7 +32,8 @@ from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Frame
 from rfedge.experiments.clips import CodedClip, luma_mse, luma_sse
 from rfedge.experiments.picture_quality import luma_ssim
-from rfedge.offline import Arrival, FrameInput, decode_promised, encode_frames
+from rfedge.experiments.rivals import CodedPictures
+from rfedge.offline import Arrival, CodedFrame, FrameInput, decode_promised, encode_frames
 
 __all__ = ["WITHOUT_FIELD", "FieldCoder", "RenderedClip", "message_bytes", "render_clip"]
 
@@ -160,19 +161,8 @@ class FieldCoder:
         longer one, ``CodecError`` if a receiver does not see what the sender promised.
         """
         del rate_hz
-        count = len(self._rendered.views)
-        if not 0 < len(frames) <= count:
-            raise InvalidInput("frames", f"{len(frames)} are outside the 1..{count} rendered")
-        config = CodecConfig(*frames[0].size_px, effort=self._effort, crf=point)
-        began_ns = process_time_ns()
-        encoder = DeltaEncoder(config)
-        coded = list(encode_frames(encoder, self._inputs(frames)))
-        cpu_ms = (process_time_ns() - began_ns) / 1e6
-        render_cpu_ms = self._renders * self._rendered.render_cpu_ms * len(frames) / count
-        began_ns = process_time_ns()
-        decoded = list(decode_promised(DeltaDecoder(encoder.header), coded))
-        receiver_cpu_ms = (process_time_ns() - began_ns) / 1e6
-        pairs = [(picture, coded_frame.given.frame) for coded_frame, picture in decoded]
+        coded, made = self._coded(frames, point)
+        pairs = list(zip(made.decoded, frames, strict=True))
         packets = [coded_frame.encoded.packet for coded_frame in coded]
         notes: dict[str, tuple[float | str, ...]] = {
             "references": tuple(references_name(packet.references) for packet in packets),
@@ -185,13 +175,37 @@ class FieldCoder:
             notes["foreground_sse"] = tuple(luma_sse(*pair, mask) for pair, mask in masked)
         return CodedClip(
             point,
-            np.array([message_bytes(frame.arrival) for frame in coded]),
+            np.array(made.frame_bytes),
             np.array([luma_mse(*pair) for pair in pairs]),
             np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
-            cpu_ms + render_cpu_ms,
+            made.cpu_ms,
             notes,
-            receiver_cpu_ms + render_cpu_ms,
+            made.decoder_cpu_ms,
         )
+
+    def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
+        """Return what ``code`` measures; takes and raises the same."""
+        del rate_hz
+        return self._coded(frames, point)[1]
+
+    def _coded(
+        self, frames: Sequence[I420], point: float
+    ) -> tuple[Sequence[CodedFrame], CodedPictures]:
+        count = len(self._rendered.views)
+        if not 0 < len(frames) <= count:
+            raise InvalidInput("frames", f"{len(frames)} are outside the 1..{count} rendered")
+        config = CodecConfig(*frames[0].size_px, effort=self._effort, crf=point)
+        began_ns = process_time_ns()
+        encoder = DeltaEncoder(config)
+        coded = list(encode_frames(encoder, self._inputs(frames)))
+        cpu_ms = (process_time_ns() - began_ns) / 1e6
+        render_cpu_ms = self._renders * self._rendered.render_cpu_ms * len(frames) / count
+        began_ns = process_time_ns()
+        decoded = [picture for _, picture in decode_promised(DeltaDecoder(encoder.header), coded)]
+        receiver_cpu_ms = (process_time_ns() - began_ns) / 1e6
+        sizes = [message_bytes(frame.arrival) for frame in coded]
+        both_ms = cpu_ms + render_cpu_ms, receiver_cpu_ms + render_cpu_ms
+        return coded, CodedPictures(sizes, decoded, *both_ms)
 
     def _inputs(self, frames: Sequence[I420]) -> Iterator[FrameInput]:
         for index, frame in enumerate(frames):

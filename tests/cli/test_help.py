@@ -21,7 +21,8 @@ VERBS = (
     *("link", "loadtest", "watch", "twin", "bench", "size"),
 )
 EVAL_VERBS = tuple(
-    f"eval {verb}" for verb in ("adapt", "compare", "never-worse", "paper", "robust", "sizing")
+    f"eval {verb}"
+    for verb in ("adapt", "classes", "compare", "never-worse", "paper", "robust", "sizing")
 )
 CERTS_VERBS = ("certs init", "certs show")
 SCENE_VERBS = ("scene build", "scene convert", "scene poses", "scene record-carla")

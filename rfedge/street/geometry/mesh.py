@@ -13,12 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
+from rfedge.datasets.classes import Label
 
 __all__ = [
     "F32",
@@ -38,25 +38,6 @@ __all__ = [
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
-
-
-class Label(IntEnum):
-    """What a pixel shows; the numbers are those of the class mask's levels."""
-
-    SKY = 0
-    ROAD = 1
-    MARKING = 2
-    PAVEMENT = 3
-    BUILDING = 4
-    WINDOW = 5
-    VEGETATION = 6
-    VEHICLE = 7
-    SIGN = 8
-    POLE = 9
-    WIRE = 10
-    OBJECT = 11
-    PERSON = 12
-    BICYCLE = 13
 
 
 @dataclass(frozen=True, eq=False)
