@@ -31,6 +31,7 @@ SPECIAL = {
     "along_m": (3.0,),
     "oncoming_m": (5.0,),
     "crossing_m": (7.0,),
+    "floors": (1, 3),
     "rate_hz": 60.0,
     "rig": "mid_front,mid_back",
     "cameras": 17,
@@ -89,8 +90,17 @@ def low_skies(monkeypatch: pytest.MonkeyPatch) -> None:
     blank = Sky(np.full((16, 32, 3), 0.5, np.float32))
     monkeypatch.setattr("rfedge.street.assembly.clear_sky", lambda _rng: blank)
     monkeypatch.setattr("rfedge.street.assembly.road", lambda *_: Part((), ()))
-    monkeypatch.setattr("rfedge.street.assembly.buildings", lambda *_: Part((), ()))
+    monkeypatch.setattr("rfedge.street.assembly.buildings", blocks_for_buildings)
     monkeypatch.setattr("rfedge.street.assembly.trees", posts_for_trees)
+
+
+def blocks_for_buildings(layout: Layout, _rng: np.random.Generator) -> Part:
+    """What is as high as a house: painting its walls takes seconds."""
+    blocks = [
+        boxes(Stuff("block", Label.BUILDING), (p.start_m, p.y_m, 0), (p.end_m, p.y_m, p.height_m))
+        for p in layout.plots
+    ]
+    return Part(tuple(blocks), (Material("block", (0.1, 0.1, 0.1)),))
 
 
 def posts_for_trees(layout: Layout, _rng: np.random.Generator) -> Part:

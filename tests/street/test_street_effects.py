@@ -286,6 +286,27 @@ def test_cyclists_keep_between_the_lane_and_the_bays(street: World) -> None:
             assert middle_m == pytest.approx(start + direction * 4.0 * time_s, abs=0.2)
 
 
+def test_in_a_wider_street_nothing_of_the_effects_is_where_it_would_be_in_a_narrow_one() -> None:
+    """The site, the tunnel, parked vehicles and people are as much farther out as the kerbs."""
+    layout = Layout(Geometry(length_m=60.0, wider_m=2.5))
+    wide = World(layout, Sky(np.full((16, 32, 3), 0.5, np.float32)))
+    for effect, nearest_m in (
+        (Works(), 4.1),
+        (Tunnel(height_m=5.0), 6.6),
+        (ParkedVehicles(1.0), 3.9),
+    ):
+        made = effect.change(wide, rng())
+        points = np.concatenate([mesh.vertices for mesh in made.meshes])
+        low = points[points[:, 2] < 4.0]
+        assert np.abs(low[:, 1]).min() >= nearest_m + 2.5 - 1e-5
+    people = Pedestrians((-10.0, 4.0), (7.0,), (3.0,)).change(wide, rng())
+    *along, across = bodies_at(people.movers, 0.0, WALKING_PARTS)
+    for body in along:
+        assert np.abs(body[:, 1]).min() > 8.0 + 2.5
+        assert np.abs(body[:, 1]).max() < layout.facade_m - 0.2
+    assert across[:, 1].mean() == pytest.approx(-6.6 - 2.5, abs=0.2)
+
+
 def test_people_change_nothing_else_in_the_street(street: World) -> None:
     """What was there stays the same object, and vehicles are those of the same street without."""
     for effect in (Pedestrians(), Cyclists()):
@@ -299,7 +320,7 @@ def test_people_change_nothing_else_in_the_street(street: World) -> None:
         ]
 
 
-@pytest.mark.parametrize("name", ["street-people", "samples/street/people.toml"])
+@pytest.mark.parametrize("name", ["street-people", "avenue-people", "samples/street/people.toml"])
 def test_nobody_of_the_ready_made_people_is_inside_a_vehicle_or_at_the_camera(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from rfcore.tables import Range
-from rfedge.street.geometry.layout import BEYOND_M, KERB_M, PAVEMENT_UP_M, ROAD_HALF_M, Course
+from rfedge.street.geometry.layout import BEYOND_M, KERB_M, PAVEMENT_UP_M, Course
 from rfedge.street.geometry.mesh import F64
 from rfedge.street.geometry.person import (
     BodyPart,
@@ -25,10 +25,10 @@ from rfedge.street.geometry.world import Mover, Part, World
 
 __all__ = ["Pedestrians"]
 
-NEAR_M, FAR_M = 8.5, 9.5
-"""Distances from the middle of the road between which pavements are free to walk on."""
-TURN_BACK_M = 8.8
-"""Who crosses the road turns back so far from its middle."""
+NEAR_M, FAR_M = 1.9, 2.9
+"""Distances from the edge of the road between which pavements are free to walk on."""
+TURN_BACK_M = 2.2
+"""Who crosses the road turns back so far from its edge."""
 USUAL_MPS = 1.4
 Way = Callable[[float], tuple[float, F64]]
 """From a time (s): the way walked (m) and world_from_person (4x4)."""
@@ -52,14 +52,15 @@ class Pedestrians:
     def change(self, world: World, rng: np.random.Generator) -> World:
         """Return the world with the people as movers, one for each part of a body."""
         reach_m = world.layout.end_m + BEYOND_M
+        half_m = world.layout.road_half_m
         movers: list[Mover] = []
         for direction, starts in ((1, self.along_m), (-1, self.oncoming_m)):
             for number, start_m in enumerate(starts):
                 course = Course(start_m, direction, self.speed_mps, reach_m)
-                y_m = (-1) ** (number + 1) * float(rng.uniform(NEAR_M, FAR_M))
+                y_m = (-1) ** (number + 1) * (half_m + float(rng.uniform(NEAR_M, FAR_M)))
                 movers += self._walker(partial(_on_pavement, course, y_m), rng)
         for number, x_m in enumerate(self.crossing_m):
-            way = partial(_crossing, x_m, (-1) ** (number + 1), self.speed_mps)
+            way = partial(_crossing, x_m, (-1) ** (number + 1), half_m, self.speed_mps)
             movers += self._walker(way, rng)
         return world.plus(Part((), person_materials(), tuple(movers)))
 
@@ -99,13 +100,15 @@ def _on_pavement(course: Course, y_m: float, time_s: float) -> tuple[float, F64]
     return course.speed_mps * time_s, pose
 
 
-def _crossing(x_m: float, side: int, speed_mps: float, time_s: float) -> tuple[float, F64]:
-    """Across the road from the kerb of ``side`` and back, over and over."""
-    walked_m = speed_mps * time_s
-    way_m = (walked_m + TURN_BACK_M - ROAD_HALF_M) % (4 * TURN_BACK_M)
-    there = way_m < 2 * TURN_BACK_M
-    y_m = side * (TURN_BACK_M - way_m if there else way_m - 3 * TURN_BACK_M)
+def _crossing(
+    x_m: float, side: int, half_m: float, speed_mps: float, time_s: float
+) -> tuple[float, F64]:
+    """Across a road of ``2 * half_m`` from the kerb of ``side`` and back, over and over."""
+    walked_m, turn_m = speed_mps * time_s, half_m + TURN_BACK_M
+    way_m = (walked_m + TURN_BACK_M) % (4 * turn_m)
+    there = way_m < 2 * turn_m
+    y_m = side * (turn_m - way_m if there else way_m - 3 * turn_m)
     heading_rad = -side * 0.5 * np.pi if there else side * 0.5 * np.pi
     pose = world_from_vehicle(x_m, y_m, heading_rad)
-    pose[2, 3] = PAVEMENT_UP_M * np.clip((abs(y_m) - ROAD_HALF_M + KERB_M) / KERB_M, 0.0, 1.0)
+    pose[2, 3] = PAVEMENT_UP_M * np.clip((abs(y_m) - half_m + KERB_M) / KERB_M, 0.0, 1.0)
     return walked_m, pose

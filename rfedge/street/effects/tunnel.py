@@ -11,7 +11,6 @@ from typing import Annotated
 import numpy as np
 
 from rfcore.tables import Range
-from rfedge.street.geometry.layout import ROAD_HALF_M
 from rfedge.street.geometry.mesh import Label, Material
 from rfedge.street.geometry.solids import Stuff, boxes
 from rfedge.street.geometry.world import Part, World
@@ -33,7 +32,8 @@ class Tunnel:
     def change(self, world: World, _rng: np.random.Generator) -> World:
         """Return the world with the tunnel over its road."""
         start, end, top = self.start_m, self.start_m + self.length_m, self.height_m
-        inner, outer = ROAD_HALF_M, ROAD_HALF_M + WALL_M
+        inner = world.layout.road_half_m
+        outer = inner + WALL_M
         low = [(start, -outer, 0.0), (start, inner, 0.0), (start, -outer, top)]
         high = [(end, -inner, top), (end, outer, top), (end, outer, top + WALL_M)]
         material = Material(CONCRETE.material, (0.32, 0.31, 0.3))

@@ -20,8 +20,10 @@ from rfedge.street.geometry.world import Part, World
 __all__ = ["Works"]
 
 NEAR_M, FAR_M = 4.1, ROAD_HALF_M - KERB_M
-"""Distances from the middle of the road between which the site lies: the parking bays."""
+"""Distances from the middle of the road between which the site lies: the parking bays, which are
+farther out in a wider street."""
 BOARD_M, BOARD_UP_M, BOARD_THICK_M = 2.0, 1.1, 0.04
+HEAP_M = 5.2
 CONTAINER_M = (6.06, 2.0, 2.59)
 BOARDS = (Stuff("board-red", Label.OBJECT), Stuff("board-white", Label.OBJECT))
 CONTAINER = Stuff("container", Label.OBJECT)
@@ -53,29 +55,31 @@ class Works:
         """Return the world with the site in it."""
         closed = Closure(self.side, self.start_m, self.start_m + self.length_m)
         layout = replace(world.layout, closures=(*world.layout.closures, closed))
-        meshes = [*_fence(closed), *self._inside(closed, rng)]
+        wider_m = world.layout.geometry.wider_m
+        meshes = [*_fence(closed, wider_m), *self._inside(closed, wider_m, rng)]
         return replace(world, layout=layout).plus(Part(tuple(meshes), MATERIALS))
 
-    def _inside(self, closed: Closure, rng: np.random.Generator) -> list[Mesh]:
+    def _inside(self, closed: Closure, wider_m: float, rng: np.random.Generator) -> list[Mesh]:
         length, width, height = CONTAINER_M
         meshes, x = [], closed.start_m + 0.5
         for _ in range(self.containers):
             if x + length > closed.end_m - 0.5:
                 break
-            y = closed.side * (FAR_M - 0.5 * width)
+            y = closed.side * (FAR_M + wider_m - 0.5 * width)
             low, high = (x, y - 0.5 * width, 0.0), (x + length, y + 0.5 * width, height)
             meshes.append(boxes(CONTAINER, low, high))
             x += length + 0.3
         if x + 2.4 < closed.end_m:
-            meshes.append(_heap(Place(x + 1.4, closed.side * 5.2, 0.0, closed.side, 0.0), rng))
+            y = closed.side * (HEAP_M + wider_m)
+            meshes.append(_heap(Place(x + 1.4, y, 0.0, closed.side, 0.0), rng))
         return meshes
 
 
-def _fence(closed: Closure) -> list[Mesh]:
+def _fence(closed: Closure, wider_m: float) -> list[Mesh]:
     """Boards in two colours by turns, along the lane and across both ends."""
     xs = np.arange(closed.start_m, closed.end_m - 1e-6, BOARD_M)
-    near, far = sorted((closed.side * NEAR_M, closed.side * FAR_M))
-    lane_y = closed.side * NEAR_M
+    near, far = sorted(closed.side * (y + wider_m) for y in (NEAR_M, FAR_M))
+    lane_y = closed.side * (NEAR_M + wider_m)
     meshes = []
     for turn, board in enumerate(BOARDS):
         x = xs[turn::2]

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from rfedge.street.geometry.layout import FACADE_M, PAVEMENT_UP_M, SIDES, Layout, Place
+from rfedge.street.geometry.layout import PAVEMENT_UP_M, SIDES, Layout, Place
 from rfedge.street.geometry.mesh import F32, F64, Label, Material, Mesh, placed
 from rfedge.street.geometry.signage import FACES, NAMES, ROUND, face_uv, name_uv, sign_materials
 from rfedge.street.geometry.solids import Stuff, boxes, disc, quads, tube
@@ -30,6 +30,8 @@ WIRE_RADIUS_M = 0.011
 WIRE_HEIGHTS_M = (6.6, 6.9)
 SAG_M = 0.5
 SPAN_UP_M = 8.1
+RAIL_M = 7.05
+"""From the middle of the road to railings and bollards."""
 
 
 def lamps(layout: Layout, _rng: np.random.Generator) -> Part:
@@ -49,8 +51,8 @@ def wires(layout: Layout, _rng: np.random.Generator) -> Part:
             for height in WIRE_HEIGHTS_M:
                 z = height - 4 * SAG_M * share * (1 - share)
                 meshes.append(_wire(start + (end - start) * share, y, z))
-    across = np.linspace(-FACADE_M, FACADE_M, 24)
-    span_z = SPAN_UP_M + 0.15 + 0.7 * (across / FACADE_M) ** 2
+    across = np.linspace(-layout.facade_m, layout.facade_m, 24)
+    span_z = SPAN_UP_M + 0.15 + 0.7 * (across / layout.facade_m) ** 2
     spans = [place.x_m for place in layout.lamps if place.side > 0][::2]
     meshes += [_wire(x, across, span_z) for x in spans]
     along = np.arange(layout.start_m, layout.end_m, 4.0)
@@ -65,8 +67,9 @@ def railings(layout: Layout, rng: np.random.Generator) -> Part:
     meshes: list[Mesh] = []
     for crossing in layout.crossings_x_m:
         for side in SIDES:
-            meshes += _railing(crossing + 2.5 + rng.uniform(0, 0.5), side)
-            meshes += _bollards(crossing - 10.0, side)
+            y = side * (RAIL_M + layout.geometry.wider_m)
+            meshes += _railing(crossing + 2.5 + rng.uniform(0, 0.5), y)
+            meshes += _bollards(crossing - 10.0, y)
     rail = Material("rail", (0.5, 0.51, 0.52), roughness=0.35, metallic=0.9)
     return Part(tuple(meshes), (rail, POST_PAINT))
 
@@ -93,8 +96,8 @@ def _wire(x: np.ndarray | float, y: np.ndarray | float, z: np.ndarray | float) -
     return tube(WIRE, np.stack(np.broadcast_arrays(x, y, z), axis=1), WIRE_RADIUS_M, 5)
 
 
-def _railing(start: float, side: int) -> list[Mesh]:
-    bars, y = start + 0.15 * np.arange(50), side * 7.05
+def _railing(start: float, y: float) -> list[Mesh]:
+    bars = start + 0.15 * np.arange(50)
     ones = np.ones_like(bars)
     low = np.stack([bars - 0.01, (y - 0.01) * ones, 0.14 * ones], axis=1)
     upright = boxes(RAIL, low, low + np.array([0.02, 0.02, 1.0]))
@@ -107,10 +110,10 @@ def _railing(start: float, side: int) -> list[Mesh]:
     return [upright, rails]
 
 
-def _bollards(start: float, side: int) -> list[Mesh]:
+def _bollards(start: float, y: float) -> list[Mesh]:
     meshes = []
     for i in range(5):
-        x, y = start + 1.4 * i, side * 7.05
+        x = start + 1.4 * i
         meshes.append(tube(LAMP_POST, [(x, y, 0.1), (x, y, 0.95)], 0.05))
         meshes.append(disc(LAMP_POST, (x, y, 0.95), (0, 0, 1), 0.05, 10))
     return meshes
@@ -125,8 +128,8 @@ UNDER_M = 0.3
 """Posts begin so far under the pavement."""
 FACE_M = 0.60
 CENTRE_M = 2.45
-LIGHT_OFFSET_M = 2.6
-"""Traffic lights stand so far before the middle of a crossing."""
+LIGHT_OFFSET_M, LIGHT_M = 2.6, 6.95
+"""Traffic lights stand so far before the middle of a crossing, and from the middle of the road."""
 LENS_RADIUS_M = 0.10
 CASE_HALF_M = np.array([0.06, 0.16, 0.46])
 BOARD_M = np.array([0.012, 0.11, 0.14])
@@ -144,7 +147,9 @@ def signs(layout: Layout, rng: np.random.Generator) -> Part:
         for side in SIDES:
             at = crossing + side * LIGHT_OFFSET_M
             heading = 0.0 if side > 0 else np.pi
-            place = Place(at, side * 6.95, PAVEMENT_UP_M, side, heading)
+            place = Place(
+                at, side * (LIGHT_M + layout.geometry.wider_m), PAVEMENT_UP_M, side, heading
+            )
             green = int(rng.integers(2)) * 2
             meshes += [placed(mesh, _facing(place)) for mesh in traffic_light(green)]
     return Part(tuple(meshes), sign_materials())

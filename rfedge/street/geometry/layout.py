@@ -13,6 +13,7 @@ from typing import Annotated
 
 import numpy as np
 
+from rfcore.errors import InvalidInput
 from rfcore.tables import Range
 from rfedge.street.geometry.mesh import F64
 
@@ -41,8 +42,7 @@ PAVEMENT_UP_M = 0.14
 FACADE_M = 10.2
 LANE_M = 2.1
 BAY_M, BAY_LENGTH_M = 5.4, 6.2
-LAMP_M, LAMP_SPACING_M = 7.3, 24.0
-TREE_M, TREE_SPACING_M = 7.7, 11.0
+LAMP_M, TREE_M = 7.3, 7.7
 SIGN_M, SIGN_SPACING_M = 7.0, 19.0
 CROSSING_SPACING_M, CROSSING_M = 80.0, 3.2
 FASCIA_M = (3.35, 3.95)
@@ -54,7 +54,12 @@ SIDES = (1, -1)
 
 @dataclass(frozen=True)
 class Geometry:
-    """The street. ``tiles`` of ``length_m`` each follow one another."""
+    """The street. ``tiles`` of ``length_m`` each follow one another.
+
+    ``wider_m``: how much farther from the middle everything from the parking bays outwards is, on
+    either side, than in a street whose road is 13.2 m wide. ``floors``: the fewest and the most
+    that houses have above the ground floor.
+    """
 
     length_m: Annotated[float, Range(20, 1000)] = 120.0
     tiles: Annotated[int, Range(1, 20)] = 1
@@ -62,6 +67,14 @@ class Geometry:
     trees: bool = True
     signs: bool = True
     wires: bool = True
+    wider_m: Annotated[float, Range(0, 6)] = 0.0
+    tree_spacing_m: Annotated[float, Range(3, 100)] = 11.0
+    lamp_spacing_m: Annotated[float, Range(6, 100)] = 24.0
+    floors: Annotated[tuple[int, int], Range(1, 12)] = (2, 5)
+
+    def __post_init__(self) -> None:
+        if self.floors[0] > self.floors[1]:
+            raise InvalidInput("floors", f"{list(self.floors)} are not the fewest and the most")
 
 
 @dataclass(frozen=True)
@@ -163,6 +176,16 @@ class Layout:
         """Where the facades end, x."""
         return -self.start_m
 
+    @property
+    def road_half_m(self) -> float:
+        """From the middle of the road to its edge, where the kerb begins."""
+        return ROAD_HALF_M + self.geometry.wider_m
+
+    @property
+    def facade_m(self) -> float:
+        """From the middle of the road to the facades."""
+        return FACADE_M + self.geometry.wider_m
+
     @cached_property
     def plots(self) -> tuple[Plot, ...]:
         """The buildings, side by side, on both sides."""
@@ -178,7 +201,7 @@ class Layout:
     @cached_property
     def lamps(self) -> tuple[Place, ...]:
         """The feet of the lamp posts, staggered; they look towards the road."""
-        return self._along(LAMP_M, 8.0, LAMP_SPACING_M, stagger_m=12.0)
+        return self._along(LAMP_M, 8.0, self.geometry.lamp_spacing_m, stagger_m=12.0)
 
     @cached_property
     def trees(self) -> tuple[Place, ...]:
@@ -186,7 +209,7 @@ class Layout:
         rng = np.random.default_rng([self.geometry.seed, 2])
         taken = [(lamp.x_m, lamp.side) for lamp in self.lamps]
         kept = []
-        for place in self._along(TREE_M, 4.0, TREE_SPACING_M, stagger_m=5.0):
+        for place in self._along(TREE_M, 4.0, self.geometry.tree_spacing_m, stagger_m=5.0):
             moved_m, heading_rad, chance = rng.uniform((-1, 0, 0), (1, 2 * np.pi, 1))
             x_m = place.x_m + moved_m
             free = all(abs(x_m - x) > 2.0 for x, side in taken if side == place.side)
@@ -227,6 +250,8 @@ class Layout:
     def _along(
         self, y_m: float, first_m: float, spacing_m: float, stagger_m: float
     ) -> tuple[Place, ...]:
+        """Places on both sides; ``y_m`` is that of a street that is not wider."""
+        y_m += self.geometry.wider_m
         return tuple(
             Place(float(x), side * y_m, PAVEMENT_UP_M, side, -0.5 * np.pi * side)
             for side in SIDES
@@ -237,6 +262,7 @@ class Layout:
 
     def _row(self, side: int, rng: np.random.Generator) -> list[Plot]:
         plots: list[Plot] = []
+        fewest, most = self.geometry.floors
         x = self.start_m
         while x < self.end_m - 6.0:
             if plots and rng.random() < 0.1:
@@ -247,9 +273,9 @@ class Layout:
                     side=side,
                     start_m=x,
                     end_m=x + width,
-                    y_m=side * FACADE_M,
+                    y_m=side * self.facade_m,
                     ground_m=4.2,
-                    floors=int(rng.integers(2, 6)),
+                    floors=int(rng.integers(fewest, most + 1)),
                     floor_m=rng.uniform(3.1, 3.5),
                     style=int(rng.integers(0, 2**31)),
                 )

@@ -15,7 +15,6 @@ from rfedge.street.geometry.layout import (
     CROSSING_M,
     KERB_M,
     PAVEMENT_UP_M,
-    ROAD_HALF_M,
     SIDES,
     Layout,
 )
@@ -99,7 +98,7 @@ SLABS = Stuff("slabs", Label.PAVEMENT, SLAB_TILE_M)
 KERB = Stuff("kerb", Label.PAVEMENT)
 PAINT = Stuff("paint", Label.MARKING, 2.0)
 IRON = Stuff("iron", Label.ROAD)
-BAY_LINE_M = 4.2
+BAY_LINE_M, ZEBRA_HALF_M = 4.2, 6.0
 PAINT_UP_M = 0.004
 """Markings lie this much above the road, less than any depth map resolves at 10 m."""
 PAVEMENT_TO_M = 30.0
@@ -108,8 +107,9 @@ PAVEMENT_TO_M = 30.0
 def road(layout: Layout, rng: np.random.Generator) -> Part:
     """Return the ground of the street."""
     start, end = layout.start_m - BEYOND_M, layout.end_m + BEYOND_M
-    meshes = [_flat(ASPHALT, np.array([[start, -ROAD_HALF_M, end, ROAD_HALF_M]]), 0.0)]
-    meshes += [mesh for side in SIDES for mesh in _edge(side, start, end)]
+    half = layout.road_half_m
+    meshes = [_flat(ASPHALT, np.array([[start, -half, end, half]]), 0.0)]
+    meshes += [mesh for side in SIDES for mesh in _edge(side, start, end, half)]
     meshes += _markings(layout)
     meshes += _manholes(layout, rng)
     return Part(
@@ -124,27 +124,27 @@ def road(layout: Layout, rng: np.random.Generator) -> Part:
     )
 
 
-def _edge(side: int, start: float, end: float) -> list[Mesh]:
+def _edge(side: int, start: float, end: float, half_m: float) -> list[Mesh]:
     """Kerb stones of a metre with joints between them, and the pavement behind."""
     stones = np.arange(start, end, 1.0)
-    inner, outer = sorted((side * ROAD_HALF_M, side * (ROAD_HALF_M + KERB_M)))
+    inner, outer = sorted((side * half_m, side * (half_m + KERB_M)))
     ones = np.ones_like(stones)
     low = np.stack([stones + 0.006, inner * ones, -0.1 * ones], axis=1)
     high = np.stack([stones + 0.994, outer * ones, PAVEMENT_UP_M * ones], axis=1)
-    near, far = sorted((side * (ROAD_HALF_M + KERB_M), side * PAVEMENT_TO_M))
+    near, far = sorted((side * (half_m + KERB_M), side * PAVEMENT_TO_M))
     pavement = np.array([[start, near, end, far]])
     return [boxes(KERB, low, high), _flat(SLABS, pavement, PAVEMENT_UP_M)]
 
 
 def _markings(layout: Layout) -> list[Mesh]:
-    start, end = layout.start_m, layout.end_m
+    start, end, wider_m = layout.start_m, layout.end_m, layout.geometry.wider_m
     dashes = np.arange(start, end, 6.0)
     kept = dashes[[not layout.at_crossing(x + 1.5, 2.0) for x in dashes]]
     areas = [_strips(kept, 3.0, -0.07, 0.07)]
     for side in SIDES:
         areas += _bay_lines(layout, side)
     for crossing in layout.crossings_x_m:
-        across = np.arange(-6.0, 6.0, 1.0)
+        across = np.arange(-ZEBRA_HALF_M - wider_m, ZEBRA_HALF_M + wider_m, 1.0)
         left = np.full_like(across, crossing - CROSSING_M / 2)
         areas.append(np.stack([left, across + 0.25, left + CROSSING_M, across + 0.75], axis=1))
     return [_flat(PAINT, np.concatenate(areas), PAINT_UP_M)]
@@ -155,8 +155,8 @@ def _bay_lines(layout: Layout, side: int) -> list[F64]:
     middles = np.array([bay.x_m for bay in layout.bays if bay.side == side])
     starts = middles - BAY_LENGTH_M / 2
     edges = np.unique(np.round(np.concatenate([starts, starts + BAY_LENGTH_M]), 3))
-    line = side * BAY_LINE_M
-    low, high = sorted((line, side * ROAD_HALF_M))
+    line = side * (BAY_LINE_M + layout.geometry.wider_m)
+    low, high = sorted((line, side * layout.road_half_m))
     return [
         _strips(starts, BAY_LENGTH_M, line - 0.06, line + 0.06),
         _strips(edges - 0.05, 0.1, low, high),
