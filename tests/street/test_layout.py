@@ -1,5 +1,7 @@
 """Streets differ by what their geometry says, and by nothing else."""
 
+import hashlib
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,17 @@ from rfedge.street.geometry.road import road
 
 WIDER_M = 2.4
 NARROW, WIDE = Layout(Geometry()), Layout(Geometry(wider_m=WIDER_M))
+
+
+def test_the_plan_of_the_first_street_stays_what_it_was() -> None:
+    """Golden: fields and recordings of it exist. Micrometres, without any trigonometry."""
+    layout = Layout(Geometry())
+    places = [*layout.lamps, *layout.trees, *layout.signposts, *layout.bays]
+    plan: list[tuple[float, ...]] = [(round(p.x_m, 6), round(p.y_m, 6), p.side) for p in places]
+    for p in layout.plots:
+        metres = (round(value, 6) for value in (p.start_m, p.end_m, p.y_m))
+        plan.append((*metres, p.floors, round(p.floor_m, 6), p.style))
+    assert hashlib.sha256(repr(plan).encode()).hexdigest()[:16] == "24dff91fb9ae8853"
 
 
 @pytest.mark.parametrize("what", ["lamps", "trees", "signposts", "bays", "plots"])

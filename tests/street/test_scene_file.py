@@ -56,7 +56,7 @@ def test_effects_run_in_the_registrys_order(tmp_path: Path) -> None:
         (START + "[geometry]\nlength_m = nan\n", r"line 4: geometry.length_m: is nan, outside"),
         (START + "[geometry]\ntrees = 1\n", r"line 4: geometry.trees: is 1, not true or false"),
         (START + "[geometry]\nseed = true\n", r"line 4: geometry.seed: is True, not a whole"),
-        (START + "[geometry]\ntress = true\n", r"line 4: geometry.tress: is none of length_m"),
+        (START + "[geometry]\ntress = true\n", r"line 4: geometry.tress: is none of floors"),
         (START + '[rig]\ndirections = "up"\n', r"line 4: rig.directions: is 'up', none of both"),
         (
             START + "[drive]\nsize_px = [640]\n",

@@ -337,8 +337,8 @@ def test_nobody_of_the_ready_made_people_is_inside_a_vehicle_or_at_the_camera(
             parked += [mesh.vertices for mesh in made.meshes]
     walkers = movers["pedestrians"][::WALKING_PARTS]
     riders = movers["cyclists"][::RIDING_PARTS]
-    standing = np.concatenate(parked)[:, :2]
-    for shot in shots_of(scene, Split.DRIVE)[::4]:
+    standing = np.unique(np.concatenate(parked)[:, :2].round(1), axis=0)
+    for shot in shots_of(scene, Split.DRIVE)[::6]:
         now = shot.time_s
         people = np.array([m.world_from_mover(now)[:2, 3] for m in (*walkers, *riders)])
         for mover in movers["traffic"]:
@@ -430,10 +430,12 @@ print(*sorted(n for n in sys.modules if n.startswith("rfedge.street.effects.")))
 print(Path(rfedge.__file__).parents[1])
 """
 SMALL = 'name = "x"\nfield = "x"\n[geometry]\nlength_m = 40\ntrees = false\n'
+PEOPLE = {"pedestrians": "person", "cyclists": "cyclist"}
+"""Effects and the modules of geometry that they alone need."""
 PARTS = (
-    ("parked", "works", "pedestrians", "overcast", "haze", "lens", "exposure"),
-    ("traffic", "cyclists", "dusk", "wet_road", "rain", "rolling_shutter", "noise"),
-    ("tunnel", "evening", "passing_cloud", "auto_exposure"),
+    ("parked", "works", "overcast", "haze", "lens", "exposure"),
+    ("traffic", "dusk", "wet_road", "rain", "rolling_shutter", "noise"),
+    ("pedestrians", "cyclists", "tunnel", "evening", "passing_cloud", "auto_exposure"),
 )
 
 
@@ -455,10 +457,13 @@ def test_a_build_neither_imports_nor_needs_what_is_not_declared(
     for package in ("rfedge", "rfcore"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("csrc"))
     shutil.copy(str(_native.__file__), tmp_path / "rfcore" / "native")
+    street = tmp_path / "rfedge" / "street"
     whole = built(tmp_path, tmp_path / "s.toml", tmp_path / "whole")
     for effect in EFFECTS:
         if effect.name not in declared:
-            (tmp_path / "rfedge" / "street" / "effects" / f"{effect.name}.py").unlink()
+            (street / "effects" / f"{effect.name}.py").unlink()
+            if effect.name in PEOPLE:
+                (street / "geometry" / f"{PEOPLE[effect.name]}.py").unlink()
     assert built(tmp_path, tmp_path / "s.toml", tmp_path / "cut") == whole
     assert Path(whole[2]) == tmp_path
     assert whole[1].split() == sorted(f"rfedge.street.effects.{name}" for name in declared)
