@@ -115,7 +115,8 @@ def coded_clip(point: float, size: int, mse: dict[str, float], pixels: np.ndarra
     )
 
 
-PIXELS = np.array([60.0, 30.0, 10.0, 0.0, 0.0])
+FIRST_PIXELS, PIXELS = np.array([0.0, 0.0, 0.0, 100.0, 0.0]), np.array([60.0, 30.0, 10.0, 0.0, 0.0])
+"""In the first frame, which does not count, a sign fills the picture."""
 
 
 def curve(method: str, factor: float) -> ClassCurve:
@@ -129,7 +130,7 @@ def curve(method: str, factor: float) -> ClassCurve:
         )
         for point, size in ((20.0, 4000), (26.0, 2000), (32.0, 1000), (38.0, 500), (44.0, 250))
     ]
-    return ClassCurve(method, clips, np.tile(PIXELS, (3, 1)))
+    return ClassCurve(method, clips, np.stack([FIRST_PIXELS, PIXELS, PIXELS]))
 
 
 CLIP = Clip("alley", 10.0, [], "", None)
