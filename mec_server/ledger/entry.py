@@ -199,7 +199,10 @@ class StreamAccount:
             self._decoders = ledger.hold(identity, Resource.DECODERS, now, decoders_of(hello))
             self._granted.append(self._release_decoders)
             self._granted.append(lambda: entry.promises.leave(self._session_id))
-            rate_hz = entry.promises.enter(self._session_id, identity, hello, now)
+            doubtful = ledger.is_doubtful(identity, now)
+            rate_hz = entry.promises.enter(
+                self._session_id, identity, hello, now, is_doubtful=doubtful
+            )
             self._granted.append(lambda: entry.cameras.leave(sender))
             entry.cameras.enter(hello, sender, now)
         except LimitExceeded:

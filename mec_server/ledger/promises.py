@@ -8,8 +8,11 @@ rates are granted.
 Worker time is given out in three rounds, each in the order in which streams came: what a stream
 uses, within its identity's share; what it asked for, within that share; and what is left. So a
 promise that is not used decays to what is, one identity holds more than its share only as long as
-nobody else wants it, and a newcomer finds the rest at once. One for whom less than the lowest rate
-is left is refused and told when to try again; no admitted stream is ended.
+nobody else wants it, and a newcomer finds the rest at once. Frames that were rejected use nothing
+(their time is limited apart, ``IdentityBudget.rejected_workers``), and a stream of an identity that
+is doubtful needs nothing until it does use something: neither junk nor streams that are opened
+again and again keep newcomers out. One for whom less than the lowest rate is left is refused and
+told when to try again; no admitted stream is ended, nor told a rate below the lowest.
 """
 
 from __future__ import annotations
@@ -115,15 +118,26 @@ class Promises:
         """Return who was promised something."""
         return {stream.identity for stream in self._streams.values()}
 
-    def enter(self, session_id: str, identity: str, hello: Hello, now: float) -> float:
+    def enter(
+        self,
+        session_id: str,
+        identity: str,
+        hello: Hello,
+        now: float,
+        *,
+        is_doubtful: bool = False,
+    ) -> float:
         """Admit a stream; return the rate for each of its cameras, 0 for as many as it likes.
 
+        ``is_doubtful``: work for this identity came to nothing lately (``Ledger.is_doubtful``).
         Raises ``LimitExceeded`` with the time after which to try again.
         """
         if not self._capacity:
             return 0.0
         self._count_use(now)
         stream = self._new_stream(identity, hello)
+        if is_doubtful:
+            stream.used_hz = 0.0
         is_first = not self._streams
         self._streams[session_id] = stream
         rate_hz = self._rates_hz()[session_id]
@@ -131,6 +145,7 @@ class Promises:
             del self._streams[session_id]
             raise self._full(stream, rate_hz)
         stream.granted_hz = max(rate_hz, self._lowest_hz(stream))
+        stream.used_hz = min(stream.used_hz, stream.granted_hz)
         self.is_crowded = len(self.identities()) > 1
         self._reviewed_s = float("-inf")  # what others used less than promised, they lose now
         return _offered_hz(stream)
@@ -145,16 +160,19 @@ class Promises:
     ) -> None:
         """Note for how long a frame of this session kept a worker busy.
 
-        One that was rejected on the way (not ``complete``) cannot make frames seem quick.
+        One that was rejected on the way (not ``complete``) is no use of its promise, and can make
+        neither frames seem quick nor those of others slow.
         """
         stream = self._streams.get(session_id)
         if stream is None:
             return
-        stream.frames += 1
         if not complete and worker_s < stream.cost_s:
             return
         worker_s = min(worker_s, MAX_RELATIVE_COST * stream.cost_s)
         stream.cost_s += FRAME_WEIGHT * (worker_s - stream.cost_s)
+        if not complete:
+            return
+        stream.frames += 1
         s_per_pixel = self._field_s_per_pixel(field_id)
         s_per_pixel += FRAME_WEIGHT * (worker_s / stream.pixels - s_per_pixel)
         self._s_per_pixel[field_id] = s_per_pixel
@@ -185,7 +203,7 @@ class Promises:
         given: dict[str, float] = defaultdict(float)
         left = self._capacity
         rounds: tuple[tuple[Callable[[Promise], float], float], ...] = (
-            (lambda s: max(self._lowest_hz(s), s.needed_hz), self._share),
+            (lambda s: s.needed_hz, self._share),
             (lambda s: s.requested_hz, self._share),
             (lambda s: s.requested_hz, 1.0),
         )

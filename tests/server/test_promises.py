@@ -1,5 +1,6 @@
 """Who is let in at which rate, on a clock the test turns."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -178,7 +179,8 @@ def test_a_promise_that_is_not_used_decays_and_comes_back_when_it_is() -> None:
     full = 0.8 / 0.04
     assert promises.enter("second", "second", hello_of(full), now) == pytest.approx(full, rel=1e-3)
     third_hz = promises.enter("third", "third", hello_of(30.0), now)
-    assert third_hz == pytest.approx(40.0 - full - 2 * HEADROOM - 1.0, rel=0.05)
+    # "first" has sent nothing for all this time.
+    assert third_hz == pytest.approx(40.0 - full - 2 * HEADROOM, rel=0.05)
     lowered = promises.reallocate_rates(now)
     assert lowered["idle"] == pytest.approx(2 * HEADROOM, rel=0.05)
     for _ in range(8):
@@ -187,6 +189,54 @@ def test_a_promise_that_is_not_used_decays_and_comes_back_when_it_is() -> None:
             promises.worked("idle", FIELD, 0.04)
         lowered |= promises.reallocate_rates(now)
     assert lowered["idle"] > 4.0, "it uses all it has, and gets more"
+
+
+def test_frames_that_are_rejected_are_no_use_of_a_promise() -> None:
+    """1.6 workers are to be had; 40 Hz of 40 ms. "junk" had its half of them."""
+    promises = server_where_frames_take(0.04)
+    assert promises.enter("junk", "junk", hello_of(20.0), 0.0) == 20.0
+    for second in range(1, round(10 * DECAY_S)):
+        for _ in range(20):
+            promises.worked("junk", FIELD, 0.04, complete=False)
+        promises.reallocate_rates(float(second))
+    assert promises.enter("second", "second", hello_of(20.0), 10 * DECAY_S) == 20.0
+    third_hz = promises.enter("third", "third", hello_of(30.0), 10 * DECAY_S)
+    assert third_hz == pytest.approx(20.0, rel=0.02), "all that the second has left"
+
+
+@pytest.mark.parametrize(("is_doubtful", "left_hz"), [(False, 0.0), (True, 10.0)])
+def test_a_doubtful_identity_needs_nothing_until_it_uses_something(
+    is_doubtful: bool, left_hz: float
+) -> None:
+    """0.8 workers are to be had: 20 Hz of 40 ms, what two vehicles of 10 Hz need."""
+    promises = server_where_frames_take(0.04, workers=1)
+    promises.leave("first")
+    promises.enter("empty", "empty", hello_of(10.0), 0.0, is_doubtful=is_doubtful)
+    assert promises.enter("second", "second", hello_of(10.0), 0.0) == 10.0
+    if left_hz == 0.0:
+        with pytest.raises(LimitExceeded):
+            promises.enter("third", "third", hello_of(10.0), 0.0)
+        return
+    assert promises.enter("third", "third", hello_of(10.0), 0.0) == pytest.approx(left_hz)
+    lowered = promises.reallocate_rates(1.0)
+    assert lowered == {"empty": AdmissionLimits().lowest_hz}, "it stays, at the lowest rate"
+    for _ in range(2):
+        promises.worked("empty", FIELD, 0.04)
+    promises.reallocate_rates(2.0)
+    with pytest.raises(LimitExceeded, match=r"leave 0\.00"):
+        promises.enter("fourth", "fourth", hello_of(10.0), 2.0)
+
+
+def test_more_than_was_granted_is_not_used() -> None:
+    """1.6 workers are to be had, 40 Hz of 40 ms; who asks for 1000 Hz is lent all of it."""
+    promises = server_where_frames_take(0.04)
+    promises.enter("greedy", "greedy", hello_of(1000.0), 0.0)
+    later_s = 2 * DECAY_S
+    for second in range(1, round(later_s)):
+        promises.reallocate_rates(float(second))
+    assert promises.enter("second", "second", hello_of(20.0), later_s) == 20.0
+    third_hz = promises.enter("third", "third", hello_of(20.0), later_s)
+    assert third_hz == pytest.approx(40.0 - 20.0 - 1.0 - 39.0 / math.e**2 * HEADROOM, rel=0.05)
 
 
 def test_a_field_that_is_slow_to_render_is_known_by_the_next_vehicle() -> None:
@@ -208,6 +258,9 @@ def test_frames_that_were_rejected_do_not_make_others_seem_quick() -> None:
     for _ in range(1000):
         promises.worked("first", FIELD, 0.1, complete=False)
     assert promises.expected_s("first") == pytest.approx(0.1, rel=1e-3)
+    promises.leave("first")
+    promises.enter("second", "second", hello_of(10.0), 0.0)
+    assert promises.expected_s("second") == pytest.approx(0.04, rel=1e-3), "nor slow"
 
 
 def test_one_slow_frame_is_an_accident() -> None:
