@@ -23,7 +23,7 @@ from rfcore.wire.notices import StreetNotice
 from rfedge.loadtest.grpc_call import GrpcCall, Status
 from rfedge.loadtest.prerecorded import PrerecordedDrive, Replay, Schedule
 
-__all__ = ["PrerecordedVehicle"]
+__all__ = ["PrerecordedVehicle", "wall_ns"]
 
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
 CODES = {code.value[0]: code.name for code in grpc.StatusCode}
@@ -52,20 +52,26 @@ class PrerecordedVehicle(asyncio.Protocol):
         self.on_notice: Callable[[StreetNotice], None] = lambda _: None
         self._address, self._tls = address, tls
         self._hello = replace(hello, vehicle_id=name)
-        self.replays = [Replay(c.camera_id, drive, _wall_ns) for c in hello.cameras]
+        self.replays = [Replay(c.camera_id, drive, wall_ns) for c in hello.cameras]
         self._call = GrpcCall(address, STREAM_METHOD)
         self._transport: asyncio.Transport | None = None
         self._alarm: asyncio.TimerHandle | None = None
         self._is_full = False
         self._departed = False
 
-    async def connect(self, within_s: float) -> None:
-        """Say Hello and wait for the answer; what goes wrong is in ``refused`` or ``failed``."""
+    async def connect(self, within_s: float, source: str = "") -> None:
+        """Say Hello and wait for the answer; what goes wrong is in ``refused`` or ``failed``.
+
+        ``source``: the address to come from; without one the kernel chooses.
+        """
         host, port = self._address.rsplit(":", 1)
         try:
             async with asyncio.timeout(within_s):
                 loop = asyncio.get_running_loop()
-                await loop.create_connection(lambda: self, host, int(port), ssl=self._tls)
+                own = (source, 0) if source else None
+                await loop.create_connection(
+                    lambda: self, host, int(port), ssl=self._tls, local_addr=own
+                )
                 await self.met.wait()
         except TimeoutError:
             self._fail(f"no Welcome within {within_s:g} s")
@@ -202,6 +208,6 @@ class PrerecordedVehicle(asyncio.Protocol):
             self.leave()
 
 
-def _wall_ns(moment_s: float) -> int:
+def wall_ns(moment_s: float) -> int:
     """Return the Unix time of a moment on the monotonic clock."""
     return _EPOCH_NS + round(moment_s * 1e9)

@@ -1,12 +1,13 @@
-"""A server under compose's limits, a bystander at street size, and what an attack did to both.
+"""A server under compose's limits, bystanders at street size, and what an attack did to them.
 
 The shipped field, 640x360 at 10 Hz, coded beforehand (``attack.bystander``): a vehicle computes on
 a machine of its own. The bystander's latencies during the attack are compared with calm ones and
 with a *control*: the same attacker, as long, aimed at a decoy that reads everything and answers
-nothing. The three take turns, so that what else the machine does meets all of them. Attacker and
-decoy have a processor while it is idle (SCHED_IDLE), also where the kernel shares it out by
-sessions (sched(7), "The autogroup feature"): theirs would be another machine. Control groups (v1 or
-v2) need root, no docker.
+nothing. The three take turns, so that what else the machine does meets all of them. A consumer
+watches all the while. Newcomers have an attack of their own afterwards, as those who come would
+disturb the bystander. Attacker and decoy have a processor while it is idle (SCHED_IDLE), also where
+the kernel shares it out by sessions (sched(7), "The autogroup feature"): theirs would be another
+machine. Control groups (v1 or v2) need root, no docker.
 """
 
 import asyncio
@@ -17,8 +18,8 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Iterator
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,18 +31,17 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from attack.attacker import DEFERRED, LOG_LINES, OPEN_FILES, PROCESSOR_S
-from attack.target import Target
+from attack.bystander import NAME, NEWCOMER
+from attack.control_group import ControlGroup
+from attack.target import VEHICLE, Target
 from rfedge.certs.authority import Members, certify, write_certificates
 from scoreboard import Scoreboard
 
 ROOT = Path(__file__).parents[2]
 FIELD = ROOT / "samples/fields/street.rff"
-ATTACKER = ("-m", "attack.attacker")
-GROUPS = Path("/sys/fs/cgroup")
-MEMORY_BYTES, PIDS, CPUS, MAX_FIELD_GB = 1 << 30, 128, 1.0, 0.25
-"""``mem_limit``, ``pids_limit``, ``cpus`` and ``--max-field-gb`` of docker-compose.yml."""
-CPU_PERIOD_US = 100_000
-"""Within which a group may use ``CPUS`` of this long; Docker's own."""
+ATTACKER, BYSTANDER = ("-m", "attack.attacker"), ("-m", "attack.bystander")
+MAX_FIELD_GB = 0.25
+"""``--max-field-gb`` of docker-compose.yml."""
 ROUNDS = 2
 """How often calm, control and attack take turns."""
 AUTOGROUP_NICE = 10
@@ -49,6 +49,9 @@ ALLOWANCE_MS = 10.0
 SCRAPE_S = 5.0
 REPORT_S = 30.0
 """Within which the bystander knows how a picture ended: it loses its stream, and opens another."""
+WATCHED_S = 5.0
+"""After which a picture that the vehicle knows to be shown and the consumer has not is missed."""
+CALM_NEWCOMERS = 3
 BOARD = Scoreboard("attacks", "make test-attack")
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT / "tests")}
@@ -74,70 +77,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.slow)
 
 
-class ControlGroup:
-    """Limits on memory, processes and processors: of version 2 where that has them, else of 1."""
-
-    def __init__(self, name: str, memory_bytes: int = MEMORY_BYTES, cpus: float = CPUS) -> None:
-        two = GROUPS / "cgroup.controllers"
-        self._is_2 = two.exists() and {"memory", "pids", "cpu"} <= set(two.read_text().split())
-        kinds = ("",) if self._is_2 else ("memory", "pids", "cpu")
-        self._folders = [GROUPS / kind / name for kind in kinds]
-        for folder in self._folders:
-            folder.mkdir()
-        self.limit_memory(memory_bytes)
-        of_pids = self._folders[0 if self._is_2 else 1]
-        (of_pids / "pids.max").write_text(str(PIDS))
-        self._limit_cpus(cpus)
-
-    def _limit_cpus(self, cpus: float) -> None:
-        quota_us = round(cpus * CPU_PERIOD_US)
-        if self._is_2:
-            (self._folders[0] / "cpu.max").write_text(f"{quota_us} {CPU_PERIOD_US}")
-            return
-        (self._folders[-1] / "cpu.cfs_period_us").write_text(str(CPU_PERIOD_US))
-        (self._folders[-1] / "cpu.cfs_quota_us").write_text(str(quota_us))
-
-    def limit_memory(self, limit_bytes: int) -> None:
-        """Set how much memory its processes may have together."""
-        name = "memory.max" if self._is_2 else "memory.limit_in_bytes"
-        (self._folders[0] / name).write_text(str(limit_bytes))
-
-    @property
-    def within(self) -> tuple[str, ...]:
-        """Return what runs a command in it."""
-        put = "; ".join(f"echo $$ > {folder}/cgroup.procs" for folder in self._folders)
-        return ("sh", "-c", f'{put}; exec "$@"', "sh")
-
-    def enter(self) -> None:
-        """Put this process into it; for ``preexec_fn``."""
-        for folder in self._folders:
-            (folder / "cgroup.procs").write_text(str(os.getpid()))
-
-    def memory_bytes(self) -> int:
-        """Return the memory of its processes now, without the kernel's cache of files."""
-        name = "anon" if self._is_2 else "total_rss"
-        stat = (self._folders[0] / "memory.stat").read_text().splitlines()
-        return next(int(line.split()[1]) for line in stat if line.split()[0] == name)
-
-    def kills(self) -> int:
-        """Return how many of its processes the kernel has killed for memory."""
-        file = self._folders[0] / ("memory.events" if self._is_2 else "memory.oom_control")
-        pairs = (line.split() for line in file.read_text().splitlines())
-        return next((int(count) for name, count in pairs if name == "oom_kill"), 0)
-
-    def close(self) -> None:
-        """Remove it; its processes have ended."""
-        for folder in self._folders:
-            until_s = time.monotonic() + 10
-            while True:
-                try:
-                    folder.rmdir()
-                    break
-                except OSError:
-                    assert time.monotonic() < until_s, f"{folder} is not empty"
-                    time.sleep(0.05)
-
-
 async def appears(path: Path, process: subprocess.Popen[bytes], log: Path) -> str:
     """Return what ``path`` holds, once it is there."""
     async with asyncio.timeout(60):
@@ -156,12 +95,17 @@ class Scene:
     server: subprocess.Popen[bytes]
     target: Target
     decoy: Target
-    report: Path
+    drive: Path
     attack_s: float
+    start: Callable[..., subprocess.Popen[bytes]]
+    """Starts a process, by its log's name and its command."""
     name: str = ""
     what: str = ""
     identity: str = ""
     p99_ms: float = 0.0
+    consumer_p99_ms: float = 0.0
+    newcomer_s: float | None = None
+    """Of the slowest under attack; None: one was never shown, or none came."""
     bounds: list[str] = field(default_factory=list)
     measured: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
@@ -188,19 +132,63 @@ class Scene:
             "bound": "; ".join(bounds),
             "measured": "; ".join([*self.measured, *(() if whole else ("no",))]),
             "bystander_p99_ms": round(self.p99_ms, 1),
+            "consumer_p99_ms": round(self.consumer_p99_ms, 1),
+            "newcomer_s": None if self.newcomer_s is None else round(self.newcomer_s, 2),
             "held": whole and not self.failed,
         }
 
-    async def _lines(self, begin_s: float, end_s: float) -> list[dict[str, Any]]:
-        """Return the bystander's pictures that were captured in a time, once all have ended."""
-        async with asyncio.timeout(REPORT_S):
-            while True:
-                lines = [json.loads(line) for line in self.report.read_text().split("\n")[:-1]]
-                captured_s = [x["capture_time_ns"] / 1e9 for x in lines]
-                if captured_s and captured_s[-1] > end_s:
-                    break
+    async def begin(self, role: str) -> None:
+        """Start a bystander, and wait for the first line of its report."""
+        drive = () if role == "consumer" else (self.drive,)
+        told = (role, self.target.address, self.target.certificates, self._report(role))
+        process = self.start(role, *BYSTANDER, *told, *drive)
+        await appears(self._report(role), process, self.folder / f"{role}.log")
+
+    def _report(self, role: str) -> Path:
+        return self.folder / f"{role}.jsonl"
+
+    def _reported(self, role: str) -> list[dict[str, Any]]:
+        """Return what a bystander has written down so far."""
+        return [json.loads(line) for line in self._report(role).read_text().split("\n")[:-1]]
+
+    async def _after(self, role: str, key: str, end_s: float) -> list[dict[str, Any]]:
+        """Return what a bystander wrote down, once it has come to what began after a moment."""
+        async with asyncio.timeout(REPORT_S + end_s - time.time()):
+            while not (lines := self._reported(role)) or lines[-1][key] / 1e9 <= end_s:
                 await asyncio.sleep(0.05)
-        return [x for x, s in zip(lines, captured_s, strict=True) if begin_s <= s <= end_s]
+        return lines
+
+    async def _lines(self, begin_s: float, end_s: float) -> list[dict[str, Any]]:
+        """Return the bystander's pictures that were captured in a time, once all have ended.
+
+        ``watched_ms``: how old each was when the consumer had it, None if it never had.
+        """
+        lines = await self._after("vehicle", "capture_time_ns", end_s)
+        within = [x for x in lines if begin_s <= x["capture_time_ns"] / 1e9 <= end_s]
+        shown = {x["capture_time_ns"] for x in within if x["result"] == "acked"}
+        until_s = time.monotonic() + WATCHED_S
+        while True:
+            ages_ms = {x["capture_time_ns"]: x["age_ms"] for x in self._reported("consumer")}
+            if shown <= ages_ms.keys() or time.monotonic() > until_s:
+                break
+            await asyncio.sleep(0.05)
+        return [x | {"watched_ms": ages_ms.get(x["capture_time_ns"])} for x in within]
+
+    async def newcomers(self, attack: str) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        """Return those that came before an attack of its own, and those that came during it.
+
+        The attack goes on until the last of these was shown, or left without.
+        """
+        await self.begin("newcomer")
+        async with asyncio.timeout(60):
+            while len(self._reported("newcomer")) < CALM_NEWCOMERS:
+                await asyncio.sleep(0.05)
+        calm_s = time.time()
+        async with self._attacking(attack, self.target):
+            began_s = time.time()
+            lines = await self._after("newcomer", "began_ns", began_s + self.attack_s / ROUNDS)
+        calm = [x for x in lines if x["began_ns"] / 1e9 < calm_s][:CALM_NEWCOMERS]
+        return calm, [x for x in lines if x["began_ns"] / 1e9 >= began_s]
 
     def counters(self) -> Counter[str]:
         """Return what the server has counted of everything so far, its log's lines included.
@@ -216,10 +204,12 @@ class Scene:
     async def phase(self, attack: str = "", target: Target | None = None) -> "Phase":
         """Let a while pass, attacking or not; return what the bystander had of it."""
         before = await asyncio.to_thread(self.counters)
-        attacker = None if target is None else await self._attacker(attack, target)
-        most_bytes, most_files, began_s, lasts_s = 0, 0, time.time(), self.attack_s / ROUNDS
-        before_s = processor_s(self.server.pid)
-        try:
+        async with AsyncExitStack() as stack:
+            attacker = None
+            if target is not None:
+                attacker = await stack.enter_async_context(self._attacking(attack, target))
+            most_bytes, most_files, began_s, lasts_s = 0, 0, time.time(), self.attack_s / ROUNDS
+            before_s = processor_s(self.server.pid)
             until_s = time.monotonic() + lasts_s
             while time.monotonic() < until_s and self.server.poll() is None:
                 most_bytes = max(most_bytes, self.group.memory_bytes())
@@ -229,32 +219,28 @@ class Scene:
                 await asyncio.sleep(0.05)
             end_s, worked_s = time.time(), processor_s(self.server.pid) - before_s
             attacked_s = 0.0 if attacker is None else processor_s(attacker.pid)
-        finally:
-            if attacker is not None:
-                attacker.kill()
-                attacker.wait()
         lines = await self._lines(began_s, end_s)
         grown = await asyncio.to_thread(self.counters)
         grown.subtract(before)
         grown.update({OPEN_FILES: most_files, PROCESSOR_S: worked_s})
         return Phase(lines, most_bytes, end_s - began_s, worked_s, attacked_s, grown)
 
-    async def _attacker(self, attack: str, target: Target) -> subprocess.Popen[bytes]:
-        """Return the process of an attack that has begun."""
-        begun, log = self.folder / "begun", self.folder / "attacker.log"
+    @asynccontextmanager
+    async def _attacking(
+        self, attack: str, target: Target
+    ) -> AsyncIterator[subprocess.Popen[bytes]]:
+        """Attack from a process of its own, from when it has begun until the block is left."""
+        begun = self.folder / "begun"
         begun.unlink(missing_ok=True)
-        arguments = (attack, str(self.attack_s + 60), json.dumps(asdict(target)), str(begun))
-        with log.open("ab") as file:
-            attacker = subprocess.Popen(
-                [sys.executable, *ATTACKER, *arguments],
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                env=ENVIRONMENT,
-                start_new_session=True,
-            )
+        seconds, aim = str(self.attack_s + 60), json.dumps(asdict(target))
+        attacker = self.start("attacker", *ATTACKER, attack, seconds, aim, begun)
         leave_the_processor(attacker.pid)
-        await appears(begun, attacker, log)
-        return attacker
+        try:
+            await appears(begun, attacker, self.folder / "attacker.log")
+            yield attacker
+        finally:
+            attacker.kill()
+            attacker.wait()
 
 
 def leave_the_processor(pid: int) -> None:
@@ -333,10 +319,17 @@ class Phase:
     @property
     def p99_ms(self) -> float:
         """Return the 99th percentile of the latencies of what was delivered."""
-        latencies_ms = [x["latency_ms"] for x in self.lines if x["result"] == "acked"]
-        if not latencies_ms:
-            return 60e3  # nothing was answered for all that time
-        return float(np.percentile(latencies_ms, 99))
+        return p99_of([x["latency_ms"] for x in self.lines if x["result"] == "acked"])
+
+    @property
+    def consumer_p99_ms(self) -> float:
+        """Return the 99th percentile of the ages at the consumer of what it was sent."""
+        return p99_of([x["watched_ms"] for x in self.lines if x["watched_ms"] is not None])
+
+    @property
+    def missed(self) -> int:
+        """Return how many pictures were shown at the server and never came to the consumer."""
+        return sum(x["result"] == "acked" and x["watched_ms"] is None for x in self.lines)
 
     @property
     def cores(self) -> float:
@@ -354,13 +347,18 @@ class Phase:
         return ", ".join(f"{count} {end}" for end, count in sorted(ends.items()))
 
 
+def p99_of(values_ms: list[float]) -> float:
+    """Return the 99th percentile; a minute if there is nothing: all that time nothing came."""
+    return float(np.percentile(values_ms, 99)) if values_ms else 60e3
+
+
 def reason(line: dict[str, Any]) -> str:
     return "" if line["reason"] == "none" else str(line["reason"])
 
 
 @pytest.fixture
 def certificates(tmp_path: Path) -> Path:
-    members = Members(("bystander", "attacker"), ("attacker",))
+    members = Members((NAME, NEWCOMER, VEHICLE), (NAME, VEHICLE))
     write_certificates(tmp_path / "certs", certify(members, datetime.now(UTC), days=2))
     return tmp_path / "certs"
 
@@ -407,16 +405,15 @@ async def scene(
 
     fields, access = tmp_path / "fields", tmp_path / "access.toml"
     for empty in (access, tmp_path / "decoy.toml"):
-        empty.write_text("[consumers.attacker]\nall = true\n")
+        empty.write_text("".join(f"[consumers.{name}]\nall = true\n" for name in (VEHICLE, NAME)))
     (tmp_path / "decoy-fields").mkdir()
     store = FieldStore(fields)
     field_id = store.add(FIELD)
     started: list[subprocess.Popen[bytes]] = []
 
-    def start(name: str, *command: object, limited: bool = False) -> Any:
-        log = tmp_path / f"{name}.log"
+    def start(name: str, *command: object, limited: bool = False) -> subprocess.Popen[bytes]:
         words = [sys.executable, *map(str, command)]
-        with log.open("wb") as file:
+        with (tmp_path / f"{name}.log").open("ab") as file:
             process = subprocess.Popen(
                 words,
                 stdout=file,
@@ -426,10 +423,10 @@ async def scene(
                 start_new_session=True,
             )
         started.append(process)
-        return started[-1], log
+        return process
 
     try:
-        server, server_log = start(
+        server = start(
             "server",
             *("-m", "mec_server", "--fields", fields, "--listen", "127.0.0.1:0"),
             *("--ready-file", tmp_path / "ready", "--metrics-port", 0, "--log", "json"),
@@ -438,26 +435,23 @@ async def scene(
             *tls(certificates, "server"),
             limited=True,
         )
-        decoy, decoy_log = start("decoy", *ATTACKER, "--decoy", tmp_path / "decoy", certificates)
+        decoy = start("decoy", *ATTACKER, "--decoy", tmp_path / "decoy", certificates)
         leave_the_processor(decoy.pid)
-        address = await appears(tmp_path / "ready", server, server_log)
-        told = await appears(tmp_path / "decoy", decoy, decoy_log)
+        address = await appears(tmp_path / "ready", server, tmp_path / "server.log")
+        told = await appears(tmp_path / "decoy", decoy, tmp_path / "decoy.log")
         root = str(certificates)
         target = Target(
-            *(address, metrics_address(server_log), root),
+            *(address, metrics_address(tmp_path / "server.log"), root),
             *(field_id, str(fields), str(access), server.pid),
         )
         in_vain = Target(
             *(*told.split(), root, field_id),
             *(str(tmp_path / "decoy-fields"), str(tmp_path / "decoy.toml"), decoy.pid),
         )
-        report = tmp_path / "bystander.jsonl"
-        bystander, log = start(
-            "bystander", *("-m", "attack.bystander", coded_drive, address, root, report)
-        )
-        await appears(report, bystander, log)
         attack_s = request.config.getoption("--attack-s")
-        made = Scene(tmp_path, group, server, target, in_vain, report, attack_s)
+        made = Scene(tmp_path, group, server, target, in_vain, coded_drive, attack_s, start)
+        await made.begin("vehicle")
+        await made.begin("consumer")
         yield made
         BOARD.add(request.node.name, [made.row()])
     finally:

@@ -18,7 +18,8 @@ from typing import Any
 import pytest
 
 from attack.attacker import ATTACKS
-from attack.conftest import ENVIRONMENT, ControlGroup
+from attack.conftest import ENVIRONMENT
+from attack.control_group import ControlGroup
 from attack.target import Target
 from fault.test_packets import FAULT_S, PACE_S, nacked, numbered
 from rfcore.wire.messages import Ack
