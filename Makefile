@@ -85,8 +85,8 @@ test-attack: build-full test-system-packages  ## attack a server under compose's
 	$(BIN)/python -m rfedge.pages.attacks results/attacks.json > docs/attacks.md.part
 	mv docs/attacks.md.part docs/attacks.md
 
-# The most telling ones: a server and a decoder that die, packets that are damaged. Chosen by a mark:
-# where one fails, `.ci/run` has pytest choose among them what it runs again.
+# The most telling ones: a server and a decoder that die, packets that are damaged, renders for nothing;
+# on a small street and at street size, the shipped field at 640x360. Chosen by a mark: where one fails, `.ci/run` has pytest choose among them what it runs again.
 test-fault-core: build-full test-system-packages  ## the faults that CI injects on each push
 	$(BIN)/python -m pytest tests/fault -m fault_core --timeout 120
 

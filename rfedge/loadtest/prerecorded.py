@@ -68,12 +68,16 @@ class End(StrEnum):
 
 @dataclass
 class Shot:
-    """One picture: when it was due, when it was handed to the socket, when it was answered."""
+    """One picture: when it was due, when it was handed to the socket, when it was answered.
+
+    ``is_exact``: the server's picture is the vehicle's, byte for byte.
+    """
 
     due_s: float
     sent_s: float | None = None
     ended_s: float | None = None
     end: End = End.OPEN
+    is_exact: bool = False
 
     @property
     def latency_s(self) -> float | None:
@@ -110,7 +114,8 @@ class Replay:
         self._granted = 0
         self._used = 0
         self._waiting: int | None = None
-        self._pending: dict[FrameAddress, Shot] = {}
+        self._pending: dict[FrameAddress, tuple[Shot, bytes]] = {}
+        """Of pictures that were not answered; the digest is of what the vehicle decoded."""
         self._epoch = -1
         self._sequence = 0
         self._chained = False
@@ -152,13 +157,13 @@ class Replay:
         match message:
             case Credit(camera_id, frames) if camera_id == self._camera_id:
                 self._granted = max(self._granted, frames)
-            case Ack(address):
-                if (shot := self._pending.pop(address, None)) is not None:
-                    shot.ended_s, shot.end = now, End.ACKED
-            case Nack(address):
-                if (shot := self._pending.pop(address, None)) is not None:
-                    shot.ended_s, shot.end = now, End.NACKED
-                    self._chained = False
+            case Ack(address, _, digest) if address in self._pending:
+                shot, wanted = self._pending.pop(address)
+                shot.ended_s, shot.end, shot.is_exact = now, End.ACKED, digest == wanted
+            case Nack(address) if address in self._pending:
+                shot, _ = self._pending.pop(address)
+                shot.ended_s, shot.end = now, End.NACKED
+                self._chained = False
 
     def give_up(self) -> None:
         """The stream is lost: what was still to come is dropped."""
@@ -191,7 +196,7 @@ class Replay:
             coded.quality,
         )
         self._sequence += 1
-        self._pending[frame.address] = shot
+        self._pending[frame.address] = shot, coded.packet.reconstruction_digest
         return frame
 
 

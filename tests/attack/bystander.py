@@ -2,6 +2,7 @@
 [DRIVE]``.
 
 * ``vehicle``: it was there before. A stream that ends is opened again; what was under way is lost.
+  Where CERTIFICATES is empty, it has none.
 * ``consumer``: it watches that vehicle, in JPEG.
 * ``newcomer``: a vehicle that comes for one picture, again and again, from an address of its own.
 
@@ -54,7 +55,7 @@ def vehicle(drive: PrerecordedDrive, target: Target, name: str = NAME) -> Prerec
     """Return one that is not connected yet, with a camera of ``HZ``."""
     camera = replace(drive.hello.cameras[0], rate_hz=HZ)
     hello = replace(drive.hello, cameras=(camera,))
-    context = target.tls_context(f"vehicle-{name}")
+    context = target.tls_context(f"vehicle-{name}") if target.certificates else None
     return PrerecordedVehicle(name, target.address, hello, drive, context)
 
 
@@ -71,6 +72,7 @@ def line(shot: Shot, reason: str) -> dict[str, Any]:
         "capture_time_ns": wall_ns(shot.due_s),
         "result": result,
         "latency_ms": latency_ms,
+        "exact": shot.is_exact,
         "reason": "none" if shot.end is End.ACKED else reason,
     }
 

@@ -1,8 +1,11 @@
 """Real processes, something done to them, and a scoreboard of what followed.
 
-The street, its coded frames and the raw vehicle are those of ``tests/integration``. Time is part of
-what is tested here: bounds are in seconds of this machine, so run it on one that is quiet
-(``make test-fault``; it writes ``results/faults.json``, and ``docs/reliability.md`` from it).
+The street, its coded frames and the raw vehicle are those of ``tests/integration``. What is marked
+``fault_core`` is also run at street size: the shipped field, 640x360 at 10 Hz, where a frame costs
+a server what it does on a road; bystanders replay packets there that were coded beforehand, as a
+vehicle renders and codes on a machine of its own. Time is part of what is tested here: bounds are
+in seconds of this machine, so run it on one that is quiet (``make test-fault``; it writes
+``results/faults.json``, and ``docs/reliability.md`` from it).
 """
 
 import asyncio
@@ -23,25 +26,39 @@ from typing import Any
 import numpy as np
 import pytest
 
+from attack.bystander import HZ as BYSTANDER_HZ
 from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
-from integration.conftest import coded, raw_vehicle, street
+from fault.streets import SHIPPED, SMALL, ShippedStreet, shipped_street
+from integration.conftest import (
+    CodedStreet,
+    Street,
+    coded_small_street,
+    raw_vehicle,
+    small_street,
+)
 from mec_server.decoding.child import DECODER_NAME
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.dataset import read_dataset
 from rfcore.wire.messages import FrameAddress
 from scoreboard import Scoreboard
 
-__all__ = ["coded", "raw_vehicle", "street"]
+__all__ = ["raw_vehicle"]
 
+ROOT = Path(__file__).parents[2]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT / "tests")}
 RATE_HZ = 20
+SHIPPED_HZ = 5.0
+"""Of a vehicle that renders and codes 640x360 here, beside servers."""
 CALM_S = 3.0
+FAULT_S = 3.0
+"""As long as the calm that it is compared with: a p99 of fewer pictures is the latest one."""
 ALLOWANCE_MS = 10.0
 """A tenth of the frame budget: the 99th of a few dozen latencies is the largest, and one late
 wake-up of a shared machine shall not count as harm done by a neighbour."""
 
 FEWER = 0.05
-"""Of 3 s at 20 Hz, three frames."""
+"""Of 3 s at 20 Hz, and of as many frames at street size, three."""
 
 BOARD = Scoreboard("faults", "make test-fault")
 
@@ -52,6 +69,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     BOARD.open(config)
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if metafunc.definition.get_closest_marker("fault_core") is not None:
+        metafunc.parametrize("street", (SMALL, SHIPPED), indirect=True, scope="session")
+
+
+@pytest.fixture(scope="session")
+def street(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Street:
+    root = tmp_path_factory.mktemp("street")
+    if getattr(request, "param", SMALL) == SMALL:
+        return small_street(root)
+    return shipped_street(root)
+
+
+@pytest.fixture(scope="session")
+def coded(street: Street) -> CodedStreet:
+    return street.coded if isinstance(street, ShippedStreet) else coded_small_street(street)
 
 
 async def appears(condition: Callable[[], Any], within_s: float = 60.0) -> Any:
@@ -190,6 +225,19 @@ class Site:
         assert vehicle.process.poll() is None, vehicle.log.read_text()
         return vehicle
 
+    async def bystander(self, address: str, name: str = "bystander") -> Vehicle:
+        """Return a vehicle that nothing is to happen to, which had some frames acknowledged."""
+        if not isinstance(self.street, ShippedStreet):
+            return await self.vehicle(address, name)
+        report = self._folder / f"{name}.jsonl"
+        words = ("vehicle", address, "", str(report), str(self.street.packets))
+        process, log = self._start((), "attack.bystander", *words)
+        bystander = Vehicle(process, log, report)
+        self._programs.append(bystander)
+        await appears(lambda: len(bystander.acked()) >= 3 or process.poll() is not None)
+        assert process.poll() is None, log.read_text()
+        return bystander
+
     def start_vehicle(
         self, address: str, name: str, *options: str, within: Sequence[str] = ()
     ) -> Vehicle:
@@ -200,7 +248,7 @@ class Site:
             "--drive": self.street.drive,
             "--fields": self.street.store,
             "--vehicle": name,
-            "--rate": RATE_HZ,
+            "--rate": SHIPPED_HZ if isinstance(self.street, ShippedStreet) else RATE_HZ,
             "--field": self.street.field_id,
             "--effort": "fast",
             "--report": report,
@@ -218,7 +266,7 @@ class Site:
         log = self._folder / f"{module}-{next(self._numbers)}.log"
         with log.open("wb") as file:
             command = [*within, sys.executable, "-m", module, *arguments]
-            return subprocess.Popen(command, stderr=file, stdout=file), log
+            return subprocess.Popen(command, stderr=file, stdout=file, env=ENVIRONMENT), log
 
     def close(self) -> None:
         """Kill what is left."""
@@ -254,12 +302,19 @@ class Case:
 
     def about(self, fault: str, injected_with: str, covers: str) -> None:
         """Say what is done, with what, and which of ``rfedge.pages.faults.KINDS`` it is."""
-        self.fault, self.injected_with, self.covers = fault, injected_with, covers
+        size = f", {SHIPPED}" if isinstance(self.street, ShippedStreet) else ""
+        self.fault, self.injected_with, self.covers = f"{fault}{size}", injected_with, covers
+
+    def lasting(self, seconds: float) -> float:
+        """Return how long that takes in which a bystander of ``RATE_HZ`` takes as many pictures."""
+        return (
+            seconds * RATE_HZ / BYSTANDER_HZ if isinstance(self.street, ShippedStreet) else seconds
+        )
 
     async def calm(self) -> None:
-        """Let things run undisturbed for 3 s, to compare with."""
+        """Let things run undisturbed for 3 s, at street size 6 s, to compare with."""
         self._started_s = time.time()
-        await asyncio.sleep(CALM_S)
+        await asyncio.sleep(self.lasting(CALM_S))
         self._calm_until_s = time.time()
 
     def over(self) -> None:
@@ -280,7 +335,7 @@ class Case:
 
     async def spares(self, bystander: Vehicle) -> None:
         """Note what the fault did to a vehicle that it was not meant for."""
-        await asyncio.sleep(CALM_S / 2)
+        await asyncio.sleep(self.lasting(CALM_S / 2))
         lines = bystander.lines()
         disturbed = [x for x in lines if self._in_fault(x)]
         quiet = [
@@ -344,6 +399,8 @@ class Case:
 
 def is_exact(line: dict[str, Any]) -> bool:
     """Tell whether the server's picture is the vehicle's."""
+    if "exact" in line:
+        return bool(line["exact"])
     return bool(line["server_digest"] == line["reconstruction_digest"])
 
 
@@ -361,8 +418,10 @@ def delivered(lines: Sequence[dict[str, Any]]) -> float:
 
 def fault_free(street: Any, indices: Sequence[int]) -> list[str]:
     """Return the digests of a stream that begins with these pictures of the drive."""
-    pictures = read_dataset(street.drive).pictures
-    pipeline = Pipeline(street.field, CodecConfig(76, 52, "fast"), time.perf_counter_ns)
+    pictures = read_dataset(street.drive, tile_origin=street.field.metadata.tile_origin).pictures
+    k = pictures[0].camera.intrinsics
+    config = CodecConfig(k.width_px, k.height_px, "fast")
+    pipeline = Pipeline(street.field, config, time.perf_counter_ns)
     digests = []
     for sequence, index in enumerate(indices):
         picture = pictures[index]
@@ -382,7 +441,7 @@ def control(street: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[V
 
     async def start() -> Vehicle:
         server = await site.server()
-        return await site.vehicle(server.address, "control")
+        return await site.bystander(server.address, "control")
 
     yield asyncio.run(start())
     site.close()
@@ -399,7 +458,7 @@ def case(request: pytest.FixtureRequest, street: Any, control: Vehicle) -> Itera
 async def streaming(site: Site) -> tuple[Server, Vehicle]:
     """A server and a vehicle that nothing is to happen to."""
     server = await site.server()
-    return server, await site.vehicle(server.address, "bystander")
+    return server, await site.bystander(server.address)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

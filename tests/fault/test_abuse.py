@@ -15,17 +15,23 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import grpc
 import pytest
 
 from attack.attacker import ATTACKS
 from attack.conftest import ENVIRONMENT
 from attack.control_group import ControlGroup
 from attack.target import Target
-from fault.test_packets import FAULT_S, PACE_S, nacked, numbered
+from fault.conftest import FAULT_S
+from fault.test_packets import PACE_S, nacked, numbered
+from mec_server.config import IdentityBudget
+from mec_server.ledger.budgets import Resource
+from mec_server.ledger.ledger import LONGER_BURST_S
 from rfcore.wire.messages import Ack
 from rfedge.certs.authority import Members, certify, write_certificates
 
 ROOM_BYTES = 24 << 20
+BURST_OF_REJECTED_S = LONGER_BURST_S[Resource.REJECTED_SECONDS]
 
 
 async def test_renders_that_differ(streaming: Any, case: Any, coded: Any, raw_vehicle: Any) -> None:
@@ -50,6 +56,52 @@ async def test_renders_that_differ(streaming: Any, case: Any, coded: Any, raw_ve
     case.holds("metric counts them", counted)
     await case.spares(bystander)
     case.finish()
+
+
+@pytest.mark.fault_core
+async def test_renders_for_nothing(site: Any, case: Any, coded: Any, raw_vehicle: Any) -> None:
+    case.about(
+        "renders for nothing",
+        "50 Hz of frames with another render's digest: each costs a render before it is refused",
+        "F13 F23",
+    )
+    server = await site.server()
+    bystander = await site.bystander(server.address)
+    told: Counter[str] = Counter()
+    ended = False
+    async with raw_vehicle(server.address) as vehicle:
+        await vehicle.greet(coded.hello)
+        await case.calm()
+        spent_s = -rejected_s(server)
+        began_s = time.monotonic()
+        for frame in numbered(coded.frames):
+            await asyncio.sleep(PACE_S)
+            packet = replace(frame.packet, render_digest=bytes(16)).sealed()
+            try:
+                told[(await vehicle.told(replace(frame, packet=packet)))[0]] += 1
+            except grpc.aio.AioRpcError as error:
+                ended = error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+                break
+            if time.monotonic() > began_s + case.lasting(FAULT_S):
+                break
+        await asyncio.sleep(max(0.0, began_s + case.lasting(FAULT_S) - time.monotonic()))
+        lasted_s = time.monotonic() - began_s
+        spent_s += rejected_s(server)
+        case.over()
+    renders = told["render_mismatch"]
+    case.tells("answers", ", ".join(f"{reason} {n}" for reason, n in sorted(told.items())))
+    case.tells("its stream ended for them", "yes" if ended else "no")
+    case.holds("some rendered, none shown", renders > 0 and told["ack"] == 0)
+    # A budget is known to be spent when the frame that overdrew it has been paid.
+    budget_s = IdentityBudget().rejected_workers * (lasted_s + BURST_OF_REJECTED_S)
+    beyond_one_s = spent_s * (1 - 1 / max(1, renders))
+    case.at_most("worker time for them, but for one frame", beyond_one_s, budget_s)
+    await case.spares(bystander)
+    case.finish()
+
+
+def rejected_s(server: Any) -> float:
+    return float(server.value("rfedge_server_spent_total", resource="rejected_seconds"))
 
 
 async def test_a_decoder_that_hangs(

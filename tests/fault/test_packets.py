@@ -14,6 +14,7 @@ from typing import Any
 import grpc
 import pytest
 
+from fault.conftest import FAULT_S
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.sender.encoder import DeltaEncoder
@@ -22,7 +23,6 @@ from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import Ack, FieldNotice, Frame, Nack
 from rfcore.wire.v1 import edge_pb2 as pb
 
-FAULT_S = 3.0
 PACE_S = 0.02
 """A hostile vehicle is as fast as a quick camera; what more it may do, quotas say."""
 
@@ -69,7 +69,7 @@ async def test_damaged_packets(
         await vehicle.greet(coded.hello)
         frames = numbered(coded.frames)
         await case.calm()
-        until_s = time.monotonic() + FAULT_S
+        until_s = time.monotonic() + case.lasting(FAULT_S)
         while time.monotonic() < until_s or sent < 100:
             frame = next(frames)
             await asyncio.sleep(PACE_S)

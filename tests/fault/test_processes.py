@@ -8,10 +8,8 @@ from typing import Any
 
 import pytest
 
+from fault.conftest import FAULT_S
 from rfcore.wire.messages import Ack, Nack
-
-FAULT_S = 3.0
-"""As long as the calm that it is compared with: a p99 of fewer pictures is the latest one."""
 
 
 async def port_opens(address: str) -> float:
@@ -75,7 +73,7 @@ async def test_kill_9_of_a_decoder(
     case.about("decoder process killed", "kill -9 of the process of one camera", "F17")
     server = await site.server("--decoder", "child")
     (of_bystander,) = server.decoders()
-    bystander = await site.vehicle(server.address, "bystander")
+    bystander = await site.bystander(server.address)
     async with raw_vehicle(server.address) as vehicle:
         await appears(lambda: len(server.decoders()) == 2)
         (ready,) = set(server.decoders()) - {of_bystander}
@@ -96,7 +94,7 @@ async def test_kill_9_of_a_decoder(
             "frames after it byte-equal to a fault-free run",
             isinstance(decoded, Ack) and decoded.reconstruction_digest == wanted,
         )
-        await asyncio.sleep(FAULT_S)
+        await asyncio.sleep(case.lasting(FAULT_S))
         case.over()
     (entry,) = server.entries("decoder lost")
     case.holds("log names the signal", "SIGKILL" in entry["problem"])

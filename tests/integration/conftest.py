@@ -130,9 +130,8 @@ class Street:
     other_store: Path
 
 
-@pytest.fixture(scope="session")
-def street(tmp_path_factory: pytest.TempPathFactory) -> Street:
-    root = tmp_path_factory.mktemp("street")
+def small_street(root: Path) -> Street:
+    """Build a street of 400 Gaussians under ``root``, with pictures of 76x52."""
     field = random_field(1)
     for name in ("drive", "store", "other"):
         (root / name).mkdir()
@@ -147,6 +146,11 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Street:
     )
 
 
+@pytest.fixture(scope="session")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Street:
+    return small_street(tmp_path_factory.mktemp("street"))
+
+
 @dataclass(frozen=True)
 class CodedStreet:
     """What a vehicle would say on the drive."""
@@ -157,6 +161,10 @@ class CodedStreet:
 
 @pytest.fixture(scope="session")
 def coded(street: Street) -> CodedStreet:
+    return coded_small_street(street)
+
+
+def coded_small_street(street: Street) -> CodedStreet:
     pictures = read_dataset(street.drive).pictures
     pipeline = Pipeline(street.field, CodecConfig(76, 52, "fast"), time.perf_counter_ns)
     camera = CameraDescription("front", INTRINSICS, pipeline.header)
