@@ -72,21 +72,22 @@ test-prometheus: build-full test-system-packages  ## test rules with promtool, a
 test-netns: build-full test-system-packages  ## compare the link with the kernel's own shaper (root)
 	$(BIN)/python -m pytest -m netns --timeout 600
 
-# RESUME=1: keep the rows that are there of this revision, and run what is missing.
+# RESUME=1: keep the rows that are there of this revision, and run what is missing. ONLY: of the cases
+# that its words choose (pytest -k), as ONLY="a_lossy_link and 2Mbps".
+CHOICE = $(if $(RESUME),--resume) $(if $(ONLY),-k "$(ONLY)")
 test-fault: build-full test-system-packages  ## break servers, vehicles and links; writes results/faults.json (root)
-	$(BIN)/python -m pytest tests/fault -m fault --timeout 120 --faults-json results/faults.json \
-		$(if $(RESUME),--resume)
+	$(BIN)/python -m pytest tests/fault -m fault --timeout 120 --faults-json results/faults.json $(CHOICE)
 	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
 	mv docs/reliability.md.part docs/reliability.md
 
 test-attack: build-full test-system-packages  ## attack a server under compose's limits; writes results/attacks.json (root)
-	$(BIN)/python -m pytest tests/attack -m attack --timeout 180 --attacks-json results/attacks.json \
-		$(if $(RESUME),--resume)
+	$(BIN)/python -m pytest tests/attack -m attack --timeout 180 --attacks-json results/attacks.json $(CHOICE)
 	$(BIN)/python -m rfedge.pages.attacks results/attacks.json > docs/attacks.md.part
 	mv docs/attacks.md.part docs/attacks.md
 
 # The most telling ones: a server and a decoder that die, packets that are damaged, renders for nothing;
-# on a small street and at street size, the shipped field at 640x360. Chosen by a mark: where one fails, `.ci/run` has pytest choose among them what it runs again.
+# on a small street, and at street size: the shipped field, 640x360. Chosen by a mark: where one
+# fails, `.ci/run` has pytest choose among them what it runs again.
 test-fault-core: build-full test-system-packages  ## the faults that CI injects on each push
 	$(BIN)/python -m pytest tests/fault -m fault_core --timeout 120
 

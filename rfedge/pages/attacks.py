@@ -28,6 +28,11 @@ class AttackRow:
     held: bool
     test: str | None = None
     """The case of ``tests/attack`` that measured it."""
+    consumer_p99_ms: float | None = None
+    """From capture to a consumer that watched the bystander, in JPEG."""
+    newcomer_s: float | None = None
+    """Of the slowest vehicle that came meanwhile, from its first packet to its first picture shown;
+    None: one was never shown, or the row is from before there were any."""
 
 
 OPENING = """# What attacks cost the others
@@ -41,7 +46,12 @@ picture is due to its Ack. One attack after the other, each from a process that 
 while it is idle. *Control* is the same attacker aimed at a decoy that reads everything and answers
 nothing: what the bystander suffers then is the machine's doing. Calm, control and attack take
 turns; of what a slow machine drops in calm, as much may be dropped under attack, and of what it
-does not drop, nothing. See [SECURITY.md](../SECURITY.md).
+does not drop, nothing. A consumer watches the bystander all the while, in JPEG. In an attack of its
+own, newcomers come one after another, each a vehicle with a certificate and an address of its own:
+what is measured is the way from its first packet to its first picture shown, and the slowest
+counts. A packet that opens a connection and is lost is sent again after a second, and a vehicle
+that comes back to a server at rest is held to one, so a newcomer has two.
+See [SECURITY.md](../SECURITY.md).
 """
 
 

@@ -9,12 +9,29 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypedDict
 
 from rfcore.errors import InvalidInput
 from rfedge.report.tables import table
 from rfedge.results import read_result, rows_of
 
-__all__ = ["FaultRow", "faults_page"]
+__all__ = ["FaultRow", "LinkCell", "faults_page"]
+
+
+class LinkCell(TypedDict):
+    """What came of pictures behind a link with loss, delay and a limited rate."""
+
+    loss_percent: float
+    rtt_ms: float
+    rate_mbps: float
+    shown_hz: float
+    sent_mbps: float
+    frozen_percent: float
+    """Of the time: in gaps between pictures of at least max(3 d, d + 150 ms), d their mean."""
+    age_p50_ms: float
+    age_p99_ms: float
+    psnr_db: float
+    """Of the server's pictures against the camera's."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +47,7 @@ class FaultRow:
     """Which of ``KINDS`` it is, split by spaces."""
     test: str | None = None
     """The case of ``tests/fault`` that measured it."""
+    cell: LinkCell | None = None
 
 
 KINDS = {
@@ -126,7 +144,8 @@ def faults_page(path: Path) -> str:
         f"`{result['revision']}`; {machine['cpu']}, {machine['cores']} cores, {machine['isa']}.\n"
     )
     loads = {kind: _runs_held(kind, path.parent) for kind in ELSEWHERE}
-    return "\n".join([OPENING, score, *_kinds(rows, loads), *_sections(rows)])
+    cells = [row.cell for row in rows if row.cell is not None]
+    return "\n".join([OPENING, score, *_kinds(rows, loads), *_matrix(cells), *_sections(rows)])
 
 
 def _runs_held(kind: str, folder: Path) -> list[bool]:
@@ -158,6 +177,29 @@ def _kinds(rows: list[FaultRow], loads: Mapping[str, list[bool]]) -> Iterator[st
         told = f"{sum(held)} of {len(held)}" if held else "**not recorded**"
         cells.append((kind, what, by, told if tested or kind in ELSEWHERE else ""))
     yield table(("kind", "fault", "tested by", "hold"), cells)
+    yield ""
+
+
+def _matrix(cells: list[LinkCell]) -> Iterator[str]:
+    """Yield the table of packet loss x RTT x rate."""
+    if not cells:
+        return
+    yield "## Packet loss, round trip and rate\n"
+    heads = ("loss", "RTT", "link", "shown", "sent", "frozen", "age, median / 99th", "quality")
+    lines = [
+        (
+            f"{cell['loss_percent']:g} %",
+            f"{cell['rtt_ms']:g} ms",
+            f"{cell['rate_mbps']:g} Mbit/s",
+            f"{cell['shown_hz']:.1f} Hz",
+            f"{cell['sent_mbps']:.2f} Mbit/s",
+            f"{cell['frozen_percent']:.0f} %",
+            f"{cell['age_p50_ms']:.0f} / {cell['age_p99_ms']:.0f} ms",
+            f"{cell['psnr_db']:.1f} dB",
+        )
+        for cell in sorted(cells, key=lambda c: (c["loss_percent"], c["rtt_ms"], c["rate_mbps"]))
+    ]
+    yield table(heads, lines)
     yield ""
 
 

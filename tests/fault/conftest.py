@@ -41,6 +41,7 @@ from mec_server.decoding.child import DECODER_NAME
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.dataset import read_dataset
 from rfcore.wire.messages import FrameAddress
+from rfedge.pages.faults import LinkCell
 from scoreboard import Scoreboard
 
 __all__ = ["raw_vehicle"]
@@ -292,6 +293,7 @@ class Case:
     fault: str = ""
     injected_with: str = ""
     covers: str = ""
+    cell: LinkCell | None = None
     bounds: list[str] = field(default_factory=list)
     measured: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
@@ -384,6 +386,7 @@ class Case:
             "measured": "; ".join(self.measured + ["no"] * (not self.finished)),
             "passed": self.finished and not self.failed,
             "covers": self.covers,
+            **({} if self.cell is None else {"cell": self.cell}),
         }
 
     def _in_fault(self, line: dict[str, Any]) -> bool:

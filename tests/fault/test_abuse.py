@@ -79,8 +79,8 @@ async def test_renders_for_nothing(site: Any, case: Any, coded: Any, raw_vehicle
             packet = replace(frame.packet, render_digest=bytes(16)).sealed()
             try:
                 told[(await vehicle.told(replace(frame, packet=packet)))[0]] += 1
-            except grpc.aio.AioRpcError as error:
-                ended = error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+            except (grpc.aio.AioRpcError, asyncio.InvalidStateError):
+                ended = await vehicle.stream.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
                 break
             if time.monotonic() > began_s + case.lasting(FAULT_S):
                 break

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rfcore.errors import InvalidInput
-from rfedge.pages.faults import ELSEWHERE, KINDS, FaultRow, faults_page
+from rfedge.pages.faults import ELSEWHERE, KINDS, FaultRow, LinkCell, faults_page
 from rfedge.results import Provenance, make_result, write_result
 
 ROOT = Path(__file__).parents[2]
@@ -97,6 +97,30 @@ def test_each_kind_of_fault_is_listed_with_the_rows_that_test_it(tmp_path: Path)
     assert "| F5 | link that flaps | it flaps, it flaps again | 1 of 2 |" in page
     assert "| L5 | connection storm | it flaps | 1 of 1 |" in page
     assert "| F6 | packet loss x RTT x rate | **not tested** |" in page
+
+
+def test_cells_of_the_matrix_are_a_table_by_loss_round_trip_and_rate(tmp_path: Path) -> None:
+    cell = LinkCell(
+        loss_percent=1,
+        rtt_ms=300,
+        rate_mbps=0.5,
+        shown_hz=4.26,
+        sent_mbps=0.123,
+        frozen_percent=12.4,
+        age_p50_ms=210.4,
+        age_p99_ms=812.3,
+        psnr_db=31.26,
+    )
+    dearer = replace(ROW, fault="it loses", cell=cell)
+    without = replace(ROW, fault="it does not", cell=LinkCell(**{**cell, "loss_percent": 0}))
+    page = faults_page(scoreboard(tmp_path / "faults.json", dearer, ROW, without))
+    figures = "| 4.3 Hz | 0.12 Mbit/s | 12 % | 210 / 812 ms | 31.3 dB |"
+    lines = [f"| {loss} % | 300 ms | 0.5 Mbit/s {figures}" for loss in (0, 1)]
+    assert "\n".join(lines) in page
+
+
+def test_without_a_cell_there_is_no_matrix(tmp_path: Path) -> None:
+    assert "round trip" not in faults_page(scoreboard(tmp_path / "faults.json", ROW))
 
 
 def test_every_kind_of_fault_has_a_case_that_names_it_or_a_command_that_measures_it() -> None:
