@@ -253,7 +253,8 @@ class StreamAccount:
     def worked(self, field_id: str, worker_s: float, now: float, *, complete: bool = True) -> None:
         """Charge the time for which a frame kept a worker busy; not ``complete``: was rejected."""
         self._entry.promises.worked(self._session_id, field_id, worker_s, complete=complete)
-        self._entry.ledger.charge(self.identity, Resource.WORKER_SECONDS, worker_s, now)
+        lent = not self._entry.promises.is_crowded
+        self._entry.ledger.charge(self.identity, Resource.WORKER_SECONDS, worker_s, now, lent=lent)
         if complete:
             self._is_unpaid = False
             self._entry.ledger.opening_paid(self.identity, now)

@@ -73,10 +73,10 @@ class TokenBucket:
         self._fill(now)
         return 0.0 if self._left > 0 else max(1e-3, -self._left / self._rate)
 
-    def charge(self, amount: float, now: float) -> None:
-        """Take ``amount``, whatever is left."""
+    def charge(self, amount: float, now: float, *, lent: bool = False) -> None:
+        """Take ``amount``, whatever is left; if it is ``lent``, no more than is left."""
         self._fill(now)
-        self._left -= amount
+        self._left -= min(amount, max(0.0, self._left)) if lent else amount
 
     def take(self, amount: float, now: float) -> bool:
         """Return whether anything is left; if so take ``amount``, even if that is more."""
@@ -235,9 +235,14 @@ class Ledger:
                     wait_s,
                 )
 
-    def charge(self, identity: str, resource: Resource, amount: float, now: float) -> None:
-        """Charge ``identity`` with what it has used already."""
-        self._account(identity, now).spent[resource].charge(amount, now)
+    def charge(
+        self, identity: str, resource: Resource, amount: float, now: float, *, lent: bool = False
+    ) -> None:
+        """Charge ``identity`` with what it has used already.
+
+        ``lent``: nobody else wanted it, so it makes no debt, to be paid when somebody does.
+        """
+        self._account(identity, now).spent[resource].charge(amount, now, lent=lent)
         self._buckets[resource].charge(amount, now)
         self._spent[resource] += amount
 

@@ -136,6 +136,25 @@ def test_worker_time_binds_only_while_others_stream(hello: Hello, make_frame: ob
     account.spend_frame(frame, 10, 0.0)
 
 
+def test_who_was_alone_owes_nothing_when_somebody_comes(hello: Hello, make_frame: object) -> None:
+    """A minute of a whole worker, of which its share is a half, and another vehicle connects."""
+    frame = make_frame(0)  # type: ignore[operator]
+    entry = entry_control()
+    account = entry.open("s-1", "slow", named=True, now=0.0)
+    account.enter(hello, Sender(), 0.0)
+    for second in range(60):
+        account.worked(hello.field_ids[0], 2.0, float(second))
+    other = entry.open("s-2", "modest", named=True, now=60.0)
+    other.enter(replace(hello, vehicle_id="modest"), Sender(), 60.0)
+    account.spend_frame(frame, 10, 60.5)
+    account.worked(hello.field_ids[0], 5.0, 60.5)
+    with pytest.raises(LimitExceeded, match="identity_worker_seconds") as caught:
+        account.spend_frame(frame, 10, 60.6)
+    share = entry.ledger.budget(Resource.WORKER_SECONDS).identity
+    since_its_last_s = 60.6 - 59.0
+    assert caught.value.retry_after_s == pytest.approx(5.0 / share - since_its_last_s)
+
+
 def test_frames_that_are_rejected_take_little_of_the_workers_while_others_stream(
     hello: Hello, make_frame: object
 ) -> None:
