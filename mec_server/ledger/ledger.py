@@ -296,9 +296,8 @@ class Ledger:
         account = self._account(identity, now)
         account.failed_openings += 1
         doublings = account.failed_openings - FREE_FAILURES - 1
-        if doublings >= 0:
-            pause_s = FIRST_PAUSE_S * 2 ** min(doublings, 16)
-            account.opens_again_s = now + min(pause_s, LONGEST_PAUSE_S)
+        pause_s = 0.0 if doublings < 0 else FIRST_PAUSE_S * 2 ** min(doublings, 16)
+        account.opens_again_s = now + min(pause_s, LONGEST_PAUSE_S)
 
     def opening_paid(self, identity: str, now: float) -> None:
         """Note that a stream gave a picture: the openings before it were worth their cost."""

@@ -286,6 +286,16 @@ def test_openings_that_come_to_nothing_in_a_row_are_waited_for_longer_and_longer
     ledger.check_opening("cav-1", now)
 
 
+def test_an_opening_that_came_to_nothing_is_remembered_over_a_pause() -> None:
+    ledger = ledger_of()
+    ledger.opening_failed("cav-1", 0.0)
+    for second in range(round(LONGEST_PAUSE_S)):
+        ledger.charge(f"other-{second}", Resource.CALLS, 1.0, float(second))
+        assert ledger.is_doubtful("cav-1", float(second))
+    ledger.charge("another", Resource.CALLS, 1.0, LONGEST_PAUSE_S + 1.0)
+    assert not ledger.is_doubtful("cav-1", LONGEST_PAUSE_S + 1.0)
+
+
 # --- budgets
 
 
