@@ -18,15 +18,17 @@ from fault.conftest import FAULT_S
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.sender.encoder import DeltaEncoder
+from rfcore.errors import RejectReason
 from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
-from rfcore.wire.messages import Ack, FieldNotice, Frame, Nack
+from rfcore.wire.messages import Ack, FieldNotice, Frame, Nack, Welcome
 from rfcore.wire.v1 import edge_pb2 as pb
 
 PACE_S = 0.02
 """A hostile vehicle is as fast as a quick camera; what more it may do, quotas say."""
 
 SEED = 20261121
+DECIDED_S = 5.0
 
 
 def nacked(server: Any, reason: str) -> float:
@@ -49,6 +51,18 @@ def flipped(data: bytes, rng: random.Random) -> bytes:
 
 def truncated(data: bytes, rng: random.Random) -> bytes:
     return data[: rng.randrange(1, len(data))]
+
+
+async def decided(vehicle: Any, frame: Frame) -> Ack | Nack:
+    """Send a frame and return the answer; again, a camera's while later, if there is no time for
+    it: on a slow machine its vehicle is granted less than what is sent here."""
+    until_s = time.monotonic() + DECIDED_S
+    while True:
+        answer = await vehicle.ask(frame)
+        is_late = time.monotonic() > until_s
+        if is_late or isinstance(answer, Ack) or answer.reason is not RejectReason.OVERLOADED:
+            return answer  # type: ignore[no-any-return]
+        await asyncio.sleep(0.1)
 
 
 @pytest.mark.fault_core
@@ -74,9 +88,11 @@ async def test_damaged_packets(
             frame = next(frames)
             await asyncio.sleep(PACE_S)
             answer = await vehicle.ask(damage(client_message_to_bytes(frame), rng))
+            while isinstance(answer, Welcome):  # at another rate, as frames take longer here
+                answer = await vehicle.hear()
             sent += 1
             answers[str(answer.reason) if isinstance(answer, Nack) else "ack"] += 1
-            good = await vehicle.ask(frame) if isinstance(answer, Nack) else answer
+            good = await decided(vehicle, frame) if isinstance(answer, Nack) else answer
             exact = frame.packet.reconstruction_digest
             wrong += not isinstance(good, Ack) or good.reconstruction_digest != exact
         case.over()

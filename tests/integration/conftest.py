@@ -262,9 +262,12 @@ class RawVehicle:
                     return message
 
     async def ask(self, message: Hello | Frame | bytes) -> ServerMessage:
-        """Send a message and return the answer."""
+        """Send a message and return the answer; a Welcome with a new rate is none to a frame."""
         await self.say(message)
-        return await self.hear()
+        answer = await self.hear()
+        while isinstance(message, Frame) and isinstance(answer, Welcome):
+            answer = await self.hear()
+        return answer
 
     async def greet(self, hello: Hello) -> None:
         """Say hello and expect to be welcome."""
