@@ -93,11 +93,11 @@ inline Mv skip_vector(const MotionField& f) {
     return median_prediction(f, 0, 0, 0, 4);
 }
 
-// About the bits of one component of mvd_l0, in 1/256.
+// About the bits of one component of mvd_l0, in 1/256: 180, or 700 and 512 for every doubling.
 inline uint32_t vector_bits(int difference) {
     const uint32_t size = static_cast<uint32_t>(difference < 0 ? -difference : difference);
-    if (size == 0) return 180;
-    return 700 + 512u * static_cast<uint32_t>(31 - __builtin_clz(size));
+    const auto digits = static_cast<uint32_t>(31 - __builtin_clz(2 * size + 1));
+    return 188 + 512 * digits - (size == 0 ? 8 : 0);
 }
 
 struct Range {

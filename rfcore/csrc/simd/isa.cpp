@@ -11,11 +11,15 @@ struct Available {
     Available() {
         const char** next = names;
 #if defined(RF_HAVE_X86)
-        if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+        // Processors with AVX2 count bits with BMI, BMI2 and LZCNT; a virtual machine may hide them.
+        const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+                          __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2") &&
+                          __builtin_cpu_supports("lzcnt");
+        if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
             __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")) {
             *next++ = "avx512";
         }
-        if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) *next++ = "avx2";
+        if (avx2) *next++ = "avx2";
 #endif
 #if defined(RF_HAVE_NEON)
         *next++ = "neon";
