@@ -223,11 +223,15 @@ private:
     }
 
     Search search_of(int index, int shape, const Partition& part) const {
+        return search_of(index, shape, part, predicted_vector(field_, shape, part, index));
+    }
+
+    Search search_of(int index, int shape, const Partition& part, Mv predicted) const {
         const int x = 8 * (part.block & 1), y = 8 * (part.block >> 1);
         const int width = 4 * part.width, height = 4 * part.height;
         return {job_.references[index], source_[0].at + y * source_[0].stride + x,
                 source_[0].stride, transformed_.rows(x, y, width), x_ + x, y_ + y, width, height,
-                predicted_vector(field_, shape, part, index), motion_q8_, range_};
+                predicted, motion_q8_, range_};
     }
 
     Found started(const Search& search, int index, const Mv* starts, int count) const {
@@ -261,14 +265,14 @@ private:
     }
 
     // Refines a partition's vectors in the best reference and in those that come near to it.
-    void refine_near(int shape, const Partition& part, Found* found) const {
+    void refine_near(int shape, const Partition& part, const Mv* predicted, Found* found) const {
         const int best = least_of(found), reach = job_.effort.references_reach;
         const uint64_t near = uint64_t{found[best].cost} * unsigned(reach) / 100;
         const uint64_t most = reach == 0 ? kNotSearched : near;
         for (int r = 0; r < job_.reference_count; ++r) {
             if (found[r].cost == kNotSearched || found[r].cost > most) continue;
             if (best_alone() && r != best) continue;
-            found[r] = refined(search_of(r, shape, part), r, found[r]);
+            found[r] = refined(search_of(r, shape, part, predicted[r]), r, found[r]);
         }
     }
 
@@ -363,12 +367,14 @@ private:
             const Partition& part = kPartitions[shape][p];
             const int last = part.block + (part.width == 4) + 2 * (part.height == 4);
             Found found[kMaxReferences];
+            Mv predicted[kMaxReferences];
             for (int r = 0; r < job_.reference_count; ++r) {
                 found[r] = {{0, 0}, kNotSearched};
                 if (from && r != from->reference[part.block] && r != from->reference[last]) {
                     continue;
                 }
                 const Search search = search_of(r, shape, part);
+                predicted[r] = search.predicted;
                 Mv starts[4] = {whole[r].mv, search.predicted};
                 if (from) {
                     starts[2] = from->mv[part.block];
@@ -377,12 +383,10 @@ private:
                 found[r] = search.first_of(starts, from ? 4 : 2);
                 found[r].cost += reference_cost(r);
             }
-            if (!from || !best_alone()) refine_near(shape, part, found);
+            if (!from || !best_alone()) refine_near(shape, part, predicted, found);
             const int index = least_of(found);
             const Found least = found[index];
-            const Search search = search_of(index, shape, part);
-            const Mv least_predicted = search.predicted;
-            set_partition(out, part, index, least.mv, least_predicted);
+            set_partition(out, part, index, least.mv, predicted[index]);
             field_.fill(part, static_cast<int8_t>(index), least.mv);
             total += least.cost;
         }

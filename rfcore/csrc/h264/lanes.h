@@ -298,6 +298,36 @@ RF_INLINE uint32_t absolute_difference(const uint8_t* a, ptrdiff_t a_stride, con
 #endif
 }
 
+// The same between `a` and the four blocks one sample right, left, below and above `b`.
+template <int width>
+RF_INLINE void absolute_differences_around(const uint8_t* a, ptrdiff_t a_stride, const uint8_t* b,
+                                           ptrdiff_t b_stride, int height, uint32_t* sums) {
+    const uint8_t* around[4] = {b + 1, b - 1, b + b_stride, b - b_stride};
+#ifdef RF_H264_X86
+    constexpr int kRows = width == 16 ? 1 : 2;  // in sixteen lanes
+    const auto load = [](const uint8_t* at, ptrdiff_t stride) {
+        if (width == 16) return _mm_loadu_si128(reinterpret_cast<const __m128i*>(at));
+        return _mm_unpacklo_epi64(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(at)),
+                                  _mm_loadl_epi64(reinterpret_cast<const __m128i*>(at + stride)));
+    };
+    __m128i sum[4] = {};
+    for (int y = 0; y < height; y += kRows, a += kRows * a_stride) {
+        const __m128i row = load(a, a_stride);
+        for (int i = 0; i < 4; ++i) {
+            const __m128i other = load(around[i] + y * b_stride, b_stride);
+            sum[i] = _mm_add_epi32(sum[i], _mm_sad_epu8(row, other));
+        }
+    }
+    for (int i = 0; i < 4; ++i) {
+        sums[i] = static_cast<uint32_t>(_mm_cvtsi128_si32(sum[i]) + _mm_extract_epi32(sum[i], 2));
+    }
+#else
+    for (int i = 0; i < 4; ++i) {
+        sums[i] = absolute_difference<width>(a, a_stride, around[i], b_stride, height);
+    }
+#endif
+}
+
 template <int side>
 RF_INLINE uint32_t squared_error(const uint8_t* a, ptrdiff_t a_stride, const uint8_t* b,
                                  ptrdiff_t b_stride) {

@@ -148,25 +148,57 @@ struct Search {
         return 256 * sum + vector_cost(v);
     }
 
-    // At most `steps` steps, each to the best of the four neighbours at `distance`, until none is
-    // better. Where the last step came from is not measured again: it cost more.
-    template <class Measure>
-    void walk(Found& best, int distance, int steps, Measure measure) const {
+    // Costs of the four vectors around `centre`; kOutside where there is no such vector.
+    using Costs = uint32_t[4];
+
+    void whole_around(Mv centre, Costs& costs) const {
+        const Plane& plane = reference.luma[0];
+        const uint8_t* at =
+            plane.at + (y + (centre.y >> 2)) * plane.stride + x + (centre.x >> 2);
+        if (width == 16) {
+            absolute_differences_around<16>(source, source_stride, at, plane.stride, height, costs);
+        } else {
+            absolute_differences_around<8>(source, source_stride, at, plane.stride, height, costs);
+        }
+        for (int i = 0; i < 4; ++i) {
+            const Mv v = neighbour(centre, 4, i);
+            costs[i] = range.holds(v) ? 256 * costs[i] + vector_cost(v) : kOutside;
+        }
+    }
+
+    void exact_around(Mv centre, int distance, int left_out, Costs& costs) const {
+        for (int i = 0; i < 4; ++i) {
+            const Mv v = neighbour(centre, distance, i);
+            costs[i] = i != left_out && range.holds(v) ? exact(v) : kOutside;
+        }
+    }
+
+    static constexpr uint32_t kOutside = UINT32_MAX;
+
+    // Right, left, below, above.
+    static Mv neighbour(Mv centre, int distance, int i) {
         static constexpr int8_t kDirections[4][2] = {{1, 0}, {-1, 0}, {0, 1}, {0, -1}};
+        return {static_cast<int16_t>(centre.x + distance * kDirections[i][0]),
+                static_cast<int16_t>(centre.y + distance * kDirections[i][1])};
+    }
+
+    // At most `steps` steps, each to the best of the four neighbours at `distance`, until none is
+    // better. `measure(centre, left_out, costs)` need not measure the neighbour left out: the last
+    // step came from there, so it costs more.
+    template <class Measure>
+    static void walk(Found& best, int distance, int steps, Measure measure) {
         int back = -1;
         while (steps-- > 0) {
-            const Mv centre = best.mv;
+            Costs costs;
+            measure(best.mv, back, costs);
             int taken = -1;
+            uint32_t least = best.cost;
             for (int i = 0; i < 4; ++i) {
-                const Mv v = {static_cast<int16_t>(centre.x + distance * kDirections[i][0]),
-                              static_cast<int16_t>(centre.y + distance * kDirections[i][1])};
-                if (i == back || !range.holds(v)) continue;
-                const uint32_t cost = measure(v);
-                if (cost >= best.cost) continue;
-                best = {v, cost};
-                taken = i;
+                taken = costs[i] < least ? i : taken;
+                least = costs[i] < least ? costs[i] : least;
             }
             if (taken < 0) return;
+            best = {neighbour(best.mv, distance, taken), least};
             back = taken ^ 1;
         }
     }
@@ -201,21 +233,24 @@ struct Search {
 
     // Walks from `start` by whole samples, then by halves and quarters.
     Found refined(const Found& start, const Effort& effort) const {
-        const auto by_whole = [this](Mv v) { return whole(v); };
-        const auto by_exact = [this](Mv v) { return exact(v); };
         const Mv rounded = {static_cast<int16_t>((start.mv.x + 2) & ~3),
                             static_cast<int16_t>((start.mv.y + 2) & ~3)};
         Found best = start;
         if (range.holds(rounded)) {
             Found other = {rounded, whole(rounded)};
-            walk(other, 4, effort.search_steps, by_whole);
+            walk(other, 4, effort.search_steps,
+                 [&](Mv centre, int, Costs& costs) { whole_around(centre, costs); });
             if (!(other.mv == rounded)) {
                 other.cost = exact(other.mv);
                 if (other.cost < best.cost) best = other;
             }
         }
-        walk(best, 2, effort.subsample_steps, by_exact);
-        walk(best, 1, effort.subsample_steps, by_exact);
+        for (int distance = 2; distance > 0; --distance) {
+            walk(best, distance, effort.subsample_steps,
+                 [&](Mv centre, int left_out, Costs& costs) {
+                     exact_around(centre, distance, left_out, costs);
+                 });
+        }
         return best;
     }
 };
