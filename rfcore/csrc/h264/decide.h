@@ -30,7 +30,9 @@ constexpr uint32_t kNotSearched = UINT32_MAX;
 class MacroblockCoder {
 public:
     MacroblockCoder(const SliceJob& job, const Contexts& contexts)
-        : job_(job), contexts_(contexts) {}
+        : job_(job), contexts_(contexts) {
+        for (int r = 0; r < job.reference_count; ++r) planes_[r].begin(job.references[r]);
+    }
 
     // Decides on macroblock (mx, my); the result is valid until the next call.
     const Candidate& decide(int mx, int my, const Around& around) {
@@ -131,10 +133,10 @@ private:
             const Partition& part = kPartitions[mb.shape][p];
             const int x = 8 * (part.block & 1), y = 8 * (part.block >> 1);
             const int width = 4 * part.width, height = 4 * part.height;
-            const Reference& reference = job_.references[mb.reference[part.block]];
+            const int index = mb.reference[part.block];
             const Mv mv = mb.mv[part.block];
             const Block block =
-                luma_prediction(reference, x_ + x, y_ + y, mv, width, height, scratch);
+                luma_prediction(planes_[index], x_ + x, y_ + y, mv, width, height, scratch);
             uint8_t* out = luma + 16 * y + x;
             if (width == 16) {
                 copy_block<16>(block.at, block.stride, out, 16, height);
@@ -142,7 +144,7 @@ private:
                 copy_block<8>(block.at, block.stride, out, 16, height);
             }
             for (int c = 0; c < 2; ++c) {
-                const Plane& plane = reference.chroma[c];
+                const Plane& plane = job_.references[index].chroma[c];
                 uint8_t* to = chroma[c] + 4 * y + x / 2;
                 if (width == 16) {
                     predict_chroma<8>(plane, (x_ + x) / 2, (y_ + y) / 2, mv, height / 2, to);
@@ -229,7 +231,7 @@ private:
     Search search_of(int index, int shape, const Partition& part, Mv predicted) const {
         const int x = 8 * (part.block & 1), y = 8 * (part.block >> 1);
         const int width = 4 * part.width, height = 4 * part.height;
-        return {job_.references[index], source_[0].at + y * source_[0].stride + x,
+        return {planes_[index], source_[0].at + y * source_[0].stride + x,
                 source_[0].stride, transformed_.rows(x, y, width), x_ + x, y_ + y, width, height,
                 predicted, motion_q8_, range_};
     }
@@ -614,6 +616,7 @@ private:
     const Around* around_ = nullptr;
     int x_ = 0, y_ = 0;
     Plane source_[3];
+    QuarterPlanes planes_[kMaxReferences];
     TransformedSource transformed_;
     uint8_t* picture_[3];
     Rates rates_;

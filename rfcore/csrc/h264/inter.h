@@ -41,26 +41,46 @@ RF_INLINE void mean_of_blocks(const uint8_t* a, const uint8_t* b, ptrdiff_t stri
     }
 }
 
-// Where the samples of a luma prediction by `mv` lie: a block, or two to take the mean of.
+// Where the samples of a luma prediction lie: a block, or two to take the mean of.
 struct QuarterSamples {
     const uint8_t *first, *second;  // second: nullptr where there is none
     ptrdiff_t stride;
 };
 
-inline QuarterSamples quarter_samples(const Reference& reference, int x, int y, Mv mv) {
-    const QuarterPosition& q = kQuarter[4 * (mv.y & 3) + (mv.x & 3)];
-    const ptrdiff_t stride = reference.luma[0].stride;
-    const ptrdiff_t base = (y + (mv.y >> 2)) * stride + x + (mv.x >> 2);
-    const uint8_t* first = reference.luma[q.plane[0]].at + base + q.dy[0] * stride + q.dx[0];
-    const uint8_t* second = reference.luma[q.plane[1]].at + base + q.dy[1] * stride + q.dx[1];
-    return {first, q.mean ? second : nullptr, stride};
-}
+// Where those of sample (0, 0) lie for each of the sixteen quarter-sample positions.
+struct QuarterPlanes {
+    const uint8_t *first[16], *second[16];
+    ptrdiff_t stride;
+
+    void begin(const Reference& reference) {
+        stride = reference.luma[0].stride;
+        for (int i = 0; i < 16; ++i) {
+            const QuarterPosition& q = kQuarter[i];
+            const auto at = [&](int k) {
+                return reference.luma[q.plane[k]].at + q.dy[k] * stride + q.dx[k];
+            };
+            first[i] = at(0);
+            second[i] = q.mean ? at(1) : nullptr;
+        }
+    }
+
+    // The integer samples of the block at (x, y).
+    const uint8_t* whole(int x, int y) const { return first[0] + y * stride + x; }
+
+    // The samples of the block at (x, y) moved by `mv`.
+    QuarterSamples at(int x, int y, Mv mv) const {
+        const int position = 4 * (mv.y & 3) + (mv.x & 3);
+        const ptrdiff_t offset = (y + (mv.y >> 2)) * stride + x + (mv.x >> 2);
+        const uint8_t* other = second[position];
+        return {first[position] + offset, other ? other + offset : nullptr, stride};
+    }
+};
 
 // The luma prediction of a block at (x, y) by `mv`, 8 or 16 wide: in the reference's planes where
 // no mean is needed, else in `scratch` (stride 16).
-inline Block luma_prediction(const Reference& reference, int x, int y, Mv mv, int width, int height,
+inline Block luma_prediction(const QuarterPlanes& planes, int x, int y, Mv mv, int width, int height,
                              uint8_t* scratch) {
-    const QuarterSamples at = quarter_samples(reference, x, y, mv);
+    const QuarterSamples at = planes.at(x, y, mv);
     if (at.second == nullptr) return {at.first, at.stride};
     if (width == 16) {
         mean_of_blocks<Bytes16>(at.first, at.second, at.stride, height, scratch);

@@ -118,7 +118,7 @@ struct Found {
 
 // Searches one block in one reference.
 struct Search {
-    const Reference& reference;
+    const QuarterPlanes& planes;
     const uint8_t* source;
     ptrdiff_t source_stride;
     const Short16* transformed;  // rows of a TransformedSource
@@ -133,16 +133,15 @@ struct Search {
     }
 
     uint32_t whole(Mv v) const {
-        const Plane& plane = reference.luma[0];
-        const uint8_t* at = plane.at + (y + (v.y >> 2)) * plane.stride + x + (v.x >> 2);
+        const uint8_t* at = planes.whole(x + (v.x >> 2), y + (v.y >> 2));
         const uint32_t sum =
-            width == 16 ? absolute_difference<16>(source, source_stride, at, plane.stride, height)
-                        : absolute_difference<8>(source, source_stride, at, plane.stride, height);
+            width == 16 ? absolute_difference<16>(source, source_stride, at, planes.stride, height)
+                        : absolute_difference<8>(source, source_stride, at, planes.stride, height);
         return 256 * sum + vector_cost(v);
     }
 
     uint32_t exact(Mv v) const {
-        const QuarterSamples at = quarter_samples(reference, x, y, v);
+        const QuarterSamples at = planes.at(x, y, v);
         const uint32_t sum = width == 16 ? transformed_difference<16>(transformed, at, height)
                                          : transformed_difference<8>(transformed, at, height);
         return 256 * sum + vector_cost(v);
@@ -152,13 +151,11 @@ struct Search {
     using Costs = uint32_t[4];
 
     void whole_around(Mv centre, Costs& costs) const {
-        const Plane& plane = reference.luma[0];
-        const uint8_t* at =
-            plane.at + (y + (centre.y >> 2)) * plane.stride + x + (centre.x >> 2);
+        const uint8_t* at = planes.whole(x + (centre.x >> 2), y + (centre.y >> 2));
         if (width == 16) {
-            absolute_differences_around<16>(source, source_stride, at, plane.stride, height, costs);
+            absolute_differences_around<16>(source, source_stride, at, planes.stride, height, costs);
         } else {
-            absolute_differences_around<8>(source, source_stride, at, plane.stride, height, costs);
+            absolute_differences_around<8>(source, source_stride, at, planes.stride, height, costs);
         }
         for (int i = 0; i < 4; ++i) {
             const Mv v = neighbour(centre, 4, i);
