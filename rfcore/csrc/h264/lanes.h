@@ -124,6 +124,19 @@ RF_INLINE void store_clipped(Row4 v, uint8_t* at) {
 #endif
 }
 
+RF_INLINE void store_clipped(Short16 v, uint8_t* at) {
+#ifdef RF_H264_X86
+    const __m256i w = reinterpret_cast<__m256i>(v);
+    const __m128i bytes = _mm_packus_epi16(_mm256_castsi256_si128(w), _mm256_extracti128_si256(w, 1));
+    _mm_storeu_si128(reinterpret_cast<__m128i*>(at), bytes);
+#else
+    v = v < 0 ? Short16{} : v;
+    v = v > 255 ? Short16{} + 255 : v;
+    const Bytes16 bytes = __builtin_convertvector(v, Bytes16);
+    __builtin_memcpy(at, &bytes, 16);
+#endif
+}
+
 // A bit for each of eight values above `limit`.
 RF_INLINE uint32_t above(const int32_t* values, int32_t limit) {
     Row8 v;
