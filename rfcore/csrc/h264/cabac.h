@@ -27,12 +27,28 @@ inline void init_contexts(Contexts& contexts, bool p_slice, int qp) {
     }
 }
 
-inline uint8_t after_symbol(uint8_t packed, bool likely) {
+constexpr uint8_t after_symbol(int packed, bool likely) {
     const int state = packed >> 1;
     if (likely) return static_cast<uint8_t>(packed + (state < 62 ? 2 : 0));
     const int mps = (packed & 1) ^ (state == 0);
     return static_cast<uint8_t>((kNextLps[state] << 1) | mps);
 }
+
+// The state after one, by the state and whether the symbol was the less likely one.
+struct NextStates {
+    uint8_t of[128][2];
+};
+
+constexpr NextStates make_next_states() {
+    NextStates next{};
+    for (int packed = 0; packed < 128; ++packed) {
+        next.of[packed][0] = after_symbol(packed, true);
+        next.of[packed][1] = after_symbol(packed, false);
+    }
+    return next;
+}
+
+constexpr NextStates kNextStates = make_next_states();
 
 // Writes the bytes of slice_data; the caller has room for them (checked between macroblocks).
 class CabacWriter {
@@ -42,13 +58,11 @@ public:
     void bin(int context, int value) {
         uint8_t& packed = contexts_.state[context];
         const uint32_t less = kRangeLps[packed >> 1][(range_ >> 6) & 3];
-        range_ -= less;
-        const bool likely = value == (packed & 1);
-        if (!likely) {
-            low_ += range_;
-            range_ = less;
-        }
-        packed = after_symbol(packed, likely);
+        const uint32_t rest = range_ - less;
+        const int unlikely = value ^ (packed & 1);
+        low_ += unlikely ? rest : 0;
+        range_ = unlikely ? less : rest;
+        packed = kNextStates.of[packed][unlikely];
         renormalise();
     }
 
@@ -101,11 +115,9 @@ public:
 private:
     void renormalise() {
         const int shift = __builtin_clz(range_) - 23;  // until range >= 256
-        if (shift > 0) {
-            range_ <<= shift;
-            low_ <<= shift;
-            shifted(shift);
-        }
+        range_ <<= shift;
+        low_ <<= shift;
+        shifted(shift);
     }
 
     // Bits above the ten of codILow are final but for a carry; whole bytes of them go out.
@@ -138,7 +150,7 @@ public:
 
     void bin(int context, int value) {
         uint8_t& packed = contexts_.state[context];
-        packed = after_symbol(packed, value == (packed & 1));
+        packed = kNextStates.of[packed][value ^ (packed & 1)];
     }
     void bypass(int) {}
     void bypass_bits(uint32_t, int) {}

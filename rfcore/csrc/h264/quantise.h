@@ -110,9 +110,11 @@ private:
     LevelRates rates_[6];
 };
 
+// The category is known when compiling: its sizes, contexts and scan are constants then.
+template <Category kCategory>
 struct RateQuantiser {
+    static constexpr Category category = kCategory;
     Rates& rates;
-    Category category;
     int flag_context;  // of coded_block_flag, -1 where there is none
     uint32_t lambda_q8;
     int shift;         // of `multiplier` to levels in 1/256
@@ -155,10 +157,11 @@ struct Choice {
 
 // Returns the level inside. (A returned Choice would be copied by a wide load behind narrow stores,
 // which took 3 % of a picture.)
-inline int choose_level(const RateQuantiser& q, const LevelRates& rates, int position,
+template <Category category>
+RF_INLINE int choose_level(const RateQuantiser<category>& q, const LevelRates& rates, int position,
                         int32_t scaled, Cost weight, int ones, int more, Choice& choice) {
     const Cost lambda = q.lambda_q8;
-    const bool end = position == kCoefficients[q.category] - 1;
+    const bool end = position == kCoefficients[category] - 1;
     const uint32_t zero_bits = end ? 0 : rates.zero(position);
     const Cost zero = (static_cast<Cost>(scaled) * scaled * weight) >> 8;
     int chosen = 0, chosen_last = 0;
@@ -168,7 +171,7 @@ inline int choose_level(const RateQuantiser& q, const LevelRates& rates, int pos
     for (int level = high; level >= low; --level) {
         const Cost off = scaled - 256 * level;
         const Cost saved = ((off * off * weight) >> 8) - zero;
-        const Cost bits = rates.level(q.category, ones, more, level);
+        const Cost bits = rates.level(category, ones, more, level);
         const Cost last = saved + lambda * (bits + rates.last[position]);
         if (last < least_last) {
             least_last = last;
@@ -190,18 +193,19 @@ inline int choose_level(const RateQuantiser& q, const LevelRates& rates, int pos
 }
 
 // Writes the levels up to choices[chosen], the last one; choices run from the end of the scan.
-inline Quantised take_levels(const RateQuantiser& q, const LevelRates& rates, Choice* choices,
+template <Category category>
+Quantised take_levels(const RateQuantiser<category>& q, const LevelRates& rates, Choice* choices,
                              int chosen, int count, const int32_t* coefficients, int16_t* levels) {
-    const Scan& scan = kScan[q.category];
+    constexpr const Scan& scan = kScan[category];
     Quantised result = {0, rates.zeros_before[choices[chosen].position]};
-    __builtin_memset(levels, 0, sizeof(int16_t) * static_cast<size_t>(kCoefficients[q.category]));
+    __builtin_memset(levels, 0, sizeof(int16_t) * static_cast<size_t>(kCoefficients[category]));
     choices[chosen].level = choices[chosen].last_level;
     int ones = 0, more = 0;
     for (int k = chosen; k < count; ++k) {
         const int level = choices[k].level, position = choices[k].position;
         if (level == 0) continue;
         result.coded |= uint64_t{1} << position;
-        result.bits += rates.level(q.category, ones, more, level);
+        result.bits += rates.level(category, ones, more, level);
         result.bits += k == chosen ? rates.last[position]
                                    : rates.inside[position] - rates.zero(position);
         ++(level == 1 ? ones : more);
@@ -213,21 +217,20 @@ inline Quantised take_levels(const RateQuantiser& q, const LevelRates& rates, Ch
 
 // Levels in scan order for the `coefficients` of a block; `levels` is left alone where nothing is
 // worth its bits.
-inline Quantised quantise(const RateQuantiser& q, const int32_t* coefficients,
+template <Category category>
+Quantised quantise(const RateQuantiser<category>& q, const int32_t* coefficients,
                           const uint16_t* multiplier, const uint16_t* energy, int16_t* levels) {
-    const Scan& scan = kScan[q.category];
+    constexpr const Scan& scan = kScan[category];
     alignas(32) int32_t scaled[64];
-    uint64_t large = q.category == kLuma8 ? scale<64>(coefficients, multiplier, q.shift, scaled)
-                     : q.category == kChromaDc
-                         ? scale<4>(coefficients, multiplier, q.shift, scaled)
-                         : scale<16>(coefficients, multiplier, q.shift, scaled);
-    if (q.category == kLumaAc || q.category == kChromaAc) large &= ~uint64_t{1};
+    constexpr int kCount = category == kLuma8 ? 64 : category == kChromaDc ? 4 : 16;
+    uint64_t large = scale<kCount>(coefficients, multiplier, q.shift, scaled);
+    if (category == kLumaAc || category == kChromaAc) large &= ~uint64_t{1};
     if (large == 0) return {0, 0};
     uint64_t todo = 0;
     for (; large != 0; large &= large - 1) {
         todo |= uint64_t{1} << scan.position[__builtin_ctzll(large)];
     }
-    const LevelRates& rates = q.rates.of(q.category);
+    const LevelRates& rates = q.rates.of(category);
     Choice choices[64];
     int count = 0, ones = 0, more = 0;
     while (todo != 0) {

@@ -37,8 +37,8 @@ struct LumaCosts {
 };
 
 // 8.5.12.1 and 8.5.13.1 without the DC that was transformed once more: only coded positions.
-inline void dequantise4(const int16_t* levels, Category category, uint64_t coded, int qp,
-                        int32_t* out) {
+template <Category category>
+void dequantise4(const int16_t* levels, uint64_t coded, int qp, int32_t* out) {
     const Quantiser<4>& q = kQuantiser4[qp % 6];
     __builtin_memset(out, 0, 16 * sizeof(int32_t));
     for (; coded != 0; coded &= coded - 1) {
@@ -59,11 +59,11 @@ inline void dequantise8(const int16_t* levels, uint64_t coded, int qp, int32_t* 
     }
 }
 
-inline RateQuantiser rate_quantiser(const Quality& quality, Category category, int flag_context,
-                                    int qp) {
+template <Category category>
+RF_INLINE RateQuantiser<category> rate_quantiser(const Quality& quality, int flag_context, int qp) {
     const int shift = qp / 6 + (category == kLuma8 ? 16 : 15) - 8;
     const int more = category == kChromaDc ? 1 : category == kLumaDc ? 2 : 0;
-    return {*quality.rates, category, flag_context, quality.lambda_q8, shift + more, 2 * (qp / 6)};
+    return {*quality.rates, flag_context, quality.lambda_q8, shift + more, 2 * (qp / 6)};
 }
 
 template <int width>
@@ -81,7 +81,7 @@ inline uint32_t code_block8(const Quality& quality, const uint8_t* source, ptrdi
     const Quantiser<8>& q = kQuantiser8[quality.qp % 6];
     alignas(32) int32_t coefficients[64];
     forward8(source, source_stride, prediction, stride, coefficients);
-    const RateQuantiser rate = rate_quantiser(quality, kLuma8, -1, quality.qp);
+    const auto rate = rate_quantiser<kLuma8>(quality, -1, quality.qp);
     const Quantised block = quantise(rate, coefficients, q.multiplier, q.energy, levels);
     if (!block) {
         copy_block<8>(prediction, stride, out, out_stride, 8);
@@ -98,13 +98,13 @@ inline uint32_t code_block4(const Quality& quality, int flag_context, const uint
     const Quantiser<4>& q = kQuantiser4[quality.qp % 6];
     alignas(16) int32_t coefficients[16];
     forward4(source, source_stride, prediction, stride, coefficients);
-    const RateQuantiser rate = rate_quantiser(quality, kLuma4, flag_context, quality.qp);
+    const auto rate = rate_quantiser<kLuma4>(quality, flag_context, quality.qp);
     const Quantised block = quantise(rate, coefficients, q.multiplier, q.energy, levels);
     if (!block) {
         copy_block<4>(prediction, stride, out, out_stride, 4);
         return 0;
     }
-    dequantise4(levels, kLuma4, block.coded, quality.qp, coefficients);
+    dequantise4<kLuma4>(levels, block.coded, quality.qp, coefficients);
     inverse4(coefficients, prediction, stride, out, out_stride);
     return block.bits;
 }
@@ -196,7 +196,7 @@ inline void code_luma16(const Quality& quality, const Plane& source, const uint8
         dc[raster] = coefficients[blk][0];
         const int context =
             kFlagContext[kLumaAc] + luma_flag_context(c.mb, *quality.around, raster, c.mb.coded);
-        const Quantised block = quantise(rate_quantiser(quality, kLumaAc, context, qp),
+        const Quantised block = quantise(rate_quantiser<kLumaAc>(quality, context, qp),
                                          coefficients[blk], q.multiplier, q.energy,
                                          c.mb.luma + 16 * blk + 1);
         coded[blk] = block.coded;
@@ -211,7 +211,7 @@ inline void code_luma16(const Quality& quality, const Plane& source, const uint8
     const Quantiser<4>& q_dc = kQuantiserDc[qp % 6];
     const int context = kFlagContext[kLumaDc] + flag_of(quality.around->left, 16, true) +
                         2 * flag_of(quality.around->above, 16, true);
-    const Quantised levels_dc = quantise(rate_quantiser(quality, kLumaDc, context, qp), transformed,
+    const Quantised levels_dc = quantise(rate_quantiser<kLumaDc>(quality, context, qp), transformed,
                                          q_dc.multiplier, q_dc.energy, c.mb.luma_dc);
     c.luma_bits += levels_dc.bits;
     if (levels_dc) c.mb.coded |= 1u << 16;
@@ -221,7 +221,7 @@ inline void code_luma16(const Quality& quality, const Plane& source, const uint8
     for (int blk = 0; blk < 16; ++blk) {
         const int raster = kRasterOfBlk[blk];
         const int at = 64 * (raster >> 2) + 4 * (raster & 3);
-        dequantise4(c.mb.luma + 16 * blk + 1, kLumaAc, coded[blk], qp, coefficients[blk]);
+        dequantise4<kLumaAc>(c.mb.luma + 16 * blk + 1, coded[blk], qp, coefficients[blk]);
         const int32_t value = transformed[raster] * scale;
         coefficients[blk][0] =
             shift >= 6 ? value * (1 << (shift - 6)) : (value + (1 << (5 - shift))) >> (6 - shift);
@@ -255,7 +255,7 @@ inline void code_chroma(const Quality& quality, const Plane* source,
         const int context = kFlagContext[kChromaDc] + flag_of(quality.around->left, 17 + p, intra) +
                             2 * flag_of(quality.around->above, 17 + p, intra);
         const Quantised levels_dc =
-            quantise(rate_quantiser(quality, kChromaDc, context, qp), transformed, q_dc.multiplier,
+            quantise(rate_quantiser<kChromaDc>(quality, context, qp), transformed, q_dc.multiplier,
                      q_dc.energy, c.mb.chroma_dc[p]);
         coded_dc[p] = levels_dc.coded;
         c.chroma_bits += levels_dc.bits;
@@ -266,8 +266,7 @@ inline void code_chroma(const Quality& quality, const Plane* source,
                                    : flag_of(quality.around->left, first + b + 1, intra);
             const int above = b & 2 ? (c.mb.coded >> (first + b - 2)) & 1
                                     : flag_of(quality.around->above, first + b + 2, intra);
-            const RateQuantiser rate = rate_quantiser(
-                quality, kChromaAc, kFlagContext[kChromaAc] + left + 2 * above, qp);
+            const auto rate = rate_quantiser<kChromaAc>(quality, kFlagContext[kChromaAc] + left + 2 * above, qp);
             const Quantised block = quantise(rate, coefficients[p][b], q.multiplier, q.energy,
                                              c.mb.chroma_ac[p][b] + 1);
             coded[p][b] = block.coded;
@@ -287,7 +286,7 @@ inline void code_chroma(const Quality& quality, const Plane* source,
         const int32_t f[4] = {s0 + s2, s1 + s3, s0 - s2, s1 - s3};
         for (int b = 0; b < 4; ++b) {
             const int at = 32 * (b >> 1) + 4 * (b & 1);
-            dequantise4(c.mb.chroma_ac[p][b] + 1, kChromaAc, coded[p][b], qp, coefficients[p][b]);
+            dequantise4<kChromaAc>(c.mb.chroma_ac[p][b] + 1, coded[p][b], qp, coefficients[p][b]);
             coefficients[p][b][0] = ((f[b] * 16 * q.norm[0]) * (1 << (qp / 6))) >> 5;
             inverse4(coefficients[p][b], prediction[p] + at, 8, c.chroma[p] + at, 8);
         }
