@@ -105,6 +105,10 @@ struct Range {
     bool holds(Mv v) const {
         return v.x >= low_x && v.x <= high_x && v.y >= low_y && v.y <= high_y;
     }
+    bool holds_around(Mv v, int distance) const {
+        return v.x - distance >= low_x && v.x + distance <= high_x && v.y - distance >= low_y &&
+               v.y + distance <= high_y;
+    }
     Mv clamped(Mv v) const {
         return {v.x < low_x ? low_x : v.x > high_x ? high_x : v.x,
                 v.y < low_y ? low_y : v.y > high_y ? high_y : v.y};
@@ -127,9 +131,12 @@ struct Search {
     uint32_t motion_q8;
     Range range;
 
-    uint32_t vector_cost(Mv v) const {
-        const uint32_t bits = vector_bits(v.x - predicted.x) + vector_bits(v.y - predicted.y);
+    uint32_t cost_of_bits(uint32_t bits) const {
         return static_cast<uint32_t>((static_cast<uint64_t>(motion_q8) * bits) >> 8);
+    }
+
+    uint32_t vector_cost(Mv v) const {
+        return cost_of_bits(vector_bits(v.x - predicted.x) + vector_bits(v.y - predicted.y));
     }
 
     uint32_t whole(Mv v) const {
@@ -140,37 +147,58 @@ struct Search {
         return 256 * sum + vector_cost(v);
     }
 
-    uint32_t exact(Mv v) const {
+    // 256 times the transformed difference.
+    uint32_t exact_difference(Mv v) const {
         const QuarterSamples at = planes.at(x, y, v);
         const uint32_t sum = width == 16 ? transformed_difference<16>(transformed, at, height)
                                          : transformed_difference<8>(transformed, at, height);
-        return 256 * sum + vector_cost(v);
+        return 256 * sum;
     }
 
-    // Costs of the four vectors around `centre`; kOutside where there is no such vector.
-    using Costs = uint32_t[4];
+    uint32_t exact(Mv v) const { return exact_difference(v) + vector_cost(v); }
 
+    using Costs = uint32_t[4];
+    static constexpr uint32_t kOutside = UINT32_MAX;
+
+    // Costs of the bits of the four vectors around `centre`; kOutside for those out of range.
+    void vector_costs_around(Mv centre, int distance, Costs& costs) const {
+        const int dx = centre.x - predicted.x, dy = centre.y - predicted.y;
+        const uint32_t x = vector_bits(dx), y = vector_bits(dy);
+        costs[0] = cost_of_bits(vector_bits(dx + distance) + y);
+        costs[1] = cost_of_bits(vector_bits(dx - distance) + y);
+        costs[2] = cost_of_bits(x + vector_bits(dy + distance));
+        costs[3] = cost_of_bits(x + vector_bits(dy - distance));
+        if (range.holds_around(centre, distance)) return;
+        for (int i = 0; i < 4; ++i) {
+            if (!range.holds(neighbour(centre, distance, i))) costs[i] = kOutside;
+        }
+    }
+
+    // Costs of the four vectors a sample around `centre`.
     void whole_around(Mv centre, Costs& costs) const {
+        Costs sums;
         const uint8_t* at = planes.whole(x + (centre.x >> 2), y + (centre.y >> 2));
         if (width == 16) {
-            absolute_differences_around<16>(source, source_stride, at, planes.stride, height, costs);
+            absolute_differences_around<16>(source, source_stride, at, planes.stride, height, sums);
         } else {
-            absolute_differences_around<8>(source, source_stride, at, planes.stride, height, costs);
+            absolute_differences_around<8>(source, source_stride, at, planes.stride, height, sums);
         }
+        vector_costs_around(centre, 4, costs);
         for (int i = 0; i < 4; ++i) {
-            const Mv v = neighbour(centre, 4, i);
-            costs[i] = range.holds(v) ? 256 * costs[i] + vector_cost(v) : kOutside;
+            costs[i] = costs[i] == kOutside ? kOutside : costs[i] + 256 * sums[i];
         }
     }
 
     void exact_around(Mv centre, int distance, int left_out, Costs& costs) const {
+        vector_costs_around(centre, distance, costs);
         for (int i = 0; i < 4; ++i) {
-            const Mv v = neighbour(centre, distance, i);
-            costs[i] = i != left_out && range.holds(v) ? exact(v) : kOutside;
+            if (i == left_out || costs[i] == kOutside) {
+                costs[i] = kOutside;
+            } else {
+                costs[i] += exact_difference(neighbour(centre, distance, i));
+            }
         }
     }
-
-    static constexpr uint32_t kOutside = UINT32_MAX;
 
     // Right, left, below, above.
     static Mv neighbour(Mv centre, int distance, int i) {
