@@ -11,7 +11,8 @@ struct SixTaps {
 
     static SixTaps of_samples(const uint8_t* at, ptrdiff_t step) {
         const auto pair = [&](int i) {
-            return load_shorts(at - i * step, Short16{}) + load_shorts(at + (i + 1) * step, Short16{});
+            return load_shorts(at - i * step, Short16{}) +
+                   load_shorts(at + (i + 1) * step, Short16{});
         };
         return {pair(2), pair(1), pair(0)};
     }

@@ -78,8 +78,8 @@ struct QuarterPlanes {
 
 // The luma prediction of a block at (x, y) by `mv`, 8 or 16 wide: in the reference's planes where
 // no mean is needed, else in `scratch` (stride 16).
-inline Block luma_prediction(const QuarterPlanes& planes, int x, int y, Mv mv, int width, int height,
-                             uint8_t* scratch) {
+inline Block luma_prediction(const QuarterPlanes& planes, int x, int y, Mv mv, int width,
+                             int height, uint8_t* scratch) {
     const QuarterSamples at = planes.at(x, y, mv);
     if (at.second == nullptr) return {at.first, at.stride};
     if (width == 16) {

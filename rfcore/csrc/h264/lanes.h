@@ -127,7 +127,8 @@ RF_INLINE void store_clipped(Row4 v, uint8_t* at) {
 RF_INLINE void store_clipped(Short16 v, uint8_t* at) {
 #ifdef RF_H264_X86
     const __m256i w = reinterpret_cast<__m256i>(v);
-    const __m128i bytes = _mm_packus_epi16(_mm256_castsi256_si128(w), _mm256_extracti128_si256(w, 1));
+    const __m128i bytes =
+        _mm_packus_epi16(_mm256_castsi256_si128(w), _mm256_extracti128_si256(w, 1));
     _mm_storeu_si128(reinterpret_cast<__m128i*>(at), bytes);
 #else
     v = v < 0 ? Short16{} : v;
