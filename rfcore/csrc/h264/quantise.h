@@ -194,8 +194,8 @@ RF_INLINE int choose_level(const RateQuantiser<category>& q, const LevelRates& r
 
 // Writes the levels up to choices[chosen], the last one; choices run from the end of the scan.
 template <Category category>
-Quantised take_levels(const RateQuantiser<category>& q, const LevelRates& rates, Choice* choices,
-                             int chosen, int count, const int32_t* coefficients, int16_t* levels) {
+Quantised take_levels(const LevelRates& rates, Choice* choices, int chosen, int count,
+                      const int32_t* coefficients, int16_t* levels) {
     constexpr const Scan& scan = kScan[category];
     Quantised result = {0, rates.zeros_before[choices[chosen].position]};
     __builtin_memset(levels, 0, sizeof(int16_t) * static_cast<size_t>(kCoefficients[category]));
@@ -258,7 +258,7 @@ Quantised quantise(const RateQuantiser<category>& q, const int32_t* coefficients
         before += choices[k].inside;
     }
     if (chosen < 0) return {0, 0};
-    return take_levels(q, rates, choices, chosen, count, coefficients, levels);
+    return take_levels<category>(rates, choices, chosen, count, coefficients, levels);
 }
 
 }  // namespace
