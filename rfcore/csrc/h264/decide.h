@@ -225,10 +225,10 @@ private:
     }
 
     Search search_of(int index, int shape, const Partition& part) const {
-        return search_of(index, shape, part, predicted_vector(field_, shape, part, index));
+        return search_of(index, part, predicted_vector(field_, shape, part, index));
     }
 
-    Search search_of(int index, int shape, const Partition& part, Mv predicted) const {
+    Search search_of(int index, const Partition& part, Mv predicted) const {
         const int x = 8 * (part.block & 1), y = 8 * (part.block >> 1);
         const int width = 4 * part.width, height = 4 * part.height;
         return {planes_[index], source_[0].at + y * source_[0].stride + x,
@@ -267,14 +267,14 @@ private:
     }
 
     // Refines a partition's vectors in the best reference and in those that come near to it.
-    void refine_near(int shape, const Partition& part, const Mv* predicted, Found* found) const {
+    void refine_near(const Partition& part, const Mv* predicted, Found* found) const {
         const int best = least_of(found), reach = job_.effort.references_reach;
         const uint64_t near = uint64_t{found[best].cost} * unsigned(reach) / 100;
         const uint64_t most = reach == 0 ? kNotSearched : near;
         for (int r = 0; r < job_.reference_count; ++r) {
             if (found[r].cost == kNotSearched || found[r].cost > most) continue;
             if (best_alone() && r != best) continue;
-            found[r] = refined(search_of(r, shape, part, predicted[r]), r, found[r]);
+            found[r] = refined(search_of(r, part, predicted[r]), r, found[r]);
         }
     }
 
@@ -385,7 +385,7 @@ private:
                 found[r] = search.first_of(starts, from ? 4 : 2);
                 found[r].cost += reference_cost(r);
             }
-            if (!from || !best_alone()) refine_near(shape, part, predicted, found);
+            if (!from || !best_alone()) refine_near(part, predicted, found);
             const int index = least_of(found);
             const Found least = found[index];
             set_partition(out, part, index, least.mv, predicted[index]);
