@@ -89,7 +89,7 @@ ATTACKS = {
         Attack("vehicle", rpcs.compressed_bombs, spent(Resource.CALLS)),
         Attack("vehicle", rpcs.rapid_resets, spent(Resource.CALLS)),
         Attack("vehicle", rpcs.foreign_names, spent(Resource.CALLS)),
-        Attack("vehicle", rpcs.refused_frames, nacked(RejectReason.SEQUENCE_GAP)),
+        Attack("vehicle", rpcs.refused_frames, nacked(RejectReason.RENDER_MISMATCH)),
         Attack("vehicle", rpcs.unknown_fields, spent(Resource.BYTES)),
         Attack("vehicle", rpcs.odd_numbers, nacked(RejectReason.INVALID_ARGUMENT)),
         Attack("consumer", rpcs.foreign_paths, spent(Resource.CALLS)),

@@ -254,7 +254,7 @@ async def stream_for_ever(
 
 
 async def refused_frames(target: Target) -> None:
-    """Frames whose sequence has a gap: a Nack for each."""
+    """Frames of another render, every second one left out: a Nack for each."""
     greeting = client_message_to_bytes(hello(target, 320, 180))
     await stream_for_ever(
         target, greeting, lambda n: client_message_to_bytes(frame(2 * n + 1, good_crc=True))
