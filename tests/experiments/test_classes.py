@@ -191,9 +191,9 @@ def test_a_row_has_the_keys_of_the_file_and_comes_back() -> None:
     row = ClassQuality("alley", 10.0, "ours", "vehicle", 31.5, 7.0, "bits", 33.5, 900.0)
     assert row.row()["class"] == "vehicle"
     assert row.row().keys() >= {"scene", "hz", "method", "class", "psnr_db", "share_percent"}
-    assert ClassQuality.of_row(json.loads(json.dumps(row.row()))) == row
-    with pytest.raises(InvalidInput, match="row has"):
-        ClassQuality.of_row({"scene": "alley"})
+    assert ClassQuality.of_rows([json.loads(json.dumps(row.row()))]) == [row]
+    with pytest.raises(InvalidInput, match="row 0 lacks"):
+        ClassQuality.of_rows([{"scene": "alley"}])
 
 
 def write_classes(folder: Path, labels: np.ndarray) -> None:
@@ -241,7 +241,7 @@ def test_a_drive_becomes_rows_and_is_not_coded_twice(
     said = io.StringIO()
     run_classes(job, Console(file=said, width=200))
     result = read_result(job.out, "classes")
-    rows = [ClassQuality.of_row(row) for row in result["rows"]]
+    rows = ClassQuality.of_rows(result["rows"])
     methods = ("rfedge", "x264-our-tools-veryfast", "x264-lowdelay-veryfast")
     assert {row.method for row in rows} == set(methods)
     assert {row.class_ for row in rows} == {"all", "rest", "vehicle"}

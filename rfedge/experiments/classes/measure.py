@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import chain
 from pathlib import Path
@@ -42,7 +42,14 @@ from rfedge.experiments.performance import perform, seconds_left
 from rfedge.experiments.picture_quality import luma_ssim
 from rfedge.experiments.rivals import CodedPictures, x264_lowdelay, x264_with_our_tools
 from rfedge.report.tables import heading, print_table, table
-from rfedge.results import Result, check_result_path, make_result, provenance, write_result
+from rfedge.results import (
+    Result,
+    check_result_path,
+    make_result,
+    provenance,
+    rows_of,
+    write_result,
+)
 
 with needs("eval"):
     from scipy.interpolate import PchipInterpolator
@@ -203,12 +210,11 @@ class ClassQuality:
         return {f.name.rstrip("_"): getattr(self, f.name) for f in fields(self)}
 
     @staticmethod
-    def of_row(row: Mapping[str, Any]) -> ClassQuality:
-        """Read it back; raises ``InvalidInput`` for a row of other keys."""
+    def of_rows(rows: Iterable[Mapping[str, Any]]) -> list[ClassQuality]:
+        """Read them back; raises ``InvalidInput`` for a row of other keys."""
         names = {field.name.rstrip("_"): field.name for field in fields(ClassQuality)}
-        if row.keys() != names.keys():
-            raise InvalidInput("result", f"row has {sorted(row)}, not {sorted(names)}")
-        return ClassQuality(**{names[key]: value for key, value in row.items()})
+        named = ({names.get(key, key): value for key, value in row.items()} for row in rows)
+        return rows_of(ClassQuality, named)
 
 
 @dataclass(frozen=True)
@@ -405,7 +411,7 @@ PIXELS = "share of the pixels, %"
 
 def classes_section(path: Path, result: Result) -> str:
     """Return the table of a result: a line for each coder at equal bits or equal quality."""
-    rows = [ClassQuality.of_row(row) for row in result["rows"]]
+    rows = ClassQuality.of_rows(result["rows"])
     return "\n\n".join([heading(path, result), table(COLUMNS, _lines(rows)), ""])
 
 
