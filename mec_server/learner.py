@@ -109,7 +109,7 @@ class Learner:
     def report(self, harm: Harm) -> None:
         """Tell the process what was found; nothing if there is none now."""
         if self._process is not None and self._process.stdin is not None:
-            with suppress(BrokenPipeError):
+            with suppress(BrokenPipeError, ValueError):  # it has ended, or is being restarted
                 self._process.stdin.write(json.dumps(asdict(harm)).encode() + b"\n")
                 self._process.stdin.flush()
 

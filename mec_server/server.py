@@ -97,8 +97,8 @@ NATS_FIELDS_S = 20.0
 
 NATS_END_S = 2.0
 
-MAX_VIEWED_FIELDS = 2
-"""Fields kept open for views of the twin, beside those that frames are decoded against."""
+MOST_OF_A_THREAD = 2
+"""Fields that a thread which decodes nothing keeps open: for views, glances and trials."""
 
 CONNECTION_GRACE_MS = 30_000
 """How long streams of a connection that is renewed may go on before they are ended."""
@@ -258,8 +258,21 @@ class EdgeServer:
         return entry
 
     def _twin_views(self, twin: Twin, classify: Classify | None) -> TwinViews:
-        """Return what composes views: each render by one thread, with renderers that nobody else
-        uses; of fields that are open for decoding the numbers are shared."""
+        return TwinViews(
+            twin,
+            self._fields_of_a_thread,
+            lambda: self._published.tiles,
+            self._entry.ledger,
+            self._failed(BackgroundTask.OUTCOME),
+            classify,
+        )
+
+    def _fields_of_a_thread(self) -> Callable[[str], RadianceField]:
+        """Return what opens fields for one thread, with renderers that nobody else uses.
+
+        The numbers of fields that are open for decoding are shared; nothing is read while decoding
+        waits for it.
+        """
         render = replace(self._config.render, threads=1)
         load_anew = field_loader(self._index, render, opened=lambda _: None)
 
@@ -267,14 +280,7 @@ class EdgeServer:
             opened = self._shelf.opened(field_id)
             return load_anew(field_id) if opened is None else opened.with_threads(1)
 
-        return TwinViews(
-            twin,
-            lambda: FieldShelf(self._index, load, MAX_VIEWED_FIELDS).open,
-            lambda: self._published.tiles,
-            self._entry.ledger,
-            self._failed(BackgroundTask.OUTCOME),
-            classify,
-        )
+        return FieldShelf(self._index, load, MOST_OF_A_THREAD).open
 
     def _twin_metrics(self, twin: Twin) -> TwinMetrics:
         return TwinMetrics(
@@ -367,10 +373,10 @@ class EdgeServer:
         await asyncio.to_thread(self._decoders.close)
         self._twin_service.close()
         await asyncio.to_thread(self._views.close)
-        if self._learner is not None:
-            await asyncio.to_thread(self._learner.close)
         if self._trials is not None:
             await asyncio.to_thread(self._trials.close)
+        if self._learner is not None:
+            await asyncio.to_thread(self._learner.close)
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
         if self._metrics_endpoint is not None:
@@ -535,10 +541,8 @@ class EdgeServer:
         return Learner(job, config.log, self._show_learnt)
 
     def _open_trials(self, learner: Learner) -> UnrecordedTrials:
-        def open_field(field_id: str) -> RadianceField:
-            return self._shelf.open(field_id).with_threads(1)
-
-        return UnrecordedTrials(open_field, self._failed(BackgroundTask.LEARNING), learner.report)
+        failed = self._failed(BackgroundTask.LEARNING)
+        return UnrecordedTrials(self._fields_of_a_thread(), failed, learner.report)
 
     def _show_learnt(self, histories: Mapping[str, TileHistory]) -> None:
         self._metrics.show_learnt(histories)

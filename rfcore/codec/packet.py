@@ -78,7 +78,12 @@ class DeltaPacket:
     @property
     def needs_base(self) -> bool:
         """Whether an earlier frame is needed, which ``base_digest`` names."""
-        return (self.relit and not self.light) or is_temporal(self.references)
+        return self.learns_light or is_temporal(self.references)
+
+    @property
+    def learns_light(self) -> bool:
+        """Whether the render's light is learnt from that earlier frame."""
+        return self.relit and not self.light
 
     def expected_crc32(self) -> int:
         """Return zlib.crc32 of epoch and sequence (8 bytes each, big-endian), the digests in the

@@ -67,6 +67,11 @@ class Prediction:
         lit = replace(view, render=render)
         return Prediction(lit, past, threads, (), True, light, view.render)
 
+    @property
+    def learns_light(self) -> bool:
+        """Whether its light is learnt from the frame in ``past``."""
+        return self.is_relit and not self.light
+
     def past_of(self, picture: I420, digest: bytes | None = None) -> Past:
         """Return what later frames predict from once this frame was decoded to ``picture``.
 

@@ -26,7 +26,8 @@ from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import BASE_DIGEST_BYTES, DeltaPacket
-from rfcore.codec.references import INTRA, Reference, is_temporal
+from rfcore.codec.photometric import sent_light
+from rfcore.codec.references import INTRA, RENDER_ONLY, Reference, is_temporal
 from rfcore.codec.sender.encoder import LEFT_TO_THE_ENCODER, DeltaEncoder, FrameChoice
 from rfcore.codec.state import DecoderState
 from rfcore.errors import CodecError, PacketRejected
@@ -104,12 +105,16 @@ def make_stream(size_px: tuple[int, int] = SIZE_PX) -> FuzzStream:
 
 
 def make_adapting_stream(size_px: tuple[int, int] = SIZE_PX) -> FuzzStream:
-    """Code frames of a street that grows dark: the first is not relit, all others are."""
-    choices = [LEFT_TO_THE_ENCODER, *(FrameChoice(names, relight=True) for names in RELIT)]
-    moments = [_moment(index, size_px) for index in range(len(choices))]
+    """Code frames of a street that grows dark: the first is not relit, all others are, the second
+    by a light that is sent."""
+    moments = [_moment(index, size_px) for index in range(2 + len(RELIT))]
     darker = [
         (_lamplit(frame, 0.9 - 0.05 * index), view) for index, (frame, view) in enumerate(moments)
     ]
+    second, view = darker[1]
+    light = sent_light(second, view.render)
+    choices = [LEFT_TO_THE_ENCODER, FrameChoice(RENDER_ONLY, relight=True, light=light)]
+    choices += [FrameChoice(names, relight=True) for names in RELIT]
     return _coded(size_px, choices, darker)
 
 
@@ -230,10 +235,13 @@ def exchange_references(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     """Name other references, in another order."""
     count = int(rng.integers(4))
     order = [Reference(int(n)) for n in rng.permutation(4)[:count] + 1]
-    learns = packet.relit and not packet.light
-    needs = learns or any(reference is not Reference.RENDER for reference in order)
-    base = (packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)) if needs else b""
-    return replace(packet, references=tuple(order), base_digest=base)
+    needs = packet.learns_light or any(reference is not Reference.RENDER for reference in order)
+    return replace(packet, references=tuple(order), base_digest=_base(packet, rng, needs))
+
+
+def _base(packet: DeltaPacket, rng: Rng, needed: bool) -> bytes:
+    """Return the packet's base, or one that is made up; nothing where none is needed."""
+    return (packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)) if needed else b""
 
 
 def relight(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
@@ -241,24 +249,21 @@ def relight(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     matrix = tuple(int(n) for n in rng.integers(-(1 << 15), 1 << 15, 12))
     relit = not rng.integers(3)
     photometric = matrix if not relit and rng.integers(4) else ()
-    base = packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)
-    needed = base if relit or is_temporal(packet.references) else b""
+    needed = _base(packet, rng, relit or is_temporal(packet.references))
     return replace(packet, photometric=photometric, base_digest=needed, relit=relit, light=b"")
 
 
 def switch_relit(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     """Relight the render or leave it; the base stays, or is made up where one is needed now."""
     relit = not packet.relit
-    base = packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)
-    needed = base if relit or is_temporal(packet.references) else b""
+    needed = _base(packet, rng, relit or is_temporal(packet.references))
     return replace(packet, photometric=(), base_digest=needed, relit=relit, light=b"")
 
 
 def damage_light(packet: DeltaPacket, rng: Rng) -> DeltaPacket:
     """Relight the render by a light that is damaged or, where none was sent, made up."""
     light = flip_bits(packet.light, rng) if packet.light else b"\x04" + rng.bytes(60)
-    base = packet.base_digest or rng.bytes(BASE_DIGEST_BYTES)
-    needed = base if is_temporal(packet.references) else b""
+    needed = _base(packet, rng, is_temporal(packet.references))
     return replace(packet, photometric=(), base_digest=needed, relit=True, light=light)
 
 
@@ -284,6 +289,7 @@ MUTATIONS: dict[str, Mutation] = {
         exchange_references,
         relight,
         switch_relit,
+        damage_light,
     )
 }
 """Damage that needs nothing but the packet."""

@@ -4,13 +4,15 @@ A million of them: ``python -m rfedge.bench.fuzz --packets 1000000``, with ``--a
 another light than the field's.
 """
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.references import Reference
-from rfcore.errors import CodecError, RejectReason
+from rfcore.errors import CodecError, PacketRejected, RejectReason
 from rfedge.bench.fuzz import FuzzStream, fuzz, make_adapting_stream, make_stream, mutations_of
 
 
@@ -67,6 +69,9 @@ def test_an_adapting_stream_relights_every_frame_that_has_one_before_it(
 ) -> None:
     packets = [frame.packet for frame in adapting.frames]
     assert [packet.relit for packet in packets] == [False] + [True] * (len(packets) - 1)
+    assert [bool(packet.light) for packet in packets] == [False, True] + [False] * (
+        len(packets) - 2
+    )
     assert {reference for packet in packets for reference in packet.references} == set(Reference)
 
 
@@ -79,6 +84,24 @@ def test_damage_relights_by_other_frames_and_not_at_all(adapting: FuzzStream) ->
     named = {mutations["exchange_base"](frame.packet, rng).base_digest for _ in range(50)}
     held = {past.digest[: len(frame.packet.base_digest)] for past in frame.before.kept}
     assert len(named & held) > 1
+
+
+def test_a_damaged_light_is_refused_or_shows_the_same(adapting: FuzzStream) -> None:
+    """The last bits of a deflated light say nothing: with others there it is the same light."""
+    rng, frame = np.random.default_rng(0), adapting.frames[1]
+    decoder, outcomes = DeltaDecoder(adapting.header), Counter[str]()
+    for _ in range(200):
+        damaged = mutations_of(adapting)["damage_light"](frame.packet, rng).sealed()
+        try:
+            shown = decoder.decode(frame.before, damaged, frame.view).frame
+        except PacketRejected as refused:
+            outcomes[str(refused.reason)] += 1
+        else:
+            assert shown.digest() == frame.packet.reconstruction_digest
+            outcomes["shown"] += 1
+    assert outcomes[RejectReason.INVALID_ARGUMENT] > 20, "written wrongly"
+    assert outcomes[RejectReason.RECONSTRUCTION_MISMATCH] > 20, "another light"
+    assert outcomes["shown"] < 40
 
 
 def test_the_stream_has_every_kind_of_frame(stream: FuzzStream) -> None:

@@ -14,12 +14,12 @@ from rfcore.errors import InvalidInput
 from rfcore.field import load_field
 from rfcore.image import I420
 from rfedge.experiments.adapt.measure import (
+    FIRST,
     AdaptCase,
     AdaptJob,
     AdaptRow,
     adapt_section,
     drives_to_break_even,
-    first_kbit_at,
     kbit_at,
     messages_differ,
     most_kbit,
@@ -84,8 +84,8 @@ def test_the_first_frame_has_a_curve_of_its_own() -> None:
     done = coded_at(*((40.0 - 2 * n, 1000 - 100 * n) for n in range(6)))
     for clip in done.clips:
         clip.frame_bytes[0] = 5 * clip.frame_bytes[1]
-    assert first_kbit_at(36.0, done) == pytest.approx(5 * 8 * 0.8)
-    assert first_kbit_at(40.1, done) is None
+    assert kbit_at(36.0, done, FIRST) == pytest.approx(5 * 8 * 0.8)
+    assert kbit_at(40.1, done, FIRST) is None
 
 
 def test_above_33_db_the_fewest_bits_are_an_upper_bound() -> None:

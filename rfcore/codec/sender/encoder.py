@@ -156,8 +156,7 @@ class _Plan:
     @property
     def needs_base(self) -> bool:
         """Whether the receiver needs the earlier frame."""
-        learns_light = self.prediction.is_relit and not self.prediction.light
-        return learns_light or is_temporal(self.references)
+        return self.prediction.learns_light or is_temporal(self.references)
 
 
 class DeltaEncoder:

@@ -285,24 +285,37 @@ RF_INLINE Words4 columns_of(Short16 sums) {
 }
 #endif
 
+#ifdef RF_H264_X86
+// How many rows of a block 8 or 16 wide sixteen lanes hold.
+template <int width>
+constexpr int kRowsInLanes = width == 16 ? 1 : 2;
+
+template <int width>
+RF_INLINE __m128i load_rows(const uint8_t* at, ptrdiff_t stride) {
+    if constexpr (width == 16) return _mm_loadu_si128(reinterpret_cast<const __m128i*>(at));
+    return _mm_unpacklo_epi64(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(at)),
+                              _mm_loadl_epi64(reinterpret_cast<const __m128i*>(at + stride)));
+}
+
+RF_INLINE uint32_t sum_of_differences(__m128i sums) {
+    return static_cast<uint32_t>(_mm_cvtsi128_si32(sums) + _mm_extract_epi32(sums, 2));
+}
+#endif
+
 // Sum of absolute differences of a block 8 or 16 wide; its height is a multiple of 4, 16 at most.
 template <int width>
 RF_INLINE uint32_t absolute_difference(const uint8_t* a, ptrdiff_t a_stride, const uint8_t* b,
                                        ptrdiff_t b_stride, int height) {
 #ifdef RF_H264_X86
-    constexpr int kRows = width == 16 ? 1 : 2;  // in sixteen lanes
-    const auto load = [](const uint8_t* at, ptrdiff_t stride) {
-        if (width == 16) return _mm_loadu_si128(reinterpret_cast<const __m128i*>(at));
-        return _mm_unpacklo_epi64(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(at)),
-                                  _mm_loadl_epi64(reinterpret_cast<const __m128i*>(at + stride)));
-    };
+    constexpr int kRows = kRowsInLanes<width>;
     __m128i sum = _mm_setzero_si128();
     for (int y = 0; y < height; y += 4) {
         for (int i = 0; i < 4; i += kRows, a += kRows * a_stride, b += kRows * b_stride) {
-            sum = _mm_add_epi32(sum, _mm_sad_epu8(load(a, a_stride), load(b, b_stride)));
+            const __m128i row = load_rows<width>(a, a_stride);
+            sum = _mm_add_epi32(sum, _mm_sad_epu8(row, load_rows<width>(b, b_stride)));
         }
     }
-    return static_cast<uint32_t>(_mm_cvtsi128_si32(sum) + _mm_extract_epi32(sum, 2));
+    return sum_of_differences(sum);
 #else
     Short8 sum{};
     for (int y = 0; y < height; ++y, a += a_stride, b += b_stride) {
@@ -318,23 +331,16 @@ RF_INLINE void absolute_differences_around(const uint8_t* a, ptrdiff_t a_stride,
                                            ptrdiff_t b_stride, int height, uint32_t* sums) {
     const uint8_t* around[4] = {b + 1, b - 1, b + b_stride, b - b_stride};
 #ifdef RF_H264_X86
-    constexpr int kRows = width == 16 ? 1 : 2;  // in sixteen lanes
-    const auto load = [](const uint8_t* at, ptrdiff_t stride) {
-        if (width == 16) return _mm_loadu_si128(reinterpret_cast<const __m128i*>(at));
-        return _mm_unpacklo_epi64(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(at)),
-                                  _mm_loadl_epi64(reinterpret_cast<const __m128i*>(at + stride)));
-    };
+    constexpr int kRows = kRowsInLanes<width>;
     __m128i sum[4] = {};
     for (int y = 0; y < height; y += kRows, a += kRows * a_stride) {
-        const __m128i row = load(a, a_stride);
+        const __m128i row = load_rows<width>(a, a_stride);
         for (int i = 0; i < 4; ++i) {
-            const __m128i other = load(around[i] + y * b_stride, b_stride);
+            const __m128i other = load_rows<width>(around[i] + y * b_stride, b_stride);
             sum[i] = _mm_add_epi32(sum[i], _mm_sad_epu8(row, other));
         }
     }
-    for (int i = 0; i < 4; ++i) {
-        sums[i] = static_cast<uint32_t>(_mm_cvtsi128_si32(sum[i]) + _mm_extract_epi32(sum[i], 2));
-    }
+    for (int i = 0; i < 4; ++i) sums[i] = sum_of_differences(sum[i]);
 #else
     for (int i = 0; i < 4; ++i) {
         sums[i] = absolute_difference<width>(a, a_stride, around[i], b_stride, height);

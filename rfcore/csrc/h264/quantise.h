@@ -159,7 +159,7 @@ struct Choice {
 // which took 3 % of a picture.)
 template <Category category>
 RF_INLINE int choose_level(const RateQuantiser<category>& q, const LevelRates& rates, int position,
-                        int32_t scaled, Cost weight, int ones, int more, Choice& choice) {
+                           int32_t scaled, Cost weight, int ones, int more, Choice& choice) {
     const Cost lambda = q.lambda_q8;
     const bool end = position == kCoefficients[category] - 1;
     const uint32_t zero_bits = end ? 0 : rates.zero(position);
@@ -219,7 +219,7 @@ Quantised take_levels(const LevelRates& rates, Choice* choices, int chosen, int 
 // worth its bits.
 template <Category category>
 Quantised quantise(const RateQuantiser<category>& q, const int32_t* coefficients,
-                          const uint16_t* multiplier, const uint16_t* energy, int16_t* levels) {
+                   const uint16_t* multiplier, const uint16_t* energy, int16_t* levels) {
     constexpr const Scan& scan = kScan[category];
     alignas(32) int32_t scaled[64];
     constexpr int kCount = category == kLuma8 ? 64 : category == kChromaDc ? 4 : 16;

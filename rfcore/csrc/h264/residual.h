@@ -266,7 +266,8 @@ inline void code_chroma(const Quality& quality, const Plane* source,
                                    : flag_of(quality.around->left, first + b + 1, intra);
             const int above = b & 2 ? (c.mb.coded >> (first + b - 2)) & 1
                                     : flag_of(quality.around->above, first + b + 2, intra);
-            const auto rate = rate_quantiser<kChromaAc>(quality, kFlagContext[kChromaAc] + left + 2 * above, qp);
+            const int flag_context = kFlagContext[kChromaAc] + left + 2 * above;
+            const auto rate = rate_quantiser<kChromaAc>(quality, flag_context, qp);
             const Quantised block = quantise(rate, coefficients[p][b], q.multiplier, q.energy,
                                              c.mb.chroma_ac[p][b] + 1);
             coded[p][b] = block.coded;

@@ -35,7 +35,7 @@ from rfcore.field import load_field
 from rfcore.image import I420
 from rfcore.native.warp import relight_i420
 from rfedge.experiments.cells import CellStore, program_version
-from rfedge.experiments.clips import Drive, DriveName, read_drive
+from rfedge.experiments.clips import STEADY, Drive, DriveName, read_drive
 from rfedge.experiments.field_coder import FieldCoder, render_clip
 from rfedge.experiments.performance import Performance, perform
 from rfedge.experiments.rate_curve import rate_curve
@@ -307,7 +307,7 @@ class _Measured:
                 ),
                 relit_frames=int(sum(map(float, chosen))),
                 switches=int(np.count_nonzero(np.diff([float(relit) for relit in chosen]))),
-                first_kbit_33db=first_kbit_at(AT_DB, done),
+                first_kbit_33db=kbit_at(AT_DB, done, FIRST),
             )
 
     def _tool_ms(self, drive: Drive) -> Mapping[str, float]:
@@ -416,20 +416,12 @@ def _cpu_ms(work: Callable[[], object]) -> float:
     return (process_time_ns() - began_ns) / 1e6
 
 
-def kbit_at(psnr_db: float, done: Performance) -> float | None:
-    """Return the kilobits a frame at a luma PSNR, the first frame apart; None outside the curve."""
-    reached_db = [clip.psnr_db() for clip in done.clips]
+def kbit_at(psnr_db: float, done: Performance, frames: slice = STEADY) -> float | None:
+    """Return the kilobits a frame of ``frames`` at their luma PSNR; None outside the curve."""
+    reached_db = [clip.psnr_db(frames) for clip in done.clips]
     if not min(reached_db) <= psnr_db <= max(reached_db):
         return None
-    return 8e-3 * done.steady.bytes_at(psnr_db)
-
-
-def first_kbit_at(psnr_db: float, done: Performance) -> float | None:
-    """Return the kilobits of the first frame at a luma PSNR of its own; None outside the curve."""
-    reached_db = [clip.psnr_db(FIRST) for clip in done.clips]
-    if not min(reached_db) <= psnr_db <= max(reached_db):
-        return None
-    return 8e-3 * rate_curve(done.clips, FIRST).bytes_at(psnr_db)
+    return 8e-3 * rate_curve(done.clips, frames).bytes_at(psnr_db)
 
 
 COLUMNS = (

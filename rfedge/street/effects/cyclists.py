@@ -10,7 +10,7 @@ import numpy as np
 
 from rfcore.tables import Range
 from rfedge.street.geometry.cyclist import Cyclist, cyclist_materials, cyclist_parts, riding
-from rfedge.street.geometry.layout import BEYOND_M, Course
+from rfedge.street.geometry.layout import Course
 from rfedge.street.geometry.mesh import F64
 from rfedge.street.geometry.person import BodyPart
 from rfedge.street.geometry.vehicle import world_from_vehicle
@@ -36,17 +36,15 @@ class Cyclists:
 
     def change(self, world: World, rng: np.random.Generator) -> World:
         """Return the world with the cyclists as movers, one for each part that moves."""
-        reach_m = world.layout.end_m + BEYOND_M
+        ways = self.along_m, self.oncoming_m, self.speed_mps
         movers = []
-        for direction, starts in ((1, self.along_m), (-1, self.oncoming_m)):
-            for start_m in starts:
-                course = Course(start_m, direction, self.speed_mps, reach_m)
-                looks, ahead_m = Cyclist.drawn(rng), float(rng.uniform(0, 10))
-                meshes = cyclist_parts(looks)
-                movers += [
-                    Mover(meshes[part[0]], partial(_pose, looks, course, ahead_m, part))
-                    for part in riding(looks, 0.0)
-                ]
+        for _, course in Course.both_ways(*ways, world.layout):
+            looks, ahead_m = Cyclist.drawn(rng), float(rng.uniform(0, 10))
+            meshes = cyclist_parts(looks)
+            movers += [
+                Mover(meshes[part[0]], partial(_pose, looks, course, ahead_m, part))
+                for part in riding(looks, 0.0)
+            ]
         return world.plus(Part((), cyclist_materials(), tuple(movers)))
 
 

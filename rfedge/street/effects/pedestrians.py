@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from rfcore.tables import Range
-from rfedge.street.geometry.layout import BEYOND_M, KERB_M, PAVEMENT_UP_M, Course
+from rfedge.street.geometry.layout import KERB_M, PAVEMENT_UP_M, Course
 from rfedge.street.geometry.mesh import F64
 from rfedge.street.geometry.person import (
     BodyPart,
@@ -51,14 +51,12 @@ class Pedestrians:
 
     def change(self, world: World, rng: np.random.Generator) -> World:
         """Return the world with the people as movers, one for each part of a body."""
-        reach_m = world.layout.end_m + BEYOND_M
+        ways = self.along_m, self.oncoming_m, self.speed_mps
         half_m = world.layout.road_half_m
         movers: list[Mover] = []
-        for direction, starts in ((1, self.along_m), (-1, self.oncoming_m)):
-            for number, start_m in enumerate(starts):
-                course = Course(start_m, direction, self.speed_mps, reach_m)
-                y_m = (-1) ** (number + 1) * (half_m + float(rng.uniform(NEAR_M, FAR_M)))
-                movers += self._walker(partial(_on_pavement, course, y_m), rng)
+        for number, course in Course.both_ways(*ways, world.layout):
+            y_m = (-1) ** (number + 1) * (half_m + float(rng.uniform(NEAR_M, FAR_M)))
+            movers += self._walker(partial(_on_pavement, course, y_m), rng)
         for number, x_m in enumerate(self.crossing_m):
             way = partial(_crossing, x_m, (-1) ** (number + 1), half_m, self.speed_mps)
             movers += self._walker(way, rng)

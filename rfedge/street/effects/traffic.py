@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from rfcore.tables import Range
-from rfedge.street.geometry.layout import BEYOND_M, LANE_M, Course
+from rfedge.street.geometry.layout import LANE_M, Course
 from rfedge.street.geometry.mesh import F64
 from rfedge.street.geometry.vehicle import Vehicle, vehicle, world_from_vehicle
 from rfedge.street.geometry.vehicle_trim import vehicle_materials
@@ -32,14 +32,12 @@ class Traffic:
 
     def change(self, world: World, rng: np.random.Generator) -> World:
         """Return the world with the vehicles as movers."""
-        reach_m = world.layout.end_m + BEYOND_M
-        movers = []
-        for direction, starts in ((1, self.along_m), (-1, self.oncoming_m)):
-            for start_m in starts:
-                course = Course(start_m, direction, self.speed_mps, reach_m)
-                meshes = tuple(vehicle(Vehicle.drawn(rng)))
-                movers.append(Mover(meshes, partial(_pose, course)))
-        return world.plus(Part((), vehicle_materials(), tuple(movers)))
+        ways = self.along_m, self.oncoming_m, self.speed_mps
+        movers = tuple(
+            Mover(tuple(vehicle(Vehicle.drawn(rng))), partial(_pose, course))
+            for _, course in Course.both_ways(*ways, world.layout)
+        )
+        return world.plus(Part((), vehicle_materials(), movers))
 
 
 def _pose(course: Course, time_s: float) -> F64:

@@ -7,6 +7,7 @@ outwards: lane, parking bay, kerb, lamps and trees, pavement, facades.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
@@ -147,6 +148,15 @@ class Course:
     direction: int
     speed_mps: float
     reach_m: float
+
+    @staticmethod
+    def both_ways(
+        along_m: Sequence[float], oncoming_m: Sequence[float], speed_mps: float, layout: Layout
+    ) -> Iterator[tuple[int, Course]]:
+        """Yield the courses towards +x, then those towards -x, each numbered from 0 of its own."""
+        for direction, starts in ((1, along_m), (-1, oncoming_m)):
+            for number, start_m in enumerate(starts):
+                yield number, Course(start_m, direction, speed_mps, layout.end_m + BEYOND_M)
 
     def x_m(self, time_s: float) -> float:
         """Return where it is."""
