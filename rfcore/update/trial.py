@@ -73,7 +73,7 @@ def _points(field: RadianceField, frames: Sequence[SeenFrame], told: Told) -> tu
             told()
             coded = encoder.encode(state, picture, view)
             state = coded.state
-            size_bytes += len(coded.packet.payload)
+            size_bytes += len(coded.packet.payload) + len(coded.packet.light)
             off = picture.y.astype(np.float64) - coded.reconstruction.y
             errors.append(float((off * off).mean()))
         psnr_db = 10 * math.log10(255.0**2 / max(float(np.mean(errors)), LEAST_ERROR))

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from rfcore.files import write_whole
 from rfcore.metrics import psnr
-from rfedge.demo.dusk import SHADOW, TINT, WIDTH_M
+from rfedge.demo.dusk import LAMPS_M, SHADOW, TINT, WIDTH_M
 from rfedge.demo.evening import EveningDrive, EveningPictures, LearntLight
 from rfedge.demo.measure import DriveFigures, FrameFigures, Pictures
 from rfedge.report.charts import (
@@ -227,7 +227,7 @@ def write_evening_report(path: Path, result: Result, pictures: Sequence[EveningP
         light=light,
         columns=EVENING_COLUMNS,
         rows=_evening_rows(result),
-        dusk={"tint": TINT, "shadow": SHADOW, "width_m": WIDTH_M},
+        dusk={"tint": TINT, "shadow": SHADOW, "width_m": WIDTH_M, "lamps_m": LAMPS_M},
         strips=[_evening_strip(shown) for shown in pictures],
         provenance=_provenance(result),
     )

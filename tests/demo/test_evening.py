@@ -22,7 +22,7 @@ from rfcore.image import write_png
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfedge.cli.demo import Demo
-from rfedge.demo.dusk import SHADOW, TINT, at_dusk, write_dusk
+from rfedge.demo.dusk import LAMP, REACH_M, SHADOW, TINT, DuskLight, at_dusk, write_dusk
 from rfedge.demo.evening import EveningDrive, EveningPictures, LearntLight
 from rfedge.demo.field import write_sample_field
 from rfedge.demo.report import print_evening, write_evening_report
@@ -31,6 +31,7 @@ from rfedge.results import Provenance, make_result
 K = Intrinsics(8, 6, 4.0, 4.0, 4.0, 3.0)
 CAMERA = Camera(K, Pose.identity())
 RIGHT = np.float32([1, 0, 0])
+UNLIT = DuskLight(RIGHT, 0.0, np.zeros((0, 3), np.float32))
 WHITE = np.full((6, 8, 3), 255, np.uint8)
 
 
@@ -77,14 +78,14 @@ def shown(linear: np.ndarray) -> np.ndarray:
 
 def test_half_way_between_light_and_shadow_white_is_the_tint() -> None:
     far_m = 1e-3  # all pixels within a millimetre of the border
-    dusk = at_dusk(WHITE, np.full((6, 8), far_m, np.float32), CAMERA, (RIGHT, 0.0))
+    dusk = at_dusk(WHITE, np.full((6, 8), far_m, np.float32), CAMERA, UNLIT)
     expected = shown((SHADOW + 0.5) * np.array(TINT))
     assert np.abs(dusk.astype(float) - expected).max() <= 1
 
 
 def test_far_to_either_side_there_is_the_shadow_and_the_light() -> None:
     """The sky, where the field shows nothing, is far away."""
-    dusk = at_dusk(WHITE, np.zeros((6, 8), np.float32), CAMERA, (RIGHT, 0.0)).astype(float)
+    dusk = at_dusk(WHITE, np.zeros((6, 8), np.float32), CAMERA, UNLIT).astype(float)
     assert np.abs(dusk[:, 0] - shown(SHADOW * np.array(TINT))).max() <= 1
     assert np.abs(dusk[:, -1] - shown((SHADOW + 1) * np.array(TINT))).max() <= 1
 
@@ -93,14 +94,25 @@ def test_the_light_belongs_to_the_place_and_not_to_the_picture() -> None:
     """A wall 4 m off seen from 1 m further right: two pixels of 1 m each to the left."""
     depth_m = np.full((6, 8), 4.0, np.float32)
     moved = Camera(K, Pose((2.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)))
-    first, second = (at_dusk(WHITE, depth_m, c, (RIGHT, 0.0)) for c in (CAMERA, moved))
+    first, second = (at_dusk(WHITE, depth_m, c, UNLIT) for c in (CAMERA, moved))
     assert (first[:, 2:] == second[:, :-2]).all()
     assert (first[:, 2:] != first[:, :-2]).any()
 
 
+def test_lamps_hang_beside_the_way_and_their_light_falls_off_as_said() -> None:
+    ahead = Camera(K, Pose((0.0, 0.0, 10.0), (1.0, 0.0, 0.0, 0.0)))
+    light = DuskLight.along([CAMERA, ahead])
+    assert np.allclose(light.lamps_m[:2], [[3, -0.5, 6], [-3, -0.5, 12]])
+    assert light.lamps_m[-1, 2] == 48, "40 m beyond the last camera at most"
+    alone = DuskLight(RIGHT, 0.0, np.float32([[0, 0, 4]]))
+    points = np.float32([[0, 0, 4], [0, 0, 4 + REACH_M], [0, REACH_M * 3, 4]])
+    added = alone.on(points) - UNLIT.on(points)
+    assert np.allclose(added, np.outer([1, 1 / 2, 1 / 82], LAMP), atol=1e-6)
+
+
 def test_black_stays_black() -> None:
     black = np.zeros((6, 8, 3), np.uint8)
-    assert not at_dusk(black, np.ones((6, 8), np.float32), CAMERA, (RIGHT, 0.0)).any()
+    assert not at_dusk(black, np.ones((6, 8), np.float32), CAMERA, UNLIT).any()
 
 
 def test_a_drive_at_dusk_has_the_poses_and_times_of_the_one_at_noon(
