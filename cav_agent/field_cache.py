@@ -1,23 +1,21 @@
 """Radiance fields on the vehicle: fetched from a server, opened, made ready, and kept.
 
 A frame can be coded once the field of its tile is prepared. A field that is not in the local store
-is fetched from the server that publishes the tile: resumable, and its digest is checked before
-anything of it is parsed. Where the server publishes a preview of the tile, that is fetched first
-and drawn while the tile's own field arrives.
+is fetched from the server that publishes the tile (``cav_agent.field_fetch``). Frames are coded
+against its lowest level of detail as soon as that has arrived, then against higher ones. Where the
+server publishes a preview of the tile, that is fetched first and drawn instead while the tile's own
+field arrives.
 """
 
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import itertools
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-import grpc
 import structlog
 
 from cav_agent.config import AgentConfig
@@ -29,10 +27,11 @@ from cav_agent.drive_pictures import (
     VehicleCamera,
     VehiclePictures,
 )
+from cav_agent.field_fetch import Beginnings, fetch_field
 from cav_agent.frame_log import DriveObserver
 from cav_agent.handover import ServedTile
 from cav_agent.lights import TileLights
-from cav_agent.server_connection import ServerConnection, retry_after_s
+from cav_agent.server_connection import ServerConnection
 from rfcore.camera import TileOrigin
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.sender.ladder import MeasuredRung, Rung, read_ladder
@@ -40,54 +39,30 @@ from rfcore.codec.sender.steering import Steering
 from rfcore.dataset import read_dataset
 from rfcore.dataset.rig import read_rig, read_rig_drive
 from rfcore.errors import FieldFormatError, InvalidInput, RfedgeError, UnknownField
-from rfcore.field import FieldStore, RadianceField
+from rfcore.field import FULL, FieldStore, RadianceField
+from rfcore.field.store import decode_beginning
 from rfcore.views import PosedPicture
 from rfcore.wire.tiles import Tile
-from rfcore.wire.v1 import field_pb2 as pb
-from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 
 if TYPE_CHECKING:
-    from rfcore.wire.v1.field_pb2_grpc import FieldServiceAsyncStub
+    pass
 
 Metadata = tuple[tuple[str, str], ...]
 
 __all__ = [
-    "MAX_FIELD_BYTES",
     "FieldCache",
     "PreparedCamera",
     "PreparedField",
-    "Store",
-    "fetch_field",
     "read_drive",
 ]
 
 log = structlog.get_logger()
 
-MAX_FIELD_BYTES = 4 << 30
-"""Longest archive the agent takes; more than any vehicle renders in time."""
-
-MAX_RESUMES = 5
-MAX_REFUSALS = 60
-"""Tries of a transfer that broke, and of one that a server has no room for: about a minute."""
-
-RETRIED = (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL, grpc.StatusCode.CANCELLED)
-
-
 OWN_AGAIN_S = 10.0
-"""From a failure to fetch a tile's own field to the next try, while its preview is drawn."""
+"""From a failure to fetch a tile's own field to the next try, while something is drawn."""
 
 MAX_PREPARED = 3
 """Fields kept ready: the previous tile's, the present one's and the next one's."""
-
-
-class Store(Protocol):
-    """A directory of field archives, as ``rfcore.field.FieldStore``."""
-
-    def ids(self) -> tuple[str, ...]:
-        """Return the ids of the fields there."""
-
-    def add(self, source: bytes | Path, field_id: str | None = None) -> str:
-        """Add an archive, checked against ``field_id`` before it is parsed."""
 
 
 @dataclass(frozen=True)
@@ -159,48 +134,102 @@ class FieldCache:
 
     async def _load(self, served: ServedTile) -> PreparedField:
         tile, loop = served.tile, asyncio.get_running_loop()
+        own = _OwnField()
         preview = await self._preview(tile)
-        field = await self._opened(served, preview or (tile.field_id,))
+        if preview:
+            own.take(await self._opened(served, preview))
+        field = await self._first(served, own)
 
         def want() -> None:
             loop.call_soon_threadsafe(self._fetch_lights, served, lights)
 
         lights = TileLights(field, want if tile.other_lights else lambda: None, tile.field_id)
         prepared = await asyncio.to_thread(self._prepare, field, lights, tile.renderable_ids)
+        own.shown_by(lights)
         if preview:
-            fetching = asyncio.create_task(self._take_own(served, lights))
-            self._fetching_own.add(fetching)
-            fetching.add_done_callback(self._fetching_own.discard)
+            self._begin(self._arrive(served, own))
         return prepared
 
-    async def _preview(self, tile: Tile) -> tuple[str, ...]:
-        """Return the archives of the field to begin with; none if the tile's own is here.
-
-        None either where a camera is looked for in the field (``--localise``), on another thread
-        than takes a preview's place, or within its bounds (a feed's).
-        """
-        config = self._config
-        waits = config.localise or config.feed.source is not None
-        if tile.preview is None or waits:
-            return ()
+    async def _first(self, served: ServedTile, own: _OwnField) -> RadianceField:
+        """Return what can be drawn first; what is not here of the tile's own field is fetched."""
+        config, tile = self._config, served.tile
+        if own.field is not None:
+            return own.field
         held = await asyncio.to_thread(FieldStore(config.fields.expanduser()).ids)
+        if tile.field_id in held or self._needs_all:
+            return await self._opened(served, (tile.field_id,))
+        arriving = self._begin(self._arrive(served, own))
+        either: set[asyncio.Future[Any]] = {arriving, own.first}
+        await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+        if own.field is None:
+            await arriving  # raises what went wrong
+        return await own.first
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.create_task(work)
+        self._fetching_own.add(task)
+        task.add_done_callback(self._fetching_own.discard)
+        return task
+
+    @property
+    def _needs_all(self) -> bool:
+        """Whether a drive needs the whole of the tile's own field: a camera is looked for in it
+        (``--localise``), on another thread than takes it, or within its bounds (a feed's)."""
+        return self._config.localise or self._config.feed.source is not None
+
+    async def _preview(self, tile: Tile) -> tuple[str, ...]:
+        """Return the archives of the field to begin with; none if the tile's own is here."""
+        if tile.preview is None or self._needs_all:
+            return ()
+        held = await asyncio.to_thread(FieldStore(self._config.fields.expanduser()).ids)
         return () if tile.field_id in held else tile.preview.field_ids
 
-    async def _take_own(self, served: ServedTile, lights: TileLights) -> None:
-        """Fetch the tile's own field and have it drawn; try again until it is there."""
+    async def _arrive(self, served: ServedTile, own: _OwnField) -> None:
+        """Fetch the tile's own field and have it drawn; try again until all of it is there.
+
+        Raises ``RfedgeError`` if it cannot be fetched and nothing can be drawn instead.
+        """
         while True:
             try:
-                field = await self._opened(served, (served.tile.field_id,))
-                _check_origin(field, lights.own)
-                await asyncio.to_thread(_prepare_renderers, field, self._ladder(field))
+                await self._take_own(served, own)
+                return
             except RfedgeError as error:
+                if own.field is None:
+                    raise
                 log.warning("own field not fetched", tile=served.tile.name, problem=str(error))
                 await asyncio.sleep(OWN_AGAIN_S)
-            else:
-                lights.take_own(field)
-                return
 
-    async def _opened(self, served: ServedTile, archive_ids: Sequence[str]) -> RadianceField:
+    async def _take_own(self, served: ServedTile, own: _OwnField) -> None:
+        async def take(field: RadianceField) -> None:
+            if own.field is not None:
+                _check_origin(field, own.field)
+            await asyncio.to_thread(_prepare_renderers, field, self._ladder(field))
+            own.take(field)
+
+        async def begin(data: bytes) -> None:
+            field = await asyncio.to_thread(self._beginning, data, served.tile.field_id)
+            await take(field)
+            log.info("beginning of the field ready", detail=field.most_detail, bytes=len(data))
+
+        beginnings = None if served.tile.preview else Beginnings(begin)
+        await take(await self._opened(served, (served.tile.field_id,), beginnings))
+
+    def _beginning(self, data: bytes, field_id: str) -> RadianceField:
+        render = self._config.render
+        return decode_beginning(
+            data,
+            field_id,
+            threads=render.threads,
+            isa=render.field_isa,
+            max_bytes=render.max_field_bytes,
+        )
+
+    async def _opened(
+        self,
+        served: ServedTile,
+        archive_ids: Sequence[str],
+        beginnings: Beginnings | None = None,
+    ) -> RadianceField:
         """Return the last of ``archive_ids``, fetching those that are not in the store."""
         config = self._config
         folder, render = config.fields.expanduser(), config.render
@@ -210,7 +239,7 @@ class FieldCache:
                 server = self._servers[served.server]
                 channel = await server.require(config.limits.give_up_s or None)
                 try:
-                    await fetch_field(channel, store, field_id, folder, server.metadata)
+                    await fetch_field(channel, store, field_id, folder, server.metadata, beginnings)
                     size_bytes = (await asyncio.to_thread(store.path, field_id)).stat().st_size
                     self._observer.field_fetched(size_bytes)
                 except UnknownField:
@@ -288,6 +317,29 @@ class FieldCache:
         return DeadlineRungs(controller, self._observer.coded_under_deadline)
 
 
+class _OwnField:
+    """The tile's own field as far as it has arrived, or its preview; used on the event loop."""
+
+    def __init__(self) -> None:
+        self.first: asyncio.Future[RadianceField] = asyncio.get_running_loop().create_future()
+        self.field: RadianceField | None = None
+        self._lights: TileLights | None = None
+
+    def take(self, field: RadianceField) -> None:
+        """Draw ``field`` from now on."""
+        self.field = field
+        if not self.first.done():
+            self.first.set_result(field)
+        if self._lights is not None:
+            self._lights.take_own(field)
+
+    def shown_by(self, lights: TileLights) -> None:
+        """Hand what comes to ``lights``, which have the first one."""
+        self._lights = lights
+        if self.field is not None and self.field is not lights.own:
+            lights.take_own(self.field)
+
+
 def _without_ground(tile: Tile) -> Tile:
     """Return what of a tile says which fields there are: tiles of the same ones share them."""
     return replace(tile, name="any", area=None, margin_m=0.0, version=1)
@@ -331,110 +383,11 @@ def read_drive(config: AgentConfig, origin: TileOrigin) -> tuple[PosedPicture, .
 
 def _prepare_renderers(field: RadianceField, ladder: Sequence[MeasuredRung]) -> None:
     """Make every renderer that frames may ask for."""
-    field.prepare()
-    for quality in {measured.rung.quality for measured in ladder}:
-        field.prepare(quality)
+    for quality in {FULL, *(measured.rung.quality for measured in ladder)}:
+        field.prepare(replace(quality, detail=min(quality.detail, field.most_detail)))
 
 
 def _with_rounded_pose(picture: PosedPicture) -> PosedPicture:
     camera = picture.camera
     rounded = camera.rounded()
     return replace(picture, camera=rounded)
-
-
-async def fetch_field(
-    channel: grpc.aio.Channel, store: Store, field_id: str, folder: Path, metadata: Metadata = ()
-) -> None:
-    """Put field ``field_id`` of the server into ``store``; what arrived before is not sent again.
-
-    The partial file lies in ``folder``; ``metadata`` goes with each call. Raises ``UnknownField``
-    when the server lacks the field, ``FieldFormatError`` when what arrives is not the field,
-    ``RfedgeError`` when it does not come.
-    """
-    stub = FieldServiceStub(channel)
-    partial = folder / f".{field_id}.part"
-    size_bytes = await _size(stub, field_id, metadata)
-    log.info("fetching field", field=field_id, size_bytes=size_bytes)
-    await _receive_all(stub, field_id, partial, size_bytes, metadata)
-    await asyncio.to_thread(_check_and_add, store, field_id, partial)
-    log.info("field fetched", field=field_id)
-
-
-async def _size(stub: FieldServiceAsyncStub, field_id: str, metadata: Metadata) -> int:
-    request = pb.GetManifestRequest(field_id=field_id)
-    try:
-        manifest = await stub.GetManifest(request, metadata=metadata, wait_for_ready=True)
-    except grpc.aio.AioRpcError as error:
-        if error.code() is grpc.StatusCode.NOT_FOUND:
-            raise UnknownField(f"{error.details()} (asked for {field_id})") from error
-        raise RfedgeError(f"the server has no manifest of {field_id}: {error.details()}") from error
-    if not 0 < manifest.size_bytes <= MAX_FIELD_BYTES:
-        raise FieldFormatError(
-            f"field {field_id} has {manifest.size_bytes} bytes, at most {MAX_FIELD_BYTES} are taken"
-        )
-    return int(manifest.size_bytes)
-
-
-async def _receive_all(
-    stub: FieldServiceAsyncStub,
-    field_id: str,
-    partial: Path,
-    size_bytes: int,
-    metadata: Metadata,
-) -> None:
-    """Receive what is missing; resume where it broke, and come again to a server that is busy."""
-    resumes = refusals = 0
-    while True:
-        try:
-            await _receive(stub, field_id, partial, size_bytes, metadata)
-            return
-        except grpc.aio.AioRpcError as error:
-            is_refused = error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-            resumes, refusals = resumes + (not is_refused), refusals + is_refused
-            final = not is_refused and error.code() not in RETRIED
-            if final or resumes > MAX_RESUMES or refusals > MAX_REFUSALS:
-                problem = f"{error.code().name}: {error.details()}"
-                raise RfedgeError(f"field {field_id} does not arrive ({problem})") from error
-            log.warning("field transfer interrupted", problem=error.details())
-            await asyncio.sleep(retry_after_s(error))
-
-
-async def _receive(
-    stub: FieldServiceAsyncStub,
-    field_id: str,
-    partial: Path,
-    size_bytes: int,
-    metadata: Metadata,
-) -> None:
-    have_bytes = partial.stat().st_size if partial.exists() else 0
-    if have_bytes >= size_bytes:
-        return
-    request = pb.FetchFieldRequest(field_id=field_id, offset_bytes=have_bytes)
-    with partial.open("ab") as file:
-        async for response in stub.FetchField(request, metadata=metadata, wait_for_ready=True):
-            end_bytes = response.offset_bytes + len(response.chunk)
-            if response.offset_bytes != have_bytes or end_bytes > size_bytes:
-                raise FieldFormatError(
-                    f"the server sent bytes {response.offset_bytes}..{end_bytes} of field "
-                    f"{field_id} where {have_bytes}.. of {size_bytes} were expected"
-                )
-            await asyncio.to_thread(file.write, response.chunk)
-            have_bytes = end_bytes
-    if have_bytes != size_bytes:
-        raise FieldFormatError(
-            f"field {field_id} ended after {have_bytes} of {size_bytes} bytes; try again"
-        )
-
-
-def _check_and_add(store: Store, field_id: str, partial: Path) -> None:
-    """Add the file to the store, or remove it: a wrong digest cannot be resumed from."""
-    try:
-        with partial.open("rb") as file:
-            found = hashlib.file_digest(file, "sha256").hexdigest()
-        if found != field_id:
-            raise FieldFormatError(
-                f"what the server sent as field {field_id} has sha256 {found}; it was removed"
-            )
-        store.add(partial, field_id)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -7,14 +7,16 @@ other lights are asked for, and those that are there are rendered beside it for 
 ``LOOK_EVERY``. Another one is taken if it is clearly nearer, so that two lights between which the
 day is do not take turns.
 
-A vehicle that has not fetched the tile's own field yet may begin with another, the tile's preview;
-``take_own`` puts the tile's own in its place between two frames.
+A vehicle that has not fetched the tile's own field yet begins with a part of it, or with another
+field, the tile's preview; ``take_own`` puts more of it in the place of that between two frames. A
+part draws no higher level of detail than it has (``drawable``).
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 
 import structlog
 
@@ -86,6 +88,12 @@ class TileLights:
         """
         return self.current.render(camera, quality)
 
+    def drawable(self, quality: Quality) -> Quality:
+        """Return ``quality``, less detailed if the field in use is only there in part: what
+        ``view`` is to be asked for next, on the same thread."""
+        most = self._taken().most_detail
+        return quality if quality.detail <= most else replace(quality, detail=most)
+
     def view(self, frame: I420, camera: Camera, quality: Quality) -> FieldView:
         """Return what the field that fits shows at a frame's camera."""
         return self.fitting(frame, render_field_view(self._taken(), camera, quality), quality)
@@ -114,14 +122,23 @@ class TileLights:
                 self._fields[own.field_id] = self.own = own
                 self._arrived, self._until_look = None, 0
                 self.current = own if self.current is before else self.current
-                log.info("own field taken", field=own.field_id, instead_of=before.field_id)
+                log.info(
+                    "own field taken",
+                    field=own.field_id,
+                    detail=own.most_detail,
+                    instead_of=before.field_id,
+                )
             return self.current
 
     def _nearest(
         self, frame: I420, view: FieldView, difference: float, quality: Quality
     ) -> FieldView:
         with self._lock:
-            others = [field for field in self._fields.values() if field is not self.current]
+            others = [
+                field
+                for field in self._fields.values()
+                if field is not self.current and field.most_detail >= quality.detail
+            ]
         found, limit = view, difference - NEARER_LEVELS
         for field in others:
             other = render_field_view(field, view.camera, quality)

@@ -151,7 +151,7 @@ class Pipeline:
         picture = job.capture.picture
         rgb = self._read(picture)
         read_s = watch.lap_s()
-        rung = self._rungs.current
+        rung = self._drawable(self._rungs.current)
         frame = i420_from_rgb(rgb)
         stage_s = {"convert": watch.lap_s()}
         waited_s, received_s = 0.0, job.capture.received_s
@@ -187,9 +187,16 @@ class Pipeline:
             made.sender_s,
             self._clock_ns() / 1e9,
             job.capture.instant,
-            in_field=placed.view is not None,
+            in_field=placed.view is not None and rung is self._rungs.current,
         )
         return made
+
+    def _drawable(self, rung: Rung) -> Rung:
+        """Return the rung, at a lower level of detail while only a part of the field is here."""
+        if self._lights is None:
+            return rung
+        quality = self._lights.drawable(rung.quality)
+        return rung if quality == rung.quality else replace(rung, quality=quality)
 
     def _placed(self, job: EncodeJob, frame: I420, rung: Rung) -> Placed:
         """Return what the field shows at the pose to send, and how that was found, if it was."""

@@ -37,11 +37,14 @@ from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.files import DECODED_BYTES, is_regular, open_at_once
 
 __all__ = [
+    "PREFIX_BYTES",
     "RAISE_LIMIT",
     "Archive",
+    "array_ends",
     "check_array_bytes",
     "decode_archive",
     "encode_archive",
+    "header_end",
     "read_file",
 ]
 
@@ -49,6 +52,7 @@ MAGIC = b"RFFIELD\0"
 VERSION = 1
 PREFIX = struct.Struct("<8sII32s16x")
 PREFIX_ZEROS = 16
+PREFIX_BYTES = PREFIX.size
 ALIGN_BYTES = 64
 MAX_HEADER_BYTES = 1 << 20
 MAX_DIMENSIONS = 4
@@ -84,16 +88,39 @@ def encode_archive(archive: Archive) -> bytes:
     return b"".join(map(_padded, (prefix, header, *blobs.values())))
 
 
-def decode_archive(data: bytes, source: str = "field") -> Archive:
-    """Return the content of a field file.
+def decode_archive(data: bytes, source: str = "field", *, whole: bool = True) -> Archive:
+    """Return the content of a field file, or of its beginning: unless it must be ``whole``, arrays
+    that are not all there are left out.
 
     The arrays are read-only views of ``data``. Raises ``FieldFormatError``, naming ``source`` and
     what is wrong, for anything ``encode_archive`` would not have written.
     """
     try:
-        return _decode(memoryview(data))
+        return _decode(memoryview(data), whole)
     except _Damage as damage:
         raise FieldFormatError(f"{source}: {damage}") from damage
+
+
+def header_end(start: bytes) -> int:
+    """Return where the arrays begin in a field file, of which ``start`` are the first
+    ``PREFIX_BYTES``; raise ``FieldFormatError`` for another file."""
+    try:
+        return _aligned(PREFIX.size + _prefix(start)[0])
+    except _Damage as damage:
+        raise FieldFormatError(f"field: {damage}") from damage
+
+
+def array_ends(head: bytes) -> Mapping[str, int]:
+    """Return up to where each array needs the file, by its name; ``head`` is all before the arrays,
+    as ``header_end`` has it. Raises ``FieldFormatError`` if it is damaged."""
+    try:
+        raw = _header_bytes(memoryview(head))
+        entries, ends, end = _header(raw).get("arrays"), {}, _aligned(PREFIX.size + len(raw))
+        for entry in entries if isinstance(entries, list) else []:
+            end = ends[_described(entry)[0]] = _end_of(entry, end)
+    except _Damage as damage:
+        raise FieldFormatError(f"field: {damage}") from damage
+    return ends
 
 
 def read_file(path: Path, max_bytes: int = DECODED_BYTES) -> bytes:
@@ -131,7 +158,7 @@ class _Damage(Exception):
     """What is wrong with a file; becomes a ``FieldFormatError`` that also names the file."""
 
 
-def _decode(data: memoryview) -> Archive:
+def _decode(data: memoryview, whole: bool) -> Archive:
     raw = _header_bytes(data)
     header = _header(raw)
     kind, metadata, entries = (header.get(key) for key in ("kind", "metadata", "arrays"))
@@ -139,11 +166,26 @@ def _decode(data: memoryview) -> Archive:
         raise _Damage("header lacks 'kind', 'metadata' or 'arrays'")
     start = _aligned(PREFIX.size + len(raw))
     _check_zeros(data, PREFIX.size + len(raw), start)
-    return Archive(kind, metadata, _arrays(data[start:], entries, header.get("data_bytes")))
+    arrays, data_bytes = data[start:], header.get("data_bytes")
+    if whole and data_bytes != len(arrays):
+        raise _Damage(f"{len(arrays)} bytes of arrays, the header says {data_bytes}")
+    return Archive(kind, metadata, _arrays(arrays, entries, whole))
 
 
 def _header_bytes(data: memoryview) -> memoryview:
     """Return the JSON header after checking everything before it, and its digest."""
+    length, digest = _prefix(data)
+    if length > len(data) - PREFIX.size:
+        raise _Damage(f"header of {length} bytes does not fit the file of {len(data)}")
+    _check_zeros(data, PREFIX.size - PREFIX_ZEROS, PREFIX.size)
+    raw = data[PREFIX.size : PREFIX.size + length]
+    if hashlib.sha256(raw).digest() != digest:
+        raise _Damage("header is damaged (sha256 differs)")
+    return raw
+
+
+def _prefix(data: bytes | memoryview) -> tuple[int, bytes]:
+    """Return the length and the digest of the JSON header."""
     if len(data) < PREFIX.size:
         raise _Damage(f"{len(data)} bytes are too few for a field file")
     magic, version, length, digest = PREFIX.unpack(data[: PREFIX.size])
@@ -151,13 +193,9 @@ def _header_bytes(data: memoryview) -> memoryview:
         raise _Damage("not a field file (it does not start with RFFIELD)")
     if version != VERSION:
         raise _Damage(f"version {version} of the format, this program reads {VERSION}")
-    if length > min(MAX_HEADER_BYTES, len(data) - PREFIX.size):
-        raise _Damage(f"header of {length} bytes does not fit the file of {len(data)}")
-    _check_zeros(data, PREFIX.size - PREFIX_ZEROS, PREFIX.size)
-    raw = data[PREFIX.size : PREFIX.size + length]
-    if hashlib.sha256(raw).digest() != digest:
-        raise _Damage("header is damaged (sha256 differs)")
-    return raw
+    if length > MAX_HEADER_BYTES:
+        raise _Damage(f"header of {length} bytes is over the limit of {MAX_HEADER_BYTES}")
+    return length, digest
 
 
 def _header(raw: memoryview) -> dict[str, Any]:
@@ -170,12 +208,12 @@ def _header(raw: memoryview) -> dict[str, Any]:
     return header
 
 
-def _arrays(data: memoryview, entries: list[Any], data_bytes: Any) -> dict[str, Array]:
-    if data_bytes != len(data):
-        raise _Damage(f"{len(data)} bytes of arrays, the header says {data_bytes}")
+def _arrays(data: memoryview, entries: list[Any], whole: bool) -> dict[str, Array]:
     arrays: dict[str, Array] = {}
     end = 0
     for entry in entries:
+        if not whole and _end_of(entry, end) > len(data):
+            return arrays
         name, array, end = _array(data, entry, end)
         if name in arrays:
             raise _Damage(f"array '{name}' is there twice")
@@ -183,6 +221,12 @@ def _arrays(data: memoryview, entries: list[Any], data_bytes: Any) -> dict[str, 
     if end != len(data):
         raise _Damage(f"{len(data) - end} bytes after the last array")
     return arrays
+
+
+def _end_of(entry: Any, offset: int) -> int:
+    """Return where the array that starts at ``offset`` ends, with the zeros behind it."""
+    _, dtype, shape = _described(entry)
+    return _aligned(offset + math.prod(shape) * dtype.itemsize)
 
 
 def _refuse_constant(text: str) -> None:

@@ -135,6 +135,11 @@ class RadianceField(Protocol):
     def isa(self) -> str:
         """The instruction set it renders with; it changes the time a picture takes, no byte."""
 
+    @property
+    def most_detail(self) -> float:
+        """The highest ``Quality.detail`` that can be drawn: 1, unless only a beginning of the
+        archive is here."""
+
     def prepare(self, quality: Quality = FULL) -> None:
         """Make what rendering at ``quality`` needs, so that the first picture is not late."""
 

@@ -191,6 +191,11 @@ class NgpField:
         """How many trained numbers the field has."""
         return self.numbers.table.size + self.numbers.matrices.size
 
+    @property
+    def most_detail(self) -> float:
+        """1: a hash grid is drawn whole."""
+        return 1.0
+
     def archive(self) -> Archive:
         """Return what the field's file holds."""
         return ngp_archive(self.numbers, self.metadata)

@@ -29,6 +29,7 @@ __all__ = [
     "Quality",
     "check_levels",
     "kept_of",
+    "most_detail_of",
     "splats_at_detail",
 ]
 
@@ -99,11 +100,28 @@ def kept_of(count: int, detail: float) -> int:
     return -(-count * round(detail * 100) // 100)
 
 
-def splats_at_detail(gaussians: Gaussians, levels: LevelsOfDetail, detail: float) -> Gaussians:
-    """Return the splats of one level of detail; for full detail, ``gaussians`` itself."""
+def most_detail_of(arrived: int, count: int) -> float:
+    """Return the highest level that the first ``arrived`` of ``count`` splats draw; 0 for none."""
+    return max((d for d in DETAILS if kept_of(count, d) <= arrived), default=0.0)
+
+
+def splats_at_detail(
+    gaussians: Gaussians, levels: LevelsOfDetail, detail: float, count: int | None = None
+) -> Gaussians:
+    """Return the splats of one level of detail; for full detail, ``gaussians`` itself.
+
+    ``count``: how many the whole field has, of which ``gaussians`` are the first. Raises
+    ``InvalidInput`` for a level that needs more than those.
+    """
+    count = len(gaussians) if count is None else count
+    kept = kept_of(count, detail)
+    if kept > len(gaussians):
+        raise InvalidInput(
+            "quality.detail",
+            f"{detail:g} needs {kept} of the field's {count} splats, {len(gaussians)} are here",
+        )
     if detail == 1:
         return gaussians
-    kept = kept_of(len(gaussians), detail)
     prefix = Gaussians(
         means=gaussians.means[:kept],
         quaternions=gaussians.quaternions[:kept],
@@ -117,12 +135,12 @@ def splats_at_detail(gaussians: Gaussians, levels: LevelsOfDetail, detail: float
     return replace(prefix, log_scales=own.log_scales, opacity_logits=own.opacity_logits)
 
 
-def check_levels(gaussians: Gaussians, levels: LevelsOfDetail) -> None:
+def check_levels(gaussians: Gaussians, levels: LevelsOfDetail, count: int | None = None) -> None:
     """Raise ``InvalidInput`` unless every level has finite float32 values for its splats."""
     for detail, own in levels.items():
         if detail not in DETAILS[1:]:
             raise InvalidInput("field.detail", f"{detail} is none of {DETAILS[1:]}")
         try:
-            splats_at_detail(gaussians, {detail: own}, detail)
+            splats_at_detail(gaussians, {detail: own}, detail, count)
         except InvalidInput as error:
             raise InvalidInput(f"field.detail {detail:g}", str(error)) from error

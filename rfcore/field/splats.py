@@ -18,7 +18,14 @@ from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive, encode_archive
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
-from rfcore.field.quality import FULL, LevelsOfDetail, Quality, check_levels, splats_at_detail
+from rfcore.field.quality import (
+    FULL,
+    LevelsOfDetail,
+    Quality,
+    check_levels,
+    most_detail_of,
+    splats_at_detail,
+)
 from rfcore.field.scale import colour_at_scale, view_at_scale
 from rfcore.field.splat_archive import compressed_archive, splat_archive, splats_of_compressed
 from rfcore.field.splat_grid import FINEST, Grain, Steps
@@ -35,8 +42,10 @@ class SplatField:
     ``levels`` is what the lower levels of detail have of their own (``rfcore.field.quality``).
     ``archive`` is the one the field came from, ``None`` for one that was just made.
     ``threads`` and ``isa`` choose how it renders, never what: every choice gives the same bytes.
-    ``isa`` may be an OpenCL device. Raises ``BackendUnavailable`` if this machine lacks it. Safe to
-    share between threads.
+    ``isa`` may be an OpenCL device. ``count``: how many splats the whole field has, where
+    ``gaussians`` are the first of them (``decode_beginning``): then it draws levels of detail up to
+    ``most_detail`` alone, as the whole does, and has no archive. Raises ``BackendUnavailable`` if
+    this machine lacks ``isa``. Safe to share between threads.
     """
 
     def __init__(
@@ -48,13 +57,15 @@ class SplatField:
         threads: int = 1,
         isa: str | None = None,
         archive: Archive | None = None,
+        count: int | None = None,
     ) -> None:
         self.gaussians = gaussians
+        self._count = len(gaussians) if count is None else count
         self.metadata = metadata if metadata is not None else FieldMetadata()
         if self.metadata.kind != SPLATS:
             raise InvalidInput("field.kind", f"'{self.metadata.kind}' is not '{SPLATS}'")
         self.levels = dict(levels or {})
-        check_levels(gaussians, self.levels)
+        check_levels(gaussians, self.levels, self._count)
         self.isa = check_renderer(threads, isa)
         self._threads = threads
         self._archive = archive
@@ -81,8 +92,15 @@ class SplatField:
         """How many threads render."""
         return self._threads
 
+    @property
+    def most_detail(self) -> float:
+        """The highest level of detail that can be drawn: 1, unless only a beginning is here."""
+        return most_detail_of(len(self.gaussians), self._count)
+
     def archive(self) -> Archive:
-        """Return what the field's file holds."""
+        """Return what the field's file holds; raise ``InvalidInput`` if not all of it is here."""
+        if self._count != len(self.gaussians):
+            raise InvalidInput("field", f"{len(self.gaussians)} of {self._count} splats are here")
         if self._archive is not None:
             return self._archive
         return splat_archive(self.gaussians, self.levels, self.metadata)
@@ -136,7 +154,7 @@ class SplatField:
         with self._lock:
             if detail not in self._rasterizers:
                 self._rasterizers[detail] = Rasterizer(
-                    splats_at_detail(self.gaussians, self.levels, detail),
+                    splats_at_detail(self.gaussians, self.levels, detail, self._count),
                     threads=self._threads,
                     isa=self.isa,
                     antialiased=self.metadata.antialiased,

@@ -31,7 +31,7 @@ from rfcore.field.interface import (
 )
 from rfcore.field.layer import LAYER, base_of_layer, layered_field
 from rfcore.field.ngp import NgpField, ngp_of_archive
-from rfcore.field.splat_archive import splats_of_archive
+from rfcore.field.splat_archive import splats_of_archive, splats_of_beginning
 from rfcore.field.splats import SplatField
 from rfcore.files import DECODED_BYTES, write_whole
 from rfcore.geodesy import Anchor, anchor_values
@@ -44,6 +44,7 @@ __all__ = [
     "FieldStore",
     "OpenBase",
     "anchored_file",
+    "decode_beginning",
     "decode_field",
     "encode_field",
     "load_checked",
@@ -152,6 +153,34 @@ def decode_field(
         return READERS[archive.kind](file)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise FieldFormatError(f"{source}: {error}") from error
+
+
+def decode_beginning(
+    data: bytes,
+    field_id: str,
+    *,
+    threads: int = 1,
+    isa: str | None = None,
+    max_bytes: int = DECODED_BYTES,
+) -> SplatField:
+    """Return the field ``field_id`` as far as ``data``, the first bytes of its archive, draws it.
+
+    ``splat_archive.detail_ends`` says how many bytes that takes. Each array has the digest that the
+    header says; whether the whole is the field of that id shows when all of it is here. Raises
+    ``FieldFormatError`` if it is damaged, too large, or too short to draw anything.
+    """
+    archive = decode_archive(data, field_id, whole=False)
+    try:
+        metadata = metadata_of_header(SPLATS, archive.metadata)
+        gaussians, levels, count = splats_of_beginning(archive, max_bytes)
+        field = SplatField(
+            gaussians, metadata, levels=levels, threads=threads, isa=isa, count=count
+        )
+        field.field_id = field_id
+        field.bounds = bounds_of_header(archive.metadata) or field.bounds
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise FieldFormatError(f"field {field_id}: {error}") from error
+    return field
 
 
 def load_field(

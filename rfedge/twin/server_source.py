@@ -19,7 +19,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from cav_agent.field_cache import fetch_field
+from cav_agent.field_fetch import fetch_field
 from rfcore.errors import AccessDenied, InvalidInput, ProtocolError, RfedgeError
 from rfcore.field import FieldStore
 from rfcore.wire.address import Address

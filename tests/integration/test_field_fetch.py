@@ -6,7 +6,7 @@ from typing import Any
 import grpc
 import pytest
 
-from cav_agent.field_cache import fetch_field
+from cav_agent.field_fetch import fetch_field
 from rfcore.errors import FieldFormatError, ProtocolError, UnknownField
 from rfcore.field import FieldStore
 from rfcore.wire.v1 import field_pb2 as pb

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cav_agent.field_cache import fetch_field
+from cav_agent.field_fetch import fetch_field
 from mec_server.config import LearnSettings
 from mec_server.learner import UnrecordedTrials
 from mec_server.twin.state import TwinView
@@ -94,12 +94,12 @@ def own_may_come(street: Any, monkeypatch: pytest.MonkeyPatch) -> asyncio.Event:
     """Hold the transfer of the tile's own field back until it is set; the first try fails."""
     may_come, tries = asyncio.Event(), itertools.count()
 
-    async def held(channel: Any, store: Any, field_id: str, folder: Path, metadata: Any) -> None:
+    async def held(channel: Any, store: Any, field_id: str, *more: Any) -> None:
         if field_id == street.field_id:
             if next(tries) == 0:
                 raise RfedgeError("the transfer broke")
             await may_come.wait()
-        await fetch_field(channel, store, field_id, folder, metadata)
+        await fetch_field(channel, store, field_id, *more)
 
     monkeypatch.setattr("cav_agent.field_cache.fetch_field", held)
     monkeypatch.setattr("cav_agent.field_cache.OWN_AGAIN_S", 0.01)
