@@ -24,12 +24,12 @@ __all__ = [
     "MAX_SAMPLES_PER_RAY",
     "MAX_SH_DEGREE",
     "SCALES",
+    "Beginning",
     "LevelOfDetail",
     "LevelsOfDetail",
     "Quality",
     "check_levels",
     "kept_of",
-    "most_detail_of",
     "splats_at_detail",
 ]
 
@@ -91,6 +91,15 @@ class LevelOfDetail:
     opacity_logits: F32
 
 
+@dataclass(frozen=True)
+class Beginning:
+    """What the first splats of a field are a part of: they are of ``count``, and draw levels up to
+    ``detail``."""
+
+    count: int
+    detail: float
+
+
 LevelsOfDetail = Mapping[float, LevelOfDetail]
 """By ``Quality.detail``; full detail has none, and neither need the others."""
 
@@ -100,28 +109,16 @@ def kept_of(count: int, detail: float) -> int:
     return -(-count * round(detail * 100) // 100)
 
 
-def most_detail_of(arrived: int, count: int) -> float:
-    """Return the highest level that the first ``arrived`` of ``count`` splats draw; 0 for none."""
-    return max((d for d in DETAILS if kept_of(count, d) <= arrived), default=0.0)
-
-
 def splats_at_detail(
     gaussians: Gaussians, levels: LevelsOfDetail, detail: float, count: int | None = None
 ) -> Gaussians:
     """Return the splats of one level of detail; for full detail, ``gaussians`` itself.
 
-    ``count``: how many the whole field has, of which ``gaussians`` are the first. Raises
-    ``InvalidInput`` for a level that needs more than those.
+    ``count``: how many the whole field has, where ``gaussians`` are the first of them.
     """
-    count = len(gaussians) if count is None else count
-    kept = kept_of(count, detail)
-    if kept > len(gaussians):
-        raise InvalidInput(
-            "quality.detail",
-            f"{detail:g} needs {kept} of the field's {count} splats, {len(gaussians)} are here",
-        )
     if detail == 1:
         return gaussians
+    kept = kept_of(len(gaussians) if count is None else count, detail)
     prefix = Gaussians(
         means=gaussians.means[:kept],
         quaternions=gaussians.quaternions[:kept],

@@ -31,7 +31,7 @@ from rfcore.field.archive import RAISE_LIMIT, Archive, Array, check_array_bytes
 from rfcore.field.importance import reordered
 from rfcore.field.integers import Columns, Integers, encode_columns, open_columns
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
-from rfcore.field.quality import DETAILS, LevelOfDetail, LevelsOfDetail, kept_of
+from rfcore.field.quality import DETAILS, Beginning, LevelOfDetail, LevelsOfDetail, kept_of
 from rfcore.field.splat_grid import (
     BLOCK,
     FINEST,
@@ -174,9 +174,9 @@ def splats_of_compressed(
 
 def splats_of_beginning(
     archive: Archive, max_bytes: int = DECODED_BYTES
-) -> tuple[Gaussians, LevelsOfDetail, int]:
+) -> tuple[Gaussians, LevelsOfDetail, Beginning]:
     """Return what the first arrays of a compressed archive hold: the splats of the highest level of
-    detail that is there, and the levels up to it; and how many splats the whole archive has.
+    detail that is there, the levels up to it, and what those are the beginning of.
 
     Raises as ``splats_of_compressed``, and ``InvalidInput`` if no level is there.
     """
@@ -185,7 +185,7 @@ def splats_of_beginning(
     if not bands:
         raise InvalidInput("archive", "no level of detail is there yet")
     gaussians, levels = stored.splats(bands)
-    return gaussians, levels, stored.bands[-1].part.stop
+    return gaussians, levels, Beginning(stored.bands[-1].part.stop, bands[-1].detail)
 
 
 def detail_ends(ends: Mapping[str, int]) -> Mapping[float, int]:
@@ -193,10 +193,10 @@ def detail_ends(ends: Mapping[str, int]) -> Mapping[float, int]:
     ``ends`` as of ``archive.array_ends``."""
     needed = {}
     for band in _bands(0, ENCODING):
-        of_band = [*band.names.values(), _name(band.detail)]
-        there = [ends[name] for name in of_band if name in ends]
-        if there:
-            needed[band.detail] = max(there)
+        names = list(band.names.values())
+        if set(names) <= set(ends):
+            last = _name(band.detail) if _name(band.detail) in ends else names[-1]
+            needed[band.detail] = ends[last]
     return needed
 
 

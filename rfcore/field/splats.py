@@ -20,10 +20,10 @@ from rfcore.field.archive import Archive, encode_archive
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
 from rfcore.field.quality import (
     FULL,
+    Beginning,
     LevelsOfDetail,
     Quality,
     check_levels,
-    most_detail_of,
     splats_at_detail,
 )
 from rfcore.field.scale import colour_at_scale, view_at_scale
@@ -42,10 +42,10 @@ class SplatField:
     ``levels`` is what the lower levels of detail have of their own (``rfcore.field.quality``).
     ``archive`` is the one the field came from, ``None`` for one that was just made.
     ``threads`` and ``isa`` choose how it renders, never what: every choice gives the same bytes.
-    ``isa`` may be an OpenCL device. ``count``: how many splats the whole field has, where
-    ``gaussians`` are the first of them (``decode_beginning``): then it draws levels of detail up to
-    ``most_detail`` alone, as the whole does, and has no archive. Raises ``BackendUnavailable`` if
-    this machine lacks ``isa``. Safe to share between threads.
+    ``isa`` may be an OpenCL device. ``beginning``: what ``gaussians`` are the first splats of
+    (``decode_beginning``); they are drawn as of the whole, up to ``most_detail``, and have no
+    archive. Raises ``BackendUnavailable`` if this machine lacks ``isa``. Safe to share between
+    threads.
     """
 
     def __init__(
@@ -57,15 +57,15 @@ class SplatField:
         threads: int = 1,
         isa: str | None = None,
         archive: Archive | None = None,
-        count: int | None = None,
+        beginning: Beginning | None = None,
     ) -> None:
         self.gaussians = gaussians
-        self._count = len(gaussians) if count is None else count
+        self._beginning = beginning or Beginning(len(gaussians), 1.0)
         self.metadata = metadata if metadata is not None else FieldMetadata()
         if self.metadata.kind != SPLATS:
             raise InvalidInput("field.kind", f"'{self.metadata.kind}' is not '{SPLATS}'")
         self.levels = dict(levels or {})
-        check_levels(gaussians, self.levels, self._count)
+        check_levels(gaussians, self.levels, self._beginning.count)
         self.isa = check_renderer(threads, isa)
         self._threads = threads
         self._archive = archive
@@ -95,12 +95,13 @@ class SplatField:
     @property
     def most_detail(self) -> float:
         """The highest level of detail that can be drawn: 1, unless only a beginning is here."""
-        return most_detail_of(len(self.gaussians), self._count)
+        return self._beginning.detail
 
     def archive(self) -> Archive:
         """Return what the field's file holds; raise ``InvalidInput`` if not all of it is here."""
-        if self._count != len(self.gaussians):
-            raise InvalidInput("field", f"{len(self.gaussians)} of {self._count} splats are here")
+        if self.most_detail < 1:
+            count = self._beginning.count
+            raise InvalidInput("field", f"{len(self.gaussians)} of {count} splats are here")
         if self._archive is not None:
             return self._archive
         return splat_archive(self.gaussians, self.levels, self.metadata)
@@ -150,11 +151,16 @@ class SplatField:
         self.rasterizer(quality.detail)
 
     def rasterizer(self, detail: float = 1.0) -> Rasterizer:
-        """Return the renderer of a level, made when it is first needed and kept."""
+        """Return the renderer of a level, made when it is first needed and kept.
+
+        Raises ``InvalidInput`` for a level that is not here.
+        """
+        if detail > self.most_detail:
+            raise InvalidInput("quality.detail", f"{detail:g} is above {self.most_detail:g}, here")
         with self._lock:
             if detail not in self._rasterizers:
                 self._rasterizers[detail] = Rasterizer(
-                    splats_at_detail(self.gaussians, self.levels, detail, self._count),
+                    splats_at_detail(self.gaussians, self.levels, detail, self._beginning.count),
                     threads=self._threads,
                     isa=self.isa,
                     antialiased=self.metadata.antialiased,

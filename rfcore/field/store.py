@@ -172,9 +172,9 @@ def decode_beginning(
     archive = decode_archive(data, field_id, whole=False)
     try:
         metadata = metadata_of_header(SPLATS, archive.metadata)
-        gaussians, levels, count = splats_of_beginning(archive, max_bytes)
+        gaussians, levels, beginning = splats_of_beginning(archive, max_bytes)
         field = SplatField(
-            gaussians, metadata, levels=levels, threads=threads, isa=isa, count=count
+            gaussians, metadata, levels=levels, threads=threads, isa=isa, beginning=beginning
         )
         field.field_id = field_id
         field.bounds = bounds_of_header(archive.metadata) or field.bounds

@@ -5,8 +5,9 @@ import numpy as np
 from cav_agent.lights import FITS_LEVELS, LOOK_EVERY, TileLights
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.block_means import median_block_mean_difference
-from rfcore.field import FULL, FieldMetadata, SplatField
+from rfcore.field import FULL, FieldMetadata, Quality, SplatField
 from rfcore.field.layer import SH_DC
+from rfcore.field.quality import Beginning
 from rfcore.image import I420
 from rfcore.raster.gaussians import Gaussians
 
@@ -124,3 +125,43 @@ def test_another_light_stays_when_the_own_field_arrives() -> None:
     lights.view(frame_of(dusk), CAMERA, FULL)
     assert lights.current is dusk
     assert lights.held_ids() == {own.field_id, dusk.field_id}
+
+
+def beginning_of(field: SplatField, detail: float) -> SplatField:
+    """The first splats of a field, which draw it up to ``detail``."""
+    begun = SplatField(field.gaussians, field.metadata, beginning=Beginning(4, detail))
+    begun.field_id = field.field_id
+    return begun
+
+
+def test_a_part_of_the_field_is_drawn_at_the_detail_it_has_until_more_arrives() -> None:
+    """Frames are named by the tile's own field throughout; what it shows depends on the detail."""
+    own = flat(0.8)
+    lights = TileLights(beginning_of(own, 0.1))
+    half_size = Quality(scale=0.5)
+    assert lights.drawable(half_size) == Quality(detail=0.1, scale=0.5)
+    assert lights.drawable(Quality(detail=0.1)) == Quality(detail=0.1)
+    lights.take_own(beginning_of(own, 0.25))
+    assert lights.drawable(FULL) == Quality(detail=0.25)
+    view = lights.view(frame_of(own), CAMERA, Quality(detail=0.25))
+    assert view.render.digest() == frame_of(own).digest()
+    lights.take_own(own)
+    assert lights.drawable(FULL) == FULL
+    assert lights.current is own
+    assert lights.named_id == ""
+
+
+def test_a_part_is_no_light_for_frames_of_more_detail_than_it_has() -> None:
+    own, dusk = flat(0.8), flat(0.4)
+    lights = TileLights(beginning_of(own, 0.25))
+    lights.add(dusk)
+    for _ in range(2 * LOOK_EVERY):
+        lights.view(frame_of(dusk), CAMERA, lights.drawable(FULL))
+    assert lights.current is dusk
+    for _ in range(2 * LOOK_EVERY):
+        lights.view(frame_of(own), CAMERA, lights.drawable(FULL))
+    assert lights.current is dusk, "the part cannot be drawn at full detail"
+    lights.take_own(own)
+    for _ in range(2 * LOOK_EVERY):
+        lights.view(frame_of(own), CAMERA, lights.drawable(FULL))
+    assert lights.current is own

@@ -21,14 +21,21 @@ from rfcore.field import (
     save_field,
     splat_archive,
 )
-from rfcore.field.archive import Archive, decode_archive, encode_archive
+from rfcore.field.archive import (
+    PREFIX_BYTES,
+    Archive,
+    array_ends,
+    decode_archive,
+    encode_archive,
+    header_end,
+)
 from rfcore.field.quality import DETAILS, LevelOfDetail, kept_of
-from rfcore.field.splat_archive import compressed_archive, splats_of_compressed
+from rfcore.field.splat_archive import compressed_archive, detail_ends, splats_of_compressed
 from rfcore.field.splat_grid import BLOCK, Grain, Steps, gaussians_of, numbers_of
-from rfcore.field.store import decode_field, encode_field
+from rfcore.field.store import decode_beginning, decode_field, encode_field
 from rfcore.raster.gaussians import Gaussians
 
-GOLDEN = Path(__file__).parent / "golden" / "grid-1.rff"
+GOLDEN = Path(__file__).parent / "golden"
 GOLDEN_SPLATS = "3597093196fa52eeb631e76985d822af7bb577ea11ec70dd24045f1194120adf"
 CAMERA = Camera(Intrinsics(48, 36, 40.0, 40.0, 24.0, 18.0), Pose((0, 0, -5), (1, 0, 0, 0)))
 STEPS = Steps()
@@ -71,23 +78,29 @@ def test_a_compressed_field_survives_its_file(
     assert save_field(back, tmp_path / "b.rff") == field_id, "what was loaded is saved as it was"
 
 
-def test_the_decoded_bytes_are_pinned() -> None:
-    """Both ends of a session decode for themselves; ``golden_field`` made the file."""
-    field = load_field(GOLDEN)
+@pytest.mark.parametrize("name", ["grid-1", "grid-2"])
+def test_the_decoded_bytes_are_pinned(name: str) -> None:
+    """Both ends of a session decode for themselves; ``golden_field`` made the files, that of grid-1
+    at a revision that wrote it."""
+    path = GOLDEN / f"{name}.rff"
+    field = load_field(path)
     assert isinstance(field, SplatField)
     assert digest_of(field) == GOLDEN_SPLATS
-    assert field.field_id == hashlib.sha256(GOLDEN.read_bytes()).hexdigest()
+    assert field.field_id == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert field.archive().metadata["encoding"]["name"] == name
 
 
 def golden_field(gaussians: Gaussians) -> bytes:
-    """What the golden file was made of: ``make_gaussians(300, 1)``."""
+    """What the golden files were made of: ``make_gaussians(300, 1)``."""
     return encode_field(field_of(gaussians, 0.5, 0.25).compressed())
 
 
 def test_the_golden_file_is_what_its_maker_makes(make_gaussians) -> None:
-    made = decode_field(golden_field(make_gaussians(300, 1)))
+    data = golden_field(make_gaussians(300, 1))
+    made = decode_field(data)
     assert isinstance(made, SplatField)
     assert digest_of(made) == GOLDEN_SPLATS
+    assert data == (GOLDEN / "grid-2.rff").read_bytes()
 
 
 def test_every_value_is_within_half_a_step(make_gaussians) -> None:
@@ -306,3 +319,61 @@ def test_a_field_beyond_the_memory_it_may_take_is_refused_before_it_is_decoded(
     assert decode_field(data, max_bytes=size_bytes).primitives == 700
     with pytest.raises(FieldFormatError, match=r"700 of SH degree 3 take 0\.00 GB of memory, over"):
         decode_field(data, max_bytes=size_bytes - 1)
+
+
+def ends_of(data: bytes) -> dict[float, int]:
+    """What each level of detail needs of an archive."""
+    return dict(detail_ends(array_ends(data[: header_end(data[:PREFIX_BYTES])])))
+
+
+@pytest.mark.parametrize("levels", [(), (0.5,), (0.5, 0.25, 0.1)])
+@pytest.mark.parametrize("n", [1, 3, 700])
+def test_a_beginning_draws_its_levels_as_the_whole_does(
+    make_gaussians, n: int, levels: tuple[float, ...]
+) -> None:
+    data = encode_field(field_of(make_gaussians(n, 2), *levels).compressed())
+    whole, ends = decode_field(data), ends_of(data)
+    assert list(ends) == [0.1, 0.25, 0.5, 1.0]
+    assert ends[1.0] == len(data)
+    for detail in (0.1, 0.25, 0.5):
+        begun = decode_beginning(data[: ends[detail]], whole.field_id)
+        assert (begun.field_id, begun.bounds) == (whole.field_id, whole.bounds)
+        assert begun.most_detail == detail
+        for below in (d for d in ends if d <= detail):
+            quality = Quality(detail=below)
+            mine, theirs = (f.render_colour(CAMERA, quality) for f in (begun, whole))
+            np.testing.assert_array_equal(mine, theirs)
+
+
+def test_a_beginning_draws_no_more_than_it_has_and_is_no_archive(make_gaussians) -> None:
+    data = encode_field(field_of(make_gaussians(700, 1), 0.5).compressed())
+    begun = decode_beginning(data[: ends_of(data)[0.25] + 100], "ab" * 32)
+    assert begun.most_detail == 0.25
+    with pytest.raises(InvalidInput, match=r"quality\.detail: 0\.5 is above 0\.25, here"):
+        begun.render(CAMERA, Quality(detail=0.5))
+    with pytest.raises(InvalidInput, match=r"1 is above 0\.25"):
+        begun.render(CAMERA)
+    with pytest.raises(InvalidInput, match="175 of 700 splats are here"):
+        begun.archive()
+
+
+def test_too_short_or_damaged_a_beginning_is_refused(make_gaussians) -> None:
+    data = bytearray(encode_field(field_of(make_gaussians(700, 1), 0.1).compressed()))
+    end = ends_of(bytes(data))[0.1]
+    for short in (10, 63, 64, end // 2, end - 1):
+        with pytest.raises(FieldFormatError):
+            decode_beginning(bytes(data[:short]), "ab" * 32)
+    for at in (20, 200, end - 100):
+        data[at] ^= 1
+        with pytest.raises(FieldFormatError, match=r"differs|zero|damaged"):
+            decode_beginning(bytes(data[:end]), "ab" * 32)
+        data[at] ^= 1
+    assert decode_beginning(bytes(data[:end]), "ab" * 32).most_detail == 0.1
+
+
+def test_other_archives_have_no_beginning(make_gaussians) -> None:
+    old = (GOLDEN / "grid-1.rff").read_bytes()
+    raw = encode_field(SplatField(make_gaussians(9, 0)))
+    assert ends_of(old) == ends_of(raw) == {}
+    with pytest.raises(FieldFormatError):
+        decode_beginning(old[:-1], "ab" * 32)

@@ -1,14 +1,22 @@
 """A vehicle without the field gets it from the server, whole or not at all."""
 
+import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import grpc
 import pytest
 
-from cav_agent.field_fetch import fetch_field
+from cav_agent.field_fetch import Beginnings, fetch_field
+from mec_server.fields.shelf import read_chunk
 from rfcore.errors import FieldFormatError, ProtocolError, UnknownField
 from rfcore.field import FieldStore
+from rfcore.field.archive import PREFIX_BYTES, array_ends, header_end
+from rfcore.field.splat_archive import detail_ends
+from rfcore.field.store import decode_beginning, encode_field
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 
@@ -120,3 +128,111 @@ async def test_a_damaged_field_keeps_the_server_from_starting(
     with pytest.raises(FieldFormatError, match=street.field_id):
         async with serve(fields=tmp_path):
             pass
+
+
+@contextmanager
+def sent_up_to(monkeypatch: pytest.MonkeyPatch, size_bytes: int) -> Iterator[Event]:
+    """Servers send so many bytes of a field, 100 at once, and the rest once the event is set."""
+    may_go_on = Event()
+
+    def chunk(path: Path, offset_bytes: int) -> bytes:
+        if offset_bytes >= size_bytes:
+            assert may_go_on.wait(60)
+        return read_chunk(path, offset_bytes)[:100]
+
+    monkeypatch.setattr("mec_server.fields.service.read_chunk", chunk)
+    try:
+        yield may_go_on
+    finally:
+        may_go_on.set()
+
+
+def detail_bytes(archive: bytes) -> dict[float, int]:
+    """What each level of detail needs of an archive."""
+    return dict(detail_ends(array_ends(archive[: header_end(archive[:PREFIX_BYTES])])))
+
+
+async def test_a_vehicle_drives_with_the_beginning_of_a_field_and_then_with_all_of_it(
+    street: Any, serve: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One stream, one epoch, no frame refused: each says what level of detail it was drawn at."""
+    archive = encode_field(street.field.compressed())
+    store, mine = tmp_path / "fields", tmp_path / "mine"
+    field_id = FieldStore(store).add(archive)
+    with sent_up_to(monkeypatch, detail_bytes(archive)[0.25]) as may_go_on:
+        async with (
+            serve(fields=store) as server,
+            vehicle(server.address, fields=mine, field=field_id, loop=True) as driving,
+        ):
+            await driving.until(lambda: driving.acked() >= 3 and details(driving)[-1] == "25%")
+            assert driving.fields() == {f".{field_id}.part"}
+            may_go_on.set()
+            await driving.until(lambda: details(driving)[-1] == "100%")
+            seen = driving.acked()
+            await driving.until(lambda: driving.acked() >= seen + 3)
+    drawn = details(driving)
+    assert drawn == sorted(drawn, key=lambda detail: float(detail[:-1]))
+    assert {line["result"] for line in driving.lines()} == {"acked"}
+    assert {line["epoch"] for line in driving.lines()} == {0}
+    assert {line["light_field"] for line in driving.lines()} == {None}
+    assert driving.fields() == {f"{field_id}.rff"}
+    assert driving.value("rfedge_agent_field_bytes_total") == len(archive)
+
+
+def details(driving: Any) -> list[str]:
+    """Return at what detail each picture was drawn, by the name of its rung."""
+    return [line["rung"].split()[0] for line in driving.lines()]
+
+
+async def test_beginnings_are_handed_over_once_each_and_again_after_a_broken_transfer(
+    street: Any, serve: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive = encode_field(street.field.compressed())
+    ends, mine = detail_bytes(archive), tmp_path / "mine"
+    field_id = FieldStore(tmp_path / "fields").add(archive)
+    begun: list[float] = []
+
+    async def take(data: bytes) -> None:
+        begun.append(decode_beginning(data, field_id).most_detail)
+
+    async with (
+        serve(fields=tmp_path / "fields") as server,
+        grpc.aio.insecure_channel(str(server.address)) as channel,
+    ):
+        with sent_up_to(monkeypatch, ends[0.25]) as may_go_on:
+            fetching = asyncio.create_task(
+                fetch_field(channel, FieldStore(mine), field_id, mine, (), Beginnings(take))
+            )
+            async with asyncio.timeout(30):
+                while begun != [0.1, 0.25]:
+                    await asyncio.sleep(0.001)
+            fetching.cancel()
+            may_go_on.set()
+        await fetch_field(channel, FieldStore(mine), field_id, mine, (), Beginnings(take))
+    assert begun == [0.1, 0.25, 0.25, 0.5], "what is there at once is handed over as one"
+    assert FieldStore(mine).path(field_id).read_bytes() == archive
+
+
+async def test_a_damaged_beginning_is_removed_and_named(
+    street: Any, serve: Any, tmp_path: Path
+) -> None:
+    archive = encode_field(street.field.compressed())
+    field_id = FieldStore(tmp_path / "fields").add(archive)
+    store = FieldStore(tmp_path / "mine")
+    partial = tmp_path / "mine" / f".{field_id}.part"
+    damaged = bytearray(archive[: detail_bytes(archive)[0.1]])
+    damaged[-100] ^= 1
+    partial.write_bytes(damaged)
+
+    async def take(data: bytes) -> None:
+        decode_beginning(data, field_id)
+
+    async with (
+        serve(fields=tmp_path / "fields") as server,
+        grpc.aio.insecure_channel(str(server.address)) as channel,
+    ):
+        with pytest.raises(FieldFormatError, match=f"{field_id}: array .* is damaged"):
+            await fetch_field(channel, store, field_id, tmp_path / "mine", (), Beginnings(take))
+        assert not partial.exists()
+        await fetch_field(channel, store, field_id, tmp_path / "mine", (), Beginnings(take))
+    assert store.ids() == (field_id,)
