@@ -192,7 +192,8 @@ class LearnSettings:
     """Learn from what is recorded (--record), in a process of its own while a processor is idle,
     and publish what makes bits fall into the folder of fields (docs/fields.md)."""
     learn_as: Annotated[LearnAs, arg(name="learn-as")] = LearnAs.COLOURS
-    """Another light as colours (a layer on the tile's field) or as all (a field of its own)."""
+    """Another light as colours (a layer on the tile's field), as delta (all parameters, as their
+    difference to the tile's field) or as all (a field of its own)."""
     min_identities: Annotated[int, arg(name="learn-min-identities")] = 2
     """From fewer vehicles nothing is learnt."""
     cpu_s_per_h: Annotated[float, arg(name="learn-cpu-s-per-h")] = 900.0

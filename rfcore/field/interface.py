@@ -28,13 +28,16 @@ from rfcore.native.yuv import field_view_from_view
 from rfcore.views import FieldView, View
 
 __all__ = [
+    "DELTA",
     "KINDS",
+    "LAYER",
     "NGP",
     "SPLATS",
     "Bounds",
     "FieldMetadata",
     "RadianceField",
     "Renderer",
+    "base_of",
     "bounds_of_header",
     "metadata_of_header",
     "render_field_view",
@@ -47,6 +50,9 @@ SPLATS = "splats"
 NGP = "ngp"
 """Multiresolution hash grid with a small network (Mueller et al. 2022)."""
 KINDS = (SPLATS, NGP)
+LAYER, DELTA = "layer", "delta"
+"""Archives that are nothing without the splats of their base: ``rfcore.field.layer`` and
+``rfcore.field.delta``."""
 Vec3 = tuple[float, float, float]
 
 
@@ -163,6 +169,11 @@ def render_field_view(renderer: Renderer, camera: Camera, quality: Quality = FUL
     A sender passes the camera it announces: ``Camera.rounded``.
     """
     return field_view_from_view(renderer.render(camera, quality), camera)
+
+
+def base_of(archive: Archive) -> str | None:
+    """Return the id of the field that an archive is a layer or a delta of, if it is one."""
+    return str(archive.metadata["base"]) if archive.kind in (LAYER, DELTA) else None
 
 
 def stored_metadata(metadata: FieldMetadata, bounds: Bounds) -> dict[str, Any]:

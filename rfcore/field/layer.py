@@ -29,12 +29,18 @@ from numpy.typing import NDArray
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive
 from rfcore.field.integers import Integers, decode_columns, encode_columns
-from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
+from rfcore.field.interface import (
+    LAYER,
+    SPLATS,
+    Bounds,
+    FieldMetadata,
+    base_of,
+    stored_metadata,
+)
 from rfcore.field.splats import SplatField
 from rfcore.raster.gaussians import Gaussians
 
 __all__ = [
-    "LAYER",
     "MIDDLE_LUMA",
     "OFFSET_STEP",
     "OWN_STEP",
@@ -42,7 +48,6 @@ __all__ = [
     "SLOPE_STEP",
     "VOXELS_M",
     "ColourLayer",
-    "base_of_layer",
     "layer_archive",
     "layered_colours",
     "layered_field",
@@ -51,8 +56,6 @@ __all__ = [
     "voxels_of",
 ]
 
-LAYER = "layer"
-"""The archive's kind."""
 ENCODING = "voxels-1"
 VOXELS_M = (0.25, 1.0, 4.0, 16.0)
 """Sides of the voxels, powers of two so that dividing by them is exact."""
@@ -143,18 +146,13 @@ def layer_archive(layer: ColourLayer, base: SplatField, metadata: FieldMetadata)
     return Archive(LAYER, {**header, "base": base.field_id, "encoding": encoding}, arrays)
 
 
-def base_of_layer(archive: Archive) -> str | None:
-    """Return the id of the field that a layer is for; None if the archive is no layer."""
-    return str(archive.metadata["base"]) if archive.kind == LAYER else None
-
-
 def layered_field(archive: Archive, base: SplatField, metadata: FieldMetadata) -> SplatField:
     """Return the field that ``archive``, a layer, makes of ``base``.
 
     Raises ``InvalidInput`` if it is for another base, ``KeyError`` or ``TypeError`` if it is no
     layer.
     """
-    stated = base_of_layer(archive)
+    stated = base_of(archive)
     if stated != base.field_id:
         raise InvalidInput("layer.base", f"is for field {stated}, not {base.field_id}")
     if base.archive().kind != SPLATS:

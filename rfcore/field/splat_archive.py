@@ -42,19 +42,25 @@ from rfcore.field.splat_grid import (
     level_numbers_of,
     level_of,
     numbers_of,
+    placed,
 )
 from rfcore.files import DECODED_BYTES
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
 
 __all__ = [
     "ENCODING",
+    "GridSplats",
     "check_decoded_size",
     "compressed_archive",
     "detail_ends",
+    "grid_splats",
+    "level_name",
     "splat_archive",
+    "splats_in",
     "splats_of_archive",
     "splats_of_beginning",
     "splats_of_compressed",
+    "stream_shapes",
 ]
 
 
@@ -93,7 +99,7 @@ def compressed_archive(
     sorted_splats = reordered(gaussians, order)
     own = {detail: _reordered_level(level, order) for detail, level in levels.items()}
     numbers = [
-        (band, numbers_of(_splats_in(sorted_splats, band.part), chosen, grain))
+        (band, numbers_of(splats_in(sorted_splats, band.part), chosen, grain))
         for band in _bands(len(gaussians), ENCODING)
     ]
     coded = {name: encode_columns(part) for name, part in _stored(numbers, own, chosen)}
@@ -134,7 +140,8 @@ def _bands(count: int, encoding: str) -> Sequence[_Band]:
     )
 
 
-def _splats_in(gaussians: Gaussians, part: slice) -> Gaussians:
+def splats_in(gaussians: Gaussians, part: slice) -> Gaussians:
+    """Return some splats."""
     return Gaussians(**{f.name: getattr(gaussians, f.name)[part] for f in fields(Gaussians)})
 
 
@@ -155,7 +162,7 @@ def _stored(
                 level_numbers_of(_level_in(level, below.part), of_below, steps)
                 for below, of_below in numbers[: index + 1]
             ]
-            yield _name(band.detail), np.vstack(own)
+            yield level_name(band.detail), np.vstack(own)
 
 
 def splats_of_compressed(
@@ -188,6 +195,23 @@ def splats_of_beginning(
     return gaussians, levels, Beginning(stored.bands[-1].part.stop, bands[-1].detail)
 
 
+@dataclass(frozen=True)
+class GridSplats:
+    """The whole numbers of a compressed archive: ``numbers`` of all splats in the file's order,
+    with means as steps of ``2^exponents`` [N], and no blocks; ``levels`` [K, 4] by detail."""
+
+    numbers: SplatNumbers
+    exponents: Integers
+    levels: Mapping[float, Integers]
+    steps: Steps
+    sh_degree: int
+
+
+def grid_splats(archive: Archive, max_bytes: int = DECODED_BYTES) -> GridSplats:
+    """Return the numbers of a compressed archive; raises as ``splats_of_compressed``."""
+    return _Stored.of(archive, max_bytes).grid()
+
+
 def detail_ends(ends: Mapping[str, int]) -> Mapping[float, int]:
     """Return the bytes of a file that each level of detail needs, where a beginning of it will do;
     ``ends`` as of ``archive.array_ends``."""
@@ -195,7 +219,7 @@ def detail_ends(ends: Mapping[str, int]) -> Mapping[float, int]:
     for band in _bands(0, ENCODING):
         names = list(band.names.values())
         if set(names) <= set(ends):
-            last = _name(band.detail) if _name(band.detail) in ends else names[-1]
+            last = level_name(band.detail) if level_name(band.detail) in ends else names[-1]
             needed[band.detail] = ends[last]
     return needed
 
@@ -221,7 +245,7 @@ class _Stored:
         sh_degree = _whole(encoding, "sh_degree", 3)
         check_decoded_size(count, sh_degree, max_bytes)
         bands = _bands(count, name)
-        levels = {_name(detail): (kept_of(count, detail), 4) for detail in DETAILS[1:]}
+        levels = {level_name(detail): (kept_of(count, detail), 4) for detail in DETAILS[1:]}
         shapes = _shapes(bands, sh_degree) | {
             level: shape for level, shape in levels.items() if level in encoding["streams"]
         }
@@ -229,7 +253,7 @@ class _Stored:
 
     def is_there(self, band: _Band) -> bool:
         """Tell whether a band and the level that ends with it can be decoded."""
-        level = _name(band.detail)
+        level = level_name(band.detail)
         needed = {*band.names.values(), *({level} & set(self.shapes))}
         return needed <= set(self.archive.arrays)
 
@@ -237,11 +261,31 @@ class _Stored:
         """Return the splats of ``bands``, which are the first ones, and the levels of those."""
         numbers = [(band, self._columns(band)) for band in bands]
         levels = {
-            detail: self._level(_name(detail), numbers)
+            detail: self._level(level_name(detail), numbers)
             for detail in DETAILS[1:]
-            if _name(detail) in self.shapes and detail <= bands[-1].detail
+            if level_name(detail) in self.shapes and detail <= bands[-1].detail
         }
         return self._gaussians(numbers), levels
+
+    def grid(self) -> GridSplats:
+        """Return all numbers that are stored."""
+        parts = [of_part for _, of_part in _in_parts([(b, self._columns(b)) for b in self.bands])]
+        parts = parts or [_no_numbers(self.sh_degree)]
+        means, exponents = zip(*map(placed, parts), strict=True)
+        joined = {
+            f.name: np.concatenate([getattr(part, f.name) for part in parts])
+            for f in fields(SplatNumbers)
+        }
+        numbers = SplatNumbers(
+            **{**joined, "blocks": np.zeros((0, 4), np.int32), "means": np.concatenate(means)}
+        )
+        levels = {
+            detail: self._opened(level_name(detail)).rows(slice(None))
+            for detail in DETAILS[1:]
+            if level_name(detail) in self.shapes
+        }
+        exponent = np.concatenate(exponents)
+        return GridSplats(numbers, exponent, levels, self.steps, self.sh_degree)
 
     def _opened(self, name: str) -> Columns:
         streams = self.archive.metadata["encoding"]["streams"]
@@ -282,6 +326,11 @@ class _Stored:
         return level
 
 
+def _no_numbers(sh_degree: int) -> SplatNumbers:
+    shapes = stream_shapes(0, sh_degree)
+    return SplatNumbers(**{name: np.zeros(shape, np.int32) for name, shape in shapes.items()})
+
+
 def _in_parts(
     numbers: Sequence[tuple[_Band, Mapping[str, Columns]]],
 ) -> Iterator[tuple[slice, SplatNumbers]]:
@@ -307,22 +356,24 @@ def check_decoded_size(count: int, sh_degree: int, max_bytes: int) -> None:
         )
 
 
-def _shapes(bands: Sequence[_Band], sh_degree: int) -> dict[str, tuple[int, int]]:
-    columns = {
-        "blocks": 4,
-        "means": 3,
-        "rotations": 4,
-        "log_scales": 3,
-        "opacity_logits": 1,
-        "sh": 3 * (sh_degree + 1) ** 2,
+def stream_shapes(count: int, sh_degree: int) -> dict[str, tuple[int, int]]:
+    """Return rows and columns of the streams of ``count`` splats."""
+    return {
+        "blocks": (-(-count // BLOCK), 4),
+        "means": (count, 3),
+        "rotations": (count, 4),
+        "log_scales": (count, 3),
+        "opacity_logits": (count, 1),
+        "sh": (count, 3 * (sh_degree + 1) ** 2),
     }
-    shapes = {}
-    for band in bands:
-        count = band.part.stop - band.part.start
-        for field, name in band.names.items():
-            rows = -(-count // BLOCK) if field == "blocks" else count
-            shapes[name] = (rows, columns[field])
-    return shapes
+
+
+def _shapes(bands: Sequence[_Band], sh_degree: int) -> dict[str, tuple[int, int]]:
+    return {
+        f"{band.prefix}{name}": shape
+        for band in bands
+        for name, shape in stream_shapes(band.part.stop - band.part.start, sh_degree).items()
+    }
 
 
 def _whole(encoding: Mapping[str, Any], key: str, highest: int) -> int:
@@ -332,7 +383,8 @@ def _whole(encoding: Mapping[str, Any], key: str, highest: int) -> int:
     return value
 
 
-def _name(detail: float) -> str:
+def level_name(detail: float) -> str:
+    """Return the stream of what a level of detail has of its own."""
     return f"detail_{round(detail * 100)}"
 
 

@@ -17,6 +17,7 @@ rotation aside, a float32 division by 127 each).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,11 @@ __all__ = [
     "gaussians_of",
     "level_numbers_of",
     "level_of",
+    "means_of_steps",
+    "means_steps",
     "numbers_of",
+    "placed",
+    "rotations_like",
 ]
 
 BLOCK = 256
@@ -115,10 +120,13 @@ def numbers_of(gaussians: Gaussians, steps: Steps, grain: Grain = FINEST) -> Spl
     )
 
 
-def gaussians_of(numbers: SplatNumbers, steps: Steps) -> Gaussians:
-    """Return the splats of ``numbers``; raise ``InvalidInput`` for numbers that are none."""
+def gaussians_of(numbers: SplatNumbers, steps: Steps, means: F32 | None = None) -> Gaussians:
+    """Return the splats of ``numbers``; raise ``InvalidInput`` for numbers that are none.
+
+    ``means`` [N, 3]: instead of those that the blocks say.
+    """
     return Gaussians(
-        means=_means_of(numbers),
+        means=_means_of(numbers) if means is None else means,
         quaternions=_quaternions_of(numbers.rotations),
         log_scales=_scaled(numbers.log_scales, steps.log_scales),
         opacity_logits=_scaled(numbers.opacity_logits, steps.opacity_logits)[:, 0].copy(),
@@ -184,22 +192,50 @@ def _exponent(gaussians: Gaussians, start: int, means_bits: int) -> int:
 
 
 def _means_of(numbers: SplatNumbers) -> F32:
+    return means_of_steps(*placed(numbers))
+
+
+def means_steps(means: F32, exponents: Integers) -> NDArray[np.float64]:
+    """Return ``means`` [N, 3] in steps of ``2^exponents`` [N], whole numbers."""
+    return np.rint(np.ldexp(means.astype(np.float64), -exponents[:, None]))
+
+
+def means_of_steps(steps: Integers, exponents: Integers) -> F32:
+    """Return the means [N, 3] of so many steps of ``2^exponents`` [N]."""
+    return np.ascontiguousarray(np.ldexp(steps.astype(np.float64), exponents[:, None]), np.float32)
+
+
+def placed(numbers: SplatNumbers) -> tuple[Integers, Integers]:
+    """Return the means of ``numbers`` as steps [N, 3], and the exponents [N] of those."""
     n = len(numbers.means)
     blocks = np.repeat(numbers.blocks, BLOCK, axis=0)[:n]
-    exponents = np.clip(blocks[:, :1], *EXPONENTS)
-    whole = (blocks[:, 1:] + numbers.means).astype(np.float64)
-    return np.ascontiguousarray(np.ldexp(whole, exponents), dtype=np.float32)
+    return blocks[:, 1:] + numbers.means, np.clip(blocks[:, 0], *EXPONENTS)
 
 
 def _rotation_numbers(quaternions: F32, multiple: int) -> Integers:
-    q = quaternions.astype(np.float64)
-    largest = np.abs(q).argmax(axis=1)
-    divisor = np.take_along_axis(q, largest[:, None], axis=1)
-    unit = np.where(divisor == 0, [[1.0, 0, 0, 0]], q / np.where(divisor == 0, 1, divisor))
-    others = np.take_along_axis(unit, _others(largest), axis=1)
+    largest = np.abs(quaternions.astype(np.float64)).argmax(axis=1)
     most = ROTATION_STEPS // multiple
-    steps = np.clip(np.rint(others * ROTATION_STEPS / multiple), -most, most) * multiple
+    steps = np.clip(np.rint(_beside(quaternions, largest) / multiple), -most, most) * multiple
     return np.hstack([largest[:, None], steps]).astype(np.int32)
+
+
+def rotations_like(quaternions: F32, like: Integers) -> Integers:
+    """Return the nearest numbers [N, 4], with the component that is largest in ``like`` [N, 4], the
+    numbers of nearby rotations, as long as it is not small."""
+    size = np.abs(quaternions.astype(np.float64))
+    of_like = np.take_along_axis(size, like[:, :1].astype(np.intp), axis=1)[:, 0]
+    keeps = of_like >= 0.7 * size.max(axis=1, initial=0.0)
+    largest = np.where(keeps, like[:, 0], size.argmax(axis=1)).astype(np.intp)
+    steps = np.rint(_beside(quaternions, largest))
+    return np.hstack([largest[:, None], steps]).astype(np.int32)
+
+
+def _beside(quaternions: F32, largest: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return the three components that are not ``largest`` [N] in rotation steps of that one."""
+    q = quaternions.astype(np.float64)
+    divisor = np.take_along_axis(q, largest[:, None], axis=1)
+    unit = np.where(divisor == 0, 0.0, q / np.where(divisor == 0, 1, divisor))
+    return np.take_along_axis(unit, _others(largest), axis=1) * ROTATION_STEPS
 
 
 def _quaternions_of(rotations: Integers) -> F32:
@@ -213,10 +249,10 @@ def _quaternions_of(rotations: Integers) -> F32:
     return q
 
 
-def _others(largest: Integers) -> Integers:
+def _others(largest: NDArray[np.signedinteger[Any]]) -> NDArray[np.intp]:
     """Return the three components [N, 3] that are not ``largest`` [N], in order."""
     rest = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-    return rest[largest]
+    return np.asarray(rest[largest], np.intp)
 
 
 def colour_numbers(sh: F32, steps: Steps) -> Integers:

@@ -67,6 +67,8 @@ class SplatField:
         self.levels = dict(levels or {})
         check_levels(gaussians, self.levels, self._beginning.count)
         self.isa = check_renderer(threads, isa)
+        self.base: SplatField | None = None
+        """The field that this one's archive is a layer or a delta of, if it is one."""
         self._threads = threads
         self._archive = archive
         self._rasterizers: dict[float, Rasterizer] = {}
@@ -131,10 +133,17 @@ class SplatField:
         return self._like(self.gaussians, metadata, self.levels, archive)
 
     def derived(
-        self, gaussians: Gaussians, metadata: FieldMetadata, archive: Archive
+        self,
+        gaussians: Gaussians,
+        metadata: FieldMetadata,
+        archive: Archive,
+        levels: LevelsOfDetail | None = None,
     ) -> SplatField:
-        """Return the field ``archive`` that has ``gaussians`` and this one's levels of detail."""
-        return self._like(gaussians, metadata, self.levels, archive)
+        """Return the field ``archive`` that has ``gaussians`` and ``levels``, None: this one's."""
+        levels = self.levels if levels is None else levels
+        made = self._like(gaussians, metadata, levels, archive)
+        made.base = self
+        return made
 
     def with_threads(self, threads: int) -> SplatField:
         """Return the same field with renderers of its own, of so many threads."""

@@ -3,8 +3,8 @@
 ``decode_field`` makes a field that renders out of an archive's bytes, ``encode_field`` the reverse;
 ``READERS`` is the one place that knows which kinds of field there are.
 
-A colour layer (``rfcore.field.layer``) needs its base, which ``open_base`` finds by its id, or the
-folder that the layer's file is in.
+A colour layer (``rfcore.field.layer``) and a delta (``rfcore.field.delta``) need their base, which
+``open_base`` finds by its id, or the folder that the file is in.
 
 In a directory (``FieldStore``) a file named ``<field id>.rff`` is listed by its name, any other
 ``.rff`` file by its SHA-256, so that ``street.rff`` may simply be put there. Contents are checked
@@ -20,16 +20,20 @@ from pathlib import Path
 
 from rfcore.errors import FieldFormatError, InvalidInput, UnknownField
 from rfcore.field.archive import Archive, decode_archive, encode_archive, read_file
+from rfcore.field.delta import delta_field
 from rfcore.field.folder import FIELD_ID, SUFFIX, FieldFolder
 from rfcore.field.interface import (
+    DELTA,
+    LAYER,
     NGP,
     SPLATS,
     FieldMetadata,
     RadianceField,
+    base_of,
     bounds_of_header,
     metadata_of_header,
 )
-from rfcore.field.layer import LAYER, base_of_layer, layered_field
+from rfcore.field.layer import layered_field
 from rfcore.field.ngp import NgpField, ngp_of_archive
 from rfcore.field.splat_archive import splats_of_archive, splats_of_beginning
 from rfcore.field.splats import SplatField
@@ -71,13 +75,27 @@ class FieldFile:
 
 
 def _layer(file: FieldFile) -> RadianceField:
-    base_id = base_of_layer(file.archive)
+    base = _base(file)
+    return _named(file, layered_field(file.archive, base, file.metadata))
+
+
+def _delta(file: FieldFile) -> RadianceField:
+    base = _base(file)
+    return _named(file, delta_field(file.archive, base, file.metadata, file.max_bytes))
+
+
+def _base(file: FieldFile) -> SplatField:
+    """Return the splats that a layer or a delta is of."""
+    kind, base_id = file.archive.kind, base_of(file.archive)
     if base_id is None or FIELD_ID.fullmatch(base_id) is None:
-        raise InvalidInput("layer.base", f"{base_id!r} is no field id")
+        raise InvalidInput(f"{kind}.base", f"{base_id!r} is no field id")
     base = file.open_base(base_id)
     if not isinstance(base, SplatField):
-        raise InvalidInput("layer.base", f"{base_id} is a field of {base.metadata.kind}")
-    field = layered_field(file.archive, base, file.metadata)
+        raise InvalidInput(f"{kind}.base", f"{base_id} is a field of {base.metadata.kind}")
+    return base
+
+
+def _named(file: FieldFile, field: SplatField) -> SplatField:
     field.field_id = file.field_id
     return field
 
@@ -114,6 +132,7 @@ READERS: Mapping[str, Callable[[FieldFile], RadianceField]] = {
     SPLATS: _splats,
     NGP: _ngp,
     LAYER: _layer,
+    DELTA: _delta,
 }
 """Makes the field of a file, by its archive's kind."""
 
@@ -124,7 +143,7 @@ def encode_field(field: RadianceField) -> bytes:
 
 
 def _no_base(field_id: str) -> RadianceField:
-    raise UnknownField(f"a layer is nothing without its base, field {field_id}: put both together")
+    raise UnknownField(f"it is nothing without its base, field {field_id}: put both together")
 
 
 def decode_field(
@@ -146,7 +165,7 @@ def decode_field(
         known = ", ".join(READERS)
         raise FieldFormatError(f"{source}: holds a field of kind '{archive.kind}', not {known}")
     try:
-        kind = SPLATS if archive.kind == LAYER else archive.kind
+        kind = SPLATS if archive.kind in (LAYER, DELTA) else archive.kind
         metadata = metadata_of_header(kind, archive.metadata)
         field_id = hashlib.sha256(data).hexdigest()
         file = FieldFile(archive, metadata, field_id, threads, isa, max_bytes, open_base)
@@ -193,7 +212,7 @@ def load_field(
         paths = FieldFolder(path.parent).look().paths
         if field_id not in paths:
             raise UnknownField(
-                f"{path}: is a layer of field {field_id}, which {path.parent} lacks; put it there"
+                f"{path}: is of the base {field_id}, which {path.parent} lacks; put it there"
             )
         return load_checked(
             paths[field_id], field_id, threads=threads, isa=isa, max_bytes=max_bytes

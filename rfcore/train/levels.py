@@ -72,18 +72,21 @@ def with_levels(
     cameras: Sequence[Camera],
     config: LevelFitConfig | None = None,
     progress: Progress | None = None,
+    *,
+    keep_order: bool = False,
 ) -> SplatField:
     """Return the field with its splats in order of importance and its lower levels fitted.
 
-    ``cameras`` are those the field is to be seen from, as the training views'. The full level draws
-    the same splats as before. Raises ``InvalidInput`` when there is no camera.
+    ``keep_order``: leave the splats in the field's order. ``cameras`` are those the field is to be
+    seen from, as the training views'. The full level draws the same splats as before. Raises
+    ``InvalidInput`` when there is no camera.
     """
     settings = config if config is not None else LevelFitConfig()
     antialiased = field.metadata.antialiased
-    weights = contributions(
-        field.gaussians, cameras, threads=settings.threads, antialiased=antialiased
-    )
-    ordered = reordered(field.gaussians, most_important_first(weights))
+    ordered = field.gaussians
+    if not keep_order:
+        weights = contributions(ordered, cameras, threads=settings.threads, antialiased=antialiased)
+        ordered = reordered(ordered, most_important_first(weights))
     wanted = len(ordered) and settings.iterations
     levels = _fitted_levels(ordered, antialiased, cameras, settings, progress) if wanted else {}
     return SplatField(

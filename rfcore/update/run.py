@@ -12,6 +12,7 @@ import numpy as np
 
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, SplatField
+from rfcore.field.delta import check_base, delta_of
 from rfcore.update.agreement import without_outliers
 from rfcore.update.colours import ColourFit, colour_layer
 from rfcore.update.passes import Pass, SeenFrame, check_passes, split_frames
@@ -22,9 +23,11 @@ __all__ = ["LearnAs", "Update", "UpdateSettings", "learn", "learn_from"]
 
 
 class LearnAs(StrEnum):
-    """What an update makes: another field, or the colours of one light on the same field."""
+    """What an update makes: another field; the same, stored as its difference to the base
+    (``rfcore.field.delta``); or the colours of one light on the same field."""
 
     ALL = "all"
+    DELTA = "delta"
     COLOURS = "colours"
 
 
@@ -136,13 +139,15 @@ def _made(
     settings: UpdateSettings,
     progress: Progress | None,
 ) -> SplatField:
+    """Return what is learnt of ``base``, or of the field that it is itself a delta or layer of."""
     if settings.learn_as is LearnAs.COLOURS:
-        made = colour_layer(base, frames, settings.colours, progress)
-    else:
-        made = fine_tuned(base, frames, settings.fine_tuning, progress)
-        made = made.described(replace(made.metadata, training_digest=_digest(base, frames)))
-        made = made.compressed()
-    return made
+        return colour_layer(base, frames, settings.colours, progress)
+    as_delta, root = settings.learn_as is LearnAs.DELTA, base.base or base
+    if as_delta:
+        check_base(root)
+    made = fine_tuned(base, frames, settings.fine_tuning, progress, keep_order=as_delta)
+    made = made.described(replace(made.metadata, training_digest=_digest(base, frames)))
+    return delta_of(root, made) if as_delta else made.compressed()
 
 
 def _digest(base: SplatField, frames: Sequence[SeenFrame]) -> str:

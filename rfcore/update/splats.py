@@ -89,10 +89,14 @@ def fine_tuned(
     frames: Sequence[SeenFrame],
     config: FineTuning,
     progress: Progress | None = None,
+    *,
+    keep_order: bool = False,
 ) -> SplatField:
     """Return another field with all parameters fine-tuned to ``frames``, uncompressed.
 
-    Raises ``InvalidInput`` without frames or splats.
+    Its splats are in order of importance, or, to ``keep_order``, in the field's with those that
+    were added behind them: then every level of detail draws the splats that it drew before. Raises
+    ``InvalidInput`` without frames or splats.
     """
     if not frames or not field.primitives:
         raise InvalidInput("update", f"{len(frames)} frames, {field.primitives} splats: not enough")
@@ -103,7 +107,8 @@ def fine_tuned(
         descent.step(iteration)
         if progress is not None:
             progress("fine-tuning", iteration + 1, config.iterations)
-    return _finished(descent.field(), frames, config, bool(field.levels), progress)
+    made = descent.field()
+    return _finished(made, frames, config, progress, bool(field.levels), keep_order)
 
 
 class _Descent:
@@ -154,10 +159,11 @@ def _finished(
     field: SplatField,
     frames: Sequence[SeenFrame],
     config: FineTuning,
-    has_levels: bool,
     progress: Progress | None,
+    has_levels: bool,
+    keep_order: bool,
 ) -> SplatField:
-    """Return the field with its splats in order of importance and its levels of detail."""
+    """Return the field with its splats in their order and its levels of detail."""
     cameras = [frame.camera for frame in frames]
     if has_levels and config.level_iterations:
         levels = LevelFitConfig(iterations=config.level_iterations, threads=config.threads)
@@ -166,7 +172,9 @@ def _finished(
             if progress is not None:
                 progress("levels of detail", done, total)
 
-        return with_levels(field, cameras, levels, told)
+        return with_levels(field, cameras, levels, told, keep_order=keep_order)
+    if keep_order:
+        return field
     weights = contributions(
         field.gaussians, cameras, threads=config.threads, antialiased=field.metadata.antialiased
     )

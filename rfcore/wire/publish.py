@@ -16,7 +16,7 @@ from pathlib import Path
 from rfcore.errors import InvalidInput, UnknownField
 from rfcore.field import FieldStore
 from rfcore.field.archive import decode_archive, read_file
-from rfcore.field.layer import base_of_layer
+from rfcore.field.interface import base_of
 from rfcore.wire.tile_manifest import (
     OWN_LIGHT,
     Publication,
@@ -67,7 +67,7 @@ def publish(
         if only_after is not None and (before is None or before.tile(name) != only_after):
             raise InvalidInput("tile", f"{name!r} was published by somebody else meanwhile")
         field_id = store.add(archive)
-        base = base_of_layer(decode_archive(read_file(archive), str(archive))) or ""
+        base = base_of(decode_archive(read_file(archive), str(archive))) or ""
         label = replace(label, base_field_id=base)
         versions = _next(before, field_id, now.astimezone(UTC), label)
         if ground.area is not None:

@@ -35,14 +35,15 @@ class FieldUpdate:
     recordings: Annotated[tuple[Path, ...], arg(name="from", metavar="DATASET...")]
     """Passes under one light, a dataset each (docs/data.md)."""
     out: Annotated[Path, RFF]
-    """The archive to write; a layer belongs into the folder of its base."""
-    learn_as: Annotated[Literal["all", "colours"], arg(name="as")] = "all"
-    """all: another field, every parameter fine-tuned. colours: a colour layer on this field, of a
-    tenth of the bytes, for another light on what is there."""
+    """The archive to write; a layer or a delta belongs into the folder of its base."""
+    learn_as: Annotated[Literal["all", "delta", "colours"], arg(name="as")] = "all"
+    """all: another field, every parameter fine-tuned. delta: the same as its difference to this
+    field, of a fifth of the bytes. colours: a colour layer on this field, of a fiftieth, for
+    another light on what is there."""
     frames: int = 48
     """Most frames taken of all passes; a quarter of them is held back for the trial."""
     iterations: int = 600
-    """Of fine-tuning (with --as all)."""
+    """Of fine-tuning (with --as all or delta)."""
     min_identities: int = 2
     """Refuse to learn from fewer passes: what one alone shows may be what drove by."""
     threads: int = 1

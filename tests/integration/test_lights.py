@@ -16,6 +16,7 @@ from mec_server.learner import UnrecordedTrials
 from mec_server.twin.state import TwinView
 from rfcore.errors import RfedgeError
 from rfcore.field import FieldStore, SplatField, load_field, save_field
+from rfcore.field.delta import delta_of
 from rfcore.field.layer import VOXELS_M, ColourLayer, layer_archive, layered_field, voxels_of
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tile_manifest import VersionLabel
@@ -66,17 +67,30 @@ async def test_the_light_is_fetched_while_driving_and_used_without_a_new_stream(
     assert last < first
 
 
-async def test_a_layer_is_fetched_with_its_base(
-    street: Any, folder: Path, serve: Any, vehicle: Any, tmp_path: Path
-) -> None:
-    day = load_field(street.store / "street.rff")
-    assert isinstance(day, SplatField)
+def a_layer(day: SplatField) -> SplatField:
+    """The day in another light, as a colour layer."""
     voxels = [np.zeros((voxels_of(day.gaussians.means, m)[1], 6), np.int32) for m in VOXELS_M]
     voxels[-1][:, 0] = 1
     layer = ColourLayer(tuple(voxels), np.zeros((day.primitives, 3), np.int32))
-    made = layered_field(layer_archive(layer, day, day.metadata), day, day.metadata)
+    return layered_field(layer_archive(layer, day, day.metadata), day, day.metadata)
+
+
+def a_delta(day: SplatField) -> SplatField:
+    """The day with one splat moved."""
+    means = day.gaussians.means.copy()
+    means[7] += 1
+    return delta_of(day, SplatField(replace(day.gaussians, means=means)))
+
+
+@pytest.mark.parametrize("made_of", [a_layer, a_delta])
+async def test_a_layer_or_a_delta_is_fetched_with_its_base(
+    street: Any, folder: Path, serve: Any, vehicle: Any, tmp_path: Path, made_of: Any
+) -> None:
+    day = street.field.compressed()
+    made = made_of(day)
+    save_field(day, tmp_path / "day.rff")
     save_field(made, tmp_path / "layer.rff")
-    FieldStore(folder).add(street.store / "street.rff")
+    FieldStore(folder).add(tmp_path / "day.rff")
     publish(folder, "street", tmp_path / "layer.rff", Ground(), NOW, DUSK)
     mine = {"fields": tmp_path / "mine", "loop": True}
     async with serve(fields=folder) as server, vehicle(server.address, **mine) as driving:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
+from rfcore.field.interface import base_of
 from rfcore.field.layer import SH_DC
 from rfcore.field.store import decode_field, encode_field
 from rfcore.image import Rgb
@@ -60,6 +61,35 @@ def test_a_layer_learns_the_light_on_the_shape_that_is_there(
     again = decode_field(data, open_base=lambda _: noon)
     assert (again.gaussians.sh == update.learnt.gaussians.sh).all()  # type: ignore[attr-defined]
     assert (again.gaussians.means == noon.gaussians.means).all()  # type: ignore[attr-defined]
+
+
+def test_a_delta_learns_as_much_in_fewer_bytes_and_again_from_what_it_learnt(
+    noon: SplatField, dusk: SplatField, make_pass: MakePass
+) -> None:
+    """A second update starts from the first one's field, and is a delta of the same base."""
+    base = noon.compressed()
+    passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
+    whole = learn(base, passes, QUICK)
+    delta = learn(base, passes, replace(QUICK, learn_as=LearnAs.DELTA))
+    assert not delta.refused
+    third = make_pass(dusk, "c", -0.1)
+    assert luma_error(delta.learnt, third) < 1.1 * luma_error(whole.learnt, third)
+    data = encode_field(delta.learnt)
+    assert len(data) < len(encode_field(whole.learnt))
+    assert decode_field(data, open_base=lambda _: base).field_id == delta.learnt.field_id
+    more = learn(
+        delta.learnt, passes, replace(QUICK, learn_as=LearnAs.DELTA, min_saved_percent=-100)
+    )
+    assert base_of(more.learnt.archive()) == base.field_id
+    assert luma_error(more.learnt, third) < 1.1 * luma_error(delta.learnt, third)
+
+
+def test_a_delta_of_a_field_that_is_not_compressed_is_refused_before_learning(
+    noon: SplatField, dusk: SplatField, make_pass: MakePass
+) -> None:
+    passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
+    with pytest.raises(InvalidInput, match=r"delta\.base: .* is not a compressed field"):
+        learn(noon, passes, replace(QUICK, learn_as=LearnAs.DELTA))
 
 
 def test_what_is_known_already_is_not_written(noon: SplatField, make_pass: MakePass) -> None:

@@ -32,7 +32,7 @@ def recorded(folder: Path, drive: Pass) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("learn_as", ["all", "colours"])
+@pytest.mark.parametrize("learn_as", ["all", "delta", "colours"])
 def test_what_pays_is_written(
     noon: SplatField,
     dusk: SplatField,
@@ -41,7 +41,7 @@ def test_what_pays_is_written(
     learn_as: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    save_field(noon, tmp_path / "noon.rff")
+    save_field(noon.compressed(), tmp_path / "noon.rff")
     passes = [make_pass(dusk, "a"), make_pass(dusk, "b", 0.15)]
     folders = tuple(recorded(tmp_path / drive.identity, drive) for drive in passes)
     out = tmp_path / "dusk.rff"
@@ -58,7 +58,9 @@ def test_what_pays_is_written(
     for doing in {line.partition(":")[0] for line in lines}:
         assert sum(line.startswith(f"{doing}:") for line in lines) <= 11, "a line a tenth"
     assert any(line.startswith("trial:") for line in lines)
-    assert load_field(out).field_id != noon.field_id
+    assert load_field(out).archive().kind == {"colours": "layer"}.get(
+        learn_as, "splats" if learn_as == "all" else learn_as
+    )
 
 
 @pytest.mark.slow

@@ -1,0 +1,247 @@
+"""A delta: another version of a splat field, all of its parameters, as what differs from the base.
+
+An archive of its own of kind ``delta``, good for one base field alone, a compressed one, whose id
+its header states. As that id is under the archive's digest, the SHA-256 of the delta names the
+field that base and delta make together, as with a colour layer (``rfcore.field.layer``).
+
+The version has the base's splats in the base's order, and perhaps others behind them. The header
+has an ``encoding``, {"name": "delta-1", "count", "streams"}, with ``count`` splats in all; each
+array is one stream of ``rfcore.field.integers``: the numbers of ``rfcore.field.splat_grid`` less
+the base's, ``means`` in the steps of the base's blocks, then those of the splats behind,
+``added.means`` and so on, and of each level of detail that the version has, ``detail_50``: its own
+scales and opacities less the full level's, less what the base has there. Streams of zeros are left
+out. Quantiser steps are the base's; nothing is rounded in decoding.
+
+Measured on the sample's field of 300,000 splats (7.7 MB), fine-tuned to the 24 frames of its empty
+drive: 1.56 MB without its levels and with every difference; 1.08 MB, and 0.11 of 3.4 dB less, where
+higher bands of colours that differ by one step keep the base's (``SMALLEST_BAND``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.errors import InvalidInput
+from rfcore.field.archive import Archive
+from rfcore.field.integers import LIMIT, Integers, decode_columns, encode_columns
+from rfcore.field.interface import DELTA, SPLATS, Bounds, FieldMetadata, base_of, stored_metadata
+from rfcore.field.quality import DETAILS, LevelsOfDetail, kept_of
+from rfcore.field.splat_archive import (
+    GridSplats,
+    check_decoded_size,
+    grid_splats,
+    level_name,
+    splats_in,
+    stream_shapes,
+)
+from rfcore.field.splat_grid import (
+    SplatNumbers,
+    Steps,
+    gaussians_of,
+    level_numbers_of,
+    level_of,
+    means_of_steps,
+    means_steps,
+    numbers_of,
+    rotations_like,
+)
+from rfcore.field.splats import SplatField
+from rfcore.files import DECODED_BYTES
+from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
+
+__all__ = ["check_base", "delta_archive", "delta_field", "delta_of"]
+
+ENCODING = "delta-1"
+ADDED = "added."
+SMALLEST_BAND = 2
+"""Steps by which a number of the higher bands of colours must differ to be stored."""
+OF_BASE = tuple(f.name for f in fields(SplatNumbers) if f.name != "blocks")
+"""Streams that are less the base's; blocks are the base's."""
+
+
+def delta_of(base: SplatField, version: SplatField) -> SplatField:
+    """Return the field that the delta from ``base`` to ``version`` makes: nearly ``version``.
+
+    Raises ``InvalidInput`` if ``base`` is not compressed, or ``version`` has fewer splats or values
+    that the base's grid cannot hold.
+    """
+    archive = delta_archive(base, version.gaussians, version.levels, version.metadata)
+    return delta_field(archive, base, version.metadata)
+
+
+def delta_archive(
+    base: SplatField, gaussians: Gaussians, levels: LevelsOfDetail, metadata: FieldMetadata
+) -> Archive:
+    """Return the archive of a version of ``base``; raises as ``delta_of``."""
+    grid = _grid_of(base)
+    n = len(grid.numbers.means)
+    if len(gaussians) < n:
+        raise InvalidInput("delta", f"{len(gaussians)} splats are fewer than the base's {n}")
+    if gaussians.sh_degree != base.gaussians.sh_degree:
+        raise InvalidInput("delta", f"SH degree {gaussians.sh_degree} is not the base's")
+    numbers = _numbers_on(grid, splats_in(gaussians, slice(0, n)))
+    parts: dict[str, Integers] = {
+        name: getattr(numbers, name) - getattr(grid.numbers, name) for name in OF_BASE
+    }
+    parts["sh"] = _without_small_bands(parts["sh"])
+    numbers = _with_differences(grid.numbers, parts)
+    added = numbers_of(splats_in(gaussians, slice(n, None)), grid.steps)
+    parts |= {f"{ADDED}{f.name}": getattr(added, f.name) for f in fields(SplatNumbers)}
+    whole = _joined(numbers, added)
+    for detail, level in levels.items():
+        own = level_numbers_of(level, whole, grid.steps)
+        parts[level_name(detail)] = own - _expected_level(grid, detail, len(own))
+    coded = {name: encode_columns(part) for name, part in parts.items() if part.any()}
+    encoding = {
+        "name": ENCODING,
+        "count": len(gaussians),
+        "levels": sorted(levels),
+        "streams": {name: header for name, (header, _) in coded.items()},
+    }
+    made = _gaussians(grid, numbers, added)
+    header = stored_metadata(metadata, Bounds.around(made.means))
+    arrays = {name: stream for name, (_, stream) in coded.items()}
+    return Archive(DELTA, {**header, "base": base.field_id, "encoding": encoding}, arrays)
+
+
+def delta_field(
+    archive: Archive, base: SplatField, metadata: FieldMetadata, max_bytes: int = DECODED_BYTES
+) -> SplatField:
+    """Return the field that ``archive``, a delta, makes of ``base``.
+
+    Raises ``InvalidInput`` if it is for another base or takes more than ``max_bytes``, ``KeyError``
+    or ``TypeError`` if it is no delta.
+    """
+    stated = base_of(archive)
+    if stated != base.field_id:
+        raise InvalidInput("delta.base", f"is for field {stated}, not {base.field_id}")
+    if metadata.antialiased != base.metadata.antialiased:
+        raise InvalidInput("delta.antialiased", "differs from the base's")
+    grid = _grid_of(base)
+    stored = _Stored.of(archive, grid, max_bytes)
+    numbers = _with_differences(grid.numbers, {name: stored.part(name) for name in OF_BASE})
+    added = SplatNumbers(**{f.name: stored.part(f"{ADDED}{f.name}") for f in fields(SplatNumbers)})
+    whole = _joined(numbers, added)
+    levels = {}
+    for detail in stored.levels:
+        own = stored.part(level_name(detail))
+        own = own + _expected_level(grid, detail, len(own))
+        levels[detail] = level_of(own, whole, grid.steps)
+    return base.derived(_gaussians(grid, numbers, added), metadata, archive, levels)
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """The streams of a delta, checked against what its header and its base say."""
+
+    archive: Archive
+    streams: Mapping[str, Any]
+    shapes: Mapping[str, tuple[int, int]]
+    levels: tuple[float, ...]
+
+    @classmethod
+    def of(cls, archive: Archive, grid: GridSplats, max_bytes: int) -> _Stored:
+        """Raises as ``delta_field``; every size is checked before it is allocated."""
+        encoding = archive.metadata["encoding"]
+        if encoding["name"] != ENCODING:
+            raise InvalidInput("encoding", f"{encoding['name']!r} is not '{ENCODING}'")
+        count, n = encoding["count"], len(grid.numbers.means)
+        if type(count) is not int or not n <= count <= MAX_GAUSSIANS:
+            raise InvalidInput(
+                "encoding.count", f"{count!r} is not a whole number {n}..{MAX_GAUSSIANS}"
+            )
+        check_decoded_size(count, grid.sh_degree, max_bytes)
+        levels = tuple(encoding["levels"])
+        if not set(levels) <= set(DETAILS[1:]):
+            raise InvalidInput("encoding.levels", f"{levels} are not of {DETAILS[1:]}")
+        of_base = stream_shapes(n, grid.sh_degree)
+        shapes = {name: of_base[name] for name in OF_BASE}
+        added = stream_shapes(count - n, grid.sh_degree)
+        shapes |= {f"{ADDED}{name}": shape for name, shape in added.items()}
+        shapes |= {level_name(detail): (kept_of(count, detail), 4) for detail in levels}
+        streams = encoding["streams"]
+        if set(archive.arrays) != set(streams) or set(streams) - set(shapes):
+            raise InvalidInput(
+                "encoding", f"arrays {', '.join(archive.arrays)} are not its streams"
+            )
+        return cls(archive, streams, shapes, levels)
+
+    def part(self, name: str) -> Integers:
+        """Return the numbers of a stream; zeros where it was left out."""
+        shape = self.shapes[name]
+        if name not in self.archive.arrays:
+            return np.zeros(shape, np.int32)
+        return decode_columns(self.streams[name], self.archive.arrays[name], shape)
+
+
+def check_base(base: SplatField) -> None:
+    """Raise ``InvalidInput`` unless a delta can be of ``base``: a compressed field of its own."""
+    archive = base.archive()
+    if archive.kind != SPLATS or "encoding" not in archive.metadata:
+        raise InvalidInput(
+            "delta.base",
+            f"{base.field_id} is not a compressed field of splats; learn another field (--as all)",
+        )
+
+
+def _grid_of(base: SplatField) -> GridSplats:
+    check_base(base)
+    return grid_splats(base.archive())
+
+
+def _numbers_on(grid: GridSplats, gaussians: Gaussians) -> SplatNumbers:
+    """Return the nearest numbers, means and rotations written as the base's are."""
+    own = numbers_of(gaussians, grid.steps)
+    steps = means_steps(gaussians.means, grid.exponents)
+    if steps.size and np.abs(steps).max() >= LIMIT:
+        raise InvalidInput("delta.means", "a splat went further than the base's grid reaches")
+    return replace(
+        own,
+        blocks=grid.numbers.blocks,
+        means=steps.astype(np.int32),
+        rotations=rotations_like(gaussians.quaternions, grid.numbers.rotations),
+    )
+
+
+def _with_differences(base: SplatNumbers, parts: Mapping[str, Integers]) -> SplatNumbers:
+    changed = {name: getattr(base, name) + parts[name] for name in OF_BASE}
+    return SplatNumbers(blocks=base.blocks, **changed)
+
+
+def _without_small_bands(sh: Integers) -> Integers:
+    """Return differences [N, 3 K] of colours without those of higher bands that hardly show."""
+    bands = sh.reshape(len(sh), 3, sh.shape[1] // 3).copy()
+    higher = bands[:, :, 1:]
+    higher[np.abs(higher) < SMALLEST_BAND] = 0
+    return np.asarray(bands.reshape(sh.shape))
+
+
+def _joined(numbers: SplatNumbers, added: SplatNumbers) -> SplatNumbers:
+    """Return the numbers that levels of detail are relative to; blocks and means have no use."""
+    both = {name: np.vstack([getattr(numbers, name), getattr(added, name)]) for name in OF_BASE}
+    return SplatNumbers(blocks=added.blocks, **both)
+
+
+def _expected_level(grid: GridSplats, detail: float, kept: int) -> Integers:
+    """Return what the base's level of that detail has of its own, [kept, 4]; else 0."""
+    expected = np.zeros((kept, 4), np.int32)
+    own = grid.levels.get(detail)
+    if own is not None:
+        expected[: len(own)] = own[:kept]
+    return expected
+
+
+def _gaussians(grid: GridSplats, numbers: SplatNumbers, added: SplatNumbers) -> Gaussians:
+    steps: Steps = grid.steps
+    behind = gaussians_of(added, steps)
+    shown = gaussians_of(numbers, steps, means_of_steps(numbers.means, grid.exponents))
+    parts: dict[str, NDArray[np.float32]] = {
+        f.name: np.concatenate([getattr(shown, f.name), getattr(behind, f.name)])
+        for f in fields(Gaussians)
+    }
+    return Gaussians(**parts)
