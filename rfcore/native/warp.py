@@ -36,15 +36,15 @@ depth or pose enters. Cells are 16x16 luma px, bins 32 levels; x is the render's
 the frame's plane differs by from the render's, both at chroma resolution (luma: means of 2x2,
 rounded half up). Every sample adds w (1, x, x^2, d, x d) to its cell's two nearest bins, their
 weights adding up to 16. Numbers of a vertex are an offset in levels / 2**8 and a gain per level of
-x in 1 / 2**15, solved by ridge regression (weights 10 and 16000) towards those of the next
+x in 1 / 2**15, solved by ridge regression (weights 160 and 16000) towards those of the next
 coarser level: all of the picture, its bins, then cells of 16x16, 4x4 and 1 with sums filtered
 by (1, 2, 1) over rows, columns and bins. A coarser level's numbers are repeated and filtered by
 (1, 2, 1) / 4 over rows and columns. With n, sx, sxx, r, xr the sums of w, w x, w x^2 and of what
 the prior leaves of d and x d::
 
-    mean = round(2**11 sx / (n + 10))
+    mean = round(2**11 sx / (n + 160))
     gain += round(2**7 (xr - (r mean >> 11)) / (max(sxx - (sx mean >> 11), 0) + 16000))
-    offset += round((r - (sx gain_step >> 7)) / (n + 10))
+    offset += round((r - (sx gain_step >> 7)) / (n + 160))
 
 both clamped to -2**16..2**16. What a sample's luma makes of each of the four cells around it, in
 1/32 level and interpolated between bins, is interpolated between them in 1/32 of their distance,

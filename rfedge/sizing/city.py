@@ -14,7 +14,7 @@
     overhead_percent = 4.0      # of transport, over the bytes of frames
     propagation_ms = 20.0       # one way
     [tile]
-    field_mb = 7.73             # 10^6 bytes; fetched by a vehicle that comes without it
+    field_mb = 3.62             # 10^6 bytes; fetched by a vehicle that comes without it
     known_percent = 90.0        # vehicles that hold the field already when they come
     [admission]                 # of every server, as mec-server has them
     max_load = 0.8
@@ -108,7 +108,7 @@ class VehicleKind:
 class Tile:
     """The field of a server's tile, and the share of the vehicles that come with it."""
 
-    field_bytes: float = 7.73e6
+    field_bytes: float = 3.62e6
     known_share: float = 0.9
 
 
@@ -248,7 +248,7 @@ def _vehicle(table: Table) -> VehicleKind:
 
 def _tile(table: Table) -> Tile:
     tile = Tile(
-        1e6 * table.number("field_mb", Range(0, 1e5), 7.73),
+        1e6 * table.number("field_mb", Range(0, 1e5), 3.62),
         table.number("known_percent", Range(0, 100), 90.0) / 100,
     )
     table.finish()

@@ -40,7 +40,7 @@ def rounded_div(a: I64, b: I64) -> I64:
 def solved(sums: I64, prior: I64) -> I64:
     """Sums [9, ...], prior [6, ...] -> [6, ...]."""
     n, sx, sxx = sums[:3]
-    mean = rounded_div(sx << 11, n + 10)
+    mean = rounded_div(sx << 11, n + 160)
     spread = np.maximum(sxx - ((sx * mean) >> 11), 0) + 16000
     found = []
     for plane in range(3):
@@ -49,7 +49,7 @@ def solved(sums: I64, prior: I64) -> I64:
         xr = (sums[4 + 2 * plane] << 8) - offset * sx - ((gain * sxx) >> 7)
         step = rounded_div((xr - ((r * mean) >> 11)) << 7, spread)
         step = np.clip(gain + step, -MOST, MOST) - gain
-        level = rounded_div(r - ((step * sx) >> 7), n + 10)
+        level = rounded_div(r - ((step * sx) >> 7), n + 160)
         found += [np.clip(offset + level, -MOST, MOST), gain + step]
     return np.stack(found)
 

@@ -13,7 +13,7 @@ namespace {
 constexpr int kBins = kLightBins, kBinLevels = 32, kBinUnits = 16;
 constexpr int kCellSamples = 8;                     // a side of a cell, in chroma samples
 constexpr int kPlaces = 32;                         // positions from one vertex to the next
-constexpr std::int64_t kOffsetWeight = 10, kGainWeight = 16000;
+constexpr std::int64_t kOffsetWeight = 160, kGainWeight = 16000;
 constexpr int kOffsetBits = 8, kGainBits = 15, kMeanBits = 11, kTableBits = 5;
 constexpr std::int64_t kMostOffset = 1 << 16, kMostGain = 1 << 16;
 constexpr std::array<int, 3> kLevels = {16, 4, 1};  // cells a side, coarse to fine
