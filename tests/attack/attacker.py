@@ -1,6 +1,6 @@
 """One attack, in a process of its own: ``python -m attack.attacker NAME SECONDS TARGET [BEGUN]``,
-the target as JSON, BEGUN a file to write when it begins; ``--decoy READY CERTIFICATES`` is somebody
-to attack in vain."""
+the target as JSON, BEGUN a file to write when it begins, from when on it gives way to whoever wants
+a processor; ``--decoy READY CERTIFICATES`` is somebody to attack in vain."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import asyncio
 import json
 import resource
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,9 @@ from attack import connection_attacks as connections
 from attack import field_attacks as fields
 from attack import packet_attacks as packets
 from attack import rpc_attacks as rpcs
+from attack.control_group import leave_the_processor
 from attack.target import Target
+from mec_server.decoding.process import LossCause
 from mec_server.ledger.budgets import Limit, Resource
 from rfcore.errors import RejectReason
 from rfcore.wire.tls import TlsFiles
@@ -35,17 +37,34 @@ class Attack:
 
     ``effect`` names what must be more than ``EFFECT`` times as much when the server is attacked as
     when the decoy is: a counter of the server's metrics ("NAME{LABELS}", the values of its labels
-    in the order of their names), or one of the four above for what no metric counts.
+    in the order of their names), or one of the four above for what no metric counts. ``refusal``:
+    where it depends on the machine whether the attacker is let in, the counter of the limit that
+    keeps it out. What is refused was noticed, too, so both are added up.
     """
 
     identity: str
     work: Callable[[Target], Awaitable[None]]
     effect: str
+    refusal: str = ""
 
     @property
     def name(self) -> str:
         """Return how it is called."""
         return self.work.__name__
+
+    @property
+    def evidence(self) -> str:
+        """Return what shows that it reached the server, in words."""
+        return " or ".join(filter(None, (self.effect, self.refusal)))
+
+    def amount(self, grown: Mapping[str, float]) -> float:
+        """Return how much of it there was, by how much the server's counters grew."""
+        return grown.get(self.effect, 0.0) + grown.get(self.refusal, 0.0)
+
+    def is_noticed(self, by_decoy: Mapping[str, float], by_server: Mapping[str, float]) -> bool:
+        """Whether the server's counters show the attack, beside how much they grew while the decoy
+        was attacked."""
+        return self.amount(by_server) > EFFECT.get(self.effect, MUCH) * self.amount(by_decoy)
 
 
 EFFECT = {LOG_LINES: 2.0, OPEN_FILES: 1.2, PROCESSOR_S: 1.1}
@@ -68,8 +87,14 @@ def spent(resource: Resource) -> str:
     return f"rfedge_server_spent_total{{{resource}}}"
 
 
+def lost(cause: LossCause) -> str:
+    """Return the counter of decoder processes that ended in use."""
+    return f"rfedge_server_decoders_lost_total{{{cause}}}"
+
+
 OPENED = "rfedge_server_openings_total{opened}"
 REFUSED_CERTIFICATES = "rfedge_server_refused_certificates_total{}"
+NO_CAPACITY = limited(Limit.CAPACITY)
 
 ATTACKS = {
     attack.name: attack
@@ -77,10 +102,10 @@ ATTACKS = {
         Attack("consumer", rpcs.unread_fetches, limited(Limit.IDENTITY_FETCHES)),
         Attack("vehicle", rpcs.decoders_for_nothing, limited(Limit.IDENTITY_DECODERS)),
         Attack("vehicle", rpcs.decoders_within_budget, OPENED),
-        Attack("vehicle", rpcs.bad_crc, nacked(RejectReason.CRC_MISMATCH)),
+        Attack("vehicle", rpcs.bad_crc, nacked(RejectReason.CRC_MISMATCH), NO_CAPACITY),
         Attack("vehicle", rpcs.junk_slices, spent(Resource.MESSAGES)),
         Attack("vehicle", rpcs.greedy_promise, limited(Limit.IDENTITY_DECODERS)),
-        Attack("vehicle", rpcs.greedy_promise_within_budget, OPENED),
+        Attack("vehicle", rpcs.greedy_promise_within_budget, OPENED, NO_CAPACITY),
         Attack("vehicle", rpcs.cancelled_hellos, spent(Resource.CALLS)),
         Attack("vehicle", rpcs.unread_refusals, spent(Resource.MESSAGES)),
         Attack("consumer", rpcs.unread_watches, limited(Limit.IDENTITY_WATCHES)),
@@ -96,7 +121,7 @@ ATTACKS = {
         Attack("vehicle", rpcs.many_connections, limited(Limit.IDENTITY_CONNECTIONS)),
         Attack("vehicle", rpcs.revoked, REFUSED_CERTIFICATES),
         Attack("vehicle", packets.flipped_slices, spent(Resource.MESSAGES)),
-        Attack("vehicle", packets.hung_decoders, spent(Resource.MESSAGES)),
+        Attack("vehicle", packets.hung_decoders, lost(LossCause.TIMEOUT)),
         Attack("none", connections.strangers, PROCESSOR_S),
         Attack("none", connections.silent_connections, DEFERRED),
         Attack("none", connections.half_requests, OPEN_FILES),
@@ -116,6 +141,7 @@ ATTACKS = {
 
 async def decoy(ready: Path, certificates: Path) -> None:
     """Take every call and connection, read everything and answer nothing, until killed."""
+    leave_the_processor()
 
     class Swallow(grpc.GenericRpcHandler):
         def service(self, handler_call_details: object) -> object:  # noqa: ARG002
@@ -146,11 +172,13 @@ async def decoy(ready: Path, certificates: Path) -> None:
 async def main(name: str, seconds: str, target: str, begun: str = "") -> None:
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    if begun:
-        Path(begun).write_text("begun")
     with suppress(TimeoutError):
-        async with asyncio.timeout(float(seconds)):
-            await ATTACKS[name].work(Target(**json.loads(target)))
+        async with asyncio.timeout(float(seconds)), asyncio.TaskGroup() as tasks:
+            tasks.create_task(ATTACKS[name].work(Target(**json.loads(target))))
+            await asyncio.sleep(0)  # until it first waits: what it sends is prepared by then
+            if begun:
+                leave_the_processor()
+                Path(begun).write_text("begun")
 
 
 if __name__ == "__main__":

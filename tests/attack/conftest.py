@@ -5,9 +5,9 @@ a machine of its own. The bystander's latencies during the attack are compared w
 with a *control*: the same attacker, as long, aimed at a decoy that reads everything and answers
 nothing. The three take turns, so that what else the machine does meets all of them. A consumer
 watches all the while. Newcomers have an attack of their own afterwards, as those who come would
-disturb the bystander. Attacker and decoy have a processor while it is idle (SCHED_IDLE), also where
-the kernel shares it out by sessions (sched(7), "The autogroup feature"): theirs would be another
-machine. Control groups (v1 or v2) need root, no docker.
+disturb the bystander. Once it has prepared what it sends, the attacker has a processor while it is
+idle (``leave_the_processor``), and the decoy likewise: theirs would be another machine. Control
+groups (v1 or v2) need root, no docker.
 """
 
 import asyncio
@@ -44,7 +44,6 @@ MAX_FIELD_GB = 0.25
 """``--max-field-gb`` of docker-compose.yml."""
 ROUNDS = 2
 """How often calm, control and attack take turns."""
-AUTOGROUP_NICE = 10
 ALLOWANCE_MS = 10.0
 SCRAPE_S = 5.0
 REPORT_S = 30.0
@@ -72,7 +71,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     here = Path(__file__).parent
     BOARD.leave_out(items, here, config.hook.pytest_deselected)
     for item in items:
-        if here in item.path.parents:
+        if here in item.path.parents and "scene" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.attack)
             item.add_marker(pytest.mark.slow)
 
@@ -234,21 +233,12 @@ class Scene:
         begun.unlink(missing_ok=True)
         seconds, aim = str(self.attack_s + 60), json.dumps(asdict(target))
         attacker = self.start("attacker", *ATTACKER, attack, seconds, aim, begun)
-        leave_the_processor(attacker.pid)
         try:
             await appears(begun, attacker, self.folder / "attacker.log")
             yield attacker
         finally:
             attacker.kill()
             attacker.wait()
-
-
-def leave_the_processor(pid: int) -> None:
-    """Let a session's leader, and what it starts, have the processor when others leave it."""
-    os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
-    autogroup = Path(f"/proc/{pid}/autogroup")
-    if autogroup.exists():
-        autogroup.write_text(str(AUTOGROUP_NICE))
 
 
 def processor_s(pid: int) -> float:
@@ -436,7 +426,6 @@ async def scene(
             limited=True,
         )
         decoy = start("decoy", *ATTACKER, "--decoy", tmp_path / "decoy", certificates)
-        leave_the_processor(decoy.pid)
         address = await appears(tmp_path / "ready", server, tmp_path / "server.log")
         told = await appears(tmp_path / "decoy", decoy, tmp_path / "decoy.log")
         root = str(certificates)

@@ -11,6 +11,18 @@ MEMORY_BYTES, PIDS, CPUS = 1 << 30, 128, 1.0
 """``mem_limit``, ``pids_limit`` and ``cpus`` of docker-compose.yml."""
 CPU_PERIOD_US = 100_000
 """Within which a group may use ``CPUS`` of this long; Docker's own."""
+AUTOGROUP_NICE = 10
+AUTOGROUP = Path("/proc/self/autogroup")
+
+
+def leave_the_processor() -> None:
+    """Let this process, a session's leader, and what it starts have a processor while it is idle
+    (SCHED_IDLE), also where the kernel shares it out by sessions (sched(7), "The autogroup
+    feature")."""
+    for thread in Path("/proc/self/task").iterdir():
+        os.sched_setscheduler(int(thread.name), os.SCHED_IDLE, os.sched_param(0))
+    if AUTOGROUP.exists():
+        AUTOGROUP.write_text(str(AUTOGROUP_NICE))
 
 
 class ControlGroup:

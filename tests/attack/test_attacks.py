@@ -1,15 +1,22 @@
 """Every attack of the list against a server under compose's limits (`make test-attack`)."""
 
 import math
+import os
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import reduce
 from operator import add
 from typing import Any
 
 import pytest
 
-from attack.attacker import ATTACKS, EFFECT, MUCH
+from attack.attacker import ATTACKS, NO_CAPACITY, OPENED, PROCESSOR_S, Attack
 from attack.conftest import ALLOWANCE_MS, ROUNDS
 from attack.control_group import CPUS, MEMORY_BYTES
+from attack.packet_attacks import was_given
+from attack.target import Target
+from mec_server.decoding.child import DECODER_NAME
 
 NEWCOMER_S = 2.0
 """A SYN that is lost is sent again after 1 s (RFC 6298, section 2), and a vehicle that comes back
@@ -28,20 +35,20 @@ async def test_an_attack_costs_the_bystander_nothing(attack: str, scene: Any) ->
     newcomers = await scene.newcomers(attack)
     after = await scene.phase()
     phases = [reduce(add, parts) for parts in (calm, control, attacked)]
-    judge_effect(scene, made.effect, *phases[1:])
+    judge_effect(scene, made, *phases[1:])
     judge_newcomers(scene, *newcomers)
     judge_consumer(scene, *phases)
     judge(scene, *phases, after)
     assert scene.failed == []
 
 
-def judge_effect(scene: Any, effect: str, control: Any, attacked: Any) -> None:
-    """Hold against the server's own counters whether the attack reached it."""
-    before, now = control.grown[effect], attacked.grown[effect]
+def judge_effect(scene: Any, attack: Attack, control: Any, attacked: Any) -> None:
+    """Hold against the server's own counters whether the attack reached it, or was refused."""
+    before, now = attack.amount(control.grown), attack.amount(attacked.grown)
     scene.note(
-        f"what of it reached the server: {effect}",
+        f"what of it reached the server: {attack.evidence}",
         f"control / attacked {before:.4g} / {now:.4g}",
-        now > EFFECT.get(effect, MUCH) * before,
+        attack.is_noticed(control.grown, attacked.grown),
     )
 
 
@@ -123,3 +130,46 @@ def judge(scene: Any, calm: Any, control: Any, attacked: Any, after: Any) -> Non
     most, limit = max(attacked.most_bytes, after.most_bytes), MEMORY_BYTES / 2**20
     scene.note(f"memory <= {limit:.0f} MiB", f"{most / 2**20:.0f} MiB", most <= MEMORY_BYTES)
     scene.finished = True
+
+
+async def nothing(_: Target) -> None:
+    """An attack that does nothing."""
+
+
+def test_what_nobody_notices_is_no_attack() -> None:
+    refused_early = Attack("vehicle", nothing, OPENED, NO_CAPACITY)
+    assert not refused_early.is_noticed({}, {})
+    assert not refused_early.is_noticed({OPENED: 2.0}, {OPENED: 2.0, NO_CAPACITY: 2.0})
+    assert not Attack("none", nothing, PROCESSOR_S).is_noticed(
+        {PROCESSOR_S: 4.0}, {PROCESSOR_S: 4.3}
+    )
+
+
+@pytest.mark.parametrize("grown", [{OPENED: 1.0}, {NO_CAPACITY: 1.0}])
+def test_what_is_refused_was_noticed_too(grown: dict[str, float]) -> None:
+    assert Attack("vehicle", nothing, OPENED, NO_CAPACITY).is_noticed({}, grown)
+
+
+def test_a_refusal_for_another_reason_is_no_effect() -> None:
+    assert not Attack("vehicle", nothing, OPENED).is_noticed({}, {NO_CAPACITY: 9.0})
+
+
+def test_of_two_decoders_only_the_one_that_was_given_the_slice_is_found() -> None:
+    slice_, other = bytes(range(1, 200)), bytes(range(2, 201))
+    with decoding(other) as bystanders, decoding(bytes(354_000) + slice_) as attackers:
+        assert was_given(attackers, slice_)
+        assert not was_given(bystanders, slice_)
+    assert not was_given(attackers, slice_)
+
+
+@contextmanager
+def decoding(given: bytes) -> Iterator[int]:
+    """Yield the number of a process with a decoder's memory, in which ``given`` stands."""
+    memory = os.memfd_create(DECODER_NAME)
+    os.write(memory, given)
+    process = subprocess.Popen(["cat"], stdin=subprocess.PIPE, pass_fds=(memory,))
+    os.close(memory)
+    try:
+        yield process.pid
+    finally:
+        process.communicate()
