@@ -42,6 +42,7 @@ __all__ = [
     "Archive",
     "array_ends",
     "check_array_bytes",
+    "check_length",
     "decode_archive",
     "encode_archive",
     "header_end",
@@ -55,6 +56,8 @@ PREFIX_ZEROS = 16
 PREFIX_BYTES = PREFIX.size
 ALIGN_BYTES = 64
 MAX_HEADER_BYTES = 1 << 20
+HEAD_BYTES = PREFIX.size + MAX_HEADER_BYTES
+"""What ``check_length`` needs of a file."""
 MAX_DIMENSIONS = 4
 MAX_EMPTY_SIZE = 1 << 40
 """Product of an empty array's other sides: numpy refuses shapes beyond 2^63."""
@@ -121,6 +124,23 @@ def array_ends(head: bytes) -> Mapping[str, int]:
     except _Damage as damage:
         raise FieldFormatError(f"field: {damage}") from damage
     return ends
+
+
+def check_length(head: bytes, size_bytes: int) -> None:
+    """Raise ``FieldFormatError`` unless an archive that begins with ``head`` has this length.
+
+    ``head``: its first ``HEAD_BYTES``, or all of it. What follows the header is not checked.
+    """
+    try:
+        raw = _header_bytes(memoryview(head))
+        data_bytes = _header(raw).get("data_bytes")
+        if not isinstance(data_bytes, int) or isinstance(data_bytes, bool):
+            raise _Damage("header lacks 'data_bytes'")
+        whole_bytes = _aligned(PREFIX.size + len(raw)) + data_bytes
+        if whole_bytes != size_bytes:
+            raise _Damage(f"{size_bytes} bytes, the header says {whole_bytes}")
+    except _Damage as damage:
+        raise FieldFormatError(str(damage)) from damage
 
 
 def read_file(path: Path, max_bytes: int = DECODED_BYTES) -> bytes:

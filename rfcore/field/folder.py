@@ -2,8 +2,9 @@
 
 A file named ``<field id>.rff`` is listed by its name, any other by its digest. Each is looked at
 again only when its time, size or inode changes. What cannot be an archive (a folder, a pipe, a link
-to nowhere, a file without the archive's first bytes, or too large) is skipped and named, and hangs
-or fails nobody. Contents are checked when a field is loaded.
+to nowhere, a file without the archive's first bytes, too large, or of another length than its
+header says) is skipped and named, and hangs or fails nobody. Contents are checked when a field is
+loaded.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rfcore.field.archive import MAGIC
+from rfcore.errors import FieldFormatError
+from rfcore.field.archive import HEAD_BYTES, MAGIC, check_length
 from rfcore.files import open_at_once
 
 __all__ = ["FIELD_ID", "MAX_ARCHIVE_BYTES", "SUFFIX", "FieldFolder", "FolderListing"]
@@ -107,6 +109,10 @@ def _examined(path: Path, status: os.stat_result, stamp: Stamp) -> _Entry:
             if FIELD_ID.fullmatch(path.stem):
                 return _Entry(stamp, path.stem)
             file.seek(0)
+            check_length(file.read(HEAD_BYTES), status.st_size)  # before gigabytes are hashed
+            file.seek(0)
             return _Entry(stamp, hashlib.file_digest(file, "sha256").hexdigest())
+    except FieldFormatError as error:
+        return _Entry(stamp, problem=f"is no field archive: {error}")
     except OSError as error:
         return _Entry(stamp, problem=f"cannot be read ({error.strerror})")

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from rfcore.field.archive import MAGIC
+from rfcore.field.archive import MAGIC, Archive, encode_archive
 from rfcore.field.folder import MAX_ARCHIVE_BYTES, FieldFolder
 
 
 def archive(path: Path, content: bytes = b"field") -> str:
-    data = MAGIC + content
+    data = encode_archive(Archive("test", {"content": content.decode()}, {}))
     path.write_bytes(data)
     return hashlib.sha256(data).hexdigest()
 
@@ -24,6 +24,10 @@ def test_entries_that_are_no_archives_are_skipped_with_their_reason(tmp_path: Pa
     (tmp_path / "loop.rff").symlink_to(tmp_path / "loop.rff")
     (tmp_path / "text.rff").write_text("hello")
     (tmp_path / "empty.rff").write_bytes(b"")
+    (tmp_path / "magic.rff").write_bytes(MAGIC)
+    archive(tmp_path / "longer.rff")
+    with (tmp_path / "longer.rff").open("ab") as longer:
+        longer.truncate(3 << 30)
     with (tmp_path / "huge.rff").open("wb") as huge:
         huge.truncate(MAX_ARCHIVE_BYTES + 1)
     listing = FieldFolder(tmp_path).look()
@@ -36,6 +40,8 @@ def test_entries_that_are_no_archives_are_skipped_with_their_reason(tmp_path: Pa
         "loop": "cannot be read (Too many levels of symbolic links)",
         "text": "is no field archive: its first bytes are others",
         "empty": "is no field archive: its first bytes are others",
+        "magic": "is no field archive: 8 bytes are too few for a field file",
+        "longer": "is no field archive: 3221225472 bytes, the header says 192",
         "huge": f"has {MAX_ARCHIVE_BYTES + 1} bytes, above {MAX_ARCHIVE_BYTES}: not listed",
     }
 
