@@ -24,6 +24,7 @@ __all__ = [
     "FairQueue",
     "LazyTimer",
     "Workers",
+    "give_way",
     "repeat_forever",
     "work_when_idle",
 ]
@@ -74,9 +75,8 @@ class Workers:
 
     ``callback_failed`` is called on the loop with what a ``done`` raised; the others still run.
     While ``crowded``, no owner keeps more than all threads but one busy: work cannot be
-    interrupted, and a thread is to be there for the others when one's pieces take long. ``nice``:
-    how far the threads give way to others where processors are scarce (setpriority(2)); ``idle``:
-    wholly (``work_when_idle``).
+    interrupted, and a thread is to be there for the others when one's pieces take long. Each thread
+    calls ``begin`` first, for its priority (``give_way``, ``work_when_idle``).
     """
 
     def __init__(
@@ -85,12 +85,10 @@ class Workers:
         callback_failed: Callable[[Exception], None],
         name: str = "worker",
         crowded: Callable[[], bool] = lambda: False,
-        nice: int = 0,
-        idle: bool = False,
+        begin: Callable[[], object] = lambda: None,
     ) -> None:
         self._count = count
-        self._nice = nice
-        self._idle = idle
+        self._begin = begin
         self._callback_failed = callback_failed
         self._name = name
         self._threads: list[threading.Thread] = []
@@ -171,12 +169,7 @@ class Workers:
         self._threads.append(thread)
 
     def _run(self, loop: asyncio.AbstractEventLoop) -> None:
-        thread = threading.get_native_id()
-        if self._nice:
-            before = os.getpriority(os.PRIO_PROCESS, thread)
-            os.setpriority(os.PRIO_PROCESS, thread, before + self._nice)  # kept in range there
-        if self._idle:
-            work_when_idle(thread)
+        self._begin()
         while self._permits.get():
             self._work_next(loop)
 
@@ -225,6 +218,14 @@ def _outcome(work: Callable[[], R]) -> R | Exception:
         return work()
     except Exception as error:
         return error
+
+
+def give_way(nice: int) -> None:
+    """Let other threads come before the one that calls, where processors are scarce
+    (setpriority(2))."""
+    thread = threading.get_native_id()
+    before = os.getpriority(os.PRIO_PROCESS, thread)
+    os.setpriority(os.PRIO_PROCESS, thread, before + nice)  # kept in range there
 
 
 def work_when_idle(thread: int = 0) -> None:

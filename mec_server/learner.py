@@ -152,7 +152,7 @@ class UnrecordedTrials:
         report: Callable[[Harm], None],
     ) -> None:
         self._open_field, self._report = open_field, report
-        self._worker = Workers(1, failed, "trials", idle=True)
+        self._worker = Workers(1, failed, "trials", begin=work_when_idle)
         self._watched: Mapping[str, _Watched] = {}
         self._rested: Counter[tuple[CameraKey, str]] = Counter()
         self._taken: list[TwinView] = []

@@ -7,6 +7,7 @@ import re
 import socket
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -24,7 +25,7 @@ from mec_server.config import RecordSettings, ServerConfig
 from mec_server.connections import Connections
 from mec_server.decoding.decoders import Decoders, DecoderSettings
 from mec_server.edge_service import EdgeService
-from mec_server.event_loop import BACKGROUND_NICE, Workers, repeat_forever
+from mec_server.event_loop import BACKGROUND_NICE, Workers, give_way, repeat_forever
 from mec_server.fields.index import FieldIndex, PublishedFields, field_loader
 from mec_server.fields.service import FieldService
 from mec_server.fields.shelf import FieldShelf
@@ -136,7 +137,9 @@ class EdgeServer:
         self._connections = Connections(config.address_connections, config.identity_connections)
         promises = self._entry.promises
         self._opener = Workers(1, outcome_failed, "opener")
-        self._background = Workers(1, outcome_failed, "background", nice=BACKGROUND_NICE)
+        self._background = Workers(
+            1, outcome_failed, "background", begin=partial(give_way, BACKGROUND_NICE)
+        )
         self._workers = Workers(
             self._worker_count, outcome_failed, crowded=lambda: promises.is_crowded
         )
@@ -148,6 +151,7 @@ class EdgeServer:
             self._waiting,
         )
         self._health = health_aio.HealthServicer()
+        self._lister = ThreadPoolExecutor(1, "lister", give_way, (BACKGROUND_NICE,))
         self._index = FieldIndex(config.fields)
         load = field_loader(self._index, config.render, opened=self._metrics.field_opened)
         self._shelf = FieldShelf(self._index, load)
@@ -370,6 +374,7 @@ class EdgeServer:
         await asyncio.to_thread(self._opener.close)
         await asyncio.to_thread(self._background.close)
         await asyncio.to_thread(self._workers.close)
+        await asyncio.to_thread(self._lister.shutdown)
         await asyncio.to_thread(self._decoders.close)
         self._twin_service.close()
         await asyncio.to_thread(self._views.close)
@@ -448,8 +453,11 @@ class EdgeServer:
             self._edge.fields_changed(tuple(every)[:MAX_FIELDS])
 
     async def index_fields(self) -> None:
-        """Look for archives that were put into the folder, or taken out of it."""
-        await asyncio.to_thread(self._index.refresh)
+        """Look for archives that were put into the folder, or taken out of it.
+
+        What lies there may take seconds to read: it gives way to frames.
+        """
+        await asyncio.get_running_loop().run_in_executor(self._lister, self._index.refresh)
 
     async def _look_at_learning(self) -> None:
         if self._learner is not None:

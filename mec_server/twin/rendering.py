@@ -24,7 +24,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mec_server.event_loop import Workers
+from mec_server.event_loop import Workers, give_way, work_when_idle
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Ledger
 from mec_server.twin.composition import (
@@ -215,8 +215,8 @@ class TwinViews:
         self._classify = classify
         self._tiles = tiles
         self._ledger = ledger
-        views = Workers(1, failed, "views", idle=True)
-        looks = Workers(1, failed, "looks", nice=LOOKS_NICE)
+        views = Workers(1, failed, "views", begin=work_when_idle)
+        looks = Workers(1, failed, "looks", begin=partial(give_way, LOOKS_NICE))
         self._composing = _FieldThread(views, open_fields())
         self._looking = _FieldThread(looks, open_fields())
         self._kept = _KeptLooks()

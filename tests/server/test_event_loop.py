@@ -4,13 +4,21 @@ import asyncio
 import os
 import threading
 from collections import Counter, defaultdict
+from functools import partial
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mec_server import event_loop
-from mec_server.event_loop import FairQueue, LazyTimer, Workers, repeat_forever
+from mec_server.event_loop import (
+    FairQueue,
+    LazyTimer,
+    Workers,
+    give_way,
+    repeat_forever,
+    work_when_idle,
+)
 
 
 def unexpected(error: Exception) -> None:
@@ -143,7 +151,9 @@ def test_threads_of_background_work_give_way_and_no_other_thread_does() -> None:
 
     own = own_niceness()
     for nice, expected in ((0, own), (4, min(19, own + 4)), (40, 19)):
-        assert asyncio.run(niceness(Workers(1, unexpected, nice=nice))) == expected
+        assert (
+            asyncio.run(niceness(Workers(1, unexpected, begin=partial(give_way, nice)))) == expected
+        )
 
 
 def test_threads_of_idle_work_are_of_the_kernels_idle_class_and_no_other_thread_is() -> None:
@@ -157,7 +167,7 @@ def test_threads_of_idle_work_are_of_the_kernels_idle_class_and_no_other_thread_
 
     own = os.sched_getscheduler(0)
     assert asyncio.run(policy(Workers(1, unexpected))) == own
-    assert asyncio.run(policy(Workers(1, unexpected, idle=True))) == os.SCHED_IDLE
+    assert asyncio.run(policy(Workers(1, unexpected, begin=work_when_idle))) == os.SCHED_IDLE
     assert os.sched_getscheduler(0) == own
 
 
