@@ -7,7 +7,8 @@ So the sockets of this process are looked at a few times a second, and shut down
 
 * one address has too many of them, or one identity;
 * more bytes came in than became messages (``explain``): what a peer sends beyond that it sends to
-  keep the server busy. A call that its budget refused counts as some of these bytes;
+  keep the server busy. A call that its budget refused counts as some of these bytes, and where
+  that alone is too much, nothing waits for the next look;
 * a call's headers are larger than any client's (``offend``).
 
 Who did one of these but the first is *barred*: for some seconds the kernel drops what its address
@@ -158,10 +159,17 @@ class Connections:
             notes = self._notes[peer]
             notes.explained_bytes += OVERHEAD * message_bytes + MESSAGE_OVERHEAD
 
-    def refuse(self, peer: str) -> None:
-        """Note that a call was refused for a budget."""
+    def refuse(self, peer: str, now: float) -> None:
+        """Note that a call was refused for a budget; cut a connection of too many at once.
+
+        By the next sweep hundreds of calls would have been answered, one by one, before others'.
+        """
         with self._lock:
-            self._notes[peer].explained_bytes -= REFUSED_CALL_BYTES
+            notes = self._notes[peer]
+            notes.explained_bytes -= REFUSED_CALL_BYTES
+            is_too_dear = notes.explained_bytes < -UNEXPLAINED_BYTES
+        if is_too_dear:
+            self.offend(peer, Limit.CONNECTION_BYTES, now)
 
     def claim(self, peer: str, identity: str) -> None:
         """Note whose connection it is."""

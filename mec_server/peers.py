@@ -240,7 +240,7 @@ class ChargeRpcs(grpc.aio.ServerInterceptor):
         except LimitExceeded as error:
             self._limited(error.limit)
             if error.limit in (Limit.IDENTITY_CALLS, Limit.IDENTITY_RPCS):
-                self._connections.refuse(peer)
+                self._connections.refuse(peer, now)
             await abort(context, error)
         self._connections.explain(peer, CALL_BYTES)
         return hold

@@ -27,6 +27,7 @@ from mec_server.connections import (
     INTERNET,
     MOST_BARRED,
     MOST_HEADER_BYTES,
+    REFUSED_CALL_BYTES,
     SILENT_S,
     UNEXPLAINED_BYTES,
     Connections,
@@ -203,9 +204,12 @@ def test_calls_that_a_budget_refuses_end_a_connection(
     connections = watching(listener, 0, 0)
     pairs = Pairs(stack, listener, "127.0.0.1", 2)
     connections.sweep(0.0)
-    for _ in range(100):
-        connections.refuse(pairs.peers[0])
-    connections.refuse(pairs.peers[1])
+    for _ in range(UNEXPLAINED_BYTES // REFUSED_CALL_BYTES):
+        for peer in pairs.peers:
+            connections.refuse(peer, 0.1)
+    assert not any(map(is_closed, pairs.nears))
+    connections.refuse(pairs.peers[0], 0.2)
+    assert [is_closed(near) for near in pairs.nears] == [True, False], "it waits for no sweep"
     (cut,) = connections.sweep(0.25)
     assert (cut.limit, cut.count) == (Limit.CONNECTION_BYTES, 1)
     assert [is_closed(near) for near in pairs.nears] == [True, False]
