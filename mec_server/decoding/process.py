@@ -47,8 +47,9 @@ overloaded, and of a fork, some ms."""
 ANSWER_S = 2.0
 """Time limit of an answer: a thousand times what a 640x360 picture takes."""
 
-PATIENCE_S = 0.1
-"""An answer that takes longer is waited for without holding a worker of the server."""
+PATIENCE_S = 0.03
+"""An answer that takes longer, as one of 1080p may, is waited for without holding a worker of the
+server: a decoder that hangs costs others no more."""
 
 Waiting = Callable[[], AbstractContextManager[None]]
 """Makes a context in which a thread waits, so that another one may work in its place."""
