@@ -51,6 +51,7 @@ REPORT_S = 30.0
 WATCHED_S = 5.0
 """After which a picture that the vehicle knows to be shown and the consumer has not is missed."""
 CALM_NEWCOMERS = 3
+STOPPED_S = "seconds for which the kernel stopped the server's group"
 BOARD = Scoreboard("attacks", "make test-attack")
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT / "tests")}
@@ -196,6 +197,7 @@ class Scene:
         """
         lines = (self.folder / "server.log").read_bytes().count(b"\n")
         counted = Counter({LOG_LINES: lines, DEFERRED: kernel_count("TCPDeferAcceptDrop")})
+        counted.update({STOPPED_S: self.group.stopped_s()})
         with suppress(OSError):
             counted.update(scraped(self.target.metrics))
         return counted

@@ -76,6 +76,13 @@ class ControlGroup:
         pairs = (line.split() for line in file.read_text().splitlines())
         return next((int(count) for name, count in pairs if name == "oom_kill"), 0)
 
+    def stopped_s(self) -> float:
+        """Return for how long the kernel has stopped its processes on each processor, added up,
+        because they had used up what they are granted of the period."""
+        lines = (self._folders[-1] / "cpu.stat").read_text().splitlines()
+        counts = {name: int(count) for name, count in (line.split() for line in lines)}
+        return counts["throttled_usec"] / 1e6 if self._is_2 else counts["throttled_time"] / 1e9
+
     def close(self) -> None:
         """Remove it; its processes have ended."""
         for folder in self._folders:

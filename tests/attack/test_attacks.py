@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from attack.attacker import ATTACKS, NO_CAPACITY, OPENED, PROCESSOR_S, Attack
-from attack.conftest import ALLOWANCE_MS, ROUNDS
+from attack.conftest import ALLOWANCE_MS, ROUNDS, STOPPED_S
 from attack.control_group import CPUS, MEMORY_BYTES
 from attack.packet_attacks import was_given
 from attack.target import Target
@@ -120,6 +120,12 @@ def judge(scene: Any, calm: Any, control: Any, attacked: Any, after: Any) -> Non
     cores = " / ".join(f"{p.cores:.2f}" for p in (calm, control, attacked))
     busy = f"processors that the server kept busy, of {CPUS:g} that it may"
     scene.note(busy, f"calm / control / attacked {cores}", True)
+    stopped = " / ".join(f"{p.grown[STOPPED_S]:.2f}" for p in (calm, control, attacked))
+    scene.note(
+        "for how long the kernel stopped it, as its processor time was used up, on each processor",
+        f"calm / control / attacked {stopped} s",
+        True,
+    )
     spent = f"control / attacked {control.attacked_s:.1f} / {attacked.attacked_s:.1f} s"
     scene.note("the attacker's processor time", spent, attacked.attacked_s > 0)
     scene.note("how its frames ended", attacked.told, attacked.count("acked") > 0)
