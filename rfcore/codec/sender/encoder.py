@@ -79,7 +79,8 @@ class FrameChoice:
     pose_only: bool = False
     """Send no slice: the frame is its only reference."""
     max_references: int = DEFAULT_REFERENCES
-    """How many the encoder may choose."""
+    """How many the encoder may choose; of the usual three, one more under the light of the frame
+    before."""
     block_means: bool = False
     """Send those of the render, by which a receiver whose renderer is not exact tells rounding from
     a wrong pose."""

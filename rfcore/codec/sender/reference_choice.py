@@ -66,7 +66,12 @@ def choose_references(
     That is the render or the correction. The previous frame comes next, then the other one; the
     warp only as a fourth (0.4 and 0.9 % fewer bits, a seventh more of the sender's time on the
     sample drives). It is never last: what skipped blocks copy from it drifts from frame to frame.
+
+    Under the light of the frame before the usual three become four: what the field does not show is
+    in earlier frames alone (2.2 % fewer bits on the yardstick's dusk with a field of noon).
     """
+    if prediction.learns_light and max_references == DEFAULT_REFERENCES:
+        max_references += 1
     if min(costs.frame.size_px) < BLOCK_PX:
         return RENDER_ONLY
     at_crf = RateDistortion.at(crf)
