@@ -21,7 +21,7 @@ from rfedge.experiments.compare.report import compare_section, headline_table
 from rfedge.experiments.ladder.page import write_ladder_figure
 from rfedge.experiments.latency.report import latency_section, write_latency_figures
 from rfedge.experiments.localisation.rows import localise_section
-from rfedge.experiments.never_worse.report import never_worse_section
+from rfedge.experiments.never_worse.measure import never_worse_section
 from rfedge.experiments.paper.figures import write_paper_figures
 from rfedge.experiments.paper.report import PaperRow, paper_section
 from rfedge.experiments.robust.report import robust_section, write_robust_figure

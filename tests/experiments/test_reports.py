@@ -40,7 +40,7 @@ from rfedge.experiments.latency.report import (
     print_needed,
     write_latency_figures,
 )
-from rfedge.experiments.never_worse.report import (
+from rfedge.experiments.never_worse.measure import (
     NeverWorseRow,
     never_worse_section,
     print_never_worse,

@@ -25,10 +25,17 @@ from rfcore.views import FieldView
 from rfedge.experiments.cells import CellStore, program_version
 from rfedge.experiments.clips import DECIMATION, Clip, ClipCoder, Drive, DriveName, read_drive
 from rfedge.experiments.field_coder import FieldCoder, RenderedClip, render_clip
-from rfedge.experiments.never_worse.report import NeverWorseRow, print_never_worse
 from rfedge.experiments.performance import Performance, perform, seconds_left
 from rfedge.experiments.rivals import x264_for_psnr, x264_lowdelay
-from rfedge.results import check_result_path, make_result, provenance, write_result
+from rfedge.report.tables import heading, print_table, table
+from rfedge.results import (
+    Result,
+    check_result_path,
+    make_result,
+    provenance,
+    rows_of,
+    write_result,
+)
 
 __all__ = [
     "ALLOWED_PERCENT",
@@ -36,7 +43,10 @@ __all__ = [
     "CONTROLS",
     "NeverWorse",
     "NeverWorseJob",
+    "NeverWorseRow",
     "controls_of",
+    "never_worse_section",
+    "print_never_worse",
     "run_never_worse",
 ]
 
@@ -49,6 +59,34 @@ POINTS = (18.0, 22.0, 26.0, 30.0, 34.0, 38.0, 42.0)
 QUARTER_TURN = Pose((0.0, 0.0, 0.0), (0.5**0.5, 0.0, -(0.5**0.5), 0.0))
 """About the camera's vertical axis."""
 BLACK_YUV = (16, 128, 128)
+
+
+@dataclass(frozen=True)
+class NeverWorseRow:
+    """One drive with one field, right or wrong, at one quality. CPU is the sender's, a frame."""
+
+    scene: str
+    hz: float
+    frames: int
+    control: str
+    """Which field both ends hold."""
+    preset: str
+    at_db: float
+    bytes: float
+    """Of a whole message, header included, as all bytes here a mean over all frames but one."""
+    header_bytes: float
+    rival_bytes: float
+    excess_percent: float
+    """Bytes without the header over those of x264 at the same quality."""
+    excess_percent_psnr_tuned: float
+    """The same against x264 tuned for PSNR."""
+    holds: bool
+    first_frame_bytes: int
+    rival_first_frame_bytes: int
+    references: str
+    """What most frames were predicted from."""
+    cpu_ms: float
+    rival_cpu_ms: float
 
 
 def controls_of(field: RadianceField, drive: Drive) -> Mapping[str, RenderedClip]:
@@ -212,3 +250,64 @@ def _drives(job: NeverWorseJob) -> list[Drive]:
     limit = QUICK_FRAMES if job.quick else None
     slow = [read_drive(text).every(DECIMATION) for text in job.decimated]
     return [*slow, *(read_drive(text, limit) for text in job.drives)]
+
+
+COLUMNS = (
+    "scene",
+    "Hz",
+    "field",
+    "dB",
+    "bytes",
+    "of them header",
+    "x264",
+    "excess without header %",
+    "against x264 tuned for PSNR %",
+    "at most 2 %",
+    "mostly predicted from",
+    "CPU ms",
+    "x264's",
+)
+
+PRINTED = ("scene", "Hz", "field", "dB", "excess %", "psnr-tuned", "holds", "references")
+
+
+def never_worse_section(path: Path, result: Result) -> str:
+    """Return the table; a field that made it worse stands out."""
+    rows = map(_cells, rows_of(NeverWorseRow, result["rows"]))
+    return "\n\n".join([heading(path, result), table(COLUMNS, rows), ""])
+
+
+def print_never_worse(console: Console, rows: Sequence[NeverWorseRow]) -> None:
+    """Print the verdict on each field at each quality."""
+    print_table(console, "A field against none", PRINTED, [_printed_cells(row) for row in rows])
+
+
+def _printed_cells(row: NeverWorseRow) -> list[str]:
+    return [
+        row.scene,
+        f"{row.hz:g}",
+        row.control,
+        f"{row.at_db:g}",
+        f"{row.excess_percent:.1f}",
+        f"{row.excess_percent_psnr_tuned:.1f}",
+        "yes" if row.holds else "NO",
+        row.references,
+    ]
+
+
+def _cells(row: NeverWorseRow) -> list[str]:
+    return [
+        row.scene,
+        f"{row.hz:g}",
+        row.control,
+        f"{row.at_db:g}",
+        f"{row.bytes:.0f}",
+        f"{row.header_bytes:.0f}",
+        f"{row.rival_bytes:.0f}",
+        f"{row.excess_percent:+.1f}",
+        f"{row.excess_percent_psnr_tuned:+.1f}",
+        "yes" if row.holds else "**no**",
+        row.references,
+        f"{row.cpu_ms:.0f}",
+        f"{row.rival_cpu_ms:.0f}",
+    ]
