@@ -9,7 +9,8 @@ from rfedge.cli import Verb
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("rfcore", "cav_agent", "mec_server", "rfedge")
-MOST_MODULES, MOST_VERBS = 510, 16
+MOST_MODULES, MOST_VERBS = 512, 16
+"""rfedge-bench took four: verbs, definition, submission, method; one was merged away for it."""
 
 
 def layered_contracts() -> list[dict[str, Any]]:

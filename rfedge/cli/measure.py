@@ -10,6 +10,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from rfedge.arguments import DATASET, FIELD, FOLDER, JSON, field_path
 from rfedge.experiments.adapt import EvalAdapt
+from rfedge.experiments.benchmark import EvalBenchmark
 from rfedge.experiments.classes import EvalClasses
 from rfedge.experiments.compare import EvalCompare
 from rfedge.experiments.ladder import EvalLadder
@@ -255,6 +256,7 @@ class Eval:
 
     verb: Annotated[
         Annotated[EvalAdapt, subcommand("adapt")]
+        | Annotated[EvalBenchmark, subcommand("benchmark")]
         | Annotated[EvalClasses, subcommand("classes")]
         | Annotated[EvalCompare, subcommand("compare")]
         | Annotated[EvalLadder, subcommand("ladder")]

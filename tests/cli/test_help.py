@@ -23,7 +23,7 @@ VERBS = (
 EVAL_VERBS = tuple(
     f"eval {verb}"
     for verb in ("adapt", "classes", "compare", "never-worse", "paper", "robust", "sizing")
-)
+) + tuple(f"eval benchmark {verb}" for verb in ("run", "check", "show", "anchors"))
 CERTS_VERBS = ("certs init", "certs show")
 SCENE_VERBS = ("scene build", "scene convert", "scene poses", "scene record-carla")
 FIELD_VERBS = tuple(

@@ -1,4 +1,5 @@
-"""What is in ``examples/`` runs; ``tests/docs/test_evaluation.py`` runs the codec alone."""
+"""What is in ``examples/`` runs; ``tests/docs/test_evaluation.py`` runs the codec alone, and
+``tests/experiments/test_benchmark.py`` what is handed in to the benchmark."""
 
 import asyncio
 import json
@@ -46,7 +47,7 @@ def write_trajectory(drive: Path, out: Path) -> list[Pose]:
 def test_every_example_is_listed() -> None:
     page = (EXAMPLES / "README.md").read_text()
     names = {path.name for path in EXAMPLES.glob("*.py")}
-    assert len(names) == 5
+    assert len(names) == 7
     assert all(f"`{name}`" in page for name in names)
 
 
