@@ -29,6 +29,8 @@ class Mutant:
 
 
 RIVALS = "rfedge/experiments/rivals.py"
+BENCHMARK = "rfedge/experiments/benchmark"
+BENCHMARK_TESTS = "tests/experiments/test_benchmark.py"
 MUTANTS = (
     Mutant(
         "x264 is crippled",
@@ -120,6 +122,34 @@ MUTANTS = (
         "for clip in clips])",
         "tests/experiments/test_rate_curve.py"
         "::test_quality_is_the_psnr_of_the_mean_error_not_the_mean_of_psnrs",
+    ),
+    Mutant(
+        "the benchmark counts bytes as they are stated",
+        f"{BENCHMARK}/submission.py",
+        "        if found != stated:",
+        "        if False:",
+        f"{BENCHMARK_TESTS}::test_a_poisoned_submission_is_refused_with_its_fault",
+    ),
+    Mutant(
+        "the benchmark takes packets that are made of later frames",
+        f"{BENCHMARK}/method.py",
+        "        if one != other:",
+        "        if False:",
+        f"{BENCHMARK_TESTS}::test_a_coder_that_looks_ahead_is_found_out",
+    ),
+    Mutant(
+        "the benchmark scores the first frame",
+        f"{BENCHMARK}/definition.py",
+        "return slice(self.first_scored_frame, None)",
+        "return slice(0, None)",
+        f"{BENCHMARK_TESTS}::test_v1_scores_as_it_did_when_it_was_frozen",
+    ),
+    Mutant(
+        "the benchmark takes any frames for a drive",
+        f"{BENCHMARK}/definition.py",
+        "        if drive.digest != self.sha256:",
+        "        if False:",
+        f"{BENCHMARK_TESTS}::test_a_drive_of_other_frames_is_refused",
     ),
 )
 

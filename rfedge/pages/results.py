@@ -15,6 +15,7 @@ from rfcore.files import write_whole
 from rfedge.bench import bench_section
 from rfedge.demo.report import demo_section
 from rfedge.experiments.adapt.measure import adapt_section
+from rfedge.experiments.benchmark.definition import benchmark_section
 from rfedge.experiments.classes.measure import classes_section
 from rfedge.experiments.compare.figures import write_compare_figures
 from rfedge.experiments.compare.report import compare_section, headline_table
@@ -51,6 +52,7 @@ SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
     "adapt": adapt_section,
     "attacks": lambda path, result: _reference(path, result, "attacks", "attacks"),
     "bench": bench_section,
+    "benchmark": benchmark_section,
     "classes": classes_section,
     "compare": compare_section,
     "demo": demo_section,

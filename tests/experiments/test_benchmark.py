@@ -22,6 +22,7 @@ from rfedge.experiments.benchmark.definition import (
     V1,
     Benchmark,
     BenchmarkDrive,
+    benchmark_section,
     described,
     print_scores,
     read_benchmark,
@@ -223,9 +224,13 @@ def test_a_result_says_what_was_checked_and_what_was_not(small: Benchmark, hande
     assert content["submission"]["prior_bytes"] == 10
     (cost,) = content["break_even"]
     assert (cost["field_bytes"], cost["passes_to_break_even"]) == (10, None)
+    result = make_result("benchmark", provenance(command="x", at="1"), content)
     console = Console(record=True, width=120)
-    print_scores(console, make_result("benchmark", provenance(command="x", at="1"), content))
+    print_scores(console, result)
     assert "Not checked: " in console.export_text()
+    section = benchmark_section(Path("benchmark.json"), result)
+    assert "| wall | 10 | x264-lowdelay-veryfast | 32..36 | 0.0 |" in section
+    assert "* wall: the prior of 10 bytes is never paid for." in section
 
 
 def test_pictures_may_be_handed_in_as_png(small: Benchmark, copied: Path, handed_in: Path) -> None:

@@ -38,7 +38,7 @@ from rfedge.experiments.rate_curve import (
     rate_curve,
 )
 from rfedge.experiments.rivals import Rival
-from rfedge.report.tables import print_table
+from rfedge.report.tables import heading, print_table, table
 from rfedge.results import Result, rows_of
 from rfedge.samples import sample_path
 
@@ -48,6 +48,7 @@ __all__ = [
     "BenchmarkDrive",
     "BenchmarkRow",
     "Scoring",
+    "benchmark_section",
     "described",
     "print_scores",
     "read_benchmark",
@@ -411,12 +412,25 @@ def print_scores(console: Console, result: Result) -> None:
     headline = [_cells(row) for row in rows if row.window_db == rows[0].window_db]
     title = f"{result['submission']['method']}: {result['benchmark']}"
     print_table(console, title, COLUMNS, headline)
+    for line in _remarks(result):
+        console.print(line, markup=False, highlight=False)
+
+
+def benchmark_section(path: Path, result: Result) -> str:
+    """Return a submission's section of the results page: all windows, what was not checked."""
+    rows = [_cells(row) for row in rows_of(BenchmarkRow, result["rows"])]
+    about = f"`{result['submission']['method']}` in {result['benchmark']}:"
+    remarks = "\n".join(f"* {line}" for line in _remarks(result))
+    return "\n\n".join([heading(path, result), about, table(COLUMNS, rows), remarks, ""])
+
+
+def _remarks(result: Result) -> list[str]:
+    lines = []
     for row in rows_of(BreakEvenRow, result["break_even"]):
         passes = row.passes_to_break_even
         paid = "is never paid for" if passes is None else f"is paid for by {passes} passes"
-        console.print(f"{row.scene}: the prior of {row.field_bytes:,} bytes {paid}")
-    for what in result["not_checked"]:
-        console.print(f"Not checked: {what}.", markup=False, highlight=False)
+        lines.append(f"{row.scene}: the prior of {row.field_bytes:,} bytes {paid}.")
+    return lines + [f"Not checked: {what}." for what in result["not_checked"]]
 
 
 def _cells(row: BenchmarkRow) -> list[str]:
