@@ -47,7 +47,7 @@ FOUND := $(OUT)/passes-5/camera.toml
 $(OUT)/passes-5/found.tum: $(call drive,passes-5) $(OUT)/dusk-beside.rff
 	$(RFEDGE) localise $< --field $(OUT)/dusk-beside.rff --start-error 1.5m:1.5deg --out $@
 $(FOUND): $(OUT)/passes-5/found.tum
-	printf '%s\n' [camera] 'width_px = 640' 'height_px = 360' 'fx_px = 320.0' [pictures] 'folder = "drive"' \
+	printf '%s\n' [camera] 'width_px = 640' 'height_px = 360' 'fx_px = 320.0' [pictures] 'folder = "drive/images"' \
 		'rate_hz = 10.0' [trajectory] 'file = "found.tum"' 'outside = "drop"' >$@
 
 # --- cases: NAME@HZ=DRIVE,KEY=PATH... as `rfedge eval adapt` takes them
