@@ -38,7 +38,7 @@ class FieldUpdate:
     """The archive to write; a layer or a delta belongs into the folder of its base."""
     learn_as: Annotated[Literal["all", "delta", "colours"], arg(name="as")] = "all"
     """all: another field, every parameter fine-tuned. delta: the same as its difference to this
-    field, of a fifth of the bytes. colours: a colour layer on this field, of a fiftieth, for
+    field, of a third of the bytes. colours: a colour layer on this field, of a fiftieth, for
     another light on what is there."""
     frames: int = 48
     """Most frames taken of all passes; a quarter of them is held back for the trial."""
