@@ -40,6 +40,7 @@ async def serve(config: ServerConfig, opened: OpenCameras = open_cameras) -> Non
     gc.collect()
     gc.freeze()  # looking through all that is there for cycles stops every thread for 50 ms
     await stopped.wait()
+    gc.unfreeze()  # what the native library counts as leaked at the end is collected again
     await server.stop()
 
 

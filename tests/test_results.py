@@ -8,9 +8,9 @@ import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import pytest
 from hypothesis import given
@@ -219,18 +219,31 @@ def test_a_committed_result_says_how_it_was_made(path: Path) -> None:
 
 def test_no_verb_of_eval_writes_over_a_tracked_file_unless_told_to() -> None:
     """Everything a verb writes by default lies below ``out``, which is not tracked."""
-    from dataclasses import fields
-    from typing import get_args, get_type_hints
-
     from rfedge.cli.measure import Eval
 
-    choices = get_args(get_type_hints(Eval, include_extras=True)["verb"])
-    verbs = [get_args(choice)[0] for choice in get_args(choices[0])]
+    verbs = verbs_of(Eval)
     assert len(verbs) >= 6
     for verb in verbs:
         outputs = {f.name: f.default for f in fields(verb) if f.name in ("out", "figures", "cells")}
-        assert outputs["out"] == Path("out/eval") / outputs["out"].name
-        assert all(path is None or path.parts[0] == "out" for path in outputs.values())
+        for path in outputs.values():
+            assert path in (None, MISSING) or path.parts[0] == "out"
+        out = outputs.get("out", MISSING)
+        assert out is MISSING or out == Path("out/eval") / out.name
+    without = {verb.__name__ for verb in verbs if not hasattr(verb, "out")}
+    assert without == {"BenchmarkRun", "BenchmarkShow"}, "where one writes is asked for, one reads"
+
+
+def verbs_of(command: type) -> list[type]:
+    """Return the verbs of a command, those of its verbs in their place."""
+    hint = get_type_hints(command, include_extras=True)["verb"]
+    while get_origin(hint) is Annotated:
+        hint = get_args(hint)[0]
+    verbs = [get_args(choice)[0] for choice in get_args(hint)]
+    return [
+        each
+        for verb in verbs
+        for each in (verbs_of(verb) if "verb" in verb.__annotations__ else [verb])
+    ]
 
 
 def test_the_host_is_described_without_a_clock() -> None:
