@@ -14,7 +14,7 @@ import itertools
 from collections import OrderedDict
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import structlog
 
@@ -43,11 +43,6 @@ from rfcore.field import FULL, FieldStore, RadianceField
 from rfcore.field.store import decode_beginning
 from rfcore.views import PosedPicture
 from rfcore.wire.tiles import Tile
-
-if TYPE_CHECKING:
-    pass
-
-Metadata = tuple[tuple[str, str], ...]
 
 __all__ = [
     "FieldCache",
@@ -135,10 +130,15 @@ class FieldCache:
     async def _load(self, served: ServedTile) -> PreparedField:
         tile, loop = served.tile, asyncio.get_running_loop()
         own = _OwnField()
-        preview = await self._preview(tile)
-        if preview:
-            own.take(await self._opened(served, preview))
-        field = await self._first(served, own)
+        preview: tuple[str, ...] = ()
+        if self._needs_all or await self._holds(tile.field_id):
+            field = await self._opened(served, (tile.field_id,))
+        elif tile.preview is not None:
+            preview = tile.preview.field_ids
+            field = await self._opened(served, preview)
+            own.take(field)
+        else:
+            field = await self._first(served, own)
 
         def want() -> None:
             loop.call_soon_threadsafe(self._fetch_lights, served, lights)
@@ -151,19 +151,17 @@ class FieldCache:
         return prepared
 
     async def _first(self, served: ServedTile, own: _OwnField) -> RadianceField:
-        """Return what can be drawn first; what is not here of the tile's own field is fetched."""
-        config, tile = self._config, served.tile
-        if own.field is not None:
-            return own.field
-        held = await asyncio.to_thread(FieldStore(config.fields.expanduser()).ids)
-        if tile.field_id in held or self._needs_all:
-            return await self._opened(served, (tile.field_id,))
+        """Begin to fetch the tile's own field; return what can be drawn of it first."""
         arriving = self._begin(self._arrive(served, own))
         either: set[asyncio.Future[Any]] = {arriving, own.first}
         await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
         if own.field is None:
             await arriving  # raises what went wrong
         return await own.first
+
+    async def _holds(self, field_id: str) -> bool:
+        store = FieldStore(self._config.fields.expanduser())
+        return field_id in await asyncio.to_thread(store.ids)
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.create_task(work)
@@ -176,13 +174,6 @@ class FieldCache:
         """Whether a drive needs the whole of the tile's own field: a camera is looked for in it
         (``--localise``), on another thread than takes it, or within its bounds (a feed's)."""
         return self._config.localise or self._config.feed.source is not None
-
-    async def _preview(self, tile: Tile) -> tuple[str, ...]:
-        """Return the archives of the field to begin with; none if the tile's own is here."""
-        if tile.preview is None or self._needs_all:
-            return ()
-        held = await asyncio.to_thread(FieldStore(self._config.fields.expanduser()).ids)
-        return () if tile.field_id in held else tile.preview.field_ids
 
     async def _arrive(self, served: ServedTile, own: _OwnField) -> None:
         """Fetch the tile's own field and have it drawn; try again until all of it is there.

@@ -70,9 +70,10 @@ class Beginnings:
         """Look at a partial file of ``have_bytes``; raise ``FieldFormatError`` if it is damaged."""
         if self._ends is None:
             self._ends = await asyncio.to_thread(_ends_of, partial, have_bytes)
-        there = [end for end in self._ends or () if end <= have_bytes]
-        if there and self._ends is not None:
-            self._ends = self._ends[len(there) :]
+        ends = self._ends or []
+        there = [end for end in ends if end <= have_bytes]
+        if there:
+            self._ends = ends[len(there) :]
             await self._take(await asyncio.to_thread(_first_bytes, partial, there[-1]))
 
 
@@ -90,13 +91,6 @@ def _ends_of(partial: Path, have_bytes: int) -> list[int] | None:
 def _first_bytes(partial: Path, count: int) -> bytes:
     with partial.open("rb") as file:
         return file.read(count)
-
-
-async def _nothing(_partial: Path, _have_bytes: int) -> None:
-    pass
-
-
-Arrived = Callable[[Path, int], Awaitable[None]]
 
 
 async def fetch_field(
@@ -117,9 +111,7 @@ async def fetch_field(
     partial = folder / f".{field_id}.part"
     size_bytes = await _size(stub, field_id, metadata)
     log.info("fetching field", field=field_id, size_bytes=size_bytes)
-    arrived = _nothing if beginnings is None else beginnings.arrived
-    transfer = _Transfer(stub, field_id, partial, size_bytes, metadata, arrived)
-    await transfer.receive_all()
+    await _Transfer(stub, field_id, partial, size_bytes, metadata, beginnings).receive_all()
     await asyncio.to_thread(_check_and_add, store, field_id, partial)
     log.info("field fetched", field=field_id)
 
@@ -148,7 +140,7 @@ class _Transfer:
     partial: Path
     size_bytes: int
     metadata: Metadata
-    arrived: Arrived
+    beginnings: Beginnings | None
 
     async def receive_all(self) -> None:
         """Receive what is missing; resume where it broke, and come again to a busy server."""
@@ -195,8 +187,10 @@ class _Transfer:
 
     async def _look(self, have_bytes: int) -> None:
         """Use what has arrived; remove it if it is damaged, for then it cannot be resumed from."""
+        if self.beginnings is None:
+            return
         try:
-            await self.arrived(self.partial, have_bytes)
+            await self.beginnings.arrived(self.partial, have_bytes)
         except FieldFormatError:
             self.partial.unlink(missing_ok=True)
             raise

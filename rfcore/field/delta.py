@@ -30,13 +30,12 @@ from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive
 from rfcore.field.integers import LIMIT, Integers, decode_columns, encode_columns
 from rfcore.field.interface import DELTA, SPLATS, Bounds, FieldMetadata, base_of, stored_metadata
-from rfcore.field.quality import DETAILS, LevelsOfDetail, kept_of
+from rfcore.field.quality import DETAILS, kept_of, splats_in
 from rfcore.field.splat_archive import (
     GridSplats,
     check_decoded_size,
     grid_splats,
     level_name,
-    splats_in,
     stream_shapes,
 )
 from rfcore.field.splat_grid import (
@@ -54,7 +53,7 @@ from rfcore.field.splats import SplatField
 from rfcore.files import DECODED_BYTES
 from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
 
-__all__ = ["check_base", "delta_archive", "delta_field", "delta_of"]
+__all__ = ["check_base", "delta_field", "delta_of"]
 
 ENCODING = "delta-1"
 ADDED = "added."
@@ -70,19 +69,16 @@ def delta_of(base: SplatField, version: SplatField) -> SplatField:
     Raises ``InvalidInput`` if ``base`` is not compressed, or ``version`` has fewer splats or values
     that the base's grid cannot hold.
     """
-    archive = delta_archive(base, version.gaussians, version.levels, version.metadata)
-    return delta_field(archive, base, version.metadata)
-
-
-def delta_archive(
-    base: SplatField, gaussians: Gaussians, levels: LevelsOfDetail, metadata: FieldMetadata
-) -> Archive:
-    """Return the archive of a version of ``base``; raises as ``delta_of``."""
     grid = _grid_of(base)
-    n = len(grid.numbers.means)
+    archive = _archive(base.field_id, grid, version)
+    return _field(archive, base, grid, version.metadata, DECODED_BYTES)
+
+
+def _archive(base_id: str, grid: GridSplats, version: SplatField) -> Archive:
+    gaussians, n = version.gaussians, len(grid.numbers.means)
     if len(gaussians) < n:
         raise InvalidInput("delta", f"{len(gaussians)} splats are fewer than the base's {n}")
-    if gaussians.sh_degree != base.gaussians.sh_degree:
+    if gaussians.sh_degree != grid.sh_degree:
         raise InvalidInput("delta", f"SH degree {gaussians.sh_degree} is not the base's")
     numbers = _numbers_on(grid, splats_in(gaussians, slice(0, n)))
     parts: dict[str, Integers] = {
@@ -93,20 +89,20 @@ def delta_archive(
     added = numbers_of(splats_in(gaussians, slice(n, None)), grid.steps)
     parts |= {f"{ADDED}{f.name}": getattr(added, f.name) for f in fields(SplatNumbers)}
     whole = _joined(numbers, added)
-    for detail, level in levels.items():
+    for detail, level in version.levels.items():
         own = level_numbers_of(level, whole, grid.steps)
         parts[level_name(detail)] = own - _expected_level(grid, detail, len(own))
     coded = {name: encode_columns(part) for name, part in parts.items() if part.any()}
     encoding = {
         "name": ENCODING,
         "count": len(gaussians),
-        "levels": sorted(levels),
+        "levels": sorted(version.levels),
         "streams": {name: header for name, (header, _) in coded.items()},
     }
     made = _gaussians(grid, numbers, added)
-    header = stored_metadata(metadata, Bounds.around(made.means))
+    header = stored_metadata(version.metadata, Bounds.around(made.means))
     arrays = {name: stream for name, (_, stream) in coded.items()}
-    return Archive(DELTA, {**header, "base": base.field_id, "encoding": encoding}, arrays)
+    return Archive(DELTA, {**header, "base": base_id, "encoding": encoding}, arrays)
 
 
 def delta_field(
@@ -120,9 +116,15 @@ def delta_field(
     stated = base_of(archive)
     if stated != base.field_id:
         raise InvalidInput("delta.base", f"is for field {stated}, not {base.field_id}")
+    return _field(archive, base, _grid_of(base), metadata, max_bytes)
+
+
+def _field(
+    archive: Archive, base: SplatField, grid: GridSplats, metadata: FieldMetadata, max_bytes: int
+) -> SplatField:
+    """Return what ``archive`` makes of ``base``, whose numbers are ``grid``."""
     if metadata.antialiased != base.metadata.antialiased:
         raise InvalidInput("delta.antialiased", "differs from the base's")
-    grid = _grid_of(base)
     stored = _Stored.of(archive, grid, max_bytes)
     numbers = _with_differences(grid.numbers, {name: stored.part(name) for name in OF_BASE})
     added = SplatNumbers(**{f.name: stored.part(f"{ADDED}{f.name}") for f in fields(SplatNumbers)})

@@ -13,7 +13,7 @@ worth is measured there). Nothing is computed: the same splats on every machine.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 from rfcore.errors import InvalidInput
 from rfcore.raster.gaussians import F32, Gaussians
@@ -31,6 +31,7 @@ __all__ = [
     "check_levels",
     "kept_of",
     "splats_at_detail",
+    "splats_in",
 ]
 
 
@@ -109,6 +110,11 @@ def kept_of(count: int, detail: float) -> int:
     return -(-count * round(detail * 100) // 100)
 
 
+def splats_in(gaussians: Gaussians, part: slice) -> Gaussians:
+    """Return some splats; nothing is copied."""
+    return Gaussians(**{f.name: getattr(gaussians, f.name)[part] for f in fields(Gaussians)})
+
+
 def splats_at_detail(
     gaussians: Gaussians, levels: LevelsOfDetail, detail: float, count: int | None = None
 ) -> Gaussians:
@@ -119,13 +125,7 @@ def splats_at_detail(
     if detail == 1:
         return gaussians
     kept = kept_of(len(gaussians) if count is None else count, detail)
-    prefix = Gaussians(
-        means=gaussians.means[:kept],
-        quaternions=gaussians.quaternions[:kept],
-        log_scales=gaussians.log_scales[:kept],
-        opacity_logits=gaussians.opacity_logits[:kept],
-        sh=gaussians.sh[:kept],
-    )
+    prefix = splats_in(gaussians, slice(0, kept))
     own = levels.get(detail)
     if own is None:
         return prefix

@@ -31,7 +31,14 @@ from rfcore.field.archive import RAISE_LIMIT, Archive, Array, check_array_bytes
 from rfcore.field.importance import reordered
 from rfcore.field.integers import Columns, Integers, encode_columns, open_columns
 from rfcore.field.interface import SPLATS, Bounds, FieldMetadata, stored_metadata
-from rfcore.field.quality import DETAILS, Beginning, LevelOfDetail, LevelsOfDetail, kept_of
+from rfcore.field.quality import (
+    DETAILS,
+    Beginning,
+    LevelOfDetail,
+    LevelsOfDetail,
+    kept_of,
+    splats_in,
+)
 from rfcore.field.splat_grid import (
     BLOCK,
     FINEST,
@@ -56,7 +63,6 @@ __all__ = [
     "grid_splats",
     "level_name",
     "splat_archive",
-    "splats_in",
     "splats_of_archive",
     "splats_of_beginning",
     "splats_of_compressed",
@@ -138,11 +144,6 @@ def _bands(count: int, encoding: str) -> Sequence[_Band]:
         _Band(f"{round(detail * 100)}.", slice(start, end), detail)
         for detail, start, end in zip(ASCENDING, [0, *ends], ends, strict=False)
     )
-
-
-def splats_in(gaussians: Gaussians, part: slice) -> Gaussians:
-    """Return some splats."""
-    return Gaussians(**{f.name: getattr(gaussians, f.name)[part] for f in fields(Gaussians)})
 
 
 def _level_in(level: LevelOfDetail, part: slice) -> LevelOfDetail:

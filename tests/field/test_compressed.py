@@ -41,14 +41,32 @@ CAMERA = Camera(Intrinsics(48, 36, 40.0, 40.0, 24.0, 18.0), Pose((0, 0, -5), (1,
 STEPS = Steps()
 
 
-def field_of(gaussians: Gaussians, *details: float) -> SplatField:
-    """A field with levels a little wider than their prefix."""
+def levels_of(gaussians: Gaussians, *details: float) -> dict[float, LevelOfDetail]:
+    """Levels a little wider than their prefix."""
     levels = {}
     for detail in details:
         kept = kept_of(len(gaussians), detail)
         wider = gaussians.log_scales[:kept] + np.float32(1 / detail / 16)
         levels[detail] = LevelOfDetail(wider, gaussians.opacity_logits[:kept] + np.float32(0.5))
-    return SplatField(gaussians, FieldMetadata("street", held_out_psnr_db=27.0), levels=levels)
+    return levels
+
+
+def field_of(gaussians: Gaussians, *details: float) -> SplatField:
+    metadata = FieldMetadata("street", held_out_psnr_db=27.0)
+    return SplatField(gaussians, metadata, levels=levels_of(gaussians, *details))
+
+
+def harmed(archive: Archive, data: st.DataObject) -> Archive:
+    """The archive with a byte of one of its streams and what its header says of that changed."""
+    name = data.draw(st.sampled_from(sorted(archive.arrays)))
+    numbers = archive.metadata["encoding"]["streams"][name]
+    stream = archive.arrays[name].copy()
+    stream[data.draw(st.integers(0, len(stream) - 1))] ^= data.draw(st.integers(0, 255))
+    lowest = [data.draw(st.integers(-(2**24), 2**24)) for _ in numbers["lowest"]]
+    streams = {**archive.metadata["encoding"]["streams"], name: {**numbers, "lowest": lowest}}
+    encoding = {**archive.metadata["encoding"], "streams": streams}
+    metadata = {**archive.metadata, "encoding": encoding}
+    return Archive(archive.kind, metadata, {**archive.arrays, name: stream})
 
 
 def digest_of(field: SplatField) -> str:
@@ -268,17 +286,9 @@ def test_streams_made_to_harm_give_splats_or_are_refused(
     make_gaussians, data: st.DataObject
 ) -> None:
     """Whoever writes the file writes its digests: beneath them anything may stand."""
-    archive = field_of(make_gaussians(20, 1), 0.5).compressed().archive()
-    name = data.draw(st.sampled_from(sorted(archive.arrays)))
-    numbers = archive.metadata["encoding"]["streams"][name]
-    stream = archive.arrays[name].copy()
-    stream[data.draw(st.integers(0, len(stream) - 1))] ^= data.draw(st.integers(0, 255))
-    lowest = [data.draw(st.integers(-(2**24), 2**24)) for _ in numbers["lowest"]]
-    streams = {**archive.metadata["encoding"]["streams"], name: {**numbers, "lowest": lowest}}
-    encoding = {**archive.metadata["encoding"], "streams": streams}
-    metadata = {**archive.metadata, "encoding": encoding}
-    del metadata["bounds"]
-    harmful = Archive(archive.kind, metadata, {**archive.arrays, name: stream})
+    harmful = harmed(field_of(make_gaussians(20, 1), 0.5).compressed().archive(), data)
+    metadata = {key: value for key, value in harmful.metadata.items() if key != "bounds"}
+    harmful = Archive(harmful.kind, metadata, harmful.arrays)
     try:
         field = decode_field(encode_archive(harmful))
     except FieldFormatError:

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from field.test_compressed import harmed, levels_of
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import FieldFormatError, InvalidInput, UnknownField
 from rfcore.field import FieldMetadata, FieldStore, SplatField, load_field, save_field
 from rfcore.field.archive import Archive, encode_archive
 from rfcore.field.delta import SMALLEST_BAND, delta_of
 from rfcore.field.interface import base_of
-from rfcore.field.quality import LevelOfDetail, kept_of
-from rfcore.field.splat_archive import splats_in
+from rfcore.field.quality import splats_in
 from rfcore.field.splat_grid import Steps
 from rfcore.field.store import decode_field, encode_field
 from rfcore.raster.gaussians import Gaussians
@@ -25,16 +25,6 @@ from rfcore.raster.gaussians import Gaussians
 Make = Callable[..., Gaussians]
 CAMERA = Camera(Intrinsics(48, 36, 40.0, 40.0, 24.0, 18.0), Pose((0, 0, -5), (1, 0, 0, 0)))
 STEPS = Steps()
-
-
-def levels_of(gaussians: Gaussians, *details: float) -> dict[float, LevelOfDetail]:
-    """Levels a little wider than their prefix."""
-    made = {}
-    for detail in details:
-        kept = kept_of(len(gaussians), detail)
-        wider = gaussians.log_scales[:kept] + np.float32(1 / detail / 16)
-        made[detail] = LevelOfDetail(wider, gaussians.opacity_logits[:kept] + np.float32(0.5))
-    return made
 
 
 def compressed(gaussians: Gaussians, *details: float) -> SplatField:
@@ -200,19 +190,7 @@ def test_streams_made_to_harm_give_splats_or_are_refused(
     base = compressed(make_gaussians(20, 1), 0.5)
     wanted = joined(moved(base.gaussians, 1), make_gaussians(3, 1))
     version = SplatField(wanted, levels=levels_of(wanted, 0.5))
-    archive = delta_of(base, version).archive()
-    name = data.draw(st.sampled_from(sorted(archive.arrays)))
-    numbers = archive.metadata["encoding"]["streams"][name]
-    stream = archive.arrays[name].copy()
-    stream[data.draw(st.integers(0, len(stream) - 1))] ^= data.draw(st.integers(0, 255))
-    lowest = [data.draw(st.integers(-(2**24), 2**24)) for _ in numbers["lowest"]]
-    streams = {**archive.metadata["encoding"]["streams"], name: {**numbers, "lowest": lowest}}
-    encoding = {**archive.metadata["encoding"], "streams": streams}
-    harmful = Archive(
-        archive.kind,
-        {**archive.metadata, "encoding": encoding},
-        {**archive.arrays, name: stream},
-    )
+    harmful = harmed(delta_of(base, version).archive(), data)
     try:
         field = decode_field(encode_archive(harmful), open_base=lambda _: base)
     except FieldFormatError:
