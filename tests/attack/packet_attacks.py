@@ -7,7 +7,7 @@ import os
 import random
 import signal
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -113,9 +113,14 @@ def decoders(pid: int) -> set[int]:
 
 def was_given(pid: int, slice_: bytes) -> bool:
     """Whether a decoder process was given a slice to decode (``mec_server.decoding.protocol``)."""
-    with suppress(OSError):  # it has ended
+    return any(slice_ in memory for memory in _shared_memory(pid))
+
+
+def _shared_memory(pid: int) -> Iterator[bytes]:
+    """Yield what stands in the memory that a decoder process shares with its server."""
+    with suppress(OSError):  # the process has ended
         for descriptor in Path(f"/proc/{pid}/fd").iterdir():
-            if str(descriptor.readlink()).startswith(f"/memfd:{DECODER_NAME}"):
-                with descriptor.open("rb") as memory:
-                    return slice_ in memory.read(SEARCHED_BYTES)
-    return False
+            with suppress(OSError):  # the process has closed that one since
+                if str(descriptor.readlink()).startswith(f"/memfd:{DECODER_NAME}"):
+                    with descriptor.open("rb") as memory:
+                        yield memory.read(SEARCHED_BYTES)
