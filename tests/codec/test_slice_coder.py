@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, cast
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -20,7 +21,13 @@ from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.codec.h264.header import StreamHeader, own_header
 from rfcore.codec.h264.parameter_sets import NAL_IDR, NAL_P, nal_type
-from rfcore.codec.h264.slice_coder import Effort, MacroblockMode, OwnSlice, SliceCoder
+from rfcore.codec.h264.slice_coder import (
+    LAMBDA_FACTOR,
+    Effort,
+    MacroblockMode,
+    OwnSlice,
+    SliceCoder,
+)
 from rfcore.codec.h264.slices import encode_slice
 from rfcore.codec.h264.splice import SpliceDecoder, grey
 from rfcore.errors import BackendUnavailable, InvalidInput
@@ -270,7 +277,7 @@ def test_any_number_of_threads_writes_the_same_bytes(effort: Effort, threads: in
 GOLDEN = {
     (Effort.FAST, 3, 22): "48a3b66945a18a60",
     (Effort.DEFAULT, 3, 22): "ab3a65d333422ac7",
-    (Effort.THOROUGH, 3, 22): "9a1633a313791995",
+    (Effort.THOROUGH, 3, 22): "a3bfc1658934340c",
     (Effort.DEFAULT, 1, 34): "676182d9fa7f965d",
     (Effort.DEFAULT, 0, 30): "2aa480f2cbe0f6ae",
     (Effort.DEFAULT, 4, 26): "a503a289d27ae68b",
@@ -318,10 +325,12 @@ def test_slices_keep_their_bytes(effort: Effort, references: int, qp: int) -> No
 
 
 def ramp(size: Size, lifted: int) -> I420:
-    """Brighter by 1 from row to row: a vertical shift of so many rows, that every step of a search
-    comes nearer to."""
+    """Brighter by 1 from row to row, with a pattern: a vertical shift of so many rows, that every
+    step of a search comes nearer to, and that nothing else is as good as."""
     width, height = size
-    rows = np.repeat(60 + lifted + np.arange(height)[:, None], width, 1).astype(np.uint8)
+    pattern = np.random.default_rng(5).integers(-4, 5, (height + 72, width))
+    rows = 60 + lifted + np.arange(height)[:, None] + pattern[lifted : lifted + height]
+    rows = rows.astype(np.uint8)
     half = np.ascontiguousarray(rows[::2, ::2])
     return I420(rows, half, half)
 
@@ -364,6 +373,35 @@ def test_vectors_stay_within_the_levels_vertical_range(
     assert least <= vectors.min() <= vectors.max() <= most
     farthest = int(np.abs(vectors).max())
     assert farthest > 250 if level_idc == 10 else farthest == 4 * 72
+
+
+def cost_of_moved(effort: Effort, qp: int) -> float:
+    """D + lambda R of the luma of three frames against noisy pictures moved by parts of samples."""
+    size, total = (160, 96), 0.0
+    rng = np.random.default_rng(6)
+    fine = cv2.GaussianBlur(rng.uniform(0, 255, (4 * 112, 4 * 176)).astype(np.float32), (0, 0), 6)
+    fine = 128 + 6 * (fine - fine.mean())
+
+    def seen(x: int, y: int) -> I420:
+        """The scene from a quarter of a sample further right or down for each of x and y."""
+        luma = fine[y : y + 4 * 96 : 4, x : x + 4 * 160 : 4] + rng.normal(0, 2, (96, 160))
+        return I420(luma.clip(1, 255).astype(np.uint8), *halves_of_grey)
+
+    halves_of_grey = (np.full((48, 80), 128, np.uint8), np.full((48, 80), 128, np.uint8))
+    coder = SliceCoder(own_header(CodecConfig(*size)))
+    for move in (3, 6, 11):
+        frame = seen(move, move // 2)
+        coded = coder.encode(frame, [seen(0, 5), seen(4, 0)], qp, effort=effort)
+        error = coded.reconstruction.y.astype(np.float64) - frame.y
+        bits = 8 * len(coded.payload)
+        total += float((error**2).sum()) + LAMBDA_FACTOR * 2 ** ((qp - 12) / 3) * bits
+    return total
+
+
+@pytest.mark.parametrize("qp", [20, 24, 28])
+def test_more_effort_finds_what_costs_less(qp: int) -> None:
+    fast, default, thorough = (cost_of_moved(effort, qp) for effort in Effort)
+    assert thorough < default < fast
 
 
 @pytest.mark.parametrize("qp", [-1, 61])

@@ -31,7 +31,7 @@ public:
 
     nb::bytes encode(const Planes& frame, const std::vector<Planes>& references, int slice_qp,
                      Quantisers qp, Quantisers forced, Weights lambda_q8, Weights motion_q8,
-                     const std::array<int, 6>& effort, bool deblocked, int vertical_reach,
+                     const std::array<int, 7>& effort, bool deblocked, int vertical_reach,
                      const std::array<OutPlane, 3>& out, OutModes modes) {
         if (references.size() > h264::kMaxReferences || lambda_q8.shape(0) != 52 ||
             motion_q8.shape(0) != 52 ||
@@ -48,7 +48,7 @@ public:
         std::copy_n(lambda_q8.data(), 52, settings.lambda_q8);
         std::copy_n(motion_q8.data(), 52, settings.motion_q8);
         settings.effort = {effort[0], effort[1], effort[2], effort[3], effort[4],
-                           effort[5]};
+                           effort[5], effort[6]};
         settings.deblocked = deblocked;
         settings.forced = forced.data();
         settings.vertical_reach = vertical_reach;

@@ -40,7 +40,10 @@ public:
         best_ = nullptr;
         forced_ = static_cast<Mode>(job_.forced[my * job_.width_mb + mx]);
         if (forced_ != kModePcm) {
-            if (job_.reference_count > 0) try_inter();
+            if (job_.reference_count > 0) {
+                try_inter();
+                refine_by_cost();
+            }
             if (best_ == nullptr || forced_ >= kModeIntra16 || wants_intra()) try_intra();
         }
         if (best_ == nullptr || (free() && quality_.cost(0, kPcmBits) < best_->cost)) {
@@ -155,22 +158,32 @@ private:
         }
     }
 
-    // Completes an inter candidate whose shape, references, vectors and differences are set.
-    void finish_inter(Candidate& c) {
+    // Completes an inter candidate whose shape, references, vectors and differences are set;
+    // `smaller`: whether with 4x4 transforms, too.
+    void finish_inter(Candidate& c, bool smaller = true) {
         alignas(32) uint8_t luma[256], chroma[2][64];
         predict(c.mb, luma, chroma);
         code_chroma(quality_, &source_[1], chroma, c);
-        const LumaCosts costs = code_luma8(quality_, source_[0], luma, c);
-        weigh(c);
-        if (c.mb.cbp_luma == 0) return;
+        const Cost most = most_for_luma(c);
+        if (most <= 0) return;
+        LumaCosts costs;
+        const bool whole = code_luma8(quality_, source_[0], luma, most, c, costs);
+        if (whole) weigh(c);
+        if (!smaller || (whole && c.mb.cbp_luma == 0)) return;
         Candidate& other = scratch_;
         other = c;
-        if (!code_luma4(quality_, source_[0], luma, costs, other)) return;
+        if (!code_luma4(quality_, source_[0], luma, costs, most, other)) return;
         weigh(other);
         if (best_ == &other) {
             c = other;
             best_ = &c;
         }
+    }
+
+    // What the luma of a candidate may cost, so that all of it may still be the least.
+    Cost most_for_luma(const Candidate& c) const {
+        if (best_ == nullptr) return kWorst;
+        return best_->cost - quality_.cost(c.chroma_error, c.chroma_bits);
     }
 
     void set_partition(Coded& mb, const Partition& part, int index, Mv mv, Mv predicted) {
@@ -306,15 +319,67 @@ private:
             whole[r] = refined(search_of(r, 0, kPartitions[0][0]), r, whole[r]);
         }
         order(best, second);
-        const Mv predicted = predicted_vector(field_, 0, kPartitions[0][0], best);
         inter_cost_ = whole[best].cost;
-        Candidate& c = spare();
-        start(c, Kind::kInter);
-        set_partition(c.mb, kPartitions[0][0], best, whole[best].mv, predicted);
-        finish_inter(c);
+        code_whole(best, whole[best].mv);
+        if (job_.effort.cost_rounds > 0) {
+            const Mv predicted = predicted_vector(field_, 0, kPartitions[0][0], best);
+            const bool differs = !(whole[best].mv == predicted);
+            if (differs && range_.holds(predicted)) code_whole(best, predicted);
+            if (second != best) code_whole(second, whole[second].mv);
+        }
         if (free() && best_->mb.kind == Kind::kInter && best_->mb.cbp_luma == 0) return;
         if (free() && inter_cost_ < kWholeBits * motion_q8_) return;
         try_parts(whole);
+    }
+
+    // The macroblock as one partition.
+    void code_whole(int index, Mv mv) {
+        const Partition& all = kPartitions[0][0];
+        Candidate& c = spare();
+        start(c, Kind::kInter);
+        set_partition(c.mb, all, index, mv, predicted_vector(field_, 0, all, index));
+        finish_inter(c);
+    }
+
+    // Moves the best candidate's vectors by a quarter sample, one at a time, while its cost falls.
+    void refine_by_cost() {
+        for (int round = 0; round < job_.effort.cost_rounds; ++round) {
+            if (best_->mb.kind != Kind::kInter) return;
+            const Cost before = best_->cost;
+            for (int p = 0; p < kPartitionCount[best_->mb.shape]; ++p) code_around(p);
+            if (best_->cost == before) return;
+        }
+    }
+
+    // The best candidate with the vector of partition `p` moved in each of four directions.
+    void code_around(int p) {
+        Coded from;
+        __builtin_memcpy(&from, &best_->mb, offsetof(Coded, luma));
+        const Mv centre = from.mv[kPartitions[from.shape][p].block];
+        const bool smaller = from.cbp_luma != 0 && !from.transform8;
+        for (int i = 0; i < 4; ++i) {
+            const Mv mv = Search::neighbour(centre, 1, i);
+            if (!range_.holds(mv)) continue;
+            Candidate& c = spare();
+            start(c, Kind::kInter);
+            move_partition(from, p, mv, c.mb);
+            finish_inter(c, smaller);
+        }
+    }
+
+    // The partitions of `from` with another vector for number `moved`; those after it may be
+    // predicted from that.
+    void move_partition(const Coded& from, int moved, Mv mv, Coded& out) {
+        out.shape = from.shape;
+        field_.forget();
+        for (int p = 0; p < kPartitionCount[from.shape]; ++p) {
+            const Partition& part = kPartitions[from.shape][p];
+            const int index = from.reference[part.block];
+            const Mv vector = p == moved ? mv : from.mv[part.block];
+            const Mv predicted = predicted_vector(field_, from.shape, part, index);
+            set_partition(out, part, index, vector, predicted);
+            field_.fill(part, static_cast<int8_t>(index), vector);
+        }
     }
 
     // Four 8x8 blocks, then the halves that agree with them; the cheapest of these are coded.
@@ -511,7 +576,7 @@ private:
         c.mb.cbp_luma = 0;
         c.mb.coded &= ~0x1FFFFu;
         c.luma_bits = c.luma_error = 0;
-        const Cost most = best_->cost - quality_.cost(c.chroma_error, c.chroma_bits);
+        const Cost most = most_for_luma(c);
         begin_canvas();
         for (int i = 0; i < kAcross * kAcross; ++i) {
             const int raster = kRasterOfBlk[i * (side == 8 ? 4 : 1)];

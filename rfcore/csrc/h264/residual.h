@@ -109,10 +109,11 @@ inline uint32_t code_block4(const Quality& quality, int flag_context, const uint
     return block.bits;
 }
 
-// Inter luma with 8x8 transforms. `prediction` and the candidate's luma have stride 16.
-inline LumaCosts code_luma8(const Quality& quality, const Plane& source, const uint8_t* prediction,
-                            Candidate& c) {
-    LumaCosts costs;
+// Inter luma with 8x8 transforms; gives up and returns false where it costs more than `most`.
+// `prediction` and the candidate's luma have stride 16.
+inline bool code_luma8(const Quality& quality, const Plane& source, const uint8_t* prediction,
+                       Cost most, Candidate& c, LumaCosts& costs) {
+    for (Cost& cost : costs.after) cost = kWorst;
     c.mb.transform8 = true;
     c.mb.cbp_luma = 0;
     c.mb.coded &= ~0xFFFFu;
@@ -129,14 +130,15 @@ inline LumaCosts code_luma8(const Quality& quality, const Plane& source, const u
             c.mb.cbp_luma |= static_cast<uint8_t>(1 << b);
             c.mb.coded |= 0x33u << (2 * (b & 1) + 8 * (b >> 1));
         }
+        if (costs.after[b] > most) return false;
     }
     if (c.mb.cbp_luma == 0) c.mb.transform8 = false;
-    return costs;
+    return true;
 }
 
-// The same with 4x4 transforms; gives up and returns false where it falls behind the `rival`.
+// The same with 4x4 transforms; gives up, too, where it falls behind the `rival`.
 inline bool code_luma4(const Quality& quality, const Plane& source, const uint8_t* prediction,
-                       const LumaCosts& rival, Candidate& c) {
+                       const LumaCosts& rival, Cost most, Candidate& c) {
     c.mb.transform8 = false;
     c.mb.cbp_luma = 0;
     c.mb.coded &= ~0xFFFFu;
@@ -156,8 +158,9 @@ inline bool code_luma4(const Quality& quality, const Plane& source, const uint8_
             c.mb.coded |= 1u << raster;
         }
         if (blk % 4 == 3) {
-            const Cost most = rival.after[blk / 4] + rival.after[blk / 4] / kPatience;
-            if (quality.cost(c.luma_error, c.luma_bits) > most) return false;
+            const Cost behind = rival.after[blk / 4] + rival.after[blk / 4] / kPatience;
+            const Cost least = quality.cost(c.luma_error, c.luma_bits);
+            if (least > behind || least > most) return false;
         }
     }
     return true;

@@ -73,6 +73,9 @@ struct Effort {
                            // the whole; 0: always
     int shapes_reach;      // partitions are coded, too, that cost at most this many percent of the
                            // cheapest; at least 100
+    int cost_rounds;       // in which vectors are moved by a quarter sample, each time coding the
+                           // macroblock; with any, 16x16 is coded with the predicted vector and
+                           // with the second best reference, too
 };
 
 struct SliceJob {
