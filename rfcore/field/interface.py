@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,6 +118,14 @@ class Renderer(Protocol):
         """Return colour, depth and opacity as ``camera`` sees them."""
 
 
+@runtime_checkable
+class CodecPictureRenderer(Protocol):
+    """A renderer that makes the codec's picture itself, sooner than from the colours."""
+
+    def field_view(self, camera: Camera, quality: Quality) -> FieldView:
+        """Return what ``field_view_from_view`` makes of ``Renderer.render``."""
+
+
 class RadianceField(Protocol):
     """A radiance field with all that is known about it."""
 
@@ -168,6 +176,8 @@ def render_field_view(renderer: Renderer, camera: Camera, quality: Quality = FUL
 
     A sender passes the camera it announces: ``Camera.rounded``.
     """
+    if isinstance(renderer, CodecPictureRenderer):
+        return renderer.field_view(camera, quality)
     return field_view_from_view(renderer.render(camera, quality), camera)
 
 

@@ -29,9 +29,10 @@ from rfcore.field.quality import (
 from rfcore.field.scale import colour_at_scale, view_at_scale
 from rfcore.field.splat_archive import compressed_archive, splat_archive, splats_of_compressed
 from rfcore.field.splat_grid import FINEST, Grain, Steps
+from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer, check_renderer
-from rfcore.views import View
+from rfcore.views import FieldView, View
 
 __all__ = ["SplatField"]
 
@@ -182,6 +183,13 @@ class SplatField:
 
     def _view(self, camera: Camera, quality: Quality) -> View:
         return self.rasterizer(quality.detail).render(camera, sh_degree=self._degree(quality))
+
+    def field_view(self, camera: Camera, quality: Quality = FULL) -> FieldView:
+        """Render what a codec's end holds; with a device, the codec's picture is made there."""
+        if quality.scale != 1:
+            return field_view_from_view(self.render(camera, quality), camera)
+        rasterizer = self.rasterizer(quality.detail)
+        return rasterizer.field_view(camera, sh_degree=self._degree(quality))
 
     def render_colour(self, camera: Camera, quality: Quality = FULL) -> NDArray[np.float32]:
         """Render colour alone, float32 [H, W, 3]: the bytes of ``render``, sooner."""

@@ -12,6 +12,7 @@ shorter than 1e-12 counts as no rotation.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from threading import Lock
@@ -22,11 +23,13 @@ import structlog
 
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
+from rfcore.image import I420
 from rfcore.native import _native
 from rfcore.native.backend import FLOAT32_MAX, check_backend
+from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.renderers import DEVICES, is_opencl
-from rfcore.views import View
+from rfcore.views import FieldView, View
 
 if TYPE_CHECKING:
     from rfcore.raster.opencl import DeviceRasterizer
@@ -173,6 +176,24 @@ class Rasterizer:
         self._draw(camera, sh_degree, colour)
         return colour
 
+    def field_view(self, camera: Camera, *, sh_degree: int | None = None) -> FieldView:
+        """Render what a codec's end holds: ``render``, with the colours as a codec picture.
+
+        A device makes that picture itself, and the colours stay there.
+        """
+        k = camera.intrinsics
+        shape, half = (k.height_px, k.width_px), (-(-k.height_px // 2), -(-k.width_px // 2))
+        picture = I420(*(np.empty(side, np.uint8) for side in (shape, half, half)))
+        depth, opacity = (np.empty(shape, np.float32) for _ in range(2))
+        degree = bands_to_use(sh_degree, self.sh_degree)
+        native_camera(camera)  # raises for what the kernels do not take
+        with overlaps_limited():
+            if self._drawn_by_device(
+                lambda device: device.draw_codec_picture(camera, degree, picture, depth, opacity)
+            ):
+                return FieldView(camera, picture, depth, opacity)
+        return field_view_from_view(self.render(camera, sh_degree=sh_degree), camera)
+
     def statistics(self, camera: Camera) -> RasterStatistics:
         """Count what rendering this view takes on the CPU; slower than rendering it."""
         seen_from = native_camera(camera)
@@ -191,16 +212,17 @@ class Rasterizer:
     ) -> None:
         seen_from, degree = native_camera(camera), bands_to_use(sh_degree, self.sh_degree)
         with overlaps_limited():
-            if self._drawn_by_device(camera, degree, colour, depth, opacity):
+            if self._drawn_by_device(
+                lambda device: device.draw(camera, degree, colour, depth, opacity)
+            ):
                 return
             if depth is None or opacity is None:
                 self._on_cpu().render_colour(seen_from, degree, colour)
             else:
                 self._on_cpu().render(seen_from, degree, colour, depth, opacity)
 
-    def _drawn_by_device(
-        self, camera: Camera, degree: int, colour: F32, depth: F32 | None, opacity: F32 | None
-    ) -> bool:
+    def _drawn_by_device(self, draw: Callable[[DeviceRasterizer], None]) -> bool:
+        """Have the device draw; False where there is none, or it cannot."""
         if self._device is None:
             return False
         from rfcore.raster.opencl import DeviceFull, DeviceLost
@@ -209,7 +231,7 @@ class Rasterizer:
             if self._device is None:  # lost while another picture was drawn
                 return False
             try:
-                self._device.draw(camera, degree, colour, depth, opacity)
+                draw(self._device)
             except DeviceFull as error:
                 DEVICES.add_full()
                 log.warning("opencl picture drawn by cpu", reason=str(error))

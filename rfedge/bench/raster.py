@@ -112,9 +112,9 @@ def _calls(
 ) -> dict[str, Callable[[], object]]:
     return {
         "device": lambda: device.render_colour(camera),
-        "device view": lambda: device.render(camera),
+        "device view": lambda: device.field_view(camera),
         "native": lambda: native.render_colour(camera),
-        "native view": lambda: native.render(camera),
+        "native view": lambda: native.field_view(camera),
     }
 
 
@@ -123,6 +123,8 @@ def _check_bytes(device: Rasterizer, native: Rasterizer, camera: Camera) -> None
     for name in ("colour", "depth", "opacity"):
         if getattr(got, name).tobytes() != getattr(want, name).tobytes():
             raise RfedgeError(f"the {name} of {device.isa} is not that of {native.isa}")
+    if device.field_view(camera).render.digest() != native.field_view(camera).render.digest():
+        raise RfedgeError(f"the codec's picture of {device.isa} is not that of {native.isa}")
 
 
 MODE_SIZES_PX = ((300, 168), (640, 360), (1920, 1080))

@@ -1,7 +1,7 @@
 """OpenCL draws the bytes of the native kernels, in every build, or is refused, or left in time."""
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -11,8 +11,10 @@ from structlog.testing import capture_logs
 from forward_isas import POCL, WORST_CASE
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import BackendUnavailable, InvalidInput
-from rfcore.field import FieldMetadata, Quality, SplatField
+from rfcore.field import FieldMetadata, Quality, SplatField, render_field_view
+from rfcore.image import I420
 from rfcore.native.backend import available_isas
+from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.raster.opencl import Device, DeviceRasterizer, open_device
@@ -23,13 +25,14 @@ from rfcore.raster.opencl.self_check import (
     OPERATIONS,
     Check,
     arithmetic_operands,
+    bytes_of,
     canonical,
     check_device,
     check_gaussians,
     digest,
 )
 from rfcore.raster.renderers import DEVICES
-from rfcore.views import View
+from rfcore.views import FieldView, View
 
 SceneMaker = Callable[..., Gaussians]
 CameraMaker = Callable[..., Camera]
@@ -142,6 +145,40 @@ def test_the_check_holds_devices_to_the_native_kernels(check: Check) -> None:
 
 
 @slow
+@pytest.mark.parametrize("isa", [POCL, GUARDED, WORST_CASE])
+@pytest.mark.parametrize("size_px", [(64, 48), (63, 47), (1, 1), (2, 5)])
+def test_a_device_makes_the_codecs_picture_of_what_it_draws(
+    isa: str, size_px: tuple[int, int], scene: SceneMaker
+) -> None:
+    width, height = size_px
+    camera = Camera(Intrinsics(width, height, 40.0, 40.0, width / 2, height / 2), Pose.identity())
+    gaussians = scene(500)
+    want = field_view_from_view(Rasterizer(gaussians).render(camera), camera)
+    half = (-(-height // 2), -(-width // 2))
+    picture = I420(*(np.zeros(side, np.uint8) for side in ((height, width), half, half)))
+    depth, opacity = (np.full((height, width), np.nan, F32) for _ in range(2))
+    drawn_by = DeviceRasterizer(opened(isa), gaussians, antialiased=False)
+    drawn_by.draw_codec_picture(camera, gaussians.sh_degree, picture, depth, opacity)
+    assert bytes_of(FieldView(camera, picture, depth, opacity)) == bytes_of(want)
+    assert want.kept_opacity.any()
+
+
+@slow
+def test_a_fields_view_is_the_same_from_a_device(scene: SceneMaker, camera: CameraMaker) -> None:
+    """Also while the device is lost, and at half the size, where the CPU makes the picture."""
+    fields = [SplatField(scene(2000), FieldMetadata(), isa=isa) for isa in (POCL, None)]
+    for quality in (Quality(), Quality(scale=0.5)):
+        views = [render_field_view(field, camera(), quality) for field in fields]
+        assert bytes_of(views[0]) == bytes_of(views[1])
+    device = fields[0].rasterizer(1.0)._device
+    assert device is not None
+    device._kernels["codec_picture"] = until_gone(device._kernels["codec_picture"], iter(()))
+    views = [render_field_view(field, camera()) for field in fields]
+    assert bytes_of(views[0]) == bytes_of(views[1])
+    assert fields[0].rasterizer(1.0).isa == available_isas()[0]
+
+
+@slow
 def test_an_opened_device_is_named_with_its_driver(scene: SceneMaker) -> None:
     Rasterizer(scene(3), isa=POCL)
     assert "PoCL" in open_device("Portable").description
@@ -172,7 +209,6 @@ def test_a_device_removed_in_a_picture_costs_no_picture(
     scene: SceneMaker, camera: CameraMaker, call: int
 ) -> None:
     """The device is gone from the ``call``-th command on; a picture has about 60."""
-    import pyopencl as cl
 
     gaussians = scene(3000)
     want = view_bytes(Rasterizer(gaussians).render(camera()))
@@ -182,7 +218,7 @@ def test_a_device_removed_in_a_picture_costs_no_picture(
     device = rasterizer._device
     assert device is not None
     for name, kernel in list(device._kernels.items()):
-        device._kernels[name] = until_gone(kernel, left, cl)
+        device._kernels[name] = until_gone(kernel, left)
     lost = DEVICES.lost
     with capture_logs() as logs:
         assert view_bytes(rasterizer.render(camera())) == want
@@ -192,7 +228,9 @@ def test_a_device_removed_in_a_picture_costs_no_picture(
     assert rasterizer.isa == available_isas()[0]
 
 
-def until_gone(kernel: Callable[..., object], left: object, cl: object) -> Callable[..., object]:
+def until_gone(kernel: Callable[..., object], left: Iterator[int]) -> Callable[..., object]:
+    import pyopencl as cl
+
     def run(*arguments: object) -> object:
         if next(left, None) is None:
             raise cl.RuntimeError("clEnqueueNDRangeKernel failed: DEVICE_NOT_AVAILABLE")

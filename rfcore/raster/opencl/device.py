@@ -14,7 +14,7 @@ with needs("opencl"):
 
 __all__ = ["BUILDS", "Build", "Device", "DeviceFull", "DeviceLost", "build_device", "find_device"]
 
-SOURCES = ("arithmetic.cl", "project.cl", "tiles.cl", "sort.cl", "blend.cl")
+SOURCES = ("arithmetic.cl", "project.cl", "tiles.cl", "sort.cl", "blend.cl", "codec_picture.cl")
 
 
 class DeviceLost(Exception):

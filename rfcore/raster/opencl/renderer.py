@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rfcore.camera import Camera
 from rfcore.extras import needs
+from rfcore.image import I420
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.opencl.device import Device, DeviceFull, DeviceLost
 
@@ -100,16 +101,40 @@ class DeviceRasterizer:
         for what only this device cannot hold, and ``DeviceLost``. None of them leaves a picture.
         """
         with _lost_if_it_fails(self.device):
-            self._load(camera)
-            self._project(degree)
-            visible = self._gather()
-            self._place(visible, camera)
-            self._blend(camera)
-            memory, queue = self._memory, self._queue
-            for name, out in (("colour", colour), ("depth", depth), ("opacity", opacity)):
-                if out is not None:
-                    cl.enqueue_copy(queue, out, memory[name], is_blocking=False)
-            queue.finish()
+            self._draw(camera, degree)
+            self._fetch(("colour", colour), ("depth", depth), ("opacity", opacity))
+
+    def draw_codec_picture(
+        self, camera: Camera, degree: int, picture: I420, depth: F32, opacity: F32
+    ) -> None:
+        """Write what ``draw`` does, but of the colour the codec's picture: 9.5 bytes a pixel come
+        back instead of 20. Raises as ``draw`` does."""
+        k = camera.intrinsics
+        blocks = -(-k.width_px // 2) * -(-k.height_px // 2)
+        samples = np.empty(k.width_px * k.height_px + 2 * blocks, np.uint8)
+        with _lost_if_it_fails(self.device):
+            self._draw(camera, degree)
+            self._memory.at_least("picture", samples.nbytes)
+            names = ("camera", "colour", "picture")
+            self._run("codec_picture", blocks, *self._buffers(*names), ZERO)
+            self._fetch(("picture", samples), ("depth", depth), ("opacity", opacity))
+        planes = np.split(samples, (-2 * blocks, -blocks))
+        for plane, drawn in zip(picture.planes, planes, strict=True):
+            plane[:] = drawn.reshape(plane.shape)
+
+    def _draw(self, camera: Camera, degree: int) -> None:
+        self._load(camera)
+        self._project(degree)
+        visible = self._gather()
+        self._place(visible, camera)
+        self._blend(camera)
+
+    def _fetch(self, *wanted: tuple[str, NDArray[Any] | None]) -> None:
+        """Copy buffers to where they are wanted, and wait for all of it."""
+        for name, out in wanted:
+            if out is not None:
+                cl.enqueue_copy(self._queue, out, self._memory[name], is_blocking=False)
+        self._queue.finish()
 
     def _load(self, camera: Camera) -> None:
         cl.enqueue_copy(self._queue, self._memory["camera"], camera_on_device(camera))

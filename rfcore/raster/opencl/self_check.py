@@ -21,11 +21,13 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import BackendUnavailable
 from rfcore.extras import needs
+from rfcore.image import I420
+from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.opencl.device import BUILDS, Device, DeviceLost, build_device, find_device
 from rfcore.raster.opencl.renderer import SIDE, DeviceRasterizer
 from rfcore.raster.renderers import DEVICES
-from rfcore.views import View
+from rfcore.views import FieldView, View
 
 __all__ = ["open_device"]
 
@@ -135,6 +137,12 @@ def digest(*arrays: NDArray[np.float32]) -> str:
     return hashlib.blake2b(b"".join(a.tobytes() for a in arrays), digest_size=8).hexdigest()
 
 
+def bytes_of(view: FieldView) -> bytes:
+    """Return all that a codec's end holds of a picture, which is drawn with its opacity."""
+    arrays = (*view.render.planes, view.depth, view.kept_opacity)
+    return b"".join(array.tobytes() for array in arrays)
+
+
 def arithmetic_on(device: Device) -> F32:
     """Return what the device makes of the operands [6, PATTERNS], canonical."""
     queue, flags = cl.CommandQueue(device.context), cl.mem_flags
@@ -157,14 +165,17 @@ class Check:
         self.camera, self.degree, self.antialiased = _camera(*size_px), degree, antialiased
         self.want = want
 
-    def on(self, device: Device, gaussians: Gaussians) -> View:
-        """Return the picture that the device draws."""
+    def on(self, device: Device, gaussians: Gaussians) -> tuple[View, FieldView]:
+        """Return the picture that the device draws, and the codec's that it makes of it."""
         k = self.camera.intrinsics
-        shape = (k.height_px, k.width_px)
+        shape, half = (k.height_px, k.width_px), (-(-k.height_px // 2), -(-k.width_px // 2))
         view = View(*(np.empty(s, np.float32) for s in ((*shape, 3), shape, shape)))
         drawn_by = DeviceRasterizer(device, gaussians, antialiased=self.antialiased)
         drawn_by.draw(self.camera, self.degree, view.colour, view.depth, view.opacity)
-        return view
+        picture = I420(*(np.empty(side, np.uint8) for side in (shape, half, half)))
+        depth, opacity = np.empty_like(view.depth), np.empty_like(view.opacity)
+        drawn_by.draw_codec_picture(self.camera, self.degree, picture, depth, opacity)
+        return view, FieldView(self.camera, picture, depth, opacity)
 
 
 def _camera(width_px: int, height_px: int) -> Camera:
@@ -219,12 +230,17 @@ def check_device(device: Device) -> None:
                 raise BackendUnavailable(f"{device.description}: a {name} is not the IEEE result")
         gaussians = check_gaussians()
         for check in CHECKS:
-            view = check.on(device, gaussians)
+            view, held = check.on(device, gaussians)
+            k = check.camera.intrinsics
             if digest(view.colour, view.depth, view.opacity) != check.want:
-                k = check.camera.intrinsics
                 raise BackendUnavailable(
                     f"{device.description}: its picture of {k.width_px}x{k.height_px} pixels with "
                     f"bands up to {check.degree} is not that of the native kernels"
+                )
+            if bytes_of(held) != bytes_of(field_view_from_view(view, check.camera)):
+                raise BackendUnavailable(
+                    f"{device.description}: its codec picture of {k.width_px}x{k.height_px} pixels "
+                    "is not that of the native kernels"
                 )
     except (DeviceLost, cl.Error) as error:
         raise BackendUnavailable(f"{device.description}: {error}") from error
