@@ -231,7 +231,7 @@ class SliceCoder:
         forced: NDArray[np.int8],
         lambda_q8: NDArray[np.uint32],
         motion_q8: NDArray[np.uint32],
-        effort: tuple[int, int, int, int, int, int],
+        effort: tuple[int, int, int, int, int, int, int],
         deblocked: bool,
         vertical_reach: int,
         out: tuple[_U8, _U8, _U8],
