@@ -24,7 +24,7 @@ from rfcore.errors import DatasetError, FieldFormatError, InvalidData
 from rfcore.field import SplatField, load_field, save_field
 from rfcore.field.store import encode_field
 from rfcore.files import write_whole
-from rfcore.train import DensityControl, SplatTrainingConfig
+from rfcore.train import Bands, DensityControl, SplatTrainingConfig
 from rfcore.train.levels import LevelFitConfig
 from rfedge.results import Provenance, make_result, provenance, write_result
 from rfedge.samples import sample_path
@@ -116,6 +116,8 @@ class MakeSampleField:
     """Density control: let the set grow to so many Gaussians."""
     antialiased: bool = False
     """Draw splats smaller than a pixel fainter; the field says so."""
+    sh_degree: int | None = None
+    """Bands of the colour's dependence on direction, 0..3; default: the trainer's own."""
     max_mb: float | None = None
     """Write the best field of at most so many MB (10^6 bytes)."""
 
@@ -134,12 +136,15 @@ class MakeSampleField:
         threads = len(os.sched_getaffinity(0))
         config = training_config(self.gaussians, self.iterations, threads)
         config = replace(config, antialiased=self.antialiased)
+        if self.sh_degree is not None:
+            config = replace(config, bands=Bands(degree=self.sh_degree))
         if self.limit is None:
             return config
         return replace(config, density=DensityControl(limit=self.limit))
 
     def _command(self) -> str:
-        given = {n: getattr(self, n) for n in ("gaussians", "iterations", "limit", "max_mb")}
+        names = ("gaussians", "iterations", "limit", "sh_degree", "max_mb")
+        given = {name: getattr(self, name) for name in names}
         options = " ".join(
             f"--{n.replace('_', '-')} {v}" for n, v in given.items() if v is not None
         )
