@@ -133,16 +133,13 @@ def test_a_field_too_large_to_ship_is_not_left_there(
 def test_making_the_sample_field_writes_what_the_demo_takes(
     tiny_sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = ["--iterations", "3", "--gaussians", "100", "--limit", "120", "--max-mb", "0.02"]
-    options += ["--sh-degree", "1"]
-    monkeypatch.setattr("sys.argv", ["sample-field", str(tiny_sample), *options])
+    options = "--gaussians 100 --iterations 3 --limit 120 --sh-degree 1 --max-mb 0.02"
+    monkeypatch.setattr("sys.argv", ["sample-field", str(tiny_sample), *options.split()])
     assert make_sample_field.main() == 0
     path = chosen(tiny_sample, tmp_path / "c", SplatTrainingConfig())
     assert path == sample_field_path(tiny_sample)
     record = json.loads(path.with_suffix(".json").read_text())
-    assert record["command"] == (
-        'make sample-field ARGS="--gaussians 100 --iterations 3 --limit 120 --sh-degree 1 --max-mb 0.02"'
-    )
+    assert record["command"] == f'make sample-field ARGS="{options}"'
     field = load_field(path)
     assert isinstance(field, SplatField)
     assert field.gaussians.sh_degree == 1
