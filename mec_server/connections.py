@@ -3,12 +3,12 @@
 gRPC limits connections in total and the time of a handshake. It knows no limit by address, and of
 what happens below a call (pings, settings, headers without end, calls that are reset, headers that
 are named ten thousand times) it tells nobody; by the time a call is seen its headers are in memory.
-So the sockets of this process are looked at a few times a second, and shut down where
+So the sockets of this process are looked at many times a second, and shut down where
 
 * one address has too many of them, or one identity;
 * more bytes came in than became messages (``explain``): what a peer sends beyond that it sends to
-  keep the server busy. A call that its budget refused counts as some of these bytes, and where
-  that alone is too much, nothing waits for the next look;
+  keep the server busy. Before a call was seen, little is too much. A call that its budget refused
+  counts as some of these bytes, and where that alone is too much, nothing waits for the next look;
 * a call's headers are larger than any client's (``offend``).
 
 Who did one of these but the first is *barred*: for some seconds the kernel drops what its address
@@ -52,6 +52,8 @@ MOST_HEADER_BYTES = 16_384
 UNEXPLAINED_BYTES = 4 << 20
 """What a connection may have sent that became no message: more than waits to be read of a rig of 18
 cameras, two large frames each, while the server is too busy to read."""
+UNCALLED_BYTES = 256 << 10
+"""The same of a connection on which no call was seen yet: a Hello has some kB."""
 UNEXPLAINED_BYTES_PER_S = 64 << 10
 """By so much that becomes less: acknowledgements, pings, headers, consumers' requests."""
 OVERHEAD = 1.1
@@ -112,6 +114,8 @@ class Account:
     inode: str
     received_bytes: int = 0
     unexplained_bytes: float = 0.0
+    is_called: bool = False
+    """Whether a call was seen on it."""
 
 
 @dataclass
@@ -255,6 +259,7 @@ class Connections:
         explained = 0.0
         if notes is not None:
             explained, notes.explained_bytes = notes.explained_bytes, 0.0
+            account.is_called = True
         allowed = UNEXPLAINED_BYTES_PER_S * passed_s
         left = account.unexplained_bytes + came - explained - allowed
         account.received_bytes = connection.received_bytes
@@ -264,7 +269,8 @@ class Connections:
         return {
             peer: Limit.CONNECTION_BYTES
             for peer, account in self._accounts.items()
-            if account.unexplained_bytes > UNEXPLAINED_BYTES
+            if account.unexplained_bytes
+            > (UNEXPLAINED_BYTES if account.is_called else UNCALLED_BYTES)
         }
 
     def _too_many(self, found: dict[str, Connection]) -> dict[str, Limit]:

@@ -87,8 +87,10 @@ longer good."""
 NOTICES_EVERY_S = 0.05
 """How soon it is noticed that a vehicle takes notices."""
 
-CONNECTIONS_EVERY_S = 0.25
-"""How often connections are counted by address."""
+CONNECTIONS_EVERY_S = 0.05
+"""How often connections are counted by address, unless that takes long: they are left alone for
+``CONNECTIONS_REST`` times as long as it took."""
+CONNECTIONS_REST = 20
 
 NATS_AGAIN_S = 0.1
 """How soon publishing begins, and begins anew after an unexpected exception."""
@@ -471,7 +473,9 @@ class EdgeServer:
     def _follow_connections(self) -> None:
         async def sweep() -> None:
             now = time.monotonic()
-            for cut in await asyncio.to_thread(self._connections.sweep, now):
+            cuts = await asyncio.to_thread(self._connections.sweep, now)
+            took_s = time.monotonic() - now
+            for cut in cuts:
                 limit = cut.limit
                 self._metrics.count_limited(limit, cut.count)
                 lines = PeerLog(log, self._log_limiter, cut.source, time.monotonic)
@@ -482,6 +486,7 @@ class EdgeServer:
                     reason=limit,
                     barred=cut.barred,
                 )
+            await asyncio.sleep(CONNECTIONS_REST * took_s)
 
         self._follow(sweep, CONNECTIONS_EVERY_S, BackgroundTask.CONNECTIONS)
 

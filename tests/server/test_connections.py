@@ -29,6 +29,7 @@ from mec_server.connections import (
     MOST_HEADER_BYTES,
     REFUSED_CALL_BYTES,
     SILENT_S,
+    UNCALLED_BYTES,
     UNEXPLAINED_BYTES,
     Connections,
     Cut,
@@ -163,7 +164,10 @@ def test_bytes_that_become_no_message_end_a_connection_and_messages_do_not(
 ) -> None:
     connections = watching(listener, 0, 0)
     pairs = Pairs(stack, listener, "127.0.0.1", 3)
+    connections.claim(pairs.peers[2], "sender")
     connections.sweep(0.0)
+    pairs.send(2, UNEXPLAINED_BYTES * 3 // 4)
+    assert not connections.sweep(0.1)
     for number in range(3):
         pairs.send(number, 2 * UNEXPLAINED_BYTES)
     connections.explain(pairs.peers[0], 2 * UNEXPLAINED_BYTES)
@@ -173,11 +177,27 @@ def test_bytes_that_become_no_message_end_a_connection_and_messages_do_not(
     assert [is_closed(near) for near in pairs.nears] == [False, False, True]
 
 
+def test_a_connection_without_a_call_is_ended_for_less(
+    listener: socket.socket, stack: ExitStack
+) -> None:
+    connections = watching(listener, 0, 0)
+    pairs = Pairs(stack, listener, "127.0.0.1", 3)
+    connections.claim(pairs.peers[0], "called")
+    connections.sweep(0.0)
+    pairs.send(0, 2 * UNCALLED_BYTES)
+    pairs.send(1, UNCALLED_BYTES * 3 // 4)
+    pairs.send(2, 2 * UNCALLED_BYTES)
+    (cut,) = connections.sweep(0.05)
+    assert (cut.limit, cut.count) == (Limit.CONNECTION_BYTES, 1)
+    assert [is_closed(near) for near in pairs.nears] == [False, False, True]
+
+
 def test_a_little_beside_the_messages_is_forgotten_with_time(
     listener: socket.socket, stack: ExitStack
 ) -> None:
     connections = watching(listener, 0, 0)
     pairs = Pairs(stack, listener, "127.0.0.1", 1)
+    connections.claim(pairs.peers[0], "sender")
     connections.sweep(0.0)
     for minute in range(1, 6):
         pairs.send(0, UNEXPLAINED_BYTES * 3 // 4)
