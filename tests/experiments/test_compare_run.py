@@ -173,6 +173,7 @@ def test_every_row_of_a_comparison_has_its_interval_around_its_figure(compared):
         assert low <= row["bd_rate_percent"] <= high
     assert {row["method"].rsplit("-", 2)[0] for row in result["rows"]} == {
         "rfedge",
+        "rfedge-thorough",
         "rfedge-render-only",
         "rfedge-without-field",
     }

@@ -169,12 +169,24 @@ def _working_folder_on_path() -> Iterator[None]:
 
 
 QUICK_FRAMES = 8
-METHODS: dict[str, References | None] = {
-    "rfedge": None,
-    "rfedge-render-only": RENDER_ONLY,
-    "rfedge-without-field": WITHOUT_FIELD,
+
+
+@dataclass(frozen=True)
+class Method:
+    """How ours codes a drive; ``None`` leaves references to the encoder, the effort to the job."""
+
+    references: References | None = None
+    effort: str | None = None
+
+
+METHODS = {
+    "rfedge": Method(),
+    "rfedge-thorough": Method(effort="thorough"),
+    "rfedge-render-only": Method(RENDER_ONLY),
+    "rfedge-without-field": Method(WITHOUT_FIELD),
 }
-"""Ours first, then what is left of it without a past, and without a field: what each is worth."""
+"""Ours first, then with about x264 medium's time for a slice, then what is left of it without a
+past, and without a field: what each is worth."""
 
 
 @dataclass(frozen=True)
@@ -308,13 +320,13 @@ def _drive_comparison(
     coders = [
         FieldCoder(
             rendered,
-            f"{name}-{job.effort}-{rendered.field_id[:12]}",
+            f"{name}-{method.effort or job.effort}-{rendered.field_id[:12]}",
             stamp,
-            effort=job.effort,
-            references=references,
+            effort=method.effort or job.effort,
+            references=method.references,
             foregrounds=() if behind is None else foregrounds,
         )
-        for name, references in METHODS.items()
+        for name, method in METHODS.items()
     ]
     rival = None
     if behind is not None:
