@@ -151,7 +151,7 @@ def compared(thumbnail, tmp_path_factory):
 def test_a_comparison_says_what_it_will_do_before_it_starts(compared):
     _, _, said = compared
     first = said.splitlines()[0]
-    assert first.startswith("BD-rates over 33..36 dB: 75 clips to code, about ")
+    assert first.startswith("BD-rates over 33..36 dB: 83 clips to code, about ")
     assert "Points are added where a curve does not span the window" in said
     assert re.search(r"rfedge-fast-\w+ also at 41", said)
 
