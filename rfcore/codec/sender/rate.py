@@ -41,8 +41,10 @@ __all__ = [
 
 
 CRF_STEP = 1.0
-LEAST_BITS = 200.0
-"""A slice in which every block is copied from reference 0: its header and a run of skips."""
+LEAST_BITS = 400.0
+"""A slice in which every block is copied from reference 0: its header and a run of skips, and what
+an estimate block by block does not see. With 200 the sample's drive with vehicles misses its
+targets by 5.4 % in the median instead of 4.5."""
 MEMORY = 0.5
 """Weight of what was known of the factor, when a frame was coded."""
 CLIMB_CRF = 2.0
