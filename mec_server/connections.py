@@ -117,6 +117,12 @@ class Account:
     is_called: bool = False
     """Whether a call was seen on it."""
 
+    @property
+    def is_too_dear(self) -> bool:
+        """Whether more came than may become no message."""
+        most_bytes = UNEXPLAINED_BYTES if self.is_called else UNCALLED_BYTES
+        return self.unexplained_bytes > most_bytes
+
 
 @dataclass
 class Notes:
@@ -269,8 +275,7 @@ class Connections:
         return {
             peer: Limit.CONNECTION_BYTES
             for peer, account in self._accounts.items()
-            if account.unexplained_bytes
-            > (UNEXPLAINED_BYTES if account.is_called else UNCALLED_BYTES)
+            if account.is_too_dear
         }
 
     def _too_many(self, found: dict[str, Connection]) -> dict[str, Limit]:

@@ -82,6 +82,13 @@ class I420:
         """(width, height)."""
         return (self.y.shape[1], self.y.shape[0])
 
+    @staticmethod
+    def empty(size_px: tuple[int, int]) -> I420:
+        """Return a picture of (width, height) whose samples are still to be written."""
+        width, height = size_px
+        half = ((height + 1) // 2, (width + 1) // 2)
+        return I420(*(np.empty(shape, np.uint8) for shape in ((height, width), half, half)))
+
     def packed(self) -> bytes:
         """Return the planes one after the other, each row by row without padding."""
         return b"".join(plane.tobytes() for plane in self.planes)

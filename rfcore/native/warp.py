@@ -138,7 +138,7 @@ def _carried(
     size_px = now.render.size_px
     if previous.size_px != size_px:
         raise InvalidInput("warp.previous", f"{previous.size_px} px of a camera of {size_px} px")
-    out = _blank_like(now.render)
+    out = I420.empty(now.render.size_px)
     _native.warp_i420(
         _dense(previous),
         np.ascontiguousarray(before.depth),
@@ -158,10 +158,6 @@ def _dense(picture: I420) -> tuple[Plane, Plane, Plane]:
     return y, u, v
 
 
-def _blank_like(picture: I420) -> I420:
-    return I420(*(np.empty(plane.shape, np.uint8) for plane in picture.planes))
-
-
 def relight_i420(seen: I420, seen_render: I420, render: I420) -> I420:
     """Return ``render`` under the light in which ``seen`` differs from ``seen_render``, its render.
 
@@ -171,7 +167,7 @@ def relight_i420(seen: I420, seen_render: I420, render: I420) -> I420:
     for name, picture in (("seen", seen), ("seen_render", seen_render)):
         if picture.size_px != size_px:
             raise InvalidInput(f"relight.{name}", f"{picture.size_px} px of a render of {size_px}")
-    out = _blank_like(render)
+    out = I420.empty(render.size_px)
     _native.relight_i420(_dense(seen), _dense(seen_render), _dense(render), *out.planes)
     return out
 
@@ -205,7 +201,7 @@ def apply_light(render: I420, changes: NDArray[np.int32]) -> I420:
     shape = light_shape(_check_relit(render))
     if changes.shape != shape or np.abs(changes).max() > MOST_CHANGE:
         raise InvalidInput("light", f"must be of shape {shape} and within 2**16")
-    out = _blank_like(render)
+    out = I420.empty(render.size_px)
     dense = np.ascontiguousarray(changes, np.int32)
     _native.apply_light(dense, _dense(render), *out.planes)
     return out

@@ -44,7 +44,7 @@ __all__ = ["field_view_from_view", "i420_from_colour", "i420_from_rgb", "rgb_fro
 def i420_from_rgb(rgb: Rgb) -> I420:
     """Convert uint8 [H, W, 3] to I420; raise ``InvalidInput`` for another shape or dtype."""
     _require_picture("rgb", rgb, np.uint8)
-    out = _empty_i420(rgb.shape[1], rgb.shape[0])
+    out = I420.empty((rgb.shape[1], rgb.shape[0]))
     _native.i420_from_rgb(np.ascontiguousarray(rgb), *out.planes)
     return out
 
@@ -57,7 +57,7 @@ def i420_from_colour(colour: NDArray[np.float32]) -> I420:
     infinity, saying how many.
     """
     _require_picture("colour", colour, np.float32)
-    out = _empty_i420(colour.shape[1], colour.shape[0])
+    out = I420.empty((colour.shape[1], colour.shape[0]))
     bad = _native.i420_from_colour(np.ascontiguousarray(colour), *out.planes)
     if bad:
         raise InvalidInput(
@@ -88,12 +88,3 @@ def _require_picture(name: str, array: NDArray[np.generic], dtype: type[np.gener
         raise InvalidInput(name, f"shape {array.shape} must be [H, W, 3] with H, W >= 1")
     if array.dtype != dtype:
         raise InvalidInput(name, f"dtype {array.dtype} must be {np.dtype(dtype)}")
-
-
-def _empty_i420(width_px: int, height_px: int) -> I420:
-    half = ((height_px + 1) // 2, (width_px + 1) // 2)
-    return I420(
-        np.empty((height_px, width_px), np.uint8),
-        np.empty(half, np.uint8),
-        np.empty(half, np.uint8),
-    )

@@ -181,17 +181,9 @@ class Rasterizer:
 
         A device makes that picture itself, and the colours stay there.
         """
-        k = camera.intrinsics
-        shape, half = (k.height_px, k.width_px), (-(-k.height_px // 2), -(-k.width_px // 2))
-        picture = I420(*(np.empty(side, np.uint8) for side in (shape, half, half)))
-        depth, opacity = (np.empty(shape, np.float32) for _ in range(2))
-        degree = bands_to_use(sh_degree, self.sh_degree)
-        native_camera(camera)  # raises for what the kernels do not take
-        with overlaps_limited():
-            if self._drawn_by_device(
-                lambda device: device.draw_codec_picture(camera, degree, picture, depth, opacity)
-            ):
-                return FieldView(camera, picture, depth, opacity)
+        made = None if self._device is None else self._view_of_device(camera, sh_degree)
+        if made is not None:
+            return made
         return field_view_from_view(self.render(camera, sh_degree=sh_degree), camera)
 
     def statistics(self, camera: Camera) -> RasterStatistics:
@@ -220,6 +212,18 @@ class Rasterizer:
                 self._on_cpu().render_colour(seen_from, degree, colour)
             else:
                 self._on_cpu().render(seen_from, degree, colour, depth, opacity)
+
+    def _view_of_device(self, camera: Camera, sh_degree: int | None) -> FieldView | None:
+        """Return what the device makes of the whole; None where it cannot."""
+        k, degree = camera.intrinsics, bands_to_use(sh_degree, self.sh_degree)
+        native_camera(camera)  # raises for what the kernels do not take
+        picture = I420.empty((k.width_px, k.height_px))
+        depth, opacity = (np.empty(picture.y.shape, np.float32) for _ in range(2))
+        with overlaps_limited():
+            is_drawn = self._drawn_by_device(
+                lambda device: device.draw_codec_picture(camera, degree, picture, depth, opacity)
+            )
+        return FieldView(camera, picture, depth, opacity) if is_drawn else None
 
     def _drawn_by_device(self, draw: Callable[[DeviceRasterizer], None]) -> bool:
         """Have the device draw; False where there is none, or it cannot."""

@@ -154,8 +154,7 @@ def test_a_device_makes_the_codecs_picture_of_what_it_draws(
     camera = Camera(Intrinsics(width, height, 40.0, 40.0, width / 2, height / 2), Pose.identity())
     gaussians = scene(500)
     want = field_view_from_view(Rasterizer(gaussians).render(camera), camera)
-    half = (-(-height // 2), -(-width // 2))
-    picture = I420(*(np.zeros(side, np.uint8) for side in ((height, width), half, half)))
+    picture = I420.empty(size_px)
     depth, opacity = (np.full((height, width), np.nan, F32) for _ in range(2))
     drawn_by = DeviceRasterizer(opened(isa), gaussians, antialiased=False)
     drawn_by.draw_codec_picture(camera, gaussians.sh_degree, picture, depth, opacity)
@@ -209,7 +208,6 @@ def test_a_device_removed_in_a_picture_costs_no_picture(
     scene: SceneMaker, camera: CameraMaker, call: int
 ) -> None:
     """The device is gone from the ``call``-th command on; a picture has about 60."""
-
     gaussians = scene(3000)
     want = view_bytes(Rasterizer(gaussians).render(camera()))
     rasterizer = Rasterizer(gaussians, isa=POCL)

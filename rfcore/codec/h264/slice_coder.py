@@ -53,8 +53,8 @@ class Effort(Enum):
 
     The default leaves out references that are 18 % behind: 10 % less time at 1280x720, 0.05 and
     0.19 % more bits at equal squared error (sample drives); 110 takes 0.26 %. The two rounds of
-    ``THOROUGH`` double its time and save 1.9 to 2.3 %; with one, the default would save 1.7 to
-    2.4 % and take half as much time again. Levels chosen along a trellis instead of one after the
+    ``THOROUGH`` nearly double its time and save 1.9 to 2.3 %; with one, the default would save 1.7
+    to 2.4 % and take half as much time again. Levels chosen along a trellis instead of one after the
     other saved 0.1 % more beside them, and are not built.
     """
 
@@ -148,7 +148,7 @@ class SliceCoder:
         for index, reference in enumerate(references):
             self._check_size(f"references[{index}]", reference)
         modes = np.empty(self._macroblocks, np.int8)
-        reconstruction = I420(*(np.empty(plane.shape, np.uint8) for plane in frame.planes))
+        reconstruction = I420.empty(frame.size_px)
         data = self._native.encode(
             frame.planes,
             [picture.planes for picture in reversed(references)],

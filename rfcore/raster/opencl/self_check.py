@@ -168,11 +168,11 @@ class Check:
     def on(self, device: Device, gaussians: Gaussians) -> tuple[View, FieldView]:
         """Return the picture that the device draws, and the codec's that it makes of it."""
         k = self.camera.intrinsics
-        shape, half = (k.height_px, k.width_px), (-(-k.height_px // 2), -(-k.width_px // 2))
+        shape = (k.height_px, k.width_px)
         view = View(*(np.empty(s, np.float32) for s in ((*shape, 3), shape, shape)))
         drawn_by = DeviceRasterizer(device, gaussians, antialiased=self.antialiased)
         drawn_by.draw(self.camera, self.degree, view.colour, view.depth, view.opacity)
-        picture = I420(*(np.empty(side, np.uint8) for side in (shape, half, half)))
+        picture = I420.empty(shape[::-1])
         depth, opacity = np.empty_like(view.depth), np.empty_like(view.opacity)
         drawn_by.draw_codec_picture(self.camera, self.degree, picture, depth, opacity)
         return view, FieldView(self.camera, picture, depth, opacity)

@@ -185,7 +185,7 @@ METHODS = {
     "rfedge-render-only": Method(RENDER_ONLY),
     "rfedge-without-field": Method(WITHOUT_FIELD),
 }
-"""Ours first, then with about x264 medium's time for a slice, then what is left of it without a
+"""Ours first, then with nearly x264 medium's time for a slice, then what is left of it without a
 past, and without a field: what each is worth."""
 
 
