@@ -54,8 +54,8 @@ class Effort(Enum):
     The default leaves out references that are 18 % behind: 10 % less time at 1280x720, 0.05 and
     0.19 % more bits at equal squared error (sample drives); 110 takes 0.26 %. The two rounds of
     ``THOROUGH`` nearly double its time and save 1.9 to 2.3 %; with one, the default would save 1.7
-    to 2.4 % and take half as much time again. Levels chosen along a trellis instead of one after the
-    other saved 0.1 % more beside them, and are not built.
+    to 2.4 % and take half as much time again. Levels chosen along a trellis instead of one after
+    the other saved 0.1 % more beside them, and are not built.
     """
 
     FAST = (8, 1, 100, 5, 101, 100, 0)
