@@ -2,7 +2,7 @@
 
 ``python -m rfedge.loadtest.fleet SPEC RESULT``: both are JSON. All vehicles connect before the
 first picture is due; their pictures are due at times spread evenly over a period, as those of
-vehicles that know nothing of each other.
+vehicles that know nothing of each other, or all at the same.
 """
 
 from __future__ import annotations
@@ -41,12 +41,13 @@ class FleetSpec:
     warm_up_s: float
     duration_s: float
     ready_s: float
+    together: bool
     drive: str
 
 
 @dataclass(frozen=True)
 class Departure:
-    """When the whole fleet starts: vehicle i a share i / N of a period later."""
+    """When the whole fleet starts: vehicle i a share i / N of a period later, unless together."""
 
     start_s: float
     vehicles: int
@@ -55,7 +56,8 @@ class Departure:
     def schedule(self, vehicle: int) -> Schedule:
         """Return the schedule of a vehicle."""
         spec = self.spec
-        start_s = self.start_s + vehicle / self.vehicles / spec.hz
+        later = 0.0 if spec.together else vehicle / self.vehicles / spec.hz
+        start_s = self.start_s + later
         end_s = start_s + spec.warm_up_s + spec.duration_s
         return Schedule(start_s, end_s, spec.hz, spec.ready_s)
 

@@ -1,6 +1,8 @@
 """A long run at half load: nothing may grow. ``python -m rfedge.loadtest.soak --minutes 30``
 
 Two prerecorded vehicles at 5 Hz put half the load on ``mec-server`` that it must hold on two cores.
+Their pictures are due together: every worker renders from the start, and has its scratch memory
+(40 MB) before it counts, instead of when two happen to meet.
 Its memory must grow by less than 1 MB a minute (least squares over the counted part), the least
 descriptors and processes it holds may not rise (what is leaked stays; a socket that lives for a
 moment is none), and no vehicle may lose its stream. Pools start a thread when all theirs are busy
@@ -17,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import tyro
 
@@ -30,6 +32,8 @@ from rfedge.results import Result, make_result, provenance, rows_of, write_resul
 from rfedge.samples import sample_path
 
 __all__ = ["MAX_SLOPE_MB", "SoakRow", "SoakSettings", "soak", "soak_section", "what_grew"]
+
+Amount = TypeVar("Amount", int, float)
 
 MAX_SLOPE_MB = 1.0
 """Per minute."""
@@ -77,10 +81,11 @@ class SoakRow:
     held: bool
     frames: int
     slope_mb_per_minute: float
-    memory_mb: float
+    memory_mb_first: float
     descriptors_first: int
     threads_first: int
     processes_first: int
+    memory_mb_last: float
     descriptors_last: int
     threads_last: int
     processes_last: int
@@ -92,7 +97,14 @@ class SoakRow:
 def soak(settings: SoakSettings) -> dict[str, Any]:
     """Run, write the result, return it; raise ``RfedgeError`` if anything grew."""
     made = provenance([settings.field], command=_command())
-    load = Load(Mode.FULL, settings.vehicles, settings.hz, 60 * settings.minutes, settings.warm_up)
+    load = Load(
+        Mode.FULL,
+        settings.vehicles,
+        settings.hz,
+        60 * settings.minutes,
+        settings.warm_up,
+        together=True,
+    )
     folder = settings.out.parent
     bed = TestBed(settings.field, settings.drive, 2, Path("out/cache/loadtest"), folder / "work")
     run = run_load(load, bed)
@@ -139,7 +151,7 @@ COUNTED: tuple[tuple[str, Callable[[Sample], int]], ...] = (
 )
 
 
-def _least(samples: Sequence[Sample], count: Callable[[Sample], int]) -> list[int]:
+def _least(samples: Sequence[Sample], count: Callable[[Sample], Amount]) -> list[Amount]:
     """Return the least there was in each quarter; a short run has samples that count twice."""
     edges = [len(samples) * quarter // QUARTERS for quarter in range(QUARTERS + 1)]
     return [min(map(count, samples[begin : max(end, begin + 1)])) for begin, end in pairwise(edges)]
@@ -162,6 +174,7 @@ def _lost(run: Run) -> list[str]:
 
 def _row(settings: SoakSettings, run: Run, samples: Sequence[Sample], *, held: bool) -> SoakRow:
     counts = {name: _least(samples, count) for name, count in COUNTED}
+    memory_mb = _least(samples, lambda sample: sample.rss_mb)
     return SoakRow(
         minutes=settings.minutes,
         vehicles=settings.vehicles,
@@ -169,7 +182,8 @@ def _row(settings: SoakSettings, run: Run, samples: Sequence[Sample], *, held: b
         held=held,
         frames=len(run.latency_ms),
         slope_mb_per_minute=slope_per_minute(samples),
-        memory_mb=samples[-1].rss_mb,
+        memory_mb_first=memory_mb[0],
+        memory_mb_last=memory_mb[-1],
         **{f"{name}_first": least[0] for name, least in counts.items()},
         **{f"{name}_last": least[-1] for name, least in counts.items()},
         server_cores=run.row.server_cores,

@@ -11,7 +11,7 @@ from mec_server.config import AdmissionLimits
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.field import render_field_view
 from rfcore.field.quality import FULL
-from rfedge.loadtest.fleet import FleetSpec, run_fleet
+from rfedge.loadtest.fleet import Departure, FleetSpec, run_fleet
 from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
 from rfedge.loadtest.result import Command
@@ -59,6 +59,7 @@ def spec_of(address: object, drive: Path, **changes: Any) -> FleetSpec:
         "warm_up_s": 0.2,
         "duration_s": 0.5,
         "ready_s": 0.0,
+        "together": False,
         "drive": str(drive),
     }
     return FleetSpec(**{**values, **changes})
@@ -84,6 +85,15 @@ async def test_a_fleet_counts_every_picture_and_the_server_refuses_none(
         assert (vehicle["refused"], vehicle["failed"], vehicle["nacked"]) == ("", "", 0)
         assert vehicle["due"] == 2 * 5
         assert vehicle["latency_ms"], "the newest picture always gets through"
+
+
+def test_pictures_are_due_spread_over_a_period_or_together(tmp_path: Path) -> None:
+    spread, together = (
+        Departure(5.0, 4, spec_of("127.0.0.1:1", tmp_path, together=chosen))
+        for chosen in (False, True)
+    )
+    assert [spread.schedule(i).start_s for i in range(4)] == [5.0, 5.025, 5.05, 5.075]
+    assert {together.schedule(i).start_s for i in range(4)} == {5.0}
 
 
 async def test_vehicles_that_reach_nobody_are_counted_as_failed(

@@ -65,7 +65,9 @@ def test_a_run_too_short_for_quarters_is_judged_all_the_same() -> None:
 
 
 def test_a_soak_is_a_row_of_the_results_page(tmp_path: Path) -> None:
-    row = SoakRow(5.0, 2, 5.0, True, 3000, -0.25, 400.5, 15, 14, 3, 15, 16, 3, 0.5, 40.0, None)
+    row = SoakRow(
+        5.0, 2, 5.0, True, 3000, -0.25, 400.5, 15, 14, 3, 400.25, 15, 16, 3, 0.5, 40.0, None
+    )
     path = tmp_path / "soak.json"
     write_result(path, make_result("soak", provenance(), {"rows": [row]}))
     section = soak_section(path, read_result(path, "soak"))
