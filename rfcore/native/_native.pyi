@@ -220,6 +220,19 @@ def draw_patch(
 
 # --- h264 -------------------------------------------------------------------
 
+class SliceEffort:
+    def __init__(
+        self,
+        *,
+        search_steps: int,
+        subsample_steps: int,
+        references_reach: int,
+        intra_reach: int,
+        halves_reach: int,
+        shapes_reach: int,
+        cost_rounds: int,
+    ) -> None: ...
+
 class SliceCoder:
     def __init__(self, width: int, height: int, isa: str, threads: int = 1) -> None: ...
     def encode(
@@ -231,7 +244,7 @@ class SliceCoder:
         forced: NDArray[np.int8],
         lambda_q8: NDArray[np.uint32],
         motion_q8: NDArray[np.uint32],
-        effort: tuple[int, int, int, int, int, int, int],
+        effort: SliceEffort,
         deblocked: bool,
         vertical_reach: int,
         out: tuple[_U8, _U8, _U8],

@@ -60,13 +60,13 @@ def test_aarch64_codes_a_picture_to_the_same_bytes(
         np.full(MACROBLOCKS, -1, np.int8),
         LAMBDA_Q8,
         MOTION_Q8,
-        effort.value,
+        _native.SliceEffort(**effort.value._asdict()),
         True,
         252,
         reconstruction.planes,
         np.empty(MACROBLOCKS, np.int8),
     )
-    scene = struct.pack("<11i", *SIZE, references, qp, *effort.value, True)
+    scene = struct.pack("<12i", *SIZE, references, qp, *effort.value, True)
     scene += LAMBDA_Q8.tobytes() + MOTION_Q8.tobytes() + quantisers.tobytes()
     scene += b"".join(picture.packed() for picture in (frame, *others))
     there = emulated("exactness_slices", isa, 1, scene)

@@ -16,7 +16,9 @@ Functions = dict[str, list[str]]
 
 
 def stub_parameters(function: ast.FunctionDef) -> list[str]:
-    return [argument.arg for argument in function.args.args]
+    named = function.args.kwonlyargs
+    only_named = ["*", *(argument.arg for argument in named)] if named else []
+    return [*(argument.arg for argument in function.args.args), *only_named]
 
 
 def stub_functions() -> Functions:

@@ -31,7 +31,7 @@ public:
 
     nb::bytes encode(const Planes& frame, const std::vector<Planes>& references, int slice_qp,
                      Quantisers qp, Quantisers forced, Weights lambda_q8, Weights motion_q8,
-                     const std::array<int, 7>& effort, bool deblocked, int vertical_reach,
+                     const h264::Effort& effort, bool deblocked, int vertical_reach,
                      const std::array<OutPlane, 3>& out, OutModes modes) {
         if (references.size() > h264::kMaxReferences || lambda_q8.shape(0) != 52 ||
             motion_q8.shape(0) != 52 ||
@@ -47,8 +47,7 @@ public:
         settings.qp = qp.data();
         std::copy_n(lambda_q8.data(), 52, settings.lambda_q8);
         std::copy_n(motion_q8.data(), 52, settings.motion_q8);
-        settings.effort = {effort[0], effort[1], effort[2], effort[3], effort[4],
-                           effort[5], effort[6]};
+        settings.effort = effort;
         settings.deblocked = deblocked;
         settings.forced = forced.data();
         settings.vertical_reach = vertical_reach;
@@ -105,6 +104,17 @@ private:
 }  // namespace
 
 void bind_h264(nb::module_& m) {
+    using h264::Effort;
+    nb::class_<Effort>(m, "SliceEffort")
+        .def("__init__",
+             [](Effort* made, int search_steps, int subsample_steps, int references_reach,
+                int intra_reach, int halves_reach, int shapes_reach, int cost_rounds) {
+                 new (made) Effort{search_steps, subsample_steps, references_reach, intra_reach,
+                                   halves_reach, shapes_reach, cost_rounds};
+             },
+             nb::kw_only(), nb::arg("search_steps"), nb::arg("subsample_steps"),
+             nb::arg("references_reach"), nb::arg("intra_reach"), nb::arg("halves_reach"),
+             nb::arg("shapes_reach"), nb::arg("cost_rounds"));
     nb::class_<LockedCoder>(m, "SliceCoder")
         .def(nb::init<int, int, const std::string&, int>(), nb::arg("width"), nb::arg("height"),
              nb::arg("isa"), nb::arg("threads") = 1)
