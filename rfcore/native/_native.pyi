@@ -157,6 +157,7 @@ class NgpTrainer:
 
 _U8 = NDArray[np.uint8]
 
+def warp_filter() -> bytes: ...
 def block_costs(frame: _U8, reference: _U8, satd: _I32, ssd: _I32) -> None: ...
 def solve_light(
     frame: tuple[_U8, _U8, _U8], render: tuple[_U8, _U8, _U8], changes: _I32

@@ -80,6 +80,10 @@ PictureSize size_of(const Plane& plane) {
 }  // namespace
 
 void bind_warp(nb::module_& m) {
+    m.def("warp_filter", [] {
+        const std::size_t size_bytes = sizeof(std::int16_t) * kWarpSteps * kWarpLanes;
+        return nb::bytes(warp_filter(), size_bytes);
+    });
     m.def(
         "warp_i420",
         [](const Picture& previous, InDepth previous_depth, InDepth depth, const Picture& render,

@@ -18,8 +18,8 @@
 namespace rfcore {
 namespace {
 
-constexpr int kSteps = 64;  // positions per sample
-constexpr int kTaps = 6, kLanes = 8;
+constexpr int kSteps = kWarpSteps;  // positions per sample
+constexpr int kTaps = 6, kLanes = kWarpLanes;
 constexpr std::int32_t kNowhere = INT32_MIN;
 constexpr float kNearest = 0.1f;
 constexpr float kRelative = 0.08f, kAbsolute = 0.1f;
@@ -417,6 +417,8 @@ std::int64_t warp_i420(const WarpInputs& in, const WarpGeometry& geometry, Pictu
     });
     return std::accumulate(taken.begin(), taken.end(), std::int64_t{0});
 }
+
+const std::int16_t* warp_filter() { return kFilter[0]; }
 
 void block_costs(const std::uint8_t* frame, const std::uint8_t* reference, PictureSize size,
                  std::int32_t* satd, std::int32_t* ssd) {

@@ -34,6 +34,11 @@ struct WarpInputs {
 std::int64_t warp_i420(const WarpInputs& in, const WarpGeometry& geometry, PictureSize size,
                        I420Planes out, int threads = 1);
 
+// The interpolation filter, [64][8]: Lanczos-3 at n / 64, six taps in 1/64 and two zeros. OpenCL
+// devices take this very table.
+constexpr int kWarpSteps = 64, kWarpLanes = 8;
+const std::int16_t* warp_filter();
+
 // For every whole 8x8 block: the sums of absolute Hadamard coefficients (DC included, divided by
 // 8) and of squared differences between frame and reference.
 void block_costs(const std::uint8_t* frame, const std::uint8_t* reference, PictureSize size,
