@@ -16,13 +16,17 @@ along an axis of one or two pixels nothing bends.
 
 Only float32 subtraction, multiplication, division, minimum and maximum, each rounded once as
 IEEE 754 prescribes: the same bytes on every machine.
+
+A device that drew a view may hold its depth and opacity: a ``HeldFieldView`` has them come to the
+CPU when somebody asks, and until then says where they are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +35,16 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 
-__all__ = ["BEND_LIMIT", "FieldView", "PointCloud", "PosedPicture", "View", "confidence"]
+__all__ = [
+    "BEND_LIMIT",
+    "FieldView",
+    "HeldFieldView",
+    "HeldPlane",
+    "PointCloud",
+    "PosedPicture",
+    "View",
+    "confidence",
+]
 
 
 BEND_LIMIT = np.float32(0.1)
@@ -127,6 +140,19 @@ class FieldView:
         return FieldView(Camera(intrinsics, Pose.identity()), I420(*grey), nowhere, nowhere)
 
     @property
+    def held_depth(self) -> HeldPlane | None:
+        """What holds the depth, where that is a device."""
+        return None
+
+    def under(self, render: I420) -> FieldView:
+        """Return the view with ``render``, its own under another light."""
+        return replace(self, render=render)
+
+    def without_opacity(self) -> FieldView:
+        """Return the view for those that will not ask for opacity."""
+        return replace(self, opacity=None)
+
+    @property
     def confidence(self) -> F32:
         """Opacity, less where depth breaks; raises ``InvalidInput`` where opacity was dropped."""
         return confidence(self.depth, self.kept_opacity)
@@ -141,6 +167,66 @@ class FieldView:
         if self.opacity is None:
             raise InvalidInput("opacity", "was dropped from this view; render it again")
         return self.opacity
+
+
+class HeldPlane(Protocol):
+    """Depth or opacity of a view, float32 [H, W], where it was drawn. Depth is finite there."""
+
+    def array(self) -> F32:
+        """Return it, from any thread."""
+
+    def carry(
+        self, previous: I420, minus: I420 | None, before: FieldView, now: FieldView
+    ) -> I420 | None:
+        """Return what ``warp_i420`` or, with ``minus``, ``correct_i420`` (``rfcore.native.warp``)
+        make, this being the depth of ``now``; ``None``: that is left to the CPU."""
+
+
+class HeldFieldView(FieldView):
+    """A view whose depth and opacity are held elsewhere, and come when they are first asked for.
+
+    Made by ``of``. What ``dataclasses.replace`` makes of one is a view like any other.
+    """
+
+    _depth: HeldPlane | None = None
+    _opacity: HeldPlane | None = None
+
+    @staticmethod
+    def of(
+        camera: Camera, render: I420, depth: HeldPlane, opacity: HeldPlane | None
+    ) -> HeldFieldView:
+        """Return a view of planes that are of the camera's size, as ``render`` is."""
+        view = object.__new__(HeldFieldView)
+        vars(view).update(camera=camera, render=render, _depth=depth, _opacity=opacity)
+        return view
+
+    @cached_property
+    def depth(self) -> F32:
+        """z in metres [H, W], 0 where nothing was hit."""
+        assert self._depth is not None
+        return self._depth.array()
+
+    @cached_property
+    def opacity(self) -> F32 | None:
+        """Opacity [H, W], ``None`` where it was dropped."""
+        return None if self._opacity is None else self._opacity.array()
+
+    @property
+    def held_depth(self) -> HeldPlane | None:
+        """What holds the depth."""
+        return self._depth
+
+    def under(self, render: I420) -> FieldView:
+        """Return the view with ``render``, its own under another light."""
+        if self._depth is None:
+            return super().under(render)
+        return HeldFieldView.of(self.camera, render, self._depth, self._opacity)
+
+    def without_opacity(self) -> FieldView:
+        """Return the view for those that will not ask for opacity."""
+        if self._depth is None:
+            return super().without_opacity()
+        return HeldFieldView.of(self.camera, self.render, self._depth, None)
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,16 @@
 """Every way to draw splats, for tests that take the implementation as an argument."""
 
-from typing import Any
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from rfcore.native.backend import available_isas
+
+if TYPE_CHECKING:
+    from rfcore.raster.opencl import Device
 
 POCL = "opencl:Portable"
 """OpenCL on the CPU. Debian has it (``make test-system-packages``); its tests fail without it."""
@@ -13,6 +19,35 @@ POCL = "opencl:Portable"
 WORST_CASE = "opencl:worst-case"
 """The same with products contracted where the compiler may, its own divisions and square roots, and
 subnormals flushed, but for what the kernels do against it; tests/raster/conftest.py opens it."""
+
+
+GUARDED = "guarded"
+"""PoCL in the build for inexact compilers; for ``opened``."""
+
+
+def opened(isa: str) -> Device:
+    """Return an opened device; ``GUARDED``: PoCL in that build."""
+    from rfcore.raster.opencl import open_device
+    from rfcore.raster.opencl.device import BUILDS, build_device, find_device
+    from rfcore.raster.opencl.self_check import check_device
+
+    if isa != GUARDED:
+        return open_device(isa.partition(":")[2])
+    device = build_device(find_device("Portable"), BUILDS[1])
+    check_device(device)
+    return device
+
+
+def until_gone(call: Callable[..., object], left: Iterator[int]) -> Callable[..., object]:
+    """Return a kernel, or another call, whose device is removed once ``left`` is exhausted."""
+    import pyopencl as cl
+
+    def run(*arguments: object, **named: object) -> object:
+        if next(left, None) is None:
+            raise cl.RuntimeError("clEnqueueNDRangeKernel failed: DEVICE_NOT_AVAILABLE")
+        return call(*arguments, **named)
+
+    return run
 
 
 def forward_isas() -> list[Any]:

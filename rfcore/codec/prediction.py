@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 from rfcore.codec.photometric import Photometric, adapt, lit_by
@@ -45,7 +45,7 @@ class Prediction:
         """Return the prediction with the render of ``view`` changed by ``photometric``."""
         if not photometric:
             return Prediction(view, past, threads)
-        lit = replace(view, render=adapt(view.render, photometric))
+        lit = view.under(adapt(view.render, photometric))
         return Prediction(lit, past, threads, photometric, plain_render=view.render)
 
     @staticmethod
@@ -64,7 +64,7 @@ class Prediction:
             render = relight_i420(past.picture, past.field_render, view.render)
         else:
             raise InvalidInput("relit", "there is no earlier frame to learn the light from")
-        lit = replace(view, render=render)
+        lit = view.under(render)
         return Prediction(lit, past, threads, (), True, light, view.render)
 
     @property
@@ -77,7 +77,7 @@ class Prediction:
 
         ``digest``: the picture's, where it is known already.
         """
-        return Past(picture, replace(self.view, opacity=None), digest, self.plain_render)
+        return Past(picture, self.view.without_opacity(), digest, self.plain_render)
 
     @property
     def available(self) -> frozenset[Reference]:

@@ -73,6 +73,7 @@ from rfcore.views import FieldView
 
 __all__ = [
     "BLOCK_PX",
+    "CORRECTION_DOUBT",
     "BlockCosts",
     "apply_light",
     "block_costs",
@@ -113,8 +114,9 @@ class BlockCosts:
 def warp_i420(previous: I420, before: FieldView, now: FieldView, threads: int = 1) -> I420:
     """Return ``previous``, taken at ``before``, as it would look from ``now.camera``.
 
-    Samples that are not known are those of ``now.render``. Raises ``InvalidInput`` for pictures of
-    another size, cameras of different intrinsics, or no threads.
+    Samples that are not known are those of ``now.render``. A device that holds the depths of both
+    makes the same picture. Raises ``InvalidInput`` for pictures of another size, cameras of
+    different intrinsics, or no threads.
     """
     return _carried(previous, None, before, now, threads)
 
@@ -122,8 +124,8 @@ def warp_i420(previous: I420, before: FieldView, now: FieldView, threads: int = 
 def correct_i420(previous: I420, before: FieldView, now: FieldView, threads: int = 1) -> I420:
     """Return ``now.render`` plus most of what ``previous`` differed by from ``before.render``.
 
-    The difference is carried from ``before.camera`` to ``now.camera``. Raises ``InvalidInput`` for
-    pictures of another size, cameras of different intrinsics, or no threads.
+    The difference is carried from ``before.camera`` to ``now.camera``, by a device as above. Raises
+    ``InvalidInput`` for pictures of another size, cameras of different intrinsics, or no threads.
     """
     return _carried(previous, before.render, before, now, threads)
 
@@ -138,6 +140,10 @@ def _carried(
     size_px = now.render.size_px
     if previous.size_px != size_px:
         raise InvalidInput("warp.previous", f"{previous.size_px} px of a camera of {size_px} px")
+    if now.held_depth is not None and before.held_depth is not None:
+        made = now.held_depth.carry(previous, minus, before, now)
+        if made is not None:
+            return made
     out = I420.empty(now.render.size_px)
     _native.warp_i420(
         _dense(previous),

@@ -26,13 +26,14 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native import _native
 from rfcore.native.backend import FLOAT32_MAX, check_backend
+from rfcore.native.warp import CORRECTION_DOUBT, warp_numbers
 from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.renderers import DEVICES, is_opencl
-from rfcore.views import FieldView, View
+from rfcore.views import FieldView, HeldFieldView, View
 
 if TYPE_CHECKING:
-    from rfcore.raster.opencl import DeviceRasterizer
+    from rfcore.raster.opencl import DeviceRasterizer, DrawnPlane, LentBuffer
 
 __all__ = [
     "RasterStatistics",
@@ -121,8 +122,8 @@ class Rasterizer:
     ``InvalidInput`` when the Gaussians overlap more than 2^28 regions of 64x64 pixels, and for an
     ``sh_degree`` they lack.
 
-    When an OpenCL device fails, the CPU draws the same picture and every one after it: ``isa`` says
-    so from then on, and a line is logged.
+    When an OpenCL device fails, the CPU draws the same picture and every one after it, and again
+    what only the device had of those before: ``isa`` says so from then on, and a line is logged.
     """
 
     def __init__(
@@ -179,7 +180,8 @@ class Rasterizer:
     def field_view(self, camera: Camera, *, sh_degree: int | None = None) -> FieldView:
         """Render what a codec's end holds: ``render``, with the colours as a codec picture.
 
-        A device makes that picture itself, and the colours stay there.
+        A device makes that picture itself. The colours stay there, depth and opacity until somebody
+        asks for them.
         """
         made = None if self._device is None else self._view_of_device(camera, sh_degree)
         if made is not None:
@@ -218,15 +220,21 @@ class Rasterizer:
         k, degree = camera.intrinsics, bands_to_use(sh_degree, self.sh_degree)
         native_camera(camera)  # raises for what the kernels do not take
         picture = I420.empty((k.width_px, k.height_px))
-        depth, opacity = (np.empty(picture.y.shape, np.float32) for _ in range(2))
+        planes: list[DrawnPlane] = []
         with overlaps_limited():
             is_drawn = self._drawn_by_device(
-                lambda device: device.draw_codec_picture(camera, degree, picture, depth, opacity)
+                lambda device: planes.extend(device.draw_codec_picture(camera, degree, picture))
             )
-        return FieldView(camera, picture, depth, opacity) if is_drawn else None
+        if not is_drawn:
+            return None
+        depth = _PlaneOnDevice(self, planes[0], lambda: self.render(camera, sh_degree=degree).depth)
+        opacity = _PlaneOnDevice(
+            self, planes[1], lambda: self.render(camera, sh_degree=degree).opacity
+        )
+        return HeldFieldView.of(camera, picture, depth, opacity)
 
-    def _drawn_by_device(self, draw: Callable[[DeviceRasterizer], None]) -> bool:
-        """Have the device draw; False where there is none, or it cannot."""
+    def _drawn_by_device(self, draw: Callable[[DeviceRasterizer], object]) -> bool:
+        """Have the device do its work; False where there is none, or it cannot."""
         if self._device is None:
             return False
         from rfcore.raster.opencl import DeviceFull, DeviceLost
@@ -273,3 +281,40 @@ class Rasterizer:
     def _native_rasterizer(self, g: Gaussians, isa: str) -> _native.Rasterizer:
         arrays = (g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh)
         return _native.Rasterizer(*arrays, self.threads, isa, self.antialiased)
+
+
+class _PlaneOnDevice:
+    """A ``HeldPlane`` that ``rasterizer`` drew; ``again`` draws it when the device was lost."""
+
+    def __init__(self, rasterizer: Rasterizer, plane: DrawnPlane, again: Callable[[], F32]) -> None:
+        self._rasterizer, self._plane, self._again = rasterizer, plane, again
+
+    def array(self) -> F32:
+        plane = self._plane
+        if plane.array is None and not self._rasterizer._drawn_by_device(
+            lambda device: device.fetch(plane)
+        ):
+            plane.array = self._again()
+        assert plane.array is not None
+        return plane.array
+
+    def carry(
+        self, previous: I420, minus: I420 | None, before: FieldView, now: FieldView
+    ) -> I420 | None:
+        other = before.held_depth
+        if not isinstance(other, _PlaneOnDevice) or other._plane.device is not self._plane.device:
+            return None
+        earlier, depth = other._lent(), self._lent()  # stay as they are while they are held here
+        if earlier is None or depth is None:
+            return None
+        from rfcore.raster.opencl import DeviceWarp
+
+        numbers = warp_numbers(before.camera, now.camera)
+        doubt = 0 if minus is None else CORRECTION_DOUBT
+        warp = DeviceWarp(numbers, earlier, depth, previous, now.render, minus, doubt)
+        out = I420.empty(now.render.size_px)
+        made = self._rasterizer._drawn_by_device(lambda device: device.carry(warp, out))
+        return out if made else None
+
+    def _lent(self) -> LentBuffer | None:
+        return None if self._rasterizer._device is None else self._plane.lent

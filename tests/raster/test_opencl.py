@@ -1,14 +1,14 @@
 """OpenCL draws the bytes of the native kernels, in every build, or is refused, or left in time."""
 
 import ctypes
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from forward_isas import POCL, WORST_CASE
+from forward_isas import GUARDED, POCL, WORST_CASE, opened, until_gone
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import BackendUnavailable, InvalidInput
 from rfcore.field import FieldMetadata, Quality, SplatField, render_field_view
@@ -18,7 +18,7 @@ from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.raster.opencl import Device, DeviceRasterizer, open_device
-from rfcore.raster.opencl.device import BUILDS, Build, build_device, find_device
+from rfcore.raster.opencl.device import Build, build_device, find_device
 from rfcore.raster.opencl.self_check import (
     ARITHMETIC_DIGESTS,
     CHECKS,
@@ -38,19 +38,9 @@ SceneMaker = Callable[..., Gaussians]
 CameraMaker = Callable[..., Camera]
 F32 = np.float32
 
-GUARDED = "guarded"
 FUZZED_SCENES, VIEWS_OF_A_SCENE = 60, 2
 
 slow = pytest.mark.slow
-
-
-def opened(isa: str) -> Device:
-    """Return an opened device; ``guarded``: PoCL in the build for inexact compilers."""
-    if isa != GUARDED:
-        return open_device(isa.partition(":")[2])
-    device = build_device(find_device("Portable"), BUILDS[1])
-    check_device(device)
-    return device
 
 
 def view_on(device: Device, gaussians: Gaussians, camera: Camera, antialiased: bool) -> View:
@@ -155,10 +145,9 @@ def test_a_device_makes_the_codecs_picture_of_what_it_draws(
     gaussians = scene(500)
     want = field_view_from_view(Rasterizer(gaussians).render(camera), camera)
     picture = I420.empty(size_px)
-    depth, opacity = (np.full((height, width), np.nan, F32) for _ in range(2))
     drawn_by = DeviceRasterizer(opened(isa), gaussians, antialiased=False)
-    drawn_by.draw_codec_picture(camera, gaussians.sh_degree, picture, depth, opacity)
-    assert bytes_of(FieldView(camera, picture, depth, opacity)) == bytes_of(want)
+    planes = drawn_by.draw_codec_picture(camera, gaussians.sh_degree, picture)
+    assert bytes_of(FieldView(camera, picture, *map(drawn_by.fetch, planes))) == bytes_of(want)
     assert want.kept_opacity.any()
 
 
@@ -224,17 +213,6 @@ def test_a_device_removed_in_a_picture_costs_no_picture(
     assert DEVICES.lost == lost + 1
     assert [line["event"] for line in logs] == ["opencl device lost"]
     assert rasterizer.isa == available_isas()[0]
-
-
-def until_gone(kernel: Callable[..., object], left: Iterator[int]) -> Callable[..., object]:
-    import pyopencl as cl
-
-    def run(*arguments: object) -> object:
-        if next(left, None) is None:
-            raise cl.RuntimeError("clEnqueueNDRangeKernel failed: DEVICE_NOT_AVAILABLE")
-        return kernel(*arguments)
-
-    return run
 
 
 @slow

@@ -1,10 +1,12 @@
-"""An OpenCL device with the program built for it."""
+"""An OpenCL device with the program built for it, and memory on it."""
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
+from weakref import finalize
 
 from rfcore.errors import BackendUnavailable
 from rfcore.extras import needs
@@ -12,9 +14,26 @@ from rfcore.extras import needs
 with needs("opencl"):
     import pyopencl as cl
 
-__all__ = ["BUILDS", "Build", "Device", "DeviceFull", "DeviceLost", "build_device", "find_device"]
+__all__ = [
+    "BUILDS",
+    "Build",
+    "Device",
+    "DeviceFull",
+    "DeviceLost",
+    "DeviceMemory",
+    "LentBuffer",
+    "build_device",
+    "find_device",
+]
 
-SOURCES = ("arithmetic.cl", "project.cl", "tiles.cl", "sort.cl", "blend.cl", "codec_picture.cl")
+SOURCES = (
+    *("arithmetic.cl", "project.cl", "tiles.cl", "sort.cl", "blend.cl", "codec_picture.cl"),
+    "warp.cl",
+)
+LEAST_BYTES = 64
+"""Of a buffer: there are none of nothing."""
+MOST_RETURNED = 8
+"""Buffers that were lent and are kept for the next loan."""
 
 
 class DeviceLost(Exception):
@@ -107,3 +126,61 @@ def build_device(device: Any, build: Build) -> Device:
 
 def _source() -> str:
     return "\n".join((files(__package__) / name).read_text("utf-8") for name in SOURCES)
+
+
+class LentBuffer:
+    """A buffer that its memory does not use while this is referred to, from any thread."""
+
+    def __init__(self, buffer: Any, returned: deque[Any]) -> None:
+        self.buffer = buffer
+        finalize(self, returned.append, buffer).atexit = False
+
+    @property
+    def size_bytes(self) -> int:
+        """What it takes on the device."""
+        return int(self.buffer.size)
+
+
+class DeviceMemory:
+    """Buffers by name. They grow by half when they must, and are kept from picture to picture."""
+
+    def __init__(self, device: Device) -> None:
+        self._context = device.context
+        self._buffers: dict[str, Any] = {}
+        self._returned: deque[Any] = deque(maxlen=MOST_RETURNED)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._buffers[name]
+
+    def at_least(self, name: str, size_bytes: int) -> None:
+        """Make room for ``size_bytes``; what a buffer held is lost when it grows."""
+        before = self._buffers.get(name)
+        if before is not None and before.size >= size_bytes:
+            return
+        grown = size_bytes if before is None else max(size_bytes, 3 * before.size // 2)
+        self._buffers[name] = self._buffer(max(grown, LEAST_BYTES))
+        if before is not None:
+            before.release()
+
+    def lend(self, name: str, size_bytes: int) -> LentBuffer:
+        """Take out a buffer of ``size_bytes``: what its name stands for next is another one."""
+        self.at_least(name, size_bytes)
+        return LentBuffer(self._buffers.pop(name), self._returned)
+
+    def _buffer(self, size_bytes: int) -> Any:
+        """Return a buffer that was lent and came back, or a new one."""
+        for _ in range(len(self._returned)):
+            returned = self._returned.popleft()
+            if returned.size == size_bytes:
+                return returned
+            self._returned.append(returned)
+        return cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size_bytes)
+
+    def swap(self, one: str, other: str) -> None:
+        """Exchange two names."""
+        buffers = self._buffers
+        buffers[one], buffers[other] = buffers[other], buffers[one]
+
+    def give_back(self, name: str) -> None:
+        """Free a buffer."""
+        self._buffers.pop(name).release()

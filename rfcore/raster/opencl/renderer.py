@@ -1,16 +1,22 @@
-"""One set of Gaussians in a device's memory, and the kernels that draw them.
+"""One set of Gaussians in a device's memory, the kernels that draw them, and what they drew.
 
 A picture is projected, its visible Gaussians gathered and sorted by depth, their overlaps with
 tiles written down and sorted by tile, and every tile blended. Both sorts are stable, so that ties
 stay in the order of the Gaussians. Two numbers come back in between: how many are visible, and how
 many overlaps there are.
+
+Of a codec's picture, depth and opacity stay on the device until somebody asks for them
+(``DrawnPlane``), for what warps and corrections take is there already: depths, and the pictures
+that were drawn or uploaded before. They make room, the oldest first, when they take too much of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
+from weakref import ReferenceType, ref
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,20 +24,40 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.extras import needs
 from rfcore.image import I420
+from rfcore.native import _native
 from rfcore.raster.gaussians import F32, Gaussians
-from rfcore.raster.opencl.device import Device, DeviceFull, DeviceLost
+from rfcore.raster.opencl.device import (
+    Device,
+    DeviceFull,
+    DeviceLost,
+    DeviceMemory,
+    LentBuffer,
+)
 
 with needs("opencl"):
     import pyopencl as cl
 
-__all__ = ["MAX_GROUP_ENTRIES", "MAX_TILE_ENTRIES", "DeviceRasterizer"]
+__all__ = [
+    "MAX_GROUP_ENTRIES",
+    "MAX_TILE_ENTRIES",
+    "MOST_HELD_BYTES",
+    "DeviceRasterizer",
+    "DeviceWarp",
+    "DrawnPlane",
+]
 
 TILE_SIDE_PX = 16
 MAX_GROUP_ENTRIES = 1 << 28
 """Overlaps of Gaussians and 64x64 pixels; the native kernels refuse more in the same words."""
 MAX_TILE_ENTRIES = 1 << 26
 """Overlaps of Gaussians and tiles that memory is kept for, 16 bytes each: 1 GiB."""
+MOST_HELD_BYTES = 1 << 28
+"""Depths and opacities of one rasterizer's pictures that stay on the device: 32 planes of
+1920x1080. Beyond it the oldest come back to the CPU."""
+MOST_PICTURES = 32
+"""Pictures that are kept on the device beside the CPU's, of one rasterizer."""
 SPLAT_BYTES, BOX_BYTES, PREPARED_BYTES, CAMERA_BYTES = 64, 12, 40, 84
+PLACE_BYTES = 8
 SIDE = 64
 """Work-items of a group, where a kernel does not say."""
 SCAN_ITEMS, SCAN_BLOCK, SORT_BLOCK, DIGIT_BITS = 256, 2048, 1024, 4
@@ -44,10 +70,36 @@ ZERO = U32(0)
 """Known to the kernels at run time alone (``PRODUCT`` in arithmetic.cl)."""
 
 
+class DrawnPlane:
+    """Depth or opacity, float32 [H, W], of a picture: ``lent`` while it is on ``device``, ``array``
+    once it is with the CPU; at first on the device alone."""
+
+    def __init__(self, device: Device, lent: LentBuffer, shape: tuple[int, int]) -> None:
+        self.device, self.shape = device, shape
+        self.lent: LentBuffer | None = lent
+        self.array: F32 | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceWarp:
+    """What a warp is made of, or with ``minus`` a correction (``rfcore.native.warp``).
+
+    ``numbers`` are those of ``warp_numbers``, the depths buffers of the device.
+    """
+
+    numbers: Sequence[float]
+    earlier_depth: LentBuffer
+    depth: LentBuffer
+    previous: I420
+    render: I420
+    minus: I420 | None = None
+    doubt: int = 0
+
+
 class DeviceRasterizer:
     """Gaussians on a device; for one thread at a time.
 
-    Raises ``DeviceLost`` when the device fails, here and in ``draw``.
+    Raises ``DeviceLost`` when the device fails, here and in each method.
     """
 
     def __init__(self, device: Device, gaussians: Gaussians, *, antialiased: bool) -> None:
@@ -58,6 +110,8 @@ class DeviceRasterizer:
             self._queue = cl.CommandQueue(device.context)
             self._kernels = {k.function_name: k for k in device.program.all_kernels()}
             self._memory = DeviceMemory(device)
+            self._held: list[ReferenceType[DrawnPlane]] = []
+            self._pictures: list[tuple[ReferenceType[I420], LentBuffer]] = []
             self._prepare(gaussians)
 
     def _prepare(self, g: Gaussians) -> None:
@@ -81,6 +135,7 @@ class DeviceRasterizer:
         memory.at_least("depth_bits", 4 * count)
         memory.at_least("marks", 4 * count)
         memory.at_least("camera", CAMERA_BYTES)
+        self._fill("filter", np.frombuffer(_native.warp_filter(), np.uint8))
         arrays = (memory[name] for name in (*used_once, "prepared"))
         self._run("prepare", count, I32(count), *arrays, ZERO)
         self._queue.finish()
@@ -105,21 +160,55 @@ class DeviceRasterizer:
             self._fetch(("colour", colour), ("depth", depth), ("opacity", opacity))
 
     def draw_codec_picture(
-        self, camera: Camera, degree: int, picture: I420, depth: F32, opacity: F32
-    ) -> None:
-        """Write what ``draw`` does, but of the colour the codec's picture: 9.5 bytes a pixel come
-        back instead of 20. Raises as ``draw`` does."""
-        memory, start = self._memory, 0
+        self, camera: Camera, degree: int, picture: I420
+    ) -> tuple[DrawnPlane, DrawnPlane]:
+        """Write the colours as the codec's picture; return depth and opacity.
+
+        Of the 20 bytes a pixel of ``draw`` 1.5 come back. Raises as ``draw`` does.
+        """
         with _lost_if_it_fails(self.device):
             self._draw(camera, degree)
-            memory.at_least("picture", sum(plane.nbytes for plane in picture.planes))
+            self._memory.at_least("picture", _size_bytes(picture))
             names = ("camera", "colour", "picture")
             self._run("codec_picture", picture.u.size, *self._buffers(*names), ZERO)
-            for plane in picture.planes:
-                made = memory["picture"]
-                cl.enqueue_copy(self._queue, plane, made, src_offset=start, is_blocking=False)
-                start += plane.nbytes
-            self._fetch(("depth", depth), ("opacity", opacity))
+            self._fetch_picture("picture", picture)
+            self._keep_picture(picture)
+            shape = picture.y.shape
+            return self._hold("depth", shape), self._hold("opacity", shape)
+
+    def hold(self, plane: F32) -> DrawnPlane:
+        """Return a plane [H, W] of the CPU's as if it were drawn here."""
+        with _lost_if_it_fails(self.device):
+            self._fill("depth", plane)
+            return self._hold("depth", plane.shape)
+
+    def fetch(self, plane: DrawnPlane) -> F32:
+        """Return a plane as the CPU's array, copied once; it stays on the device, too."""
+        with _lost_if_it_fails(self.device):
+            if plane.array is None:
+                assert plane.lent is not None
+                array = np.empty(plane.shape, np.float32)
+                cl.enqueue_copy(self._queue, array, plane.lent.buffer)
+                plane.array = array
+            return plane.array
+
+    def carry(self, warp: DeviceWarp, out: I420) -> None:
+        """Write what ``warp_i420`` or, with ``minus``, ``correct_i420`` make."""
+        memory, pixels, names = self._memory, out.y.size, ("warp", "filter", "places")
+        with _lost_if_it_fails(self.device):
+            minus = warp.previous if warp.minus is None else warp.minus
+            given = [self._picture(picture) for picture in (warp.previous, minus, warp.render)]
+            self._fill("warp", warp_on_device(warp.numbers, out.size_px))
+            memory.at_least("places", PLACE_BYTES * pixels)
+            memory.at_least("picture", _size_bytes(out))
+            depths = (warp.earlier_depth.buffer, warp.depth.buffer)
+            self._run("locate", pixels, memory["warp"], *depths, memory["places"], ZERO)
+            buffers = [lent.buffer for lent in given]
+            arguments = (*self._buffers(*names), *buffers, memory["picture"])
+            rule = I32(warp.minus is not None), I32(warp.doubt)
+            for kernel, items in (("carry_luma", pixels), ("carry_chroma", out.u.size)):
+                self._run(kernel, items, *arguments, *rule)
+            self._fetch_picture("picture", out)
 
     def _draw(self, camera: Camera, degree: int) -> None:
         self._load(camera)
@@ -134,6 +223,55 @@ class DeviceRasterizer:
             if out is not None:
                 cl.enqueue_copy(self._queue, out, self._memory[name], is_blocking=False)
         self._queue.finish()
+
+    def _fetch_picture(self, name: str, out: I420) -> None:
+        """Copy a buffer to the planes of ``out``, and wait for that."""
+        start, made = 0, self._memory[name]
+        for plane in out.planes:
+            cl.enqueue_copy(self._queue, plane, made, src_offset=start, is_blocking=False)
+            start += plane.nbytes
+        self._queue.finish()
+
+    def _fill(self, name: str, values: NDArray[Any]) -> None:
+        self._memory.at_least(name, values.nbytes)
+        cl.enqueue_copy(self._queue, self._memory[name], np.ascontiguousarray(values))
+
+    def _hold(self, name: str, shape: tuple[int, int]) -> DrawnPlane:
+        """Return what a buffer holds as a plane that the next picture leaves alone."""
+        lent = self._memory.lend(name, 4 * shape[0] * shape[1])
+        plane = DrawnPlane(self.device, lent, shape)
+        self._held.append(ref(plane))
+        self._make_room()
+        return plane
+
+    def _make_room(self) -> None:
+        """Have the planes that are held longest come back to the CPU while all take too much."""
+        held = [plane for each in self._held if (plane := each()) and plane.lent is not None]
+        sizes = [plane.lent.size_bytes for plane in held if plane.lent is not None]
+        while len(held) > 1 and sum(sizes) > MOST_HELD_BYTES:
+            oldest, _ = held.pop(0), sizes.pop(0)
+            self.fetch(oldest)
+            oldest.lent = None
+        self._held = [ref(plane) for plane in held]
+
+    def _picture(self, picture: I420) -> LentBuffer:
+        """Return the buffer of a picture of the CPU's, uploaded unless it is here."""
+        for each, lent in self._pictures:
+            if each() is picture:
+                return lent
+        self._memory.at_least("picture", _size_bytes(picture))
+        start, made = 0, self._memory["picture"]
+        for plane in map(np.ascontiguousarray, picture.planes):
+            cl.enqueue_copy(self._queue, made, plane, dst_offset=start)
+            start += plane.nbytes
+        return self._keep_picture(picture)
+
+    def _keep_picture(self, picture: I420) -> LentBuffer:
+        """Keep the buffer ``picture``, which holds one of the CPU's, as long as that lives."""
+        lent = self._memory.lend("picture", _size_bytes(picture))
+        alive = [(each, kept) for each, kept in self._pictures if each() is not None]
+        self._pictures = [*alive[-(MOST_PICTURES - 1) :], (ref(picture), lent)]
+        return lent
 
     def _load(self, camera: Camera) -> None:
         cl.enqueue_copy(self._queue, self._memory["camera"], camera_on_device(camera))
@@ -252,36 +390,6 @@ class DeviceRasterizer:
             memory.swap(values, f"{values} moved")
 
 
-class DeviceMemory:
-    """Buffers by name. They grow by half when they must, and are kept from picture to picture."""
-
-    def __init__(self, device: Device) -> None:
-        self._context = device.context
-        self._buffers: dict[str, Any] = {}
-
-    def __getitem__(self, name: str) -> Any:
-        return self._buffers[name]
-
-    def at_least(self, name: str, size_bytes: int) -> None:
-        """Make room for ``size_bytes``; what a buffer held is lost when it grows."""
-        before = self._buffers.get(name)
-        if before is not None and before.size >= size_bytes:
-            return
-        grown = size_bytes if before is None else max(size_bytes, 3 * before.size // 2)
-        self._buffers[name] = cl.Buffer(self._context, cl.mem_flags.READ_WRITE, max(grown, SIDE))
-        if before is not None:
-            before.release()
-
-    def swap(self, one: str, other: str) -> None:
-        """Exchange two names."""
-        buffers = self._buffers
-        buffers[one], buffers[other] = buffers[other], buffers[one]
-
-    def give_back(self, name: str) -> None:
-        """Free a buffer."""
-        self._buffers.pop(name).release()
-
-
 def camera_on_device(camera: Camera) -> NDArray[np.uint8]:
     """Return the bytes of ``Camera`` in project.cl: float32, rounded once; the position as two."""
     k = camera.intrinsics
@@ -292,6 +400,16 @@ def camera_on_device(camera: Camera) -> NDArray[np.uint8]:
     numbers = np.concatenate([rotation, position, rest, lens]).astype(np.float32)
     sides = np.array([k.width_px, k.height_px], I32)
     return np.concatenate([numbers.view(np.uint8), sides.view(np.uint8)])
+
+
+def warp_on_device(numbers: Sequence[float], size_px: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return the bytes of ``Warp`` in warp.cl: ``numbers`` rounded to float32 once."""
+    rounded = np.array(numbers, np.float64).astype(np.float32)
+    return np.concatenate([rounded.view(np.uint8), np.array(size_px, I32).view(np.uint8)])
+
+
+def _size_bytes(picture: I420) -> int:
+    return sum(plane.nbytes for plane in picture.planes)
 
 
 def _tiles(camera: Camera) -> int:

@@ -3,7 +3,9 @@
 What a driver says of itself is no gate: one that reports neither fused multiply-add nor correct
 rounding may be exact, and another that reports both may contract. So its arithmetic is compared on
 bit patterns and whole pictures with the digests of the native kernels, which reach every path:
-all SH degrees, both modes, splats of all sizes, ties, several batches a tile, opaque pixels.
+all SH degrees, both modes, splats of all sizes, ties, several batches a tile, opaque pixels. Its
+codec pictures, warps and corrections are compared with those of the CPU: odd sizes, holes, steps of
+depth, depths of any size, poses that leave the earlier picture.
 
 ``open_device`` opens one for the process, and only once it has passed.
 """
@@ -11,6 +13,8 @@ all SH degrees, both modes, splats of all sizes, ties, several batches a tile, o
 from __future__ import annotations
 
 import hashlib
+import math
+from dataclasses import dataclass
 from threading import Lock
 from time import perf_counter
 
@@ -22,10 +26,11 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import BackendUnavailable
 from rfcore.extras import needs
 from rfcore.image import I420
+from rfcore.native.warp import CORRECTION_DOUBT, correct_i420, warp_i420, warp_numbers
 from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.opencl.device import BUILDS, Device, DeviceLost, build_device, find_device
-from rfcore.raster.opencl.renderer import SIDE, DeviceRasterizer
+from rfcore.raster.opencl.renderer import SIDE, DeviceRasterizer, DeviceWarp
 from rfcore.raster.renderers import DEVICES
 from rfcore.views import FieldView, View
 
@@ -78,7 +83,7 @@ def _first_exact(wanted: str) -> Device:
 with needs("opencl"):
     import pyopencl as cl
 
-__all__ = ["ARITHMETIC_DIGESTS", "CHECKS", "Check", "check_device"]
+__all__ = ["ARITHMETIC_DIGESTS", "CHECKS", "WARP_CASES", "Check", "WarpCase", "check_device"]
 
 OPERATIONS = ("addition", "product", "quotient", "square root", "fused multiply-add", "floor")
 PATTERNS = 1 << 14
@@ -173,17 +178,59 @@ class Check:
         drawn_by = DeviceRasterizer(device, gaussians, antialiased=self.antialiased)
         drawn_by.draw(self.camera, self.degree, view.colour, view.depth, view.opacity)
         picture = I420.empty(shape[::-1])
-        depth, opacity = np.empty_like(view.depth), np.empty_like(view.opacity)
-        drawn_by.draw_codec_picture(self.camera, self.degree, picture, depth, opacity)
-        return view, FieldView(self.camera, picture, depth, opacity)
+        planes = drawn_by.draw_codec_picture(self.camera, self.degree, picture)
+        return view, FieldView(self.camera, picture, *map(drawn_by.fetch, planes))
 
 
 def _camera(width_px: int, height_px: int) -> Camera:
+    pose = Pose((0.25, -0.125, -0.5), (0.96, 0.0, 0.28, 0.0))
+    return Camera(_lens(width_px, height_px), pose)
+
+
+def _lens(width_px: int, height_px: int) -> Intrinsics:
     focal = 0.5 * max(width_px, height_px)
-    lens = Intrinsics(
+    return Intrinsics(
         width_px, height_px, focal, 1.03125 * focal, 0.48 * width_px, 0.53 * height_px
     )
-    return Camera(lens, Pose((0.25, -0.125, -0.5), (0.96, 0.0, 0.28, 0.0)))
+
+
+@dataclass(frozen=True)
+class WarpCase:
+    """A warp of a self-check: the pose of the present camera, seen from the earlier one."""
+
+    size_px: tuple[int, int]
+    step_m: tuple[float, float, float]
+    turn: tuple[float, float, float, float]
+    """A quaternion w, x, y, z of any length."""
+
+    def given(self) -> tuple[I420, FieldView, FieldView]:
+        """Return noise of every level, on a rough surface, and the two views of it."""
+        chance, lens = Chance(), _lens(*self.size_px)
+        length = math.sqrt(sum(part * part for part in self.turn))
+        w, x, y, z = (part / length for part in self.turn)
+        poses = (Pose.identity(), Pose(self.step_m, (w, x, y, z)))
+        before, now = (
+            FieldView(Camera(lens, pose), noise(chance, self.size_px), rough(chance, self.size_px))
+            for pose in poses
+        )
+        return noise(chance, self.size_px), before, now
+
+
+def noise(chance: Chance, size_px: tuple[int, int]) -> I420:
+    """Return a picture of every level."""
+    shapes = [plane.shape for plane in I420.empty(size_px).planes]
+    return I420(*(chance.bits(*shape).astype(np.uint8) for shape in shapes))
+
+
+def rough(chance: Chance, size_px: tuple[int, int]) -> F32:
+    """Return the depth of a rough surface with a step in it, holes, and depths of any size."""
+    width_px, height_px = size_px
+    shape = (height_px, width_px)
+    depth = chance.uniform(4, 6, *shape)
+    depth[:, 3 * width_px // 4 :] *= np.float32(2)
+    specials = np.array([0, 0, -1, 1e-30, 1e30, -1e30, 3e38, 0.125], np.float32)
+    special = specials[chance.bits(*shape) & np.uint32(7)]
+    return np.where(chance.bits(*shape) % np.uint32(16) == 0, special, depth)
 
 
 def check_gaussians() -> Gaussians:
@@ -222,25 +269,75 @@ CHECKS = (
 )
 
 
+WARP_CASES = (
+    WarpCase((101, 67), (0.2, -0.1, 0.5), (0.9995, 0.02, -0.01, 0.005)),
+    WarpCase((64, 48), (1.5, 0.25, -0.5), (0.99, 0.0, 0.1, 0.0)),  # leaves the picture
+    WarpCase((37, 3), (0.0, 0.0, -0.5), (1.0, 0.0, 0.0, 0.03125)),
+    WarpCase((1, 9), (0.0, 0.125, 0.0), (1.0, 0.0, 0.0, 0.0)),
+    WarpCase((1, 1), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
+    WarpCase((24, 18), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),  # sees nothing of it
+)
+
+
 def check_device(device: Device) -> None:
     """Raise ``BackendUnavailable`` saying what differs, unless the device is exact."""
     try:
-        for name, result in zip(OPERATIONS, arithmetic_on(device), strict=True):
-            if digest(result) != ARITHMETIC_DIGESTS[name]:
-                raise BackendUnavailable(f"{device.description}: a {name} is not the IEEE result")
+        _check_arithmetic(device)
         gaussians = check_gaussians()
         for check in CHECKS:
-            view, held = check.on(device, gaussians)
-            k = check.camera.intrinsics
-            if digest(view.colour, view.depth, view.opacity) != check.want:
-                raise BackendUnavailable(
-                    f"{device.description}: its picture of {k.width_px}x{k.height_px} pixels with "
-                    f"bands up to {check.degree} is not that of the native kernels"
-                )
-            if bytes_of(held) != bytes_of(field_view_from_view(view, check.camera)):
-                raise BackendUnavailable(
-                    f"{device.description}: its codec picture of {k.width_px}x{k.height_px} pixels "
-                    "is not that of the native kernels"
-                )
+            _check_pictures(device, check, gaussians)
+        carried_by = DeviceRasterizer(device, gaussians, antialiased=False)
+        for case in WARP_CASES:
+            _check_carried(carried_by, case)
     except (DeviceLost, cl.Error) as error:
         raise BackendUnavailable(f"{device.description}: {error}") from error
+
+
+def _check_arithmetic(device: Device) -> None:
+    for name, result in zip(OPERATIONS, arithmetic_on(device), strict=True):
+        if digest(result) != ARITHMETIC_DIGESTS[name]:
+            raise BackendUnavailable(f"{device.description}: a {name} is not the IEEE result")
+
+
+def _check_pictures(device: Device, check: Check, gaussians: Gaussians) -> None:
+    view, held = check.on(device, gaussians)
+    k = check.camera.intrinsics
+    if digest(view.colour, view.depth, view.opacity) != check.want:
+        raise BackendUnavailable(
+            f"{device.description}: its picture of {k.width_px}x{k.height_px} pixels with "
+            f"bands up to {check.degree} is not that of the native kernels"
+        )
+    if bytes_of(held) != bytes_of(field_view_from_view(view, check.camera)):
+        raise BackendUnavailable(
+            f"{device.description}: its codec picture of {k.width_px}x{k.height_px} pixels "
+            "is not that of the native kernels"
+        )
+
+
+def _check_carried(device: DeviceRasterizer, case: WarpCase) -> None:
+    previous, before, now = case.given()
+    wanted = {
+        "warp": (None, warp_i420(previous, before, now)),
+        "correction": (before.render, correct_i420(previous, before, now)),
+    }
+    for name, (minus, want) in wanted.items():
+        if carried_on(device, previous, minus, before, now).digest() != want.digest():
+            width_px, height_px = case.size_px
+            raise BackendUnavailable(
+                f"{device.device.description}: its {name} of {width_px}x{height_px} pixels is not "
+                "that of the native kernels"
+            )
+
+
+def carried_on(
+    device: DeviceRasterizer, previous: I420, minus: I420 | None, before: FieldView, now: FieldView
+) -> I420:
+    """Return the warp or, with ``minus``, the correction that a device makes of the CPU's views."""
+    earlier, depth = (device.hold(view.depth).lent for view in (before, now))
+    assert earlier is not None
+    assert depth is not None
+    numbers = warp_numbers(before.camera, now.camera)
+    doubt = 0 if minus is None else CORRECTION_DOUBT
+    out = I420.empty(now.render.size_px)
+    device.carry(DeviceWarp(numbers, earlier, depth, previous, now.render, minus, doubt), out)
+    return out
