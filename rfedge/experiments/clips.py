@@ -1,8 +1,9 @@
 """What experiments code: drives, clips of them, and a clip as some codec coded it.
 
 A ``Drive`` is a data set in time order, named with its rate on the command line (``NAME@HZ=
-DATASET``) and read once. A ``Clip`` is what a codec gets of it, a ``ClipCoder`` a codec under test,
-and a ``CodedClip`` what it made: bytes, errors and processor time a frame, and nothing of how.
+DATASET``, with ``,noise=SIGMA`` for frames of a noisy camera) and read once. A ``Clip`` is what a
+codec gets of it, a ``ClipCoder`` a codec under test, and a ``CodedClip`` what it made: bytes,
+errors and processor time a frame, and nothing of how.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ __all__ = [
     "luma_sse",
     "psnr_of_mse",
     "read_drive",
+    "with_noise",
 ]
 
 
@@ -123,30 +125,49 @@ def luma_sse(decoded: I420, frame: I420, where: NDArray[np.bool_]) -> float:
     return float(difference @ difference)
 
 
+NOISE_SEED = 1
+MAX_NOISE_SIGMA = 64.0
+"""Levels; nothing of a picture is left."""
+
 DECIMATION = 5
 """Of the frames of a drive that stands for a slow camera: 10 Hz to 2."""
 
 
 @dataclass(frozen=True)
 class DriveName:
-    """A drive as it is named on the command line: ``NAME@HZ=DATASET``."""
+    """A drive as it is named on the command line: ``NAME@HZ=DATASET[,noise=SIGMA]``.
+
+    ``noise_sigma``: of Gaussian noise on every sample of the frames, in levels; the scene of such a
+    drive is named with it.
+    """
 
     scene: str
     rate_hz: float
     dataset: Path
+    noise_sigma: float = 0.0
 
     @staticmethod
     def parse(text: str) -> DriveName:
         """Raise ``InvalidInput`` for text of another form."""
-        found = re.fullmatch(r"([\w.-]+)@(\d+(?:\.\d+)?)=(.+)", text)
+        found = re.fullmatch(r"([\w.-]+)@(\d+(?:\.\d+)?)=(.+?)(?:,noise=([^,]*))?", text)
         if not found or float(found[2]) <= 0:
             raise InvalidInput("drives", f"{text!r} is not NAME@HZ=DATASET, as empty@10=drive.json")
-        return DriveName(found[1], float(found[2]), Path(found[3]))
+        sigma = 0.0 if found[4] is None else _noise_sigma(found[4])
+        scene = f"{found[1]} noise {sigma:g}" if sigma else found[1]
+        return DriveName(scene, float(found[2]), Path(found[3]), sigma)
+
+
+def _noise_sigma(text: str) -> float:
+    number = float(text) if re.fullmatch(r"\d+(\.\d+)?", text) else math.nan
+    if not number <= MAX_NOISE_SIGMA:
+        raise InvalidInput("drives", f"noise={text} is not a number of 0..{MAX_NOISE_SIGMA:g}")
+    return number
 
 
 @dataclass(frozen=True)
 class DriveOfField:
-    """A drive and the field that it is rendered with: ``NAME@HZ=DATASET[,FIELD.rff]``."""
+    """A drive and the field that it is rendered with:
+    ``NAME@HZ=DATASET[,FIELD.rff][,noise=SIGMA]``."""
 
     name: DriveName
     field: Path
@@ -154,10 +175,10 @@ class DriveOfField:
     @staticmethod
     def parse(text: str, field: Path) -> DriveOfField:
         """Take ``field`` where the text names none; raises as ``DriveName.parse``."""
-        drive, comma, own = text.rpartition(",")
-        if not comma or not own.endswith(".rff"):
+        found = re.fullmatch(r"(.+),([^,]+\.rff)(,noise=[^,]*)?", text)
+        if not found:
             return DriveOfField(DriveName.parse(text), field)
-        return DriveOfField(DriveName.parse(drive), Path(own))
+        return DriveOfField(DriveName.parse(found[1] + (found[3] or "")), Path(found[2]))
 
     def read(self, limit: int | None) -> tuple[Drive, RadianceField]:
         """Read the frames and the field."""
@@ -178,7 +199,7 @@ class Clip:
 @dataclass(frozen=True)
 class Drive:
     """The frames of a drive: as posed pictures, read again when asked for, and as the codec takes
-    them, in memory."""
+    them, in memory. Noise is in the latter alone."""
 
     name: DriveName
     pictures: Sequence[PosedPicture]
@@ -214,4 +235,17 @@ def read_drive(name: DriveName | str, limit: int | None = None) -> Drive:
     if isinstance(name, str):
         name = DriveName.parse(name)
     pictures = read_dataset(name.dataset).pictures[:limit]
-    return Drive(name, pictures, [i420_from_rgb(picture.read()) for picture in pictures])
+    frames = [i420_from_rgb(picture.read()) for picture in pictures]
+    return Drive(name, pictures, with_noise(frames, name.noise_sigma))
+
+
+def with_noise(frames: Sequence[I420], sigma: float) -> Sequence[I420]:
+    """Add Gaussian noise, always the same, to every sample of the frames; as they are for 0."""
+    if not sigma:
+        return frames
+    rng = np.random.default_rng(NOISE_SEED)
+
+    def noisy(plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return np.clip(plane + rng.normal(0, sigma, plane.shape), 0, 255).round().astype(np.uint8)
+
+    return [I420(*map(noisy, frame.planes)) for frame in frames]

@@ -95,3 +95,22 @@ def test_a_clip_is_named_with_the_condition_it_is_coded_under(thumbnail):
     noisy = drive.clip("pose noise", 27.5)
     assert (noisy.scene, noisy.rate_hz, noisy.field_psnr_db) == ("wall pose noise", 10.0, 27.5)
     assert noisy.frames_digest == drive.digest
+
+
+def test_a_noisy_drive_has_the_noise_that_its_name_says_and_always_the_same(thumbnail):
+    plain = read_drive(thumbnail.drive)
+    noisy, again = (read_drive(f"{thumbnail.drive},noise=3") for _ in range(2))
+    assert (noisy.name.scene, noisy.name.noise_sigma) == ("wall noise 3", 3.0)
+    assert noisy.digest == again.digest != plain.digest
+    assert read_drive(f"{thumbnail.drive},noise=0").digest == plain.digest
+    differences = [n.y.astype(float) - p.y for n, p in zip(noisy.frames, plain.frames, strict=True)]
+    inside = [(p.y > 20) & (p.y < 235) for p in plain.frames]
+    of_all = np.concatenate([d[w] for d, w in zip(differences, inside, strict=True)])
+    assert of_all.std() == pytest.approx(3.0, abs=0.1)
+    assert abs(of_all.mean()) < 0.1
+
+
+@pytest.mark.parametrize("noise", ["65", "-1", "much"])
+def test_noise_that_is_none_is_refused(noise):
+    with pytest.raises(InvalidInput, match=f"noise={noise} is not a number of 0..64"):
+        DriveName.parse(f"wall@10=drive.json,noise={noise}")

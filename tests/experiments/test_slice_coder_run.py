@@ -19,7 +19,7 @@ from rfcore.codec.h264.slice_coder import Effort, SliceCoder
 from rfcore.codec.h264.slices import CodedSlice, SliceCoding, encode_slice, slice_options
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
-from rfedge.experiments.clips import DriveOfField
+from rfedge.experiments.clips import DriveName, DriveOfField
 from rfedge.experiments.slice_coder import run
 from rfedge.experiments.slice_coder.report import BdRow, TimeRow, slice_coder_section
 from rfedge.experiments.slice_coder.run import (
@@ -72,13 +72,17 @@ def test_a_drive_may_name_its_own_field() -> None:
     own = DriveOfField.parse("city@5=out/city.json,out/city.rff", FIELD)
     assert (own.name.dataset, own.field) == (Path("out/city.json"), Path("out/city.rff"))
     assert DriveOfField.parse(DRIVE, FIELD).field == FIELD
+    noisy = DriveOfField.parse("city@5=out/city.json,out/city.rff,noise=1.5", FIELD)
+    assert (noisy.field, noisy.name) == (
+        Path("out/city.rff"),
+        DriveName("city noise 1.5", 5.0, Path("out/city.json"), 1.5),
+    )
 
 
 def job(tmp_path: Path, *sizes: str) -> SliceCoderJob:
     return SliceCoderJob(
         field=FIELD,
-        drives=(DRIVE,),
-        noisy=(DRIVE,),
+        drives=(DRIVE, f"{DRIVE},noise=3"),
         timed=DRIVE,
         sizes=sizes,
         out=tmp_path / "slice-coder.json",

@@ -27,11 +27,10 @@ class EvalSliceCoder:
     """
 
     drives: Annotated[tuple[str, ...], Positional] = SAMPLES
-    """NAME@HZ=DATASET for each drive; NAME@HZ=DATASET,FIELD.rff for one of another field."""
+    """NAME@HZ=DATASET for each drive; NAME@HZ=DATASET,FIELD.rff for one of another field;
+    with ,noise=3 behind it for frames with camera noise of standard deviation 3."""
     field: Path = sample_path("fields/street.rff")
     """The field archive (.rff) of the drives that name none."""
-    noisy: tuple[str, ...] = ()
-    """The same for drives whose frames get camera noise of standard deviation 3."""
     timed: str = SAMPLES[1]
     """The drive whose frames are timed."""
     sizes: tuple[str, ...] = ("640x360", "1280x720")
@@ -53,7 +52,6 @@ class EvalSliceCoder:
         job = SliceCoderJob(
             field=field_path(self.field),
             drives=self.drives,
-            noisy=self.noisy,
             timed=self.timed,
             sizes=self.sizes,
             out=self.out,

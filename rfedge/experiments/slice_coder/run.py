@@ -47,14 +47,12 @@ from rfedge.results import check_result_path, make_result, provenance, write_res
 
 __all__ = [
     "CRFS",
-    "NOISE_SIGMA",
     "RIVALS",
     "Footage",
     "SliceCoderJob",
     "SliceTask",
     "bd_rows",
     "header_of",
-    "noisy",
     "resized",
     "run_slice_coder",
     "slice_qp",
@@ -72,7 +70,6 @@ QP_ABOVE = 1
 """Our quantiser above x264's: the same bytes and quality within 3 %. References differ from point
 to point, so a coder with finer points would predict from worse pictures at the same quality."""
 REPEATS = 3
-NOISE_SIGMA, NOISE_SEED = 3.0, 1
 QUICK_FRAMES = 4
 TIMED_FRAMES = 6
 _END_OF_CHANGES = 3
@@ -136,17 +133,6 @@ def _resampled(frame: I420, width_px: int, height_px: int) -> I420:
 
 def _resampled_plane(plane: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(plane, size_px, interpolation=cv2.INTER_CUBIC), np.uint8)
-
-
-def noisy(footage: Footage, sigma: float, seed: int) -> Footage:
-    """Add Gaussian noise, as a camera's sensor does, to every sample of the frames."""
-    rng = np.random.default_rng(seed)
-
-    def plus_noise(plane: NDArray[Any]) -> NDArray[np.uint8]:
-        return np.clip(plane + rng.normal(0, sigma, plane.shape), 0, 255).round().astype(np.uint8)
-
-    frames = [I420(*map(plus_noise, frame.planes)) for frame in footage.frames]
-    return Footage(frames, footage.views)
 
 
 def slice_tasks(footage: Footage, crf: float, lights: list[Photometric]) -> Iterator[SliceTask]:
@@ -340,7 +326,6 @@ class SliceCoderJob:
 
     field: Path
     drives: Sequence[str]
-    noisy: Sequence[str]
     timed: str
     sizes: Sequence[str]
     out: Path
@@ -349,7 +334,7 @@ class SliceCoderJob:
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
-        if not (self.drives or self.noisy):
+        if not self.drives:
             raise InvalidInput("drives", "there is none")
         for number in self.threads:
             if number < 1:
@@ -373,30 +358,19 @@ def run_slice_coder(job: SliceCoderJob, console: Console) -> dict[str, Any]:
 
     Raises ``InvalidInput`` or ``DatasetError`` before anything is coded if an input is wrong.
     """
-    plain, noise = ([DriveOfField.parse(t, job.field) for t in d] for d in (job.drives, job.noisy))
+    drives = [DriveOfField.parse(text, job.field) for text in job.drives]
     sizes_px, timed = job.sizes_px, DriveOfField.parse(job.timed, job.field)
-    made = provenance(sorted({drive.field for drive in (*plain, *noise, timed)}))
+    made = provenance(sorted({drive.field for drive in (*drives, timed)}))
     limit = QUICK_FRAMES if job.quick else None
     rows: list[BdRow] = []
-    for drive in plain:
-        rows += _bd_rows(drive, limit, sigma=0.0)
+    for drive in drives:
+        rows += bd_rows(drive.name.scene, drive.name.rate_hz, Footage.of(*drive.read(limit)))
         console.print(f"{drive.name.scene}: done")
-    for drive in noise:
-        rows += _bd_rows(drive, limit, sigma=NOISE_SIGMA)
-        console.print(f"{drive.name.scene} with noise: done")
     times = _time_rows(timed, sizes_px, job.threads)
     result = make_result("slice-coder", made, {"quick": job.quick, "rows": rows, "times": times})
     write_result(job.out, result)
     print_slice_coder(console, rows, times)
     return result
-
-
-def _bd_rows(drive: DriveOfField, limit: int | None, sigma: float) -> list[BdRow]:
-    footage, name = Footage.of(*drive.read(limit)), drive.name
-    if sigma:
-        footage = noisy(footage, sigma, NOISE_SEED)
-        name = replace(name, scene=f"{name.scene} noise {sigma:g}")
-    return list(bd_rows(name.scene, name.rate_hz, footage))
 
 
 def _time_rows(
