@@ -19,7 +19,7 @@ NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 .PHONY: help demo sample sample-field test test-slow test-slices test-scale test-aarch64 test-prometheus test-netns test-fault test-attack \
 	test-compose test-system-packages drive-long stability check build bench proto figures images up \
 	down operations-figures load load-transport load-receiver load-full load-links load-overload load-ratio soak soak-short \
-	test-wheels build-full lock wheels nightly test-asan fuzz fuzz-nightly test-fault-core sizing
+	test-wheels build-full results results-full lock wheels nightly test-asan fuzz fuzz-nightly test-fault-core sizing
 
 help:  ## show the targets
 	@awk -F':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-18s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -200,6 +200,9 @@ bench: build-full  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench raster
 	$(BIN)/rfedge bench train
 	$(BIN)/rfedge bench codec
+
+results results-full: build-full  ## record anew what takes two hours, or everything (samples/results.mk; DATA)
+	$(MAKE) -f samples/results.mk $@ DATA=$(DATA) RFEDGE=$(BIN)/rfedge
 
 results-%: build-full  ## record `rfedge eval NAME` in results/NAME.json; options in ARGS (docs/evaluation.md)
 	$(BIN)/rfedge eval $* $(ARGS) --out results/$*.json

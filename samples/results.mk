@@ -1,0 +1,120 @@
+# What `rfedge eval` and `rfedge bench` record in results/, on a quiet machine from a committed revision:
+#     make results [DATA=FOLDER]         what takes two hours of two cores
+#     make results-full [DATA=FOLDER]    the rest, too, which takes days
+# DATA is a folder that has `street` (the yardstick), `kitti/city` and `kitti/loop` (docs/data.md); without it the
+# sample's drives are compared alone. What is there is not made again: a record is begun anew by deleting its file in
+# out/results. Faults, attacks and loads have targets of their own in the Makefile.
+OUT    ?= out/results
+RFEDGE ?= .venv/bin/rfedge
+DATA   ?=
+SAMPLE := samples/fields/street.rff
+EMPTY    := samples/street/transforms_drive_empty.json
+VEHICLES := samples/street/transforms_drive_vehicles.json
+
+.DELETE_ON_ERROR:
+.SECONDARY:
+.PHONY: results results-full
+results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec slice-coder classes never-worse robust ladder latency compare)
+	cp $^ results/
+results-full: results $(patsubst %,$(OUT)/%.json,compare-harder localise benchmark paper)
+	cp $(filter %.json,$^) results/
+	$(MAKE) -f samples/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
+
+$(OUT):
+	mkdir -p $@
+
+# --- fields that do not ship
+
+NGP := $(OUT)/street-ngp.rff
+$(NGP): | $(OUT)
+	$(RFEDGE) train samples/street --points samples/street/points.ply --held-out $(EMPTY) --kind ngp --minutes 10 --out $@
+ifneq ($(DATA),)
+YARD := $(DATA)/street
+LOOP := $(DATA)/kitti/loop
+CITY := $(DATA)/kitti/city
+trained = $(RFEDGE) train $1 --points $(dir $1)points.ply --held-out $2 --antialiased --plain --minutes $3 --out $@
+$(OUT)/yardstick.rff: | $(OUT)
+	$(call trained,$(YARD)/transforms_train.json,$(YARD)/transforms_drive_empty.json,5)
+$(OUT)/city.rff: | $(OUT)
+	$(call trained,$(CITY)/transforms_train.json,$(CITY)/transforms_drive.json,2.5)
+$(OUT)/loop.rff: | $(OUT)
+	$(call trained,$(LOOP)/transforms_first.json,$(LOOP)/transforms_second.json,2.5)
+FIELDS := $(patsubst %,$(OUT)/%.rff,yardstick city loop)
+endif
+
+# --- drives: through the sample's street under other circumstances, and of other people
+
+SCENES := $(OUT)/scenes
+drive = $(SCENES)/$1/transforms_drive.json
+COMMA := ,
+effects = (cat samples/street/empty.toml; echo; awk -v RS= -v ORS='\n\n' '/^\[effects$2/' samples/scenes/$1.toml) >$@
+lane = (cat samples/street/empty.toml; echo 'lane_offset_m = $1') >$@
+
+$(SCENES):
+	mkdir -p $@
+$(SCENES)/lane-%.toml: samples/street/empty.toml | $(SCENES)
+	$(call lane,$*)
+$(SCENES)/dusk.toml: samples/street/empty.toml | $(SCENES)
+	$(call effects,street-dusk)
+$(SCENES)/rain.toml: samples/street/empty.toml | $(SCENES)
+	$(call effects,street-rain)
+$(SCENES)/rolling-shutter.toml: samples/street/empty.toml | $(SCENES)
+	$(call effects,street-sensor,.rolling_shutter)
+$(SCENES)/exposure.toml: samples/street/empty.toml | $(SCENES)
+	$(call effects,street-sensor,.exposure)
+$(SCENES)/people.toml: samples/street/people.toml | $(SCENES)
+	cp $< $@
+$(SCENES)/%/transforms_drive.json: $(SCENES)/%.toml
+	$(RFEDGE) scene build $< --split drive --out $(@D)
+
+HARDER := lane-0.6 lane-1.5 dusk rain rolling-shutter exposure people
+HARDER_DRIVES := $(foreach name,$(HARDER),$(call drive,$(name)))
+
+NOON := sample-empty@10=$(EMPTY) sample-vehicles@10=$(VEHICLES)
+REAL := $(if $(DATA),kitti-loop@10=$(LOOP)/transforms_second.json$(COMMA)$(OUT)/loop.rff \
+	kitti-city@5=$(CITY)/transforms_drive.json$(COMMA)$(OUT)/city.rff)
+YARDSTICK := $(if $(DATA),yardstick-empty@10=$(YARD)/transforms_drive_empty.json$(COMMA)$(OUT)/yardstick.rff \
+	yardstick-vehicles@10=$(YARD)/transforms_drive_vehicles.json$(COMMA)$(OUT)/yardstick.rff)
+YARDSTICK_30 := $(if $(DATA),yardstick-empty@30=$(YARD)/transforms_drive30_empty.json$(COMMA)$(OUT)/yardstick.rff \
+	yardstick-vehicles@30=$(YARD)/transforms_drive30_vehicles.json$(COMMA)$(OUT)/yardstick.rff)
+NOISY := sample-vehicles@10=$(VEHICLES)$(COMMA)noise=1.5 sample-vehicles@10=$(VEHICLES)$(COMMA)noise=3 \
+	$(if $(DATA),yardstick-vehicles@10=$(YARD)/transforms_drive_vehicles.json$(COMMA)$(OUT)/yardstick.rff$(COMMA)noise=3)
+
+# --- records
+
+$(OUT)/bench-%.json: | $(OUT)
+	$(RFEDGE) bench $* --json $@
+$(OUT)/slice-coder.json: $(FIELDS) | $(OUT)
+	$(RFEDGE) eval slice-coder $(NOON) sample-vehicles@10=$(VEHICLES),noise=3 $(REAL) $(wordlist 2,2,$(YARDSTICK)) \
+		$(wordlist 2,2,$(YARDSTICK_30)) --out $@
+$(OUT)/compare.json: $(FIELDS) | $(OUT)
+	$(RFEDGE) eval compare $(SAMPLE) $(NOON) $(REAL) $(YARDSTICK) --background sample-vehicles@10=$(EMPTY) \
+		$(if $(DATA),yardstick-vehicles@10=$(YARD)/transforms_drive_empty.json) \
+		--cells $(OUT)/compare --out $@
+$(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) | $(OUT)
+	$(RFEDGE) eval compare $(SAMPLE) $(NOISY) $(YARDSTICK_30) \
+		$(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) --cells $(OUT)/compare --out $@
+$(OUT)/classes.json: $(call drive,people) | $(OUT)
+	$(RFEDGE) eval classes $(SAMPLE) people@10=$< --cells $(OUT)/classes --out $@
+$(OUT)/never-worse.json: $(FIELDS) | $(OUT)
+	$(RFEDGE) eval never-worse $(SAMPLE) $(NOON) --decimated $(NOON) --cells $(OUT)/never-worse --out $@
+$(OUT)/robust.json: $(call drive,dusk) | $(OUT)
+	$(RFEDGE) eval robust --dusk dusk@10=$< --cells $(OUT)/robust --out $@
+$(OUT)/ladder.json: $(NGP) | $(OUT)
+	$(RFEDGE) eval ladder $(SAMPLE) $(NGP) --frames 8 --cells $(OUT)/ladder --out $@
+$(OUT)/latency.json: | $(OUT)
+	$(RFEDGE) eval latency --cells $(OUT)/latency --out $@
+$(OUT)/localise.json: $(call drive,dusk) $(call drive,lane-1.5) | $(OUT)
+	$(RFEDGE) eval localise sample=$(EMPTY),$(SAMPLE) vehicles=$(VEHICLES),$(SAMPLE),rows=2m:3deg \
+		noise=$(EMPTY),$(SAMPLE),noise=3,rows=2m:3deg dusk=$(call drive,dusk),$(SAMPLE),rows=2m:3deg \
+		lane=$(call drive,lane-1.5),$(SAMPLE),rows=2m:3deg --tries 100 --false-starts 50 --seed 2 \
+		--cells $(OUT)/localise --out $@
+BENCH := $(dir $(RFEDGE))python examples/bench_rfedge.py
+$(OUT)/benchmark:
+	$(RFEDGE) eval benchmark run $@ --name rfedge --points 17 20 23 26 29 32 35 38 41 --prior $(SAMPLE) \
+		--method "$(BENCH) encode {prior}/street.rff {frames} {out} {point}"
+$(OUT)/benchmark.json: $(OUT)/benchmark
+	$(RFEDGE) eval benchmark check $< --decoder "$(BENCH) decode {prior}/street.rff {packets} {out}" --out $@
+$(OUT)/paper.json: $(NGP) | $(OUT)
+	$(RFEDGE) eval paper --fields 3dgs=$(SAMPLE) ingp=$(NGP) --drives sample-empty=$(EMPTY) sample-vehicles=$(VEHICLES) \
+		--cells $(OUT)/paper --out $@
