@@ -169,8 +169,8 @@ soak: build-full  ## half load for MINUTES (30): memory, descriptors and threads
 	$(BIN)/python -m rfedge.loadtest.soak --minutes $(MINUTES) $(ARGS); ended=$$?; \
 		cp out/soak/soak.json results/soak.json && exit $$ended
 
-soak-short: build-full  ## five minutes of it
-	$(BIN)/python -m rfedge.loadtest.soak --minutes 5
+soak-short: build-full  ## three minutes of it
+	$(BIN)/python -m rfedge.loadtest.soak --minutes 3
 
 sizing: build-full  ## measure the tables of `rfedge size` (half an hour of one core); then `make figures`
 	$(BIN)/rfedge scene build samples/sizing/drive_1080p.toml --split drive --out out/drive-1080p

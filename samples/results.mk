@@ -115,6 +115,18 @@ $(OUT)/benchmark:
 		--method "$(BENCH) encode {prior}/street.rff {frames} {out} {point}"
 $(OUT)/benchmark.json: $(OUT)/benchmark
 	$(RFEDGE) eval benchmark check $< --decoder "$(BENCH) decode {prior}/street.rff {packets} {out}" --out $@
-$(OUT)/paper.json: $(NGP) | $(OUT)
-	$(RFEDGE) eval paper --fields 3dgs=$(SAMPLE) ingp=$(NGP) --drives sample-empty=$(EMPTY) sample-vehicles=$(VEHICLES) \
+
+# --- the published experiment whole: 144 poses, two scenes, two fields of that very street
+
+PAPER := $(OUT)/paper-street
+$(PAPER)/train/transforms_train.json:
+	$(RFEDGE) scene build street-empty --split train --out $(@D)
+$(PAPER)/%/transforms_eval.json:
+	$(RFEDGE) scene build street-$* --split eval --size 1920x1080 --out $(@D)
+$(PAPER)/3dgs.rff $(PAPER)/ingp.rff: $(PAPER)/%.rff: $(PAPER)/train/transforms_train.json $(PAPER)/empty/transforms_eval.json
+	$(RFEDGE) train $< --held-out $(word 2,$^) --minutes 30 $(if $(filter 3dgs,$*),--antialiased --plain --limit 400000,--kind ngp) \
+		--json $(@:.rff=.json) --out $@
+$(OUT)/paper.json: $(PAPER)/3dgs.rff $(PAPER)/ingp.rff $(PAPER)/empty/transforms_eval.json $(PAPER)/parked/transforms_eval.json
+	$(RFEDGE) eval paper --fields 3dgs=$(PAPER)/3dgs.rff ingp=$(PAPER)/ingp.rff --sizes 300x168 500x280 720x404 1920x1080 \
+		--drives empty=$(PAPER)/empty/transforms_eval.json parked=$(PAPER)/parked/transforms_eval.json \
 		--cells $(OUT)/paper --out $@
