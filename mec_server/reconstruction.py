@@ -15,7 +15,7 @@ from mec_server.session import DecodeJob, DecodeOutcome, OpenJob
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.state import DecoderState
 from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason
-from rfcore.field import Renderer
+from rfcore.field import CodecPictureRenderer, Renderer
 from rfcore.image import I420
 from rfcore.native.yuv import field_view_from_view
 from rfcore.views import FieldView, View
@@ -54,7 +54,7 @@ class Reconstruction:
     """A frame, identical to the one in the vehicle's closed loop, and its ``outcome``.
 
     ``render``: what the field shows there, at the frame's quality; ``None`` where nothing was
-    rendered, as for a camera that is lost.
+    rendered, as for a camera that is lost, and where a device did and kept the colours.
     """
 
     picture: I420
@@ -122,13 +122,16 @@ class CameraDecoder:
         return Reconstruction(decoded.frame, outcome, render)
 
     def _render(self, job: DecodeJob) -> tuple[View | None, FieldView]:
-        """Return what the field shows at the frame's pose, and that as the codec holds it; nothing
-        of either if the camera is lost."""
+        """Return what the field shows at the frame's pose, where the CPU has it, and that as the
+        codec holds it; nothing of either if the camera is lost."""
         camera = job.frame.camera(self._camera.intrinsics)
         if camera is None:
             return None, FieldView.nothing(self._camera.intrinsics)
+        renderer, quality = self._renderers[job.field_id], job.frame.quality
         try:
-            render = self._renderers[job.field_id].render(camera, job.frame.quality)
+            if isinstance(renderer, CodecPictureRenderer) and renderer.is_on_device:
+                return None, renderer.field_view(camera, quality)
+            render = renderer.render(camera, quality)
             return render, field_view_from_view(render, camera)
         except InvalidInput as error:
             raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error

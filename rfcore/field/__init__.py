@@ -2,6 +2,7 @@
 
 from rfcore.field.interface import (
     Bounds,
+    CodecPictureRenderer,
     FieldMetadata,
     RadianceField,
     Renderer,
@@ -17,6 +18,7 @@ from rfcore.field.store import FieldStore, load_field, save_field
 __all__ = [
     "FULL",
     "Bounds",
+    "CodecPictureRenderer",
     "FieldMetadata",
     "FieldStore",
     "NgpField",

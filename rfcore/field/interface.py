@@ -122,6 +122,11 @@ class Renderer(Protocol):
 class CodecPictureRenderer(Protocol):
     """A renderer that makes the codec's picture itself, sooner than from the colours."""
 
+    @property
+    def is_on_device(self) -> bool:
+        """Whether a device draws, where depth and opacity of a ``field_view`` stay until somebody
+        asks for them, and the colours for good."""
+
     def field_view(self, camera: Camera, quality: Quality) -> FieldView:
         """Return what ``field_view_from_view`` makes of ``Renderer.render``."""
 

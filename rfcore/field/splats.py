@@ -32,6 +32,7 @@ from rfcore.field.splat_grid import FINEST, Grain, Steps
 from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import Gaussians
 from rfcore.raster.native import Rasterizer, check_renderer
+from rfcore.raster.renderers import is_opencl
 from rfcore.views import FieldView, View
 
 __all__ = ["SplatField"]
@@ -183,6 +184,11 @@ class SplatField:
 
     def _view(self, camera: Camera, quality: Quality) -> View:
         return self.rasterizer(quality.detail).render(camera, sh_degree=self._degree(quality))
+
+    @property
+    def is_on_device(self) -> bool:
+        """Whether an OpenCL device was chosen to draw."""
+        return is_opencl(self.isa)
 
     def field_view(self, camera: Camera, quality: Quality = FULL) -> FieldView:
         """Render what a codec's end holds; with a device, the codec's picture is made there."""

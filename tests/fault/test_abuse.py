@@ -138,12 +138,15 @@ async def test_memory_that_runs_out(
     site: Any, case: Any, coded: Any, raw_vehicle: Any, appears: Any
 ) -> None:
     case.about(
-        "out of memory", f"a control group with {ROOM_BYTES >> 20} MiB left, 16 cameras open", "F21"
+        "out of memory",
+        f"a control group with {ROOM_BYTES >> 20} MiB left, 16 cameras and decoders allowed",
+        "F21",
     )
+    options = ("--decoder", "child", "--max-decoders", "64")
     group = ControlGroup(f"rfedge-fault-{os.getpid()}")
     cameras = tuple(replace(coded.hello.cameras[0], camera_id=f"c{i}") for i in range(16))
     try:
-        server = await site.server("--decoder", "child", within=group.within)
+        server = await site.server(*options, within=group.within)
         bystander = await site.vehicle(server.address, "bystander")
         group.limit_memory(group.memory_bytes() + ROOM_BYTES)
         async with raw_vehicle(server.address) as vehicle:
@@ -153,7 +156,7 @@ async def test_memory_that_runs_out(
         await asyncio.sleep(0.2)
         died = server.process.poll() is not None
         if died:  # as compose does with `restart: unless-stopped`
-            await site.server("--decoder", "child", listen=server.address, within=group.within)
+            await site.server(*options, listen=server.address, within=group.within)
         await appears(lambda: bystander.acked(killed_s + 0.2))
         served_s = bystander.acked_at_s(killed_s + 0.2)[0]
         case.at_most("bystander served again", served_s - killed_s, 5)
@@ -199,8 +202,9 @@ async def attacking(name: str, target: Target, folder: Path) -> AsyncIterator[No
 async def test_an_abusive_peer(
     attack: str, covers: str, site: Any, street: Any, case: Any, tmp_path: Path
 ) -> None:
-    identity, work = ATTACKS[attack]
-    case.about(attack.replace("_", " "), f"{work.__doc__} Certificate: {identity}.", covers)
+    chosen = ATTACKS[attack]
+    about = f"{chosen.work.__doc__} Certificate: {chosen.identity}."
+    case.about(attack.replace("_", " "), about, covers)
     root = tmp_path / "certs"
     members = Members(("attacker", "bystander"), ("attacker",))
     write_certificates(root, certify(members, datetime.now(UTC), days=2))

@@ -17,7 +17,7 @@ from rfcore.codec.h264.config import CoderSettings, LightChange
 from rfcore.codec.sender.steering import SteeringSettings
 from rfcore.dataset import read_dataset
 from rfcore.errors import BackendUnavailable
-from rfcore.image import read_rgb, write_png
+from rfcore.image import I420, read_rgb, write_png
 from rfcore.native.backend import available_isas
 from rfcore.wire.settings import RenderSettings
 from rfedge.link.proxy import LinkProxy, ProxySettings
@@ -78,22 +78,36 @@ async def test_an_opencl_device_at_either_end_changes_no_byte(
 
 
 @pytest.mark.slow
+async def test_colours_stay_on_the_device_at_both_ends(
+    serve: Any, travel: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fetched(*_: Any, **__: Any) -> None:
+        raise AssertionError("colours, depth and opacity of a whole picture came to the CPU")
+
+    monkeypatch.setattr("rfcore.raster.native.Rasterizer.render", fetched)
+    device = RenderSettings(renderer=POCL)
+    async with serve(render=device) as server:
+        record = await travel(server.address, render=device)
+    assert record.counts == {"acked": 6}
+
+
+@pytest.mark.slow
 async def test_a_device_removed_under_a_server_costs_no_frame(
     serve: Any, travel: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of six pictures the device draws two and fails in the third."""
     from rfcore.raster.opencl import DeviceLost, DeviceRasterizer
 
-    draw, left = DeviceRasterizer.draw, iter(range(2))
+    draw, left = DeviceRasterizer.draw_codec_picture, iter(range(2))
 
-    def removed(self: DeviceRasterizer, camera: Any, degree: int, *pictures: Any) -> None:
-        for picture in pictures:
-            picture.fill(7.0)  # what a dying device may have left
+    def removed(self: DeviceRasterizer, camera: Any, degree: int, picture: I420) -> Any:
+        for plane in picture.planes:
+            plane.fill(7)  # what a dying device may have left
         if next(left, None) is None:
             raise DeviceLost("DEVICE_NOT_AVAILABLE")
-        draw(self, camera, degree, *pictures)
+        return draw(self, camera, degree, picture)
 
-    monkeypatch.setattr(DeviceRasterizer, "draw", removed)
+    monkeypatch.setattr(DeviceRasterizer, "draw_codec_picture", removed)
     async with serve(record=tmp_path, render=RenderSettings(renderer=POCL)) as server:
         with capture_logs() as logs:
             record = await travel(server.address)
