@@ -201,8 +201,8 @@ bench: build-full  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench train
 	$(BIN)/rfedge bench codec
 
-results results-full: build-full  ## record anew what takes two hours, or everything (samples/results.mk; DATA)
-	$(MAKE) -f samples/results.mk $@ DATA=$(DATA) RFEDGE=$(BIN)/rfedge
+results results-full: build-full  ## record anew what takes two hours, or everything (results/record.mk; DATA)
+	$(MAKE) -f results/record.mk $@ DATA=$(DATA) RFEDGE=$(BIN)/rfedge
 
 results-%: build-full  ## record `rfedge eval NAME` in results/NAME.json; options in ARGS (docs/evaluation.md)
 	$(BIN)/rfedge eval $* $(ARGS) --out results/$*.json
