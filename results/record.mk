@@ -96,7 +96,7 @@ $(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) | $(OUT)
 		$(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) --cells $(OUT)/compare --out $@
 $(OUT)/classes.json: $(call drive,people) | $(OUT)
 	$(RFEDGE) eval classes $(SAMPLE) people@10=$< --cells $(OUT)/classes --out $@
-$(OUT)/never-worse.json: $(FIELDS) | $(OUT)
+$(OUT)/never-worse.json: | $(OUT)
 	$(RFEDGE) eval never-worse $(SAMPLE) $(NOON) --decimated $(NOON) --cells $(OUT)/never-worse --out $@
 $(OUT)/robust.json: $(call drive,dusk) | $(OUT)
 	$(RFEDGE) eval robust --dusk dusk@10=$< --cells $(OUT)/robust --out $@

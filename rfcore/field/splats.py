@@ -187,8 +187,10 @@ class SplatField:
 
     @property
     def is_on_device(self) -> bool:
-        """Whether an OpenCL device was chosen to draw."""
-        return is_opencl(self.isa)
+        """Whether an OpenCL device draws; none does once it failed."""
+        with self._lock:
+            drawn_by = [self.isa, *(each.isa for each in self._rasterizers.values())]
+        return all(map(is_opencl, drawn_by))
 
     def field_view(self, camera: Camera, quality: Quality = FULL) -> FieldView:
         """Render what a codec's end holds; with a device, the codec's picture is made there."""

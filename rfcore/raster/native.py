@@ -26,7 +26,6 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native import _native
 from rfcore.native.backend import FLOAT32_MAX, check_backend
-from rfcore.native.warp import CORRECTION_DOUBT, warp_numbers
 from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.renderers import DEVICES, is_opencl
@@ -309,9 +308,7 @@ class _PlaneOnDevice:
             return None
         from rfcore.raster.opencl import DeviceWarp
 
-        numbers = warp_numbers(before.camera, now.camera)
-        doubt = 0 if minus is None else CORRECTION_DOUBT
-        warp = DeviceWarp(numbers, earlier, depth, previous, now.render, minus, doubt)
+        warp = DeviceWarp(previous, minus, before, now, earlier, depth)
         out = I420.empty(now.render.size_px)
         made = self._rasterizer._drawn_by_device(lambda device: device.carry(warp, out))
         return out if made else None

@@ -158,12 +158,14 @@ def test_a_fields_view_is_the_same_from_a_device(scene: SceneMaker, camera: Came
     for quality in (Quality(), Quality(scale=0.5)):
         views = [render_field_view(field, camera(), quality) for field in fields]
         assert bytes_of(views[0]) == bytes_of(views[1])
+    assert fields[0].is_on_device
     device = fields[0].rasterizer(1.0)._device
     assert device is not None
     device._kernels["codec_picture"] = until_gone(device._kernels["codec_picture"], iter(()))
     views = [render_field_view(field, camera()) for field in fields]
     assert bytes_of(views[0]) == bytes_of(views[1])
     assert fields[0].rasterizer(1.0).isa == available_isas()[0]
+    assert not fields[0].is_on_device
 
 
 @slow

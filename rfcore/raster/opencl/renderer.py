@@ -25,6 +25,7 @@ from rfcore.camera import Camera
 from rfcore.extras import needs
 from rfcore.image import I420
 from rfcore.native import _native
+from rfcore.native.warp import CORRECTION_DOUBT, warp_numbers
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.opencl.device import (
     Device,
@@ -33,6 +34,7 @@ from rfcore.raster.opencl.device import (
     DeviceMemory,
     LentBuffer,
 )
+from rfcore.views import FieldView
 
 with needs("opencl"):
     import pyopencl as cl
@@ -84,16 +86,25 @@ class DrawnPlane:
 class DeviceWarp:
     """What a warp is made of, or with ``minus`` a correction (``rfcore.native.warp``).
 
-    ``numbers`` are those of ``warp_numbers``, the depths buffers of the device.
+    ``previous`` was taken at ``before``; the depths are buffers of the device.
     """
 
-    numbers: Sequence[float]
+    previous: I420
+    minus: I420 | None
+    before: FieldView
+    now: FieldView
     earlier_depth: LentBuffer
     depth: LentBuffer
-    previous: I420
-    render: I420
-    minus: I420 | None = None
-    doubt: int = 0
+
+    @property
+    def numbers(self) -> Sequence[float]:
+        """Those of ``warp_numbers``."""
+        return warp_numbers(self.before.camera, self.now.camera)
+
+    @property
+    def doubt(self) -> int:
+        """Levels that a difference is not trusted by."""
+        return 0 if self.minus is None else CORRECTION_DOUBT
 
 
 class DeviceRasterizer:
@@ -197,7 +208,7 @@ class DeviceRasterizer:
         memory, pixels, names = self._memory, out.y.size, ("warp", "filter", "places")
         with _lost_if_it_fails(self.device):
             minus = warp.previous if warp.minus is None else warp.minus
-            given = [self._picture(picture) for picture in (warp.previous, minus, warp.render)]
+            given = [self._picture(each) for each in (warp.previous, minus, warp.now.render)]
             self._fill("warp", warp_on_device(warp.numbers, out.size_px))
             memory.at_least("places", PLACE_BYTES * pixels)
             memory.at_least("picture", _size_bytes(out))

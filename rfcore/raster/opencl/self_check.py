@@ -26,7 +26,7 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import BackendUnavailable
 from rfcore.extras import needs
 from rfcore.image import I420
-from rfcore.native.warp import CORRECTION_DOUBT, correct_i420, warp_i420, warp_numbers
+from rfcore.native.warp import correct_i420, warp_i420
 from rfcore.native.yuv import field_view_from_view
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.opencl.device import BUILDS, Device, DeviceLost, build_device, find_device
@@ -34,7 +34,18 @@ from rfcore.raster.opencl.renderer import SIDE, DeviceRasterizer, DeviceWarp
 from rfcore.raster.renderers import DEVICES
 from rfcore.views import FieldView, View
 
-__all__ = ["open_device"]
+with needs("opencl"):
+    import pyopencl as cl
+
+__all__ = [
+    "ARITHMETIC_DIGESTS",
+    "CHECKS",
+    "WARP_CASES",
+    "Check",
+    "WarpCase",
+    "check_device",
+    "open_device",
+]
 
 log = structlog.get_logger()
 _opened: dict[str, Device] = {}
@@ -79,11 +90,6 @@ def _first_exact(wanted: str) -> Device:
         "render with --renderer cpu"
     )
 
-
-with needs("opencl"):
-    import pyopencl as cl
-
-__all__ = ["ARITHMETIC_DIGESTS", "CHECKS", "WARP_CASES", "Check", "WarpCase", "check_device"]
 
 OPERATIONS = ("addition", "product", "quotient", "square root", "fused multiply-add", "floor")
 PATTERNS = 1 << 14
@@ -336,8 +342,6 @@ def carried_on(
     earlier, depth = (device.hold(view.depth).lent for view in (before, now))
     assert earlier is not None
     assert depth is not None
-    numbers = warp_numbers(before.camera, now.camera)
-    doubt = 0 if minus is None else CORRECTION_DOUBT
     out = I420.empty(now.render.size_px)
-    device.carry(DeviceWarp(numbers, earlier, depth, previous, now.render, minus, doubt), out)
+    device.carry(DeviceWarp(previous, minus, before, now, earlier, depth), out)
     return out
