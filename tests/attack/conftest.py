@@ -34,6 +34,7 @@ from attack.attacker import DEFERRED, LOG_LINES, OPEN_FILES, PROCESSOR_S
 from attack.bystander import NAME, NEWCOMER
 from attack.control_group import ControlGroup
 from attack.target import VEHICLE, Target
+from machine import MEASURED_AGAIN, Host, judge
 from rfedge.certs.authority import Members, certify, write_certificates
 from scoreboard import Scoreboard
 
@@ -75,6 +76,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if here in item.path.parents and "scene" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.attack)
             item.add_marker(pytest.mark.slow)
+            item.add_marker(MEASURED_AGAIN)
 
 
 async def appears(path: Path, process: subprocess.Popen[bytes], log: Path) -> str:
@@ -110,13 +112,23 @@ class Scene:
     measured: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     finished: bool = False
+    host: Host = field(default_factory=Host)
+    timed: set[str] = field(default_factory=set)
+    """What failed of the bounds of time."""
 
-    def note(self, bound: str, measured: str, good: bool) -> None:
+    def note(self, bound: str, measured: str, good: bool, is_timed: bool = False) -> None:
         """Note a figure and its bound."""
         self.bounds.append(bound)
         self.measured.append(measured)
         if not good:
             self.failed.append(f"{bound}: {measured}")
+            self.timed.update(self.failed[-1:] if is_timed else ())
+
+    def finish(self) -> None:
+        """Every figure is in: fail, or have it measured again, if one is out of bounds."""
+        self.finished = True
+        self.note("of the processors the host gave to others", f"{self.host.taken():.1%}", True)
+        judge(self.failed, self.timed, self.host.taken())
 
     def about(self, name: str, what: str, identity: str) -> None:
         """Say what is done, and with whose certificate."""

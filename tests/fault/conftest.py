@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from attack.bystander import HZ as BYSTANDER_HZ
 from cav_agent.frames import Capture, EncodeJob
 from cav_agent.pipeline import Pipeline
 from fault.streets import SHIPPED, SMALL, ShippedStreet, shipped_street
@@ -37,6 +36,7 @@ from integration.conftest import (
     raw_vehicle,
     small_street,
 )
+from machine import MEASURED_AGAIN, Host, judge
 from mec_server.decoding.child import DECODER_NAME
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.dataset import read_dataset
@@ -54,12 +54,15 @@ SHIPPED_HZ = 5.0
 CALM_S = 3.0
 FAULT_S = 3.0
 """As long as the calm that it is compared with: a p99 of fewer pictures is the latest one."""
+AS_LONG_AT_STREET_SIZE = 4
+"""120 pictures: the p99 of 60 of them is the latest one but for a trifle, and a shared machine has
+one that is late every few seconds, at the control as well, though not in the same ones."""
 ALLOWANCE_MS = 10.0
 """A tenth of the frame budget: the 99th of a few dozen latencies is the largest, and one late
 wake-up of a shared machine shall not count as harm done by a neighbour."""
 
 FEWER = 0.05
-"""Of 3 s at 20 Hz, and of as many frames at street size, three."""
+"""Of 3 s at 20 Hz, three."""
 
 BOARD = Scoreboard("faults", "make test-fault")
 
@@ -298,6 +301,8 @@ class Case:
     measured: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     finished: bool = False
+    _host: Host = field(default_factory=Host)
+    _timed: set[str] = field(default_factory=set)
     _started_s: float = field(default_factory=time.time)
     _calm_until_s: float = 0.0
     _fault_until_s: float = 0.0
@@ -308,13 +313,11 @@ class Case:
         self.fault, self.injected_with, self.covers = f"{fault}{size}", injected_with, covers
 
     def lasting(self, seconds: float) -> float:
-        """Return how long that takes in which a bystander of ``RATE_HZ`` takes as many pictures."""
-        return (
-            seconds * RATE_HZ / BYSTANDER_HZ if isinstance(self.street, ShippedStreet) else seconds
-        )
+        """Return how long something lasts that takes so long on the small street."""
+        return seconds * (AS_LONG_AT_STREET_SIZE if isinstance(self.street, ShippedStreet) else 1)
 
     async def calm(self) -> None:
-        """Let things run undisturbed for 3 s, at street size 6 s, to compare with."""
+        """Let things run undisturbed for 3 s, at street size 12 s, to compare with."""
         self._started_s = time.time()
         await asyncio.sleep(self.lasting(CALM_S))
         self._calm_until_s = time.time()
@@ -325,7 +328,8 @@ class Case:
 
     def at_most(self, what: str, value: float, limit: float, unit: str = "s") -> None:
         """Note a figure and its bound."""
-        self._note(f"{what} <= {limit:g} {unit}", f"{value:.3g} {unit}", value <= limit)
+        bound, is_timed = f"{what} <= {limit:g} {unit}", unit == "s"
+        self._note(bound, f"{value:.3g} {unit}", value <= limit, is_timed=is_timed)
 
     def holds(self, what: str, value: object) -> None:
         """Note something that must be so."""
@@ -352,6 +356,7 @@ class Case:
             f"bystander's p99 <= 1.2 x the larger of calm and control + {ALLOWANCE_MS:g} ms",
             f"{before:.1f} -> {during:.1f} ms, control {elsewhere:.1f} ms",
             during <= limit,
+            is_timed=True,
         )
         ended = {x["result"] for x in lines if x["capture_time_ns"] / 1e9 > self._started_s}
         self.holds("none of its frames lost or refused", ended <= {"acked", "dropped"})
@@ -373,9 +378,10 @@ class Case:
         self.holds("frames after it byte-equal to a fault-free run", got == list(enumerate(fresh)))
 
     def finish(self) -> None:
-        """Every figure is in."""
+        """Every figure is in: fail, or have it measured again, if one is out of bounds."""
         self.finished = True
-        assert self.failed == []
+        self.tells("of the processors the host gave to others", f"{self._host.taken():.1%}")
+        judge(self.failed, self._timed, self._host.taken())
 
     def row(self) -> dict[str, Any]:
         """Return the row of the scoreboard."""
@@ -393,11 +399,12 @@ class Case:
         captured_s = line["capture_time_ns"] / 1e9
         return self._calm_until_s <= captured_s <= self._fault_until_s
 
-    def _note(self, bound: str, measured: str, good: bool) -> None:
+    def _note(self, bound: str, measured: str, good: bool, is_timed: bool = False) -> None:
         self.bounds.append(bound)
         self.measured.append(measured)
         if not good:
             self.failed.append(f"{bound}: {measured}")
+            self._timed.update(self.failed[-1:] if is_timed else ())
 
 
 def is_exact(line: dict[str, Any]) -> bool:
@@ -471,6 +478,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if here in item.path.parents:
             item.add_marker(pytest.mark.fault)
             item.add_marker(pytest.mark.slow)
+            item.add_marker(MEASURED_AGAIN)
 
 
 @pytest.fixture

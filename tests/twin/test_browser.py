@@ -72,10 +72,14 @@ def program(name: str) -> str:
     return found
 
 
-def until(holds: Callable[[], Any], timeout_s: float = 60.0) -> Any:
+def until(
+    holds: Callable[[], Any], timeout_s: float = 60.0, instead: Callable[[], str] | None = None
+) -> Any:
+    """Return the first true value; ``instead`` tells what there is when none came in time."""
     deadline_s = time.monotonic() + timeout_s
     while not (value := holds()):
-        assert time.monotonic() < deadline_s, "did not come in time"
+        late = time.monotonic() > deadline_s
+        assert not late, "did not come in time" if instead is None else instead()
         time.sleep(0.1)
     return value
 
@@ -171,7 +175,11 @@ def test_the_street_is_seen_from_anywhere_with_what_vehicles_see(tmp_path: Path)
         )  # takes seconds each
         page.execute_script(LOOK_FROM_CAMERA)
         page.execute_script("document.getElementById('look').click()")
-        until(lambda: "cav-1/front" in live_text(page) and "live" in live_text(page), LOADED_S)
+        until(
+            lambda: "cav-1/front" in live_text(page) and "live" in live_text(page),
+            LOADED_S,
+            instead=lambda: told(page, tmp_path),
+        )
         plain = page.execute_script(DRAWN)
         page.execute_script("document.getElementById('live-freshness').click()")
         until(lambda: page.execute_script(DRAWN) != plain)
@@ -195,6 +203,12 @@ DRAWN = "return document.getElementById('live-canvas').toDataURL()"
 
 def live_text(page: webdriver.Chrome) -> str:
     return str(page.execute_script("return document.getElementById('live-state').textContent"))
+
+
+def told(page: webdriver.Chrome, folder: Path) -> str:
+    """Return what the page says of the view, its pictures, and the last words of all programs."""
+    logs = [f"{log.name}: {log.read_text()[-1500:]}" for log in folder.glob("*.log")]
+    return "\n".join([live_text(page), str(sequences(page)), state(page), *logs])
 
 
 def state(page: webdriver.Chrome) -> str:
