@@ -16,7 +16,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .PHONY: results results-full
 results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec slice-coder classes never-worse robust ladder latency compare)
 	cp $^ results/
-results-full: results $(patsubst %,$(OUT)/%.json,compare-harder localise benchmark paper)
+results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp compare-harder localise benchmark rig live world paper)
 	cp $(filter %.json,$^) results/
 	$(MAKE) -f samples/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
 
@@ -109,6 +109,16 @@ $(OUT)/localise.json: $(call drive,dusk) $(call drive,lane-1.5) | $(OUT)
 		noise=$(EMPTY),$(SAMPLE),noise=3,rows=2m:3deg dusk=$(call drive,dusk),$(SAMPLE),rows=2m:3deg \
 		lane=$(call drive,lane-1.5),$(SAMPLE),rows=2m:3deg --tries 100 --false-starts 50 --seed 2 \
 		--cells $(OUT)/localise --out $@
+$(OUT)/rig.json: $(OUT)/rig/rig.toml $(OUT)/rig18/rig.toml
+	$(RFEDGE) eval rig --rig $(OUT)/rig --many $(OUT)/rig18 --link-bps 300000 --rate 2 --max-delay-ms 2500 --work $(OUT)/rig-work --out $@
+$(OUT)/rig/rig.toml: | $(OUT)
+	$(RFEDGE) scene build samples/street/vehicles.toml --split rig --spp 9 --out $(@D)
+$(OUT)/rig18/rig.toml: | $(OUT)
+	$(RFEDGE) scene build samples/street/vehicles.toml --split rig --rig all --size 300x168 --spp 9 --frames 0:72 --out $(@D)
+$(OUT)/live.json: | $(OUT)
+	$(RFEDGE) eval live --cameras 1 4 8 --hz 1 --rounds 2 --work $(OUT)/live --out $@
+$(OUT)/world.json: | $(OUT)
+	$(RFEDGE) eval world --work $(OUT)/world --out $@
 BENCH := $(dir $(RFEDGE))python examples/bench_rfedge.py
 $(OUT)/benchmark:
 	$(RFEDGE) eval benchmark run $@ --name rfedge --points 17 20 23 26 29 32 35 38 41 --prior $(SAMPLE) \
