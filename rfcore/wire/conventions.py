@@ -100,7 +100,9 @@ SERVER_OPTIONS: Final[Options] = (
     ("grpc.keepalive_timeout_ms", 5_000),
     # Two servers on one port would share the vehicles between them at random.
     ("grpc.so_reuseport", 0),
-    ("grpc.max_concurrent_streams", 256),
+    # A vehicle or consumer has a handful; a proxy opens another connection. What one connection may
+    # have at once, the event loop has to answer before it comes to anybody else.
+    ("grpc.max_concurrent_streams", 64),
     # By default a peer may take two minutes over its handshake, and hold a connection for it; and
     # there may be any number of connections.
     ("grpc.server_handshake_timeout_ms", 5_000),

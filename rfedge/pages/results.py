@@ -18,7 +18,7 @@ from rfedge.experiments.adapt.measure import adapt_section
 from rfedge.experiments.benchmark.definition import benchmark_section
 from rfedge.experiments.classes.measure import classes_section
 from rfedge.experiments.compare.figures import write_compare_figures
-from rfedge.experiments.compare.report import compare_section, headline_table
+from rfedge.experiments.compare.report import compare_section, headline
 from rfedge.experiments.ladder.page import write_ladder_figure
 from rfedge.experiments.latency.report import latency_section, write_latency_figures
 from rfedge.experiments.localisation.rows import localise_section
@@ -131,7 +131,7 @@ def with_headline(page: str, compared: Result) -> str:
     _, end, after = rest.partition(HEADLINE_ENDS)
     if not (mark and end):
         raise InvalidInput("page", f"it lacks {HEADLINE_BEGINS!r} ... {HEADLINE_ENDS!r}")
-    return f"{before}{mark}\n\n{headline_table(compared)}\n\n{end}{after}"
+    return f"{before}{mark}\n\n{headline(compared)}\n\n{end}{after}"
 
 
 def main(results: Path, docs: Path) -> None:

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 GROUPS = Path("/sys/fs/cgroup")
-MEMORY_BYTES, PIDS, CPUS = 1 << 30, 128, 1.0
+MEMORY_BYTES, PIDS, CPUS = 1 << 30, 128, 2.0
 """``mem_limit``, ``pids_limit`` and ``cpus`` of docker-compose.yml."""
 CPU_PERIOD_US = 100_000
 """Within which a group may use ``CPUS`` of this long; Docker's own."""

@@ -23,7 +23,7 @@ from rfedge.experiments.compare.report import (
     ForegroundRow,
     SsimRow,
     compare_section,
-    headline_table,
+    headline,
     print_compared,
 )
 from rfedge.experiments.ladder.page import (
@@ -201,13 +201,41 @@ def test_the_headline_has_the_fair_anchor_the_best_rival_and_ours_without_the_fi
     )
     bare = replace(fair, method="rfedge-without-field-veryfast-0123", bd_rate_percent=1.24)
     wider = replace(fair, window_db=(30.0, 33.0), bd_rate_percent=-99.0)
-    line = headline_table(result_of(rows=[fair, best, bare, wider])).splitlines()[-1]
+    sentence, *_, line = headline(result_of(rows=[fair, best, bare, wider])).splitlines()
+    assert (
+        "**57 %** (95 %: 54 to 60 %) on drives through synthetic streets; for 151 to 151 ms"
+        in sentence
+    )
     assert line == (
         "| yardstick-empty, 10 Hz | -57.3 % (-60.0..-54.0) | -41.2 % (svtav1-lowdelay-p4) "
         "| +1.2 % | 151 / 24 |"
     )
     with pytest.raises(InvalidInput, match="yardstick-empty@10 lacks rfedge-without-field"):
-        headline_table(result_of(rows=[fair, best]))
+        headline(result_of(rows=[fair, best]))
+
+
+def test_the_headline_tells_real_second_passes_apart_and_leaves_out_what_is_an_upper_bound() -> (
+    None
+):
+    def drive(scene: str, percent: float) -> list[CompareRow]:
+        interval = (percent - 3, percent + 2)
+        fair = replace(
+            COMPARED,
+            scene=scene,
+            rival="x264-our-tools-medium",
+            bd_rate_percent=percent,
+            ci95=interval,
+        )
+        bare = replace(fair, method="rfedge-without-field-veryfast-0123")
+        return [fair, replace(fair, rival="best-of-any-cpu"), bare]
+
+    drives = {"kitti-city": -90.0, "a": -50.0, "b": -70.0, "kitti-loop": -68.0}
+    rows = [row for scene, percent in drives.items() for row in drive(scene, percent)]
+    sentence = headline(result_of(rows=rows)).splitlines()[0]
+    assert "**50 to 70 %** (95 %: 48 to 73 %) on drives through synthetic streets, " in sentence
+    assert "**68 %** (95 %: 66 to 71 %) on a real street's second pass; for" in sentence
+    with pytest.raises(InvalidInput, match="no drive but upper bounds: kitti-city"):
+        headline(result_of(rows=rows[:3]))
 
 
 def test_every_point_of_every_curve_is_beside_its_figure(tmp_path: Path) -> None:

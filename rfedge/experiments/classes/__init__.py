@@ -26,7 +26,8 @@ class EvalClasses:
     """The field archive (.rff) both ends hold, for the drives that name none."""
     drives: Annotated[tuple[str, ...], Positional] = ()
     """NAME@HZ=DATASET for each drive, such as `people@10=out/people/transforms_drive.json`;
-    NAME@HZ=DATASET,FIELD.rff for one of another field."""
+    NAME@HZ=DATASET,FIELD.rff for one of another field;
+    with `,noise=3` at the end: with a camera's noise of that standard deviation, in code values."""
     at_db: tuple[float, ...] = (33.5,)
     """Luma PSNR of the whole picture. Equal bits are those that ours needs for it."""
     effort: str = DEFAULT_EFFORT

@@ -26,7 +26,8 @@ class EvalCompare:
     """The field archive (.rff) both ends hold, for the drives that name none."""
     drives: Annotated[tuple[str, ...], Positional] = ()
     """NAME@HZ=DATASET for each drive, such as `yardstick-empty@10=street/transforms_drive.json`;
-    NAME@HZ=DATASET,FIELD.rff for one of another field."""
+    NAME@HZ=DATASET,FIELD.rff for one of another field;
+    with `,noise=3` at the end: with a camera's noise of that standard deviation, in code values."""
     decimated: tuple[str, ...] = ()
     """The same for drives of which every fifth frame is taken, at a fifth of the rate."""
     background: tuple[str, ...] = ()
