@@ -203,7 +203,7 @@ def test_the_headline_has_the_fair_anchor_the_best_rival_and_ours_without_the_fi
     wider = replace(fair, window_db=(30.0, 33.0), bd_rate_percent=-99.0)
     sentence, *_, line = headline(result_of(rows=[fair, best, bare, wider])).splitlines()
     assert (
-        "**57 %** (95 %: 54 to 60 %) on drives through synthetic streets; for 151 to 151 ms"
+        "**57 %** (95 %: 54 to 60 %) on drives through synthetic streets; for 151 ms of"
         in sentence
     )
     assert line == (

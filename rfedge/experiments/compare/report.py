@@ -249,10 +249,11 @@ def _headline_sentence(fair: Sequence[CompareRow]) -> str:
     fair = [row for row in fair if row.scene not in UPPER_BOUNDS]
     if not fair:
         raise InvalidInput("rows", f"no drive but upper bounds: {', '.join(UPPER_BOUNDS)}")
-    real = [row for row in fair if row.scene in SECOND_PASSES]
-    made = [row for row in fair if row.scene not in SECOND_PASSES]
-    told = [f"{_saved(made)} on drives through synthetic streets"] * bool(made)
-    told += [f"{_saved(real)} on a real street's second pass"] * bool(real)
+    groups = {
+        "drives through synthetic streets": [x for x in fair if x.scene not in SECOND_PASSES],
+        "a real street's second pass": [x for x in fair if x.scene in SECOND_PASSES],
+    }
+    told = [f"{_saved(rows)} on {what}" for what, rows in groups.items() if rows]
     ours = _from_to([row.both_ends_ms[0] for row in fair])
     theirs = _from_to([row.rival_both_ends_ms[0] for row in fair])
     return (
