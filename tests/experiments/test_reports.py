@@ -203,8 +203,7 @@ def test_the_headline_has_the_fair_anchor_the_best_rival_and_ours_without_the_fi
     wider = replace(fair, window_db=(30.0, 33.0), bd_rate_percent=-99.0)
     sentence, *_, line = headline(result_of(rows=[fair, best, bare, wider])).splitlines()
     assert (
-        "**57 %** (95 %: 54 to 60 %) on drives through synthetic streets; for 151 ms of"
-        in sentence
+        "**57 %** (95 %: 54 to 60 %) on drives through synthetic streets; for 151 ms of" in sentence
     )
     assert line == (
         "| yardstick-empty, 10 Hz | -57.3 % (-60.0..-54.0) | -41.2 % (svtav1-lowdelay-p4) "
