@@ -34,7 +34,8 @@ sys.path.insert(0, {root!r})
 
 def search(code: Path, work: Path) -> tuple[int, float]:
     """Return how many vehicles the code held, and what one of them costs its server: ms a frame."""
-    (work / "sitecustomize.py").write_text(OF_THAT_CODE.format(root=str(code)))
+    if code != ROOT:  # what is installed is this checkout, with its extension beside it
+        (work / "sitecustomize.py").write_text(OF_THAT_CODE.format(root=str(code)))
     command = [sys.executable, "-c", "from rfedge.cli import main; main()", "loadtest", *SEARCH]
     folders = ["--out", str(work / "out"), "--cache", str(work / "cache")]
     environment = os.environ | {"PYTHONPATH": str(work)}
