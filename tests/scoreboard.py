@@ -7,14 +7,61 @@ revision are not run again, and their rows stay.
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from machine import Host, judge
 from rfedge.results import make_result, provenance, revision, write_result
 
 Row = dict[str, Any]
+
+
+@dataclass(kw_only=True)
+class Figures:
+    """What a case measured, each figure beside its bound; one broken off does not hold."""
+
+    bounds: list[str] = field(default_factory=list)
+    measured: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    late: list[str] = field(default_factory=list)
+    """Those of ``failed`` that are bounds of time."""
+    finished: bool = False
+    host: Host = field(default_factory=Host)
+
+    def note(self, bound: str, measured: str, good: bool, is_timed: bool = False) -> None:
+        """Note a figure and its bound."""
+        self.bounds.append(bound)
+        self.measured.append(measured)
+        if not good:
+            self.failed.append(f"{bound}: {measured}")
+        if not good and is_timed:
+            self.late.append(self.failed[-1])
+
+    def tells(self, what: str, figure: str) -> None:
+        """Note a figure without a bound."""
+        self.note(what, figure, good=True)
+
+    def finish(self) -> None:
+        """Every figure is in: fail, or have it measured again, if one is out of bounds."""
+        self.finished = True
+        taken = self.host.taken()
+        self.tells("of the processors the host gave to others", f"{taken:.1%}")
+        judge(self.failed, self.late, taken)
+
+    @property
+    def held(self) -> bool:
+        """Whether all figures are in, and within their bounds."""
+        return self.finished and not self.failed
+
+    def texts(self) -> Row:
+        """Return ``bound`` and ``measured`` of the row."""
+        end = [] if self.finished else [("measured to the end", "no")]
+        every = [*zip(self.bounds, self.measured, strict=True), *end]
+        bounds, measured = zip(*every, strict=True)
+        return {"bound": "; ".join(bounds), "measured": "; ".join(measured)}
 
 
 class Scoreboard:

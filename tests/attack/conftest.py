@@ -20,7 +20,7 @@ import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -34,9 +34,9 @@ from attack.attacker import DEFERRED, LOG_LINES, OPEN_FILES, PROCESSOR_S
 from attack.bystander import NAME, NEWCOMER
 from attack.control_group import ControlGroup
 from attack.target import VEHICLE, Target
-from machine import MEASURED_AGAIN, Host, judge
+from machine import MEASURED_AGAIN
 from rfedge.certs.authority import Members, certify, write_certificates
-from scoreboard import Scoreboard
+from scoreboard import Figures, Scoreboard
 
 ROOT = Path(__file__).parents[2]
 FIELD = ROOT / "samples/fields/street.rff"
@@ -89,7 +89,7 @@ async def appears(path: Path, process: subprocess.Popen[bytes], log: Path) -> st
 
 
 @dataclass
-class Scene:
+class Scene(Figures):
     """Everything that runs, and the row in the making."""
 
     folder: Path
@@ -108,45 +108,21 @@ class Scene:
     consumer_p99_ms: float = 0.0
     newcomer_s: float | None = None
     """Of the slowest under attack; None: one was never shown, or none came."""
-    bounds: list[str] = field(default_factory=list)
-    measured: list[str] = field(default_factory=list)
-    failed: list[str] = field(default_factory=list)
-    finished: bool = False
-    host: Host = field(default_factory=Host)
-    timed: set[str] = field(default_factory=set)
-    """What failed of the bounds of time."""
-
-    def note(self, bound: str, measured: str, good: bool, is_timed: bool = False) -> None:
-        """Note a figure and its bound."""
-        self.bounds.append(bound)
-        self.measured.append(measured)
-        if not good:
-            self.failed.append(f"{bound}: {measured}")
-            self.timed.update(self.failed[-1:] if is_timed else ())
-
-    def finish(self) -> None:
-        """Every figure is in: fail, or have it measured again, if one is out of bounds."""
-        self.finished = True
-        self.note("of the processors the host gave to others", f"{self.host.taken():.1%}", True)
-        judge(self.failed, self.timed, self.host.taken())
 
     def about(self, name: str, what: str, identity: str) -> None:
         """Say what is done, and with whose certificate."""
         self.name, self.what, self.identity = name.replace("_", " "), what, identity
 
     def row(self) -> dict[str, Any]:
-        """Return the row of the scoreboard; one that was broken off does not hold."""
-        whole = bool(self.measured) and self.finished
-        bounds = [*self.bounds, *(() if whole else ("measured to the end",))]
+        """Return the row of the scoreboard."""
         return {
             "attack": f"{self.name}: {self.what}",
             "identity": self.identity,
-            "bound": "; ".join(bounds),
-            "measured": "; ".join([*self.measured, *(() if whole else ("no",))]),
+            **self.texts(),
             "bystander_p99_ms": round(self.p99_ms, 1),
             "consumer_p99_ms": round(self.consumer_p99_ms, 1),
             "newcomer_s": None if self.newcomer_s is None else round(self.newcomer_s, 2),
-            "held": whole and not self.failed,
+            "held": self.held,
         }
 
     async def begin(self, role: str) -> None:

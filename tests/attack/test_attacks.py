@@ -72,7 +72,7 @@ def judge_newcomers(scene: Any, calm: list[Any], attacked: list[Any]) -> None:
         f"from a newcomer's first packet to its first picture shown <= {NEWCOMER_S:g} s",
         f"slowest calm / attacked {told}, of {len(calm)} / {len(attacked)}",
         slowest_s[1] <= NEWCOMER_S,
-        is_timed=True,
+        is_timed=math.isfinite(slowest_s[1]),
     )
 
 
@@ -137,7 +137,6 @@ def judge(scene: Any, calm: Any, control: Any, attacked: Any, after: Any) -> Non
     scene.note("nothing killed for memory", str(scene.group.kills()), scene.group.kills() == 0)
     most, limit = max(attacked.most_bytes, after.most_bytes), MEMORY_BYTES / 2**20
     scene.note(f"memory <= {limit:.0f} MiB", f"{most / 2**20:.0f} MiB", most <= MEMORY_BYTES)
-    scene.finished = True
 
 
 async def nothing(_: Target) -> None:

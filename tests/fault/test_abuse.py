@@ -160,8 +160,8 @@ async def test_memory_that_runs_out(
         await appears(lambda: bystander.acked(killed_s + 0.2))
         served_s = bystander.acked_at_s(killed_s + 0.2)[0]
         case.at_most("bystander served again", served_s - killed_s, 5)
-        case.bounds.append("what the kernel killed")
-        case.measured.append("the server, started again" if died else "a decoder")
+        killed = "the server, started again" if died else "a decoder"
+        case.tells("what the kernel killed", killed)
         case.recovers_exactly(bystander, killed_s + 0.2)
     finally:
         site.close()

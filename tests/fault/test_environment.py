@@ -234,8 +234,7 @@ async def test_a_storm_of_connections(site: Any, case: Any, coded: Any) -> None:
         counts = Counter(ended for ended, _ in told)
         refused = STORM - counts["welcome"]
         told_what = ", ".join(f"{status} {n}" for status, n in sorted(counts.items()))
-        case.bounds.append("statuses")
-        case.measured.append(told_what)
+        case.tells("statuses", told_what)
         case.holds(
             f"some admitted, at most {ADMITTED - 1}, all others RESOURCE_EXHAUSTED",
             0 < counts["welcome"] < ADMITTED and counts["RESOURCE_EXHAUSTED"] == refused,

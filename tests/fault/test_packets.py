@@ -100,8 +100,7 @@ async def test_damaged_packets(
     case.at_most("silently wrong or lost pictures afterwards", wrong, 0, f"of {sent}")
     case.holds("damage refused", refused >= 0.9 * sent)
     case.holds("reasons in the metrics", sum(nacked(server, r) for r in answers) >= refused)
-    case.measured.append(", ".join(f"{reason} {n}" for reason, n in sorted(answers.items())))
-    case.bounds.append("reasons given")
+    case.tells("reasons given", ", ".join(f"{reason} {n}" for reason, n in sorted(answers.items())))
     await case.spares(bystander)
     case.finish()
 

@@ -73,13 +73,14 @@ def program(name: str) -> str:
 
 
 def until(
-    holds: Callable[[], Any], timeout_s: float = 60.0, instead: Callable[[], str] | None = None
+    holds: Callable[[], Any],
+    timeout_s: float = 60.0,
+    instead: Callable[[], str] = lambda: "did not come in time",
 ) -> Any:
     """Return the first true value; ``instead`` tells what there is when none came in time."""
     deadline_s = time.monotonic() + timeout_s
     while not (value := holds()):
-        late = time.monotonic() > deadline_s
-        assert not late, "did not come in time" if instead is None else instead()
+        assert time.monotonic() < deadline_s, instead()
         time.sleep(0.1)
     return value
 
