@@ -143,7 +143,6 @@ def drive_prerecorded(
         warm_up_s=load.warm_up_s,
         duration_s=load.duration_s,
         ready_s=load.vehicle_ms / 1e3,
-        together=load.together,
         drive=str(folder),
     )
     spec_path, result_path = work / "fleet.spec.json", work / "fleet.json"

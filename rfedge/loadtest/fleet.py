@@ -41,13 +41,17 @@ class FleetSpec:
     warm_up_s: float
     duration_s: float
     ready_s: float
-    together: bool
     drive: str
 
 
 @dataclass(frozen=True)
 class Departure:
-    """When the whole fleet starts: vehicle i a share i / N of a period later, unless together."""
+    """When the whole fleet starts, and how its pictures are spread over a period.
+
+    Those of vehicle i are due a share i / N of a period later, but for the first half of the
+    warm-up, when all are due together: every worker of the server then renders, and has its scratch
+    memory (40 MB) before it counts, instead of whenever two pictures happen to meet.
+    """
 
     start_s: float
     vehicles: int
@@ -56,10 +60,10 @@ class Departure:
     def schedule(self, vehicle: int) -> Schedule:
         """Return the schedule of a vehicle."""
         spec = self.spec
-        later = 0.0 if spec.together else vehicle / self.vehicles / spec.hz
-        start_s = self.start_s + later
-        end_s = start_s + spec.warm_up_s + spec.duration_s
-        return Schedule(start_s, end_s, spec.hz, spec.ready_s)
+        later_s = vehicle / self.vehicles / spec.hz
+        end_s = self.start_s + later_s + spec.warm_up_s + spec.duration_s
+        together_s = spec.warm_up_s / 2
+        return Schedule(self.start_s, end_s, spec.hz, spec.ready_s, together_s, later_s)
 
 
 def _hello(spec: FleetSpec, drive: PrerecordedDrive) -> Hello:

@@ -66,8 +66,7 @@ class Load:
     in transport mode; other modes send what the encoder made of the drive. ``vehicle_ms``: how long
     a prerecorded vehicle waits before it sends a picture, in place of the encoding time of a real
     one. ``admission``: whether the server may refuse vehicles or lower their rate; it may not by
-    default, so that its limit can be seen. ``together``: pictures of all prerecorded vehicles are
-    due at the same moments, not spread over a period: the server has them all in work at once.
+    default, so that its limit can be seen.
     """
 
     mode: Mode
@@ -81,7 +80,6 @@ class Load:
     kind: Vehicles = Vehicles.PRERECORDED
     vehicle_ms: float = 0.0
     admission: bool = False
-    together: bool = False
     bounds: Bounds = Bounds()
 
     def __post_init__(self) -> None:

@@ -89,12 +89,22 @@ class Shot:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Pictures at ``start_s + i / hz`` until ``end_s``, ready to send ``ready_s`` later."""
+    """Pictures at ``start_s + i / hz`` until ``end_s``, ready to send ``ready_s`` later.
+
+    After the first ``together_s`` every picture is due ``later_s`` later.
+    """
 
     start_s: float
     end_s: float
     hz: float
     ready_s: float = 0.0
+    together_s: float = 0.0
+    later_s: float = 0.0
+
+    def due_s(self, index: int) -> float:
+        """Return when picture ``index`` is due."""
+        since_s = index / self.hz
+        return self.start_s + since_s + (self.later_s if since_s >= self.together_s else 0.0)
 
 
 NEVER = Schedule(float("inf"), float("inf"), 1.0)
@@ -136,7 +146,7 @@ class Replay:
 
     def get_timer(self) -> float | None:
         """Return when the next picture is ready, or None when there is no other."""
-        due_s = self._due_s(len(self.shots))
+        due_s = self._schedule.due_s(len(self.shots))
         return None if due_s >= self._schedule.end_s else due_s + self._schedule.ready_s
 
     def frame_to_send(self, now: float) -> Frame | None:
@@ -145,7 +155,7 @@ class Replay:
             if self._waiting is not None:
                 self._drop(self._waiting, now)
             self._waiting = len(self.shots)
-            self.shots.append(Shot(self._due_s(self._waiting)))
+            self.shots.append(Shot(self._schedule.due_s(self._waiting)))
         if self._waiting is None or self._used >= self._granted:
             return None
         index, self._waiting = self._waiting, None
@@ -167,11 +177,8 @@ class Replay:
 
     def give_up(self) -> None:
         """The stream is lost: what was still to come is dropped."""
-        while self._due_s(len(self.shots)) < self._schedule.end_s:
-            self.shots.append(Shot(self._due_s(len(self.shots)), end=End.DROPPED))
-
-    def _due_s(self, index: int) -> float:
-        return self._schedule.start_s + index / self._schedule.hz
+        while self._schedule.due_s(len(self.shots)) < self._schedule.end_s:
+            self.shots.append(Shot(self._schedule.due_s(len(self.shots)), end=End.DROPPED))
 
     def _drop(self, index: int, now: float) -> None:
         shot = self.shots[index]

@@ -1,8 +1,6 @@
 """A long run at half load: nothing may grow. ``python -m rfedge.loadtest.soak --minutes 30``
 
 Two prerecorded vehicles at 5 Hz put half the load on ``mec-server`` that it must hold on two cores.
-Their pictures are due together: every worker renders from the start, and has its scratch memory
-(40 MB) before it counts, instead of when two happen to meet.
 Its memory must grow by less than 1 MB a minute (least squares over the counted part), the least
 descriptors and processes it holds may not rise (what is leaked stays; a socket that lives for a
 moment is none), and no vehicle may lose its stream. Pools start a thread when all theirs are busy
@@ -97,14 +95,8 @@ class SoakRow:
 def soak(settings: SoakSettings) -> dict[str, Any]:
     """Run, write the result, return it; raise ``RfedgeError`` if anything grew."""
     made = provenance([settings.field], command=_command())
-    load = Load(
-        Mode.FULL,
-        settings.vehicles,
-        settings.hz,
-        60 * settings.minutes,
-        settings.warm_up,
-        together=True,
-    )
+    seconds = 60 * settings.minutes
+    load = Load(Mode.FULL, settings.vehicles, settings.hz, seconds, settings.warm_up)
     folder = settings.out.parent
     bed = TestBed(settings.field, settings.drive, 2, Path("out/cache/loadtest"), folder / "work")
     run = run_load(load, bed)

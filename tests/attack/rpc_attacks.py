@@ -314,11 +314,14 @@ async def many_connections(target: Target) -> None:
 
 async def revoked(target: Target) -> None:
     """Streams that go on while their certificate is revoked, let in, revoked again."""
+    path = Path(target.access)
+    lines = path.read_text().splitlines(keepends=True)
+    of_consumers = "".join(line for line in lines if not line.startswith("revoked"))
 
     async def access() -> None:
         for number in itertools.count():
-            rule = f'revoked = ["spiffe://rfedge/vehicle/{VEHICLE}"]' * (number % 2)
-            Path(target.access).write_text(rule)
+            rule = f'revoked = ["spiffe://rfedge/vehicle/{VEHICLE}"]\n' * (number % 2)
+            path.write_text(rule + of_consumers)
             await asyncio.sleep(1.5)
 
     await all_of(access(), junk_slices(target))

@@ -59,7 +59,6 @@ def spec_of(address: object, drive: Path, **changes: Any) -> FleetSpec:
         "warm_up_s": 0.2,
         "duration_s": 0.5,
         "ready_s": 0.0,
-        "together": False,
         "drive": str(drive),
     }
     return FleetSpec(**{**values, **changes})
@@ -87,13 +86,14 @@ async def test_a_fleet_counts_every_picture_and_the_server_refuses_none(
         assert vehicle["latency_ms"], "the newest picture always gets through"
 
 
-def test_pictures_are_due_spread_over_a_period_or_together(tmp_path: Path) -> None:
-    spread, together = (
-        Departure(5.0, 4, spec_of("127.0.0.1:1", tmp_path, together=chosen))
-        for chosen in (False, True)
-    )
-    assert [spread.schedule(i).start_s for i in range(4)] == [5.0, 5.025, 5.05, 5.075]
-    assert {together.schedule(i).start_s for i in range(4)} == {5.0}
+def test_pictures_are_due_together_while_the_server_warms_up_then_spread_over_a_period(
+    tmp_path: Path,
+) -> None:
+    departure = Departure(5.0, 4, spec_of("127.0.0.1:1", tmp_path, warm_up_s=0.5))
+    schedules = [departure.schedule(i) for i in range(4)]
+    assert [{each.due_s(index) for each in schedules} for index in (0, 2)] == [{5.0}, {5.2}]
+    assert [each.due_s(3) for each in schedules] == pytest.approx([5.3, 5.325, 5.35, 5.375])
+    assert [each.end_s for each in schedules] == pytest.approx([6.0, 6.025, 6.05, 6.075])
 
 
 async def test_vehicles_that_reach_nobody_are_counted_as_failed(
