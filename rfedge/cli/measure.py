@@ -84,7 +84,7 @@ class LoadTest:
     """Link profile (TOML, see samples/links), a link for each vehicle; default: loopback."""
     duration: float = 20.0
     """Seconds that are counted."""
-    warm_up: float = 5.0
+    warm_up: float = 10.0
     """Seconds before them that are not."""
     deadline_ms: float = 100.0
     """From the moment a picture is due to its Ack."""

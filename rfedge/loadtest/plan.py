@@ -61,19 +61,20 @@ class Bounds:
 class Load:
     """``vehicles`` of ``cameras`` cameras at ``hz`` pictures per second, for ``duration_s``.
 
-    Pictures that are due in the first ``warm_up_s`` are sent and not counted. ``link``: a profile,
-    of which each vehicle gets a link of its own; None: loopback. ``size_bytes``: payload of a frame
-    in transport mode; other modes send what the encoder made of the drive. ``vehicle_ms``: how long
-    a prerecorded vehicle waits before it sends a picture, in place of the encoding time of a real
-    one. ``admission``: whether the server may refuse vehicles or lower their rate; it may not by
-    default, so that its limit can be seen.
+    Pictures that are due in the first ``warm_up_s`` are sent and not counted: a server keeps those
+    of the last 7 s (``mec_server.twin.state``), and its memory grows until it has them. ``link``: a
+    profile, of which each vehicle gets a link of its own; None: loopback. ``size_bytes``: payload
+    of a frame in transport mode; other modes send what the encoder made of the drive.
+    ``vehicle_ms``: how long a prerecorded vehicle waits before it sends a picture, in place of the
+    encoding time of a real one. ``admission``: whether the server may refuse vehicles or lower
+    their rate; it may not by default, so that its limit can be seen.
     """
 
     mode: Mode
     vehicles: int
     hz: float
     duration_s: float = 20.0
-    warm_up_s: float = 5.0
+    warm_up_s: float = 10.0
     cameras: int = 1
     size_bytes: int = 4096
     link: Path | None = None
