@@ -32,7 +32,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from attack.attacker import DEFERRED, LOG_LINES, OPEN_FILES, PROCESSOR_S
 from attack.bystander import NAME, NEWCOMER
-from attack.control_group import ControlGroup
+from attack.control_group import SERVER, ControlGroup
 from attack.target import VEHICLE, Target
 from machine import MEASURED_AGAIN
 from rfedge.certs.authority import Members, certify, write_certificates
@@ -41,8 +41,7 @@ from scoreboard import Figures, Scoreboard
 ROOT = Path(__file__).parents[2]
 FIELD = ROOT / "samples/fields/street.rff"
 ATTACKER, BYSTANDER = ("-m", "attack.attacker"), ("-m", "attack.bystander")
-MAX_FIELD_GB = 0.25
-"""``--max-field-gb`` of docker-compose.yml."""
+(MAX_FIELD,) = (word for word in SERVER["command"] if word.startswith("--max-field-gb="))
 ROUNDS = 2
 """How often calm, control and attack take turns."""
 ALLOWANCE_MS = 10.0
@@ -410,7 +409,7 @@ async def scene(
             "server",
             *("-m", "mec_server", "--fields", fields, "--listen", "127.0.0.1:0"),
             *("--ready-file", tmp_path / "ready", "--metrics-port", 0, "--log", "json"),
-            *("--decoder", "landlock", "--sandbox-as-root", "--max-field-gb", MAX_FIELD_GB),
+            *("--decoder", "landlock", "--sandbox-as-root", MAX_FIELD),
             *("--access", access),
             *tls(certificates, "server"),
             limited=True,

@@ -6,9 +6,13 @@ import os
 import time
 from pathlib import Path
 
+import yaml
+
 GROUPS = Path("/sys/fs/cgroup")
-MEMORY_BYTES, PIDS, CPUS = 1 << 30, 128, 2.0
-"""``mem_limit``, ``pids_limit`` and ``cpus`` of docker-compose.yml."""
+SERVER = yaml.safe_load((Path(__file__).parents[2] / "docker-compose.yml").read_text())["x-rsu"]
+"""A server of docker-compose.yml: its limits and its command."""
+MEMORY_BYTES = int(SERVER["mem_limit"].removesuffix("g")) << 30
+PIDS, CPUS = SERVER["pids_limit"], SERVER["cpus"]
 CPU_PERIOD_US = 100_000
 """Within which a group may use ``CPUS`` of this long; Docker's own."""
 AUTOGROUP_NICE = 10
