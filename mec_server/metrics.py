@@ -225,6 +225,7 @@ class ServerMetrics:
             "Pictures reconstructed, by the tile of their field; empty: of none.",
             ("tile",),
         )
+        self._of_tile: dict[str, tuple[Counter, Counter]] = {}
         self._tile_of: dict[str, str] = {}
         self._published_tile_of: dict[str, str] = {}
         self._lights = make.gauge(
@@ -325,8 +326,13 @@ class ServerMetrics:
     def count_picture(self, field_id: str, payload_bytes: int) -> None:
         """Count a reconstructed picture for the tile that publishes its field."""
         tile = self._tile_of.get(field_id, "")
-        self._tile_payload.labels(tile).inc(payload_bytes)
-        self._tile_pictures.labels(tile).inc()
+        counters = self._of_tile.get(tile)
+        if counters is None:
+            counters = self._tile_payload.labels(tile), self._tile_pictures.labels(tile)
+            self._of_tile[tile] = counters
+        payload, pictures = counters
+        payload.inc(payload_bytes)
+        pictures.inc()
 
     def count_lost_decoder(self, cause: LossCause) -> None:
         """Count a decoder process that died in use."""

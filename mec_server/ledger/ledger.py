@@ -86,9 +86,15 @@ class TokenBucket:
         self._left -= amount
         return True
 
+    def give_back(self, amount: float) -> None:
+        """Undo ``take``."""
+        self._left += amount
+
     def _fill(self, now: float) -> None:
-        elapsed_s = max(0.0, now - self._filled_s)
-        self._filled_s = max(now, self._filled_s)
+        elapsed_s = now - self._filled_s
+        if elapsed_s <= 0:
+            return
+        self._filled_s = now
         if self._left < self._burst:
             self._left = min(self._burst, self._left + elapsed_s * self._rate)
 
@@ -216,24 +222,22 @@ class Ledger:
 
     def spend(self, identity: str, resource: Resource, amount: float, now: float) -> None:
         """Charge ``identity`` with ``amount``; raise ``LimitExceeded`` while it is in debt."""
+        own, everybody = self._account(identity, now).spent[resource], self._buckets[resource]
+        if own.take(amount, now):
+            if everybody.take(amount, now):
+                self._spent[resource] += amount
+                return
+            own.give_back(amount)
         self.check(identity, resource, now)
-        self.charge(identity, resource, amount, now)
 
     def check(self, identity: str, resource: Resource, now: float) -> None:
         """Raise ``LimitExceeded`` while ``identity``, or all of them together, spent too much."""
         own = self._account(identity, now).spent[resource]
         budget = self._budgets[resource]
-        for scope, bucket, rate in (
-            ("identity", own, budget.identity),
-            ("server", self._buckets[resource], budget.total),
-        ):
-            wait_s = bucket.wait_s(now)
-            if wait_s > 0:
-                raise LimitExceeded(
-                    Limit(f"{scope}_{resource}"),
-                    f"more than {rate:g} {_words(resource)} a second; come again in {wait_s:.3g} s",
-                    wait_s,
-                )
+        if (wait_s := own.wait_s(now)) > 0:
+            raise _too_much_spent("identity", resource, budget.identity, wait_s)
+        if (wait_s := self._buckets[resource].wait_s(now)) > 0:
+            raise _too_much_spent("server", resource, budget.total, wait_s)
 
     def charge(
         self, identity: str, resource: Resource, amount: float, now: float, *, lent: bool = False
@@ -330,6 +334,14 @@ def _too_much_held(
         f"{whose} {held} {resource}, asked for {amount} more, {most:g} may be; give some back, "
         f"or come again in {HELD_RETRY_S:g} s",
         HELD_RETRY_S,
+    )
+
+
+def _too_much_spent(scope: str, resource: Resource, rate: float, wait_s: float) -> LimitExceeded:
+    return LimitExceeded(
+        Limit(f"{scope}_{resource}"),
+        f"more than {rate:g} {_words(resource)} a second; come again in {wait_s:.3g} s",
+        wait_s,
     )
 
 

@@ -37,6 +37,8 @@ STATES: Final = {
     State.LOCALISING: pb.LOCALISATION_LOCALISING,
     State.TRACKING: pb.LOCALISATION_TRACKING,
 }
+CLOCK_OF: Final[dict[int, ClockKind]] = {number: clock for clock, number in CLOCKS.items()}
+STATE_OF: Final[dict[int, State]] = {number: state for state, number in STATES.items()}
 
 
 def clock_to_wire(clock: ClockKind | None) -> pb.CaptureClock.ValueType:
@@ -46,7 +48,7 @@ def clock_to_wire(clock: ClockKind | None) -> pb.CaptureClock.ValueType:
 
 def clock_from_wire(number: int) -> ClockKind | None:
     """Return which clock ``number`` stands for, if any."""
-    return next((clock for clock, known in CLOCKS.items() if known == number), None)
+    return CLOCK_OF.get(number)
 
 
 def localisation_to_wire(state: State | None) -> pb.Localisation.ValueType:
@@ -56,4 +58,4 @@ def localisation_to_wire(state: State | None) -> pb.Localisation.ValueType:
 
 def localisation_from_wire(number: int) -> State | None:
     """Return which state ``number`` stands for, if any."""
-    return next((state for state, known in STATES.items() if known == number), None)
+    return STATE_OF.get(number)
