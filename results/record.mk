@@ -14,7 +14,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .DELETE_ON_ERROR:
 .SECONDARY:
 .PHONY: results results-full
-results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec slice-coder classes never-worse robust ladder latency compare)
+results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec slice-coder classes never-worse robust ladder latency compare compare-small)
 	cp $^ results/
 results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp compare-harder localise benchmark rig live world paper)
 	cp $(filter %.json,$^) results/
@@ -25,6 +25,10 @@ $(OUT):
 
 # --- fields that do not ship
 
+small = $(RFEDGE) train $1 --points $2 --held-out $3 --gaussians $$(($*000 * 3 / 4)) --limit $*000 --sh-degree 1 --antialiased \
+	--max-mb 1 --minutes 1.5 --out $@
+$(OUT)/sample-%k.rff: | $(OUT)
+	$(call small,samples/street/transforms_train.json,samples/street/points.ply,$(EMPTY))
 NGP := $(OUT)/street-ngp.rff
 $(NGP): | $(OUT)
 	$(RFEDGE) train samples/street --points samples/street/points.ply --held-out $(EMPTY) --kind ngp --minutes 10 --out $@
@@ -39,6 +43,9 @@ $(OUT)/city.rff: | $(OUT)
 	$(call trained,$(CITY)/transforms_train.json,$(CITY)/transforms_drive.json,2.5)
 $(OUT)/loop.rff: | $(OUT)
 	$(call trained,$(LOOP)/transforms_first.json,$(LOOP)/transforms_second.json,2.5)
+# Small ones: 30,000 and 60,000 splats, which a street's few passes pay for.
+$(OUT)/yardstick-%k.rff: | $(OUT)
+	$(call small,$(YARD)/transforms_train.json,$(YARD)/points.ply,$(YARD)/transforms_drive_empty.json)
 FIELDS := $(patsubst %,$(OUT)/%.rff,yardstick city loop)
 endif
 
@@ -94,6 +101,10 @@ $(OUT)/compare.json: $(FIELDS) | $(OUT)
 $(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) $(NOISY) $(YARDSTICK_30) \
 		$(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) --cells $(OUT)/compare --out $@
+$(OUT)/compare-small.json: $(foreach k,30 60,$(OUT)/sample-$(k)k.rff $(if $(DATA),$(OUT)/yardstick-$(k)k.rff)) | $(OUT)
+	$(RFEDGE) eval compare $(SAMPLE) --rivals x264-our-tools-medium --cells $(OUT)/compare --out $@ \
+		$(foreach k,30 60,$(foreach drive,$(NOON),$(drive)$(COMMA)$(OUT)/sample-$(k)k.rff) \
+			$(if $(DATA),$(foreach of,empty vehicles,yardstick-$(of)@30=$(YARD)/transforms_drive30_$(of).json$(COMMA)$(OUT)/yardstick-$(k)k.rff)))
 $(OUT)/classes.json: $(call drive,people) | $(OUT)
 	$(RFEDGE) eval classes $(SAMPLE) people@10=$< --cells $(OUT)/classes --out $@
 $(OUT)/never-worse.json: | $(OUT)

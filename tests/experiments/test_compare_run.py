@@ -18,7 +18,7 @@ from rfedge.experiments.clips import DriveName, read_drive
 from rfedge.experiments.compare import EvalCompare
 from rfedge.experiments.compare import run as compare_run
 from rfedge.experiments.compare.drives import CompareJob, foreign_coder, read_drive_comparisons
-from rfedge.experiments.compare.measure import BEST
+from rfedge.experiments.compare.measure import BEST, BEST_OF_ANY_CPU
 from rfedge.experiments.compare.run import code_on_ray, run_compare
 from rfedge.experiments.rivals import x264_lowdelay
 from rfedge.jobs import run_jobs
@@ -303,6 +303,24 @@ def test_a_drive_may_name_a_field_of_its_own(thumbnail, tmp_path):
 def test_a_comparison_of_nothing_is_refused(tmp_path):
     with pytest.raises(InvalidInput, match="there is none"):
         CompareJob(Path("field.rff"), (), "fast", "veryfast", tmp_path / "compare.json", tmp_path)
+
+
+def test_rivals_that_are_asked_for_stand_alone_with_the_one_a_field_is_paid_for_against(
+    thumbnail, tmp_path
+):
+    job = job_of(thumbnail, tmp_path, window_db=(33.0, 36.0), rivals=("x264-our-tools-ultrafast",))
+    result = run_compare(job, Console(quiet=True))
+    assert {row["rival"] for row in result["rows"]} - {BEST, BEST_OF_ANY_CPU} == {
+        "x264-our-tools-ultrafast",
+        "x264-lowdelay-psnr",
+    }
+    assert {row["rival"] for row in result["break_even"]} == {"x264-lowdelay-psnr-ultrafast"}
+    assert result["ssim"] == []
+
+
+def test_a_rival_that_nobody_knows_is_refused_with_those_there_are(thumbnail, tmp_path):
+    with pytest.raises(InvalidInput, match="rivals: 'h264' is none of x264-lowdelay, x264-lowd"):
+        job_of(thumbnail, tmp_path, rivals=("h264",))
 
 
 @pytest.mark.slow

@@ -43,6 +43,9 @@ class EvalCompare:
     """Folder of finished pieces."""
     method: tuple[str, ...] = ()
     """More codecs to compare with, as package.module:Class (see docs/evaluation.md)."""
+    rivals: tuple[str, ...] = ()
+    """Of the rivals these alone, by PSNR alone, as x264-our-tools-medium; x264-lowdelay-psnr, which
+    a field is paid for against, is always among them."""
     window: tuple[float, float] | None = None
     """Lowest and highest luma PSNR to compare over, in dB; 32 35 (and 30 35 where all reach it) if
     not given. Curves are coded at more points until they span it."""
@@ -77,6 +80,7 @@ class EvalCompare:
             decimated=self.decimated,
             backgrounds=self.background,
             methods=self.method,
+            rivals=self.rivals,
             quick=self.quick,
             retime=self.retime,
             window_db=self.window,

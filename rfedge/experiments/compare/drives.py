@@ -51,6 +51,7 @@ from rfedge.experiments.rivals import (
 from rfedge.results import check_result_path
 
 __all__ = [
+    "PAID_AGAINST",
     "CompareJob",
     "DriveComparison",
     "foreign_coder",
@@ -60,6 +61,8 @@ __all__ = [
 ]
 
 
+PAID_AGAINST = "x264-lowdelay-psnr"
+"""Whose bytes must be saved before a field is paid for."""
 KEYINTS = (10, 30, 250)
 OUR_TOOLS_PRESETS = ("veryfast", "medium", "veryslow")
 
@@ -74,7 +77,7 @@ def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
     """
     anchors: dict[str, list[ClipCoder]] = {
         "x264-lowdelay": [x264_lowdelay(preset)],
-        "x264-lowdelay-psnr": [x264_for_psnr(preset)],
+        PAID_AGAINST: [x264_for_psnr(preset)],
     }
     if quick:
         tools: dict[str, list[ClipCoder]] = {
@@ -202,6 +205,7 @@ class CompareJob:
     decimated: Sequence[str] = ()
     backgrounds: Sequence[str] = ()
     methods: Sequence[str] = ()
+    rivals: Sequence[str] = ()
     quick: bool = False
     retime: bool = False
     window_db: Window | None = None
@@ -214,6 +218,16 @@ class CompareJob:
         low_db, high_db = self.windows_db[0]
         if not 0 < low_db < high_db < math.inf:
             raise InvalidInput("window", f"{low_db:g} {high_db:g} are not two rising decibels")
+        known = rival_families(self.preset, quick=self.quick)
+        for name in self.rivals:
+            if name not in known:
+                raise InvalidInput("rivals", f"{name!r} is none of {', '.join(known)}")
+
+    def rival_families(self) -> dict[str, list[ClipCoder]]:
+        """Return those of the rivals that are asked for, and whom a field is paid for against."""
+        families = rival_families(self.preset, quick=self.quick)
+        wanted = {PAID_AGAINST, *(self.rivals or families)}
+        return {name: family for name, family in families.items() if name in wanted}
 
     def of_each_drive(self) -> list[CompareJob]:
         """Return a job for every drive, each with the background that stands behind it."""
@@ -309,7 +323,7 @@ def _drive_comparison(
     field: RadianceField,
 ) -> DriveComparison:
     clip = drive.clip(field_psnr_db=mean_psnr_db(field, drive.pictures))
-    families = rival_families(job.preset, quick=job.quick)
+    families = job.rival_families()
     families |= {coder.name: [coder] for coder in map(foreign_coder, job.methods)}
     rendered = render_clip(field, drive.cameras)
     foregrounds = _foregrounds(drive, background)
@@ -332,7 +346,7 @@ def _drive_comparison(
     if behind is not None:
         rival_stamp = f"{stamp}, field {rendered.field_id}"
         rival = ForegroundCoder.of(job.preset, foregrounds, rendered.renders, rival_stamp)
-    by_ssim = ssim_rivals(quick=job.quick)
+    by_ssim = {} if job.rivals else ssim_rivals(quick=job.quick)
     return DriveComparison(
         clip,
         rendered,

@@ -39,7 +39,12 @@ from rfcore.image import I420
 from rfcore.views import FieldView
 from rfedge.experiments.cells import CellStore, clip_key
 from rfedge.experiments.clips import ClipCoder
-from rfedge.experiments.compare.drives import CompareJob, DriveComparison, read_drive_comparisons
+from rfedge.experiments.compare.drives import (
+    PAID_AGAINST,
+    CompareJob,
+    DriveComparison,
+    read_drive_comparisons,
+)
 from rfedge.experiments.compare.foreground import by_macroblock, composed, foreground_row
 from rfedge.experiments.compare.measure import (
     break_even_row,
@@ -203,10 +208,6 @@ def _slice_bytes(frame: I420, coding: _Coding, made: Encoded, kinds: NDArray[np.
             spared[kind] = max(0, whole - len(coding.of(without, choice).packet.payload))
     shares: F64 = spared * (whole / max(float(spared.sum()), 1.0))
     return shares
-
-
-PAID_AGAINST = "x264-lowdelay-psnr"
-"""Whose bytes must be saved before a field is paid for."""
 
 
 def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
