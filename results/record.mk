@@ -16,7 +16,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .PHONY: results results-full
 results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec slice-coder classes never-worse robust ladder latency compare compare-small)
 	cp $^ results/
-results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp compare-harder localise benchmark rig live world paper)
+results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder localise benchmark rig live world paper)
 	cp $(filter %.json,$^) results/
 	$(MAKE) -f samples/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
 
@@ -91,6 +91,8 @@ NOISY := sample-vehicles@10=$(VEHICLES)$(COMMA)noise=1.5 sample-vehicles@10=$(VE
 
 $(OUT)/bench-%.json: | $(OUT)
 	$(RFEDGE) bench $* --json $@
+$(OUT)/bench-gpu.json: | $(OUT)  # on PoCL where there is no other OpenCL
+	$(RFEDGE) bench raster --rows native --isa opencl --json $@
 $(OUT)/slice-coder.json: $(FIELDS) | $(OUT)
 	$(RFEDGE) eval slice-coder $(NOON) sample-vehicles@10=$(VEHICLES),noise=3 $(REAL) $(wordlist 2,2,$(YARDSTICK)) \
 		$(wordlist 2,2,$(YARDSTICK_30)) --out $@
