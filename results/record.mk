@@ -25,13 +25,14 @@ $(OUT):
 
 # --- fields that do not ship
 
-small = $(RFEDGE) train $1 --points $2 --held-out $3 --gaussians $$(($*000 * 3 / 4)) --limit $*000 --sh-degree 1 --antialiased \
+# Of so many thousand splats, which few passes of a street pay for.
+small = $(RFEDGE) train $1 --points $(dir $1)points.ply --held-out $2 --gaussians $$(($*000 * 3 / 4)) --limit $*000 --sh-degree 1 --antialiased \
 	--max-mb 1 --minutes 1.5 --out $@
 $(OUT)/sample-%k.rff: | $(OUT)
-	$(call small,samples/street/transforms_train.json,samples/street/points.ply,$(EMPTY))
+	$(call small,samples/street/transforms_train.json,$(EMPTY))
 NGP := $(OUT)/street-ngp.rff
 $(NGP): | $(OUT)
-	$(RFEDGE) train samples/street --points samples/street/points.ply --held-out $(EMPTY) --kind ngp --minutes 10 --out $@
+	$(RFEDGE) train samples/street/transforms_train.json --points samples/street/points.ply --held-out $(EMPTY) --kind ngp --minutes 10 --out $@
 ifneq ($(DATA),)
 YARD := $(DATA)/street
 LOOP := $(DATA)/kitti/loop
@@ -43,9 +44,8 @@ $(OUT)/city.rff: | $(OUT)
 	$(call trained,$(CITY)/transforms_train.json,$(CITY)/transforms_drive.json,2.5)
 $(OUT)/loop.rff: | $(OUT)
 	$(call trained,$(LOOP)/transforms_first.json,$(LOOP)/transforms_second.json,2.5)
-# Small ones: 30,000 and 60,000 splats, which a street's few passes pay for.
 $(OUT)/yardstick-%k.rff: | $(OUT)
-	$(call small,$(YARD)/transforms_train.json,$(YARD)/points.ply,$(YARD)/transforms_drive_empty.json)
+	$(call small,$(YARD)/transforms_train.json,$(YARD)/transforms_drive_empty.json)
 FIELDS := $(patsubst %,$(OUT)/%.rff,yardstick city loop)
 endif
 

@@ -86,10 +86,6 @@ class TokenBucket:
         self._left -= amount
         return True
 
-    def give_back(self, amount: float) -> None:
-        """Undo ``take``."""
-        self._left += amount
-
     def _fill(self, now: float) -> None:
         elapsed_s = now - self._filled_s
         if elapsed_s <= 0:
@@ -222,13 +218,8 @@ class Ledger:
 
     def spend(self, identity: str, resource: Resource, amount: float, now: float) -> None:
         """Charge ``identity`` with ``amount``; raise ``LimitExceeded`` while it is in debt."""
-        own, everybody = self._account(identity, now).spent[resource], self._buckets[resource]
-        if own.take(amount, now):
-            if everybody.take(amount, now):
-                self._spent[resource] += amount
-                return
-            own.give_back(amount)
         self.check(identity, resource, now)
+        self.charge(identity, resource, amount, now)
 
     def check(self, identity: str, resource: Resource, now: float) -> None:
         """Raise ``LimitExceeded`` while ``identity``, or all of them together, spent too much."""
