@@ -12,7 +12,7 @@ import asyncio
 import os
 import threading
 from collections import Counter, OrderedDict, deque
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import count as count_up
@@ -25,6 +25,7 @@ __all__ = [
     "LazyTimer",
     "Workers",
     "give_way",
+    "on_every_thread",
     "repeat_forever",
     "work_when_idle",
 ]
@@ -87,7 +88,7 @@ class Workers:
         crowded: Callable[[], bool] = lambda: False,
         begin: Callable[[], object] = lambda: None,
     ) -> None:
-        self._count = count
+        self.count = count
         self._begin = begin
         self._callback_failed = callback_failed
         self._name = name
@@ -142,7 +143,7 @@ class Workers:
         with self._lock:
             self._closing = True
         self._resume_deferred()
-        for _ in range(self._count):
+        for _ in range(self.count):
             self._permits.put(False)
         for thread in self._threads:
             thread.join()
@@ -158,7 +159,7 @@ class Workers:
 
     def _start(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        for _ in range(self._count):
+        for _ in range(self.count):
             self._start_thread(loop)
 
     def _start_thread(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -174,7 +175,7 @@ class Workers:
             self._work_next(loop)
 
     def _may_begin(self, owner: str) -> bool:
-        most = max(1, self._count - 1)
+        most = max(1, self.count - 1)
         return self._in_work[owner] < most or self._closing or not self._crowded()
 
     def _work_next(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -211,6 +212,29 @@ class Workers:
                 done()
             except Exception as error:
                 self._callback_failed(error)
+
+
+async def on_every_thread(
+    pools: Sequence[Workers], work: Callable[[], object], within_s: float
+) -> None:
+    """Do ``work`` once on each thread of ``pools``, on all of them at the same time.
+
+    Raises what it raised, and ``threading.BrokenBarrierError`` if one is not free ``within_s``.
+    """
+    together = threading.Barrier(sum(pool.count for pool in pools), timeout=within_s)
+
+    def begin() -> object:
+        together.wait()
+        return work()
+
+    async def done(pool: Workers, owner: str) -> None:
+        outcome: asyncio.Future[object] = asyncio.get_running_loop().create_future()
+        pool.submit(owner, begin, outcome.set_result)
+        if isinstance(raised := await outcome, Exception):
+            raise raised
+
+    owners = ((pool, f"thread {number}") for pool in pools for number in range(pool.count))
+    await asyncio.gather(*(done(*owner) for owner in owners))
 
 
 def _outcome(work: Callable[[], R]) -> R | Exception:

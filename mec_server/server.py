@@ -25,7 +25,13 @@ from mec_server.config import RecordSettings, ServerConfig
 from mec_server.connections import Connections
 from mec_server.decoding.decoders import Decoders, DecoderSettings
 from mec_server.edge_service import EdgeService
-from mec_server.event_loop import BACKGROUND_NICE, Workers, give_way, repeat_forever
+from mec_server.event_loop import (
+    BACKGROUND_NICE,
+    Workers,
+    give_way,
+    on_every_thread,
+    repeat_forever,
+)
 from mec_server.fields.index import FieldIndex, PublishedFields, field_loader
 from mec_server.fields.service import FieldService
 from mec_server.fields.shelf import FieldShelf
@@ -99,6 +105,9 @@ NATS_FIELDS_S = 20.0
 """How long a server waits at its start for fields that it lacks and NATS may have."""
 
 NATS_END_S = 2.0
+
+DRAWN_S = 20.0
+"""Time limit for the start of the threads that decode."""
 
 MOST_OF_A_THREAD = 2
 """Fields that a thread which decodes nothing keeps open: for views, glances and trials."""
@@ -315,6 +324,7 @@ class EdgeServer:
         await asyncio.to_thread(self._published.start)
         self._metrics.show_tiles(self._published.tiles)
         opened = await asyncio.to_thread(self._shelf.warm_up)
+        await on_every_thread((self._workers, self._background), self._shelf.draw_once, DRAWN_S)
         await asyncio.to_thread(self._decoders.start)
         self._metrics.decoder_started(self._decoders.kind)
         self.address = Address(self.address.host, self._open_port())

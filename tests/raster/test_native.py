@@ -65,6 +65,23 @@ def test_pictures_drawn_at_the_same_time_are_those_drawn_one_by_one(
     assert together == one_by_one * 10
 
 
+def test_fields_of_any_size_are_drawn_in_the_same_memory(
+    scene: SceneMaker, camera: CameraMaker, threads: int
+) -> None:
+    counts, small, large = (700, 40, 2000), camera(16, 16), camera(200, 120)
+    alone = []
+    for count in counts:  # with nothing left behind: it goes with the last that uses it
+        rasterizer = Rasterizer(scene(count), threads=threads)
+        alone += [view_bytes(rasterizer.render(each)) for each in (small, large)]
+        del rasterizer
+    every = [Rasterizer(scene(count), threads=threads) for count in counts]
+    work = [(each, view_from) for each in every for view_from in (small, large)] * 10
+    in_turn = [view_bytes(each.render(view_from)) for each, view_from in work]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda x: view_bytes(x[0].render(x[1])), work))
+    assert in_turn == together == alone * 10
+
+
 def test_another_thread_count_of_the_same_gaussians_outlives_the_first(
     scene: SceneMaker, camera: CameraMaker, threads: int, antialiased: bool
 ) -> None:

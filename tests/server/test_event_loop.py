@@ -16,6 +16,7 @@ from mec_server.event_loop import (
     LazyTimer,
     Workers,
     give_way,
+    on_every_thread,
     repeat_forever,
     work_when_idle,
 )
@@ -135,6 +136,35 @@ def test_one_worker_does_work_in_the_order_of_asking() -> None:
         return order
 
     assert asyncio.run(run()) == list(range(100))
+
+
+def test_every_thread_of_all_workers_begins_at_the_same_time() -> None:
+    async def run() -> list[str]:
+        pools = Workers(3, unexpected), Workers(1, unexpected, "background")
+        here, all_here = list[str](), threading.Barrier(4, timeout=30)
+
+        def work() -> None:
+            all_here.wait()
+            here.append(threading.current_thread().name)
+
+        await on_every_thread(pools, work, 30.0)
+        for pool in pools:
+            await asyncio.to_thread(pool.close)
+        return sorted(here)
+
+    assert asyncio.run(run()) == ["background_0", "worker_0", "worker_1", "worker_2"]
+
+
+def test_what_one_thread_raised_is_raised() -> None:
+    async def run() -> None:
+        pool, first = Workers(2, unexpected), threading.Lock()
+        try:
+            await on_every_thread((pool,), lambda: 1 // (not first.acquire(blocking=False)), 30.0)
+        finally:
+            await asyncio.to_thread(pool.close)
+
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(run())
 
 
 def test_threads_of_background_work_give_way_and_no_other_thread_does() -> None:

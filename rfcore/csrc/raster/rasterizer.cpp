@@ -2,6 +2,8 @@
 
 #include <algorithm>
 #include <cstring>
+#include <map>
+#include <mutex>
 
 namespace rfcore::raster {
 namespace {
@@ -46,7 +48,8 @@ Rasterizer::Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, 
       threads_(threads),
       blocks_((gaussians.count + kLanes - 1) / kLanes),
       degree_(gaussians.degree),
-      antialiased_(antialiased) {
+      antialiased_(antialiased),
+      workplaces_(shared_workplaces(threads)) {
     const int planes = parameter_planes(degree_);
     const size_t stride = static_cast<size_t>(planes) * kLanes;
     const size_t sh_size = static_cast<size_t>(planes - kShPlane) * kLanes;
@@ -74,10 +77,21 @@ Rasterizer::Rasterizer(const Rasterizer& other, int threads)
       blocks_(other.blocks_),
       degree_(other.degree_),
       antialiased_(other.antialiased_),
-      prepared_(other.prepared_) {}
+      prepared_(other.prepared_),
+      workplaces_(std::make_shared<Workplaces>()) {}
 
-Kept<Rasterizer::Workplace>::Loan Rasterizer::workplace() {
-    return workplaces_.take([this] { return std::make_unique<Workplace>(threads_); });
+std::shared_ptr<Rasterizer::Workplaces> Rasterizer::shared_workplaces(int threads) {
+    static std::mutex mutex;
+    static std::map<int, std::weak_ptr<Workplaces>> by_threads;
+    const std::lock_guard lock(mutex);
+    std::weak_ptr<Workplaces>& kept = by_threads[threads];
+    std::shared_ptr<Workplaces> shared = kept.lock();
+    if (shared == nullptr) kept = shared = std::make_shared<Workplaces>();
+    return shared;
+}
+
+Rasterizer::Workplaces::Loan Rasterizer::workplace() {
+    return workplaces_->take([this] { return std::make_unique<Workplace>(threads_); });
 }
 
 void Rasterizer::run_front_end(Workplace& at, const Camera& camera, int degree) const {

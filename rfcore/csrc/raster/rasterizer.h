@@ -33,12 +33,14 @@ constexpr float kTransparentLogit = -100.0f;  // of lanes without a Gaussian
 // Gaussian are transparent.
 void pack_parameters(const GaussianArrays& from, float* blocks);
 
-// Pictures may be drawn at the same time, each with `threads` threads and memory of its own.
+// Pictures may be drawn at the same time, each with `threads` threads and memory of its own. All
+// rasterizers of as many threads share that memory: there is as much of it as pictures were drawn at
+// the same time, whatever they showed, and it lives as long as one of them.
 class Rasterizer {
   public:
     Rasterizer(const GaussianArrays& gaussians, const Kernels& kernels, int threads,
                bool antialiased);
-    // The Gaussians of `other`, drawn with `threads` threads and memory of its own.
+    // The Gaussians of `other`, drawn with `threads` threads and memory that nobody shares.
     Rasterizer(const Rasterizer& other, int threads);
 
     // Render colour [H, W, 3] with the first `degree` bands; with depth and opacity [H, W] both
@@ -60,14 +62,16 @@ class Rasterizer {
     struct Prepared {
         AlignedBuffer<float> geometry, harmonics;
     };
-    Kept<Workplace>::Loan workplace();
+    using Workplaces = Kept<Workplace>;
+    static std::shared_ptr<Workplaces> shared_workplaces(int threads);
+    Workplaces::Loan workplace();
     void run_front_end(Workplace& at, const Camera& camera, int degree) const;
 
     const Kernels& kernels_;
     int threads_, blocks_, degree_;
     bool antialiased_;
     std::shared_ptr<const Prepared> prepared_;
-    Kept<Workplace> workplaces_;
+    std::shared_ptr<Workplaces> workplaces_;
 };
 
 // Run `kernel` over every tile of the picture.
