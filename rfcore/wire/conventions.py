@@ -109,4 +109,7 @@ SERVER_OPTIONS: Final[Options] = (
     # A peer that shakes hands and then asks for nothing does not keep its connection.
     ("grpc.max_connection_idle_ms", 15_000),
     ("grpc.max_allowed_incoming_connections", 1_024),
+    # What is read at once is parsed at once, and its calls are answered before anybody else's: of
+    # calls whose headers are 13 kB and become 17 MB (an HPACK bomb) it shall be few.
+    ("grpc.experimental.tcp_max_read_chunk_size", 16_384),
 )
