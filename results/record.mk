@@ -37,7 +37,7 @@ ifneq ($(DATA),)
 YARD := $(DATA)/street
 LOOP := $(DATA)/kitti/loop
 CITY := $(DATA)/kitti/city
-trained = $(RFEDGE) train $1 --points $(dir $1)points.ply --held-out $2 --antialiased --plain --minutes $3 --out $@
+trained = $(RFEDGE) train $1 --points $(dir $1)points.ply --held-out $2 --antialiased --minutes $3 --out $@
 $(OUT)/yardstick.rff: | $(OUT)
 	$(call trained,$(YARD)/transforms_train.json,$(YARD)/transforms_drive_empty.json,5)
 $(OUT)/city.rff: | $(OUT)

@@ -201,16 +201,21 @@ def test_the_headline_has_the_fair_anchor_the_best_rival_and_ours_without_the_fi
     )
     bare = replace(fair, method="rfedge-without-field-veryfast-0123", bd_rate_percent=1.24)
     wider = replace(fair, window_db=(30.0, 33.0), bd_rate_percent=-99.0)
-    sentence, *_, line = headline(result_of(rows=[fair, best, bare, wider])).splitlines()
+    rows = [fair, best, bare, wider]
+    sentence, *_, line = headline(result_of(rows=rows, break_even=[PAID])).splitlines()
     assert (
         "**57 %** (95 %: 54 to 60 %) on drives through synthetic streets; for 151 ms of" in sentence
     )
     assert line == (
         "| yardstick-empty, 10 Hz | -57.3 % (-60.0..-54.0) | -41.2 % (svtav1-lowdelay-p4) "
-        "| +1.2 % | 151 / 24 |"
+        "| +1.2 % | 151 / 24 | 5.0 MB, 41 of 2.4 s |"
     )
+    never = replace(PAID, passes_to_break_even=None)
+    assert headline(result_of(rows=rows, break_even=[never])).endswith("| 5.0 MB, never |")
     with pytest.raises(InvalidInput, match="yardstick-empty@10 lacks rfedge-without-field"):
-        headline(result_of(rows=[fair, best]))
+        headline(result_of(rows=[fair, best], break_even=[PAID]))
+    with pytest.raises(InvalidInput, match="break_even: yardstick-empty@10 lacks rfedge"):
+        headline(result_of(rows=rows))
 
 
 def test_the_headline_tells_real_second_passes_apart_and_leaves_out_what_is_an_upper_bound() -> (
@@ -230,11 +235,12 @@ def test_the_headline_tells_real_second_passes_apart_and_leaves_out_what_is_an_u
 
     drives = {"kitti-city": -90.0, "a": -50.0, "b": -70.0, "kitti-loop": -68.0}
     rows = [row for scene, percent in drives.items() for row in drive(scene, percent)]
-    sentence = headline(result_of(rows=rows)).splitlines()[0]
+    paid = [replace(PAID, scene=scene) for scene in drives]
+    sentence = headline(result_of(rows=rows, break_even=paid)).splitlines()[0]
     assert "**50 to 70 %** (95 %: 48 to 73 %) on drives through synthetic streets, " in sentence
     assert "**68 %** (95 %: 66 to 71 %) on a real street's second pass; for" in sentence
     with pytest.raises(InvalidInput, match="no drive but upper bounds: kitti-city"):
-        headline(result_of(rows=rows[:3]))
+        headline(result_of(rows=rows[:3], break_even=paid))
 
 
 def test_every_point_of_every_curve_is_beside_its_figure(tmp_path: Path) -> None:

@@ -183,6 +183,7 @@ HEADLINE_COLUMNS = (
     "against the best of all rivals",
     "our coder without the field",
     "ms a frame at both ends: ours / that x264",
+    "the field, and after how many passes it is paid for",
 )
 PRINTED = ("scene", "Hz", "method", "rival", "window dB", "BD-rate %", "95 %", "CPU ms")
 SSIM_COLUMNS = (
@@ -232,7 +233,7 @@ def compare_section(path: Path, result: Result) -> str:
 def headline(result: Result) -> str:
     """Return a sentence, and a line per drive over the first window: ours against x264 with the
     same tools at preset medium and against the strongest rival of all; our coder without the
-    field; times.
+    field; times; what the field's own bytes are, and how many passes over the street save as many.
 
     Raises ``InvalidInput`` for a comparison that lacks one of them.
     """
@@ -240,7 +241,9 @@ def headline(result: Result) -> str:
     window = compared[0].window_db if compared else ()
     first = [row for row in compared if row.window_db == window]
     drives = dict.fromkeys((row.scene, row.hz) for row in first)
-    lines = table(HEADLINE_COLUMNS, [_headline_cells(first, *drive) for drive in drives])
+    paid = rows_of(BreakEvenRow, result.get("break_even", ()))
+    cells = [[*_headline_cells(first, *drive), _field_cell(paid, *drive)] for drive in drives]
+    lines = table(HEADLINE_COLUMNS, cells)
     return f"{_headline_sentence([_compared(first, *drive) for drive in drives])}\n\n{lines}"
 
 
@@ -282,10 +285,23 @@ def _compared(
     rival: str = HEADLINE_ANCHOR,
 ) -> CompareRow:
     for each in rows:
-        named = without_field(each.method).rsplit("-", 1)[0]
+        named = _without_effort(each.method)
         if (each.scene, each.hz, named, each.rival) == (scene, hz, method, rival):
             return each
     raise InvalidInput("rows", f"{scene}@{hz:g} lacks {method} against {rival}")
+
+
+def _without_effort(method: str) -> str:
+    return without_field(method).rsplit("-", 1)[0]
+
+
+def _field_cell(rows: Sequence[BreakEvenRow], scene: str, hz: float) -> str:
+    for row in rows:
+        if (row.scene, row.hz, _without_effort(row.method)) == (scene, hz, "rfedge"):
+            passes, seconds = row.passes_to_break_even, row.frames_per_pass / hz
+            paid = "never" if passes is None else f"{passes} of {seconds:.1f} s"
+            return f"{row.field_bytes / 1e6:.1f} MB, {paid}"
+    raise InvalidInput("break_even", f"{scene}@{hz:g} lacks rfedge")
 
 
 def _headline_cells(rows: Sequence[CompareRow], scene: str, hz: float) -> list[str]:
