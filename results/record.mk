@@ -71,6 +71,15 @@ $(SCENES)/exposure.toml: samples/street/empty.toml | $(SCENES)
 	$(call effects,street-sensor,.exposure)
 $(SCENES)/people.toml: samples/street/people.toml | $(SCENES)
 	cp $< $@
+# At other rates and sizes, and no longer than latencies need.
+$(SCENES)/vehicles-30hz.toml: samples/street/vehicles.toml | $(SCENES)
+	sed 's/^rate_hz.*/rate_hz = 30.0/; s/^duration_s.*/duration_s = 0.8/' $< >$@
+$(SCENES)/vehicles-720p.toml: samples/street/vehicles.toml | $(SCENES)
+	sed 's/^size_px.*/size_px = [1280, 720]/; s/^duration_s.*/duration_s = 1.2/' $< >$@
+$(SCENES)/vehicles-720p-30hz.toml: $(SCENES)/vehicles-30hz.toml
+	sed 's/^size_px.*/size_px = [1280, 720]/; s/^duration_s.*/duration_s = 0.4/' $< >$@
+$(SCENES)/vehicles-%/transforms_drive.json: $(SCENES)/vehicles-%.toml
+	$(RFEDGE) scene build $< --split drive --spp 9 --out $(@D)
 $(SCENES)/%/transforms_drive.json: $(SCENES)/%.toml
 	$(RFEDGE) scene build $< --split drive --out $(@D)
 
@@ -115,8 +124,10 @@ $(OUT)/robust.json: $(call drive,dusk) | $(OUT)
 	$(RFEDGE) eval robust --dusk dusk@10=$< --cells $(OUT)/robust --out $@
 $(OUT)/ladder.json: $(NGP) | $(OUT)
 	$(RFEDGE) eval ladder $(SAMPLE) $(NGP) --frames 8 --cells $(OUT)/ladder --out $@
-$(OUT)/latency.json: | $(OUT)
-	$(RFEDGE) eval latency --cells $(OUT)/latency --out $@
+FASTER := vehicles-30hz vehicles-720p vehicles-720p-30hz
+$(OUT)/latency.json: $(foreach name,$(FASTER),$(call drive,$(name))) | $(OUT)
+	$(RFEDGE) eval latency $(SAMPLE) $(subst sample-,,$(NOON)) vehicles@30=$(call drive,vehicles-30hz) \
+		vehicles-720p@10=$(call drive,vehicles-720p) vehicles-720p@30=$(call drive,vehicles-720p-30hz) --cells $(OUT)/latency --out $@
 $(OUT)/localise.json: $(call drive,dusk) $(call drive,lane-1.5) | $(OUT)
 	$(RFEDGE) eval localise sample=$(EMPTY),$(SAMPLE) vehicles=$(VEHICLES),$(SAMPLE),rows=2m:3deg \
 		noise=$(EMPTY),$(SAMPLE),noise=3,rows=2m:3deg dusk=$(call drive,dusk),$(SAMPLE),rows=2m:3deg \

@@ -141,20 +141,39 @@ class Rival:
         sizes = [len(packet) for packet in packets]
         return CodedPictures(sizes, decoded, (coded_ns - began_ns) / 1e6, decoder_ms)
 
+    def frames_ms(
+        self, frames: Sequence[I420], rate_hz: float, point: float
+    ) -> list[tuple[float, float]]:
+        """Return what each frame takes of a processor to code and to decode, in milliseconds.
+
+        Raises ``CodecError`` as ``code`` does.
+        """
+        decoder = self._decoder()
+        took_ms, began_ns = [], process_time_ns()
+        for packet in self._packets(frames, rate_hz, point):
+            coded_ns = process_time_ns()
+            for _ in decoder.decode(av.Packet(packet)):
+                pass
+            decoded_ns = process_time_ns()
+            took_ms.append(((coded_ns - began_ns) / 1e6, (decoded_ns - coded_ns) / 1e6))
+            began_ns = process_time_ns()
+        return took_ms
+
     def _encoded(self, frames: Sequence[I420], rate_hz: float, point: float) -> list[bytes]:
-        packets = []
+        return list(self._packets(frames, rate_hz, point))
+
+    def _packets(self, frames: Sequence[I420], rate_hz: float, point: float) -> Iterator[bytes]:
         try:
             encoder = self._encoder(frames[0].size_px, rate_hz, point)
             for index, frame in enumerate(frames):
                 made = encoder.encode(video_frame(frame, index))
                 if len(made) != 1:
                     raise CodecError(f"{self.name}: frame {index} came out as {len(made)} packets")
-                packets.append(bytes(made[0]))
+                yield bytes(made[0])
             if encoder.encode(None):
                 raise CodecError(f"{self.name}: kept a frame until the end")
         except (FFmpegError, ValueError) as error:
             raise CodecError(f"{self.name}: {error}") from error
-        return packets
 
     def _encoder(
         self, size_px: tuple[int, int], rate_hz: float, point: float
@@ -171,10 +190,14 @@ class Rival:
         return encoder
 
     def _decoded(self, packets: Sequence[bytes]) -> list[I420]:
-        decoder = _opened(self.decoder, "r")
-        decoder.thread_count = 1
+        decoder = self._decoder()
         frames = [f for packet in packets for f in decoder.decode(av.Packet(packet))]
         return [picture(frame) for frame in (*frames, *decoder.decode(None))]
+
+    def _decoder(self) -> av.VideoCodecContext:
+        decoder = _opened(self.decoder, "r")
+        decoder.thread_count = 1
+        return decoder
 
 
 @cache

@@ -175,8 +175,21 @@ def test_what_both_ends_compute_is_told_stage_by_stage(latency):
     _, result = latency
     ours, theirs = (row["stage_ms"] for row in result["needed"])
     assert {"sender render", "sender encode", "receiver render", "receiver decode"} <= ours.keys()
-    assert theirs.keys() == {"sender encode"}
+    assert theirs.keys() == {"sender encode", "receiver decode"}
     assert all(ms >= 0 for ms in (*ours.values(), *theirs.values()))
+
+
+def test_from_capture_to_shown_takes_longer_than_the_link_alone(latency):
+    _, result = latency
+    rows = {(row["method"], row["link"]): row for row in result["rows"]}
+    assert len(result["shown"]) == len(rows)
+    for shown in result["shown"]:
+        played = rows[shown["method"], shown["link"]]
+        assert shown["frames"] == played["frames"]
+        assert (shown["width_px"], shown["height_px"]) == (96, 64)
+        assert 0 < shown["sender_busy_percent"] < 100
+        if shown["dropped"] == played["dropped"] == 0:
+            assert shown["sent_ms"]["mean"] > played["network_ms"]["mean"]
 
 
 @pytest.mark.slow

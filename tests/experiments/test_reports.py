@@ -36,6 +36,7 @@ from rfedge.experiments.ladder.page import (
 from rfedge.experiments.latency.report import (
     NeededRow,
     PlayedRow,
+    ShownRow,
     latency_section,
     print_needed,
     write_latency_figures,
@@ -352,10 +353,27 @@ PLAYED = PlayedRow(
     tau_ms={"mean": 2.034, "p50": 2.0, "p99": 2.8},
     network_ms={"mean": 2.1, "p50": 2.05, "p99": 2.9},
     network_p99_ms=None,
-    end_to_end_p50_ms=92.256,
-    end_to_end_p99_ms=None,
     share_within={"5": 0.96, "10": 0.9987},
     network_quantiles_ms=[1.0, 2.0, None],
+)
+SHOWN = ShownRow(
+    scene="empty",
+    hz=10.0,
+    method="rfedge-default",
+    crf=32.0,
+    psnr_db=33.086,
+    width_px=640,
+    height_px=360,
+    link="4 Mbit/s",
+    rate_bps=4e6,
+    frames=3000,
+    dropped=30,
+    sent_ms={"mean": 90.0, "p50": 88.2, "p99": 131.0},
+    shown_p50_ms=88.3,
+    shown_p99_ms=None,
+    share_within={"50": 0.0, "100": 0.9, "200": 0.9987},
+    sender_busy_percent=52.4,
+    receiver_busy_percent=41.0,
 )
 ANCHOR = {"method": "x264-lowdelay-veryfast"}
 
@@ -366,6 +384,7 @@ def latency_result() -> dict[str, Any]:
         requirement={"share": 0.99999, "frames_needed": 299_572},
         needed=[NEEDED, replace(NEEDED, **ANCHOR, stage_ms={"sender encode": 17.0})],
         rows=[PLAYED, replace(PLAYED, **ANCHOR), replace(PLAYED, link="trace", rate_bps=3e6)],
+        shown=[SHOWN],
     )
 
 
@@ -374,8 +393,11 @@ def test_a_sender_has_what_it_needs_and_what_each_link_makes_of_it() -> None:
     needed = "| empty | 10 | rfedge-veryfast | 33.09 | 8.1 | 11.3 | 11.4 | 2.26 | 1.13 |"
     assert needed in section
     assert (
-        "| empty | 10 | rfedge-veryfast | 4 Mbit/s | 2.03 | 2.05 | never | 92.26 | 96.0 | 99.9 "
-        "| 1.0 |"
+        "| empty | 10 | rfedge-veryfast | 4 Mbit/s | 2.03 | 2.05 | never | 96.0 | 99.9 | 1.0 |"
+    ) in section
+    assert (
+        "| empty | 640x360 | 10 | rfedge-default | 4 Mbit/s | 88 | 131 | 0.0 | 90.0 | 99.9 | 1.0 "
+        "| 52 / 41 |"
     ) in section
     assert "299,572 different frames" in section
 

@@ -41,7 +41,14 @@ from rfedge.experiments.clips import Drive, luma_mse, psnr_of_mse
 from rfedge.experiments.field_coder import message_bytes
 from rfedge.offline import CodedFrame, FrameInput, decode_promised, encode_frames
 
-__all__ = ["TimedRenders", "TrackedDrive", "measure_rung", "time_renders", "track_drive"]
+__all__ = [
+    "TimedRenders",
+    "TrackedDrive",
+    "measure_frames",
+    "measure_rung",
+    "time_renders",
+    "track_drive",
+]
 
 SENDER_STAGES = ("references", "encode", "closed_loop")
 RECEIVER_STAGES = ("references", "splice", "decode")
@@ -67,11 +74,12 @@ class StageClock:
 @dataclass(frozen=True)
 class TimedRenders:
     """A clip's views at one quality, with what a frame took to render and to convert: (cpu, wall)
-    in milliseconds, lower quartiles."""
+    in milliseconds, lower quartiles; ``frames_ms``: (render, convert) of each frame, cpu."""
 
     views: tuple[FieldView, ...]
     render_ms: tuple[float, float]
     convert_ms: tuple[float, float]
+    frames_ms: tuple[tuple[float, float], ...]
 
 
 def time_renders(field: RadianceField, drive: Drive, quality: Quality) -> TimedRenders:
@@ -91,7 +99,8 @@ def time_renders(field: RadianceField, drive: Drive, quality: Quality) -> TimedR
         rendering, converting = clock.spent_ms()
         render_ms.append(rendering)
         convert_ms.append(converting)
-    return TimedRenders(tuple(views), _quartile(render_ms), _quartile(convert_ms))
+    frames_ms = tuple((r[0], c[0]) for r, c in zip(render_ms, convert_ms, strict=True))
+    return TimedRenders(tuple(views), _quartile(render_ms), _quartile(convert_ms), frames_ms)
 
 
 def measure_rung(drive: Drive, rendered: TimedRenders, rung: Rung, crf: float) -> Row:
@@ -99,6 +108,14 @@ def measure_rung(drive: Drive, rendered: TimedRenders, rung: Rung, crf: float) -
 
     Raises ``CodecError`` if the receiver does not see what the sender promised.
     """
+    return measure_frames(drive, rendered, rung, crf)[0]
+
+
+def measure_frames(
+    drive: Drive, rendered: TimedRenders, rung: Rung, crf: float
+) -> tuple[Row, list[tuple[float, float]]]:
+    """Return what ``measure_rung`` does, and what each frame took of a processor at the sender and
+    at the receiver, in milliseconds; raises as it does."""
     sender, receiver = _Stages(SENDER_STAGES), _Stages(RECEIVER_STAGES)
     config = CodecConfig(*drive.frames[0].size_px, rung.effort, crf)
     encoder = DeltaEncoder(config, sender.clock)
@@ -120,7 +137,7 @@ def measure_rung(drive: Drive, rendered: TimedRenders, rung: Rung, crf: float) -
     mse = float(np.mean([luma_mse(*pair) for pair in pairs]))
     sender_ms = {"convert": rendered.convert_ms, "render": rendered.render_ms, **sender.quartiles()}
     receiver_ms = {"render": rendered.render_ms, **receiver.quartiles()}
-    return {
+    row = {
         "sender_ms": sum(cpu for cpu, _ in sender_ms.values()),
         "receiver_ms": sum(cpu for cpu, _ in receiver_ms.values()),
         "sender_wall_ms": sum(wall for _, wall in sender_ms.values()),
@@ -132,6 +149,11 @@ def measure_rung(drive: Drive, rendered: TimedRenders, rung: Rung, crf: float) -
         "ssim": float(np.mean([ssim(ours.y, theirs.y) for ours, theirs in pairs])),
         "references_used": _counts(coded[1:]),
     }
+    ends_ms = zip(rendered.frames_ms, sender.frames_ms(), receiver.frames_ms(), strict=True)
+    return row, [
+        (render + convert + coding, render + decoding)
+        for (render, convert), coding, decoding in ends_ms
+    ]
 
 
 class _Stages:
@@ -147,6 +169,10 @@ class _Stages:
         if len(spent) != len(self._names):
             raise CodecError(f"{len(spent)} stages where {', '.join(self._names)} are expected")
         self._frames.append(spent)
+
+    def frames_ms(self) -> list[float]:
+        """Return the processor time of all stages of each frame."""
+        return [sum(cpu for cpu, _ in spent) for spent in self._frames]
 
     def quartiles(self) -> dict[str, tuple[float, float]]:
         steady = list(zip(*self._frames[1:], strict=True))

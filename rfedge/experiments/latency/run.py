@@ -4,20 +4,22 @@ Ours and low-delay x264 are coded to the same quality (the CRF is searched in
 steps of a half), then sent over constant rates and over recorded links.
 
 ``tau`` is a message's own transmission time. The network latency adds waiting behind earlier
-frames and the link's propagation; end to end adds what both ends compute. A clip is sent again and
-again without its first frame, captured at its rate. As the product does, at most ``WINDOW`` frames
-are under way: a frame that finds more is dropped before it is coded, and counts as late.
+frames and the link's propagation, as if nothing had to be computed: what an uplink alone makes of
+the frames. From capture to shown adds both ends' processors and waiting for them
+(``rfedge.experiments.latency.capture_to_shown``). A clip is sent again and again without its first
+frame, captured at its rate. As the product does, at most ``WINDOW`` frames are under way: a frame
+that finds more is dropped before it is coded, and counts as late.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +34,14 @@ from rfcore.link.trace import read_mahimahi
 from rfedge.experiments.cells import CellStore, clip_key, program_version
 from rfedge.experiments.clips import Clip, ClipCoder, CodedClip, Drive, DriveName, read_drive
 from rfedge.experiments.field_coder import FieldCoder, render_clip
-from rfedge.experiments.ladder.measure import measure_rung, time_renders
-from rfedge.experiments.latency.report import NeededRow, PlayedRow
+from rfedge.experiments.ladder.measure import measure_frames, time_renders
+from rfedge.experiments.latency.capture_to_shown import (
+    WINDOW,
+    FrameWork,
+    quantile_of_all_ms,
+    show,
+)
+from rfedge.experiments.latency.report import NeededRow, PlayedRow, ShownRow
 from rfedge.experiments.rivals import x264_lowdelay
 from rfedge.results import check_result_path, make_result, provenance, write_result
 
@@ -50,15 +58,16 @@ __all__ = [
 ]
 
 
-WINDOW = 2
-"""Frames of one camera under way (``mec_server.config.SessionLimits``)."""
 BUDGETS_MS = (5.0, 10.0)
 """Network latencies a digital twin asks for (the paper: 5 to 10 ms)."""
 REQUIREMENT = 0.99999
 """Share of frames that must be so quick (the paper)."""
+SHOWN_WITHIN_MS = (50.0, 100.0, 200.0)
+"""From capture to shown."""
 FRAMES_FOR_REQUIREMENT = math.ceil(math.log(0.05) / math.log(REQUIREMENT))
 """Frames in time without a single late one before 99.999 % may be claimed with 95 % confidence."""
 F64 = NDArray[np.float64]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -79,16 +88,14 @@ class Played:
         return float((self.network_ms <= budget_ms).sum() / self.frames)
 
     def quantile_ms(self, share: float) -> float:
-        """Return the latency that ``share`` of the captured frames stay within; dropped ones never
-        come, so it may be infinite."""
-        late = np.full(self.dropped, np.inf)
-        return float(np.quantile(np.concatenate([self.network_ms, late]), share, method="higher"))
+        """Return the latency that ``share`` of the captured frames stay within, or infinity."""
+        return quantile_of_all_ms(self.network_ms, self.dropped, share)
 
 
-def repeated(frame_bytes: Sequence[int], count: int) -> list[int]:
-    """Return ``count`` sizes: the clip without its first frame, which a stream sends once, again
-    and again."""
-    steady = list(frame_bytes)[1:]
+def repeated(frames: Sequence[T], count: int) -> list[T]:
+    """Return ``count`` frames: the clip without its first one, which a stream sends once, again and
+    again."""
+    steady = list(frames)[1:]
     if not steady:
         raise InvalidInput("frames", "a clip needs at least two frames")
     return [steady[k % len(steady)] for k in range(count)]
@@ -141,6 +148,13 @@ CRF_STEP = 0.5
 FIRST_CRF, LOWEST_CRF, HIGHEST_CRF = 27.0, 14.0, 44.0
 QUICK_FRAMES, PLAYED_FRAMES = 6, 3000
 CURVE_POINTS = 101
+TIMED = 3
+"""Times that a frame's work is measured; the least counts: what else the machine does adds to it.
+"""
+
+
+EndsMs = list[tuple[float, float]]
+"""Processor time of each frame at the sender and at the receiver."""
 
 
 @dataclass(frozen=True)
@@ -166,12 +180,14 @@ class LatencyJob:
 
 @dataclass(frozen=True)
 class Sender:
-    """A method at one quality: its frames, and what both ends compute, stage by stage."""
+    """A method at one quality: its frames, what both ends compute, stage by stage, and what each
+    frame takes of them."""
 
     clip: Clip
     method: str
     coded: CodedClip
     stage_ms: dict[str, float]
+    work: Sequence[FrameWork]
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -197,6 +213,7 @@ def run_latency(job: LatencyJob, console: Console) -> dict[str, Any]:
     senders = [s for name in names for s in _senders(job, name, field, console)]
     console.print(f"coded in {monotonic() - began_s:.0f} s")
     rows = [_row(sender, name, plan) for sender in senders for name, plan in links]
+    shown = [_shown(sender, name, plan) for sender in senders for name, plan in links]
     content = {
         "quick": job.quick,
         "field_id": field.field_id,
@@ -207,6 +224,7 @@ def run_latency(job: LatencyJob, console: Console) -> dict[str, Any]:
         "requirement": {"share": REQUIREMENT, "frames_needed": FRAMES_FOR_REQUIREMENT},
         "needed": [_needed(sender) for sender in senders],
         "rows": rows,
+        "shown": shown,
     }
     result = make_result("latency", made, content)
     write_result(job.out, result)
@@ -229,22 +247,42 @@ def _senders(
     store = CellStore(job.cells)
     ours = FieldCoder(rendered, f"rfedge-{job.effort}", program_version(), effort=job.effort)
     coded = _at_quality(clip, ours, job.quality_db, store)
-    yield Sender(clip, ours.name, coded, _own_stages(job, drive, field, coded.point))
+    stages, ends_ms = _own_times(job, drive, field, coded.point)
+    yield Sender(clip, ours.name, coded, stages, _work(coded, ends_ms))
     rival = x264_lowdelay(job.preset)
     coded = _at_quality(clip, rival, job.quality_db, store)
-    stages = {"sender encode": coded.cpu_ms / len(coded.frame_bytes)}
-    yield Sender(clip, rival.name, coded, stages)
+    ends_ms = _least(rival.frames_ms(clip.frames, clip.rate_hz, coded.point) for _ in range(TIMED))
+    encode_ms, decode_ms = np.quantile(ends_ms[1:], 0.25, axis=0).tolist()
+    stages = {"sender encode": encode_ms, "receiver decode": decode_ms}
+    yield Sender(clip, rival.name, coded, stages, _work(coded, ends_ms))
     console.print(f"  {name.scene} {name.rate_hz:g} Hz")
 
 
-def _own_stages(
+def _own_times(
     job: LatencyJob, drive: Drive, field: RadianceField, crf: float
-) -> dict[str, float]:
-    """Return the milliseconds of both ends, from the ladder's measurement of the full rung."""
+) -> tuple[dict[str, float], EndsMs]:
+    """Return the milliseconds of both ends, stage by stage, from the ladder's measurement of the
+    full rung, and those of each frame."""
     rung = Rung(effort=job.effort)
-    row = measure_rung(drive, time_renders(field, drive, rung.quality), rung, crf)
+    measured = [
+        measure_frames(drive, time_renders(field, drive, rung.quality), rung, crf)
+        for _ in range(TIMED)
+    ]
+    row = measured[0][0]
     ours = {f"sender {name}": ms for name, ms in row["sender_stage_ms"].items()}
-    return ours | {f"receiver {name}": ms for name, ms in row["receiver_stage_ms"].items()}
+    ours |= {f"receiver {name}": ms for name, ms in row["receiver_stage_ms"].items()}
+    return ours, _least(ends_ms for _, ends_ms in measured)
+
+
+def _least(measured: Iterable[EndsMs]) -> EndsMs:
+    """Return, frame by frame, the least that either end took."""
+    least = np.min(np.array(list(measured)), axis=0)
+    return [(sender_ms, receiver_ms) for sender_ms, receiver_ms in least.tolist()]
+
+
+def _work(coded: CodedClip, ends_ms: EndsMs) -> list[FrameWork]:
+    sizes = coded.frame_bytes.tolist()
+    return [FrameWork(size, *ms) for size, ms in zip(sizes, ends_ms, strict=True)]
 
 
 def _at_quality(clip: Clip, coder: ClipCoder, quality_db: float, store: CellStore) -> CodedClip:
@@ -266,7 +304,6 @@ def _at_quality(clip: Clip, coder: ClipCoder, quality_db: float, store: CellStor
 def _row(sender: Sender, name: str, plan: DirectionPlan) -> PlayedRow:
     sizes = repeated(sender.coded.frame_bytes.tolist(), PLAYED_FRAMES)
     played = play(sizes, sender.clip.rate_hz, plan)
-    computing_ms = sum(sender.stage_ms.values())
     curve = [played.quantile_ms(share) for share in np.linspace(0, 1, CURVE_POINTS)]
     return PlayedRow(
         **sender.facts,
@@ -277,10 +314,28 @@ def _row(sender: Sender, name: str, plan: DirectionPlan) -> PlayedRow:
         tau_ms=_spread(played.tau_ms),
         network_ms=_spread(played.network_ms),
         network_p99_ms=_finite(played.quantile_ms(0.99)),
-        end_to_end_p50_ms=_finite(played.quantile_ms(0.5) + computing_ms),
-        end_to_end_p99_ms=_finite(played.quantile_ms(0.99) + computing_ms),
         share_within={f"{ms:g}": played.share_within(ms) for ms in BUDGETS_MS},
         network_quantiles_ms=[_finite(ms) for ms in curve],
+    )
+
+
+def _shown(sender: Sender, name: str, plan: DirectionPlan) -> ShownRow:
+    shown = show(repeated(sender.work, PLAYED_FRAMES), sender.clip.rate_hz, plan)
+    width_px, height_px = sender.clip.frames[0].size_px
+    return ShownRow(
+        **sender.facts,
+        width_px=width_px,
+        height_px=height_px,
+        link=name,
+        rate_bps=plan.profile.rate_bps,
+        frames=shown.frames,
+        dropped=shown.dropped,
+        sent_ms=_spread(shown.latency_ms),
+        shown_p50_ms=_finite(shown.quantile_ms(0.5)),
+        shown_p99_ms=_finite(shown.quantile_ms(0.99)),
+        share_within={f"{ms:g}": shown.share_within(ms) for ms in SHOWN_WITHIN_MS},
+        sender_busy_percent=100 * shown.sender_busy,
+        receiver_busy_percent=100 * shown.receiver_busy,
     )
 
 
