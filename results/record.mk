@@ -16,7 +16,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .PHONY: results results-full
 results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec slice-coder classes never-worse robust ladder latency compare compare-small)
 	cp $^ results/
-results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder localise benchmark rig live world paper)
+results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long localise benchmark rig live world paper)
 	cp $(filter %.json,$^) results/
 	$(MAKE) -f samples/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
 
@@ -122,6 +122,12 @@ $(OUT)/never-worse.json: | $(OUT)
 	$(RFEDGE) eval never-worse $(SAMPLE) $(NOON) --decimated $(NOON) --cells $(OUT)/never-worse --out $@
 $(OUT)/robust.json: $(call drive,dusk) | $(OUT)
 	$(RFEDGE) eval robust --dusk dusk@10=$< --cells $(OUT)/robust --out $@
+# Loss with a hundred seeds, over half a minute of the street: 300 frames, small, for it is hours of a core.
+LONG := $(SCENES)/long/transforms_drive.json
+$(LONG): samples/localise/drive_30s.toml | $(SCENES)
+	$(RFEDGE) scene build $< --split drive --size 320x180 --spp 9 --out $(@D)
+$(OUT)/robust-long.json: $(LONG) | $(OUT)
+	$(RFEDGE) eval robust $(SAMPLE) long@10=$< --frames 300 --seeds 100 --rtts-ms 50 --cells $(OUT)/robust --out $@
 $(OUT)/ladder.json: $(NGP) | $(OUT)
 	$(RFEDGE) eval ladder $(SAMPLE) $(NGP) --frames 8 --cells $(OUT)/ladder --out $@
 FASTER := vehicles-30hz vehicles-720p vehicles-720p-30hz

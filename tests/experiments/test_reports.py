@@ -474,7 +474,10 @@ def test_loss_is_sorted_and_a_condition_that_was_not_measured_says_why() -> None
     section = robust_section(Path("robust.json"), robust_result())
     losses = [float(x) for x in re.findall(r"\| last-acked \| (\d+) \|", section)]
     assert losses == [0, 0, 5, 5]
-    assert "| last-acked | 0 | 20 | 0.9480 | 0.9000 |" in section
+    assert "| last-acked | 0 | 20 | 1 | 0.9480 | - | 0.9000 |" in section
+    several = LossRow("render-only", 50.0, 5.0, 0.91234, 0.8, 100, (0.9101, 0.9144))
+    section = robust_section(Path("robust.json"), {**robust_result(), "rows": as_json([several])})
+    assert "| render-only | 5 | 50 | 100 | 0.9123 | 0.9101..0.9144 | 0.8000 |" in section
     assert "| pose noise | 1 cm | 27.9 | +1.2 | 68.3 | -59.1 |" in section
     no_drive = "| light | n/a: no drive in another light was given | n/a | n/a | n/a | n/a |"
     assert no_drive in section

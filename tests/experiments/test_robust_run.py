@@ -1,14 +1,16 @@
 """``rfedge eval robust``, from files to a result file, a figure and a section."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
 from rfedge.experiments.robust.report import robust_section, write_robust_figure
-from rfedge.experiments.robust.run import RobustJob, run_robust
+from rfedge.experiments.robust.run import RobustJob, _interval, run_robust
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 
@@ -103,6 +105,33 @@ def test_a_run_that_is_finished_gives_the_same_rows_from_its_cells(robust):
     assert json.loads(job.out.read_text())["crossings"] == result["crossings"]
 
 
+def test_more_seeds_give_means_with_intervals_and_the_first_seed_is_the_one_of_before(robust):
+    job, one = robust
+    seeds = 16
+    several = replace(job, seeds=seeds, out=job.out.with_name("seeds.json"))
+    result = run_robust(several, Console(quiet=True))
+    first = one["crossings"][0]["seed"]
+    kept = [r for r in result["crossings"] if r["seed"] == first]
+    assert kept == one["crossings"]
+    lossy = [r for r in result["rows"] if r["loss_percent"]]
+    assert len(lossy) == 5 * 2
+    for row in lossy:
+        low, high = row["ssim_ci95"]
+        assert row["seeds"] == seeds
+        assert low <= row["ssim"] <= high
+    assert any(row["ssim_ci95"][0] < row["ssim_ci95"][1] for row in lossy)
+    lossless = [r for r in result["rows"] if not r["loss_percent"]]
+    assert [r["seeds"] for r in lossless] == [1] * 5 * 2
+    assert not any("ssim_ci95" in r for r in lossless)
+
+
+def test_the_interval_of_a_mean_is_near_what_a_normal_distribution_has():
+    values = np.random.default_rng(2).normal(0.9, 0.02, 400)
+    low, high = _interval(values)
+    assert (low + high) / 2 == pytest.approx(values.mean(), abs=2e-4)
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(400), rel=0.1)
+
+
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_quick_run_writes_rows_a_figure_and_a_section_and_goes_on(tmp_path):
@@ -140,7 +169,14 @@ def test_a_quick_run_writes_rows_a_figure_and_a_section_and_goes_on(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "named"), [({"out": Path("x")}, "out"), ({"frames": 1}, "frames")]
+    ("change", "named"),
+    [
+        ({"out": Path("x")}, "out"),
+        ({"frames": 1}, "frames"),
+        ({"seeds": 0}, "seeds"),
+        ({"rtts_ms": ()}, "rtts_ms"),
+        ({"rtts_ms": (20.0, -1.0)}, "rtts_ms"),
+    ],
 )
 def test_a_job_that_cannot_be_done_is_refused_by_name(change, named):
     given = {

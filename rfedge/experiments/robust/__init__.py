@@ -40,6 +40,10 @@ class EvalRobust:
     """Luma PSNR at which bits are compared where nothing is lost."""
     frames: int = 36
     """How many frames of the drive."""
+    seeds: int = 1
+    """How many seeds of loss: means, and their 95 % intervals."""
+    rtts_ms: tuple[float, ...] = (20.0, 50.0, 100.0)
+    """Round trips of the lossy link."""
     out: Path = Path("out/eval/robust.json")
     """The result file to write."""
     figures: Path = Path("out/eval/figures")
@@ -69,6 +73,8 @@ class EvalRobust:
             out=self.out,
             cells=self.cells,
             quick=self.quick,
+            seeds=self.seeds,
+            rtts_ms=self.rtts_ms,
         )
         console = Console()
         result = run_robust(job, console)

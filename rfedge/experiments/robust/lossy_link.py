@@ -12,6 +12,7 @@ fades as the refresh passes, or until the next IDR picture).
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -51,6 +52,7 @@ __all__ = [
 ]
 
 
+KEPT = 8
 DATAGRAM_BYTES = 1200
 """What passes every network without fragments (RFC 9000, 14)."""
 
@@ -189,7 +191,8 @@ class Outcome:
 class FrameCoder:
     """Codes frames of one clip at one CRF, each against any earlier one, and keeps what it made.
 
-    Crossings share what they have in common: all that was sent before the first loss.
+    Crossings share what they have in common: all that was sent before the first loss, and with the
+    same losses often more. Of ``KEPT`` times as many as the clip has, those used longest ago go.
     """
 
     def __init__(
@@ -198,7 +201,7 @@ class FrameCoder:
         self.rendered = rendered
         self._clip = clip
         self._encoder = DeltaEncoder(CodecConfig(*clip[0].size_px, effort, crf))
-        self._made: dict[tuple[int, bytes, bool], Encoded] = {}
+        self._made: OrderedDict[tuple[int, bytes, bool], Encoded] = OrderedDict()
 
     @property
     def header(self) -> StreamHeader:
@@ -213,6 +216,9 @@ class FrameCoder:
             state = EncoderState(1, index, past)
             view = self.rendered.views[index]
             self._made[key] = self._encoder.encode(state, self._clip[index], view, choice)
+            while len(self._made) > KEPT * len(self._clip):
+                self._made.popitem(last=False)
+        self._made.move_to_end(key)
         return self._made[key]
 
     def arrival(self, index: int, made: Encoded) -> Arrival:

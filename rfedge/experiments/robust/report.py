@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,17 +38,22 @@ class CrossingRow:
     not_new: int
     """Frames at which a viewer still saw an earlier picture."""
     frames: int
+    seed: int = 5
 
 
 @dataclass(frozen=True)
 class LossRow:
-    """SSIM of one method at the rate that all are compared at, interpolated between CRFs."""
+    """SSIM of one method at the rate that all are compared at, interpolated between CRFs: means
+    over the seeds of loss."""
 
     method: str
     rtt_ms: float
     loss_percent: float
     ssim: float
     ssim_p5: float
+    seeds: int = 1
+    ssim_ci95: Sequence[float] | None = None
+    """Of the mean over the seeds; None for one seed."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +70,7 @@ class DisturbanceRow:
     against_x264_percent: float | None = None
 
 
-LOSS_COLUMNS = ("method", "loss %", "RTT ms", "SSIM", "worst 5 % of frames")
+LOSS_COLUMNS = ("method", "loss %", "RTT ms", "seeds", "SSIM", "95 %", "worst 5 % of frames")
 REST_COLUMNS = ("condition", "level", "kbit a frame", "more %", "x264", "against x264 %")
 
 
@@ -111,8 +117,9 @@ def print_robust(console: Console, result: Result) -> None:
 
 
 def _loss_cells(row: LossRow) -> list[str]:
-    numbers = (f"{row.loss_percent:g}", f"{row.rtt_ms:g}", f"{row.ssim:.4f}", f"{row.ssim_p5:.4f}")
-    return [row.method, *numbers]
+    interval = "-" if row.ssim_ci95 is None else "{:.4f}..{:.4f}".format(*row.ssim_ci95)
+    link = (f"{row.loss_percent:g}", f"{row.rtt_ms:g}", str(row.seeds))
+    return [row.method, *link, f"{row.ssim:.4f}", interval, f"{row.ssim_p5:.4f}"]
 
 
 def _disturbed_cells(row: DisturbanceRow) -> list[str]:

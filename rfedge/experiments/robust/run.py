@@ -1,8 +1,9 @@
 """Run the robustness experiment: loss, pose noise, light; drives and a field in, one file out.
 
-Loss: every method at three CRFs over the same link; what is compared is SSIM at one total rate,
-interpolated between them. The rest: bits at equal quality, against nothing disturbed and against
-x264, which no pose disturbs.
+Loss: every method at some CRFs over the same link, with each of the seeds the same losses for all;
+what is compared is SSIM at one total rate, interpolated between CRFs, as the mean over the seeds
+and the 95 % interval of that mean (bootstrap over seeds). The rest: bits at equal quality, against
+nothing disturbed and against x264, which no pose disturbs.
 
 Pose noise is independent from frame to frame, normal in each axis of translation and rotation, in
 the camera's own axes. Both ends render at the noisy pose, since it is the one that is sent; or the
@@ -20,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
 from rfcore.camera import Camera, Pose
@@ -125,12 +127,13 @@ def kbit_at(clips: Sequence[CodedClip], quality_db: float) -> float:
     return math.exp(float(np.interp(quality_db, qualities, [bits for _, bits in points])))
 
 
-RTTS_S = (0.02, 0.05, 0.1)
 LOSSES = (0.0, 0.01, 0.05)
 DELTA_CRFS, X264_CRFS = (20.0, 27.0), (22.0, 27.0, 33.0, 39.0, 45.0)
 DISTURBED_CRFS, RIVAL_CRFS = (23.0, 28.0, 33.0), (20.0, 25.0, 30.0, 35.0)
 QUICK_FRAMES = 8
 SEED = 5
+"""The first of the seeds; without loss there is one."""
+RESAMPLED = 2000
 
 
 @dataclass(frozen=True)
@@ -148,12 +151,18 @@ class RobustJob:
     out: Path
     cells: Path
     quick: bool = False
+    seeds: int = 1
+    rtts_ms: Sequence[float] = (20.0, 50.0, 100.0)
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
         check_effort("effort", self.effort)
         if self.frames < 4:
             raise InvalidInput("frames", f"{self.frames} must be at least 4")
+        if not 1 <= self.seeds <= 10_000:
+            raise InvalidInput("seeds", f"{self.seeds} is outside 1..10,000")
+        if not self.rtts_ms or not all(0 <= rtt_ms <= 10_000 for rtt_ms in self.rtts_ms):
+            raise InvalidInput("rtts_ms", f"{self.rtts_ms} must be some of 0..10,000 ms")
 
 
 def run_robust(job: RobustJob, console: Console) -> dict[str, Any]:
@@ -195,26 +204,41 @@ class Bench:
 
     # --- loss
 
-    def scenarios(self) -> list[tuple[str, float, float, float]]:
-        """Return (method, round trip, loss, CRF) of every crossing."""
-        rtts = (RTTS_S[0], RTTS_S[-1]) if self.job.quick else RTTS_S
+    def scenarios(self) -> list[tuple[str, float, float, float, int]]:
+        """Return (method, round trip in ms, loss, CRF, seed) of every crossing.
+
+        Those of one seed and one coder follow one another, for what they have in common.
+        """
+        every = self.job.rtts_ms
+        rtts = dict.fromkeys((every[0], every[-1])) if self.job.quick else every
         losses = (LOSSES[0], LOSSES[-1]) if self.job.quick else LOSSES
         own = [str(policy) for policy in Policy]
         rivals = ["x264-intra-refresh", "x264-idr-on-nack"]
         ours = product(DELTA_CRFS, own, rtts, losses)
         theirs = product(X264_CRFS, rivals, rtts, losses)
-        return [(method, rtt_s, loss, crf) for crf, method, rtt_s, loss in (*ours, *theirs)]
+        seeds = range(SEED, SEED + self.job.seeds)
+        made = [
+            (method, rtt_ms, loss, crf, seed)
+            for crf, method, rtt_ms, loss in (*ours, *theirs)
+            for seed in (seeds if loss else seeds[:1])
+        ]
+        return sorted(made, key=lambda scenario: (scenario[0].startswith("x264"), *scenario[3:]))
 
-    def crossed(self, method: str, rtt_s: float, loss: float, crf: float) -> CrossingRow:
+    def crossed(
+        self, method: str, rtt_ms: float, loss: float, crf: float, seed: int
+    ) -> CrossingRow:
         """Return the row of one crossing."""
         drive, rate_hz = self.drive, self.drive.name.rate_hz
         facts: dict[str, Any] = {
             "method": method,
-            "rtt_ms": 1e3 * rtt_s,
+            "rtt_ms": rtt_ms,
             "loss_percent": 100 * loss,
             "crf": crf,
+            "seed": seed,
         }
-        crossing = Crossing(drive.frames, rate_hz, self.job.preset, crf, Bursts(loss), rtt_s, SEED)
+        crossing = Crossing(
+            drive.frames, rate_hz, self.job.preset, crf, Bursts(loss), rtt_ms / 1e3, seed
+        )
         key: dict[str, str | float | int | None] = {
             **facts,
             "verb": "robust",
@@ -223,7 +247,6 @@ class Bench:
             "hz": rate_hz,
             "effort": self.job.effort,
             "preset": self.job.preset,
-            "seed": SEED,
             "program": program_version(),
         }
         (row,) = self.store.rows(key, lambda: [self._outcome(method, crossing)])
@@ -342,22 +365,38 @@ class Bench:
 
 
 def _at_equal_rate(crossed: Sequence[CrossingRow]) -> dict[str, Any]:
-    """Return SSIM of every scenario at one rate: the lowest that all can be interpolated at."""
-    scenarios: dict[tuple[str, float, float], list[CrossingRow]] = {}
+    """Return SSIM of every scenario at one rate, near the middle of what all can be interpolated
+    at."""
+    curves: dict[tuple[str, float, float], dict[int, list[CrossingRow]]] = {}
     for row in crossed:
-        scenarios.setdefault((row.method, row.rtt_ms, row.loss_percent), []).append(row)
-    low = max(min(row.kbps for row in rows) for rows in scenarios.values())
-    high = min(max(row.kbps for row in rows) for rows in scenarios.values())
+        seeds = curves.setdefault((row.method, row.rtt_ms, row.loss_percent), {})
+        seeds.setdefault(row.seed, []).append(row)
+    every = [curve for seeds in curves.values() for curve in seeds.values()]
+    low = max(min(row.kbps for row in curve) for curve in every)
+    high = min(max(row.kbps for row in curve) for curve in every)
     if low > high:
         raise InvalidInput("crf", f"no rate is reached by all: {low:.0f} > {high:.0f} kbit/s")
-    rate = float(np.sqrt(low * high))
+    rate_kbps = float(np.sqrt(low * high))
     rows = []
-    for (method, rtt_ms, loss), points in scenarios.items():
-        points = sorted(points, key=lambda row: row.kbps)
-        log_rates = np.log([row.kbps for row in points])
-        ssim, ssim_p5 = (
-            float(np.interp(np.log(rate), log_rates, values))
-            for values in ([row.ssim for row in points], [row.ssim_p5 for row in points])
-        )
-        rows.append(LossRow(method, rtt_ms, loss, ssim, ssim_p5))
-    return {"equal_rate_kbps": rate, "rows": rows}
+    for scenario, seeds in curves.items():
+        at_rate = np.array([_at_rate(curve, rate_kbps) for curve in seeds.values()])
+        ssim, ssim_p5 = at_rate.mean(axis=0).tolist()
+        interval = _interval(at_rate[:, 0]) if len(seeds) > 1 else None
+        rows.append(LossRow(*scenario, ssim, ssim_p5, len(seeds), interval))
+    return {"equal_rate_kbps": rate_kbps, "rows": rows}
+
+
+def _at_rate(curve: Sequence[CrossingRow], rate_kbps: float) -> tuple[float, float]:
+    """Return SSIM, mean and 5th percentile of the frames, linear in log(rate) between CRFs."""
+    points = sorted(curve, key=lambda row: row.kbps)
+    log_rates = np.log([row.kbps for row in points])
+    at = np.log(rate_kbps)
+    mean = np.interp(at, log_rates, [row.ssim for row in points])
+    return float(mean), float(np.interp(at, log_rates, [row.ssim_p5 for row in points]))
+
+
+def _interval(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the 95 % interval of the mean: percentiles of the means of resampled values."""
+    chosen = np.random.default_rng(SEED).integers(len(values), size=(RESAMPLED, len(values)))
+    low, high = np.quantile(values[chosen].mean(axis=1), (0.025, 0.975)).tolist()
+    return low, high
