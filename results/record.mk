@@ -16,7 +16,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .PHONY: results results-full
 results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec slice-coder classes never-worse robust ladder latency compare compare-small)
 	cp $^ results/
-results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long localise benchmark rig live world paper)
+results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long tail localise benchmark rig live world paper)
 	cp $(filter %.json,$^) results/
 	$(MAKE) -f samples/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
 
@@ -134,6 +134,8 @@ FASTER := vehicles-30hz vehicles-720p vehicles-720p-30hz
 $(OUT)/latency.json: $(foreach name,$(FASTER),$(call drive,$(name))) | $(OUT)
 	$(RFEDGE) eval latency $(SAMPLE) $(subst sample-,,$(NOON)) vehicles@30=$(call drive,vehicles-30hz) \
 		vehicles-720p@10=$(call drive,vehicles-720p) vehicles-720p@30=$(call drive,vehicles-720p-30hz) --cells $(OUT)/latency --out $@
+$(OUT)/tail.json: | $(OUT)
+	$(RFEDGE) eval tail --processes $(shell nproc) --cells $(OUT)/tail --out $@
 $(OUT)/localise.json: $(call drive,dusk) $(call drive,lane-1.5) | $(OUT)
 	$(RFEDGE) eval localise sample=$(EMPTY),$(SAMPLE) vehicles=$(VEHICLES),$(SAMPLE),rows=2m:3deg \
 		noise=$(EMPTY),$(SAMPLE),noise=3,rows=2m:3deg dusk=$(call drive,dusk),$(SAMPLE),rows=2m:3deg \

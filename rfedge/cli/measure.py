@@ -20,6 +20,7 @@ from rfedge.experiments.never_worse import EvalNeverWorse
 from rfedge.experiments.paper import EvalPaper
 from rfedge.experiments.robust import EvalRobust
 from rfedge.experiments.slice_coder import EvalSliceCoder
+from rfedge.experiments.tail import EvalTail
 from rfedge.loadtest.live import EvalLive
 from rfedge.loadtest.rig import EvalRig
 from rfedge.loadtest.world import EvalWorld
@@ -270,6 +271,7 @@ class Eval:
         | Annotated[EvalScale, subcommand("scale")]
         | Annotated[EvalSizing, subcommand("sizing")]
         | Annotated[EvalSliceCoder, subcommand("slice-coder")]
+        | Annotated[EvalTail, subcommand("tail")]
         | Annotated[EvalWorld, subcommand("world")],
         arg(name=""),
     ]

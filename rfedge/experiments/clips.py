@@ -239,11 +239,13 @@ def read_drive(name: DriveName | str, limit: int | None = None) -> Drive:
     return Drive(name, pictures, with_noise(frames, name.noise_sigma))
 
 
-def with_noise(frames: Sequence[I420], sigma: float) -> Sequence[I420]:
+def with_noise(
+    frames: Sequence[I420], sigma: float, seed: int | Sequence[int] = NOISE_SEED
+) -> Sequence[I420]:
     """Add Gaussian noise, always the same, to every sample of the frames; as they are for 0."""
     if not sigma:
         return frames
-    rng = np.random.default_rng(NOISE_SEED)
+    rng = np.random.default_rng(seed)
 
     def noisy(plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return np.clip(plane + rng.normal(0, sigma, plane.shape), 0, 255).round().astype(np.uint8)

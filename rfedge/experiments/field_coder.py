@@ -57,6 +57,7 @@ class RenderedClip:
     covered: tuple[NDArray[np.bool_], ...]
     field_id: str
     render_cpu_ms: float
+    quality: Quality = FULL
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
@@ -76,18 +77,20 @@ class RenderedClip:
         return f"{_digest(chain.from_iterable(arrays))}-{cameras[:8]}"
 
 
-def render_clip(field: RadianceField, cameras: Sequence[Camera]) -> RenderedClip:
+def render_clip(
+    field: RadianceField, cameras: Sequence[Camera], quality: Quality = FULL
+) -> RenderedClip:
     """Render ``field`` from every camera, its pose rounded as a vehicle does before it renders.
 
     Processor time is that of all threads over the clip, without what a first render makes once.
     """
     cameras = [camera.rounded() for camera in cameras]
-    field.render(cameras[0])
+    field.render(cameras[0], quality)
     began_ns = process_time_ns()
-    views = tuple(render_field_view(field, camera) for camera in cameras)
+    views = tuple(render_field_view(field, camera, quality) for camera in cameras)
     cpu_ms = (process_time_ns() - began_ns) / 1e6
     covered = tuple(view.covers(COVERED) for view in views)
-    return RenderedClip(views, covered, field.field_id, cpu_ms)
+    return RenderedClip(views, covered, field.field_id, cpu_ms, quality)
 
 
 def _digest(arrays: Iterable[NDArray[Any]]) -> str:
@@ -168,7 +171,9 @@ class FieldCoder:
             "references": tuple(references_name(packet.references) for packet in packets),
             "slice_bytes": tuple(len(packet.payload) for packet in packets),
             "relit": tuple(float(packet.relit) for packet in packets),
-            "message": tuple(_digest_of(_message(frame.arrival)) for frame in coded),
+            "message": tuple(
+                _digest_of(_message(frame.arrival, self._rendered.quality)) for frame in coded
+            ),
         }
         if self._foregrounds:
             masked = zip(pairs, self._foregrounds, strict=False)
@@ -203,7 +208,7 @@ class FieldCoder:
         began_ns = process_time_ns()
         decoded = [picture for _, picture in decode_promised(DeltaDecoder(encoder.header), coded)]
         receiver_cpu_ms = (process_time_ns() - began_ns) / 1e6
-        sizes = [message_bytes(frame.arrival) for frame in coded]
+        sizes = [message_bytes(frame.arrival, self._rendered.quality) for frame in coded]
         both_ms = cpu_ms + render_cpu_ms, receiver_cpu_ms + render_cpu_ms
         return coded, CodedPictures(sizes, decoded, *both_ms)
 

@@ -27,6 +27,7 @@ from rfedge.experiments.paper.figures import write_paper_figures
 from rfedge.experiments.paper.report import PaperRow, paper_section
 from rfedge.experiments.robust.report import robust_section, write_robust_figure
 from rfedge.experiments.slice_coder.report import slice_coder_section
+from rfedge.experiments.tail.report import tail_section
 from rfedge.loadtest.cases import scale_section, world_section
 from rfedge.loadtest.live.report import live_section
 from rfedge.loadtest.result import load_section, ratio_section
@@ -71,6 +72,7 @@ SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
     "slice-coder": slice_coder_section,
     "soak": soak_section,
     "stability": lambda path, result: _reference(path, result, "cases", "stability"),
+    "tail": tail_section,
     "world": world_section,
 }
 """How each kind of result is shown; some have a page of their own."""

@@ -51,6 +51,7 @@ __all__ = [
     "REQUIREMENT",
     "LatencyJob",
     "Played",
+    "at_quality",
     "needed_rate_bps",
     "play",
     "repeated",
@@ -246,11 +247,11 @@ def _senders(
     rendered, clip = render_clip(field, drive.cameras), drive.clip()
     store = CellStore(job.cells)
     ours = FieldCoder(rendered, f"rfedge-{job.effort}", program_version(), effort=job.effort)
-    coded = _at_quality(clip, ours, job.quality_db, store)
+    coded = at_quality(clip, ours, job.quality_db, store)
     stages, ends_ms = _own_times(job, drive, field, coded.point)
     yield Sender(clip, ours.name, coded, stages, _work(coded, ends_ms))
     rival = x264_lowdelay(job.preset)
-    coded = _at_quality(clip, rival, job.quality_db, store)
+    coded = at_quality(clip, rival, job.quality_db, store)
     ends_ms = _least(rival.frames_ms(clip.frames, clip.rate_hz, coded.point) for _ in range(TIMED))
     encode_ms, decode_ms = np.quantile(ends_ms[1:], 0.25, axis=0).tolist()
     stages = {"sender encode": encode_ms, "receiver decode": decode_ms}
@@ -285,7 +286,7 @@ def _work(coded: CodedClip, ends_ms: EndsMs) -> list[FrameWork]:
     return [FrameWork(size, *ms) for size, ms in zip(sizes, ends_ms, strict=True)]
 
 
-def _at_quality(clip: Clip, coder: ClipCoder, quality_db: float, store: CellStore) -> CodedClip:
+def at_quality(clip: Clip, coder: ClipCoder, quality_db: float, store: CellStore) -> CodedClip:
     """Return the clip at the highest CRF, in steps of a half, that is not below ``quality_db``."""
 
     def coded(crf: float) -> CodedClip:
