@@ -16,7 +16,7 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .PHONY: results results-full
 results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec slice-coder classes never-worse robust ladder latency compare compare-small)
 	cp $^ results/
-results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long tail localise benchmark rig live world paper)
+results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long tail seams localise benchmark rig live world paper)
 	cp $(filter %.json,$^) results/
 	$(MAKE) -f samples/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
 
@@ -136,6 +136,17 @@ $(OUT)/latency.json: $(foreach name,$(FASTER),$(call drive,$(name))) | $(OUT)
 		vehicles-720p@10=$(call drive,vehicles-720p) vehicles-720p@30=$(call drive,vehicles-720p-30hz) --cells $(OUT)/latency --out $@
 $(OUT)/tail.json: | $(OUT)
 	$(RFEDGE) eval tail --processes $(shell nproc) --cells $(OUT)/tail --out $@
+# The sample's street as one field, and cut into two tiles of half its splats each.
+SEAMS := $(OUT)/seams
+SEAMS_TRAIN := --iterations 4000 --sh-degree 1 --antialiased
+$(SEAMS)/split: | $(OUT)
+	$(RFEDGE) scene split samples/street/transforms_train.json --length 50 --overlap 12 --out $@
+$(SEAMS)/fields: $(SEAMS)/split
+	$(RFEDGE) train $< --limit 140000 $(SEAMS_TRAIN) --out $@
+$(SEAMS)/whole.rff: | $(OUT)
+	$(RFEDGE) train samples/street/transforms_train.json --points samples/street/points.ply --limit 280000 $(SEAMS_TRAIN) --out $@
+$(OUT)/seams.json: $(SEAMS)/whole.rff $(SEAMS)/split $(SEAMS)/fields
+	$(RFEDGE) eval seams $(wordlist 1,2,$^) sample-empty@10=$(EMPTY) --fields $(SEAMS)/fields --cells $(OUT)/seams/cells --out $@
 $(OUT)/localise.json: $(call drive,dusk) $(call drive,lane-1.5) | $(OUT)
 	$(RFEDGE) eval localise sample=$(EMPTY),$(SAMPLE) vehicles=$(VEHICLES),$(SAMPLE),rows=2m:3deg \
 		noise=$(EMPTY),$(SAMPLE),noise=3,rows=2m:3deg dusk=$(call drive,dusk),$(SAMPLE),rows=2m:3deg \

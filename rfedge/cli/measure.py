@@ -19,6 +19,7 @@ from rfedge.experiments.localisation import EvalLocalise
 from rfedge.experiments.never_worse import EvalNeverWorse
 from rfedge.experiments.paper import EvalPaper
 from rfedge.experiments.robust import EvalRobust
+from rfedge.experiments.seams import EvalSeams
 from rfedge.experiments.slice_coder import EvalSliceCoder
 from rfedge.experiments.tail import EvalTail
 from rfedge.loadtest.live import EvalLive
@@ -269,6 +270,7 @@ class Eval:
         | Annotated[EvalRig, subcommand("rig")]
         | Annotated[EvalRobust, subcommand("robust")]
         | Annotated[EvalScale, subcommand("scale")]
+        | Annotated[EvalSeams, subcommand("seams")]
         | Annotated[EvalSizing, subcommand("sizing")]
         | Annotated[EvalSliceCoder, subcommand("slice-coder")]
         | Annotated[EvalTail, subcommand("tail")]

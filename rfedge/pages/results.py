@@ -26,6 +26,7 @@ from rfedge.experiments.never_worse.measure import never_worse_section
 from rfedge.experiments.paper.figures import write_paper_figures
 from rfedge.experiments.paper.report import PaperRow, paper_section
 from rfedge.experiments.robust.report import robust_section, write_robust_figure
+from rfedge.experiments.seams.report import seams_section
 from rfedge.experiments.slice_coder.report import slice_coder_section
 from rfedge.experiments.tail.report import tail_section
 from rfedge.loadtest.cases import scale_section, world_section
@@ -69,6 +70,7 @@ SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
     "rig": rig_section,
     "robust": robust_section,
     "scale": scale_section,
+    "seams": seams_section,
     "slice-coder": slice_coder_section,
     "soak": soak_section,
     "stability": lambda path, result: _reference(path, result, "cases", "stability"),
