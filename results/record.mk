@@ -139,11 +139,13 @@ $(OUT)/tail.json: | $(OUT)
 # The sample's street as one field, and cut into two tiles of half its splats each.
 SEAMS := $(OUT)/seams
 SEAMS_TRAIN := --iterations 4000 --sh-degree 1 --antialiased
-$(SEAMS)/split: | $(OUT)
+$(SEAMS):
+	mkdir -p $@
+$(SEAMS)/split: | $(SEAMS)
 	$(RFEDGE) scene split samples/street/transforms_train.json --length 50 --overlap 12 --out $@
 $(SEAMS)/fields: $(SEAMS)/split
 	$(RFEDGE) train $< --limit 140000 $(SEAMS_TRAIN) --out $@
-$(SEAMS)/whole.rff: | $(OUT)
+$(SEAMS)/whole.rff: | $(SEAMS)
 	$(RFEDGE) train samples/street/transforms_train.json --points samples/street/points.ply --limit 280000 $(SEAMS_TRAIN) --out $@
 $(OUT)/seams.json: $(SEAMS)/whole.rff $(SEAMS)/split $(SEAMS)/fields
 	$(RFEDGE) eval seams $(wordlist 1,2,$^) sample-empty@10=$(EMPTY) --fields $(SEAMS)/fields --cells $(OUT)/seams/cells --out $@
