@@ -25,7 +25,7 @@ from rfcore.codec.prediction import Prediction
 from rfcore.codec.state import DecoderState, Past
 from rfcore.errors import BitstreamError, CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.image import I420
-from rfcore.native.digest import digest_pair
+from rfcore.native.yuv import digest_pair
 from rfcore.views import FieldView
 
 __all__ = ["Decoded", "DeltaDecoder", "prediction_of"]

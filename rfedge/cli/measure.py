@@ -14,14 +14,12 @@ from rfedge.experiments.benchmark import EvalBenchmark
 from rfedge.experiments.classes import EvalClasses
 from rfedge.experiments.compare import EvalCompare
 from rfedge.experiments.ladder import EvalLadder
-from rfedge.experiments.latency import EvalLatency
+from rfedge.experiments.latency import EvalLatency, EvalTail
 from rfedge.experiments.localisation import EvalLocalise
 from rfedge.experiments.never_worse import EvalNeverWorse
 from rfedge.experiments.paper import EvalPaper
-from rfedge.experiments.robust import EvalRobust
-from rfedge.experiments.seams import EvalSeams
+from rfedge.experiments.robust import EvalRobust, EvalSeams
 from rfedge.experiments.slice_coder import EvalSliceCoder
-from rfedge.experiments.tail import EvalTail
 from rfedge.loadtest.live import EvalLive
 from rfedge.loadtest.rig import EvalRig
 from rfedge.loadtest.world import EvalWorld

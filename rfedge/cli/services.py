@@ -155,7 +155,7 @@ class CertsInit:
         """Make them and say what is where."""
         from datetime import UTC, datetime
 
-        from rfedge.certs.authority import Members, certify, write_certificates
+        from rfedge.certs import Members, certify, write_certificates
 
         members = Members(self.vehicles, self.consumers, self.hosts, self.operators, self.proxies)
         issued = certify(members, datetime.now(UTC), self.days)
@@ -186,7 +186,7 @@ class CertsAdd:
         """Sign, write, and say what is where."""
         from datetime import UTC, datetime
 
-        from rfedge.certs.authority import Members, add_certificates
+        from rfedge.certs import Members, add_certificates
 
         members = Members(
             self.vehicles, self.consumers, operators=self.operators, proxies=self.proxies
@@ -209,7 +209,7 @@ class CertsShow:
         from datetime import UTC, datetime, timedelta
 
         from rfcore.errors import InvalidData
-        from rfedge.certs.authority import read_certificates
+        from rfedge.certs import read_certificates
 
         soon = datetime.now(UTC) + timedelta(days=self.within_days)
         ending = []

@@ -21,14 +21,14 @@ from rfedge.experiments.compare.figures import write_compare_figures
 from rfedge.experiments.compare.report import compare_section, headline
 from rfedge.experiments.ladder.page import write_ladder_figure
 from rfedge.experiments.latency.report import latency_section, write_latency_figures
+from rfedge.experiments.latency.tail import tail_section
 from rfedge.experiments.localisation.rows import localise_section
 from rfedge.experiments.never_worse.measure import never_worse_section
 from rfedge.experiments.paper.figures import write_paper_figures
 from rfedge.experiments.paper.report import PaperRow, paper_section
 from rfedge.experiments.robust.report import robust_section, write_robust_figure
-from rfedge.experiments.seams.report import seams_section
+from rfedge.experiments.robust.seams import seams_section
 from rfedge.experiments.slice_coder.report import slice_coder_section
-from rfedge.experiments.tail.report import tail_section
 from rfedge.loadtest.cases import scale_section, world_section
 from rfedge.loadtest.live.report import live_section
 from rfedge.loadtest.result import load_section, ratio_section

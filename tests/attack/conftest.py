@@ -35,7 +35,7 @@ from attack.bystander import NAME, NEWCOMER
 from attack.control_group import SERVER, ControlGroup
 from attack.target import VEHICLE, Target
 from machine import MEASURED_AGAIN
-from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.certs import Members, certify, write_certificates
 from scoreboard import Figures, Scoreboard
 
 ROOT = Path(__file__).parents[2]

@@ -9,7 +9,7 @@ from cryptography import x509
 
 from rfcore.errors import AccessDenied, InvalidData, InvalidInput
 from rfcore.wire.identity import PeerIdentity, Role, identity_uri, peer_identity
-from rfedge.certs.authority import (
+from rfedge.certs import (
     Issued,
     Members,
     add_certificates,

@@ -107,7 +107,7 @@ def test_servers_are_started_with_options_that_there_are(tmp_path: Path) -> None
 
     from mec_server.config import ServerConfig
     from rfcore.wire.settings import OPTIONS
-    from rfedge.certs.authority import Members, certify, write_certificates
+    from rfedge.certs import Members, certify, write_certificates
 
     (container,) = pods()["mec-server"]["containers"]
     certs = tmp_path / "certs"

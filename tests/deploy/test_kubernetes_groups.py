@@ -12,7 +12,7 @@ import yaml
 
 from deploy.test_kubernetes import VERSIONS, documents
 from rfcore.wire.conventions import TILE
-from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.certs import Members, certify, write_certificates
 from rfedge.loadtest.envoy import EnvoySetup, check_config, envoy_binary
 
 pytestmark = pytest.mark.slow

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rfcore.link import DirectionPlan, LinkProfile
-from rfedge.experiments.latency.capture_to_shown import WINDOW, FrameWork, show
-from rfedge.experiments.latency.run import play
+from rfedge.experiments.latency.run import WINDOW, FrameWork, play, show
 
 QUICK = DirectionPlan(LinkProfile(1e12))
 works = st.builds(FrameWork, st.integers(100, 50_000), st.floats(0.0, 400.0), st.floats(0.0, 400.0))

@@ -12,8 +12,14 @@ from experiments.conftest import wall
 from rfcore.errors import InvalidInput
 from rfcore.field import save_field
 from rfedge.datasets.split import SplitSettings, SplitTile, split_dataset
-from rfedge.experiments.seams.report import SeamRow, seams_section
-from rfedge.experiments.seams.run import Placed, SeamsJob, placed, run_seams
+from rfedge.experiments.robust.seams import (
+    Placed,
+    SeamRow,
+    SeamsJob,
+    placed,
+    run_seams,
+    seams_section,
+)
 from rfedge.results import rows_of
 
 WEST = SplitTile("west", (0.0, 0.0, 10.0, 4.0), 1.0, (), ("east",))
@@ -87,7 +93,7 @@ def test_a_tile_with_the_field_of_another_street_costs_bits_near_its_seam(
 
 def test_finished_pieces_are_not_coded_again(seams: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     job, result = seams
-    coder = "rfedge.experiments.seams.run.FieldCoder.code"
+    coder = "rfedge.experiments.robust.seams.FieldCoder.code"
     monkeypatch.setattr(coder, lambda *_: pytest.fail("coded again"))
     assert run_seams(job)["rows"] == result["rows"]
 

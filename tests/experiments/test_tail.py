@@ -11,9 +11,15 @@ from rich.console import Console
 
 from rfcore.errors import InvalidInput
 from rfcore.metrics import psnr
-from rfedge.experiments.tail.report import TailRow, tail_section
-from rfedge.experiments.tail.run import TailJob, run_tail
-from rfedge.experiments.tail.street import LANE_M, SWAY_M, FieldStreet
+from rfedge.experiments.latency.tail import (
+    LANE_M,
+    SWAY_M,
+    FieldStreet,
+    TailJob,
+    TailRow,
+    run_tail,
+    tail_section,
+)
 from rfedge.results import rows_of
 
 SIZE_PX = (96, 64)

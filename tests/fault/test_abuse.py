@@ -28,7 +28,7 @@ from mec_server.config import IdentityBudget
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import LONGER_BURST_S
 from rfcore.wire.messages import Ack
-from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.certs import Members, certify, write_certificates
 
 ROOM_BYTES = 24 << 20
 BURST_OF_REJECTED_S = LONGER_BURST_S[Resource.REJECTED_SECONDS]

@@ -18,7 +18,7 @@ from rfcore.wire.conventions import CHANNEL_OPTIONS, STREAM_METHOD
 from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.twin import PictureEncoding, Subscription, subscription_to_wire
 from rfcore.wire.v1 import twin_pb2_grpc
-from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.certs import Members, certify, write_certificates
 
 STORM = 200
 ADMITTED = 64

@@ -27,7 +27,7 @@ from rfcore.wire.twin_render import (
     view_request_to_wire,
 )
 from rfcore.wire.v1 import field_pb2, field_pb2_grpc, twin_pb2_grpc
-from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.certs import Members, certify, write_certificates
 
 Files = Callable[[str], TlsFiles]
 SUPPRESSED = "rfedge_server_log_lines_suppressed_total"

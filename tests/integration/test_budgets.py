@@ -35,7 +35,7 @@ from rfcore.wire.twin import Subscription, subscription_to_wire
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
-from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.certs import Members, certify, write_certificates
 
 EXHAUSTED = grpc.StatusCode.RESOURCE_EXHAUSTED
 SHORT = SessionLimits(stalled_s=0.3)

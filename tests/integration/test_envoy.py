@@ -29,7 +29,7 @@ from rfcore.wire.tiles import Area
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
-from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.certs import Members, certify, write_certificates
 from rfedge.loadtest.cases import ScaleRow
 from rfedge.loadtest.envoy import (
     CLUSTER,

@@ -25,7 +25,7 @@ from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tile_manifest import MANIFEST
 from rfcore.wire.tiles import Area
 from rfcore.wire.twin import Departure, PictureEncoding, Subscription, TwinPicture
-from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.certs import Members, certify, write_certificates
 from rfedge.loadtest.cases import ScaleRow
 from rfedge.loadtest.nats import NatsServer, nats_rows
 from rfedge.loadtest.scale import ScaleJob, run_scale

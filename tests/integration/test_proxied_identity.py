@@ -24,7 +24,7 @@ from rfcore.wire.messages import Welcome
 from rfcore.wire.settings import TransportSettings
 from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2, field_pb2_grpc
-from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.certs import Members, certify, write_certificates
 
 Files = Callable[[str], TlsFiles]
 MEMBERS = Members(("cav-raw", "cav-2"), ("desk",), proxies=("edge-proxy",))

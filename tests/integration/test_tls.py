@@ -25,7 +25,7 @@ from rfcore.wire.twin import (
     twin_message_from_wire,
 )
 from rfcore.wire.v1 import twin_pb2_grpc
-from rfedge.certs.authority import Members, certify, write_certificates
+from rfedge.certs import Members, certify, write_certificates
 from rfedge.watch import WatchSettings, watch
 
 Files = Callable[[str], TlsFiles]

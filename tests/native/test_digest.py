@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.native import _native
-from rfcore.native.digest import digest_pair
+from rfcore.native.yuv import digest_pair
 
 
 def noise(width: int, height: int, seed: int) -> I420:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mec_server.proxies import FORWARDED, Proxies, forwarded_auth_context
 from rfcore.errors import AccessDenied, RfedgeError
 from rfcore.wire.identity import Role, peer_identity
-from rfedge.certs.authority import Members, certify
+from rfedge.certs import Members, certify
 
 NOW = datetime(2030, 1, 2, tzinfo=UTC)
 ISSUED = {

@@ -46,7 +46,7 @@ from rfcore.codec.sender.reference_choice import (
 from rfcore.codec.state import EncoderState, Past
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
-from rfcore.native.digest import digest_pair
+from rfcore.native.yuv import digest_pair
 from rfcore.views import FieldView
 
 __all__ = ["DeltaEncoder", "Encoded", "FrameChoice", "without_field"]

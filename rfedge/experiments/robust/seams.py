@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 
 from rfcore.camera import Camera
 from rfcore.codec.h264.config import check_effort
@@ -23,10 +24,74 @@ from rfedge.datasets.split import SplitTile, read_tiles
 from rfedge.experiments.cells import CellStore, clip_key, program_version
 from rfedge.experiments.clips import Clip, CodedClip, Drive, luma_mse, psnr_of_mse, read_drive
 from rfedge.experiments.field_coder import FieldCoder, RenderedClip, render_clip
-from rfedge.experiments.seams.report import SeamRow
-from rfedge.results import check_result_path, make_result, provenance, write_result
+from rfedge.report.tables import heading, print_table, table
+from rfedge.results import Result, check_result_path, make_result, provenance, rows_of, write_result
 
-__all__ = ["Placed", "SeamsJob", "placed", "run_seams"]
+__all__ = ["Placed", "SeamRow", "SeamsJob", "placed", "print_seams", "run_seams", "seams_section"]
+
+
+@dataclass(frozen=True)
+class SeamRow:
+    """Frames of one kind: bits at one quality and the renders' own, with one field and in tiles."""
+
+    scene: str
+    hz: float
+    frames_are: str
+    """``near a seam``, ``elsewhere`` or ``all``."""
+    frames: int
+    new_streams: int
+    """Of them, how many are the first of a tile."""
+    whole_kbit: float
+    tiles_kbit: float
+    more_percent: float
+    whole_render_db: float
+    tiles_render_db: float
+
+
+COLUMNS = (
+    "scene",
+    "Hz",
+    "frames",
+    "of them first of a tile",
+    "kbit a frame, one field",
+    "tiles",
+    "more %",
+    "render dB, one field",
+    "tiles",
+)
+
+
+def seams_section(path: Path, result: Result) -> str:
+    """Return the table."""
+    rows = [_cells(row) for row in rows_of(SeamRow, result["rows"])]
+    street = result["street"]
+    note = (
+        f"A drive across {street['tiles']} tiles; near a seam: within {street['within_m']:g} m of "
+        f"another tile's ground. Bits at {street['quality_db']:g} dB. One field has "
+        f"{street['whole_bytes'] / 1e6:.1f} MB, the tiles {street['tiles_bytes'] / 1e6:.1f} MB "
+        "together."
+    )
+    return "\n\n".join([heading(path, result), note, table(COLUMNS, rows), ""])
+
+
+def print_seams(console: Console, rows: Sequence[SeamRow]) -> None:
+    """Print the rows."""
+    print_table(console, "One field and tiles", COLUMNS, [_cells(row) for row in rows])
+
+
+def _cells(row: SeamRow) -> list[str]:
+    return [
+        row.scene,
+        f"{row.hz:g}",
+        f"{row.frames} {row.frames_are}",
+        str(row.new_streams),
+        f"{row.whole_kbit:.2f}",
+        f"{row.tiles_kbit:.2f}",
+        f"{row.more_percent:+.1f}",
+        f"{row.whole_render_db:.2f}",
+        f"{row.tiles_render_db:.2f}",
+    ]
+
 
 CRFS = (23.0, 27.0, 31.0, 35.0, 39.0)
 

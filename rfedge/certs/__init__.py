@@ -1,1 +1,0 @@
-"""Certificates of one deployment: an authority and those it vouches for."""
