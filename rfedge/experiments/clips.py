@@ -36,6 +36,7 @@ __all__ = [
     "Drive",
     "DriveName",
     "DriveOfField",
+    "frames_digest",
     "luma_mse",
     "luma_sse",
     "psnr_of_mse",
@@ -213,7 +214,7 @@ class Drive:
     @property
     def digest(self) -> str:
         """The sha256 over the frames' digests."""
-        return hashlib.sha256(b"".join(frame.digest() for frame in self.frames)).hexdigest()
+        return frames_digest(self.frames)
 
     def every(self, step: int) -> Drive:
         """Return each ``step``-th frame, at the rate that makes."""
@@ -230,6 +231,11 @@ class Drive:
         return Clip(scene, self.name.rate_hz, self.frames, self.digest, field_psnr_db)
 
 
+def frames_digest(frames: Sequence[I420]) -> str:
+    """Return the sha256 over the frames' digests."""
+    return hashlib.sha256(b"".join(frame.digest() for frame in frames)).hexdigest()
+
+
 def read_drive(name: DriveName | str, limit: int | None = None) -> Drive:
     """Read at most ``limit`` frames of ``NAME@HZ=DATASET``; raises as ``DriveName.parse`` does."""
     if isinstance(name, str):
@@ -242,7 +248,8 @@ def read_drive(name: DriveName | str, limit: int | None = None) -> Drive:
 def with_noise(
     frames: Sequence[I420], sigma: float, seed: int | Sequence[int] = NOISE_SEED
 ) -> Sequence[I420]:
-    """Add Gaussian noise, always the same, to every sample of the frames; as they are for 0."""
+    """Add Gaussian noise, for a seed always the same, to every sample of the frames; as they are
+    for 0."""
     if not sigma:
         return frames
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-// Binds rfcore/csrc/picture/blake2b.h. rfcore/native/digest.py gives both messages the same sizes.
+// Binds rfcore/csrc/picture/blake2b.h. rfcore/native/yuv.py gives both messages the same sizes.
 #include "picture/blake2b.h"
 
 #include <nanobind/nanobind.h>

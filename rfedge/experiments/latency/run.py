@@ -1,15 +1,18 @@
 """How long frames take over links, on a virtual clock: drives and a field in, one result out.
 
-Ours and low-delay x264 are coded to the same quality (the CRF is searched in
-steps of a half), then sent over constant rates and over recorded links.
+Ours and low-delay x264 are coded to the same quality (the CRF is searched in steps of a half), then
+sent over constant rates and over recorded links. A clip is sent again and again without its first
+frame, captured at its rate. At most ``WINDOW`` frames are under way, as in the product; a frame
+that is dropped before it is coded counts as late.
 
-``tau`` is a message's own transmission time. The network latency adds waiting behind earlier
-frames and the link's propagation, as if nothing had to be computed: what an uplink alone makes of
-the frames. From capture to shown adds both ends' processors and waiting for them
-(``show``): a mean would hide what a slow
-frame does to those behind it. A clip is sent again and again without its first
-frame, captured at its rate. As the product does, at most ``WINDOW`` frames are under way: a frame
-that finds more is dropped before it is coded, and counts as late.
+``play``: as if nothing had to be computed, what an uplink alone makes of the frames. ``tau`` is a
+message's own transmission time; the network latency adds waiting behind earlier frames and the
+link's propagation. A frame that finds too many under way is dropped.
+
+``show``: from capture to shown. Either end works at one frame at a time, for as long as that very
+frame took when it was measured, and frames wait for it: a mean would hide what a slow frame does to
+those behind it. A vehicle begins with the newest frame that was captured, and older ones are
+dropped; it hears that a frame is shown after the link's delay.
 """
 
 from __future__ import annotations
@@ -82,14 +85,11 @@ class FrameWork:
 
 
 @dataclass(frozen=True)
-class Shown:
-    """``latency_ms`` [N], from capture to shown, of the frames that were sent; ``sender_busy`` and
-    ``receiver_busy``: for which share of the time either end computed."""
+class Latencies:
+    """``latency_ms`` [N] of the frames that were sent; ``dropped`` ones never come."""
 
     latency_ms: F64
     dropped: int
-    sender_busy: float
-    receiver_busy: float
 
     @property
     def frames(self) -> int:
@@ -97,19 +97,34 @@ class Shown:
         return len(self.latency_ms) + self.dropped
 
     def share_within(self, budget_ms: float) -> float:
-        """Return the share of all captured frames that were shown within ``budget_ms``."""
+        """Return the share of all captured frames that came within ``budget_ms``."""
         return float((self.latency_ms <= budget_ms).sum() / self.frames)
 
     def quantile_ms(self, share: float) -> float:
         """Return the latency that ``share`` of the captured frames stay within, or infinity."""
-        return quantile_of_all_ms(self.latency_ms, self.dropped, share)
+        late = np.full(self.dropped, np.inf)
+        return float(np.quantile(np.concatenate([self.latency_ms, late]), share, method="higher"))
 
 
-def quantile_of_all_ms(latency_ms: F64, dropped: int, share: float) -> float:
-    """Return the latency that ``share`` of the captured frames stay within; dropped ones never
-    come, so it may be infinite."""
-    late = np.full(dropped, np.inf)
-    return float(np.quantile(np.concatenate([latency_ms, late]), share, method="higher"))
+@dataclass(frozen=True)
+class Shown(Latencies):
+    """From capture to shown; ``sender_busy`` and ``receiver_busy``: for which share of the time
+    either end computed."""
+
+    sender_busy: float
+    receiver_busy: float
+
+
+@dataclass(frozen=True)
+class Played(Latencies):
+    """A clip over a link, from sending to arrival; ``tau_ms`` [N]: transmission alone."""
+
+    tau_ms: F64
+
+    @property
+    def network_ms(self) -> F64:
+        """Waiting, transmission and the link's delay."""
+        return self.latency_ms
 
 
 def show(frames: Sequence[FrameWork], rate_hz: float, link: DirectionPlan) -> Shown:
@@ -146,28 +161,6 @@ def show(frames: Sequence[FrameWork], rate_hz: float, link: DirectionPlan) -> Sh
     )
 
 
-@dataclass(frozen=True)
-class Played:
-    """A clip over a link. ``tau_ms`` and ``network_ms`` [N] are of the frames that were sent."""
-
-    tau_ms: F64
-    network_ms: F64
-    dropped: int
-
-    @property
-    def frames(self) -> int:
-        """How many frames were captured."""
-        return len(self.network_ms) + self.dropped
-
-    def share_within(self, budget_ms: float) -> float:
-        """Return the share of all captured frames that came within ``budget_ms``."""
-        return float((self.network_ms <= budget_ms).sum() / self.frames)
-
-    def quantile_ms(self, share: float) -> float:
-        """Return the latency that ``share`` of the captured frames stay within, or infinity."""
-        return quantile_of_all_ms(self.network_ms, self.dropped, share)
-
-
 def repeated(frames: Sequence[T], count: int) -> list[T]:
     """Return ``count`` frames: the clip without its first one, which a stream sends once, again and
     again."""
@@ -194,7 +187,7 @@ def play(frame_bytes: Sequence[int], rate_hz: float, link: DirectionPlan) -> Pla
         due.append(delivery.due_s)
         tau.append(1e3 * (delivery.end_s - delivery.start_s))
         network.append(1e3 * (delivery.due_s - now))
-    return Played(np.array(tau), np.array(network), dropped)
+    return Played(np.array(network), dropped, np.array(tau))
 
 
 def needed_rate_bps(

@@ -1,9 +1,9 @@
-"""Many different frames, ours and x264's: random drives through a street, their sizes, one result.
+"""Many different frames, ours and x264's, coded piece by piece: how their sizes are distributed.
 
-A field as the street itself: random drives through it, what a camera sees, what both ends hold.
-
-A drive follows the cameras of a data set from its first to its last at a speed of its own, in a
-lane of its own, with a sway that changes along the way. No two drives show the same pictures.
+A field is the street itself: what a camera sees is its render with noise, and both ends hold a
+lower level of its detail. A drive follows the cameras of a data set from its first to its last at a
+speed of its own, in a lane of its own, with a sway that changes along the way. No two drives show
+the same pictures.
 """
 
 from __future__ import annotations
@@ -20,22 +20,24 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
-from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.camera import Camera, Pose
 from rfcore.codec.h264.config import check_effort
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, RadianceField, load_field
 from rfcore.image import I420
 from rfcore.motion import interpolated, quaternion_from_vector
-from rfcore.native.yuv import i420_from_rgb
+from rfcore.native.yuv import i420_from_colour
 from rfedge.experiments.cells import CellKey, CellStore, Rows, program_version
 from rfedge.experiments.clips import (
     MAX_NOISE_SIGMA,
     STEADY,
     Clip,
     ClipCoder,
+    frames_digest,
     psnr_of_mse,
     with_noise,
 )
@@ -113,28 +115,37 @@ class FieldStreet:
         """The cameras that are driven along, of the size asked for."""
         origin = self.opened.metadata.tile_origin
         pictures = read_dataset(self.path, tile_origin=origin).pictures
-        cameras = [picture.camera for picture in pictures]
-        intrinsics = cameras[0].intrinsics.resized(*self.size_px)
-        if self._length_m(cameras) <= 0:
+        poses = [picture.camera.world_from_cam for picture in pictures]
+        if all(pose.translation_m == poses[0].translation_m for pose in poses):
             raise InvalidInput("path", f"{self.path} has the poses of one place")
-        return [Camera(intrinsics, camera.world_from_cam) for camera in cameras]
+        intrinsics = pictures[0].camera.intrinsics.resized(*self.size_px)
+        return [Camera(intrinsics, pose) for pose in poses]
+
+    @cached_property
+    def _reached_m(self) -> NDArray[np.float64]:
+        """How far along the recorded way each camera is."""
+        places = (camera.world_from_cam.translation_m for camera in self.recorded)
+        return np.cumsum([0.0, *(math.dist(a, b) for a, b in pairwise(places))])
 
     def frame_count(self, number: int) -> int:
         """Return how many frames drive ``number`` has."""
-        seconds = self._length_m(self.recorded) / self._random(number).uniform(*SPEED_MPS)
-        return max(LEAST_FRAMES, math.floor(seconds * self.rate_hz))
+        return self._begun(number)[0]
+
+    def _begun(self, number: int) -> tuple[int, np.random.Generator]:
+        """Return the frames of a drive, which its speed decides, and what else of it is drawn
+        from."""
+        random = np.random.default_rng((self.seed, number))
+        seconds = self._reached_m[-1] / random.uniform(*SPEED_MPS)
+        return max(LEAST_FRAMES, math.floor(seconds * self.rate_hz)), random
 
     def drive(self, number: int) -> StreetDrive:
         """Return drive ``number``, always the same."""
         cameras = self._cameras(number)
-        colours = (self.opened.render_colour(camera) for camera in cameras)
-        pictures = [np.floor(np.clip(c, 0, 1) * 255 + 0.5).astype(np.uint8) for c in colours]
-        frames = [i420_from_rgb(picture) for picture in pictures]
-        return StreetDrive(cameras, with_noise(frames, self.noise_sigma, self._key(number)))
+        frames = [i420_from_colour(self.opened.render_colour(camera)) for camera in cameras]
+        return StreetDrive(cameras, with_noise(frames, self.noise_sigma, (self.seed, number)))
 
     def _cameras(self, number: int) -> list[Camera]:
-        count, random = self.frame_count(number), self._random(number)
-        random.uniform(*SPEED_MPS)
+        count, random = self._begun(number)
         lane_m = random.uniform(-LANE_M, LANE_M)
         periods_s, phases = random.uniform(*SWAY_S, 5), random.uniform(0, 2 * np.pi, 5)
         intrinsics, cameras = self.recorded[0].intrinsics, []
@@ -145,36 +156,18 @@ class FieldStreet:
             turn = tuple(np.deg2rad(SWAY_DEG * sway[2:]).tolist())
             step = Pose((float(x_m), float(y_m), 0.0), quaternion_from_vector(turn))
             pose = self._along(index / (count - 1)).compose(step)
-            cameras.append(_camera(intrinsics, pose))
+            cameras.append(Camera(intrinsics, pose).rounded())
         return cameras
 
     def _along(self, share: float) -> Pose:
         """Return the pose after a share of the recorded way."""
-        reached_m = np.cumsum([0.0, *self._steps_m(self.recorded)])
+        reached_m = self._reached_m
         at_m = share * reached_m[-1]
         index = min(int(np.searchsorted(reached_m, at_m, side="right")), len(reached_m) - 1) - 1
         step_m = reached_m[index + 1] - reached_m[index]
         within = (at_m - reached_m[index]) / step_m if step_m else 0.0
         first, second = (self.recorded[index + k].world_from_cam for k in range(2))
         return interpolated(first, second, min(1.0, float(within)))
-
-    @staticmethod
-    def _steps_m(cameras: Sequence[Camera]) -> list[float]:
-        places = (camera.world_from_cam.translation_m for camera in cameras)
-        return [math.dist(a, b) for a, b in pairwise(places)]
-
-    def _length_m(self, cameras: Sequence[Camera]) -> float:
-        return sum(self._steps_m(cameras))
-
-    def _key(self, number: int) -> tuple[int, int]:
-        return self.seed, number
-
-    def _random(self, number: int) -> np.random.Generator:
-        return np.random.default_rng(self._key(number))
-
-
-def _camera(intrinsics: Intrinsics, pose: Pose) -> Camera:
-    return Camera(intrinsics, pose).rounded()
 
 
 QUANTILES = ("0.5", "0.99", "0.999", "0.9999", "0.99999")
@@ -409,8 +402,7 @@ def _opened(street: FieldStreet) -> FieldStreet:
 def _crfs(job: TailJob, store: CellStore) -> tuple[float, float]:
     """Return the CRFs at which both methods code the first drive to the quality asked for."""
     drive = job.street.drive(0)
-    digest = "-".join(frame.digest().hex()[:8] for frame in drive.frames)
-    clip = Clip("tail", job.street.rate_hz, drive.frames, digest, None)
+    clip = Clip("tail", job.street.rate_hz, drive.frames, frames_digest(drive.frames), None)
     coders = _coders(job.street, drive, job.effort, job.preset)
     ours, theirs = (at_quality(clip, coder, job.quality_db, store).point for coder in coders)
     return ours, theirs

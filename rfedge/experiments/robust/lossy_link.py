@@ -52,9 +52,11 @@ __all__ = [
 ]
 
 
-KEPT = 8
 DATAGRAM_BYTES = 1200
 """What passes every network without fragments (RFC 9000, 14)."""
+
+KEPT = 8
+"""Coded frames that are kept, for each frame of the clip."""
 
 
 @dataclass(frozen=True)

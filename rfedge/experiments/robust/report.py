@@ -39,6 +39,7 @@ class CrossingRow:
     """Frames at which a viewer still saw an earlier picture."""
     frames: int
     seed: int = 5
+    """Of the losses; earlier records had this one and did not say so."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ sender first aligns the frame with the field's render there.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -53,6 +53,7 @@ __all__ = [
     "PoseNoise",
     "RobustJob",
     "kbit_at",
+    "kbit_between",
     "noisy_cameras",
     "refined_cameras",
     "run_robust",
@@ -115,16 +116,23 @@ def refined_cameras(
 
 
 def kbit_at(clips: Sequence[CodedClip], quality_db: float) -> float:
-    """Return kilobits a frame at a luma PSNR, log(bits) linear in dB between the clips' points,
-    the first frame left out. Raises ``InvalidInput`` when they do not span the quality."""
-    points = sorted((clip.psnr_db(), math.log(8e-3 * clip.bytes_per_frame())) for clip in clips)
-    qualities = [db for db, _ in points]
+    """Return kilobits a frame at a luma PSNR, the first frame left out; raises as
+    ``kbit_between``."""
+    points = ((clip.psnr_db(), clip.bytes_per_frame()) for clip in clips)
+    return kbit_between(points, quality_db, "quality_db")
+
+
+def kbit_between(points: Iterable[tuple[float, float]], quality_db: float, name: str) -> float:
+    """Return kilobits a frame at a luma PSNR, log(bits) linear in dB between ``points`` (dB, bytes
+    a frame). Raises ``InvalidInput``, naming ``name``, when they do not span the quality."""
+    qualities, sizes = zip(*sorted(points), strict=True)
     if not qualities[0] <= quality_db <= qualities[-1]:
         raise InvalidInput(
-            "quality_db",
-            f"{quality_db} dB is outside the {qualities[0]:.2f}..{qualities[-1]:.2f} dB reached",
+            name,
+            f"{quality_db:g} dB is outside the {qualities[0]:.2f}..{qualities[-1]:.2f} dB reached",
         )
-    return math.exp(float(np.interp(quality_db, qualities, [bits for _, bits in points])))
+    log_kbit = [math.log(8e-3 * size) for size in sizes]
+    return math.exp(float(np.interp(quality_db, qualities, log_kbit)))
 
 
 LOSSES = (0.0, 0.01, 0.05)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -18,12 +17,12 @@ from rfcore.codec.h264.config import check_effort
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
-from rfcore.image import I420
 from rfcore.wire.tiles import Area
 from rfedge.datasets.split import SplitTile, read_tiles
 from rfedge.experiments.cells import CellStore, clip_key, program_version
 from rfedge.experiments.clips import Clip, CodedClip, Drive, luma_mse, psnr_of_mse, read_drive
 from rfedge.experiments.field_coder import FieldCoder, RenderedClip, render_clip
+from rfedge.experiments.robust.run import kbit_between
 from rfedge.report.tables import heading, print_table, table
 from rfedge.results import Result, check_result_path, make_result, provenance, rows_of, write_result
 
@@ -127,14 +126,6 @@ class Placed:
     seam_m: float
 
 
-@dataclass(frozen=True)
-class Coded:
-    """A drive coded at one CRF: values per frame, and of its renders."""
-
-    frame_bytes: NDArray[np.int64]
-    luma_mse: NDArray[np.float64]
-
-
 def placed(tiles: Sequence[SplitTile], ground_m: Sequence[tuple[float, float]]) -> list[Placed]:
     """Return the place of each frame of a drive: on the nearest tile, on a border the one before.
 
@@ -201,31 +192,33 @@ class Bench:
         render_mse: list[float] = []
         for field, frames in pieces:
             rendered = render_clip(field, self._cameras(field, frames))
-            chosen = [self.drive.frames[index] for index in frames]
+            part = slice(frames[0], frames[-1] + 1)
+            piece = replace(
+                self.drive, pictures=self.drive.pictures[part], frames=self.drive.frames[part]
+            )
             for crf in CRFS:
-                by_crf[crf].append(self._clip(rendered, chosen, crf))
-            shown = zip(rendered.renders, chosen, strict=True)
+                by_crf[crf].append(self._coded(rendered, piece.clip(), crf))
+            shown = zip(rendered.renders, piece.frames, strict=True)
             render_mse += [luma_mse(render, frame) for render, frame in shown]
-        at = {
-            crf: Coded(
+        at_crf = {
+            crf: (
                 np.concatenate([clip.frame_bytes for clip in clips]),
                 np.concatenate([clip.luma_mse for clip in clips]),
             )
             for crf, clips in by_crf.items()
         }
-        return DriveAtCrfs(at, np.array(render_mse), {frames[0] for _, frames in pieces})
+        return DriveAtCrfs(at_crf, np.array(render_mse), {frames[0] for _, frames in pieces})
 
     def _cameras(self, field: RadianceField, frames: Sequence[int]) -> list[Camera]:
         origin = field.metadata.tile_origin
         pictures = read_dataset(self.drive.name.dataset, tile_origin=origin).pictures
         return [pictures[index].camera for index in frames]
 
-    def _clip(self, rendered: RenderedClip, frames: Sequence[I420], crf: float) -> CodedClip:
-        effort, hz = self.job.effort, self.drive.name.rate_hz
+    def _coded(self, rendered: RenderedClip, clip: Clip, crf: float) -> CodedClip:
+        effort = self.job.effort
         coder = FieldCoder(rendered, f"rfedge-{effort}", program_version(), effort=effort)
-        digest = "-".join(frame.digest().hex()[:8] for frame in frames)
-        clip = Clip(self.drive.name.scene, hz, frames, digest, None)
-        return self.store.clip(clip_key(clip, coder, crf), lambda: coder.code(frames, hz, crf))
+        key = clip_key(clip, coder, crf)
+        return self.store.clip(key, lambda: coder.code(clip.frames, clip.rate_hz, crf))
 
     def row(
         self, kind: str, chosen: Sequence[int], whole: DriveAtCrfs, in_tiles: DriveAtCrfs
@@ -251,31 +244,21 @@ class Bench:
 
 @dataclass(frozen=True)
 class DriveAtCrfs:
-    """A drive coded at each CRF; ``begins``: the frames that begin a stream."""
+    """A drive coded at each CRF: (bytes, squared error of the luma) of each frame; ``begins``: the
+    frames that begin a stream."""
 
-    at_crf: dict[float, Coded]
+    at_crf: dict[float, tuple[NDArray[np.int64], NDArray[np.float64]]]
     render_mse: NDArray[np.float64]
     begins: set[int]
 
     def kbit_at(self, chosen: Sequence[int], quality_db: float) -> float:
-        """Return kilobits a frame of those chosen at a luma PSNR, log(bits) linear in dB.
-
-        Raises ``InvalidInput`` when the CRFs do not span it.
-        """
+        """Return kilobits a frame of those chosen at a luma PSNR; raises as ``kbit_between``."""
         frames = list(chosen)
-        points = sorted(
-            (psnr_of_mse(float(coded.luma_mse[frames].mean())), coded.frame_bytes[frames].mean())
-            for coded in self.at_crf.values()
+        points = (
+            (psnr_of_mse(float(luma_mse[frames].mean())), float(frame_bytes[frames].mean()))
+            for frame_bytes, luma_mse in self.at_crf.values()
         )
-        qualities = [db for db, _ in points]
-        if not qualities[0] <= quality_db <= qualities[-1]:
-            raise InvalidInput(
-                "quality-db",
-                f"{quality_db:g} dB is outside the {qualities[0]:.2f}..{qualities[-1]:.2f} dB "
-                f"reached on {len(frames)} frames",
-            )
-        log_kbit = [math.log(8e-3 * size) for _, size in points]
-        return math.exp(float(np.interp(quality_db, qualities, log_kbit)))
+        return kbit_between(points, quality_db, "quality-db")
 
     def render_db(self, chosen: Sequence[int]) -> float:
         """Return the luma PSNR of the renders of the frames chosen."""
