@@ -110,7 +110,7 @@ MUTANTS = (
     Mutant(
         "our frames cost their slices alone",
         "rfedge/experiments/field_coder.py",
-        "sizes = [message_bytes(frame.arrival) for frame in coded]",
+        "sizes = [message_bytes(frame.arrival, self._rendered.quality) for frame in coded]",
         "sizes = [len(frame.encoded.packet.payload) for frame in coded]",
         "tests/experiments/test_field_coder.py::test_a_frame_costs_its_slice_and_its_header",
     ),
