@@ -107,8 +107,8 @@ async def test_a_device_removed_under_a_server_costs_no_frame(
             raise DeviceLost("DEVICE_NOT_AVAILABLE")
         return draw(self, camera, degree, picture)
 
-    monkeypatch.setattr(DeviceRasterizer, "draw_codec_picture", removed)
     async with serve(record=tmp_path, render=RenderSettings(renderer=POCL)) as server:
+        monkeypatch.setattr(DeviceRasterizer, "draw_codec_picture", removed)
         with capture_logs() as logs:
             record = await travel(server.address)
     assert record.counts == {"acked": 6}
