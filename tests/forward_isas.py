@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,11 @@ from rfcore.native.backend import available_isas
 if TYPE_CHECKING:
     from rfcore.raster.opencl import Device
 
-POCL = "opencl:Portable"
-"""OpenCL on the CPU. Debian has it (``make test-system-packages``); its tests fail without it."""
+DEVICE = os.environ.get("RFEDGE_TEST_OPENCL", "Portable")
+"""Name of the OpenCL device that tests draw on: PoCL (OpenCL on the CPU), or another.
+
+Debian has PoCL (``make test-system-packages``); the tests fail without it."""
+OPENCL = f"opencl:{DEVICE}"
 
 
 WORST_CASE = "opencl:worst-case"
@@ -22,18 +26,18 @@ subnormals flushed, but for what the kernels do against it; tests/raster/conftes
 
 
 GUARDED = "guarded"
-"""PoCL in the build for inexact compilers; for ``opened``."""
+"""The device in the build for inexact compilers; for ``opened``."""
 
 
 def opened(isa: str) -> Device:
-    """Return an opened device; ``GUARDED``: PoCL in that build."""
+    """Return an opened device; ``GUARDED``: the tests' in that build."""
     from rfcore.raster.opencl import open_device
     from rfcore.raster.opencl.device import BUILDS, build_device, find_device
     from rfcore.raster.opencl.self_check import check_device
 
     if isa != GUARDED:
         return open_device(isa.partition(":")[2])
-    device = build_device(find_device("Portable"), BUILDS[1])
+    device = build_device(find_device(DEVICE), BUILDS[1])
     check_device(device)
     return device
 
@@ -52,5 +56,5 @@ def until_gone(call: Callable[..., object], left: Iterator[int]) -> Callable[...
 
 def forward_isas() -> list[Any]:
     """Return what ``Rasterizer`` takes as ``isa`` here, what cannot train included."""
-    slow = [pytest.param(isa, marks=pytest.mark.slow) for isa in (POCL, WORST_CASE)]
+    slow = [pytest.param(isa, marks=pytest.mark.slow) for isa in (OPENCL, WORST_CASE)]
     return [*available_isas(), *slow]

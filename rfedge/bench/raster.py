@@ -18,6 +18,7 @@ in full: PoCL computes on this CPU and says nothing about a GPU.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter_ns
@@ -47,8 +48,8 @@ __all__ = [
 ]
 
 OPENCL_SIZES_PX = ((640, 360), (1920, 1080))
-CPU_THREADS = 2
-"""Of the CPU's renderer."""
+CPU_THREADS = os.cpu_count() or 1
+"""Of the CPU's renderer beside a device: all there are."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from rfedge.arguments import DATASET, FIELD, FOLDER, JSON, field_path
+from rfedge.arguments import DATASET, FIELD, FOLDER, JSON, RENDERER, field_path
 from rfedge.experiments.adapt import EvalAdapt
 from rfedge.experiments.benchmark import EvalBenchmark
 from rfedge.experiments.classes import EvalClasses
@@ -104,6 +104,8 @@ class LoadTest:
     """Run the load so many times, a row each; it is held if every run is."""
     workers: int = 2
     """Frames the server reconstructs at once, and threads of a render."""
+    renderer: Annotated[str, RENDERER] = "cpu"
+    """What the server of --mode full draws with, and vehicles that are --live."""
     out: Annotated[Path, FOLDER] = Path("out/loadtest")
     """Folder for report.html, result.json and vehicles_vs_uplink.svg."""
     cache: Annotated[Path, FOLDER] = Path("out/cache/loadtest")
@@ -132,6 +134,7 @@ class LoadTest:
             kind=Vehicles.LIVE if self.live else Vehicles.PRERECORDED,
             vehicle_ms=self.vehicle_ms,
             admission=self.admission,
+            renderer=self.renderer,
             bounds=Bounds(deadline_ms=self.deadline_ms),
         )
         bed = TestBed(

@@ -166,6 +166,7 @@ KEY = (
     "link",
     "vehicle_ms",
     "admission",
+    "renderer",
     "run",
 )
 """Fields that tell one load from another: a recorded row is replaced by one that has the same."""
@@ -315,6 +316,7 @@ COLUMNS = (
     "vehicles",
     "cameras",
     "hz",
+    "renderer",
     "link",
     "held",
     "p50_ms",

@@ -12,6 +12,7 @@ from typing import Any
 
 from rfcore.codec.h264.config import DEFAULT_EFFORT, CoderSettings
 from rfcore.field import load_field
+from rfcore.raster.renderers import CPU
 from rfedge.demo.processes import Service, command_of, service
 from rfedge.loadtest.drive import (
     RunMeasurements,
@@ -94,6 +95,7 @@ class LoadRow:
     server_growth_mb: float
     generator_lag_ms: float
     """99th percentile of how late the generator's event loop was."""
+    renderer: str = CPU
     command: str | None = None
     """In a file of several runs, as ``revision``: how this row was made."""
     revision: str | None = None
@@ -127,7 +129,7 @@ def run_load(load: Load, bed: TestBed) -> Run:
             addresses = links.address.split("\n")
             pids["links"] = links.process.pid
         if load.kind is Vehicles.LIVE:
-            measurements = drive_live(load, addresses, pids, bed.work, _agent(bed))
+            measurements = drive_live(load, addresses, pids, bed.work, _agent(load, bed))
         else:
             measurements = drive_prerecorded(load, addresses, pids, bed.work, folder)
     busy = links_busy(bed.work / "links.jsonl", load) if load.link is not None else 0.0
@@ -154,7 +156,8 @@ def _server(load: Load, bed: TestBed) -> Any:
     if load.mode is Mode.FULL:
         command = [*command_of("mec-server"), "--fields", fields, "--workers", workers]
         limits = () if load.admission else ("--max-load", "0")
-        return service("mec-server", [*command, "--listen", "127.0.0.1:0", *limits], bed.work)
+        command += ["--renderer", load.renderer, "--listen", "127.0.0.1:0", *limits]
+        return service("mec-server", command, bed.work)
     module = [sys.executable, "-m", "rfedge.loadtest.server"]
     return service("mec-server", [*module, load.mode, fields, workers], bed.work)
 
@@ -170,12 +173,12 @@ def _links(load: Load, profile: Path, server: Service, work: Path) -> Any:
     return service("links", [*module, server.address, str(work / "links.jsonl")], work)
 
 
-def _agent(bed: TestBed) -> Sequence[str]:
+def _agent(load: Load, bed: TestBed) -> Sequence[str]:
     return [
         *command_of("cav-agent"),
         *("--drive", str(bed.drive), "--fields", str(bed.field.parent)),
         *CoderSettings.of(bed.effort).arguments,
-        *("--crf", str(bed.crf), "--loop"),
+        *("--crf", str(bed.crf), "--renderer", load.renderer, "--loop"),
     ]
 
 
@@ -204,6 +207,7 @@ def _row(
         duration_s=load.duration_s,
         vehicle_ms=load.vehicle_ms,
         admission=load.admission,
+        renderer=load.renderer,
         **measurements.fields(),
     )
 

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from forward_isas import POCL
+from forward_isas import DEVICE, OPENCL
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.raster.gaussians import F32, Gaussians
 from rfcore.raster.native import Rasterizer
+from rfcore.raster.opencl import open_device
 from rfcore.views import View
 from rfedge import timing
 from rfedge.bench import print_rows, raster, run_case, train
@@ -46,9 +47,10 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_device_is_named_with_its_driver_beside_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(raster, "street_gaussians", lambda: street_gaussians(1000))
     monkeypatch.setattr(raster, "OPENCL_SIZES_PX", ((30, 20), (48, 32)))
-    rows = run_case("raster", isa=POCL)["rows"]
+    rows = run_case("raster", isa=OPENCL)["rows"]
     assert [list(row) for row in rows] == [OPENCL_KEYS] * 2
-    assert all("PoCL" in row["device"] and row["device_ms"] > 0 for row in rows)
+    assert {row["device"] for row in rows} == {open_device(DEVICE).description}
+    assert all(row["device_ms"] > 0 for row in rows)
 
 
 @pytest.mark.slow
@@ -58,11 +60,11 @@ def test_a_device_that_draws_other_bytes_is_not_timed(monkeypatch: pytest.Monkey
 
     def brighter(self: Rasterizer, camera: Camera) -> View:
         view = render(self, camera)
-        return replace(view, opacity=view.opacity + 1) if self.isa == POCL else view
+        return replace(view, opacity=view.opacity + 1) if self.isa == OPENCL else view
 
     monkeypatch.setattr(Rasterizer, "render", brighter)
-    with pytest.raises(RfedgeError, match="the opacity of opencl:Portable is not that of"):
-        run_case("raster", isa=POCL)
+    with pytest.raises(RfedgeError, match=f"the opacity of {OPENCL} is not that of"):
+        run_case("raster", isa=OPENCL)
 
 
 @pytest.mark.usefixtures("small")

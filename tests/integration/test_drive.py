@@ -11,7 +11,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from cav_agent.config import PaceKind
-from forward_isas import POCL
+from forward_isas import OPENCL
 from recorded import recorded, recorded_parts
 from rfcore.codec.h264.config import CoderSettings, LightChange
 from rfcore.codec.sender.steering import SteeringSettings
@@ -61,7 +61,7 @@ async def test_neither_instruction_set_nor_threads_at_either_end_change_a_byte(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ends", [("cpu", POCL), (POCL, "cpu"), (POCL, POCL)])
+@pytest.mark.parametrize("ends", [("cpu", OPENCL), (OPENCL, "cpu"), (OPENCL, OPENCL)])
 async def test_an_opencl_device_at_either_end_changes_no_byte(
     serve: Any, travel: Any, tmp_path: Path, ends: tuple[str, str]
 ) -> None:
@@ -85,7 +85,7 @@ async def test_colours_stay_on_the_device_at_both_ends(
         raise AssertionError("colours, depth and opacity of a whole picture came to the CPU")
 
     monkeypatch.setattr("rfcore.raster.native.Rasterizer.render", fetched)
-    device = RenderSettings(renderer=POCL)
+    device = RenderSettings(renderer=OPENCL)
     async with serve(render=device) as server:
         record = await travel(server.address, render=device)
     assert record.counts == {"acked": 6}
@@ -107,7 +107,7 @@ async def test_a_device_removed_under_a_server_costs_no_frame(
             raise DeviceLost("DEVICE_NOT_AVAILABLE")
         return draw(self, camera, degree, picture)
 
-    async with serve(record=tmp_path, render=RenderSettings(renderer=POCL)) as server:
+    async with serve(record=tmp_path, render=RenderSettings(renderer=OPENCL)) as server:
         monkeypatch.setattr(DeviceRasterizer, "draw_codec_picture", removed)
         with capture_logs() as logs:
             record = await travel(server.address)

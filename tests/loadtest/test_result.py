@@ -181,8 +181,8 @@ def test_the_section_names_what_was_not_kept_and_its_command() -> None:
     rows += [row_of(link="steady", held=True, broken=[], p99_ms=44.0, command="c", revision="r")]
     made = replace(MADE, host=HOST)
     section = load_section(Path("loadtest.json"), make_result("loadtest", made, {"rows": rows}))
-    assert "| receiver | 8 | 1 | 10.00 | loopback | no | 20.50 | not run | 97.25 |" in section
-    assert "| receiver | 8 | 1 | 10.00 | steady | yes | 20.50 | 44.00 | 97.25 |" in section
+    assert "| receiver | 8 | 1 | 10.00 | cpu | loopback | no | 20.50 | not run | 97.25 |" in section
+    assert "| receiver | 8 | 1 | 10.00 | cpu | steady | yes | 20.50 | 44.00 | 97.25 |" in section
     assert "* `rfedge loadtest --mode receiver` at `abc123` (prerecorded vehicles, 640x360" in (
         section
     )

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from forward_isas import WORST_CASE, forward_isas
+from forward_isas import DEVICE, WORST_CASE, forward_isas
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.native.backend import available_isas
 from rfcore.raster.gaussians import Gaussians
@@ -66,7 +66,7 @@ def worst_case_device() -> Iterator[None]:
     def open_first(wanted: str) -> Device:
         if wanted != WORST_CASE.partition(":")[2]:
             return first_exact(wanted)
-        device = build_device(find_device("Portable"), WORST)
+        device = build_device(find_device(DEVICE), WORST)
         check_device(device)
         return device
 

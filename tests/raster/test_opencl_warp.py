@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from forward_isas import GUARDED, POCL, WORST_CASE, opened, until_gone
+from forward_isas import DEVICE, GUARDED, OPENCL, WORST_CASE, opened, until_gone
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig
@@ -40,7 +40,7 @@ F32 = np.float32
 FRAMES = 4
 
 slow = pytest.mark.slow
-every_build = pytest.mark.parametrize("isa", [POCL, GUARDED, WORST_CASE])
+every_build = pytest.mark.parametrize("isa", [OPENCL, GUARDED, WORST_CASE])
 
 
 @cache
@@ -132,7 +132,7 @@ def test_a_device_that_carries_otherwise_is_refused(
     assert right in source
     monkeypatch.setattr(device, "_source", lambda: source.replace(right, wrong))
     with pytest.raises(BackendUnavailable, match=r"plain build: its (warp|correction) of \d+x\d+"):
-        check_device(build_device(find_device("Portable"), BUILDS[0]))
+        check_device(build_device(find_device(DEVICE), BUILDS[0]))
 
 
 @dataclass
@@ -194,7 +194,7 @@ def references(
 
 
 @slow
-@pytest.mark.parametrize("isa", [POCL, WORST_CASE])
+@pytest.mark.parametrize("isa", [OPENCL, WORST_CASE])
 @pytest.mark.parametrize("size_px", [(67, 45), (64, 48), (9, 1), (1, 7)])
 def test_references_of_a_drive_are_those_of_the_cpu(
     isa: str, size_px: tuple[int, int], scene: SceneMaker, camera: CameraMaker
@@ -210,7 +210,7 @@ def test_only_pictures_cross_between_device_and_cpu(
 ) -> None:
     """Of a frame 1.5 bytes a pixel for each picture: down its render and the references that are
     made of it, up the earlier frame. The rest are counts, camera and poses."""
-    field, cameras = SplatField(scene(800), isa=POCL), drive(camera(160, 90))
+    field, cameras = SplatField(scene(800), isa=OPENCL), drive(camera(160, 90))
     picture, rest = 160 * 90 * 3 // 2, 1000
     references(field, cameras[:1])
     views = [render_field_view(field, view_from) for view_from in cameras[:2]]
@@ -230,7 +230,7 @@ def test_only_pictures_cross_between_device_and_cpu(
 
 @slow
 def test_a_held_view_is_a_view_like_any_other(scene: SceneMaker, camera: CameraMaker) -> None:
-    fields = [SplatField(scene(800), isa=isa) for isa in (POCL, None)]
+    fields = [SplatField(scene(800), isa=isa) for isa in (OPENCL, None)]
     view, want = (render_field_view(field, camera()) for field in fields)
     assert isinstance(view, HeldFieldView)
     lit = decoded(want, 1)
@@ -250,7 +250,7 @@ def test_a_held_view_is_a_view_like_any_other(scene: SceneMaker, camera: CameraM
 def test_views_of_which_one_is_not_on_the_device_are_carried_by_the_cpu(
     scene: SceneMaker, camera: CameraMaker
 ) -> None:
-    fields = [SplatField(scene(800), isa=isa) for isa in (None, POCL, WORST_CASE)]
+    fields = [SplatField(scene(800), isa=isa) for isa in (None, OPENCL, WORST_CASE)]
     first, second = drive(camera(), 2)
     before, now = ([render_field_view(f, at) for f in fields] for at in (first, second))
     picture = decoded(before[0], 0)
@@ -261,7 +261,7 @@ def test_views_of_which_one_is_not_on_the_device_are_carried_by_the_cpu(
 
 
 @slow
-@pytest.mark.parametrize(("sender", "receiver"), [(None, POCL), (POCL, None), (POCL, POCL)])
+@pytest.mark.parametrize(("sender", "receiver"), [(None, OPENCL), (OPENCL, None), (OPENCL, OPENCL)])
 def test_a_drive_is_coded_alike_with_a_device_at_either_end(
     scene: SceneMaker, camera: CameraMaker, sender: str | None, receiver: str | None
 ) -> None:
@@ -317,11 +317,11 @@ def test_a_device_lost_anywhere_costs_no_reference(
     drive has 174 kernels and 61 copies."""
     cameras = drive(camera())
     want = references(SplatField(scene(800)), cameras)
-    field = SplatField(scene(800), isa=POCL)
+    field = SplatField(scene(800), isa=OPENCL)
     field.prepare()
     lose(field, iter(range(call)), monkeypatch)
     assert references(field, cameras) == want
-    assert field.rasterizer(1.0).isa != POCL
+    assert field.rasterizer(1.0).isa != OPENCL
 
 
 @slow
@@ -329,11 +329,11 @@ def test_a_device_lost_anywhere_costs_no_reference(
 def test_what_a_lost_device_had_is_drawn_again(
     scene: SceneMaker, camera: CameraMaker, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
-    fields = [SplatField(scene(800), isa=isa) for isa in (POCL, None)]
+    fields = [SplatField(scene(800), isa=isa) for isa in (OPENCL, None)]
     view, want = (render_field_view(field, camera()) for field in fields)
     lose_copies(fields[0], iter(()), monkeypatch)
     assert np.array_equal(getattr(view, part), getattr(want, part))
-    assert fields[0].rasterizer(1.0).isa != POCL
+    assert fields[0].rasterizer(1.0).isa != OPENCL
 
 
 @slow
@@ -342,7 +342,7 @@ def test_planes_beyond_what_a_device_may_hold_come_back(
 ) -> None:
     """Three planes stay; the oldest pictures' are the CPU's, and those are carried there."""
     monkeypatch.setattr("rfcore.raster.opencl.renderer.MOST_HELD_BYTES", 3 * 4 * 67 * 45)
-    fields, cameras = [SplatField(scene(800), isa=isa) for isa in (POCL, None)], drive(camera())
+    fields, cameras = [SplatField(scene(800), isa=isa) for isa in (OPENCL, None)], drive(camera())
     held, want = ([render_field_view(field, at) for at in cameras] for field in fields)
     device = fields[0].rasterizer(1.0)._device
     assert device is not None
@@ -363,7 +363,7 @@ def test_buffers_of_dropped_views_are_used_again(
 ) -> None:
     import pyopencl as cl
 
-    field, cameras, made = SplatField(scene(800), isa=POCL), drive(camera()), []
+    field, cameras, made = SplatField(scene(800), isa=OPENCL), drive(camera()), []
     references(field, cameras)
 
     def counted(context: Any, flags: Any, size: int) -> cl.Buffer:
@@ -388,7 +388,7 @@ def test_streams_that_share_a_device_get_their_own_references(
     qualities = [(Quality(), Quality(0.5)), (Quality(),), (Quality(0.5), Quality()), (Quality(),)]
     plain = SplatField(scene(800))
     want = [references(plain, each, q) for each, q in zip(drives, qualities, strict=True)]
-    field = SplatField(scene(800), isa=POCL)
+    field = SplatField(scene(800), isa=OPENCL)
     together = threading.Barrier(len(drives))
 
     def stream(job: tuple[list[Camera], Sequence[Quality]]) -> list[bytes]:
@@ -397,4 +397,4 @@ def test_streams_that_share_a_device_get_their_own_references(
 
     with ThreadPoolExecutor(len(drives)) as pool:
         assert list(pool.map(stream, zip(drives, qualities, strict=True))) == want
-    assert field.rasterizer(1.0).isa == field.rasterizer(0.5).isa == POCL
+    assert field.rasterizer(1.0).isa == field.rasterizer(0.5).isa == OPENCL
