@@ -106,7 +106,7 @@ $(OUT)/bench-gpu.json: | $(OUT)  # on PoCL where there is no other OpenCL
 LOADTEST = $(RFEDGE) loadtest --record $@ --warm-up 8 --workers 4
 $(OUT)/load-gpu.json: $(call drive,vehicles-720p) | $(OUT)
 	for renderer in opencl cpu; do \
-		$(LOADTEST) --renderer $$renderer --vehicles 8 --find-limit --duration 8 --out $(OUT)/load-gpu/limit-$$renderer || exit; \
+		$(LOADTEST) --renderer $$renderer --vehicles 8 --find-limit --duration 6 --out $(OUT)/load-gpu/limit-$$renderer || exit; \
 		for hz in 10 30; do \
 			$(LOADTEST) --renderer $$renderer --vehicles 1 --live --drive $< --hz $$hz --duration 15 --out $(OUT)/load-gpu/live-$$renderer || true; \
 		done; \
