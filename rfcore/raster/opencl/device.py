@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import deque
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 from weakref import finalize
+
+import structlog
 
 from rfcore.errors import BackendUnavailable
 from rfcore.extras import needs
@@ -25,6 +28,8 @@ __all__ = [
     "build_device",
     "find_device",
 ]
+
+log = structlog.get_logger()
 
 SOURCES = (
     *("arithmetic.cl", "project.cl", "tiles.cl", "sort.cl", "blend.cl", "codec_picture.cl"),
@@ -109,16 +114,24 @@ def _devices() -> list[Any]:
 
 
 def build_device(device: Any, build: Build) -> Device:
-    """Compile the kernels; raise ``BackendUnavailable`` with the compiler's words if it cannot."""
+    """Compile the kernels; raise ``BackendUnavailable`` with the compiler's words if it cannot.
+
+    What it says of kernels that it compiled goes to the log.
+    """
     try:
         context = cl.Context([device])
-        # Without pyopencl's cache of binaries: services may have no home to write to.
-        program = cl.Program(context, _source()).build(
-            ["-cl-std=CL1.2", *build.options],
-            cache_dir=False,  # type: ignore[arg-type]
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", cl.CompilerWarning)
+            # Without pyopencl's cache of binaries: services may have no home to write to.
+            program = cl.Program(context, _source()).build(
+                ["-cl-std=CL1.2", *build.options],
+                cache_dir=False,  # type: ignore[arg-type]
+            )
+        words = program.get_build_info(device, cl.program_build_info.LOG)
     except cl.Error as error:
         raise BackendUnavailable(f"{device.name} ({build.name} build): {error}") from error
+    if words.strip():
+        log.debug("opencl compiler", device=device.name, build=build.name, words=words.strip())
     platform = device.platform
     driver = f"{platform.name} {platform.version}, driver {device.driver_version}"
     return Device(device.name, driver, build, context, program)
