@@ -47,6 +47,12 @@ $(OUT)/loop.rff: | $(OUT)
 $(OUT)/yardstick-%k.rff: | $(OUT)
 	$(call small,$(YARD)/transforms_train.json,$(YARD)/transforms_drive_empty.json)
 FIELDS := $(patsubst %,$(OUT)/%.rff,yardstick city loop)
+# The second pass at poses that are found in the field of the first, the first of them without any start.
+LOOP_LENS = $$($(dir $(RFEDGE))python -c "import json; t = json.load(open('$(LOOP)/transforms_second.json')); print(*(t[k] for k in ('fl_x', 'fl_y', 'cx', 'cy')))")
+$(OUT)/loop-localised/transforms.json: $(OUT)/loop.rff
+	mkdir -p $(OUT)/loop-second && cp $(LOOP)/images/second_* $(OUT)/loop-second
+	$(RFEDGE) scene poses $(OUT)/loop-second --register-to $< --camera-model PINHOLE --parameters $(LOOP_LENS) --out $(@D)
+LOCALISED := kitti-loop-localised@10=$(OUT)/loop-localised/transforms.json,$(OUT)/loop.rff
 endif
 
 # --- drives: through the sample's street under other circumstances, and of other people
@@ -114,8 +120,8 @@ $(OUT)/load-gpu.json: $(call drive,vehicles-720p) | $(OUT)
 $(OUT)/slice-coder.json: $(FIELDS) | $(OUT)
 	$(RFEDGE) eval slice-coder $(NOON) sample-vehicles@10=$(VEHICLES),noise=3 $(REAL) $(wordlist 2,2,$(YARDSTICK)) \
 		$(wordlist 2,2,$(YARDSTICK_30)) --out $@
-$(OUT)/compare.json: $(FIELDS) | $(OUT)
-	$(RFEDGE) eval compare $(SAMPLE) $(NOON) $(REAL) $(YARDSTICK) --background sample-vehicles@10=$(EMPTY) \
+$(OUT)/compare.json: $(FIELDS) $(if $(DATA),$(OUT)/loop-localised/transforms.json) | $(OUT)
+	$(RFEDGE) eval compare $(SAMPLE) $(NOON) $(REAL) $(LOCALISED) $(YARDSTICK) --background sample-vehicles@10=$(EMPTY) \
 		$(if $(DATA),yardstick-vehicles@10=$(YARD)/transforms_drive_empty.json) \
 		--cells $(OUT)/compare --out $@
 $(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) | $(OUT)

@@ -17,6 +17,7 @@ import json
 import math
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -39,6 +40,7 @@ __all__ = [
     "read_result",
     "revision",
     "rows_of",
+    "text_of",
     "write_result",
 ]
 
@@ -51,6 +53,8 @@ CHECKOUT = Path(__file__).parents[1]
 CODE = (".", ":!results", ":!docs")
 """Git pathspecs of the files that decide about a figure."""
 DIRTY = "-dirty"
+NUMBERS = re.compile(r"\[\n\s*(?:(?:-?\d[\d.eE+-]*|null),?\n\s*)+\]")
+"""A list of numbers as ``json`` writes it, each on a line; no string holds a line break."""
 STANDARD_OUTPUT = "-"
 
 
@@ -181,13 +185,22 @@ def as_json(value: Any, place: str = "result") -> Any:
 
 def write_result(out: Path | str, result: Result) -> None:
     """Write a result whole, with the folder it belongs in; to standard output for ``-``."""
-    text = json.dumps(result, indent=1, allow_nan=False) + "\n"
+    text = text_of(result)
     if str(out) == STANDARD_OUTPUT:
         sys.stdout.write(text)
         return
     path = Path(out)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, text)
+
+
+def text_of(result: Result) -> str:
+    """Return the text of a result file; a list of numbers alone is on one line."""
+    return NUMBERS.sub(_on_a_line, json.dumps(result, indent=1, allow_nan=False)) + "\n"
+
+
+def _on_a_line(numbers: re.Match[str]) -> str:
+    return " ".join(numbers[0].split()).replace("[ ", "[").replace(" ]", "]")
 
 
 def read_result(path: Path, kind: str | None = None) -> dict[str, Any]:

@@ -103,7 +103,10 @@ class LoadTest:
     runs: int = 1
     """Run the load so many times, a row each; it is held if every run is."""
     workers: int = 2
-    """Frames the server reconstructs at once, and threads of a render."""
+    """Frames the server reconstructs at once."""
+    threads: int = 1
+    """Of a render, at the server of --mode full and in vehicles that are --live, which encode with
+    as many."""
     renderer: Annotated[str, RENDERER] = "cpu"
     """What the server of --mode full draws with, and vehicles that are --live."""
     out: Annotated[Path, FOLDER] = Path("out/loadtest")
@@ -116,6 +119,7 @@ class LoadTest:
     def run(self) -> None:
         """Run, write the report, print the rows; fail if the asked number is not held."""
         from rfcore.errors import InvalidInput, RfedgeError
+        from rfcore.wire.settings import RenderSettings
         from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
         from rfedge.loadtest.result import Command
         from rfedge.loadtest.run import TestBed
@@ -134,7 +138,7 @@ class LoadTest:
             kind=Vehicles.LIVE if self.live else Vehicles.PRERECORDED,
             vehicle_ms=self.vehicle_ms,
             admission=self.admission,
-            renderer=self.renderer,
+            render=RenderSettings(threads=self.threads, renderer=self.renderer),
             bounds=Bounds(deadline_ms=self.deadline_ms),
         )
         bed = TestBed(

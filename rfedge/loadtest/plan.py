@@ -7,8 +7,8 @@ from enum import StrEnum
 from pathlib import Path
 
 from rfcore.errors import InvalidInput
-from rfcore.raster.renderers import CPU, renderer_isa
 from rfcore.wire.checks import MAX_CAMERAS, MAX_PAYLOAD_BYTES
+from rfcore.wire.settings import RenderSettings
 
 __all__ = ["Bounds", "Load", "Mode", "Vehicles"]
 
@@ -68,8 +68,8 @@ class Load:
     of a frame in transport mode; other modes send what the encoder made of the drive.
     ``vehicle_ms``: how long a prerecorded vehicle waits before it sends a picture, in place of the
     encoding time of a real one. ``admission``: whether the server may refuse vehicles or lower
-    their rate; it may not by default, so that its limit can be seen. ``renderer``: what a server at
-    full work and live vehicles draw with (``rfcore.raster.renderers``).
+    their rate; it may not by default, so that its limit can be seen. ``render``: threads and
+    renderer of a server at full work and of live vehicles.
     """
 
     mode: Mode
@@ -83,7 +83,7 @@ class Load:
     kind: Vehicles = Vehicles.PRERECORDED
     vehicle_ms: float = 0.0
     admission: bool = False
-    renderer: str = CPU
+    render: RenderSettings = RenderSettings()
     bounds: Bounds = Bounds()
 
     def __post_init__(self) -> None:
@@ -104,12 +104,13 @@ class Load:
         self._check_kind()
 
     def _check_kind(self) -> None:
-        renderer_isa(self.renderer)
         if self.mode is not Mode.FULL:
             if self.admission:
                 raise InvalidInput("admission", f"needs mode full, not {self.mode}")
-            if self.renderer != CPU:
-                raise InvalidInput("renderer", f"{self.renderer} needs mode full, not {self.mode}")
+            if self.render != RenderSettings():
+                raise InvalidInput(
+                    "render", f"threads and renderer need mode full, not {self.mode}"
+                )
         if self.kind is Vehicles.PRERECORDED:
             return
         if self.mode is not Mode.FULL:

@@ -167,6 +167,7 @@ KEY = (
     "vehicle_ms",
     "admission",
     "renderer",
+    "threads",
     "run",
 )
 """Fields that tell one load from another: a recorded row is replaced by one that has the same."""

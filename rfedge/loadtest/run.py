@@ -96,6 +96,8 @@ class LoadRow:
     generator_lag_ms: float
     """99th percentile of how late the generator's event loop was."""
     renderer: str = CPU
+    threads: int = 1
+    """Of a render."""
     command: str | None = None
     """In a file of several runs, as ``revision``: how this row was made."""
     revision: str | None = None
@@ -156,7 +158,7 @@ def _server(load: Load, bed: TestBed) -> Any:
     if load.mode is Mode.FULL:
         command = [*command_of("mec-server"), "--fields", fields, "--workers", workers]
         limits = () if load.admission else ("--max-load", "0")
-        command += ["--renderer", load.renderer, "--listen", "127.0.0.1:0", *limits]
+        command += [*_render(load), "--listen", "127.0.0.1:0", *limits]
         return service("mec-server", command, bed.work)
     module = [sys.executable, "-m", "rfedge.loadtest.server"]
     return service("mec-server", [*module, load.mode, fields, workers], bed.work)
@@ -178,8 +180,12 @@ def _agent(load: Load, bed: TestBed) -> Sequence[str]:
         *command_of("cav-agent"),
         *("--drive", str(bed.drive), "--fields", str(bed.field.parent)),
         *CoderSettings.of(bed.effort).arguments,
-        *("--crf", str(bed.crf), "--renderer", load.renderer, "--loop"),
+        *("--crf", str(bed.crf), "--loop", *_render(load)),
     ]
+
+
+def _render(load: Load) -> Sequence[str]:
+    return ["--threads", str(load.render.threads), "--renderer", load.render.renderer]
 
 
 def _row(
@@ -207,7 +213,8 @@ def _row(
         duration_s=load.duration_s,
         vehicle_ms=load.vehicle_ms,
         admission=load.admission,
-        renderer=load.renderer,
+        renderer=load.render.renderer,
+        threads=load.render.threads,
         **measurements.fields(),
     )
 

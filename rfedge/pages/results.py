@@ -25,7 +25,7 @@ from rfedge.experiments.latency.tail import tail_section
 from rfedge.experiments.localisation.rows import localise_section
 from rfedge.experiments.never_worse.measure import never_worse_section
 from rfedge.experiments.paper.figures import write_paper_figures
-from rfedge.experiments.paper.report import PaperRow, paper_section
+from rfedge.experiments.paper.report import paper_rows, paper_section
 from rfedge.experiments.robust.report import robust_section, write_robust_figure
 from rfedge.experiments.robust.seams import seams_section
 from rfedge.experiments.slice_coder.report import slice_coder_section
@@ -35,7 +35,7 @@ from rfedge.loadtest.result import load_section, ratio_section
 from rfedge.loadtest.rig.report import rig_section
 from rfedge.loadtest.soak import soak_section
 from rfedge.report.tables import heading
-from rfedge.results import Result, read_result, rows_of
+from rfedge.results import Result, read_result
 from rfedge.training.report import training_section
 
 __all__ = ["results_page", "with_headline", "write_figures"]
@@ -107,7 +107,7 @@ DRAWINGS: Mapping[str, Callable[[Result, Path], list[Path]]] = {
     "compare": write_compare_figures,
     "ladder": write_ladder_figure,
     "latency": write_latency_figures,
-    "paper": lambda result, out: write_paper_figures(rows_of(PaperRow, result["rows"]), out),
+    "paper": lambda result, out: write_paper_figures(paper_rows(result), out),
     "robust": write_robust_figure,
 }
 """Figures of the kinds of results that have some."""

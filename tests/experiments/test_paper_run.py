@@ -10,9 +10,15 @@ from rich.console import Console
 
 from rfcore.errors import InvalidInput
 from rfedge.experiments.paper.figures import write_paper_figures, write_views
-from rfedge.experiments.paper.report import PaperRow, means_of, savings_by_frame
+from rfedge.experiments.paper.report import (
+    PaperRow,
+    means_of,
+    paper_rows,
+    paper_tables,
+    savings_by_frame,
+)
 from rfedge.experiments.paper.run import PaperJob, named_path, run_paper, views_of
-from rfedge.results import rows_of
+from rfedge.results import as_json
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 
@@ -55,6 +61,25 @@ def test_a_frames_savings_are_its_mean_over_settings_and_the_spread_is_over_fram
 def test_a_clip_whose_second_picture_is_no_p_picture_is_counted():
     (mean,) = means_of([*ROWS[:3], row("b", 23, 70.0, second_type="I")])
     assert mean.second_not_p == 0.25
+
+
+def test_tables_hold_what_the_rows_say_to_a_thousandth_of_a_decibel():
+    share = 100 * 2000 / 3000
+    settings = [(f, crf, size) for size in (300, 500) for f in "ab" for crf in (18.0, 23.0)]
+    rows = [row(f, crf, share, width=size, psnr_db=36.00049) for f, crf, size in settings]
+    rows += [row("a", 23.0, share, field="3dgs:grey", rf_flip=None, second_type="I", psnr_db=None)]
+    tables = as_json(paper_tables(rows))
+    assert [len(table["settings"]) for table in tables] == [2, 2, 1]
+    read = paper_rows({"tables": tables})
+    exact = [replace(each, psnr_db=each.psnr_db and round(each.psnr_db, 3)) for each in rows]
+    assert sorted(map(repr, read)) == sorted(
+        repr(replace(r, rf_residual_bands=[0.1, 0.2, 0.4, 0.8])) for r in exact
+    )
+
+
+def test_a_table_that_lacks_a_frame_is_refused():
+    with pytest.raises(InvalidInput, match=r"\('medium', 23\) of 3dgs has other frames"):
+        paper_tables(ROWS[:3])
 
 
 def test_savings_by_frame_leave_out_what_was_rendered_natively():
@@ -102,19 +127,19 @@ def paper(thumbnail, tmp_path_factory):
 
 def test_every_frame_is_coded_at_every_setting_with_both_controls_beside_it(paper):
     _, result = paper
-    rows = result["rows"]
-    full = [r for r in rows if r["field"] == "3dgs" and r["width"] == 96]
-    small = [r for r in rows if r["field"] == "3dgs" and r["width"] == 48]
+    rows = paper_rows(result)
+    full = [row for row in rows if row.field == "3dgs" and row.width == 96]
+    small = [row for row in rows if row.field == "3dgs" and row.width == 48]
     # Two frames at three presets and three CRFs; at the small size rendered both ways.
     assert (len(full), len(small)) == (2 * 9, 2 * 9 * 2)
-    controls = {row["field"] for row in rows} - {"3dgs"}
+    controls = {row.field for row in rows} - {"3dgs"}
     assert controls == {"3dgs:behind", "3dgs:grey"}
     assert len(rows) == len(full) + len(small) + 2 * 2 * 2
 
 
 def test_the_field_saves_more_than_what_knows_nothing(paper):
     _, result = paper
-    means = means_of(rows_of(PaperRow, result["rows"]))
+    means = means_of(paper_rows(result))
     means = {(mean.field, mean.size_px[0], mean.making): mean for mean in means}
     for width in (96, 48):
         field = means["3dgs", width, "downscaled"].savings_percent
@@ -123,10 +148,12 @@ def test_the_field_saves_more_than_what_knows_nothing(paper):
 
 
 def test_the_published_figure_is_that_of_the_bytes_beside_it(paper):
-    _, result = paper
-    for row in result["rows"]:
+    job, _ = paper
+    rows = [row for cell in job.cells.iterdir() for row in json.loads(cell.read_text())["result"]]
+    for row in rows:
         expected = 100 * row["i_bytes"] / (row["i_bytes"] + row["p_bytes"])
         assert row["savings_percent"] == pytest.approx(expected)
+    assert rows
 
 
 def test_a_run_stopped_after_a_cell_goes_on_from_it(paper):
@@ -135,7 +162,7 @@ def test_a_run_stopped_after_a_cell_goes_on_from_it(paper):
     times = [path.stat().st_mtime_ns for path in cells[1:]]
     cells[0].unlink()
     again = run_paper(job, Console(quiet=True))
-    assert again["rows"] == result["rows"]
+    assert again["tables"] == result["tables"]
     assert [path.stat().st_mtime_ns for path in cells[1:]] == times
     assert cells[0].exists()
 
@@ -182,10 +209,10 @@ def test_a_quick_run_gives_the_published_rows_and_its_controls(tmp_path):
         cells=tmp_path / "cells",
         quick=True,
     )
-    rows = run_paper(job, Console(quiet=True))["rows"]
-    assert rows == json.loads(job.out.read_text())["rows"]
-    assert run_paper(job, Console(quiet=True))["rows"] == rows
-    means = means_of(rows_of(PaperRow, rows))
+    result = run_paper(job, Console(quiet=True))
+    assert result == json.loads(job.out.read_text())
+    assert run_paper(job, Console(quiet=True))["tables"] == result["tables"]
+    means = means_of(paper_rows(result))
     means = {(mean.field, mean.making): mean.savings_percent for mean in means}
     field = means["3dgs", "downscaled"]
     assert field > means["3dgs:behind", "downscaled"] > 0

@@ -9,8 +9,10 @@ import pytest
 
 from mec_server.config import AdmissionLimits
 from rfcore.codec.decoder import DeltaDecoder
+from rfcore.errors import InvalidInput
 from rfcore.field import render_field_view
 from rfcore.field.quality import FULL
+from rfcore.wire.settings import RenderSettings
 from rfedge.loadtest.fleet import Departure, FleetSpec, run_fleet
 from rfedge.loadtest.plan import Bounds, Load, Mode, Vehicles
 from rfedge.loadtest.prerecorded import PrerecordedDrive, payload_drive, prerecorded_drive
@@ -120,6 +122,21 @@ def test_kept_renders_are_rendered_once(street: Any) -> None:
     assert len(asked) == 1
 
 
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"admission": True}, "admission: needs mode full, not receiver"),
+        ({"kind": Vehicles.LIVE}, "live vehicles need mode full, not receiver"),
+        ({"render": RenderSettings(threads=2)}, "render: threads and renderer need mode full"),
+    ],
+)
+def test_a_server_that_does_not_render_refuses_what_asks_for_it(
+    changes: dict[str, Any], problem: str
+) -> None:
+    with pytest.raises(InvalidInput, match=problem):
+        Load(Mode.RECEIVER, 1, 10.0, **changes)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "kind", "link"),
@@ -134,9 +151,9 @@ def test_the_command_leaves_a_page_and_rows(
     street: Any, tmp_path: Path, mode: Mode, kind: Vehicles, link: str | None
 ) -> None:
     root = Path(__file__).parents[2]
-    load = Load(
-        mode, 2, 5.0, 2.0, 0.5, link=root / link if link else None, kind=kind, bounds=PATIENT
-    )
+    render = RenderSettings(threads=2 if mode is Mode.FULL else 1)
+    profile = root / link if link else None
+    load = Load(mode, 2, 5.0, 2.0, 0.5, link=profile, kind=kind, render=render, bounds=PATIENT)
     field = next(street.store.glob("*.rff"))
     bed = TestBed(field, street.drive, 2, tmp_path / "cache", tmp_path / "work", "fast")
     committed = tmp_path / "results.json"
@@ -144,6 +161,7 @@ def test_the_command_leaves_a_page_and_rows(
     assert result.most_held == 2, result.runs[0].verdict.broken
     (row,) = json.loads(committed.read_text())["rows"]
     assert (row["mode"], row["nacked"], row["refused"], row["held"]) == (mode, 0, 0, True)
+    assert (row["renderer"], row["threads"]) == ("cpu", render.threads)
     assert row["server_cores"] > 0.0
     assert (row["links_cores"] > 0.0) == (link is not None)
     page = (tmp_path / "out" / "report.html").read_text()

@@ -39,9 +39,8 @@ class EvalPaper:
 
         from rfedge.arguments import parse_size
         from rfedge.experiments.paper.figures import write_paper_figures, write_views
-        from rfedge.experiments.paper.report import PaperRow, print_means
+        from rfedge.experiments.paper.report import paper_rows, print_means
         from rfedge.experiments.paper.run import PaperJob, run_paper, views_of
-        from rfedge.results import rows_of
 
         sizes_px = [parse_size(size) for size in self.sizes]
         job = PaperJob(
@@ -55,7 +54,7 @@ class EvalPaper:
         )
         console = Console()
         result = run_paper(job, console)
-        rows = rows_of(PaperRow, result["rows"])
+        rows = paper_rows(result)
         print_means(console, rows)
         written = write_paper_figures(rows, self.figures)
         for path in [*written, *write_views(views_of(job), self.figures)]:

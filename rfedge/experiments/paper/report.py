@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,18 @@ from rfcore.errors import InvalidInput
 from rfedge.report.tables import heading, print_table, table
 from rfedge.results import Result, rows_of
 
-__all__ = ["PaperMean", "PaperRow", "means_of", "paper_section", "print_means", "savings_by_frame"]
+__all__ = [
+    "PaperMean",
+    "PaperRow",
+    "PaperTable",
+    "SettingColumns",
+    "means_of",
+    "paper_rows",
+    "paper_section",
+    "paper_tables",
+    "print_means",
+    "savings_by_frame",
+]
 
 
 @dataclass(frozen=True)
@@ -77,6 +88,141 @@ class PaperRow:
     def is_control(self) -> bool:
         """Whether the render knows nothing of the place."""
         return ":" in self.field
+
+
+@dataclass(frozen=True)
+class SettingColumns:
+    """What ``PaperRow`` says of each frame at one preset and CRF, in the order of the frames."""
+
+    preset: str
+    crf: float
+    i_bytes: Sequence[int]
+    p_bytes: Sequence[int]
+    second_types: str
+    """A letter a frame."""
+    header_bytes: Sequence[int]
+    i_psnr_db: Sequence[float | None]
+    psnr_db: Sequence[float | None]
+    ssim: Sequence[float]
+    camera_i_bytes: Sequence[int]
+    camera_i_psnr_db: Sequence[float | None]
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """The rows of one field, scene, size and way of rendering as the result file has them.
+
+    A row for each of 144 frames and nine settings would take ten times as much. Rounded: decibels
+    to thousandths, other shares to five decimals; savings are left out, bytes say them.
+    """
+
+    field: str
+    scene: str
+    width: int
+    height: int
+    render: str
+    frames: Sequence[str]
+    rf_psnr_db: Sequence[float]
+    rf_ssim: Sequence[float]
+    rf_residual_bands: Sequence[Sequence[float]]
+    settings: Sequence[SettingColumns]
+    rf_flip: Sequence[float] | None = None
+
+
+OF_A_SETTING = (
+    "header_bytes",
+    "i_psnr_db",
+    "psnr_db",
+    "ssim",
+    "camera_i_bytes",
+    "camera_i_psnr_db",
+)
+"""Columns whose values are those of the rows, rounded, beside bytes and types of the pictures."""
+
+
+def paper_tables(rows: Sequence[PaperRow]) -> list[PaperTable]:
+    """Return rows as tables; raise ``InvalidInput`` where a setting lacks a frame of its table."""
+    groups: dict[tuple[Any, ...], list[PaperRow]] = {}
+    for row in rows:
+        groups.setdefault((row.field, row.scene, row.size_px, row.render), []).append(row)
+    return [_table_of(group) for group in groups.values()]
+
+
+def paper_rows(result: Result) -> list[PaperRow]:
+    """Return the rows of a result of ``rfedge eval paper``."""
+    if "rows" in result:  # older files
+        return rows_of(PaperRow, result["rows"])
+    return [row for table in rows_of(PaperTable, result["tables"]) for row in _rows_of_table(table)]
+
+
+def _table_of(group: Sequence[PaperRow]) -> PaperTable:
+    first, by_setting = group[0], dict[tuple[str, float], list[PaperRow]]()
+    for row in group:
+        by_setting.setdefault((row.preset, row.crf), []).append(row)
+    of_frames = next(iter(by_setting.values()))
+    frames = [row.frame for row in of_frames]
+    for setting, rows in by_setting.items():
+        if [row.frame for row in rows] != frames:
+            raise InvalidInput("rows", f"{setting} of {first.field} has other frames than the rest")
+    return PaperTable(
+        field=first.field,
+        scene=first.scene,
+        width=first.width,
+        height=first.height,
+        render=first.render,
+        frames=frames,
+        rf_psnr_db=_rounded(of_frames, "rf_psnr_db"),
+        rf_ssim=_rounded(of_frames, "rf_ssim"),
+        rf_residual_bands=[[round(band, 5) for band in r.rf_residual_bands] for r in of_frames],
+        rf_flip=None if first.rf_flip is None else _rounded(of_frames, "rf_flip"),
+        settings=[_columns_of(rows) for rows in by_setting.values()],
+    )
+
+
+def _columns_of(rows: Sequence[PaperRow]) -> SettingColumns:
+    return SettingColumns(
+        preset=rows[0].preset,
+        crf=rows[0].crf,
+        i_bytes=[row.i_bytes for row in rows],
+        p_bytes=[row.p_bytes for row in rows],
+        second_types="".join(row.second_type for row in rows),
+        **{name: _rounded(rows, name) for name in OF_A_SETTING},
+    )
+
+
+def _rounded(rows: Sequence[PaperRow], name: str) -> list[Any]:
+    digits = 3 if name.endswith("_db") else 5
+    values = [getattr(row, name) for row in rows]
+    return [round(value, digits) if isinstance(value, float) else value for value in values]
+
+
+def _rows_of_table(table: PaperTable) -> list[PaperRow]:
+    rows = []
+    for setting in rows_of(SettingColumns, cast("Sequence[Mapping[str, Any]]", table.settings)):
+        for n, frame in enumerate(table.frames):
+            i_bytes, p_bytes = setting.i_bytes[n], setting.p_bytes[n]
+            rows.append(
+                PaperRow(
+                    field=table.field,
+                    scene=table.scene,
+                    width=table.width,
+                    height=table.height,
+                    render=table.render,
+                    preset=setting.preset,
+                    crf=setting.crf,
+                    frame=frame,
+                    i_bytes=i_bytes,
+                    p_bytes=p_bytes,
+                    second_type=setting.second_types[n],
+                    savings_percent=100.0 * i_bytes / (i_bytes + p_bytes),
+                    rf_psnr_db=table.rf_psnr_db[n],
+                    rf_ssim=table.rf_ssim[n],
+                    rf_residual_bands=table.rf_residual_bands[n],
+                    rf_flip=None if table.rf_flip is None else table.rf_flip[n],
+                    **{name: getattr(setting, name)[n] for name in OF_A_SETTING},
+                )
+            )
+    return rows
 
 
 @dataclass(frozen=True)
@@ -178,7 +324,7 @@ PRINTED = (*COLUMNS[:4], *COLUMNS[5:10], "FLIP")
 
 def paper_section(path: Path, result: Result) -> str:
     """Return the published experiment's table; means over presets and CRFs, then over frames."""
-    means = means_of(rows_of(PaperRow, result["rows"]))
+    means = means_of(paper_rows(result))
     rows = [
         [
             *_cells(mean)[:4],

@@ -38,7 +38,7 @@ from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfcore.views import PosedPicture
 from rfedge.arguments import open_field
 from rfedge.experiments.cells import CellStore, Rows, program_version
-from rfedge.experiments.paper.report import PaperRow
+from rfedge.experiments.paper.report import PaperRow, paper_tables
 from rfedge.experiments.paper.savings import (
     intra_alone,
     published_clip,
@@ -236,7 +236,7 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
         "field_ids": {name: field.field_id for name, field in fields},
         "lpips": "n/a: no weights",
         "bands_cycles_per_px": BANDS,
-        "rows": [PaperRow.of(row) for row in rows],
+        "tables": paper_tables([PaperRow.of(row) for row in rows]),
     }
     result = make_result("paper", made, content)
     write_result(job.out, result)
