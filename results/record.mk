@@ -51,7 +51,7 @@ FIELDS := $(patsubst %,$(OUT)/%.rff,yardstick city loop)
 LOOP_LENS = $$($(dir $(RFEDGE))python -c "import json; t = json.load(open('$(LOOP)/transforms_second.json')); print(*(t[k] for k in ('fl_x', 'fl_y', 'cx', 'cy')))")
 $(OUT)/loop-localised/transforms.json: $(OUT)/loop.rff
 	mkdir -p $(OUT)/loop-second && cp $(LOOP)/images/second_* $(OUT)/loop-second
-	$(RFEDGE) scene poses $(OUT)/loop-second --register-to $< --camera-model PINHOLE --parameters $(LOOP_LENS) --out $(@D)
+	$(RFEDGE) scene poses $(OUT)/loop-second --register-to $< --camera-model PINHOLE --parameters $(LOOP_LENS) --up=-y --out $(@D)
 LOCALISED := kitti-loop-localised@10=$(OUT)/loop-localised/transforms.json,$(OUT)/loop.rff
 endif
 
