@@ -104,6 +104,7 @@ class FieldRegistration:
             answer = self._anywhere.localise(rgb, prior)
             if isinstance(answer, Localised):
                 return answer.world_from_cam
+        self._tell(f"not found in the whole field, where {self._up} is taken to be up (--up)")
         return None
 
 
@@ -150,7 +151,10 @@ def register_pictures(
                 camera = SourceCamera(intrinsics)
                 written.append(WrittenPicture(f"images/{path.name}", camera, world))
         if not written:
-            raise DatasetError(f"none of the {len(paths)} pictures was found in the field")
+            raise DatasetError(
+                f"none of the {len(paths)} pictures was found in the field, where {settings.up} is "
+                f"taken to be up; if another axis is (--up {' or '.join(UPS)}), say so"
+            )
         write_transforms(folder, written, None, None)
     return _summary(out, paths, written)
 

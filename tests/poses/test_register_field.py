@@ -11,9 +11,11 @@ import pytest
 
 from rfcore.dataset import read_dataset
 from rfcore.errors import DatasetError, FieldFormatError, InvalidInput
+from rfcore.field import load_field
 from rfcore.image import write_png
 from rfedge.arguments import is_field_file
 from rfedge.cli.scene import ScenePoses
+from rfedge.fields import register
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 FIELD = SAMPLES / "fields" / "street.rff"
@@ -71,6 +73,21 @@ def test_what_is_neither_field_nor_dataset_is_refused(tmp_path) -> None:
         ScenePoses(tmp_path / "images", tmp_path / "o", register_to=text).run()
     with pytest.raises(InvalidInput, match="is no field"):
         ScenePoses(tmp_path / "images", tmp_path / "o", register_to=Path("nosuchfield")).run()
+
+
+@pytest.mark.sample
+def test_what_is_found_nowhere_asks_which_axis_is_up(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(register, "GRID_STEPS", (0.0,))
+    noise = np.random.default_rng(1).integers(0, 256, (360, 640, 3), np.uint8)
+    (tmp_path / "images").mkdir()
+    write_png(tmp_path / "images" / "0.png", noise)
+    settings, said = register.RegisterSettings("PINHOLE", tuple(PINHOLE), "y"), []
+    with pytest.raises(DatasetError, match=r"where y is taken to be up.*--up z or y or -y"):
+        register.register_pictures(
+            tmp_path / "images", tmp_path / "out", load_field(FIELD), settings, said.append
+        )
+    assert said[-1] == "not found in the whole field, where y is taken to be up (--up)"
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.sample
