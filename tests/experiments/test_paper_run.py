@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
+from rfedge.experiments.paper import run
 from rfedge.experiments.paper.figures import write_paper_figures, write_views
 from rfedge.experiments.paper.report import (
     PaperRow,
@@ -18,6 +19,7 @@ from rfedge.experiments.paper.report import (
     savings_by_frame,
 )
 from rfedge.experiments.paper.run import PaperJob, named_path, run_paper, views_of
+from rfedge.experiments.paper.savings import intra_alone
 from rfedge.results import as_json
 
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -123,6 +125,28 @@ def paper(thumbnail, tmp_path_factory):
         quick=True,
     )
     return job, run_paper(job, Console(quiet=True))
+
+
+def test_the_camera_frame_alone_is_coded_once_for_all_fields(thumbnail, tmp_path, monkeypatch):
+    coded = []
+
+    def counted(frame, preset, crf):
+        coded.append((preset, crf))
+        return intra_alone(frame, preset, crf)
+
+    monkeypatch.setattr(run, "intra_alone", counted)
+    job = PaperJob(
+        fields=[f"3dgs={thumbnail.field}", f"again={thumbnail.field}"],
+        drives=[f"wall={thumbnail.empty.partition('=')[2]}"],
+        sizes_px=[(48, 32)],
+        out=tmp_path / "paper.json",
+        cells=tmp_path / "cells",
+        quick=True,
+    )
+    rows = paper_rows(run_paper(job, Console(quiet=True)))
+    assert len(coded) == 2 * len(set(coded)) == 2 * 9, "of two frames"
+    bytes_of = {(r.frame, r.preset, r.crf): r.camera_i_bytes for r in rows if r.field == "3dgs"}
+    assert all(bytes_of[r.frame, r.preset, r.crf] == r.camera_i_bytes for r in rows)
 
 
 def test_every_frame_is_coded_at_every_setting_with_both_controls_beside_it(paper):

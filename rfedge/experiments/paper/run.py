@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
 from typing import Any, Literal
@@ -73,15 +73,21 @@ PUBLISHED_PRESETS = ("veryslow", "medium", "veryfast")
 PUBLISHED_CRFS = (18.0, 23.0, 28.0)
 Size = tuple[int, int]
 Making = Literal["downscaled", "native"]
+Alone = dict[tuple[Size, str, float], tuple[int, float]]
+"""Slice bytes and PSNR in dB, by size, preset and CRF."""
 
 
 @dataclass(frozen=True)
 class PublishedFrame:
-    """A camera frame, and how its render is made for a size: uint8 RGB [H, W, 3]."""
+    """A camera frame, and how its render is made for a size: uint8 RGB [H, W, 3].
+
+    ``alone``: what the camera frame takes coded by itself, kept for its other fields and controls.
+    """
 
     name: str
     camera: Rgb
     render: Callable[[Size, Making], Rgb]
+    alone: Alone = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,7 @@ class Setting:
 def published_rows(frame: PublishedFrame, settings: Sequence[Setting]) -> Iterator[dict[str, Any]]:
     """Yield a row per setting. Raises ``InvalidInput`` for a size larger than the frame."""
     pairs: dict[tuple[Size, Making], _Pair] = {}
-    alone: dict[tuple[Size, str, float], tuple[int, float]] = {}
+    alone = frame.alone
     for setting in settings:
         made = (setting.size_px, setting.making)
         if made not in pairs:
@@ -201,13 +207,14 @@ class PaperJob:
 
 @dataclass(frozen=True)
 class Piece:
-    """One frame of one drive, one field and one size."""
+    """One frame of one drive, one field and one size; ``alone`` is shared by those of one frame."""
 
     field_name: str
     field: RadianceField
     scene: str
     picture: PosedPicture
     size_px: Size
+    alone: Alone
 
 
 def named_path(text: str) -> tuple[str, Path]:
@@ -258,10 +265,11 @@ def _pieces(job: PaperJob, fields: Sequence[tuple[str, RadianceField]]) -> Itera
     for scene, path in map(named_path, job.drives):
         pictures = read_dataset(path).pictures[:: job.every]
         pictures = pictures[: QUICK_FRAMES if job.quick else None]
-        for name, field in fields:
-            for picture in pictures:
+        for picture in pictures:
+            alone: Alone = {}
+            for name, opened in fields:
                 for size_px in job.sizes_px:
-                    yield Piece(name, field, scene, picture, size_px)
+                    yield Piece(name, opened, scene, picture, size_px, alone)
 
 
 def _key(piece: Piece) -> dict[str, str | float | int | None]:
@@ -303,7 +311,10 @@ def _rows(piece: Piece) -> Iterator[dict[str, Any]]:
     )
     grey = np.full((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), 128, np.uint8)
     without_field = PublishedFrame(
-        piece.picture.name, piece.picture.read(), lambda size_px, _making: reduced(grey, size_px)
+        piece.picture.name,
+        piece.picture.read(),
+        lambda size_px, _making: reduced(grey, size_px),
+        piece.alone,
     )
     yield from _labelled(piece, f"{piece.field_name}:grey", without_field, control)
 
@@ -330,7 +341,7 @@ def _published_frame(piece: Piece, camera: Camera) -> PublishedFrame:
             piece.field, Camera(camera.intrinsics.resized(*size_px), camera.world_from_cam)
         )
 
-    return PublishedFrame(piece.picture.name, piece.picture.read(), render)
+    return PublishedFrame(piece.picture.name, piece.picture.read(), render, piece.alone)
 
 
 def _render(field: RadianceField, camera: Camera) -> Rgb:
