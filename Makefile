@@ -105,8 +105,8 @@ test-asan: build-full  ## kernels and readers under sanitizers, a build of their
 		$(BIN)/python tests/native/sanitized.py $(ASAN) -q -m "not slow" --timeout 250 \
 		$(ASAN_TESTS)
 
-SECONDS ?= 30
-fuzz: build-full  ## SECONDS (30) of coverage-guided fuzzing of each reader (tests/fuzz)
+SECONDS ?= 20
+fuzz: build-full  ## SECONDS (20) of coverage-guided fuzzing of each reader (tests/fuzz)
 	$(BIN)/python -m pip install -q --no-deps --require-hashes -r requirements/fuzz.txt
 	PYTHONPATH=. $(BIN)/python tests/fuzz/fuzz.py $(SECONDS) $(TARGETS)
 
