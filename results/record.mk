@@ -142,7 +142,7 @@ LONG := $(SCENES)/long/transforms_drive.json
 $(LONG): samples/localise/drive_30s.toml | $(SCENES)
 	$(RFEDGE) scene build $< --split drive --size 320x180 --spp 9 --out $(@D)
 $(OUT)/robust-long.json: $(LONG) | $(OUT)
-	$(RFEDGE) eval robust $(SAMPLE) long@10=$< --frames 300 --seeds 100 --rtts-ms 50 --cells $(OUT)/robust --out $@
+	$(RFEDGE) eval robust $(SAMPLE) long@10=$< --frames 300 --seeds 100 --rtts-ms 50 --processes $(shell nproc) --cells $(OUT)/robust --out $@
 $(OUT)/ladder.json: $(NGP) | $(OUT)
 	$(RFEDGE) eval ladder $(SAMPLE) $(NGP) --frames 8 --cells $(OUT)/ladder --out $@
 FASTER := vehicles-30hz vehicles-720p vehicles-720p-30hz
@@ -199,4 +199,4 @@ $(PAPER)/3dgs.rff $(PAPER)/ingp.rff: $(PAPER)/%.rff: $(PAPER)/train/transforms_t
 $(OUT)/paper.json: $(PAPER)/3dgs.rff $(PAPER)/ingp.rff $(PAPER)/empty/transforms_eval.json $(PAPER)/parked/transforms_eval.json
 	$(RFEDGE) eval paper --fields 3dgs=$(PAPER)/3dgs.rff ingp=$(PAPER)/ingp.rff --sizes 300x168 500x280 720x404 1920x1080 \
 		--drives empty=$(PAPER)/empty/transforms_eval.json parked=$(PAPER)/parked/transforms_eval.json \
-		--cells $(OUT)/paper --out $@
+		--processes $(shell nproc) --cells $(OUT)/paper --out $@

@@ -10,20 +10,32 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from rfcore.errors import InvalidData
+from rfcore.errors import InvalidData, InvalidInput
 from rfcore.files import write_whole
 from rfedge.experiments.clips import Clip, ClipCoder, CodedClip
 
-__all__ = ["CellKey", "CellStore", "Rows", "clip_key", "program_version"]
+__all__ = [
+    "CellKey",
+    "CellStore",
+    "Rows",
+    "check_processes",
+    "clip_key",
+    "each_done",
+    "program_version",
+]
 
+Item = TypeVar("Item")
+Done = TypeVar("Done")
 CellKey = Mapping[str, str | float | int | None]
 Rows = list[dict[str, Any]]
 CHECKOUT = Path(__file__).parents[2]
@@ -113,6 +125,24 @@ class CellStore:
         """Return the file that holds, or would hold, the cell of ``key``."""
         canonical = json.dumps(dict(key), sort_keys=True, allow_nan=False)
         return self.folder / f"{hashlib.sha256(canonical.encode()).hexdigest()[:32]}.json"
+
+
+def check_processes(processes: int) -> None:
+    """Raise ``InvalidInput`` for a number that ``each_done`` does not start."""
+    if not 1 <= processes <= 256:
+        raise InvalidInput("processes", f"{processes} is outside 1..256")
+
+
+def each_done(do: Callable[[Item], Done], items: Sequence[Item], processes: int) -> Iterator[Done]:
+    """Yield what ``do`` returns for every item, in their order, done in so many processes.
+
+    One is this process. Others get ``do`` and the items pickled: cells are what they share.
+    """
+    if processes == 1:
+        yield from map(do, items)
+        return
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        yield from pool.map(do, items)
 
 
 def _fields(clip: CodedClip) -> dict[str, Any]:

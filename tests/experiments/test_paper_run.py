@@ -117,9 +117,12 @@ def paper(thumbnail, tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper")
     drive = thumbnail.empty.partition("=")[2]
     job = PaperJob(
-        fields=[f"3dgs={thumbnail.field}"],
-        drives=[f"wall={drive}"],
-        sizes_px=[(96, 64), (48, 32)],
+        fields=(f"3dgs={thumbnail.field}",),
+        drives=(f"wall={drive}",),
+        sizes_px=(
+            (96, 64),
+            (48, 32),
+        ),
         out=folder / "paper.json",
         cells=folder / "cells",
         quick=True,
@@ -136,9 +139,9 @@ def test_the_camera_frame_alone_is_coded_once_for_all_fields(thumbnail, tmp_path
 
     monkeypatch.setattr(run, "intra_alone", counted)
     job = PaperJob(
-        fields=[f"3dgs={thumbnail.field}", f"again={thumbnail.field}"],
-        drives=[f"wall={thumbnail.empty.partition('=')[2]}"],
-        sizes_px=[(48, 32)],
+        fields=(f"3dgs={thumbnail.field}", f"again={thumbnail.field}"),
+        drives=(f"wall={thumbnail.empty.partition('=')[2]}",),
+        sizes_px=((48, 32),),
         out=tmp_path / "paper.json",
         cells=tmp_path / "cells",
         quick=True,
@@ -191,6 +194,12 @@ def test_a_run_stopped_after_a_cell_goes_on_from_it(paper):
     assert cells[0].exists()
 
 
+def test_several_processes_code_the_same(paper, tmp_path):
+    job, result = paper
+    elsewhere = replace(job, processes=2, cells=tmp_path / "cells", out=tmp_path / "b.json")
+    assert run_paper(elsewhere, Console(quiet=True))["tables"] == result["tables"]
+
+
 def test_the_first_frame_of_each_drive_is_shown_as_camera_and_field_see_it(paper):
     job, _ = paper
     views = dict(views_of(job))
@@ -226,9 +235,9 @@ def test_a_job_that_cannot_be_done_is_refused_by_name(change, named):
 @pytest.mark.sample
 def test_a_quick_run_gives_the_published_rows_and_its_controls(tmp_path):
     job = PaperJob(
-        fields=[f"3dgs={SAMPLES / 'fields' / 'street.rff'}"],
-        drives=[f"empty={SAMPLES / 'street' / 'transforms_drive_empty.json'}"],
-        sizes_px=[(300, 168)],
+        fields=(f"3dgs={SAMPLES / 'fields' / 'street.rff'}",),
+        drives=(f"empty={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
+        sizes_px=((300, 168),),
         out=tmp_path / "paper.json",
         cells=tmp_path / "cells",
         quick=True,

@@ -38,6 +38,17 @@ def robust(thumbnail, tmp_path_factory):
     return job, run_robust(job, Console(quiet=True))
 
 
+def test_several_processes_cross_the_same(robust):
+    job, result = robust
+    elsewhere = replace(job, processes=2, out=job.out.with_name("b.json"))
+    for path in job.cells.iterdir():
+        if '"verb": "robust"' in path.read_text():
+            path.unlink()
+    again = run_robust(elsewhere, Console(quiet=True))
+    assert again["crossings"] == result["crossings"]
+    assert again["rows"] == result["rows"]
+
+
 def test_every_method_crosses_every_link_at_every_rate_factor(robust):
     _, result = robust
     crossed = [(r["method"], r["rtt_ms"], r["loss_percent"], r["crf"]) for r in result["crossings"]]
@@ -174,6 +185,7 @@ def test_a_quick_run_writes_rows_a_figure_and_a_section_and_goes_on(tmp_path):
         ({"out": Path("x")}, "out"),
         ({"frames": 1}, "frames"),
         ({"seeds": 0}, "seeds"),
+        ({"processes": 0}, "processes"),
         ({"rtts_ms": ()}, "rtts_ms"),
         ({"rtts_ms": (20.0, -1.0)}, "rtts_ms"),
     ],

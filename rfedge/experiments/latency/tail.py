@@ -10,11 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import pairwise
-from multiprocessing import get_context
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -31,7 +29,14 @@ from rfcore.field import Quality, RadianceField, load_field
 from rfcore.image import I420
 from rfcore.motion import interpolated, quaternion_from_vector
 from rfcore.native.yuv import i420_from_colour
-from rfedge.experiments.cells import CellKey, CellStore, Rows, program_version
+from rfedge.experiments.cells import (
+    CellKey,
+    CellStore,
+    Rows,
+    check_processes,
+    each_done,
+    program_version,
+)
 from rfedge.experiments.clips import (
     MAX_NOISE_SIGMA,
     STEADY,
@@ -266,8 +271,7 @@ class TailJob:
         check_effort("effort", self.effort)
         if not 1 <= self.frames <= 10_000_000:
             raise InvalidInput("frames", f"{self.frames:,} is outside 1..10,000,000")
-        if not 1 <= self.processes <= 256:
-            raise InvalidInput("processes", f"{self.processes} is outside 1..256")
+        check_processes(self.processes)
         if not 20 <= self.quality_db <= 50:
             raise InvalidInput("quality_db", f"{self.quality_db} dB is outside 20..50 dB")
 
@@ -344,7 +348,8 @@ def run_tail(job: TailJob, console: Console) -> dict[str, Any]:
     console.print(f"{len(pieces)} pieces of {DRIVES_A_PIECE} drives, CRF {crfs[0]:g}, {crfs[1]:g}")
     gathered = {name: Gathered() for name in METHODS}
     began_s = monotonic()
-    for number, rows in enumerate(_done(pieces, job), 1):
+    kept = partial(_kept, cells=job.cells)
+    for number, rows in enumerate(each_done(kept, pieces, job.processes), 1):
         for row in rows:
             gathered[row["method"]].sizes += row["bytes"]
             gathered[row["method"]].errors.append(row["mse"])
@@ -378,14 +383,6 @@ def _firsts(job: TailJob) -> Iterator[int]:
         drives = range(first, first + DRIVES_A_PIECE)
         counted += sum(job.street.frame_count(number) - 1 for number in drives)
         first = drives.stop
-
-
-def _done(pieces: Sequence[Piece], job: TailJob) -> Iterator[Rows]:
-    if job.processes == 1:
-        yield from (_kept(piece, job.cells) for piece in pieces)
-        return
-    with ProcessPoolExecutor(job.processes, get_context("spawn")) as pool:
-        yield from pool.map(_kept, pieces, [job.cells] * len(pieces))
 
 
 def _kept(piece: Piece, cells: Path) -> Rows:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
-from multiprocessing import get_context
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +13,7 @@ from rfcore.dataset import read_dataset
 from rfcore.extras import needs
 from rfcore.localise.pose_errors import parse_error_model
 from rfcore.views import PosedPicture
-from rfedge.experiments.cells import CellKey, CellStore, Rows, program_version
+from rfedge.experiments.cells import CellKey, CellStore, Rows, each_done, program_version
 from rfedge.experiments.localisation.bits import bits_row, sensors_of, tracking_times
 from rfedge.experiments.localisation.given import GivenDrive
 from rfedge.experiments.localisation.rows import LocaliseRow
@@ -114,13 +112,8 @@ def _piece(
 
 def rows_of_pieces(wanted: Sequence[Piece], cells: Path, processes: int) -> Iterator[Any]:
     """Yield the rows, in their order, from the folder of cells or measured and kept there."""
-    if processes == 1:
-        for piece in wanted:
-            yield from _kept_rows(piece, cells)
-        return
-    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        for rows in pool.map(_kept_rows, wanted, [cells] * len(wanted)):
-            yield from rows
+    for rows in each_done(partial(_kept_rows, cells=cells), wanted, processes):
+        yield from rows
 
 
 def _kept_rows(piece: Piece, cells: Path) -> Rows:

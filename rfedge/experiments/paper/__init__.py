@@ -30,6 +30,8 @@ class EvalPaper:
     """Folder of finished pieces."""
     every: int = 1
     """Take each so many-th frame of a drive; neighbours at 10 Hz show almost the same."""
+    processes: int = 1
+    """How many processes code at once; the rows do not depend on it."""
     quick: bool = False
     """Two frames of each drive: to see that it works, not for figures."""
 
@@ -42,7 +44,7 @@ class EvalPaper:
         from rfedge.experiments.paper.report import paper_rows, print_means
         from rfedge.experiments.paper.run import PaperJob, run_paper, views_of
 
-        sizes_px = [parse_size(size) for size in self.sizes]
+        sizes_px = tuple(parse_size(size) for size in self.sizes)
         job = PaperJob(
             fields=self.fields,
             drives=self.drives,
@@ -51,6 +53,7 @@ class EvalPaper:
             cells=self.cells,
             every=self.every,
             quick=self.quick,
+            processes=self.processes,
         )
         console = Console()
         result = run_paper(job, console)

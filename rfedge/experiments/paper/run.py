@@ -18,6 +18,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache, partial
 from pathlib import Path
 from time import monotonic
 from typing import Any, Literal
@@ -37,7 +38,13 @@ from rfcore.metrics import psnr
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
 from rfcore.views import PosedPicture
 from rfedge.arguments import open_field
-from rfedge.experiments.cells import CellStore, Rows, program_version
+from rfedge.experiments.cells import (
+    CellStore,
+    Rows,
+    check_processes,
+    each_done,
+    program_version,
+)
 from rfedge.experiments.paper.report import PaperRow, paper_tables
 from rfedge.experiments.paper.savings import (
     intra_alone,
@@ -189,18 +196,20 @@ QUICK_FRAMES = 2
 class PaperJob:
     """What to run; see ``rfedge eval paper --help``. ``fields`` and ``drives`` are NAME=PATH."""
 
-    fields: Sequence[str]
-    drives: Sequence[str]
-    sizes_px: Sequence[Size]
+    fields: tuple[str, ...]
+    drives: tuple[str, ...]
+    sizes_px: tuple[Size, ...]
     out: Path
     cells: Path
     every: int = 1
     quick: bool = False
+    processes: int = 1
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
         if not (self.fields and self.drives and self.sizes_px):
             raise InvalidInput("paper", "needs at least one field, one drive and one size")
+        check_processes(self.processes)
         if self.every < 1:
             raise InvalidInput("every", f"{self.every} must be at least 1")
 
@@ -232,11 +241,15 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
     input is wrong.
     """
     require("eval", "flip_evaluator")
-    fields = [(name, open_field(path)) for name, path in map(named_path, job.fields)]
+    fields = _opened(job)
     pieces = list(_pieces(job, fields))
     store = CellStore(job.cells)
     made = provenance(path for _, path in map(named_path, (*job.fields, *job.drives)))
-    _say_cost(pieces, store, console)
+    _say_cost(pieces, store, console, job.processes)
+    if job.processes > 1:
+        pictures = range(len(pieces) // _pieces_a_picture(job))
+        for _ in each_done(partial(_picture_done, job), pictures, job.processes):
+            pass
     rows = [row for piece in pieces for row in store.rows(_key(piece), _maker(piece))]
     content = {
         "quick": job.quick,
@@ -248,6 +261,27 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
     result = make_result("paper", made, content)
     write_result(job.out, result)
     return result
+
+
+def _opened(job: PaperJob) -> list[tuple[str, RadianceField]]:
+    return [(name, open_field(path)) for name, path in map(named_path, job.fields)]
+
+
+def _picture_done(job: PaperJob, number: int) -> None:
+    """Have the rows of the job's picture of that number among the cells."""
+    pieces, each, store = _pieces_of_process(job), _pieces_a_picture(job), CellStore(job.cells)
+    for piece in pieces[each * number : each * (number + 1)]:
+        store.rows(_key(piece), _maker(piece))
+
+
+@lru_cache(maxsize=1)
+def _pieces_of_process(job: PaperJob) -> list[Piece]:
+    return list(_pieces(job, _opened(job)))
+
+
+def _pieces_a_picture(job: PaperJob) -> int:
+    """Return how many pieces follow one another that are of one picture."""
+    return len(job.fields) * len(job.sizes_px)
 
 
 def views_of(job: PaperJob) -> list[tuple[str, Rgb]]:
@@ -350,7 +384,7 @@ def _render(field: RadianceField, camera: Camera) -> Rgb:
     return pixels
 
 
-def _say_cost(pieces: Sequence[Piece], store: CellStore, console: Console) -> None:
+def _say_cost(pieces: Sequence[Piece], store: CellStore, console: Console, processes: int) -> None:
     """Do the first piece that is not there, and say what the others will take by their pixels."""
     left = [piece for piece in pieces if not store.has(_key(piece))]
     estimate = "nothing left to do"
@@ -359,7 +393,7 @@ def _say_cost(pieces: Sequence[Piece], store: CellStore, console: Console) -> No
         store.rows(_key(left[0]), _maker(left[0]))
         per_pixel_s = (monotonic() - began_s) / _pixels(left[0])
         total_s = sum(map(_pixels, left[1:])) * per_pixel_s
-        estimate = f"{len(left)} left, about {total_s / 60:.1f} minutes"
+        estimate = f"{len(left)} left, about {total_s / processes / 60:.1f} minutes"
     console.print(f"{len(pieces)} frames and sizes, {estimate}")
 
 

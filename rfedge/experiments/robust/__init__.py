@@ -51,6 +51,8 @@ class EvalRobust:
     """Folder of the figure (SVG, and CSV with its numbers)."""
     cells: Path = Path("out/eval/robust")
     """Folder of finished pieces."""
+    processes: int = 1
+    """How many processes send at once; the rows do not depend on it."""
     quick: bool = False
     """Eight frames and the extremes alone: to see that it works, not for figures."""
 
@@ -76,6 +78,7 @@ class EvalRobust:
             quick=self.quick,
             seeds=self.seeds,
             rtts_ms=self.rtts_ms,
+            processes=self.processes,
         )
         console = Console()
         result = run_robust(job, console)

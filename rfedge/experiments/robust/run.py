@@ -15,8 +15,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import product
+from functools import cached_property, lru_cache, partial
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from rfcore.field import RadianceField, load_field, render_field_view
 from rfcore.image import I420
 from rfcore.motion import quaternion_from_vector
 from rfcore.views import FieldView
-from rfedge.experiments.cells import CellStore, program_version
+from rfedge.experiments.cells import CellStore, check_processes, each_done, program_version
 from rfedge.experiments.clips import Clip, ClipCoder, CodedClip, Drive, read_drive
 from rfedge.experiments.field_coder import FieldCoder, render_clip
 from rfedge.experiments.performance import perform
@@ -161,6 +161,7 @@ class RobustJob:
     quick: bool = False
     seeds: int = 1
     rtts_ms: Sequence[float] = (20.0, 50.0, 100.0)
+    processes: int = 1
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
@@ -169,20 +170,22 @@ class RobustJob:
             raise InvalidInput("frames", f"{self.frames} must be at least 4")
         if not 1 <= self.seeds <= 10_000:
             raise InvalidInput("seeds", f"{self.seeds} is outside 1..10,000")
+        check_processes(self.processes)
         if not self.rtts_ms or not all(0 <= rtt_ms <= 10_000 for rtt_ms in self.rtts_ms):
             raise InvalidInput("rtts_ms", f"{self.rtts_ms} must be some of 0..10,000 ms")
 
 
 def run_robust(job: RobustJob, console: Console) -> dict[str, Any]:
     """Do what is not done yet, write ``job.out``, and return its content."""
-    count = QUICK_FRAMES if job.quick else job.frames
-    drive = read_drive(job.drive, count)
-    field = load_field(job.field)
     made = provenance([job.field])
-    bench = Bench(job, field, drive, CellStore(job.cells), console)
+    bench = _bench(job, console)
+    drive, field, count = bench.drive, bench.field, len(bench.drive.frames)
     scenarios = bench.scenarios()
     disturbances = 2 * len(bench.noises()) + 2
     console.print(f"{len(scenarios)} crossings and {disturbances} disturbances of {count} frames")
+    if job.processes > 1:
+        for _ in each_done(partial(_cross, job), _of_a_seed(scenarios), job.processes):
+            pass
     crossed = [bench.crossed(*scenario) for scenario in scenarios]
     disturbed = [*bench.pose_rows(), bench.lane_row(), *bench.light_rows()]
     content = {
@@ -200,6 +203,35 @@ def run_robust(job: RobustJob, console: Console) -> dict[str, Any]:
     return result
 
 
+Scenario = tuple[str, float, float, float, int]
+"""Method, round trip in ms, loss, CRF and seed of a crossing."""
+
+
+def _of_a_seed(scenarios: Sequence[Scenario]) -> list[list[Scenario]]:
+    """Return scenarios by coder and seed, what one process does at a time."""
+    return [
+        list(same)
+        for _, same in groupby(scenarios, lambda each: (each[0].startswith("x264"), *each[3:]))
+    ]
+
+
+def _cross(job: RobustJob, scenarios: Sequence[Scenario]) -> None:
+    """Have the crossings' rows among the cells."""
+    bench = _bench_of_process(job)
+    for scenario in scenarios:
+        bench.crossed(*scenario)
+
+
+@lru_cache(maxsize=1)
+def _bench_of_process(job: RobustJob) -> Bench:
+    return _bench(job, Console())
+
+
+def _bench(job: RobustJob, console: Console) -> Bench:
+    drive = read_drive(job.drive, QUICK_FRAMES if job.quick else job.frames)
+    return Bench(job, load_field(job.field), drive, CellStore(job.cells), console)
+
+
 @dataclass(frozen=True)
 class Bench:
     """What every part of the experiment needs."""
@@ -212,8 +244,8 @@ class Bench:
 
     # --- loss
 
-    def scenarios(self) -> list[tuple[str, float, float, float, int]]:
-        """Return (method, round trip in ms, loss, CRF, seed) of every crossing.
+    def scenarios(self) -> list[Scenario]:
+        """Return every crossing.
 
         Those of one seed and one coder follow one another, for what they have in common.
         """
