@@ -200,7 +200,7 @@ def text_of(result: Result) -> str:
 
 
 def _on_a_line(numbers: re.Match[str]) -> str:
-    return " ".join(numbers[0].split()).replace("[ ", "[").replace(" ]", "]")
+    return "".join(numbers[0].split())
 
 
 def read_result(path: Path, kind: str | None = None) -> dict[str, Any]:

@@ -151,9 +151,9 @@ def test_json_holds_every_finite_value_and_no_other(value: Any) -> None:
 
 def test_a_list_of_numbers_is_on_one_line() -> None:
     text = text_of({"rows": [{"ssim": [0.5, None, -1e-09], "names": ["a", "b"], "none": []}]})
-    assert '"ssim": [0.5, null, -1e-09],\n' in text
+    assert '"ssim": [0.5,null,-1e-09],\n' in text
     assert '"names": [\n' in text
-    assert text_of({"a": [[1, 2], [3]]}) == '{\n "a": [\n  [1, 2],\n  [3]\n ]\n}\n'
+    assert text_of({"a": [[1, 2], [3]]}) == '{\n "a": [\n  [1,2],\n  [3]\n ]\n}\n'
 
 
 def _has_infinity(value: Any) -> bool:

@@ -113,7 +113,7 @@ class PaperTable:
     """The rows of one field, scene, size and way of rendering as the result file has them.
 
     A row for each of 144 frames and nine settings would take ten times as much. Rounded: decibels
-    to thousandths, other shares to five decimals; savings are left out, bytes say them.
+    to hundredths, other shares to five decimals; savings are left out, bytes say them.
     """
 
     field: str
@@ -191,7 +191,7 @@ def _columns_of(rows: Sequence[PaperRow]) -> SettingColumns:
 
 
 def _rounded(rows: Sequence[PaperRow], name: str) -> list[Any]:
-    digits = 3 if name.endswith("_db") else 5
+    digits = 2 if name.endswith("_db") else 5
     values = [getattr(row, name) for row in rows]
     return [round(value, digits) if isinstance(value, float) else value for value in values]
 
