@@ -142,10 +142,7 @@ OF_A_SETTING = (
 
 def paper_tables(rows: Sequence[PaperRow]) -> list[PaperTable]:
     """Return rows as tables; raise ``InvalidInput`` where a setting lacks a frame of its table."""
-    groups: dict[tuple[Any, ...], list[PaperRow]] = {}
-    for row in rows:
-        groups.setdefault((row.field, row.scene, row.size_px, row.render), []).append(row)
-    return [_table_of(group) for group in groups.values()]
+    return [_table_of(group) for group in _groups(rows)]
 
 
 def paper_rows(result: Result) -> list[PaperRow]:
@@ -153,6 +150,14 @@ def paper_rows(result: Result) -> list[PaperRow]:
     if "rows" in result:  # older files
         return rows_of(PaperRow, result["rows"])
     return [row for table in rows_of(PaperTable, result["tables"]) for row in _rows_of_table(table)]
+
+
+def _groups(rows: Sequence[PaperRow]) -> list[list[PaperRow]]:
+    """Return rows by field, scene, size and way of rendering, in the order of the first of each."""
+    groups: dict[tuple[Any, ...], list[PaperRow]] = {}
+    for row in rows:
+        groups.setdefault((row.field, row.scene, row.size_px, row.render), []).append(row)
+    return list(groups.values())
 
 
 def _table_of(group: Sequence[PaperRow]) -> PaperTable:
@@ -250,10 +255,7 @@ class PaperMean:
 
 def means_of(rows: Sequence[PaperRow]) -> list[PaperMean]:
     """Return a mean for every combination there is, in the order of the rows."""
-    groups: dict[tuple[Any, ...], list[PaperRow]] = {}
-    for row in rows:
-        groups.setdefault((row.field, row.scene, row.size_px, row.render), []).append(row)
-    return [_mean(group) for group in groups.values()]
+    return [_mean(group) for group in _groups(rows)]
 
 
 def savings_by_frame(
