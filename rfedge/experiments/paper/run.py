@@ -18,7 +18,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from time import monotonic
 from typing import Any, Literal
@@ -215,15 +215,35 @@ class PaperJob:
 
 
 @dataclass(frozen=True)
-class Piece:
-    """One frame of one drive, one field and one size; ``alone`` is shared by those of one frame."""
+class DriveFrame:
+    """One frame of one drive, with what its fields and sizes share."""
 
-    field_name: str
-    field: RadianceField
     scene: str
     picture: PosedPicture
+    alone: Alone = field(default_factory=dict)
+
+    @cached_property
+    def digest(self) -> str:
+        """Of pixels and camera."""
+        pose = repr(self.picture.camera).encode()
+        return hashlib.sha256(self.picture.read().tobytes() + pose).hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class NamedField:
+    """A field by its name in the result."""
+
+    name: str
+    field: RadianceField
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One frame of one drive, one field and one size."""
+
+    source: DriveFrame
+    field: NamedField
     size_px: Size
-    alone: Alone
 
 
 def named_path(text: str) -> tuple[str, Path]:
@@ -253,7 +273,7 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
     rows = [row for piece in pieces for row in store.rows(_key(piece), _maker(piece))]
     content = {
         "quick": job.quick,
-        "field_ids": {name: field.field_id for name, field in fields},
+        "field_ids": {opened.name: opened.field.field_id for opened in fields},
         "lpips": "n/a: no weights",
         "bands_cycles_per_px": BANDS,
         "tables": paper_tables([PaperRow.of(row) for row in rows]),
@@ -263,8 +283,8 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
     return result
 
 
-def _opened(job: PaperJob) -> list[tuple[str, RadianceField]]:
-    return [(name, open_field(path)) for name, path in map(named_path, job.fields)]
+def _opened(job: PaperJob) -> list[NamedField]:
+    return [NamedField(name, open_field(path)) for name, path in map(named_path, job.fields)]
 
 
 def _picture_done(job: PaperJob, number: int) -> None:
@@ -295,26 +315,24 @@ def views_of(job: PaperJob) -> list[tuple[str, Rgb]]:
     return views
 
 
-def _pieces(job: PaperJob, fields: Sequence[tuple[str, RadianceField]]) -> Iterator[Piece]:
+def _pieces(job: PaperJob, fields: Sequence[NamedField]) -> Iterator[Piece]:
     for scene, path in map(named_path, job.drives):
         pictures = read_dataset(path).pictures[:: job.every]
         pictures = pictures[: QUICK_FRAMES if job.quick else None]
         for picture in pictures:
-            alone: Alone = {}
-            for name, opened in fields:
+            frame = DriveFrame(scene, picture)
+            for opened in fields:
                 for size_px in job.sizes_px:
-                    yield Piece(name, opened, scene, picture, size_px, alone)
+                    yield Piece(frame, opened, size_px)
 
 
 def _key(piece: Piece) -> dict[str, str | float | int | None]:
-    pixels = piece.picture.read()
-    pose = repr(piece.picture.camera).encode()
     return {
-        "field": piece.field.field_id,
-        "field_name": piece.field_name,
-        "scene": piece.scene,
-        "frame": piece.picture.name,
-        "input": hashlib.sha256(pixels.tobytes() + pose).hexdigest(),
+        "field": piece.field.field.field_id,
+        "field_name": piece.field.name,
+        "scene": piece.source.scene,
+        "frame": piece.source.picture.name,
+        "input": piece.source.digest,
         "width": piece.size_px[0],
         "height": piece.size_px[1],
         "program": program_version(),
@@ -332,50 +350,59 @@ def _rows(piece: Piece) -> Iterator[dict[str, Any]]:
         for preset in PUBLISHED_PRESETS
         for crf in PUBLISHED_CRFS
     ]
-    frame = _published_frame(piece, piece.picture.camera)
+    frame = _published_frame(piece, piece.source.picture.camera)
     size_px = piece.size_px
     difference = flip(frame.render(size_px, "downscaled"), reduced(frame.camera, size_px))
-    for row in _labelled(piece, piece.field_name, frame, settings):
+    for row in _labelled(piece, piece.field.name, frame, settings):
         yield row if row["render"] == "native" else {**row, "rf_flip": difference}
     control = [Setting(piece.size_px, "downscaled", CONTROL_PRESET, CONTROL_CRF)]
-    camera = piece.picture.camera
+    camera = piece.source.picture.camera
     behind = Camera(camera.intrinsics, camera.world_from_cam.compose(TURNED_ROUND))
     yield from _labelled(
-        piece, f"{piece.field_name}:behind", _published_frame(piece, behind), control
+        piece, f"{piece.field.name}:behind", _published_frame(piece, behind), control
     )
     grey = np.full((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), 128, np.uint8)
     without_field = PublishedFrame(
-        piece.picture.name,
-        piece.picture.read(),
+        piece.source.picture.name,
+        piece.source.picture.read(),
         lambda size_px, _making: reduced(grey, size_px),
-        piece.alone,
+        piece.source.alone,
     )
-    yield from _labelled(piece, f"{piece.field_name}:grey", without_field, control)
+    yield from _labelled(piece, f"{piece.field.name}:grey", without_field, control)
 
 
 def _makings(piece: Piece) -> Sequence[Making]:
-    k = piece.picture.camera.intrinsics
+    k = piece.source.picture.camera.intrinsics
     full = piece.size_px == (k.width_px, k.height_px)
     return ("downscaled",) if full else ("downscaled", "native")
 
 
 def _labelled(piece: Piece, label: str, frame: PublishedFrame, settings: Sequence[Setting]) -> Rows:
     return [
-        {"field": label, "scene": piece.scene, **row} for row in published_rows(frame, settings)
+        {"field": label, "scene": piece.source.scene, **row}
+        for row in published_rows(frame, settings)
     ]
 
 
 def _published_frame(piece: Piece, camera: Camera) -> PublishedFrame:
-    full = _render(piece.field, camera)
+    full = _at_own_size(piece.field, camera)
 
     def render(size_px: Size, making: Making) -> Rgb:
         if making == "downscaled":
             return reduced(full, size_px)
         return _render(
-            piece.field, Camera(camera.intrinsics.resized(*size_px), camera.world_from_cam)
+            piece.field.field, Camera(camera.intrinsics.resized(*size_px), camera.world_from_cam)
         )
 
-    return PublishedFrame(piece.picture.name, piece.picture.read(), render, piece.alone)
+    return PublishedFrame(
+        piece.source.picture.name, piece.source.picture.read(), render, piece.source.alone
+    )
+
+
+@lru_cache(maxsize=2)
+def _at_own_size(opened: NamedField, camera: Camera) -> Rgb:
+    """Return the render that those at a frame's smaller sizes are made of."""
+    return _render(opened.field, camera)
 
 
 def _render(field: RadianceField, camera: Camera) -> Rgb:
