@@ -105,3 +105,9 @@ def test_a_drive_without_a_field_is_refused() -> None:
 def test_a_sensor_of_another_form_is_refused_before_any_work() -> None:
     with pytest.raises(InvalidInput, match="whichever"):
         EvalLocalise(drives=("a=d.json,f.rff",), errors=("whichever",)).run()
+
+
+def test_a_number_of_processes_that_cannot_be_is_refused(tmp_path: Path) -> None:
+    asked = EvalLocalise(drives=("a=b,c",), processes=0, out=tmp_path / "out.json")
+    with pytest.raises(InvalidInput, match="processes: 0 is outside"):
+        asked.run()

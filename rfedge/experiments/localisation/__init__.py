@@ -60,13 +60,16 @@ class EvalLocalise:
     def run(self) -> None:
         """Measure every drive and print each row as it is there.
 
-        Raises ``InvalidInput`` for drives, starts and sensors of another form, before any work.
+        Raises ``InvalidInput`` for drives, starts and sensors of another form and for a number of
+        processes that cannot be, before any work.
         """
+        from rfedge.experiments.cells import check_processes
         from rfedge.experiments.localisation.given import GivenDrive
         from rfedge.experiments.localisation.measure import pieces, rows_of_pieces
         from rfedge.results import check_result_path, make_result, provenance, write_result
 
         check_result_path(self.out)
+        check_processes(self.processes)
         asked = _quick(self) if self.quick else self
         given = [GivenDrive.parse(text) for text in asked.drives]
         made = provenance(path for drive in given for path in (drive.field, drive.drive))
