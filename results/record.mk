@@ -109,14 +109,14 @@ $(OUT)/bench-%.json: | $(OUT)
 $(OUT)/bench-gpu.json: | $(OUT)  # on PoCL where there is no other OpenCL
 	$(RFEDGE) bench raster --rows native --isa opencl --json $@
 # What a machine with a GPU carries, with and without it: a server's vehicles, and both ends of one vehicle.
-LOADTEST = $(RFEDGE) loadtest --record $@ --warm-up 8 --workers 4
+LOADTEST = $(RFEDGE) loadtest --record $@ --duration 15 --workers $(shell nproc)
 $(OUT)/load-gpu.json: $(call drive,vehicles-720p) | $(OUT)
 	for renderer in opencl cpu; do \
-		$(LOADTEST) --renderer $$renderer --vehicles 8 --find-limit --duration 6 --out $(OUT)/load-gpu/limit-$$renderer || exit; \
-		for hz in 10 30; do \
-			$(LOADTEST) --renderer $$renderer --vehicles 1 --live --drive $< --hz $$hz --duration 15 --out $(OUT)/load-gpu/live-$$renderer || true; \
-		done; \
+		$(LOADTEST) --renderer $$renderer --vehicles 12 --find-limit --out $(OUT)/load-gpu/limit-$$renderer || exit; \
 	done
+	for hz in 10 30; do for renderer in opencl cpu; do \
+		$(LOADTEST) --renderer $$renderer --threads 4 --vehicles 1 --live --drive $< --hz $$hz --out $(OUT)/load-gpu/live-$$renderer || true; \
+	done; done
 $(OUT)/slice-coder.json: $(FIELDS) | $(OUT)
 	$(RFEDGE) eval slice-coder $(NOON) sample-vehicles@10=$(VEHICLES),noise=3 $(REAL) $(wordlist 2,2,$(YARDSTICK)) \
 		$(wordlist 2,2,$(YARDSTICK_30)) --out $@
