@@ -108,8 +108,9 @@ $(OUT)/bench-%.json: | $(OUT)
 	$(RFEDGE) bench $* --json $@
 $(OUT)/bench-gpu.json: | $(OUT)  # on PoCL where there is no other OpenCL
 	$(RFEDGE) bench raster --rows native --isa opencl --json $@
-# What a machine with a GPU carries, with and without it: a server's vehicles, and both ends of one vehicle.
-LOADTEST = $(RFEDGE) loadtest --record $@ --duration 15 --workers $(shell nproc)
+# What a machine with a GPU carries, with and without it: a server's vehicles, and both ends of one vehicle. Sixteen
+# workers' memory takes half a minute to settle.
+LOADTEST = $(RFEDGE) loadtest --record $@ --duration 15 --warm-up 30 --workers $(shell nproc)
 $(OUT)/load-gpu.json: $(call drive,vehicles-720p) | $(OUT)
 	for renderer in opencl cpu; do \
 		$(LOADTEST) --renderer $$renderer --vehicles 12 --find-limit --out $(OUT)/load-gpu/limit-$$renderer || exit; \
