@@ -75,6 +75,10 @@ $(SCENES)/rolling-shutter.toml: samples/street/empty.toml | $(SCENES)
 	$(call effects,street-sensor,.rolling_shutter)
 $(SCENES)/exposure.toml: samples/street/empty.toml | $(SCENES)
 	$(call effects,street-sensor,.exposure)
+$(SCENES)/lens.toml: samples/street/empty.toml | $(SCENES)
+	$(call effects,street-sensor,.lens)
+$(SCENES)/20hz.toml: samples/street/vehicles.toml | $(SCENES)
+	sed 's/^rate_hz.*/rate_hz = 20.0/; s/^duration_s.*/duration_s = 1.2/' $< >$@
 $(SCENES)/people.toml: samples/street/people.toml | $(SCENES)
 	cp $< $@
 # At other rates and sizes, and no longer than latencies need.
@@ -89,8 +93,8 @@ $(SCENES)/vehicles-%/transforms_drive.json: $(SCENES)/vehicles-%.toml
 $(SCENES)/%/transforms_drive.json: $(SCENES)/%.toml
 	$(RFEDGE) scene build $< --split drive --out $(@D)
 
-HARDER := lane-0.6 lane-1.5 dusk rain rolling-shutter exposure people
-HARDER_DRIVES := $(foreach name,$(HARDER),$(call drive,$(name)))
+HARDER := lane-0.6 lane-1.5 dusk rain rolling-shutter exposure lens people vehicles-720p
+HARDER_DRIVES := $(foreach name,$(HARDER) 20hz,$(call drive,$(name)))
 
 NOON := sample-empty@10=$(EMPTY) sample-vehicles@10=$(VEHICLES)
 REAL := $(if $(DATA),kitti-loop@10=$(LOOP)/transforms_second.json$(COMMA)$(OUT)/loop.rff \
@@ -127,7 +131,7 @@ $(OUT)/compare.json: $(FIELDS) $(if $(DATA),$(OUT)/loop-localised/transforms.jso
 		--cells $(OUT)/compare --out $@
 $(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) $(NOISY) $(YARDSTICK_30) \
-		$(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) --cells $(OUT)/compare --out $@
+		sample-vehicles@20=$(call drive,20hz) $(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) --cells $(OUT)/compare --out $@
 $(OUT)/compare-small.json: $(foreach k,30 60,$(OUT)/sample-$(k)k.rff $(if $(DATA),$(OUT)/yardstick-$(k)k.rff)) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) --rivals x264-our-tools-medium --cells $(OUT)/compare --out $@ \
 		$(foreach k,30 60,$(foreach drive,$(NOON),$(drive)$(COMMA)$(OUT)/sample-$(k)k.rff) \
