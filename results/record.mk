@@ -93,8 +93,13 @@ $(SCENES)/vehicles-%/transforms_drive.json: $(SCENES)/vehicles-%.toml
 $(SCENES)/%/transforms_drive.json: $(SCENES)/%.toml
 	$(RFEDGE) scene build $< --split drive --out $(@D)
 
-HARDER := lane-0.6 lane-1.5 dusk rain rolling-shutter exposure lens people vehicles-720p
-HARDER_DRIVES := $(foreach name,$(HARDER) 20hz,$(call drive,$(name)))
+# Through a lens, as a vehicle codes it.
+UNDISTORTED := $(SCENES)/undistorted/transforms.json
+$(UNDISTORTED): $(call drive,lens)
+	$(RFEDGE) scene convert $< --out $(@D)
+
+HARDER := lane-0.6 lane-1.5 dusk rain rolling-shutter exposure people vehicles-720p
+HARDER_DRIVES := $(foreach name,$(HARDER) 20hz,$(call drive,$(name))) $(UNDISTORTED)
 
 NOON := sample-empty@10=$(EMPTY) sample-vehicles@10=$(VEHICLES)
 REAL := $(if $(DATA),kitti-loop@10=$(LOOP)/transforms_second.json$(COMMA)$(OUT)/loop.rff \
@@ -131,7 +136,7 @@ $(OUT)/compare.json: $(FIELDS) $(if $(DATA),$(OUT)/loop-localised/transforms.jso
 		--cells $(OUT)/compare --out $@
 $(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) $(NOISY) $(YARDSTICK_30) \
-		sample-vehicles@20=$(call drive,20hz) $(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) --cells $(OUT)/compare --out $@
+		sample-vehicles@20=$(call drive,20hz) sample-lens@10=$(UNDISTORTED) $(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) --cells $(OUT)/compare --out $@
 $(OUT)/compare-small.json: $(foreach k,30 60,$(OUT)/sample-$(k)k.rff $(if $(DATA),$(OUT)/yardstick-$(k)k.rff)) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) --rivals x264-our-tools-medium --cells $(OUT)/compare --out $@ \
 		$(foreach k,30 60,$(foreach drive,$(NOON),$(drive)$(COMMA)$(OUT)/sample-$(k)k.rff) \
