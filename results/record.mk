@@ -136,7 +136,8 @@ $(OUT)/compare.json: $(FIELDS) $(if $(DATA),$(OUT)/loop-localised/transforms.jso
 		--cells $(OUT)/compare --out $@
 $(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) $(NOISY) $(YARDSTICK_30) \
-		sample-vehicles@20=$(call drive,20hz) sample-lens@10=$(UNDISTORTED) $(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) --cells $(OUT)/compare --out $@
+		sample-vehicles@20=$(call drive,20hz) sample-lens@10=$(UNDISTORTED) $(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) \
+		--background sample-people@10=$(EMPTY) --cells $(OUT)/compare --out $@
 $(OUT)/compare-small.json: $(foreach k,30 60,$(OUT)/sample-$(k)k.rff $(if $(DATA),$(OUT)/yardstick-$(k)k.rff)) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) --rivals x264-our-tools-medium --cells $(OUT)/compare --out $@ \
 		$(foreach k,30 60,$(foreach drive,$(NOON),$(drive)$(COMMA)$(OUT)/sample-$(k)k.rff) \

@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from history import git
 from rfcore.errors import InvalidInput
 from rfedge import results
 from rfedge.results import (
@@ -64,6 +65,30 @@ def checkout(tmp_path: Path) -> Path:
 def _git(checkout: Path, command: str) -> None:
     who = ["-c", "user.name=test", "-c", "user.email=test@localhost"]
     subprocess.run(["git", "-C", str(checkout), *who, *command.split()], check=True)
+
+
+# --- what is recorded in results/
+
+
+def revisions_in(content: object) -> set[str]:
+    """Return every revision that a result, its rows included, says it was made at."""
+    if isinstance(content, list):
+        return set().union(*map(revisions_in, content))
+    if not isinstance(content, dict):
+        return set()
+    own = {content["revision"]} if isinstance(content.get("revision"), str) else set()
+    return own.union(*map(revisions_in, content.values()))
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "results").glob("*.json")), ids=lambda p: p.stem)
+def test_what_is_recorded_was_made_by_committed_code_of_this_history(path: Path) -> None:
+    found = revisions_in(json.loads(path.read_text()))
+    assert found
+    assert not {at for at in found if not re.fullmatch(r"[0-9a-f]{7,40}", at)}
+    if git("rev-parse", "--is-shallow-repository").stdout.strip() != b"false":
+        pytest.skip("only a checkout with the whole history tells whether revisions are of it")
+    foreign = {at for at in found if git("merge-base", "--is-ancestor", at, "HEAD").returncode}
+    assert not foreign
 
 
 # --- how it was made
