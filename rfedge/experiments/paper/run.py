@@ -2,7 +2,8 @@
 
 Cells are one frame at one size; their rows run over presets and rate factors. Two controls stand
 beside every field, as render: ``grey`` knows nothing, ``behind`` is the field itself seen in the
-opposite direction, the right kind of picture of the wrong place.
+opposite direction, the right kind of picture of the wrong place. They are rendered at the size they
+are coded at, and at the largest of several sizes not at all: a hash grid takes long there.
 
 The experiment as published, frame by frame: rows as its tables need them.
 
@@ -239,11 +240,12 @@ class NamedField:
 
 @dataclass(frozen=True)
 class Piece:
-    """One frame of one drive, one field and one size."""
+    """One frame of one drive, one field and one size; with controls beside it or without."""
 
     source: DriveFrame
     field: NamedField
     size_px: Size
+    controlled: bool
 
 
 def named_path(text: str) -> tuple[str, Path]:
@@ -323,7 +325,8 @@ def _pieces(job: PaperJob, fields: Sequence[NamedField]) -> Iterator[Piece]:
             frame = DriveFrame(scene, picture)
             for opened in fields:
                 for size_px in job.sizes_px:
-                    yield Piece(frame, opened, size_px)
+                    controlled = size_px != max(job.sizes_px) or len(job.sizes_px) == 1
+                    yield Piece(frame, opened, size_px, controlled)
 
 
 def _key(piece: Piece) -> dict[str, str | float | int | None]:
@@ -335,6 +338,7 @@ def _key(piece: Piece) -> dict[str, str | float | int | None]:
         "input": piece.source.digest,
         "width": piece.size_px[0],
         "height": piece.size_px[1],
+        "controlled": piece.controlled,
         "program": program_version(),
     }
 
@@ -355,7 +359,12 @@ def _rows(piece: Piece) -> Iterator[dict[str, Any]]:
     difference = flip(frame.render(size_px, "downscaled"), reduced(frame.camera, size_px))
     for row in _labelled(piece, piece.field.name, frame, settings):
         yield row if row["render"] == "native" else {**row, "rf_flip": difference}
-    control = [Setting(piece.size_px, "downscaled", CONTROL_PRESET, CONTROL_CRF)]
+    if piece.controlled:
+        yield from _control_rows(piece)
+
+
+def _control_rows(piece: Piece) -> Iterator[dict[str, Any]]:
+    control = [Setting(piece.size_px, _makings(piece)[-1], CONTROL_PRESET, CONTROL_CRF)]
     camera = piece.source.picture.camera
     behind = Camera(camera.intrinsics, camera.world_from_cam.compose(TURNED_ROUND))
     yield from _labelled(
