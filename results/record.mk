@@ -52,7 +52,7 @@ LOOP_LENS = $$($(dir $(RFEDGE))python -c "import json; t = json.load(open('$(LOO
 $(OUT)/loop-localised/transforms.json: $(OUT)/loop.rff
 	mkdir -p $(OUT)/loop-second && cp $(LOOP)/images/second_* $(OUT)/loop-second
 	$(RFEDGE) scene poses $(OUT)/loop-second --register-to $< --camera-model PINHOLE --parameters $(LOOP_LENS) --up=-y --out $(@D)
-# One more drive of a single pass, of pictures alone: poses of every second one by COLMAP, of the others in the field.
+# One more drive of a single pass, of pictures alone: COLMAP poses every second one, then the others among them.
 RESIDENTIAL := $(OUT)/residential
 PINHOLE = --camera-model PINHOLE --parameters $$(awk '/^P2:/ {print $$2, $$7, $$4, $$8}' $(DATA)/kitti/residential/calib.txt)
 $(RESIDENTIAL)/map/transforms.json: | $(OUT)
@@ -62,8 +62,8 @@ $(RESIDENTIAL)/map/transforms.json: | $(OUT)
 	$(RFEDGE) scene poses $(RESIDENTIAL)/even $(PINHOLE) --out $(@D)
 $(OUT)/residential.rff: $(RESIDENTIAL)/map/transforms.json
 	$(RFEDGE) train $< --points $(<D)/points.ply --antialiased --minutes 2.5 --out $@
-$(RESIDENTIAL)/drive/transforms.json: $(OUT)/residential.rff
-	$(RFEDGE) scene poses $(RESIDENTIAL)/odd --register-to $< $(PINHOLE) --up=-y --out $(@D)
+$(RESIDENTIAL)/drive/transforms.json: $(RESIDENTIAL)/map/transforms.json
+	$(RFEDGE) scene poses $(RESIDENTIAL)/odd --register-to $(<D) --out $(@D)
 LOCALISED := kitti-loop-localised@10=$(OUT)/loop-localised/transforms.json,$(OUT)/loop.rff
 endif
 
@@ -146,7 +146,7 @@ $(OUT)/compare.json: $(FIELDS) $(if $(DATA),$(OUT)/loop-localised/transforms.jso
 	$(RFEDGE) eval compare $(SAMPLE) $(NOON) $(REAL) $(LOCALISED) $(YARDSTICK) --background sample-vehicles@10=$(EMPTY) \
 		$(if $(DATA),yardstick-vehicles@10=$(YARD)/transforms_drive_empty.json) \
 		--cells $(OUT)/compare --out $@
-$(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) $(if $(DATA),$(RESIDENTIAL)/drive/transforms.json) | $(OUT)
+$(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) $(if $(DATA),$(RESIDENTIAL)/drive/transforms.json $(OUT)/residential.rff) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) $(NOISY) $(YARDSTICK_30) \
 		sample-vehicles@20=$(call drive,20hz) sample-lens@10=$(UNDISTORTED) \
 		$(if $(DATA),kitti-residential@5=$(RESIDENTIAL)/drive/transforms.json$(COMMA)$(OUT)/residential.rff) $(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) \
