@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from cav_agent.path_estimator import PathEstimator
+from cav_agent.path_estimator import MIN_RTT_WINDOW_NS, PathEstimator
 from rfcore.errors import InvalidInput
 
 MS = 1_000_000
@@ -23,6 +23,16 @@ def answered(path: PathEstimator, sizes: list[int], min_rtt_ms: float, ns_per_by
     return now
 
 
+def remembered(sizes: list[int], min_rtt_ms: float, ns_per_byte: float) -> list[int]:
+    """Return the sizes whose answers came within the window of the shortest round trip."""
+    kept, before_last_ns = [], 0.0
+    for size_bytes in reversed(sizes):
+        if before_last_ns <= MIN_RTT_WINDOW_NS:
+            kept.append(size_bytes)
+        before_last_ns += min_rtt_ms * MS + ns_per_byte * size_bytes + 10 * MS
+    return kept
+
+
 @given(
     sizes=st.lists(st.integers(200, 100_000), min_size=1, max_size=20),
     min_rtt_ms=st.floats(0, 200),
@@ -30,12 +40,14 @@ def answered(path: PathEstimator, sizes: list[int], min_rtt_ms: float, ns_per_by
     spare_ms=st.integers(1, 1000),
 )
 @example(sizes=[295], min_rtt_ms=0.0, ns_per_byte=81.5, spare_ms=1)
+@example(sizes=[200, 59_876, 59_875], min_rtt_ms=200.0, ns_per_byte=80_000.0, spare_ms=1)
 def test_what_it_says_has_room_has(
     sizes: list[int], min_rtt_ms: float, ns_per_byte: float, spare_ms: int
 ) -> None:
     """On a steady path, wherever its delay is above that of the shortest packet."""
     path = PathEstimator()
     now = answered(path, sizes, min_rtt_ms, ns_per_byte)
+    sizes = remembered(sizes, min_rtt_ms, ns_per_byte)
     spare_ns = spare_ms * MS
     room = path.room_bytes(now, now + spare_ns, now)
     shortest_ns = min_rtt_ms * MS + ns_per_byte * min(sizes)
