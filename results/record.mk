@@ -52,6 +52,7 @@ LOOP_LENS = $$($(dir $(RFEDGE))python -c "import json; t = json.load(open('$(LOO
 $(OUT)/loop-localised/transforms.json: $(OUT)/loop.rff
 	mkdir -p $(OUT)/loop-second && cp $(LOOP)/images/second_* $(OUT)/loop-second
 	$(RFEDGE) scene poses $(OUT)/loop-second --register-to $< --camera-model PINHOLE --parameters $(LOOP_LENS) --up=-y --out $(@D)
+LOCALISED := kitti-loop-localised@10=$(OUT)/loop-localised/transforms.json,$(OUT)/loop.rff
 # One more drive of a single pass, of pictures alone: COLMAP poses every second one, then the others among them.
 RESIDENTIAL := $(OUT)/residential
 PINHOLE = --camera-model PINHOLE --parameters $$(awk '/^P2:/ {print $$2, $$7, $$4, $$8}' $(DATA)/kitti/residential/calib.txt)
@@ -64,7 +65,7 @@ $(OUT)/residential.rff: $(RESIDENTIAL)/map/transforms.json
 	$(RFEDGE) train $< --points $(<D)/points.ply --antialiased --minutes 2.5 --out $@
 $(RESIDENTIAL)/drive/transforms.json: $(RESIDENTIAL)/map/transforms.json
 	$(RFEDGE) scene poses $(RESIDENTIAL)/odd --register-to $(<D) --out $(@D)
-LOCALISED := kitti-loop-localised@10=$(OUT)/loop-localised/transforms.json,$(OUT)/loop.rff
+RESIDENTIAL_DRIVE := kitti-residential@5=$(RESIDENTIAL)/drive/transforms.json,$(OUT)/residential.rff
 endif
 
 # --- drives: through the sample's street under other circumstances, and of other people
@@ -89,11 +90,11 @@ $(SCENES)/exposure.toml: samples/street/empty.toml | $(SCENES)
 	$(call effects,street-sensor,.exposure)
 $(SCENES)/lens.toml: samples/street/empty.toml | $(SCENES)
 	$(call effects,street-sensor,.lens)
-$(SCENES)/20hz.toml: samples/street/vehicles.toml | $(SCENES)
-	sed 's/^rate_hz.*/rate_hz = 20.0/; s/^duration_s.*/duration_s = 1.2/' $< >$@
 $(SCENES)/people.toml: samples/street/people.toml | $(SCENES)
 	cp $< $@
 # At other rates and sizes, and no longer than latencies need.
+$(SCENES)/20hz.toml: samples/street/vehicles.toml | $(SCENES)
+	sed 's/^rate_hz.*/rate_hz = 20.0/; s/^duration_s.*/duration_s = 1.2/' $< >$@
 $(SCENES)/vehicles-30hz.toml: samples/street/vehicles.toml | $(SCENES)
 	sed 's/^rate_hz.*/rate_hz = 30.0/; s/^duration_s.*/duration_s = 0.8/' $< >$@
 $(SCENES)/vehicles-720p.toml: samples/street/vehicles.toml | $(SCENES)
@@ -148,8 +149,8 @@ $(OUT)/compare.json: $(FIELDS) $(if $(DATA),$(OUT)/loop-localised/transforms.jso
 		--cells $(OUT)/compare --out $@
 $(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) $(if $(DATA),$(RESIDENTIAL)/drive/transforms.json $(OUT)/residential.rff) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) $(NOISY) $(YARDSTICK_30) \
-		sample-vehicles@20=$(call drive,20hz) sample-lens@10=$(UNDISTORTED) \
-		$(if $(DATA),kitti-residential@5=$(RESIDENTIAL)/drive/transforms.json$(COMMA)$(OUT)/residential.rff) $(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) \
+		sample-vehicles@20=$(call drive,20hz) sample-lens@10=$(UNDISTORTED) $(RESIDENTIAL_DRIVE) \
+		$(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) \
 		--background sample-people@10=$(EMPTY) --cells $(OUT)/compare --out $@
 $(OUT)/compare-small.json: $(foreach k,30 60,$(OUT)/sample-$(k)k.rff $(if $(DATA),$(OUT)/yardstick-$(k)k.rff)) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) --rivals x264-our-tools-medium --cells $(OUT)/compare --out $@ \

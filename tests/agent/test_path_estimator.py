@@ -10,6 +10,11 @@ from cav_agent.path_estimator import MIN_RTT_WINDOW_NS, PathEstimator
 from rfcore.errors import InvalidInput
 
 MS = 1_000_000
+GAP_NS = 10 * MS
+
+
+def round_trip_ns(size_bytes: int, min_rtt_ms: float, ns_per_byte: float) -> int:
+    return round(min_rtt_ms * MS + ns_per_byte * size_bytes)
 
 
 def answered(path: PathEstimator, sizes: list[int], min_rtt_ms: float, ns_per_byte: float) -> int:
@@ -17,19 +22,19 @@ def answered(path: PathEstimator, sizes: list[int], min_rtt_ms: float, ns_per_by
     now = 0
     for key, size_bytes in enumerate(sizes):
         path.sent(key, size_bytes, now)
-        now += round(min_rtt_ms * MS + ns_per_byte * size_bytes)
+        now += round_trip_ns(size_bytes, min_rtt_ms, ns_per_byte)
         path.answered(key, now)
-        now += 10 * MS
+        now += GAP_NS
     return now
 
 
 def remembered(sizes: list[int], min_rtt_ms: float, ns_per_byte: float) -> list[int]:
     """Return the sizes whose answers came within the window of the shortest round trip."""
-    kept, before_last_ns = [], 0.0
+    kept, before_last_ns = [], 0
     for size_bytes in reversed(sizes):
         if before_last_ns <= MIN_RTT_WINDOW_NS:
             kept.append(size_bytes)
-        before_last_ns += min_rtt_ms * MS + ns_per_byte * size_bytes + 10 * MS
+        before_last_ns += round_trip_ns(size_bytes, min_rtt_ms, ns_per_byte) + GAP_NS
     return kept
 
 

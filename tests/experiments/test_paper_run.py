@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -150,6 +151,35 @@ def test_the_camera_frame_alone_is_coded_once_for_all_fields(thumbnail, tmp_path
     assert len(coded) == 2 * len(set(coded)) == 2 * 9, "of two frames"
     bytes_of = {(r.frame, r.preset, r.crf): r.camera_i_bytes for r in rows if r.field == "3dgs"}
     assert all(bytes_of[r.frame, r.preset, r.crf] == r.camera_i_bytes for r in rows)
+
+
+def test_a_frame_is_read_once_and_rendered_once_at_its_own_size(paper, monkeypatch):
+    job, _ = paper
+    rendered, read = [], []
+    render, read_dataset = run._render, run.read_dataset
+
+    def counted(field, camera):
+        rendered.append(camera.intrinsics.width_px)
+        return render(field, camera)
+
+    def dataset(path):
+        found = read_dataset(path)
+        pictures = [replace(p, read=partial(_noted, read, p)) for p in found.pictures]
+        return replace(found, pictures=pictures)
+
+    monkeypatch.setattr(run, "_render", counted)
+    monkeypatch.setattr(run, "read_dataset", dataset)
+    pieces = list(run._pieces(job, run._opened(job)))
+    for piece in pieces:
+        assert list(run._rows(piece))
+    frames = {piece.source.picture.name for piece in pieces}
+    assert sorted(read) == sorted(frames)
+    assert rendered.count(96) == len(frames)
+
+
+def _noted(read, picture):
+    read.append(picture.name)
+    return picture.read()
 
 
 def test_every_frame_is_coded_at_every_setting_with_both_controls_beside_the_smaller_size(paper):

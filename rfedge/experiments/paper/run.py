@@ -62,18 +62,20 @@ from rfedge.experiments.picture_quality import (
 )
 from rfedge.results import check_result_path, make_result, provenance, write_result
 
-__all__ = ["CONTROLS", "PaperJob", "named_path", "run_paper", "views_of"]
-
 with needs("eval"):
     import cv2
 
 __all__ = [
     "PUBLISHED_CRFS",
     "PUBLISHED_PRESETS",
+    "PaperJob",
     "PublishedFrame",
     "Setting",
+    "named_path",
     "published_rows",
     "reduced",
+    "run_paper",
+    "views_of",
 ]
 
 
@@ -186,7 +188,6 @@ def _decoded(clip: Sequence[bytes], setting: Setting) -> list[I420]:
     return [I420(p.y[:height, :width], p.u, p.v) for p in pictures]
 
 
-CONTROLS = ("grey", "behind")
 CONTROL_PRESET, CONTROL_CRF = "medium", 23.0
 TURNED_ROUND = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 """Half a turn about the camera's vertical axis."""
@@ -215,7 +216,7 @@ class PaperJob:
             raise InvalidInput("every", f"{self.every} must be at least 1")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DriveFrame:
     """One frame of one drive, with what its fields and sizes share."""
 
@@ -227,7 +228,7 @@ class DriveFrame:
     def digest(self) -> str:
         """Of pixels and camera."""
         pose = repr(self.picture.camera).encode()
-        return hashlib.sha256(self.picture.read().tobytes() + pose).hexdigest()
+        return hashlib.sha256(_pixels_of(self).tobytes() + pose).hexdigest()
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +244,7 @@ class Piece:
     """One frame of one drive, one field and one size; with controls beside it or without."""
 
     source: DriveFrame
-    field: NamedField
+    opened: NamedField
     size_px: Size
     controlled: bool
 
@@ -331,8 +332,8 @@ def _pieces(job: PaperJob, fields: Sequence[NamedField]) -> Iterator[Piece]:
 
 def _key(piece: Piece) -> dict[str, str | float | int | None]:
     return {
-        "field": piece.field.field.field_id,
-        "field_name": piece.field.name,
+        "field": piece.opened.field.field_id,
+        "field_name": piece.opened.name,
         "scene": piece.source.scene,
         "frame": piece.source.picture.name,
         "input": piece.source.digest,
@@ -357,7 +358,7 @@ def _rows(piece: Piece) -> Iterator[dict[str, Any]]:
     frame = _published_frame(piece, piece.source.picture.camera)
     size_px = piece.size_px
     difference = flip(frame.render(size_px, "downscaled"), reduced(frame.camera, size_px))
-    for row in _labelled(piece, piece.field.name, frame, settings):
+    for row in _labelled(piece, piece.opened.name, frame, settings):
         yield row if row["render"] == "native" else {**row, "rf_flip": difference}
     if piece.controlled:
         yield from _control_rows(piece)
@@ -368,16 +369,16 @@ def _control_rows(piece: Piece) -> Iterator[dict[str, Any]]:
     camera = piece.source.picture.camera
     behind = Camera(camera.intrinsics, camera.world_from_cam.compose(TURNED_ROUND))
     yield from _labelled(
-        piece, f"{piece.field.name}:behind", _published_frame(piece, behind), control
+        piece, f"{piece.opened.name}:behind", _published_frame(piece, behind), control
     )
     grey = np.full((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), 128, np.uint8)
     without_field = PublishedFrame(
         piece.source.picture.name,
-        piece.source.picture.read(),
+        _pixels_of(piece.source),
         lambda size_px, _making: reduced(grey, size_px),
         piece.source.alone,
     )
-    yield from _labelled(piece, f"{piece.field.name}:grey", without_field, control)
+    yield from _labelled(piece, f"{piece.opened.name}:grey", without_field, control)
 
 
 def _makings(piece: Piece) -> Sequence[Making]:
@@ -394,21 +395,24 @@ def _labelled(piece: Piece, label: str, frame: PublishedFrame, settings: Sequenc
 
 
 def _published_frame(piece: Piece, camera: Camera) -> PublishedFrame:
-    full = _at_own_size(piece.field, camera)
-
     def render(size_px: Size, making: Making) -> Rgb:
         if making == "downscaled":
-            return reduced(full, size_px)
+            return reduced(_at_own_size(piece.opened, camera), size_px)
         return _render(
-            piece.field.field, Camera(camera.intrinsics.resized(*size_px), camera.world_from_cam)
+            piece.opened.field, Camera(camera.intrinsics.resized(*size_px), camera.world_from_cam)
         )
 
-    return PublishedFrame(
-        piece.source.picture.name, piece.source.picture.read(), render, piece.source.alone
-    )
+    source = piece.source
+    return PublishedFrame(source.picture.name, _pixels_of(source), render, source.alone)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=1)
+def _pixels_of(source: DriveFrame) -> Rgb:
+    """Return the camera's picture, read once for all fields and sizes that follow one another."""
+    return source.picture.read()
+
+
+@lru_cache(maxsize=1)
 def _at_own_size(opened: NamedField, camera: Camera) -> Rgb:
     """Return the render that those at a frame's smaller sizes are made of."""
     return _render(opened.field, camera)
