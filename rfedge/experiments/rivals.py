@@ -115,11 +115,11 @@ class Rival:
     def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
         """Code and decode ``frames`` at CRF ``point``.
 
-        Raises ``InvalidInput`` without frames or for odd sizes, ``CodecError`` if a library fails
-        or holds a frame back.
+        Raises ``InvalidInput`` without frames, ``CodecError`` if a library fails or holds a frame
+        back.
         """
-        if not frames or any(n % 2 for n in frames[0].size_px):
-            raise InvalidInput("frames", "a rival needs frames of one even size")
+        if not frames:
+            raise InvalidInput("frames", "a rival needs at least one frame")
         made = self.pictures(frames, rate_hz, point)
         pairs = list(zip(made.decoded, frames, strict=True))
         return CodedClip(
@@ -136,7 +136,7 @@ class Rival:
         began_ns = process_time_ns()
         packets = self._encoded(frames, rate_hz, point)
         coded_ns = process_time_ns()
-        decoded = self._decoded(packets)
+        decoded = self._decoded(packets, frames[0].size_px)
         decoder_ms = (process_time_ns() - coded_ns) / 1e6
         sizes = [len(packet) for packet in packets]
         return CodedPictures(sizes, decoded, (coded_ns - began_ns) / 1e6, decoder_ms)
@@ -180,7 +180,7 @@ class Rival:
     ) -> av.VideoCodecContext:
         encoder = _opened(self.encoder, "w")
         rate = Fraction(rate_hz).limit_denominator(1000)
-        encoder.width, encoder.height = size_px
+        encoder.width, encoder.height = even_size_px(size_px)
         encoder.pix_fmt = "yuv420p"
         encoder.time_base, encoder.framerate = 1 / rate, rate
         encoder.thread_count = 1
@@ -189,10 +189,10 @@ class Rival:
             encoder.open()
         return encoder
 
-    def _decoded(self, packets: Sequence[bytes]) -> list[I420]:
+    def _decoded(self, packets: Sequence[bytes], size_px: tuple[int, int]) -> list[I420]:
         decoder = self._decoder()
         frames = [f for packet in packets for f in decoder.decode(av.Packet(packet))]
-        return [picture(frame) for frame in (*frames, *decoder.decode(None))]
+        return [picture(frame, size_px) for frame in (*frames, *decoder.decode(None))]
 
     def _decoder(self) -> av.VideoCodecContext:
         decoder = _opened(self.decoder, "r")
@@ -311,19 +311,31 @@ def _joined(options: Mapping[str, str]) -> str:
     return ":".join(f"{name}={value}" for name, value in options.items())
 
 
+def even_size_px(size_px: tuple[int, int]) -> tuple[int, int]:
+    """Return (width, height) rounded up to even, as encoders of 4:2:0 take pictures."""
+    width_px, height_px = size_px
+    return (width_px + width_px % 2, height_px + height_px % 2)
+
+
 def video_frame(source: I420, index: int, pixel_format: str = "yuv420p") -> av.VideoFrame:
-    """Return a picture of even size as PyAV's encoders take it, the ``index``-th of its clip."""
-    frame = av.VideoFrame(*source.size_px, pixel_format)
+    """Return a picture as PyAV's encoders take it, the ``index``-th of its clip.
+
+    The last row and column of an odd size are repeated, as our codec does.
+    """
+    frame = av.VideoFrame(*even_size_px(source.size_px), pixel_format)
     for plane, samples in zip(frame.planes, source.planes, strict=True):
-        _samples(plane)[:] = samples
+        target = _samples(plane)
+        missing = [(0, n - has) for n, has in zip(target.shape, samples.shape, strict=True)]
+        target[:] = np.pad(samples, missing, "edge")
     frame.pts = index
     return frame
 
 
-def picture(frame: av.VideoFrame) -> I420:
-    """Return what a decoder showed."""
+def picture(frame: av.VideoFrame, size_px: tuple[int, int]) -> I420:
+    """Return what a decoder showed of pictures of ``size_px``, without what made them even."""
+    width_px, height_px = size_px
     y, u, v = (_samples(plane).copy() for plane in frame.planes)
-    return I420(y, u, v)
+    return I420(np.ascontiguousarray(y[:height_px, :width_px]), u, v)
 
 
 def _samples(plane: Any) -> NDArray[np.uint8]:

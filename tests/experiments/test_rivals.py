@@ -53,11 +53,22 @@ def test_a_static_picture_costs_next_to_nothing_after_the_first(rival):
     assert coded.frame_bytes[1:].max() < 0.1 * coded.frame_bytes[0]
 
 
-def test_odd_sizes_are_refused():
-    plane = np.zeros((5, 7), np.uint8)
-    chroma = np.zeros((3, 4), np.uint8)
-    with pytest.raises(InvalidInput, match="even size"):
-        RIVALS[0].code([I420(plane, chroma, chroma)], 10, 23)
+@pytest.mark.parametrize("rival", RIVALS, ids=lambda rival: rival.name)
+def test_pictures_of_odd_size_cost_what_even_ones_with_their_last_row_and_column_repeated_do(rival):
+    even = panning_clip()
+    odd = [I420(frame.y[:-1, :-1].copy(), frame.u, frame.v) for frame in even]
+    padded = [I420(np.pad(frame.y, ((0, 1), (0, 1)), "edge"), frame.u, frame.v) for frame in odd]
+    made, expected = rival.pictures(odd, 10, 30.0), rival.pictures(padded, 10, 30.0)
+    assert made.frame_bytes == expected.frame_bytes
+    assert [picture.size_px for picture in made.decoded] == [(127, 95)] * 5
+    for cropped, whole in zip(made.decoded, expected.decoded, strict=True):
+        assert np.array_equal(cropped.y, whole.y[:95, :127])
+    assert rival.code(odd, 10, 30.0).luma_mse.shape == (5,)
+
+
+def test_no_frames_are_refused():
+    with pytest.raises(InvalidInput, match="at least one frame"):
+        RIVALS[0].code([], 10, 23)
 
 
 def test_keyframes_can_be_asked_of_x264():

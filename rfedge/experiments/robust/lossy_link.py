@@ -35,7 +35,7 @@ from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfcore.metrics import ssim
 from rfedge.experiments.field_coder import RenderedClip, message_bytes
-from rfedge.experiments.rivals import picture, video_frame
+from rfedge.experiments.rivals import even_size_px, picture, video_frame
 from rfedge.offline import Arrival, decode_frames
 
 __all__ = [
@@ -286,8 +286,8 @@ def x264_crossing(crossing: Crossing, *, idr_on_nack: bool) -> Outcome:
         if good:
             arrived = av.Packet(data)
             arrived.pts = index
-            decoded |= _pictures(decoder, arrived)
-    decoded |= _pictures(decoder, None)
+            decoded |= _pictures(decoder, arrived, frame.size_px)
+    decoded |= _pictures(decoder, None, crossing.frames[0].size_px)
     shown: list[I420] = []
     for index in range(len(crossing.frames)):
         shown.append(decoded.get(index, shown[-1] if shown else decoded[min(decoded)]))
@@ -303,7 +303,7 @@ def _x264(crossing: Crossing, *, idr_on_nack: bool) -> av.VideoCodecContext:
     if not isinstance(encoder, av.VideoCodecContext):
         raise CodecError("libx264 is not a video encoder here")
     rate = Fraction(crossing.rate_hz).limit_denominator(1000)
-    encoder.width, encoder.height = crossing.frames[0].size_px
+    encoder.width, encoder.height = even_size_px(crossing.frames[0].size_px)
     encoder.pix_fmt = "yuv420p"
     encoder.time_base, encoder.framerate = 1 / rate, rate
     encoder.thread_count = 1
@@ -318,10 +318,10 @@ def _x264(crossing: Crossing, *, idr_on_nack: bool) -> av.VideoCodecContext:
     return encoder
 
 
-def _pictures(decoder: Any, packet: Any) -> dict[int, I420]:
+def _pictures(decoder: Any, packet: Any, size_px: tuple[int, int]) -> dict[int, I420]:
     """Return what the decoder shows, by the frame's number; of what it cannot use, nothing."""
     try:
-        return {frame.pts: picture(frame) for frame in decoder.decode(packet)}
+        return {frame.pts: picture(frame, size_px) for frame in decoder.decode(packet)}
     except FFmpegError:
         return {}
 
