@@ -7,7 +7,7 @@ committed pages to the committed files.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from rfcore.errors import InvalidInput
@@ -17,7 +17,7 @@ from rfedge.demo.report import demo_section
 from rfedge.experiments.adapt.measure import adapt_section
 from rfedge.experiments.benchmark.definition import benchmark_section
 from rfedge.experiments.classes.measure import classes_section
-from rfedge.experiments.compare.figures import write_compare_figures
+from rfedge.experiments.compare.figures import write_bd_rates, write_compare_figures
 from rfedge.experiments.compare.report import compare_section, headline
 from rfedge.experiments.ladder.page import write_ladder_figure
 from rfedge.experiments.latency.report import latency_section, write_latency_figures
@@ -80,13 +80,17 @@ SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
 """How each kind of result is shown; some have a page of their own."""
 
 
-def results_page(folder: Path) -> str:
-    """Return the page of every result file in ``folder``, in the order of their names.
+def results_page(folder: Path, figures: Mapping[str, Sequence[Path]] | None = None) -> str:
+    """Return the page of every result file in ``folder``, in the order of their names, each with
+    what ``write_figures`` drew of it.
 
     Training runs, in ``folder/train``, share one table at the end. Raises ``InvalidInput`` for a
     folder without results, and for a file that holds none of the known kinds.
     """
-    sections = [_section(path) for path in sorted(folder.glob("*.json"))]
+    drawn = figures or {}
+    sections = [
+        _section(path) + _images(drawn.get(path.stem, ())) for path in sorted(folder.glob("*.json"))
+    ]
     runs = sorted(folder.glob("train/*.json"))
     if runs:
         sections.append(training_section(runs))
@@ -103,27 +107,30 @@ def _section(path: Path) -> str:
     return SECTIONS[result["kind"]](path, result)
 
 
+def _images(figures: Sequence[Path]) -> str:
+    """Return the drawings among the files of a section's figures, below it."""
+    return "".join(
+        f"\n![{path.stem.replace('_', ' ')}](figures/{path.name})\n"
+        for path in figures
+        if path.suffix == ".svg"
+    )
+
+
 DRAWINGS: Mapping[str, Callable[[Result, Path], list[Path]]] = {
     "compare": write_compare_figures,
+    "compare-harder": lambda result, out: write_bd_rates(result, out, "bd_rates_harder"),
     "ladder": write_ladder_figure,
     "latency": write_latency_figures,
     "paper": lambda result, out: write_paper_figures(paper_rows(result), out),
     "robust": write_robust_figure,
 }
-"""Figures of the kinds of results that have some."""
+"""Figures of the result files that have some, by their names."""
 
 
-def write_figures(folder: Path, out: Path) -> list[Path]:
-    """Draw the results of ``folder`` that have figures into ``out``; return their paths.
-
-    One beside the first of its kind (``compare-small.json``) has none: its drives are named alike.
-    """
-    drawn = [
-        read_result(path, path.stem)
-        for path in sorted(folder.glob("*.json"))
-        if path.stem in DRAWINGS
-    ]
-    return [path for result in drawn for path in DRAWINGS[result["kind"]](result, out)]
+def write_figures(folder: Path, out: Path) -> dict[str, list[Path]]:
+    """Draw the results of ``folder`` that have figures into ``out``; return the files of each."""
+    found = [path for path in sorted(folder.glob("*.json")) if path.stem in DRAWINGS]
+    return {path.stem: DRAWINGS[path.stem](read_result(path), out) for path in found}
 
 
 def _reference(path: Path, result: Result, noun: str, page: str) -> str:
@@ -146,8 +153,8 @@ def with_headline(page: str, compared: Result) -> str:
 
 def main(results: Path, docs: Path) -> None:
     """Write page and figures."""
-    write_whole(docs / "results.md", results_page(results))
-    write_figures(results, docs / "figures")
+    figures = write_figures(results, docs / "figures")
+    write_whole(docs / "results.md", results_page(results, figures))
 
 
 def write_headline(results: Path, readme: Path) -> None:

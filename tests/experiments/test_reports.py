@@ -152,18 +152,52 @@ FOREGROUND = ForegroundRow(
 
 
 def test_a_comparison_names_field_quality_and_interval_beside_its_figure() -> None:
+    section = compare_section(Path("compare.json"), result_of(rows=[COMPARED]))
+    assert "`rfedge-veryfast` over 32..35 dB, against" in section
+    assert "| drive | x264-lowdelay |" in section
+    assert "| yardstick-empty, 10 Hz | -57.3 |" in section
     assert (
-        "| yardstick-empty | 10 | rfedge-veryfast | x264-lowdelay (x264-lowdelay-veryfast) "
-        "| 32..35 | -57.3 | -60.0..-54.0 | 80 / 55 / 40 | 0.910 | 0.902 | 0.12 | 0.20 "
-        "| 12.3 | 40.0 | 90 | 151 (140..170) | 20 | 24 (24..26) | 28.12 |"
-    ) in compare_section(Path("compare.json"), result_of(rows=[COMPARED]))
+        "| yardstick-empty, 10 Hz | 80 / 55 / 40 | 0.910 / 0.902 | 0.12 / 0.20 | 12.3 / 40.0 "
+        "| 90 / 20 | 151 (140..170) | 24 (24..26) | 28.12 |"
+    ) in section
+    assert "| drive | 32..35 |" in section
+    assert section.count("| yardstick-empty, 10 Hz | -57.3 (-60.0..-54.0) |") == 2
+
+
+def test_a_comparison_has_a_line_a_drive_and_a_column_for_each_rival_window_and_method() -> None:
+    fair = replace(COMPARED, rival="x264-our-tools-medium", bd_rate_percent=-51.0)
+    best = replace(COMPARED, rival="best-of-any-cpu", rival_setting="av1", bd_rate_percent=-41.2)
+    higher = replace(fair, window_db=(35.0, 38.0), bd_rate_percent=-30.0)
+    bare = replace(fair, method="rfedge-without-field-veryfast-0123", bd_rate_percent=9.0)
+    other = replace(fair, scene="other", bd_rate_percent=-60.0)
+    rows = [COMPARED, fair, best, higher, bare, other]
+    section = compare_section(Path("compare.json"), result_of(rows=rows))
+    assert "| drive | x264-lowdelay | x264-our-tools-medium | best-of-any-cpu |" in section
+    assert "| yardstick-empty, 10 Hz | -57.3 | -51.0 | -41.2 (av1) |" in section
+    assert "| other, 10 Hz | - | -60.0 | - |" in section
+    assert "| drive | 32..35 | 35..38 |" in section
+    assert "| other, 10 Hz | -60.0 (-60.0..-54.0) | - |" in section
+    assert "| drive | rfedge-veryfast | rfedge-without-field-veryfast |" in section
+    assert "-51.0 (-60.0..-54.0) | +9.0 (-60.0..-54.0) |" in section
+
+
+def test_a_drive_with_several_fields_has_a_line_for_each() -> None:
+    rows = [COMPARED, replace(COMPARED, method="rfedge-veryfast-4567", bd_rate_percent=-20.0)]
+    section = compare_section(Path("compare.json"), result_of(rows=rows))
+    assert "| yardstick-empty, 10 Hz, field 0123 | -57.3 |" in section
+    assert "| yardstick-empty, 10 Hz, field 4567 | -20.0 |" in section
+
+
+def test_curves_that_share_no_window_are_said_to() -> None:
+    section = compare_section(Path("compare.json"), result_of(rows=[]))
+    assert section.rstrip().endswith("No curves share a window.")
 
 
 def test_a_quality_that_was_not_reached_and_an_unknown_field_are_dashes() -> None:
     row = replace(COMPARED, saving_percent_at_db={"33": 55.1}, field_psnr_db=None)
     section = compare_section(Path("compare.json"), result_of(rows=[row]))
     assert "| - / 55 / - |" in section
-    assert section.rstrip().endswith("| - |")
+    assert "| 24 (24..26) | - |" in section
 
 
 def test_what_was_not_measured_of_a_comparison_is_left_out() -> None:
@@ -182,9 +216,9 @@ def test_break_even_bits_and_foreground_stand_below_the_comparison() -> None:
     content["foreground"] = [FOREGROUND, unshared]
     section = compare_section(Path("compare.json"), result_of(**content))
     assert "| 123.5 | 5.04 | 41 | -2000 / -150 / 33 |" in section
-    assert "| other | 10 | rfedge-veryfast | 123.5 | 5.04 | never |" in section
-    assert "| scene | Hz | static | moving |" in section
-    assert "| yardstick-empty | 10 | 313 (80 %) | 1250 (20 %) |" in section
+    assert "| other, 10 Hz | 123.5 | 5.04 | never |" in section
+    assert "| drive | static | moving |" in section
+    assert "| yardstick-empty, 10 Hz | 313 (80 %) | 1250 (20 %) |" in section
     assert "has a BD-rate of +19 % at equal quality of the foreground (31.0..34.0 dB)" in section
     assert "they share no window of a decibel" in section
 
@@ -192,7 +226,8 @@ def test_break_even_bits_and_foreground_stand_below_the_comparison() -> None:
 def test_a_comparison_by_ssim_names_the_rivals_setting_and_the_window() -> None:
     row = SsimRow("s", 10.0, "rfedge-fast-01", "x264-ssim", "x264-x", (0.88, 0.92), -50.04)
     section = compare_section(Path("compare.json"), result_of(rows=[COMPARED], ssim=[row]))
-    assert "| s | 10 | rfedge-fast | x264-x | 0.88..0.92 | -50.0 |" in section
+    assert "| drive | x264-x |" in section
+    assert "| s, 10 Hz | -50.0 (0.88..0.92) |" in section
 
 
 def test_the_headline_has_the_fair_anchor_the_best_rival_and_ours_without_the_field() -> None:
@@ -248,32 +283,32 @@ def test_every_point_of_every_curve_is_beside_its_figure(tmp_path: Path) -> None
     result = result_of(rows=[COMPARED], curves=[CURVE, OURS])
     written = write_compare_figures(result, tmp_path)
     assert [path.name for path in written] == [
+        *("bd_rates.svg", "bd_rates.csv"),
         *("rd_yardstick-empty_10.svg", "rd_yardstick-empty_10.csv"),
         *("cpu_yardstick-empty_10.svg", "cpu_yardstick-empty_10.csv"),
-        *("bd_rate_bars.svg", "bd_rate_bars.csv"),
     ]
-    assert lines_of(written[1])[1:] == [
+    assert lines_of(written[3])[1:] == [
         ["x264-lowdelay-veryfast", "41", "30.000", "1000.0", "0.8000"],
         ["x264-lowdelay-veryfast", "17", "37.000", "9000.0", "0.9500"],
         ["rfedge-veryfast-0123", "41", "30.000", "500.0", "0.8000"],
         ["rfedge-veryfast-0123", "17", "37.000", "8000.0", "0.9500"],
     ]
-    assert lines_of(written[3])[1:] == [
+    assert lines_of(written[5])[1:] == [
         ["x264-lowdelay-veryfast", "24.40", "100.00"],
-        ["rfedge-veryfast-0123", "151.20", lines_of(written[3])[2][2]],
+        ["rfedge-veryfast-0123", "151.20", lines_of(written[5])[2][2]],
     ]
-    assert 50 < float(lines_of(written[3])[2][2]) < 100 * 8 / 9
-    assert lines_of(written[5])[1][-3:] == ["-57.31", "-60.04", "-54.00"]
-    assert "rfedge-veryfast" in shown_in(written[0])
+    assert 50 < float(lines_of(written[5])[2][2]) < 100 * 8 / 9
+    assert lines_of(written[1])[1][-3:] == ["-57.31", "-60.04", "-54.00"]
+    assert "yardstick-empty, 10 Hz" in shown_in(written[0])
     assert "rfedge-veryfast" in shown_in(written[2])
-    assert "x264-lowdelay" in shown_in(written[4])
+    assert {"rfedge", "x264", "veryfast"} <= set(shown_in(written[4]).split())
 
 
-def test_bars_are_of_the_headline_window_alone(tmp_path: Path) -> None:
+def test_the_figure_of_all_drives_is_of_the_headline_window_alone(tmp_path: Path) -> None:
     wider = replace(COMPARED, window_db=(30.0, 35.0), bd_rate_percent=-1.0)
     result = result_of(rows=[COMPARED, wider], curves=[CURVE, OURS])
-    bars = write_compare_figures(result, tmp_path)[-1]
-    assert [line[5] for line in lines_of(bars)[1:]] == ["-57.31"]
+    numbers = write_compare_figures(result, tmp_path)[1]
+    assert [line[5] for line in lines_of(numbers)[1:]] == ["-57.31"]
 
 
 def test_at_80_columns_each_rival_is_told_apart() -> None:

@@ -1,6 +1,7 @@
 """The committed figures page is what the committed result files say."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +48,25 @@ def page_of(folder: Path, kind: str, **content: Any) -> str:
 # --- what is committed
 
 
-def test_the_page_is_generated_from_the_result_files() -> None:
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
+    """Files of each committed result's figures, the drawings left out: these depend on the version
+    of matplotlib, and take long."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Figure, "savefig", lambda *_args, **_options: None)
+        return write_figures(ROOT / "results", tmp_path_factory.mktemp("figures"))
+
+
+def test_the_page_is_generated_from_the_result_files(drawn: dict[str, list[Path]]) -> None:
     page = (ROOT / "docs" / "results.md").read_text()
-    assert page == results_page(ROOT / "results"), "run `make figures`"
+    assert page == results_page(ROOT / "results", drawn), "run `make figures`"
+
+
+def test_every_figure_that_the_page_shows_is_committed() -> None:
+    shown = re.findall(r"!\[[^]]*\]\((.*?)\)", (ROOT / "docs" / "results.md").read_text())
+    assert len(shown) >= 15
+    for name in shown:
+        assert (ROOT / "docs" / name).is_file(), name
 
 
 def test_the_readmes_headline_is_generated_from_the_result_file() -> None:
@@ -73,16 +90,13 @@ def test_the_ladders_page_is_generated_from_the_result_files() -> None:
 
 
 def test_the_numbers_beside_the_figures_are_those_of_the_result_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    drawn: dict[str, list[Path]],
 ) -> None:
-    """The drawings themselves depend on the version of matplotlib, and take long."""
-    monkeypatch.setattr(Figure, "savefig", lambda *_args, **_options: None)
-    drawn = write_figures(ROOT / "results", tmp_path)
-    numbers = {path.name for path in drawn if path.suffix == ".csv"}
+    numbers = [path for files in drawn.values() for path in files if path.suffix == ".csv"]
     assert len(numbers) >= 15
-    for name in numbers:
-        committed = ROOT / "docs" / "figures" / name
-        assert committed.read_text() == (tmp_path / name).read_text(), "run `make figures`"
+    for path in numbers:
+        committed = ROOT / "docs" / "figures" / path.name
+        assert committed.read_text() == path.read_text(), "run `make figures`"
 
 
 def test_every_committed_result_has_its_section() -> None:
@@ -187,6 +201,8 @@ def test_page_and_figures_are_written_together(tmp_path: Path) -> None:
     write_result(results / "robust.json", make_result("robust", MADE, content))
     docs.mkdir()
     main(results, docs)
-    assert (docs / "results.md").read_text() == results_page(results)
+    page = (docs / "results.md").read_text()
+    assert page.startswith(results_page(results))
+    assert page.endswith("\n![loss ssim](figures/loss_ssim.svg)\n")
     figures = {path.name for path in (docs / "figures").iterdir()}
     assert figures == {"loss_ssim.svg", "loss_ssim.csv"}

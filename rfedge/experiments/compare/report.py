@@ -6,9 +6,10 @@ but the first. ``scene`` and ``hz`` name a drive in every kind of row.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from rich.console import Console
 
@@ -19,6 +20,7 @@ from rfedge.results import Result, rows_of
 __all__ = [
     "BEST",
     "BEST_OF_ANY_CPU",
+    "HEADLINE_ANCHOR",
     "BitShareRow",
     "BreakEvenRow",
     "CompareRow",
@@ -135,6 +137,9 @@ class ForegroundRow:
     rfdvc_style: Mapping[str, Sequence[float]]
 
 
+Row = TypeVar("Row", bound=CompareRow | SsimRow | BreakEvenRow | BitShareRow)
+
+
 @dataclass(frozen=True)
 class CurveRow:
     """The curve of one coder, from its lowest quality to its highest."""
@@ -152,27 +157,6 @@ class CurveRow:
     ssim: Sequence[float]
 
 
-COMPARE_COLUMNS = (
-    "scene",
-    "Hz",
-    "method",
-    "rival",
-    "window dB",
-    "BD-rate %",
-    "95 %",
-    "saving at 31 / 33 / 35 dB, %",
-    "SSIM",
-    "rival's",
-    "deviation dB",
-    "rival's",
-    "first frame kB",
-    "rival's",
-    "CPU ms: sender",
-    "both ends",
-    "rival's",
-    "both ends",
-    "field dB",
-)
 HEADLINE_ANCHOR = "x264-our-tools-medium"
 SECOND_PASSES, UPPER_BOUNDS = ("kitti-loop", "kitti-loop-localised"), ("kitti-city",)
 """Real drives through a street that a drive before has mapped; those whose map has pictures of the
@@ -186,19 +170,20 @@ HEADLINE_COLUMNS = (
     "the field, and after how many passes it is paid for",
 )
 PRINTED = ("scene", "Hz", "method", "rival", "window dB", "BD-rate %", "95 %", "CPU ms")
-SSIM_COLUMNS = (
-    "scene",
-    "Hz",
-    "method",
-    "rival, tuned for SSIM where it can be",
-    "SSIM",
-    "BD-rate %",
-)
 SAVING_AT_DB = ("31", "33", "35")
+DETAIL_COLUMNS = (
+    "drive",
+    "saving at 31 / 33 / 35 dB, %",
+    "SSIM",
+    "deviation dB",
+    "first frame kB",
+    "sender ms",
+    "both ends ms",
+    "the rival's",
+    "field dB",
+)
 BREAK_EVEN_COLUMNS = (
-    "scene",
-    "Hz",
-    "method",
+    "drive",
     "saved kB a pass",
     "field MB",
     "passes to break even",
@@ -212,22 +197,131 @@ def without_field(method: str) -> str:
 
 
 def compare_section(path: Path, result: Result) -> str:
-    """Return the tables of a comparison; those that it did not measure are left out."""
-    compared = [_compare_cells(row) for row in rows_of(CompareRow, result["rows"])]
-    parts = [heading(path, result), table(COMPARE_COLUMNS, compared)]
+    """Return the tables of a comparison, a line a drive; what it did not measure is left out.
+
+    Of methods and windows the first is shown against every rival, the others against one; the
+    file has all rows.
+    """
+    compared = rows_of(CompareRow, result["rows"])
+    parts = [heading(path, result), *_compared_tables(path, compared)]
     by_ssim = rows_of(SsimRow, result.get("ssim", ()))
     if by_ssim:
-        parts += ["By SSIM:", table(SSIM_COLUMNS, map(_ssim_cells, by_ssim))]
-    break_even = rows_of(BreakEvenRow, result.get("break_even", ()))
+        parts += ["By SSIM (window), rivals tuned for it where they can be:"]
+        parts += [_by_drive(by_ssim, lambda row: row.rival_setting, _ssim_cell)]
+    break_even = _of_first_method(rows_of(BreakEvenRow, result.get("break_even", ())))
     if break_even:
         parts += ["What the field's own bytes leave:"]
-        parts += [table(BREAK_EVEN_COLUMNS, map(_break_even_cells, break_even))]
+        lines = ([name, *_break_even_cells(row)] for name, row in _named(break_even))
+        parts += [table(BREAK_EVEN_COLUMNS, lines)]
     bits = rows_of(BitShareRow, result.get("bits", ()))
     if bits:
         parts += ["Where the bits go, near 33.5 dB (bytes a frame; share of the macroblocks):"]
-        parts += [_bits_table(bits)]
+        parts += [_by_drive(bits, lambda row: row.shows, _bits_cell)]
     parts += map(_foreground_line, rows_of(ForegroundRow, result.get("foreground", ())))
     return "\n\n".join([*parts, ""])
+
+
+def _compared_tables(path: Path, compared: Sequence[CompareRow]) -> list[str]:
+    if not compared:
+        return ["No curves share a window."]
+    anchor = _anchor(compared)
+    window = compared[0].window_db
+    ours = _of_first_method(compared)
+    against_anchor = [row for row in compared if row.rival == anchor]
+    detailed = [row for row in _of_first_method(against_anchor) if row.window_db == window]
+    method = without_field(compared[0].method)
+    first = [row for row in ours if row.window_db == window]
+    same = [row for row in against_anchor if row.window_db == window]
+    return [
+        f"BD-rates in % ({path.name} has every row with its interval): `{method}` over "
+        f"{_window(compared[0])} dB, against",
+        _by_drive(first, lambda row: row.rival, _bd_rate_cell),
+        f"Against {anchor}, with what a frame takes of a processor (median, least, most):",
+        table(DETAIL_COLUMNS, ([name, *_detail_cells(row)] for name, row in _named(detailed))),
+        f"Against {anchor} by window, dB (95 %):",
+        _by_drive(_of_first_method(against_anchor), _window, _interval_cell),
+        f"Against {anchor} over {_window(compared[0])} dB by method (95 %):",
+        _by_drive(same, lambda row: without_field(row.method), _interval_cell),
+    ]
+
+
+def _anchor(compared: Sequence[CompareRow]) -> str:
+    """Return the headline's rival, or the first of a comparison without it."""
+    rivals = [row.rival for row in compared]
+    return HEADLINE_ANCHOR if HEADLINE_ANCHOR in rivals else rivals[0]
+
+
+def _of_first_method(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if without_field(row.method) == without_field(rows[0].method)]
+
+
+def _by_drive(rows: Sequence[Row], column: Callable[[Row], str], text: Callable[[Row], str]) -> str:
+    """Return a table with a line for each drive and a column for each value of ``column``."""
+    columns = list(dict.fromkeys(map(column, rows)))
+    lines: dict[str, dict[str, str]] = {}
+    for name, row in _named(rows):
+        lines.setdefault(name, {})[column(row)] = text(row)
+    cells = ([name, *(line.get(each, "-") for each in columns)] for name, line in lines.items())
+    return table(("drive", *columns), cells)
+
+
+def _named(
+    rows: Sequence[Row],
+) -> list[tuple[str, Row]]:
+    """Return each row with its drive's name, and the field's where a drive has several."""
+    fields: dict[tuple[str, float], set[str]] = {}
+    for row in rows:
+        fields.setdefault((row.scene, row.hz), set()).add(_field(row.method))
+    several = {drive for drive, digests in fields.items() if len(digests) > 1}
+    named = []
+    for row in rows:
+        which = f", field {_field(row.method)}" if (row.scene, row.hz) in several else ""
+        named.append((f"{row.scene}, {row.hz:g} Hz{which}", row))
+    return named
+
+
+def _field(method: str) -> str:
+    """Return the digest of the field that a method's name ends in."""
+    return method.rsplit("-", 1)[-1]
+
+
+def _window(row: CompareRow) -> str:
+    return "{:g}..{:g}".format(*row.window_db)
+
+
+def _bd_rate_cell(row: CompareRow) -> str:
+    """Return a BD-rate, and of the best of several rivals who it is."""
+    who = f" ({row.rival_setting})" if row.rival in BESTS else ""
+    return f"{row.bd_rate_percent:+.1f}{who}"
+
+
+def _interval_cell(row: CompareRow) -> str:
+    low, high = row.ci95
+    return f"{row.bd_rate_percent:+.1f} ({low:.1f}..{high:.1f})"
+
+
+def _detail_cells(row: CompareRow) -> list[str]:
+    at_db = row.saving_percent_at_db
+    first_kb = (row.first_frame_bytes / 1000, row.rival_first_frame_bytes / 1000)
+    return [
+        " / ".join(f"{at_db[db]:.0f}" if db in at_db else "-" for db in SAVING_AT_DB),
+        f"{row.ssim:.3f} / {row.rival_ssim:.3f}",
+        f"{row.psnr_deviation_db:.2f} / {row.rival_psnr_deviation_db:.2f}",
+        "{:.1f} / {:.1f}".format(*first_kb),
+        f"{row.cpu_ms:.0f} / {row.rival_cpu_ms:.0f}",
+        _spread(row.both_ends_ms),
+        _spread(row.rival_both_ends_ms),
+        "-" if row.field_psnr_db is None else f"{row.field_psnr_db:.2f}",
+    ]
+
+
+def _ssim_cell(row: SsimRow) -> str:
+    low, high = row.window_ssim
+    return f"{row.bd_rate_percent:+.1f} ({low:g}..{high:g})"
+
+
+def _bits_cell(row: BitShareRow) -> str:
+    return f"{row.bytes_per_frame:.0f} ({row.area_percent:.0f} %)"
 
 
 def headline(result: Result) -> str:
@@ -331,7 +425,7 @@ def _printed_cells(row: CompareRow) -> list[str]:
         f"{row.hz:g}",
         without_field(row.method),
         row.rival_setting + BESTS.get(row.rival, ""),
-        "{:g}..{:g}".format(*row.window_db),
+        _window(row),
         f"{row.bd_rate_percent:.1f}",
         f"{low:.1f}..{high:.1f}",
         f"{row.both_ends_ms[0]:.0f} / {row.rival_both_ends_ms[0]:.0f}",
@@ -342,72 +436,14 @@ def _spread(both_ends_ms: Sequence[float]) -> str:
     return "{:.0f} ({:.0f}..{:.0f})".format(*both_ends_ms)
 
 
-def _ssim_cells(row: SsimRow) -> list[str]:
-    low, high = row.window_ssim
-    method = without_field(row.method)
-    window = f"{low:g}..{high:g}"
-    return [
-        row.scene,
-        f"{row.hz:g}",
-        method,
-        row.rival_setting,
-        window,
-        f"{row.bd_rate_percent:.1f}",
-    ]
-
-
-def _compare_cells(row: CompareRow) -> list[str]:
-    low, high = row.ci95
-    at_db = row.saving_percent_at_db
-    savings = " / ".join(f"{at_db[db]:.0f}" if db in at_db else "-" for db in SAVING_AT_DB)
-    return [
-        row.scene,
-        f"{row.hz:g}",
-        without_field(row.method),
-        f"{row.rival} ({row.rival_setting})",
-        "{:g}..{:g}".format(*row.window_db),
-        f"{row.bd_rate_percent:.1f}",
-        f"{low:.1f}..{high:.1f}",
-        savings,
-        f"{row.ssim:.3f}",
-        f"{row.rival_ssim:.3f}",
-        f"{row.psnr_deviation_db:.2f}",
-        f"{row.rival_psnr_deviation_db:.2f}",
-        f"{row.first_frame_bytes / 1000:.1f}",
-        f"{row.rival_first_frame_bytes / 1000:.1f}",
-        f"{row.cpu_ms:.0f}",
-        _spread(row.both_ends_ms),
-        f"{row.rival_cpu_ms:.0f}",
-        _spread(row.rival_both_ends_ms),
-        "-" if row.field_psnr_db is None else f"{row.field_psnr_db:.2f}",
-    ]
-
-
 def _break_even_cells(row: BreakEvenRow) -> list[str]:
     passes = row.passes_to_break_even
     return [
-        row.scene,
-        f"{row.hz:g}",
-        without_field(row.method),
         f"{row.saved_bytes_per_pass / 1000:.1f}",
         f"{row.field_bytes / 1e6:.2f}",
         "never" if passes is None else str(passes),
         " / ".join(f"{saving:.0f}" for saving in row.saving_percent_after.values()),
     ]
-
-
-def _bits_table(rows: Sequence[BitShareRow]) -> str:
-    kinds = list(dict.fromkeys(row.shows for row in rows))
-    drives = list(dict.fromkeys((row.scene, row.hz) for row in rows))
-    lines = []
-    for scene, hz in drives:
-        those = {row.shows: row for row in rows if (row.scene, row.hz) == (scene, hz)}
-        cells = [
-            f"{those[kind].bytes_per_frame:.0f} ({those[kind].area_percent:.0f} %)"
-            for kind in kinds
-        ]
-        lines.append([scene, f"{hz:g}", *cells])
-    return table(("scene", "Hz", *kinds), lines)
 
 
 def _foreground_line(row: ForegroundRow) -> str:
