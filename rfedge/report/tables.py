@@ -18,7 +18,7 @@ from rfedge.results import Result
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["cell", "escaped", "heading", "print_table", "table"]
+__all__ = ["cell", "escaped", "heading", "pivot", "print_table", "table"]
 
 BORDER = 3
 """Characters a column of a terminal's table needs beside its text: two spaces and a line."""
@@ -57,6 +57,19 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     _check(columns, lines)
     lines = [[escaped(text) for text in line] for line in lines]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def pivot(first: str, cells: Iterable[tuple[str, str, str]]) -> str:
+    """Return a Markdown table of (line, column, text), in the order in which each is seen first.
+
+    ``first`` heads the lines; what no cell fills is a dash.
+    """
+    lines: dict[str, dict[str, str]] = {}
+    for line, column, text in cells:
+        lines.setdefault(line, {})[column] = text
+    columns = list(dict.fromkeys(column for line in lines.values() for column in line))
+    rows = ([name, *(line.get(each, "-") for each in columns)] for name, line in lines.items())
+    return table((first, *columns), rows)
 
 
 def print_table(console: Console, title: str, columns: Sequence[str], rows: Cells) -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
-from rfedge.report.tables import cell, escaped, heading, print_table, table
+from rfedge.report.tables import cell, escaped, heading, pivot, print_table, table
 
 WIDTH = 80
 
@@ -162,6 +162,16 @@ def test_a_cell_longer_than_the_terminal_is_folded_not_cut() -> None:
     reason = "no drive with a lane offset was given (--lane NAME@HZ=DATASET) " * 3
     text = printed("", ["condition", "level"], [["lane", reason], ["light", "dusk"]])
     assert "".join(reason.split()) in re.sub(r"[\s│┃]", "", text).replace("lane", "", 1)
+
+
+def test_a_pivot_has_a_line_and_a_column_in_the_order_in_which_each_was_seen() -> None:
+    cells = [("b", "y", "1"), ("b", "x", "2"), ("a", "x", "3"), ("a", "z", "4")]
+    assert pivot("who", cells).splitlines() == [
+        "| who | y | x | z |",
+        "| --- | ---: | ---: | ---: |",
+        "| b | 1 | 2 | - |",
+        "| a | - | 3 | 4 |",
+    ]
 
 
 def test_brackets_are_text_and_not_markup() -> None:

@@ -14,7 +14,7 @@ from typing import TypeVar
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
-from rfedge.report.tables import heading, print_table, table
+from rfedge.report.tables import heading, pivot, print_table, table
 from rfedge.results import Result, rows_of
 
 __all__ = [
@@ -257,12 +257,7 @@ def _of_first_method(rows: Sequence[Row]) -> list[Row]:
 
 def _by_drive(rows: Sequence[Row], column: Callable[[Row], str], text: Callable[[Row], str]) -> str:
     """Return a table with a line for each drive and a column for each value of ``column``."""
-    columns = list(dict.fromkeys(map(column, rows)))
-    lines: dict[str, dict[str, str]] = {}
-    for name, row in _named(rows):
-        lines.setdefault(name, {})[column(row)] = text(row)
-    cells = ([name, *(line.get(each, "-") for each in columns)] for name, line in lines.items())
-    return table(("drive", *columns), cells)
+    return pivot("drive", ((name, column(row), text(row)) for name, row in _named(rows)))
 
 
 def _named(
