@@ -146,14 +146,15 @@ $(OUT)/slice-coder.json: $(FIELDS) | $(OUT)
 $(OUT)/compare.json: $(FIELDS) $(if $(DATA),$(OUT)/loop-localised/transforms.json) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) $(NOON) $(REAL) $(LOCALISED) $(YARDSTICK) --background sample-vehicles@10=$(EMPTY) \
 		$(if $(DATA),yardstick-vehicles@10=$(YARD)/transforms_drive_empty.json) \
-		--cells $(OUT)/compare --out $@
+		--processes $(shell nproc) --cells $(OUT)/compare --out $@
 $(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) $(if $(DATA),$(RESIDENTIAL)/drive/transforms.json $(OUT)/residential.rff) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) $(NOISY) $(YARDSTICK_30) \
 		sample-vehicles@20=$(call drive,20hz) sample-lens@10=$(UNDISTORTED) $(RESIDENTIAL_DRIVE) \
 		$(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) \
-		--background sample-people@10=$(EMPTY) --cells $(OUT)/compare --out $@
+		--background sample-people@10=$(EMPTY) \
+		--processes $(shell nproc) --cells $(OUT)/compare --out $@
 $(OUT)/compare-small.json: $(foreach k,30 60,$(OUT)/sample-$(k)k.rff $(if $(DATA),$(OUT)/yardstick-$(k)k.rff)) | $(OUT)
-	$(RFEDGE) eval compare $(SAMPLE) --rivals x264-our-tools-medium --cells $(OUT)/compare --out $@ \
+	$(RFEDGE) eval compare $(SAMPLE) --rivals x264-our-tools-medium --processes $(shell nproc) --cells $(OUT)/compare --out $@ \
 		$(foreach k,30 60,$(foreach drive,$(NOON),$(drive)$(COMMA)$(OUT)/sample-$(k)k.rff) \
 			$(if $(DATA),$(foreach of,empty vehicles,yardstick-$(of)@30=$(YARD)/transforms_drive30_$(of).json$(COMMA)$(OUT)/yardstick-$(k)k.rff)))
 $(OUT)/classes.json: $(call drive,people) | $(OUT)

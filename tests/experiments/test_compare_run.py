@@ -6,6 +6,7 @@ import math
 import pickle
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -221,6 +222,22 @@ def test_jobs_leave_all_cells_that_a_comparison_looks_for(
     assert [row["bytes_per_frame"] for row in again["curves"]] == [
         row["bytes_per_frame"] for row in result["curves"]
     ]
+
+
+@pytest.mark.slow
+def test_processes_give_the_rows_that_one_gives(thumbnail, tmp_path):
+    only = {"rivals": ("x264-lowdelay",), "window_db": (33.0, 36.0)}
+    alone = job_of(thumbnail, tmp_path, **only)
+    shared = replace(alone, cells=tmp_path / "shared", processes=2)
+    one, two = (run_compare(job, Console(quiet=True)) for job in (alone, shared))
+    assert [row["bytes_per_frame"] for row in two["curves"]] == [
+        row["bytes_per_frame"] for row in one["curves"]
+    ]
+
+
+def test_processes_that_cannot_be_are_refused(thumbnail, tmp_path):
+    with pytest.raises(InvalidInput, match="processes: 0 is outside"):
+        job_of(thumbnail, tmp_path, processes=0)
 
 
 def test_each_drive_of_a_comparison_keeps_its_background(tmp_path):

@@ -53,6 +53,9 @@ class EvalCompare:
     """Eight frames and few rivals: to see that it works, not for figures."""
     retime: bool = False
     """Take the processor times anew (on a quiet machine) and keep everything else."""
+    processes: int = 1
+    """How many processes code at once; processor times are taken afterwards, one coder at a time,
+    and the rows do not depend on it."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
     """Code what is not there yet on a Ray (`local` starts one here; docs/scale.md); processor times
     are taken here afterwards, and the rows are the same. Needs rfedge[ray]."""
@@ -84,6 +87,7 @@ class EvalCompare:
             quick=self.quick,
             retime=self.retime,
             window_db=self.window,
+            processes=self.processes,
         )
         console = Console()
         if self.ray is not None:

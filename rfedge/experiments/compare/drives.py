@@ -23,7 +23,7 @@ from rfcore.codec.references import RENDER_ONLY, References
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.train import mean_psnr_db
-from rfedge.experiments.cells import program_version
+from rfedge.experiments.cells import check_processes, program_version
 from rfedge.experiments.clips import (
     DECIMATION,
     Clip,
@@ -209,9 +209,11 @@ class CompareJob:
     quick: bool = False
     retime: bool = False
     window_db: Window | None = None
+    processes: int = 1
 
     def __post_init__(self) -> None:
         check_result_path(self.out)
+        check_processes(self.processes)
         check_effort("effort", self.effort)
         if not (self.drives or self.decimated):
             raise InvalidInput("drives", "there is none")

@@ -37,7 +37,7 @@ from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
 from rfcore.codec.state import EncoderState
 from rfcore.image import I420
 from rfcore.views import FieldView
-from rfedge.experiments.cells import CellStore, clip_key
+from rfedge.experiments.cells import CellStore, clip_key, each_done
 from rfedge.experiments.clips import ClipCoder
 from rfedge.experiments.compare.drives import (
     PAID_AGAINST,
@@ -220,6 +220,9 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
     fields = dict.fromkeys(comparison.field for comparison in comparisons)
     store, made = CellStore(job.cells), provenance(list(fields))
     _announce(job, comparisons, store, console)
+    if job.processes > 1:
+        for _ in each_done(_code_here, _parts(job), job.processes):
+            pass
     for comparison in comparisons:
         _check_window(job, comparison, store, console)
     tables: dict[str, list[Any]] = {}
@@ -238,8 +241,17 @@ def run_compare(job: CompareJob, console: Console) -> dict[str, Any]:
 
 
 PARTS = 4
-"""Of the coders of a drive, on Ray: each part renders the drive anew, which takes seconds."""
+"""Of the coders of a drive, each in a process that renders the drive anew, which takes seconds."""
 JOB_BYTES = 2_000_000_000
+
+
+def _parts(job: CompareJob) -> list[tuple[CompareJob, int]]:
+    """Return every drive as often as its coders have parts, which are numbered from 1."""
+    return [(one, part) for one in job.of_each_drive() for part in range(1, PARTS + 1)]
+
+
+def _code_here(numbered: tuple[CompareJob, int]) -> None:
+    _code_part(*numbered, Path.cwd(), partial(print, flush=True))
 
 
 def code_on_ray(job: CompareJob, address: str, tell: Tell) -> None:
@@ -252,15 +264,14 @@ def code_on_ray(job: CompareJob, address: str, tell: Tell) -> None:
     folder = Path.cwd()
     jobs = [
         Job(
-            f"drive-{number}-part-{part}",
+            f"drive-{1 + number // PARTS}-part-{part}",
             partial(_code_part, one, part, folder),
             (),
             None,
             cores=1,
             memory_bytes=JOB_BYTES,
         )
-        for number, one in enumerate(job.of_each_drive(), start=1)
-        for part in range(1, PARTS + 1)
+        for number, (one, part) in enumerate(_parts(job))
     ]
     run_jobs(jobs, tell, address)
 
@@ -283,7 +294,7 @@ def _announce(
     store: CellStore,
     console: Console,
 ) -> None:
-    left_s = sum(seconds_left(c.clip, c.coders, store) for c in comparisons)
+    left_s = sum(seconds_left(c.clip, c.coders, store) for c in comparisons) / job.processes
     clips = sum(len(coder.points) for c in comparisons for coder in c.coders)
     headline, *wider = map(_in_words, job.windows_db)
     also = f" (and {', '.join(wider)} where it is spanned)" if wider else ""
