@@ -137,6 +137,7 @@ def bd_rate_interval(
     *,
     first: int = 1,
     repetitions: int = 400,
+    least_share: float = 1.0,
     curve: Callable[[Sequence[CodedClip], NDArray[np.intp]], RateCurve] = rate_curve,
 ) -> tuple[float, float]:
     """Return the 95 % interval of the BD-rate from resampled blocks of frames.
@@ -144,8 +145,10 @@ def bd_rate_interval(
     The moving-block bootstrap of Kuensch (1989), percentiles: neighbouring frames resemble each
     other, so blocks of sqrt(N) consecutive frames are drawn, the same for both, from frame
     ``first`` on. It says how far the figure hangs on which part of the street the clip happens to
-    show; another street may lie outside. Draws whose curves leave the window count as no figure;
-    if they are more than 5 %, ``InvalidInput`` is raised.
+    show; another street may lie outside. Draws whose curves leave the window are compared over what
+    both reach of it, and count as no figure where that is less than ``least_share`` of it: an
+    encoder at its coarsest may just reach the window with the whole clip. If these are more than
+    5 %, ``InvalidInput`` is raised.
     """
     count = len(anchor[0].frame_bytes)
     figures = []
@@ -153,7 +156,7 @@ def bd_rate_interval(
         frames = _drawn_blocks(first, count, rng)
         try:
             curves = curve(anchor, frames), curve(test, frames)
-            figures.append(bd_rate_percent(*curves, window_db))
+            figures.append(bd_rate_percent(*curves, _reached(curves, window_db, least_share)))
         except InvalidInput:
             continue
     if len(figures) < 0.95 * repetitions:
@@ -163,6 +166,15 @@ def bd_rate_interval(
         )
     low, high = np.percentile(figures, (2.5, 97.5))
     return float(low), float(high)
+
+
+def _reached(curves: Sequence[RateCurve], window_db: Window, least_share: float) -> Window:
+    """Return what all curves reach of a window; raise ``InvalidInput`` below a share of it."""
+    low_db = max(window_db[0], *(curve.psnr_db[0] for curve in curves))
+    high_db = min(window_db[1], *(curve.psnr_db[-1] for curve in curves))
+    if high_db - low_db < least_share * (window_db[1] - window_db[0]):
+        raise InvalidInput("window_db", f"only {low_db:.2f}..{high_db:.2f} dB of it are reached")
+    return (low_db, high_db)
 
 
 def _drawn_blocks(first: int, count: int, rng: np.random.Generator) -> NDArray[np.intp]:

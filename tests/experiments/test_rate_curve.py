@@ -151,14 +151,31 @@ def test_more_frames_narrow_the_interval():
     assert width(400) < 0.5 * width(12)
 
 
-def test_an_interval_that_most_draws_leave_is_refused():
-    uneven = [
+def of_uneven_quality(clips):
+    return [
         CodedClip(c.point, c.frame_bytes, c.luma_mse * np.linspace(0.2, 1.8, 12), c.ssim, 1.0)
-        for c in clips(1)
+        for c in clips
     ]
+
+
+def test_an_interval_that_most_draws_leave_is_refused():
+    uneven = of_uneven_quality(clips(1))
     window = (float(rate_curve(uneven, slice(1, None)).psnr_db[0]) + 0.01, 35.0)
     with pytest.raises(InvalidInput, match=r"only \d+ of 400 resampled clips span"):
         bd_rate_interval(uneven, uneven, window, np.random.default_rng(1))
+
+
+def test_draws_that_leave_the_window_count_with_what_they_reach_of_it():
+    uneven, half = of_uneven_quality(clips(1)), of_uneven_quality(clips(0.5))
+    window = (float(rate_curve(uneven, slice(1, None)).psnr_db[0]) + 0.01, 35.0)
+
+    def interval(least_share):
+        rng = np.random.default_rng(1)
+        return bd_rate_interval(uneven, half, window, rng, least_share=least_share)
+
+    assert interval(0.2) == pytest.approx((-50, -50), abs=1e-2)
+    with pytest.raises(InvalidInput, match="resampled clips span"):
+        interval(0.99)
 
 
 def test_frames_that_resemble_their_neighbours_widen_the_interval():

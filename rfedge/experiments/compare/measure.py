@@ -139,7 +139,7 @@ def _row(
         rival_setting=rival.name,
         window_db=window,
         bd_rate_percent=bd_rate_percent(theirs, ours, window),
-        ci95=bd_rate_interval(rival.clips, method.clips, window, rng),
+        ci95=bd_rate_interval(rival.clips, method.clips, window, rng, least_share=0.5),
         points=len(method.clips),
         saving_percent_at_db={
             f"{db:g}": 100 * (1 - ours.bytes_at(db) / theirs.bytes_at(db))
