@@ -18,7 +18,7 @@ from rfedge.experiments.adapt.measure import adapt_section
 from rfedge.experiments.benchmark.definition import benchmark_section
 from rfedge.experiments.classes.measure import classes_section
 from rfedge.experiments.compare.figures import write_bd_rates, write_compare_figures
-from rfedge.experiments.compare.report import compare_section, headline
+from rfedge.experiments.compare.report import compare_section, harder_sentence, headline
 from rfedge.experiments.ladder.page import write_ladder_figure
 from rfedge.experiments.latency.report import latency_section, write_latency_figures
 from rfedge.experiments.latency.tail import tail_section
@@ -47,7 +47,10 @@ Machines are shared and noisy: compare within a table, not across hosts.
 """
 
 
-HEADLINE_BEGINS = "<!-- made from results/compare.json by `make figures` -->"
+HEADLINE_BEGINS = (
+    "<!-- made from results/compare.json and compare-harder.json by `make figures` -->"
+)
+HEADLINE_RESULTS = ("compare", "compare-harder")
 HEADLINE_ENDS = "<!-- end -->"
 
 SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
@@ -139,8 +142,9 @@ def _reference(path: Path, result: Result, noun: str, page: str) -> str:
     return f"{heading(path, result)}\n\n{len(rows)} {noun}: `docs/{page}.md`.\n"
 
 
-def with_headline(page: str, compared: Result) -> str:
-    """Return a page with the headline of a comparison between its two marks.
+def with_headline(page: str, compared: Result, harder: Result) -> str:
+    """Return a page with the headline of a comparison, and of one of harder drives, between its
+    two marks.
 
     Raises ``InvalidInput`` for a page without them.
     """
@@ -148,7 +152,8 @@ def with_headline(page: str, compared: Result) -> str:
     _, end, after = rest.partition(HEADLINE_ENDS)
     if not (mark and end):
         raise InvalidInput("page", f"it lacks {HEADLINE_BEGINS!r} ... {HEADLINE_ENDS!r}")
-    return f"{before}{mark}\n\n{headline(compared)}\n\n{end}{after}"
+    told = f"{headline(compared)}\n\n{harder_sentence(harder)}"
+    return f"{before}{mark}\n\n{told}\n\n{end}{after}"
 
 
 def main(results: Path, docs: Path) -> None:
@@ -158,9 +163,9 @@ def main(results: Path, docs: Path) -> None:
 
 
 def write_headline(results: Path, readme: Path) -> None:
-    """Write the headline of ``results/compare.json`` into the README."""
-    compared = read_result(results / "compare.json", "compare")
-    write_whole(readme, with_headline(readme.read_text(), compared))
+    """Write the headline of what is compared in ``results`` into the README."""
+    told = (read_result(results / f"{name}.json", "compare") for name in HEADLINE_RESULTS)
+    write_whole(readme, with_headline(readme.read_text(), *told))
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from rfedge.experiments.compare.report import (
     ForegroundRow,
     SsimRow,
     compare_section,
+    harder_sentence,
     headline,
     print_compared,
 )
@@ -277,6 +278,17 @@ def test_the_headline_tells_real_second_passes_apart_and_leaves_out_what_is_an_u
     assert "**68 %** (95 %: 66 to 71 %) on a real street's second pass; for" in sentence
     with pytest.raises(InvalidInput, match="no drive but upper bounds: kitti-city"):
         headline(result_of(rows=rows[:3], break_even=paid))
+
+
+def test_harder_drives_are_told_from_the_most_that_is_saved_to_the_least() -> None:
+    fair = replace(COMPARED, rival="x264-our-tools-medium")
+    rain = replace(fair, scene="rain", bd_rate_percent=22.9)
+    other = replace(rain, rival="x265-medium", bd_rate_percent=70.0)
+    wider = replace(fair, window_db=(30.0, 33.0), bd_rate_percent=-99.0)
+    told = harder_sentence(result_of(rows=[rain, other, fair, wider]))
+    assert told.endswith(": yardstick-empty at 10 Hz -57 %, rain at 10 Hz +23 %.")
+    with pytest.raises(InvalidInput, match="rain@10 lacks rfedge against x264-our-tools-medium"):
+        harder_sentence(result_of(rows=[other]))
 
 
 def test_every_point_of_every_curve_is_beside_its_figure(tmp_path: Path) -> None:

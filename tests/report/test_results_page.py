@@ -13,6 +13,7 @@ from rfedge.experiments.ladder.page import ladder_page
 from rfedge.pages.results import (
     HEADLINE_BEGINS,
     HEADLINE_ENDS,
+    HEADLINE_RESULTS,
     SECTIONS,
     main,
     results_page,
@@ -71,8 +72,8 @@ def test_every_figure_that_the_page_shows_is_committed() -> None:
 
 def test_the_readmes_headline_is_generated_from_the_result_file() -> None:
     readme = (ROOT / "README.md").read_text()
-    compared = read_result(ROOT / "results" / "compare.json", "compare")
-    assert readme == with_headline(readme, compared), "run `make figures`"
+    told = (read_result(ROOT / "results" / f"{name}.json", "compare") for name in HEADLINE_RESULTS)
+    assert readme == with_headline(readme, *told), "run `make figures`"
     table = readme.partition(HEADLINE_BEGINS)[2].partition(HEADLINE_ENDS)[0]
     assert "kitti-loop, 10 Hz" in table
     assert "best of all rivals" in table
@@ -80,7 +81,7 @@ def test_the_readmes_headline_is_generated_from_the_result_file() -> None:
 
 def test_a_page_without_a_place_for_the_headline_is_refused() -> None:
     with pytest.raises(InvalidInput, match="it lacks"):
-        with_headline("# A page\n", {"rows": []})
+        with_headline("# A page\n", {"rows": []}, {"rows": []})
 
 
 def test_the_ladders_page_is_generated_from_the_result_files() -> None:

@@ -205,7 +205,7 @@ def _bd_rates(rows: Sequence[CompareRow]) -> tuple[Figure, Lines]:
         axes.tick_params("y", labelsize=8)
         axes.invert_yaxis()
         axes.set_xlabel("BD-rate of ours against the rival, %")
-        axes.set_xlim(right=max(5.0, *(row.bd_rate_percent for row in ours)))
+        axes.set_xlim(right=5 + max(0.0, *(row.bd_rate_percent for row in ours)))
         if axes.lines:
             axes.legend(frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1), fontsize=8)
     return figure, lines

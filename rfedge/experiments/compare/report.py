@@ -28,6 +28,7 @@ __all__ = [
     "ForegroundRow",
     "SsimRow",
     "compare_section",
+    "harder_sentence",
     "headline",
     "print_compared",
     "without_field",
@@ -334,6 +335,20 @@ def headline(result: Result) -> str:
     cells = [[*_headline_cells(first, *drive), _field_cell(paid, *drive)] for drive in drives]
     lines = table(HEADLINE_COLUMNS, cells)
     return f"{_headline_sentence([_compared(first, *drive) for drive in drives])}\n\n{lines}"
+
+
+def harder_sentence(result: Result) -> str:
+    """Return what ours saves on each of several drives against the headline's rival, most first.
+
+    Raises ``InvalidInput`` for a comparison that lacks one.
+    """
+    compared = rows_of(CompareRow, result["rows"])
+    window = compared[0].window_db if compared else ()
+    first = [row for row in compared if row.window_db == window]
+    drives = dict.fromkeys((row.scene, row.hz) for row in first)
+    fair = sorted((_compared(first, *drive) for drive in drives), key=lambda r: r.bd_rate_percent)
+    told = [f"{row.scene} at {row.hz:g} Hz {row.bd_rate_percent:+.0f} %" for row in fair]
+    return f"Harder drives against the same x264 (`docs/results.md`): {', '.join(told)}."
 
 
 def _headline_sentence(fair: Sequence[CompareRow]) -> str:
