@@ -82,11 +82,6 @@ $(SCENES)/lane-%.toml: samples/street/empty.toml | $(SCENES)
 	$(call lane,$*)
 $(SCENES)/dusk.toml: samples/street/empty.toml | $(SCENES)
 	$(call effects,street-dusk)
-# A drive beside it, of which the field learns the dusk.
-$(SCENES)/dusk-beside.toml: $(SCENES)/dusk.toml
-	sed 's/^\[drive\]/&\nlane_offset_m = 0.6/' $< >$@
-$(OUT)/dusk.rff: $(call drive,dusk-beside) $(SAMPLE)
-	$(RFEDGE) field update $(SAMPLE) --from $< --min-identities 1 --as all --out $@
 $(SCENES)/rain.toml: samples/street/empty.toml | $(SCENES)
 	$(call effects,street-rain)
 $(SCENES)/rolling-shutter.toml: samples/street/empty.toml | $(SCENES)
@@ -152,11 +147,10 @@ $(OUT)/compare.json: $(FIELDS) $(if $(DATA),$(OUT)/loop-localised/transforms.jso
 	$(RFEDGE) eval compare $(SAMPLE) $(NOON) $(REAL) $(LOCALISED) $(YARDSTICK) --background sample-vehicles@10=$(EMPTY) \
 		$(if $(DATA),yardstick-vehicles@10=$(YARD)/transforms_drive_empty.json) \
 		--processes $(shell nproc) --cells $(OUT)/compare --out $@
-$(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) $(OUT)/dusk.rff $(if $(DATA),$(RESIDENTIAL)/drive/transforms.json $(OUT)/residential.rff) | $(OUT)
+$(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) $(if $(DATA),$(RESIDENTIAL)/drive/transforms.json $(OUT)/residential.rff) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) $(NOISY) $(YARDSTICK_30) \
 		sample-vehicles@20=$(call drive,20hz) sample-lens@10=$(UNDISTORTED) $(RESIDENTIAL_DRIVE) \
 		$(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) \
-		sample-dusk-learnt@10=$(call drive,dusk),$(OUT)/dusk.rff \
 		--background sample-people@10=$(EMPTY) \
 		--processes $(shell nproc) --cells $(OUT)/compare --out $@
 $(OUT)/compare-small.json: $(foreach k,30 60,$(OUT)/sample-$(k)k.rff $(if $(DATA),$(OUT)/yardstick-$(k)k.rff)) | $(OUT)

@@ -22,6 +22,7 @@ it as one line and exit with status 2; services map it to one gRPC status (``rfc
 """
 
 from enum import StrEnum
+from typing import Any
 
 __all__ = [
     "AccessDenied",
@@ -43,7 +44,19 @@ __all__ = [
 
 
 class RfedgeError(Exception):
-    """Base of all errors rfedge raises on purpose."""
+    """Base of all errors rfedge raises on purpose. It comes whole out of another process."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (type(self), self.args, vars(self))
+
+
+def _restored(
+    kind: type[RfedgeError], args: tuple[Any, ...], values: dict[str, Any]
+) -> RfedgeError:
+    """Return a pickled error without calling its constructor, which takes other arguments."""
+    error = kind.__new__(kind, *args)
+    vars(error).update(values)
+    return error
 
 
 class InvalidInput(RfedgeError, ValueError):
