@@ -12,7 +12,7 @@ import numpy as np
 
 from rfcore.metrics import ssim
 from rfedge.experiments.clips import CodedClip, luma_mse
-from rfedge.experiments.rivals import picture, video_frame
+from rfedge.experiments.rivals import even_size_px, picture, video_frame
 
 
 class MotionJpeg:
@@ -23,7 +23,8 @@ class MotionJpeg:
     def code(self, frames, rate_hz, point):
         """Code and decode ``frames`` (I420) one at a time at one operating point."""
         encoder = av.CodecContext.create("mjpeg", "w")
-        encoder.width, encoder.height = frames[0].size_px
+        size_px = frames[0].size_px
+        encoder.width, encoder.height = even_size_px(size_px)
         encoder.pix_fmt, encoder.time_base = "yuvj420p", 1 / Fraction(rate_hz)
         encoder.options = {"qmin": f"{point:g}", "qmax": f"{point:g}"}
         began_s = process_time()
@@ -31,7 +32,8 @@ class MotionJpeg:
         packets = [encoder.encode(video_frame(f, i, "yuvj420p"))[0] for i, f in pictures]
         cpu_ms = 1e3 * (process_time() - began_s)
         decoder = av.CodecContext.create("mjpeg", "r")
-        decoded = [picture(f) for packet in (*packets, None) for f in decoder.decode(packet)]
+        shown = [frame for packet in (*packets, None) for frame in decoder.decode(packet)]
+        decoded = [picture(frame, size_px) for frame in shown]
         pairs = list(zip(decoded, frames, strict=True))
         return CodedClip(
             point,
