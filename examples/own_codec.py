@@ -10,9 +10,10 @@ from time import process_time
 import av
 import numpy as np
 
+from rfcore.codec.h264.config import even_size_px
+from rfcore.codec.h264.ffmpeg import picture_of, video_frame
 from rfcore.metrics import ssim
 from rfedge.experiments.clips import CodedClip, luma_mse
-from rfedge.experiments.rivals import even_size_px, picture, video_frame
 
 
 class MotionJpeg:
@@ -24,16 +25,17 @@ class MotionJpeg:
         """Code and decode ``frames`` (I420) one at a time at one operating point."""
         encoder = av.CodecContext.create("mjpeg", "w")
         size_px = frames[0].size_px
-        encoder.width, encoder.height = even_size_px(size_px)
+        even_px = even_size_px(size_px)
+        encoder.width, encoder.height = even_px
         encoder.pix_fmt, encoder.time_base = "yuvj420p", 1 / Fraction(rate_hz)
         encoder.options = {"qmin": f"{point:g}", "qmax": f"{point:g}"}
         began_s = process_time()
         pictures = enumerate(frames)
-        packets = [encoder.encode(video_frame(f, i, "yuvj420p"))[0] for i, f in pictures]
+        packets = [encoder.encode(video_frame(f, even_px, i, "yuvj420p"))[0] for i, f in pictures]
         cpu_ms = 1e3 * (process_time() - began_s)
         decoder = av.CodecContext.create("mjpeg", "r")
         shown = [frame for packet in (*packets, None) for frame in decoder.decode(packet)]
-        decoded = [picture(frame, size_px) for frame in shown]
+        decoded = [picture_of(frame).cropped(size_px) for frame in shown]
         pairs = list(zip(decoded, frames, strict=True))
         return CodedClip(
             point,

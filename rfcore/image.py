@@ -89,6 +89,13 @@ class I420:
         half = ((height + 1) // 2, (width + 1) // 2)
         return I420(*(np.empty(shape, np.uint8) for shape in ((height, width), half, half)))
 
+    def cropped(self, size_px: tuple[int, int]) -> I420:
+        """Return the upper left part of (width, height), which shares this picture's samples."""
+        width, height = size_px
+        half_height, half_width = (height + 1) // 2, (width + 1) // 2
+        half = (slice(half_height), slice(half_width))
+        return I420(self.y[:height, :width], self.u[half], self.v[half])
+
     def packed(self) -> bytes:
         """Return the planes one after the other, each row by row without padding."""
         return b"".join(plane.tobytes() for plane in self.planes)

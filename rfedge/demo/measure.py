@@ -127,15 +127,10 @@ def _point(frames: Sequence[I420], preset: str, crf: float, quality: Quality) ->
     sizes = [sum(map(len, slice_nals(unit))) for unit in units]
     decoder = H264Decoder(config.coded_size_px)
     qualities = [
-        quality(_cropped(decoder.decode(unit), config), frame)
+        quality(decoder.decode(unit).cropped(config.size_px), frame)
         for unit, frame in zip(units, frames, strict=True)
     ]
     return RatePoint(crf, float(np.mean(sizes)), float(np.mean(qualities)))
-
-
-def _cropped(picture: I420, config: CodecConfig) -> I420:
-    width_px, height_px = config.size_px
-    return I420(picture.y[:height_px, :width_px], picture.u, picture.v)
 
 
 FrameAddress = tuple[int, int]

@@ -16,13 +16,14 @@ from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from time import process_time_ns
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 import av
 import numpy as np
 from av.error import FFmpegError
-from numpy.typing import NDArray
 
+from rfcore.codec.h264.config import even_size_px
+from rfcore.codec.h264.ffmpeg import picture_of, video_frame
 from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfedge.experiments.clips import CodedClip, luma_mse
@@ -32,9 +33,7 @@ __all__ = [
     "CodedPictures",
     "Rival",
     "ordinary_scheduling",
-    "picture",
     "svtav1_lowdelay",
-    "video_frame",
     "x264_for_psnr",
     "x264_for_ssim",
     "x264_lowdelay",
@@ -164,9 +163,10 @@ class Rival:
 
     def _packets(self, frames: Sequence[I420], rate_hz: float, point: float) -> Iterator[bytes]:
         try:
-            encoder = self._encoder(frames[0].size_px, rate_hz, point)
+            even_px = even_size_px(frames[0].size_px)
+            encoder = self._encoder(even_px, rate_hz, point)
             for index, frame in enumerate(frames):
-                made = encoder.encode(video_frame(frame, index))
+                made = encoder.encode(video_frame(frame, even_px, index))
                 if len(made) != 1:
                     raise CodecError(f"{self.name}: frame {index} came out as {len(made)} packets")
                 yield bytes(made[0])
@@ -180,7 +180,7 @@ class Rival:
     ) -> av.VideoCodecContext:
         encoder = _opened(self.encoder, "w")
         rate = Fraction(rate_hz).limit_denominator(1000)
-        encoder.width, encoder.height = even_size_px(size_px)
+        encoder.width, encoder.height = size_px
         encoder.pix_fmt = "yuv420p"
         encoder.time_base, encoder.framerate = 1 / rate, rate
         encoder.thread_count = 1
@@ -192,7 +192,7 @@ class Rival:
     def _decoded(self, packets: Sequence[bytes], size_px: tuple[int, int]) -> list[I420]:
         decoder = self._decoder()
         frames = [f for packet in packets for f in decoder.decode(av.Packet(packet))]
-        return [picture(frame, size_px) for frame in (*frames, *decoder.decode(None))]
+        return [picture_of(frame).cropped(size_px) for frame in (*frames, *decoder.decode(None))]
 
     def _decoder(self) -> av.VideoCodecContext:
         decoder = _opened(self.decoder, "r")
@@ -309,35 +309,3 @@ def _opened(codec: str, mode: Literal["r", "w"]) -> av.VideoCodecContext:
 
 def _joined(options: Mapping[str, str]) -> str:
     return ":".join(f"{name}={value}" for name, value in options.items())
-
-
-def even_size_px(size_px: tuple[int, int]) -> tuple[int, int]:
-    """Return (width, height) rounded up to even, as encoders of 4:2:0 take pictures."""
-    width_px, height_px = size_px
-    return (width_px + width_px % 2, height_px + height_px % 2)
-
-
-def video_frame(source: I420, index: int, pixel_format: str = "yuv420p") -> av.VideoFrame:
-    """Return a picture as PyAV's encoders take it, the ``index``-th of its clip.
-
-    The last row and column of an odd size are repeated, as our codec does.
-    """
-    frame = av.VideoFrame(*even_size_px(source.size_px), pixel_format)
-    for plane, samples in zip(frame.planes, source.planes, strict=True):
-        target = _samples(plane)
-        missing = [(0, n - has) for n, has in zip(target.shape, samples.shape, strict=True)]
-        target[:] = np.pad(samples, missing, "edge")
-    frame.pts = index
-    return frame
-
-
-def picture(frame: av.VideoFrame, size_px: tuple[int, int]) -> I420:
-    """Return what a decoder showed of pictures of ``size_px``, without what made them even."""
-    width_px, height_px = size_px
-    y, u, v = (_samples(plane).copy() for plane in frame.planes)
-    return I420(np.ascontiguousarray(y[:height_px, :width_px]), u, v)
-
-
-def _samples(plane: Any) -> NDArray[np.uint8]:
-    samples: NDArray[np.uint8] = np.frombuffer(memoryview(plane), np.uint8)
-    return samples.reshape(-1, plane.line_size)[: plane.height, : plane.width]

@@ -30,6 +30,7 @@ __all__ = [
     "check_effort",
     "coder_of",
     "effort_of_preset",
+    "even_size_px",
     "preset_of",
 ]
 
@@ -128,6 +129,12 @@ def check_crf(field: str, crf: float) -> None:
         raise InvalidInput(field, f"{crf} is outside {low:g}..{high:g}")
 
 
+def even_size_px(size_px: tuple[int, int]) -> tuple[int, int]:
+    """Return (width, height) rounded up to even, which 4:2:0 cropping can express (7.4.2.1.1)."""
+    width_px, height_px = size_px
+    return (width_px + width_px % 2, height_px + height_px % 2)
+
+
 @dataclass(frozen=True)
 class CodecConfig:
     """One stream's size and quality. Raises ``InvalidInput`` naming the field that is wrong.
@@ -170,8 +177,8 @@ class CodecConfig:
 
     @property
     def coded_size_px(self) -> tuple[int, int]:
-        """The size rounded up to even, which 4:2:0 cropping can express (7.4.2.1.1)."""
-        return (self.width_px + self.width_px % 2, self.height_px + self.height_px % 2)
+        """The size as it is coded, rounded up to even."""
+        return even_size_px(self.size_px)
 
     @property
     def size_mbs(self) -> tuple[int, int]:

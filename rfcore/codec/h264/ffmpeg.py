@@ -1,4 +1,4 @@
-"""libx264 and FFmpeg's H.264 decoder, as one function and one class: the codec's only use of PyAV.
+"""libx264 and FFmpeg's H.264 decoder, and frames as PyAV has them: the codec's only use of PyAV.
 
 Whatever changes x264's output is set here or is an argument. Threads work on whole pictures, never
 on parts of one: one picture is one slice.
@@ -23,7 +23,15 @@ from rfcore.codec.h264.qp_map import Region
 from rfcore.errors import CodecError
 from rfcore.image import I420
 
-__all__ = ["EncoderOptions", "H264Decoder", "PictureKind", "decode_clip", "encode_pictures"]
+__all__ = [
+    "EncoderOptions",
+    "H264Decoder",
+    "PictureKind",
+    "decode_clip",
+    "encode_pictures",
+    "picture_of",
+    "video_frame",
+]
 
 SIGNAL = MappingProxyType(
     {
@@ -83,7 +91,8 @@ def encode_pictures(
         encoder = _open_encoder(options)
         packets = []
         for index, (picture, kind) in enumerate(pictures):
-            frame = _frame_of(picture, options.size_px, index, kind)
+            frame = video_frame(picture, options.size_px, index)
+            frame.pict_type = kind.value
             if regions and index == len(pictures) - 1:
                 frame = _with_regions(frame, regions)
             packets += encoder.encode(frame)
@@ -147,8 +156,7 @@ class H264Decoder:
 
     def _picture_of(self, frame: av.VideoFrame) -> I420:
         self._check(frame)
-        y, u, v = (_plane_view(plane).copy() for plane in frame.planes)
-        return I420(y, u, v)
+        return picture_of(frame)
 
     def _check(self, frame: av.VideoFrame) -> None:
         if frame.is_corrupt:
@@ -197,10 +205,15 @@ def _open_encoder(options: EncoderOptions) -> av.VideoCodecContext:
     return encoder
 
 
-def _frame_of(
-    picture: I420, size_px: tuple[int, int], index: int, kind: PictureKind
+def video_frame(
+    picture: I420, size_px: tuple[int, int], index: int, pixel_format: str = "yuv420p"
 ) -> av.VideoFrame:
-    frame = av.VideoFrame(*size_px, "yuv420p")
+    """Return a picture as PyAV's encoders take it, the ``index``-th of its clip.
+
+    ``size_px`` may be larger: the last row and column are repeated. ``pixel_format`` is FFmpeg's
+    name of a form of 4:2:0.
+    """
+    frame = av.VideoFrame(*size_px, pixel_format)
     for plane, source in zip(frame.planes, picture.planes, strict=True):
         target = _plane_view(plane)
         height, width = source.shape
@@ -208,8 +221,13 @@ def _frame_of(
         target[:height, width:] = source[:, -1:]
         target[height:] = target[height - 1]
     frame.pts = index
-    frame.pict_type = kind.value
     return frame
+
+
+def picture_of(frame: av.VideoFrame) -> I420:
+    """Return a copy of what a decoder showed, in 4:2:0."""
+    y, u, v = (_plane_view(plane).copy() for plane in frame.planes)
+    return I420(y, u, v)
 
 
 def _with_regions(frame: av.VideoFrame, regions: Sequence[Region]) -> av.VideoFrame:

@@ -103,13 +103,7 @@ class SpliceDecoder:
         """
         with self._fresh_after_errors():
             picture = self._decoder.decode(join_nals([payload]))
-        width_px, height_px = self._config.size_px
-        half_height, half_width = (height_px + 1) // 2, (width_px + 1) // 2
-        return I420(
-            picture.y[:height_px, :width_px],
-            picture.u[:half_height, :half_width],
-            picture.v[:half_height, :half_width],
-        )
+        return picture.cropped(self._config.size_px)
 
     def reset(self) -> None:
         """Start over with a fresh decoder, whatever the last payload did to the old one."""

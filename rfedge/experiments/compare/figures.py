@@ -18,6 +18,8 @@ from rfedge.experiments.compare.report import (
     HEADLINE_ANCHOR,
     CompareRow,
     CurveRow,
+    of_first_method,
+    of_first_window,
     without_field,
 )
 from rfedge.report.charts import STYLE, Lines, write_figure
@@ -82,8 +84,7 @@ def write_bd_rates(result: Result, folder: Path, name: str = "bd_rates") -> list
     compared = rows_of(CompareRow, result["rows"])
     if not compared:
         raise InvalidInput("result", "there is no row to draw")
-    rows = [row for row in compared if row.window_db == compared[0].window_db]
-    return write_figure(folder / name, *_bd_rates(rows))
+    return write_figure(folder / name, *_bd_rates(of_first_window(compared)))
 
 
 def _curves(curves: Sequence[CurveRow]) -> tuple[Figure, Lines]:
@@ -121,7 +122,7 @@ def _frontier(curves: Sequence[CurveRow]) -> tuple[Figure, Lines]:
             percent = 100 * math.exp(_middle_bytes(curve) - _middle_bytes(anchor))
             lines.append([curve.setting, f"{curve.both_ends_ms:.2f}", f"{percent:.2f}"])
             at = (curve.both_ends_ms, percent)
-            codec = "rfedge" if not curve.family else _codec(curve.setting)
+            codec = _codec(curve.setting)
             axes.plot(*at, "o", color=CODECS.get(codec, OTHER), markersize=5, label=codec)
             if percent < least or not curve.family:
                 _name_point(axes, at, curve, above=len(axes.texts) % 2 == 0)
@@ -148,11 +149,9 @@ def _codec(setting: str) -> str:
 
 def _name_point(axes: Any, at: tuple[float, float], curve: CurveRow, *, above: bool) -> None:
     """Write a setting's name without its codec's, which the colour tells."""
-    setting = curve.setting if curve.family else without_field(curve.setting)
-    codec = "rfedge" if not curve.family else _codec(setting)
     offset = (0, 5) if above else (0, -11)
     axes.annotate(
-        setting.removeprefix(codec).lstrip("-"),
+        _label(curve).removeprefix(_codec(curve.setting)).lstrip("-"),
         at,
         offset,
         textcoords="offset points",
@@ -163,7 +162,6 @@ def _name_point(axes: Any, at: tuple[float, float], curve: CurveRow, *, above: b
 
 def _draw(axes: Any, curve: CurveRow, colour: str, marker: str) -> None:
     sizes = [size / 1000 for size in curve.bytes_per_frame]
-    label = curve.setting if curve.family else without_field(curve.setting)
     axes.plot(
         sizes,
         curve.psnr_db,
@@ -171,8 +169,13 @@ def _draw(axes: Any, curve: CurveRow, colour: str, marker: str) -> None:
         marker=marker,
         markersize=4,
         linewidth=1.8,
-        label=label,
+        label=_label(curve),
     )
+
+
+def _label(curve: CurveRow) -> str:
+    """Return a setting's name, ours without the digest of its field."""
+    return curve.setting if curve.family else without_field(curve.setting)
 
 
 def _middle_bytes(curve: CurveRow) -> float:
@@ -187,7 +190,7 @@ def _bd_rates(rows: Sequence[CompareRow]) -> tuple[Figure, Lines]:
         numbers = [f"{value:.2f}" for value in (row.bd_rate_percent, *row.ci95)]
         names = [row.method, row.rival, row.rival_setting]
         lines.append([row.scene, f"{row.hz:g}", *names, *numbers])
-    ours = [row for row in rows if without_field(row.method) == without_field(rows[0].method)]
+    ours = of_first_method(rows)
     drives = list(dict.fromkeys((row.scene, row.hz) for row in ours))
     with mpl.rc_context({**STYLE, "axes.grid.axis": "both"}):
         figure, axes = plt.subplots(figsize=(7.2, 0.3 * len(drives) + 1.2))

@@ -30,6 +30,8 @@ __all__ = [
     "compare_section",
     "harder_sentence",
     "headline",
+    "of_first_method",
+    "of_first_window",
     "print_compared",
     "without_field",
 ]
@@ -209,7 +211,7 @@ def compare_section(path: Path, result: Result) -> str:
     if by_ssim:
         parts += ["By SSIM (window), rivals tuned for it where they can be:"]
         parts += [_by_drive(by_ssim, lambda row: row.rival_setting, _ssim_cell)]
-    break_even = _of_first_method(rows_of(BreakEvenRow, result.get("break_even", ())))
+    break_even = of_first_method(rows_of(BreakEvenRow, result.get("break_even", ())))
     if break_even:
         parts += ["What the field's own bytes leave:"]
         lines = ([name, *_break_even_cells(row)] for name, row in _named(break_even))
@@ -226,23 +228,21 @@ def _compared_tables(path: Path, compared: Sequence[CompareRow]) -> list[str]:
     if not compared:
         return ["No curves share a window."]
     anchor = _anchor(compared)
-    window = compared[0].window_db
-    ours = _of_first_method(compared)
-    against_anchor = [row for row in compared if row.rival == anchor]
-    detailed = [row for row in _of_first_method(against_anchor) if row.window_db == window]
+    first = of_first_window(compared)
+    of_all_methods = [row for row in first if row.rival == anchor]
+    of_all_windows = [row for row in of_first_method(compared) if row.rival == anchor]
+    detailed = of_first_method(of_all_methods)
     method = without_field(compared[0].method)
-    first = [row for row in ours if row.window_db == window]
-    same = [row for row in against_anchor if row.window_db == window]
     return [
         f"BD-rates in % ({path.name} has every row with its interval): `{method}` over "
         f"{_window(compared[0])} dB, against",
-        _by_drive(first, lambda row: row.rival, _bd_rate_cell),
+        _by_drive(of_first_method(first), lambda row: row.rival, _bd_rate_cell),
         f"Against {anchor}, with what a frame takes of a processor (median, least, most):",
         table(DETAIL_COLUMNS, ([name, *_detail_cells(row)] for name, row in _named(detailed))),
         f"Against {anchor} by window, dB (95 %):",
-        _by_drive(_of_first_method(against_anchor), _window, _interval_cell),
+        _by_drive(of_all_windows, _window, _interval_cell),
         f"Against {anchor} over {_window(compared[0])} dB by method (95 %):",
-        _by_drive(same, lambda row: without_field(row.method), _interval_cell),
+        _by_drive(of_all_methods, lambda row: without_field(row.method), _interval_cell),
     ]
 
 
@@ -252,7 +252,13 @@ def _anchor(compared: Sequence[CompareRow]) -> str:
     return HEADLINE_ANCHOR if HEADLINE_ANCHOR in rivals else rivals[0]
 
 
-def _of_first_method(rows: Sequence[Row]) -> list[Row]:
+def of_first_window(rows: Sequence[CompareRow]) -> list[CompareRow]:
+    """Return the rows of the window that was asked about first."""
+    return [row for row in rows if row.window_db == rows[0].window_db]
+
+
+def of_first_method(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of the method that stands first, in whatever field."""
     return [row for row in rows if without_field(row.method) == without_field(rows[0].method)]
 
 
@@ -261,9 +267,7 @@ def _by_drive(rows: Sequence[Row], column: Callable[[Row], str], text: Callable[
     return pivot("drive", ((name, column(row), text(row)) for name, row in _named(rows)))
 
 
-def _named(
-    rows: Sequence[Row],
-) -> list[tuple[str, Row]]:
+def _named(rows: Sequence[Row]) -> list[tuple[str, Row]]:
     """Return each row with its drive's name, and the field's where a drive has several."""
     fields: dict[tuple[str, float], set[str]] = {}
     for row in rows:
@@ -328,8 +332,7 @@ def headline(result: Result) -> str:
     Raises ``InvalidInput`` for a comparison that lacks one of them.
     """
     compared = rows_of(CompareRow, result["rows"])
-    window = compared[0].window_db if compared else ()
-    first = [row for row in compared if row.window_db == window]
+    first = of_first_window(compared)
     drives = dict.fromkeys((row.scene, row.hz) for row in first)
     paid = rows_of(BreakEvenRow, result.get("break_even", ()))
     cells = [[*_headline_cells(first, *drive), _field_cell(paid, *drive)] for drive in drives]
@@ -343,8 +346,7 @@ def harder_sentence(result: Result) -> str:
     Raises ``InvalidInput`` for a comparison that lacks one.
     """
     compared = rows_of(CompareRow, result["rows"])
-    window = compared[0].window_db if compared else ()
-    first = [row for row in compared if row.window_db == window]
+    first = of_first_window(compared)
     drives = dict.fromkeys((row.scene, row.hz) for row in first)
     fair = sorted((_compared(first, *drive) for drive in drives), key=lambda r: r.bd_rate_percent)
     told = [f"{row.scene} at {row.hz:g} Hz {row.bd_rate_percent:+.0f} %" for row in fair]

@@ -110,11 +110,6 @@ class ShownRow:
     """Of the time, one core of the vehicle."""
     receiver_busy_percent: float
 
-    @property
-    def sender(self) -> str:
-        """Drive and method in a few words."""
-        return _sender(self)
-
 
 def _sender(row: NeededRow | PlayedRow | ShownRow) -> str:
     return f"{row.scene} {row.hz:g} Hz, {row.method.split('-')[0]}"
@@ -157,11 +152,14 @@ def latency_section(path: Path, result: Result) -> str:
         "sent, and how many of all were shown within 100 ms."
     )
     needed = [_needed_cells(row) for row in rows_of(NeededRow, result["needed"])]
-    played = [
-        (row.sender, row.link, _played_cell(row)) for row in rows_of(PlayedRow, result["rows"])
-    ]
-    shown = [(row.sender, row.link, _shown_cell(row)) for row in rows_of(ShownRow, result["shown"])]
-    tables = (carried, pivot("sender", played), computed, pivot("sender", shown))
+    played = rows_of(PlayedRow, result["rows"])
+    shown = rows_of(ShownRow, result["shown"])
+    tables = (
+        carried,
+        pivot("sender", ((_sender(row), row.link, _played_cell(row)) for row in played)),
+        computed,
+        pivot("sender", ((_sender(row), row.link, _shown_cell(row)) for row in shown)),
+    )
     return "\n\n".join([heading(path, result), notes, table(NEEDED, needed), *tables, ""])
 
 

@@ -183,9 +183,7 @@ def _coded(camera: Rgb, render: Rgb, setting: Setting) -> dict[str, Any]:
 
 def _decoded(clip: Sequence[bytes], setting: Setting) -> list[I420]:
     config = CodecConfig(*setting.size_px, effort_of_preset(setting.preset), setting.crf)
-    width, height = setting.size_px
-    pictures = decode_clip(config.coded_size_px, clip)
-    return [I420(p.y[:height, :width], p.u, p.v) for p in pictures]
+    return [p.cropped(setting.size_px) for p in decode_clip(config.coded_size_px, clip)]
 
 
 CONTROL_PRESET, CONTROL_CRF = "medium", 23.0

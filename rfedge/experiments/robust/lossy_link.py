@@ -26,7 +26,8 @@ from av.error import FFmpegError
 from av.video.frame import PictureType
 
 from rfcore.codec.decoder import DeltaDecoder
-from rfcore.codec.h264.config import CodecConfig
+from rfcore.codec.h264.config import CodecConfig, even_size_px
+from rfcore.codec.h264.ffmpeg import picture_of, video_frame
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.references import RENDER_ONLY
 from rfcore.codec.sender.encoder import DeltaEncoder, Encoded, FrameChoice
@@ -35,7 +36,6 @@ from rfcore.errors import CodecError, InvalidInput
 from rfcore.image import I420
 from rfcore.metrics import ssim
 from rfedge.experiments.field_coder import RenderedClip, message_bytes
-from rfedge.experiments.rivals import even_size_px, picture, video_frame
 from rfedge.offline import Arrival, decode_frames
 
 __all__ = [
@@ -273,7 +273,7 @@ def x264_crossing(crossing: Crossing, *, idr_on_nack: bool) -> Outcome:
     refreshed, sizes, new = 0, [], []
     decoded: dict[int, I420] = {}
     for index, frame in enumerate(crossing.frames):
-        fed = video_frame(frame, index)
+        fed = video_frame(frame, even_size_px(frame.size_px), index)
         if idr_on_nack and feedback.news_of_loss(refreshed):
             fed.pict_type = PictureType.I
             refreshed = index
@@ -321,7 +321,7 @@ def _x264(crossing: Crossing, *, idr_on_nack: bool) -> av.VideoCodecContext:
 def _pictures(decoder: Any, packet: Any, size_px: tuple[int, int]) -> dict[int, I420]:
     """Return what the decoder shows, by the frame's number; of what it cannot use, nothing."""
     try:
-        return {frame.pts: picture(frame, size_px) for frame in decoder.decode(packet)}
+        return {frame.pts: picture_of(frame).cropped(size_px) for frame in decoder.decode(packet)}
     except FFmpegError:
         return {}
 
