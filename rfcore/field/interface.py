@@ -25,6 +25,7 @@ from rfcore.field.archive import Archive
 from rfcore.field.quality import FULL, Quality
 from rfcore.geodesy import Anchor, anchor_of_values, anchor_values
 from rfcore.native.yuv import field_view_from_view
+from rfcore.raster.gaussians import sky_of
 from rfcore.views import FieldView, View
 
 __all__ = [
@@ -72,7 +73,8 @@ class Bounds:
 
     @staticmethod
     def around(points_m: NDArray[np.float32]) -> Bounds:
-        """Return the box of ``points_m`` [N, 3]; of none, the origin."""
+        """Return the box of those of ``points_m`` [N, 3] that are not sky; of none, the origin."""
+        points_m = points_m[~sky_of(points_m)]
         if not len(points_m):
             return Bounds((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         low, high = points_m.min(axis=0).tolist(), points_m.max(axis=0).tolist()

@@ -52,7 +52,7 @@ from rfcore.field.splat_grid import (
     placed,
 )
 from rfcore.files import DECODED_BYTES
-from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
+from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians, sky_of
 
 __all__ = [
     "ENCODING",
@@ -398,12 +398,17 @@ def _reordered_level(level: LevelOfDetail, order: NDArray[np.intp]) -> LevelOfDe
 
 
 def _local_order(gaussians: Gaussians) -> NDArray[np.intp]:
-    """Return the order [N] along the curve within each band."""
+    """Return the order [N] along the curve within each band, its sky last: a block that has both
+    takes steps of 1 cm."""
     n = len(gaussians)
     band = np.zeros(n, np.int8)
     for detail in DETAILS[1:]:
         band[kept_of(n, detail) :] += 1
-    return np.lexsort((_morton(gaussians.means.astype(np.float64)), band))
+    is_sky = sky_of(gaussians.means)
+    curve = np.zeros(n, np.uint64)
+    for part in (is_sky, ~is_sky):
+        curve[part] = _morton(gaussians.means[part].astype(np.float64))
+    return np.lexsort((curve, is_sky, band))
 
 
 def _morton(means: NDArray[np.float64]) -> NDArray[np.uint64]:

@@ -8,6 +8,7 @@ stream with a header of 16 bytes, version 4 has a plain header of 32 bytes, a ta
 one Zstandard stream a block. Version 3 is written, 2 to 4 are read.
 
 It is lossy: for looking at rather than for coding against. Axes are those of the file both ways.
+24 bits have no room for a street and its sky, which is brought to 2 km.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from rfcore.errors import FieldFormatError, InvalidInput
 from rfcore.extras import needs
 from rfcore.field.splat_archive import check_decoded_size
 from rfcore.files import write_whole
-from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.gaussians import Gaussians, with_sky_at
 
 __all__ = ["encode_spz", "read_open_spz", "write_spz"]
 
@@ -45,6 +46,7 @@ ANTIALIASED_FLAG = 1
 FIXED_POINT_BITS = 24
 FINEST_FRACTION_BITS = 12
 COLOUR_SCALE = 0.15
+SKY_DISTANCE_M = 2000.0
 COMPRESSION_LEVEL = 6
 
 F32 = NDArray[np.float32]
@@ -61,6 +63,7 @@ def encode_spz(gaussians: Gaussians, *, antialiased: bool) -> bytes:
 
     Raises ``InvalidInput`` where a mean is farther from the origin than 24 bits of whole metres.
     """
+    gaussians = with_sky_at(gaussians, SKY_DISTANCE_M)
     fraction_bits = _fraction_bits(gaussians.means)
     header = HEADER.pack(
         MAGIC,

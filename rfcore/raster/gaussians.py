@@ -7,7 +7,7 @@ whose degree-0 band is offset by 0.5. Positions are float32 relative to the tile
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from math import isqrt
 
 import numpy as np
@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 
-__all__ = ["MAX_GAUSSIANS", "Gaussians"]
+__all__ = ["MAX_GAUSSIANS", "SKY_M", "Gaussians", "joined", "sky_of", "with_sky_at"]
 
 MAX_GAUSSIANS = 50_000_000
 """Upper limit accepted from files: 11.8 GB of parameters at SH degree 3."""
+SKY_M = 1e4
+"""Gaussians whose centre is deeper than this in a picture are sky: colour without a surface."""
 
 F32 = NDArray[np.float32]
 
@@ -73,3 +75,37 @@ class Gaussians:
     def sh_degree(self) -> int:
         """Degree D of the spherical harmonics, 0..3."""
         return isqrt(self.sh.shape[1]) - 1
+
+
+def sky_of(means: F32) -> NDArray[np.bool_]:
+    """Return which of the means [N, 3] are further than ``SKY_M`` from their median on an axis.
+
+    None where that is half of them or more: a scene may be that large.
+    """
+    middle = np.median(means, axis=0) if len(means) else np.zeros(3)
+    is_far = np.asarray((np.abs(means - middle) > SKY_M).any(axis=1))
+    return np.asarray(is_far & (2 * is_far.sum() < len(means)))
+
+
+def with_sky_at(gaussians: Gaussians, distance_m: float) -> Gaussians:
+    """Return ``gaussians`` with the sky so far from the median of all, as wide to the eye there."""
+    is_sky = sky_of(gaussians.means)
+    if not is_sky.any():
+        return gaussians
+    middle = np.median(gaussians.means, axis=0).astype(np.float64)
+    offset = gaussians.means[is_sky] - middle
+    nearer = distance_m / np.linalg.norm(offset, axis=1, keepdims=True)
+    means, log_scales = gaussians.means.copy(), gaussians.log_scales.copy()
+    means[is_sky] = middle + offset * nearer
+    log_scales[is_sky] += np.log(nearer).astype(np.float32)
+    return replace(gaussians, means=means, log_scales=log_scales)
+
+
+def joined(first: Gaussians, second: Gaussians) -> Gaussians:
+    """Return the Gaussians of ``first``, then those of ``second``, of the same SH degree."""
+    return Gaussians(
+        **{
+            f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)])
+            for f in fields(Gaussians)
+        }
+    )

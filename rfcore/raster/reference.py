@@ -19,7 +19,7 @@ import numpy as np
 from rfcore.camera import Camera
 from rfcore.extras import needs
 from rfcore.harmonics import CONSTANT, higher_harmonics
-from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.gaussians import SKY_M, Gaussians
 
 with needs("reference"):
     import torch
@@ -87,8 +87,10 @@ def render(
     """Render colour [H, W, 3], depth [H, W] in metres and opacity [H, W].
 
     ``params`` has the fields of ``Gaussians`` as tensors of one floating dtype; finiteness is not
-    checked. Colour is not clamped from above; depth is the mean z weighted by each Gaussian's
-    share of the pixel, 0 where nothing was hit; opacity is 1 - final transmittance.
+    checked. Colour is not clamped from above. Depth and opacity are those of surfaces: the mean z
+    weighted by each Gaussian's share of the pixel, and the sum of those shares, what lies beyond
+    10 km (``SKY_M``) left out. Where that is more than half of what is shown depth is ``SKY_M``,
+    where nothing is shown 0.
 
     With ``antialiased`` a Gaussian that the dilation widens is made fainter by as much: its
     opacity is multiplied by sqrt(det C / det (C + 0.3 I)), C its projected covariance
@@ -105,12 +107,12 @@ def render(
             width = min(TILE_PX, k.width_px - left)
             tile = band.at(_touching(band, axis=0, start=left, length=width))
             pixels = _pixel_centres(left, top, width, height, like=splats.centre_px)
-            row.append(_composite(tile, pixels).reshape(height, width, 5))
+            row.append(_composite(tile, pixels).reshape(height, width, 6))
         rows.append(torch.cat(row, dim=1))
     picture = torch.cat(rows, dim=0)
-    opacity = picture[..., 4]
-    colour = picture[..., :3] + (1.0 - opacity)[..., None] * _like(picture, background)
-    return colour, _mean_depth(picture[..., 3], opacity), opacity
+    opacity, shown = picture[..., 4], picture[..., 5]
+    colour = picture[..., :3] + (1.0 - shown)[..., None] * _like(picture, background)
+    return colour, _depth(picture[..., 3], opacity, shown), opacity
 
 
 def loss_l1_dssim(colour: Tensor, target: Tensor, dssim_weight: float = 0.2) -> Tensor:
@@ -247,11 +249,11 @@ def _pixel_centres(left: int, top: int, width: int, height: int, like: Tensor) -
 
 
 def _composite(splats: _Splats, pixels: Tensor) -> Tensor:
-    """Blend front to back (3DGS eq. 3): [P, 5] = colour, sum of w z, sum of w.
+    """Blend front to back (3DGS eq. 3): [P, 6] = colour; sums of w z and w of surfaces; sum of w.
 
-    The weights w = alpha T telescope: their sum is 1 - final transmittance. A Gaussian whose alpha
-    is under 1/255 is skipped; the first one that would leave 1e-4 of the light or less ends the
-    pixel without being drawn.
+    The weights w = alpha T telescope: the last sum is 1 - final transmittance. A Gaussian whose
+    alpha is under 1/255 is skipped; the first one that would leave 1e-4 of the light or less ends
+    the pixel without being drawn.
     """
     d = pixels[:, None, :] - splats.centre_px[None]
     xx, xy, yy = splats.conic.unbind(-1)
@@ -262,14 +264,16 @@ def _composite(splats: _Splats, pixels: Tensor) -> Tensor:
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
     drawn = after > MIN_TRANSMITTANCE
     weight = torch.where(drawn, alpha * before, 0.0)
-    values = [splats.colour, splats.depth_m[:, None], torch.ones_like(splats.depth_m[:, None])]
-    return weight @ torch.cat(values, dim=1)
+    surface = (splats.depth_m <= SKY_M).to(weight.dtype)
+    of_surfaces = torch.stack([surface * splats.depth_m, surface, torch.ones_like(surface)], dim=1)
+    return weight @ torch.cat([splats.colour, of_surfaces], dim=1)
 
 
-def _mean_depth(weighted_m: Tensor, opacity: Tensor) -> Tensor:
-    """Divide the sum of w z by the sum of w; 0 where nothing was hit."""
+def _depth(weighted_m: Tensor, opacity: Tensor, shown: Tensor) -> Tensor:
+    """Divide the sum of w z by the sum of w, both of surfaces; 0 where nothing was hit."""
     hit = opacity > 0
-    return torch.where(hit, weighted_m / torch.where(hit, opacity, 1.0), 0.0)
+    mean = torch.where(hit, weighted_m / torch.where(hit, opacity, 1.0), 0.0)
+    return torch.where(shown > 2.0 * opacity, SKY_M, mean)
 
 
 def _ssim_map(a: Tensor, b: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from rfcore.errors import InvalidInput, TrainingDiverged
 from rfcore.field import SplatField
 from rfcore.field.interface import SPLATS
 from rfcore.geodesy import Anchor
-from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
+from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians, joined
 from rfcore.raster.trainable import LearningRates, TrainableRasterizer, TrainingState
 from rfcore.train.checkpoint import Checkpoint
 from rfcore.train.poses import PoseCorrection, PoseModel, pose_gradient, typical_depth_m
@@ -37,7 +37,7 @@ from rfcore.train.schedule import (
     is_order_due,
     view_order,
 )
-from rfcore.train.start import gaussians_from_points
+from rfcore.train.start import gaussians_from_points, sky_gaussians
 from rfcore.train.targets import ExposureModel, Target, halved, load_targets
 from rfcore.train.trainer import FieldTrainer, HeldOut, settings_of
 from rfcore.views import PointCloud, PosedPicture
@@ -54,6 +54,8 @@ class SplatTrainingConfig:
 
     gaussians: int = 150_000
     """At most as many points are drawn from those given."""
+    sky: int = 0
+    """In how many directions, over the whole sphere, Gaussians at infinity are looked for."""
     iterations: int = 2000
     initial_scale: float = 0.6
     """Standard deviation at the start, in units of the distance to the three nearest points."""
@@ -76,6 +78,8 @@ class SplatTrainingConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.gaussians <= MAX_GAUSSIANS:
             raise InvalidInput("training.gaussians", f"{self.gaussians} not in 1..{MAX_GAUSSIANS}")
+        if not 0 <= self.sky <= 1_000_000:
+            raise InvalidInput("training.sky", f"{self.sky} is outside 0..1000000")
         if not 1 <= self.iterations <= 1_000_000:
             raise InvalidInput("training.iterations", f"{self.iterations} is outside 1..1000000")
         if not 0.01 <= self.initial_scale <= 10:
@@ -256,10 +260,12 @@ class SplatTrainer(FieldTrainer):
     def _initial(self, start: PointCloud | Gaussians, rng: np.random.Generator) -> Gaussians:
         if isinstance(start, Gaussians):
             return start
-        config = self.config
-        return gaussians_from_points(
-            start, config.gaussians, config.initial_scale, rng, sh_degree=config.bands.degree
-        )
+        config, degree = self.config, self.config.bands.degree
+        scale = config.initial_scale
+        surfaces = gaussians_from_points(start, config.gaussians, scale, rng, sh_degree=degree)
+        if not config.sky:
+            return surfaces
+        return joined(surfaces, sky_gaussians(self._targets, config.sky, scale, sh_degree=degree))
 
     def _rasterizer_of(self, gaussians: Gaussians) -> TrainableRasterizer:
         config = self.config

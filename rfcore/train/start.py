@@ -4,6 +4,9 @@ Points come from the dataset, from depth maps, or are drawn at random along the 
 becomes one isotropic Gaussian, as wide as its neighbourhood (3DGS, section 5.1: the mean distance
 to the three nearest neighbours), half opaque, of the point's colour from every side.
 
+Points lie on surfaces. Clouds have none: the sky is Gaussians of their own, so far away that they
+stand still in every picture (``sky_gaussians``).
+
 Neighbours are found exactly, in a balanced k-d tree whose leaves hold at most ``LEAF_POINTS``
 points each: 120,000 points take 0.7 s of one core. Squared distances are float32 sums in the order
 x, y, z.
@@ -21,7 +24,8 @@ from numpy.typing import NDArray
 from rfcore.camera import Camera
 from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
-from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.gaussians import SKY_M, Gaussians
+from rfcore.train.targets import Target
 from rfcore.views import PointCloud, PosedPicture
 
 __all__ = [
@@ -29,6 +33,7 @@ __all__ = [
     "gaussians_from_points",
     "points_from_depth",
     "random_points",
+    "sky_gaussians",
     "spacing_m",
 ]
 
@@ -204,6 +209,98 @@ def gaussians_from_points(
         opacity_logits=np.zeros(n, np.float32),
         sh=sh,
     )
+
+
+SKY_DISTANCE_M = 10 * SKY_M
+"""Beyond ``SKY_M`` in depth, too, wherever a picture of up to 168 degrees shows it."""
+SKY_LOGIT = 2.0
+SKY_LEVELS = 15
+"""By how much, of 255, pictures differ that show the same piece of a cloud between its pixels."""
+SKY_BASELINE = 0.1
+"""How far apart cameras have to be that agree, as a share of how far apart all are: at one place
+all agree about everything."""
+DIRECTIONS = 4096
+"""Looked at together: what 1000 pictures show there is 25 MB."""
+NOT_SEEN = np.iinfo(np.int16).max
+
+
+def sky_gaussians(
+    targets: Sequence[Target], directions: int, scale: float, *, sh_degree: int = 3
+) -> Gaussians:
+    """Return Gaussians 100 km away in those of so many directions in which all look alike.
+
+    The directions are spread evenly over the sphere (Fibonacci lattice). One is kept where more
+    than half of the pictures that look there, from places apart, show the same colour: parallax
+    changes what is nearer, unless it has no texture, as a road has none. Such are kept as well, and
+    hidden by what lies before them. ``scale`` as in ``gaussians_from_points``, of the distance
+    between directions.
+    """
+    centres_m = np.array([target.camera.world_from_cam.translation_m for target in targets])
+    towards = _lattice(directions)
+    parts = [
+        _agreed_colour(targets, centres_m, towards[first : first + DIRECTIONS])
+        for first in range(0, directions, DIRECTIONS)
+    ]
+    colour, is_kept = (np.concatenate(values) for values in zip(*parts, strict=True))
+    n = int(is_kept.sum())
+    means = centres_m.mean(axis=0) + SKY_DISTANCE_M * towards[is_kept]
+    width_m = scale * SKY_DISTANCE_M * math.sqrt(4 * math.pi / directions)
+    sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)
+    sh[:, 0] = (colour[is_kept] / 255.0 - 0.5) / SH_DC
+    return Gaussians(
+        means=means.astype(np.float32),
+        quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+        log_scales=np.full((n, 3), math.log(width_m), np.float32),
+        opacity_logits=np.full(n, SKY_LOGIT, np.float32),
+        sh=sh,
+    )
+
+
+def _lattice(count: int) -> F64:
+    """Return unit vectors [count, 3], as evenly over the sphere as a spiral can be."""
+    turn = np.arange(count) + 0.5
+    up = 1 - 2 * turn / count
+    azimuth, level = math.pi * (1 + math.sqrt(5)) * turn, np.sqrt(1 - up * up)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up], axis=1)
+
+
+def _agreed_colour(
+    targets: Sequence[Target], centres_m: F64, towards: F64
+) -> tuple[NDArray[np.int16], NDArray[np.bool_]]:
+    """Return the median colour [D, 3] in each direction, and whether the pictures agree on it."""
+    colours = np.stack([_colours_at_infinity(target, towards) for target in targets])
+    is_seen = colours[..., 0] != NOT_SEEN
+    seen = is_seen.sum(axis=0)
+    middle = np.maximum(seen - 1, 0) // 2
+    median = np.take_along_axis(np.sort(colours, axis=0), middle[None, :, None], axis=0)[0]
+    agrees = is_seen & (np.abs(colours - median).max(axis=-1) <= SKY_LEVELS)
+    apart_m = _extent_m(centres_m, agrees)
+    is_enough = (2 * agrees.sum(axis=0) > seen) & (apart_m > 0)
+    all_apart_m = np.linalg.norm(np.ptp(centres_m, axis=0))
+    return median, is_enough & (apart_m >= SKY_BASELINE * all_apart_m)
+
+
+def _extent_m(centres_m: F64, is_in: NDArray[np.bool_]) -> F64:
+    """Return the diagonal [D] of the box around those of the centres [V, 3] that ``is_in`` [V, D]
+    names; 0 around none."""
+    among = is_in[:, :, None]
+    low = np.where(among, centres_m[:, None], np.inf).min(axis=0)
+    high = np.where(among, centres_m[:, None], -np.inf).max(axis=0)
+    return np.asarray(np.linalg.norm(np.where(high >= low, high - low, 0.0), axis=1))
+
+
+def _colours_at_infinity(target: Target, towards: F64) -> NDArray[np.int16]:
+    """Return the picture's colour [D, 3] in each direction, ``NOT_SEEN`` outside of it."""
+    k = target.camera.intrinsics
+    x, y, z = (towards @ np.array(target.camera.world_from_cam.rotation_matrix())).T
+    ahead = z > 1e-6
+    z = np.where(ahead, z, 1.0)
+    u, v = np.floor(k.fx_px * x / z + k.cx_px), np.floor(k.fy_px * y / z + k.cy_px)
+    is_inside = ahead & (u >= 0) & (u < k.width_px) & (v >= 0) & (v < k.height_px)
+    colours = np.full(towards.shape, NOT_SEEN, np.int16)
+    rows, columns = v[is_inside].astype(np.int64), u[is_inside].astype(np.int64)
+    colours[is_inside] = target.rgb[rows, columns]
+    return colours
 
 
 def spacing_m(xyz_m: F32) -> NDArray[np.float64]:

@@ -75,6 +75,9 @@ class Train:
     """Training iterations, one picture each; default: the trainer's own."""
     gaussians: int | None = None
     """At most how many Gaussians to start with, drawn from the points at random."""
+    sky: Annotated[int, arg(metavar="DIRECTIONS")] = 0
+    """Start Gaussians of the sky too, 100 km away, in those of so many directions in which all
+    pictures show the same: 60000 for a street under clouds. 0: none."""
     limit: int | None = None
     """Density control: let the set grow to so many Gaussians, replacing those that show nothing;
     default: 250000 with --minutes, else the set stays as it is."""
@@ -299,14 +302,17 @@ class Train:
         return read_views(choice)
 
     def _config(self, exposure_varies: bool) -> SplatTrainingConfig | NgpTrainingConfig:
+        from rfcore.errors import InvalidInput
         from rfcore.train import Bands, DensityControl, NgpTrainingConfig
         from rfedge.training.run import UNLIMITED_ITERATIONS, training_config
 
         iterations = UNLIMITED_ITERATIONS if self.minutes is not None else self.iterations
         if self.kind == "ngp":
+            if self.sky:
+                raise InvalidInput("sky", "is of splats; a hash grid reaches to the horizon itself")
             ngp = NgpTrainingConfig(threads=self.threads)
             return ngp if iterations is None else replace(ngp, iterations=iterations)
-        config = training_config(self.gaussians, iterations, self.threads)
+        config = replace(training_config(self.gaussians, iterations, self.threads), sky=self.sky)
         limit = self.limit
         if self.minutes is not None:
             limit = DEFAULT_LIMIT if limit is None else limit

@@ -224,7 +224,7 @@ def needed_bytes(job: TrainingJob) -> int:
     sizes = [(k.width_px, k.height_px) for k in cameras]
     if isinstance(config, NgpTrainingConfig):
         return ngp_training_bytes(config.model, sizes)
-    most = max(config.gaussians, config.density.limit)
+    most = max(config.gaussians + config.sky, config.density.limit)
     return splat_training_bytes(most, config.bands.degree, sizes)
 
 

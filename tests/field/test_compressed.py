@@ -33,7 +33,7 @@ from rfcore.field.quality import DETAILS, LevelOfDetail, kept_of
 from rfcore.field.splat_archive import compressed_archive, detail_ends, splats_of_compressed
 from rfcore.field.splat_grid import BLOCK, Grain, Steps, gaussians_of, numbers_of
 from rfcore.field.store import decode_beginning, decode_field, encode_field
-from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.gaussians import Gaussians, sky_of
 
 GOLDEN = Path(__file__).parent / "golden"
 GOLDEN_SPLATS = "3597093196fa52eeb631e76985d822af7bb577ea11ec70dd24045f1194120adf"
@@ -186,6 +186,21 @@ def test_splats_far_from_the_origin_keep_what_float32_keeps(make_gaussians) -> N
     distant = replace(g, means=g.means + np.float32(1e6), log_scales=g.log_scales - 9)
     back = gaussians_of(numbers_of(distant, STEPS), STEPS)
     assert np.abs(back.means - distant.means).max() <= 2.0 ** (20 - 23) / 2
+
+
+def test_a_field_with_sky_keeps_the_places_of_its_street(make_gaussians) -> None:
+    """Only the block of a band that has both takes the sky's steps, and they are 8 mm."""
+    g = make_gaussians(3000, 0)
+    g.means[::7] *= 1e5 / np.linalg.norm(g.means[::7], axis=1, keepdims=True)
+    marked = replace(g, opacity_logits=np.arange(3000, dtype=np.float32))
+    field = field_of(marked)
+    back = decode_field(encode_field(field)).gaussians
+    moved_m = np.abs(back.means - g.means[back.opacity_logits.astype(int)]).max(axis=1)
+    is_sky = sky_of(back.means)
+    assert is_sky.sum() == len(g.means[::7])
+    assert moved_m.max() <= 2.0**-7
+    assert (moved_m[~is_sky] > 2.0**-9).sum() < len(DETAILS) * BLOCK
+    assert np.abs(field.bounds.low_m).max() < 10 > np.abs(field.bounds.high_m).max()
 
 
 def test_every_level_keeps_its_splats(make_gaussians) -> None:

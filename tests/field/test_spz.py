@@ -86,6 +86,19 @@ def test_the_same_splats_give_the_same_bytes() -> None:
     assert one == other
 
 
+def test_the_sky_is_written_nearby_as_wide_to_the_eye_and_the_street_as_finely_as_ever() -> None:
+    street = random_gaussians(1, 40, 0, 60.0)
+    street.means[::5] *= 1e5 / np.linalg.norm(street.means[::5], axis=1, keepdims=True)
+    street.log_scales[::5] = 6.8
+    read, _ = decoded(encode_spz(street, antialiased=True))
+    is_sky = np.arange(40) % 5 == 0
+    assert np.abs(read.means - street.means)[~is_sky].max() <= 2.0**-12
+    turn = (read.means * street.means).sum(axis=1)[is_sky] / 1e5
+    assert np.linalg.norm(read.means[is_sky], axis=1) == pytest.approx(2000, rel=0.05)
+    assert turn == pytest.approx(np.linalg.norm(read.means[is_sky], axis=1), rel=1e-3)
+    assert read.log_scales[is_sky] == pytest.approx(6.8 - np.log(50), abs=0.05)
+
+
 def test_a_splat_beyond_24_bits_of_metres_is_refused() -> None:
     with pytest.raises(InvalidInput, match=r"means: .* reaches 8388607 m"):
         encode_spz(random_gaussians(3, 9, 0, 3e7), antialiased=False)

@@ -16,7 +16,7 @@ from forward_isas import forward_isas
 from rfcore.camera import Camera
 from rfcore.native.backend import available_isas
 from rfcore.raster import reference
-from rfcore.raster.gaussians import Gaussians
+from rfcore.raster.gaussians import SKY_M, Gaussians
 from rfcore.raster.native import Rasterizer
 from rfcore.raster.trainable import TrainableRasterizer
 from rfcore.views import View
@@ -93,11 +93,20 @@ def _named(name: str) -> Implementation:
     return torch_based(reference.render) if name == DEFINITION_FLOAT32 else native(name)
 
 
-@pytest.fixture
-def gaussians(scene: SceneMaker) -> Gaussians:
-    """Opacities below 0.95: no alpha comes near a ceiling."""
+@pytest.fixture(params=["near", "with-sky"])
+def gaussians(request: pytest.FixtureRequest, scene: SceneMaker) -> Gaussians:
+    """Opacities below 0.95: no alpha comes near a ceiling. With sky a third is 20,000 times as far
+    away, and as wide."""
     made = scene(150, 2)
-    return replace(made, opacity_logits=np.minimum(made.opacity_logits, F32(2.9)))
+    times = np.ones((150, 1), F32)
+    if request.param == "with-sky":
+        times[::3] = 20_000
+    return replace(
+        made,
+        means=made.means * times,
+        log_scales=made.log_scales + np.log(times),
+        opacity_logits=np.minimum(made.opacity_logits, F32(2.9)),
+    )
 
 
 DEFINITION = torch_based(reference.render, torch.float64)
@@ -109,6 +118,7 @@ def test_it_draws_the_definition(
     got = implementation.draw(gaussians, camera(), antialiased)
     want = DEFINITION.draw(gaussians, camera(), antialiased)
     flipped = np.abs(got.opacity - want.opacity) > PICTURE_TOLERANCE
+    flipped |= (got.depth == SKY_M) != (want.depth == SKY_M)
     assert flipped.mean() <= MAX_FLIPPED
     assert np.abs(got.colour - want.colour)[~flipped].max() < PICTURE_TOLERANCE
     assert np.abs(got.depth - want.depth)[~flipped].max() < 7.0 * PICTURE_TOLERANCE

@@ -184,6 +184,8 @@ def test_an_empty_field_against_grey_has_the_closed_form_quality(posed) -> None:
     [
         ({"gaussians": 0}, "training.gaussians: 0"),
         ({"iterations": 0}, "training.iterations: 0"),
+        ({"sky": -1}, "training.sky: -1"),
+        ({"sky": 1_000_001}, "training.sky: 1000001"),
         ({"halved_until": 1.0}, "training.halved_until: 1.0"),
         ({"halved_until": float("nan")}, "training.halved_until: nan"),
         ({"initial_scale": float("nan")}, "training.initial_scale: nan"),

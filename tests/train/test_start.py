@@ -5,7 +5,15 @@ import pytest
 
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.errors import InvalidInput
-from rfcore.train.start import RandomStart, looking_distance_m, points_from_depth, random_points
+from rfcore.raster.gaussians import SKY_M
+from rfcore.train.start import (
+    RandomStart,
+    looking_distance_m,
+    points_from_depth,
+    random_points,
+    sky_gaussians,
+)
+from rfcore.train.targets import Target
 
 K = Intrinsics(40, 24, 30.0, 30.0, 20.0, 12.0)
 
@@ -92,3 +100,61 @@ def test_cameras_with_nothing_in_common_are_refused(posed) -> None:
 def test_settings_that_make_no_sense_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(InvalidInput, match="start"):
         RandomStart(**change)
+
+
+def ray_directions(camera: Camera) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(40) + 0.5 - 20, np.arange(24) + 0.5 - 12)
+    rays = np.stack([u / 30, v / 30, np.ones_like(u)], axis=-1)
+    return rays @ np.array(camera.world_from_cam.rotation_matrix()).T
+
+
+def cloudy(towards: np.ndarray) -> np.ndarray:
+    """The colour of the sky [..., 3] in each direction, smooth over some degrees."""
+    x, y, z = np.moveaxis(towards / np.linalg.norm(towards, axis=-1, keepdims=True), -1, 0)
+    return 128 + 60 * np.stack([np.sin(5 * x + z), np.cos(4 * y), np.sin(6 * y - 3 * x)], axis=-1)
+
+
+def before_clouds(camera: Camera, wall_m: float = 3.0) -> Target:
+    """What a camera sees of the sky over a textured wall, whose top is at its own height."""
+    rays, x_m = ray_directions(camera), camera.world_from_cam.translation_m[0]
+    across = (x_m + wall_m * rays[..., 0] / rays[..., 2]) / 0.05
+    down = wall_m * rays[..., 1] / rays[..., 2] / 0.05
+    stones = np.random.default_rng(1).uniform(0, 255, (500, 100, 3))
+    texture = stones[np.floor(across).astype(int) % 500, np.floor(down).astype(int) % 100]
+    is_wall = (rays[..., 1] > 0)[..., None]
+    picture = np.where(is_wall, texture, cloudy(rays))
+    return Target(camera, np.round(picture).astype(np.uint8))
+
+
+def test_the_sky_is_where_pictures_from_places_apart_agree(cameras) -> None:
+    sky = sky_gaussians([before_clouds(camera) for camera in cameras], 20_000, 0.6, sh_degree=2)
+    towards = sky.means.astype(np.float64) / np.linalg.norm(sky.means, axis=1, keepdims=True)
+    x, y, z = towards.T
+    is_inside = (z > 0) & (np.abs(x) < 0.6 * z) & (np.abs(y) < 0.36 * z)
+    above, below = y < -0.05 * z, y > 0.05 * z  # a pixel and a half from the edge
+    assert (above & is_inside).sum() > 0.9 * 20_000 * 0.3 / (4 * np.pi)  # a third of a steradian
+    assert below.mean() < 0.05
+    shown = 255 * (0.5 + sky.sh[above, 0] * np.sqrt(1 / (4 * np.pi)))
+    assert np.abs(shown - cloudy(towards[above])).mean() < 4
+    assert not sky.sh[:, 1:].any()
+    assert sky.means[:, 2].min() > SKY_M
+
+
+def test_no_sky_is_seen_from_one_place(cameras) -> None:
+    """There all agree about everything."""
+    assert len(sky_gaussians([before_clouds(cameras[0])] * 3, 5000, 0.6)) == 0
+
+
+def test_a_wall_that_fills_all_pictures_is_no_sky(cameras) -> None:
+    rng = np.random.default_rng(3)
+    noise = [Target(c, rng.integers(0, 256, (24, 40, 3), dtype=np.uint8)) for c in cameras]
+    assert len(sky_gaussians(noise, 5000, 0.6)) < 5
+
+
+@pytest.mark.parametrize("directions", [1, 3, 4096, 9000])
+def test_directions_are_spread_evenly(directions: int) -> None:
+    """Of a smooth white everything all directions in view are kept: their share of the sphere."""
+    at = [Camera(K, Pose((x, 0.0, 0.0), (1.0, 0, 0, 0))) for x in (0.0, 5.0)]
+    sky = sky_gaussians([Target(camera, paint(255)) for camera in at], directions, 0.6)
+    corner = np.arcsin(20 * 12 / np.sqrt((30**2 + 20**2) * (30**2 + 12**2)))
+    assert abs(len(sky) - directions * 4 * corner / (4 * np.pi)) <= 1 + 0.02 * directions**0.5 * 5

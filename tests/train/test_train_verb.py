@@ -1,6 +1,7 @@
 """``rfedge train`` writes a field, a result, a page; interrupted, it ends with the same bytes."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -138,6 +139,21 @@ def test_only_a_run_short_of_time_begins_with_halved_pictures(wall: Path, tmp_pa
     assert by_count.halved_until == 0
 
 
+def test_the_sky_of_still_pictures_is_found_and_written(wall: Path, tmp_path: Path) -> None:
+    """One picture from eight places: all of it is at infinity."""
+    still = tmp_path / "still"
+    shutil.copytree(wall, still)
+    for i in range(VIEWS):
+        shutil.copy(wall / "0.png", still / f"{i}.png")
+    for directions in (0, 2000):
+        verb(still, tmp_path / f"{directions}.rff", iterations=1, sky=directions).run()
+    without, with_sky = (load_field(tmp_path / f"{n}.rff") for n in (0, 2000))
+    solid_angle = 4 * np.arcsin(24 * 16 / np.hypot(40, 24) / np.hypot(40, 16))
+    in_view = 2000 * solid_angle / (4 * np.pi)
+    assert len(with_sky.gaussians) - len(without.gaussians) == pytest.approx(in_view, rel=0.05)
+    assert np.abs(with_sky.bounds.high_m).max() < 100
+
+
 def test_a_hash_grid_is_trained_by_the_same_loop(wall: Path, tmp_path: Path) -> None:
     dataset, held_out = split_every(read_dataset(wall), 4)
     model = NgpModel(L=4, log2_T=10, N_max=64, occupancy=4000)
@@ -223,6 +239,7 @@ def test_declared_exposure_is_learned_and_nothing_else_is(wall: Path, tmp_path: 
         ({"holdout": 4, "held_out": Path("x")}, "holdout"),
         ({"views_percent": 0.0}, "views_percent"),
         ({"points": Path("x"), "depths": Path("x")}, "depths"),
+        ({"sky": 100, "kind": "ngp"}, "sky: is of splats"),
         ({"size": "24"}, "size"),
         ({"size": "24x0"}, "size"),
     ],

@@ -22,8 +22,8 @@ struct TilePixels {
     alignas(64) float red[kBlocksPerTile][16];
     alignas(64) float green[kBlocksPerTile][16];
     alignas(64) float blue[kBlocksPerTile][16];
-    alignas(64) float depth[kBlocksPerTile][16];    // sum of w z
-    alignas(64) float opacity[kBlocksPerTile][16];  // sum of w
+    alignas(64) float depth[kBlocksPerTile][16];    // sum of w z, the sky left out
+    alignas(64) float opacity[kBlocksPerTile][16];  // sum of w, the sky left out
 };
 
 template <bool kView>
@@ -52,7 +52,7 @@ RF_INLINE void add_splat(const Splat& s, Lanes weight, BlockPixels* p) {
     p->blue = fma(weight, splat(s.blue), p->blue);
     if (kView) {
         p->depth = fma(weight, splat(s.depth), p->depth);
-        p->opacity = p->opacity + weight;
+        p->opacity = fma(weight, splat(s.surface), p->opacity);
     }
 }
 
@@ -118,7 +118,7 @@ RF_INLINE bool blend_block(const TileChunk& chunk, int b, int listed, TilePixels
 
 // Four rows of the tile as rows of 16 pixels.
 struct RowsOfBlocks {
-    Lanes red[4], green[4], blue[4], depth[4], opacity[4];
+    Lanes red[4], green[4], blue[4], depth[4], opacity[4], transmittance[4];
 };
 
 RF_INLINE void load_rows(const float (*plane)[16], int block_row, Lanes* rows) {
@@ -138,6 +138,13 @@ RF_INLINE void store_columns(float* out, Lanes row, int columns) {
     memcpy(out, all, static_cast<size_t>(columns) * sizeof(float));
 }
 
+// The mean depth of the surfaces, that of the sky where it is most of what is shown, 0 where nothing is.
+RF_INLINE Lanes depth_of(Lanes weighted, Lanes opacity, Lanes transmittance) {
+    const Lanes mean = keep(gt(opacity, zero()), weighted / opacity);
+    const Mask is_sky = gt(splat(1.0f) - transmittance, opacity + opacity);
+    return select(is_sky, splat(kSkyM), mean);
+}
+
 // Write the pixels of the tile that are inside the picture.
 template <bool kView>
 RF_INLINE void write_tile(const BlendJob& job, int tile_x, int tile_y, const TilePixels& pixels) {
@@ -152,6 +159,7 @@ RF_INLINE void write_tile(const BlendJob& job, int tile_x, int tile_y, const Til
         if (kView) {
             load_rows(pixels.depth, block_row, r.depth);
             load_rows(pixels.opacity, block_row, r.opacity);
+            load_rows(pixels.transmittance, block_row, r.transmittance);
         }
         for (int s = 0; s < kBlockSide; ++s) {
             const int y = tile_y * kTileSide + block_row * kBlockSide + s;
@@ -165,9 +173,8 @@ RF_INLINE void write_tile(const BlendJob& job, int tile_x, int tile_y, const Til
                 memcpy(job.colour + 3 * first, row, 3 * sizeof(float) * static_cast<size_t>(columns));
             }
             if (kView) {
-                const Lanes mean = r.depth[s] / r.opacity[s];
                 store_columns(job.opacity + first, r.opacity[s], columns);
-                store_columns(job.depth + first, keep(gt(r.opacity[s], zero()), mean), columns);
+                store_columns(job.depth + first, depth_of(r.depth[s], r.opacity[s], r.transmittance[s]), columns);
             }
         }
     }

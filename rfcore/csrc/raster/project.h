@@ -245,13 +245,14 @@ RF_INLINE void make_splats(const Projection& p, Lanes log2_alpha, Lanes headroom
     const Lanes b = a * b_over_a;
     const Lanes c = splat(kHalfLog2ERoot) / sqrt(p.c_yy);
     const Lanes limit = splat(kMaxColour);
+    const Mask is_surface = ge(splat(kSkyM), p.in_camera.z);
     alignas(64) float rows[16 * 16];
     store(rows, a);
     store(rows + 16, b);
     store(rows + 32, c);
     store(rows + 48, log2_alpha + splat(kAlphaBits));
     for (int k = 0; k < 3; ++k) store(rows + 64 + 16 * k, min(max(colour[k], zero()), limit));
-    store(rows + 112, p.in_camera.z);
+    store(rows + 112, keep(is_surface, p.in_camera.z));
     store(rows + 128, p.centre_x);
     store(rows + 144, p.centre_y);
     store(rows + 160, half_x);
@@ -259,7 +260,7 @@ RF_INLINE void make_splats(const Projection& p, Lanes log2_alpha, Lanes headroom
     store(rows + 192, fma(headroom, splat(kCutoffScale), splat(kCutoffOffset)));
     store(rows + 208, negate(a * b) / fma(b, b, c * c));
     store(rows + 224, negate(b_over_a));
-    store(rows + 240, zero());
+    store(rows + 240, keep(is_surface, splat(1.0f)));
     transpose(rows, splats);
 }
 

@@ -18,6 +18,7 @@ constexpr int kTilesPerGroupSide = 4;
 constexpr int kTilesPerGroup = 16;
 constexpr int kGroupSide = kTilesPerGroupSide * kTileSide;
 constexpr int kMaxDegree = 3;
+constexpr float kSkyM = 1e4f;  // centres beyond this depth are sky: colours without a surface
 
 constexpr int coefficients_of(int degree) { return (degree + 1) * (degree + 1); }
 
@@ -50,13 +51,13 @@ struct alignas(64) Splat {
     float a, b, c;
     float power;  // log2(256 opacity)
     float red, green, blue;
-    float depth;               // z in the camera, m
+    float depth;               // z in the camera, m; 0 of the sky
     float centre_x, centre_y;  // px
     float half_x, half_y;      // half sides of the box outside which alpha < 1/255, px
     float cutoff;              // u^2 + v^2 above this means alpha < 1/255, with a margin
     float y_per_x;             // where alpha is largest on a vertical line: dy = y_per_x dx
     float x_per_y;             // and on a horizontal one: dx = x_per_y dy
-    float unused;
+    float surface;             // 1, or 0 of the sky: that has colour, neither depth nor opacity
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 

@@ -45,6 +45,7 @@ void blend(constant Camera* camera, global const Splat* splats, global const uin
     local float4 shape[BATCH];   // a, b, c, power
     local float2 centre[BATCH];
     local float4 light[BATCH];   // red, green, blue, depth
+    local float surface[BATCH];
     local uint touched[BATCH];
     local uint any_lit;
     const int column = get_local_id(0), row = get_local_id(1), me = TILE_SIDE * row + column;
@@ -68,6 +69,7 @@ void blend(constant Camera* camera, global const Splat* splats, global const uin
             shape[me] = (float4)(s.a, s.b, s.c, s.power);
             centre[me] = (float2)(s.centre_x, s.centre_y);
             light[me] = (float4)(s.red, s.green, s.blue, s.depth);
+            surface[me] = s.surface;
             touched[me] = touched_blocks(&s, left, top);
         }
         barrier(CLK_LOCAL_MEM_FENCE);
@@ -83,10 +85,13 @@ void blend(constant Camera* camera, global const Splat* splats, global const uin
             const float alpha = least_of(alpha_from_log2(power), MAX_ALPHA);
             const float after = fnma(transmittance, alpha, transmittance);
             is_lit = after > MIN_TRANSMITTANCE;
-            if (!is_lit) continue;
+            if (!is_lit) {
+                transmittance = 0.0f;
+                continue;
+            }
             const float weight = PRODUCT(alpha, transmittance);
             sum = fma((float4)(weight), light[k], sum);
-            weights = weights + weight;
+            weights = fma(weight, surface[k], weights);
             transmittance = after;
         }
         barrier(CLK_LOCAL_MEM_FENCE);
@@ -95,5 +100,7 @@ void blend(constant Camera* camera, global const Splat* splats, global const uin
     const size_t at = (size_t)pixel_y * camera->width + pixel_x;
     vstore3(sum.xyz, at, colour);
     opacity[at] = weights;
-    depth[at] = weights > 0.0f ? divide(sum.w, weights) : 0.0f;
+    const bool is_sky = 1.0f - transmittance > weights + weights;
+    const float mean = weights > 0.0f ? divide(sum.w, weights) : 0.0f;
+    depth[at] = is_sky ? SKY_M : mean;
 }

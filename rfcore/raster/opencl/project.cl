@@ -1,6 +1,7 @@
 // From Gaussians to splats, as rfcore/csrc/raster/project.h, one Gaussian a work-item.
 #define NEAR_M 0.01f
 #define FAR_M 1e9f
+#define SKY_M 1e4f
 #define MAX_VARIANCE 1e18f
 #define MAX_COLOUR 1e18f
 #define DILATION 0.3f
@@ -25,7 +26,7 @@ typedef struct {
     float a, b, c, power;
     float red, green, blue, depth;
     float centre_x, centre_y, half_x, half_y;
-    float cutoff, y_per_x, x_per_y, unused;
+    float cutoff, y_per_x, x_per_y, surface;
 } Splat;
 
 // Where the tiles of a splat are looked for. The arithmetic of its rows depends on the window they
@@ -202,6 +203,7 @@ kernel void project(int count, int degree, int stored_coefficients, int antialia
     const float3 colour = colour_of(degree, offset * inverse_distance,
                                     sh + 3 * (size_t)n * stored_coefficients, zero);
     const float b_over_a = negate(divide(c_xy, c_yy));
+    const bool is_surface = SKY_M >= depth;
     Splat s;
     s.a = HALF_LOG2_E_ROOT * square_root(divide(c_yy, det));
     s.b = s.a * b_over_a;
@@ -210,7 +212,7 @@ kernel void project(int count, int degree, int stored_coefficients, int antialia
     s.red = colour.x;
     s.green = colour.y;
     s.blue = colour.z;
-    s.depth = depth;
+    s.depth = is_surface ? depth : 0.0f;
     s.centre_x = centre_x;
     s.centre_y = centre_y;
     s.half_x = half_x;
@@ -218,7 +220,7 @@ kernel void project(int count, int degree, int stored_coefficients, int antialia
     s.cutoff = fma(headroom, CUTOFF_SCALE, CUTOFF_OFFSET);
     s.y_per_x = divide(negate(s.a * s.b), fma(s.b, s.b, s.c * s.c));
     s.x_per_y = negate(b_over_a);
-    s.unused = 0.0f;
+    s.surface = is_surface ? 1.0f : 0.0f;
     splats[n] = s;
     boxes[n] = box_of(left, end_x, top, end_y);
     depth_bits[n] = as_uint(depth);
