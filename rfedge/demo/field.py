@@ -118,6 +118,8 @@ class MakeSampleField:
     """Draw splats smaller than a pixel fainter; the field says so."""
     sh_degree: int | None = None
     """Bands of the colour's dependence on direction, 0..3; default: the trainer's own."""
+    sky: int = 0
+    """In how many directions the sky is looked for."""
     max_mb: float | None = None
     """Write the best field of at most so many MB (10^6 bytes)."""
 
@@ -135,7 +137,7 @@ class MakeSampleField:
     def _config(self) -> SplatTrainingConfig:
         threads = len(os.sched_getaffinity(0))
         config = training_config(self.gaussians, self.iterations, threads)
-        config = replace(config, antialiased=self.antialiased)
+        config = replace(config, antialiased=self.antialiased, sky=self.sky)
         if self.sh_degree is not None:
             config = replace(config, bands=Bands(degree=self.sh_degree))
         if self.limit is None:
