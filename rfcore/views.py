@@ -87,9 +87,9 @@ class View:
 
     ``colour`` float32 [H, W, 3], display-referred RGB, nominally 0..1 (not clamped);
     ``depth`` float32 [H, W], alpha-weighted mean z of surfaces in metres, 0 where nothing was hit,
-    10 km where most is sky; ``opacity`` float32 [H, W], that of surfaces, 0..1; ``confidence``
-    float32 [H, W], 0..1, how far the renderer itself trusts a pixel (``rfcore.views``), computed
-    when first asked for.
+    10 km where more is sky; ``opacity`` float32 [H, W], 0..1, the share of what has that depth;
+    ``confidence`` float32 [H, W], 0..1, how far the renderer itself trusts a pixel
+    (``rfcore.views``), computed when first asked for.
     """
 
     colour: NDArray[np.float32]

@@ -20,7 +20,7 @@ __all__ = ["MAX_GAUSSIANS", "SKY_M", "Gaussians", "joined", "sky_of", "with_sky_
 MAX_GAUSSIANS = 50_000_000
 """Upper limit accepted from files: 11.8 GB of parameters at SH degree 3."""
 SKY_M = 1e4
-"""Gaussians whose centre is deeper than this in a picture are sky: colour without a surface."""
+"""Gaussians whose centre is deeper than this in a picture are sky: they are no surface's depth."""
 
 F32 = NDArray[np.float32]
 

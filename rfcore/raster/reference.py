@@ -89,8 +89,8 @@ def render(
     ``params`` has the fields of ``Gaussians`` as tensors of one floating dtype; finiteness is not
     checked. Colour is not clamped from above. Depth and opacity are those of surfaces: the mean z
     weighted by each Gaussian's share of the pixel, and the sum of those shares, what lies beyond
-    10 km (``SKY_M``) left out. Where that is more than half of what is shown depth is ``SKY_M``,
-    where nothing is shown 0.
+    10 km (``SKY_M``) left out. Where that is more of what is shown they are ``SKY_M`` and its
+    share, where nothing is shown 0.
 
     With ``antialiased`` a Gaussian that the dilation widens is made fainter by as much: its
     opacity is multiplied by sqrt(det C / det (C + 0.3 I)), C its projected covariance
@@ -110,9 +110,12 @@ def render(
             row.append(_composite(tile, pixels).reshape(height, width, 6))
         rows.append(torch.cat(row, dim=1))
     picture = torch.cat(rows, dim=0)
-    opacity, shown = picture[..., 4], picture[..., 5]
+    surfaces, shown = picture[..., 4], picture[..., 5]
     colour = picture[..., :3] + (1.0 - shown)[..., None] * _like(picture, background)
-    return colour, _depth(picture[..., 3], opacity, shown), opacity
+    sky = shown - surfaces
+    is_sky = sky > surfaces
+    depth = torch.where(is_sky, SKY_M, _mean_depth(picture[..., 3], surfaces))
+    return colour, depth, torch.where(is_sky, sky, surfaces)
 
 
 def loss_l1_dssim(colour: Tensor, target: Tensor, dssim_weight: float = 0.2) -> Tensor:
@@ -269,11 +272,10 @@ def _composite(splats: _Splats, pixels: Tensor) -> Tensor:
     return weight @ torch.cat([splats.colour, of_surfaces], dim=1)
 
 
-def _depth(weighted_m: Tensor, opacity: Tensor, shown: Tensor) -> Tensor:
-    """Divide the sum of w z by the sum of w, both of surfaces; 0 where nothing was hit."""
+def _mean_depth(weighted_m: Tensor, opacity: Tensor) -> Tensor:
+    """Divide the sum of w z by the sum of w; 0 where nothing was hit."""
     hit = opacity > 0
-    mean = torch.where(hit, weighted_m / torch.where(hit, opacity, 1.0), 0.0)
-    return torch.where(shown > 2.0 * opacity, SKY_M, mean)
+    return torch.where(hit, weighted_m / torch.where(hit, opacity, 1.0), 0.0)
 
 
 def _ssim_map(a: Tensor, b: Tensor) -> Tensor:

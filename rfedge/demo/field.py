@@ -150,6 +150,7 @@ class MakeSampleField:
         options = " ".join(
             f"--{n.replace('_', '-')} {v}" for n, v in given.items() if v is not None
         )
+        options += f" --sky {self.sky}" if self.sky else ""
         options += " --antialiased" if self.antialiased else ""
         options = options.strip()
         return f'make sample-field ARGS="{options}"' if options else "make sample-field"

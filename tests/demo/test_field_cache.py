@@ -133,7 +133,7 @@ def test_a_field_too_large_to_ship_is_not_left_there(
 def test_making_the_sample_field_writes_what_the_demo_takes(
     tiny_sample: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = "--gaussians 100 --iterations 3 --limit 120 --sh-degree 1 --max-mb 0.02"
+    options = "--gaussians 100 --iterations 3 --limit 120 --sh-degree 1 --max-mb 0.02 --sky 50"
     monkeypatch.setattr("sys.argv", ["sample-field", str(tiny_sample), *options.split()])
     assert make_sample_field.main() == 0
     path = chosen(tiny_sample, tmp_path / "c", SplatTrainingConfig())

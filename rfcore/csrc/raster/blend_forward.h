@@ -138,11 +138,17 @@ RF_INLINE void store_columns(float* out, Lanes row, int columns) {
     memcpy(out, all, static_cast<size_t>(columns) * sizeof(float));
 }
 
-// The mean depth of the surfaces, that of the sky where it is most of what is shown, 0 where nothing is.
-RF_INLINE Lanes depth_of(Lanes weighted, Lanes opacity, Lanes transmittance) {
-    const Lanes mean = keep(gt(opacity, zero()), weighted / opacity);
-    const Mask is_sky = gt(splat(1.0f) - transmittance, opacity + opacity);
-    return select(is_sky, splat(kSkyM), mean);
+// Depth and opacity of the surfaces of 16 pixels, given the sums over them; of the sky where that is
+// more of what is shown.
+struct Solid {
+    Lanes depth, opacity;
+};
+
+RF_INLINE Solid solid_of(Lanes weighted, Lanes surfaces, Lanes transmittance) {
+    const Lanes mean = keep(gt(surfaces, zero()), weighted / surfaces);
+    const Lanes sky = splat(1.0f) - transmittance - surfaces;
+    const Mask is_sky = gt(sky, surfaces);
+    return {select(is_sky, splat(kSkyM), mean), select(is_sky, sky, surfaces)};
 }
 
 // Write the pixels of the tile that are inside the picture.
@@ -173,8 +179,9 @@ RF_INLINE void write_tile(const BlendJob& job, int tile_x, int tile_y, const Til
                 memcpy(job.colour + 3 * first, row, 3 * sizeof(float) * static_cast<size_t>(columns));
             }
             if (kView) {
-                store_columns(job.opacity + first, r.opacity[s], columns);
-                store_columns(job.depth + first, depth_of(r.depth[s], r.opacity[s], r.transmittance[s]), columns);
+                const Solid solid = solid_of(r.depth[s], r.opacity[s], r.transmittance[s]);
+                store_columns(job.opacity + first, solid.opacity, columns);
+                store_columns(job.depth + first, solid.depth, columns);
             }
         }
     }

@@ -18,7 +18,7 @@ constexpr int kTilesPerGroupSide = 4;
 constexpr int kTilesPerGroup = 16;
 constexpr int kGroupSide = kTilesPerGroupSide * kTileSide;
 constexpr int kMaxDegree = 3;
-constexpr float kSkyM = 1e4f;  // centres beyond this depth are sky: colours without a surface
+constexpr float kSkyM = 1e4f;  // centres beyond this depth are sky
 
 constexpr int coefficients_of(int degree) { return (degree + 1) * (degree + 1); }
 
@@ -57,7 +57,7 @@ struct alignas(64) Splat {
     float cutoff;              // u^2 + v^2 above this means alpha < 1/255, with a margin
     float y_per_x;             // where alpha is largest on a vertical line: dy = y_per_x dx
     float x_per_y;             // and on a horizontal one: dx = x_per_y dy
-    float surface;             // 1, or 0 of the sky: that has colour, neither depth nor opacity
+    float surface;             // 1, or 0 of the sky
 };
 static_assert(sizeof(Splat) == 64, "one cache line");
 

@@ -99,8 +99,9 @@ void blend(constant Camera* camera, global const Splat* splats, global const uin
     if (!is_inside) return;
     const size_t at = (size_t)pixel_y * camera->width + pixel_x;
     vstore3(sum.xyz, at, colour);
-    opacity[at] = weights;
-    const bool is_sky = 1.0f - transmittance > weights + weights;
+    const float sky = (1.0f - transmittance) - weights;
+    const bool is_sky = sky > weights;
     const float mean = weights > 0.0f ? divide(sum.w, weights) : 0.0f;
+    opacity[at] = is_sky ? sky : weights;
     depth[at] = is_sky ? SKY_M : mean;
 }
