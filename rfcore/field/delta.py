@@ -24,7 +24,6 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
 from rfcore.field.archive import Archive
@@ -51,7 +50,7 @@ from rfcore.field.splat_grid import (
 )
 from rfcore.field.splats import SplatField
 from rfcore.files import DECODED_BYTES
-from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians
+from rfcore.raster.gaussians import MAX_GAUSSIANS, Gaussians, joined
 
 __all__ = ["check_base", "delta_field", "delta_of"]
 
@@ -242,8 +241,4 @@ def _gaussians(grid: GridSplats, numbers: SplatNumbers, added: SplatNumbers) -> 
     steps: Steps = grid.steps
     behind = gaussians_of(added, steps)
     shown = gaussians_of(numbers, steps, means_of_steps(numbers.means, grid.exponents))
-    parts: dict[str, NDArray[np.float32]] = {
-        f.name: np.concatenate([getattr(shown, f.name), getattr(behind, f.name)])
-        for f in fields(Gaussians)
-    }
-    return Gaussians(**parts)
+    return joined(shown, behind)

@@ -82,7 +82,9 @@ def sky_of(means: F32) -> NDArray[np.bool_]:
 
     None where that is half of them or more: a scene may be that large.
     """
-    middle = np.median(means, axis=0) if len(means) else np.zeros(3)
+    if not len(means) or np.ptp(means, axis=0).max() <= SKY_M:
+        return np.zeros(len(means), np.bool_)  # without finding the median, which takes longer
+    middle = np.median(means, axis=0)
     is_far = np.asarray((np.abs(means - middle) > SKY_M).any(axis=1))
     return np.asarray(is_far & (2 * is_far.sum() < len(means)))
 

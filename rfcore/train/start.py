@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rfcore.camera import Camera
+from rfcore.camera import Camera, Intrinsics
 from rfcore.errors import InvalidInput
 from rfcore.image import Rgb
 from rfcore.raster.gaussians import SKY_M, Gaussians
@@ -162,12 +162,19 @@ def _views_of(xyz_m: F64, cameras: Sequence[Camera]) -> NDArray[np.int64]:
     """Return how many cameras have each point in view."""
     views = np.zeros(len(xyz_m), np.int64)
     for camera in cameras:
-        k, pose = camera.intrinsics, camera.cam_from_world()
-        x, y, z = (xyz_m @ np.array(pose.rotation_matrix()).T + pose.translation_m).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = k.fx_px * x / z + k.cx_px, k.fy_px * y / z + k.cy_px
-            views += (z > 0) & (u > 0) & (u < k.width_px) & (v > 0) & (v < k.height_px)
+        pose = camera.cam_from_world()
+        in_camera = xyz_m @ np.array(pose.rotation_matrix()).T + pose.translation_m
+        views += _in_picture(camera.intrinsics, in_camera)[2]
     return views
+
+
+def _in_picture(k: Intrinsics, in_camera: F64) -> tuple[F64, F64, NDArray[np.bool_]]:
+    """Return u and v [N] in px of points in the camera's axes, and which are in the picture."""
+    x, y, z = in_camera.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = k.fx_px * x / z + k.cx_px, k.fy_px * y / z + k.cy_px
+        is_inside = (z > 0) & (u > 0) & (u < k.width_px) & (v > 0) & (v < k.height_px)
+    return u, v, is_inside
 
 
 NEIGHBOURS = 3
@@ -198,15 +205,22 @@ def gaussians_from_points(
         raise InvalidInput("points", f"{len(points.xyz_m)} are too few, 4 or more are needed")
     chosen = np.sort(rng.permutation(len(points.xyz_m))[:count])
     means = np.ascontiguousarray(points.xyz_m[chosen], dtype=np.float32)
-    n = len(means)
     log_scales = np.log(np.clip(spacing_m(means), MIN_SPACING_M, MAX_SPACING_M) * scale)
+    return _balls(means, log_scales, 0.0, points.rgb[chosen], sh_degree)
+
+
+def _balls(
+    means: F32, log_scales: F64, logit: float, rgb: NDArray[np.integer], sh_degree: int
+) -> Gaussians:
+    """Return Gaussians that look alike from every side; ``rgb`` [N, 3] is 0..255."""
+    n = len(means)
     sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)
-    sh[:, 0] = (points.rgb[chosen] / 255.0 - 0.5) / SH_DC
+    sh[:, 0] = (rgb / 255.0 - 0.5) / SH_DC
     return Gaussians(
         means=means,
         quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         log_scales=np.repeat(log_scales[:, None].astype(np.float32), 3, axis=1),
-        opacity_logits=np.zeros(n, np.float32),
+        opacity_logits=np.full(n, logit, np.float32),
         sh=sh,
     )
 
@@ -242,18 +256,10 @@ def sky_gaussians(
         for first in range(0, directions, DIRECTIONS)
     ]
     colour, is_kept = (np.concatenate(values) for values in zip(*parts, strict=True))
-    n = int(is_kept.sum())
     means = centres_m.mean(axis=0) + SKY_DISTANCE_M * towards[is_kept]
     width_m = scale * SKY_DISTANCE_M * math.sqrt(4 * math.pi / directions)
-    sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)
-    sh[:, 0] = (colour[is_kept] / 255.0 - 0.5) / SH_DC
-    return Gaussians(
-        means=means.astype(np.float32),
-        quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        log_scales=np.full((n, 3), math.log(width_m), np.float32),
-        opacity_logits=np.full(n, SKY_LOGIT, np.float32),
-        sh=sh,
-    )
+    log_scales = np.full(len(means), math.log(width_m))
+    return _balls(means.astype(np.float32), log_scales, SKY_LOGIT, colour[is_kept], sh_degree)
 
 
 def _lattice(count: int) -> F64:
@@ -274,10 +280,9 @@ def _agreed_colour(
     middle = np.maximum(seen - 1, 0) // 2
     median = np.take_along_axis(np.sort(colours, axis=0), middle[None, :, None], axis=0)[0]
     agrees = is_seen & (np.abs(colours - median).max(axis=-1) <= SKY_LEVELS)
-    apart_m = _extent_m(centres_m, agrees)
-    is_enough = (2 * agrees.sum(axis=0) > seen) & (apart_m > 0)
     all_apart_m = np.linalg.norm(np.ptp(centres_m, axis=0))
-    return median, is_enough & (apart_m >= SKY_BASELINE * all_apart_m)
+    are_apart = _extent_m(centres_m, agrees) > SKY_BASELINE * all_apart_m
+    return median, (2 * agrees.sum(axis=0) > seen) & are_apart
 
 
 def _extent_m(centres_m: F64, is_in: NDArray[np.bool_]) -> F64:
@@ -291,12 +296,8 @@ def _extent_m(centres_m: F64, is_in: NDArray[np.bool_]) -> F64:
 
 def _colours_at_infinity(target: Target, towards: F64) -> NDArray[np.int16]:
     """Return the picture's colour [D, 3] in each direction, ``NOT_SEEN`` outside of it."""
-    k = target.camera.intrinsics
-    x, y, z = (towards @ np.array(target.camera.world_from_cam.rotation_matrix())).T
-    ahead = z > 1e-6
-    z = np.where(ahead, z, 1.0)
-    u, v = np.floor(k.fx_px * x / z + k.cx_px), np.floor(k.fy_px * y / z + k.cy_px)
-    is_inside = ahead & (u >= 0) & (u < k.width_px) & (v >= 0) & (v < k.height_px)
+    in_camera = towards @ np.array(target.camera.world_from_cam.rotation_matrix())
+    u, v, is_inside = _in_picture(target.camera.intrinsics, in_camera)
     colours = np.full(towards.shape, NOT_SEEN, np.int16)
     rows, columns = v[is_inside].astype(np.int64), u[is_inside].astype(np.int64)
     colours[is_inside] = target.rgb[rows, columns]

@@ -224,8 +224,11 @@ def needed_bytes(job: TrainingJob) -> int:
     sizes = [(k.width_px, k.height_px) for k in cameras]
     if isinstance(config, NgpTrainingConfig):
         return ngp_training_bytes(config.model, sizes)
-    most = max(config.gaussians + config.sky, config.density.limit)
-    return splat_training_bytes(most, config.bands.degree, sizes)
+    return splat_training_bytes(_most_gaussians(config), config.bands.degree, sizes)
+
+
+def _most_gaussians(config: SplatTrainingConfig) -> int:
+    return max(config.gaussians + config.sky, config.density.limit)
 
 
 def _announce(job: TrainingJob, console: Console) -> None:
@@ -233,7 +236,7 @@ def _announce(job: TrainingJob, console: Console) -> None:
     if isinstance(config, NgpTrainingConfig):
         what = "a hash grid"
     else:
-        what = f"{max(config.gaussians, config.density.limit):,} Gaussians at most"
+        what = f"{_most_gaussians(config):,} Gaussians at most"
         what += "" if job.dataset.points is not None else ", from random points,"
     length = f"{config.iterations:,} iterations"
     if job.limits.minutes is not None:

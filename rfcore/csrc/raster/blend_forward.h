@@ -140,11 +140,11 @@ RF_INLINE void store_columns(float* out, Lanes row, int columns) {
 
 // Depth and opacity of the surfaces of 16 pixels, given the sums over them; of the sky where that is
 // more of what is shown.
-struct Solid {
+struct DepthAndOpacity {
     Lanes depth, opacity;
 };
 
-RF_INLINE Solid solid_of(Lanes weighted, Lanes surfaces, Lanes transmittance) {
+RF_INLINE DepthAndOpacity depth_and_opacity(Lanes weighted, Lanes surfaces, Lanes transmittance) {
     const Lanes mean = keep(gt(surfaces, zero()), weighted / surfaces);
     const Lanes sky = splat(1.0f) - transmittance - surfaces;
     const Mask is_sky = gt(sky, surfaces);
@@ -179,9 +179,9 @@ RF_INLINE void write_tile(const BlendJob& job, int tile_x, int tile_y, const Til
                 memcpy(job.colour + 3 * first, row, 3 * sizeof(float) * static_cast<size_t>(columns));
             }
             if (kView) {
-                const Solid solid = solid_of(r.depth[s], r.opacity[s], r.transmittance[s]);
-                store_columns(job.opacity + first, solid.opacity, columns);
-                store_columns(job.depth + first, solid.depth, columns);
+                const DepthAndOpacity of_row = depth_and_opacity(r.depth[s], r.opacity[s], r.transmittance[s]);
+                store_columns(job.opacity + first, of_row.opacity, columns);
+                store_columns(job.depth + first, of_row.depth, columns);
             }
         }
     }
