@@ -48,26 +48,22 @@ class RandomStart:
 
     Distances are log-uniform between ``nearest`` and ``farthest`` times the distance at which the
     cameras look, or, where their axes do not meet, the distance between cameras. A point counts
-    when ``seen_by`` cameras have it in view. ``sky`` is the share put at ``farthest``: it shows
-    what lies beyond everything.
+    when ``seen_by`` cameras have it in view.
 
-    Measured on the fox (docs/training.md): from 0.2 to 8 with two cameras and a tenth in the sky
-    held-out pictures reach 19.9 dB, with these values 26.2 dB; Gaussians near a
-    camera that few others see are learned by heart.
+    Measured on the fox (docs/training.md): from 0.2 to 8 times with two cameras, and a tenth of the
+    points at the farthest, held-out pictures reach 19.9 dB, with these values 26.2 dB; Gaussians
+    near a camera that few others see are learned by heart.
     """
 
     nearest: float = 0.5
     farthest: float = 4.0
     seen_by: int = 6
-    sky: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 < self.nearest < self.farthest <= 1e4:
             raise InvalidInput("start.nearest", f"{self.nearest}..{self.farthest} is not a range")
         if self.seen_by < 1:
             raise InvalidInput("start.seen_by", f"{self.seen_by} must be at least 1")
-        if not 0 <= self.sky <= 1:
-            raise InvalidInput("start.sky", f"{self.sky} is outside 0..1")
 
 
 def random_points(
@@ -144,7 +140,6 @@ def _along_rays(
     k = picture.camera.intrinsics
     u, v = rng.integers(0, k.width_px, count), rng.integers(0, k.height_px, count)
     log_z = rng.uniform(np.log(start.nearest), np.log(start.farthest), count)
-    log_z[rng.uniform(size=count) < start.sky] = np.log(start.farthest)
     xyz_m = _in_world(
         picture.camera, np.float64(0.5) + u, np.float64(0.5) + v, np.exp(log_z) * unit_m
     )

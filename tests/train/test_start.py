@@ -94,9 +94,7 @@ def test_cameras_with_nothing_in_common_are_refused(posed) -> None:
         random_points(apart, 100, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize(
-    "change", [{"nearest": 0.0}, {"farthest": 0.1}, {"seen_by": 0}, {"sky": 1.5}]
-)
+@pytest.mark.parametrize("change", [{"nearest": 0.0}, {"farthest": 0.1}, {"seen_by": 0}])
 def test_settings_that_make_no_sense_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(InvalidInput, match="start"):
         RandomStart(**change)
