@@ -103,16 +103,18 @@ async def test_a_picture_comes_in_the_encoding_that_was_asked_for(
 async def test_a_consumer_that_never_reads_slows_no_vehicle_and_is_let_go(
     serve: Any, travel: Any
 ) -> None:
-    """Its window is full after a few pictures; misses are counted; after 3 s it is let go."""
+    """Its window is full after a few pictures; misses are counted; after 3 s it is let go.
+
+    Vehicles drive until then: on a busy machine a picture can be missed before the window is full.
+    """
     limits = SessionLimits(stalled_s=3.0)
     async with serve(limits=limits) as server:
         value = server.registry.get_sample_value
         async with consumer(server.address, Subscription(encoding=PictureEncoding.I420)):
-            while not value("rfedge_twin_pictures_missed_total"):
+            while value("rfedge_twin_consumers_ended_total", {"reason": "slow"}) < 1:
                 record = await travel(server.address)
                 assert record.counts == {"acked": 6}
-            while value("rfedge_twin_consumers_ended_total", {"reason": "slow"}) < 1:
-                await asyncio.sleep(0.01)
+            assert value("rfedge_twin_pictures_missed_total") > 0
             assert value("rfedge_twin_consumers") == 0
         record = await travel(server.address)
         assert record.counts == {"acked": 6}
