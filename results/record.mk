@@ -25,7 +25,7 @@ $(OUT):
 
 # --- fields that do not ship
 
-# Of so many thousand splats, which few passes of a street pay for. Too few to spend some on the sky (docs/training.md).
+# Of so many thousand splats, which few passes of a street pay for. A sky would take too many of them (docs/training.md).
 small = $(RFEDGE) train $1 --points $(dir $1)points.ply --held-out $2 --gaussians $$(($*000 * 3 / 4)) --limit $*000 --sh-degree 1 --antialiased \
 	--max-mb 1 --minutes 1.5 --out $@
 $(OUT)/sample-%k.rff: | $(OUT)

@@ -77,7 +77,8 @@ class Train:
     """At most how many Gaussians to start with, drawn from the points at random."""
     sky: Annotated[int, arg(metavar="DIRECTIONS")] = 0
     """Start Gaussians of the sky too, 100 km away, in those of so many directions in which all
-    pictures show the same: 60000 for a street under clouds. 0: none."""
+    pictures show the same: 60000 for a street under clouds. 0: none. They come beside --gaussians,
+    and count where --limit says how far the set may grow."""
     limit: int | None = None
     """Density control: let the set grow to so many Gaussians, replacing those that show nothing;
     default: 250000 with --minutes, else the set stays as it is."""
