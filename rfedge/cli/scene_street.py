@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -36,6 +36,9 @@ class SceneBuild:
     """WIDTHxHEIGHT px of all pictures; default: what the scene says for each split."""
     spp: int = 16
     """Samples a pixel, a square number."""
+    renderer: Literal["auto", "cuda", "llvm", "scalar"] = "auto"
+    """Which variant of Mitsuba renders; auto: the first that works here of CUDA on an NVIDIA GPU,
+    LLVM and scalar. Pictures of two differ by rounding, so a folder is built by one."""
     workers: int = 1
     """Processes. One uses all cores; more share them and take 1 to 2.5 GB each."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
@@ -71,7 +74,7 @@ class SceneBuild:
         selection = Selection(scene, self.split, self.frames, size_px)
         if self.ray is not None:
             require("ray", "ray")
-        settings = Settings(self.out, self.spp, self.workers, self.ray)
+        settings = Settings(self.out, self.spp, self.workers, self.ray, self.renderer)
         build_scene(selection, settings, Console(soft_wrap=True))
 
 

@@ -30,7 +30,7 @@ from rfedge.jobs import Job, Tell, run_jobs
 from rfedge.results import as_json, provenance
 from rfedge.street.build.listing import claim_folder, list_dataset, origin_of
 from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer, ShotFiles
-from rfedge.street.render.backend import Backend, chosen_backend
+from rfedge.street.render.backend import Backend, Variant, chosen_backend
 from rfedge.street.render.renderer import Sampling
 from rfedge.street.shots import Selection, Shot
 
@@ -197,6 +197,7 @@ class Settings:
     workers: int = 1
     ray: str | None = None
     """Address of the Ray that renders (``rfedge.jobs``); None: worker processes do."""
+    renderer: Variant = "auto"
 
     def __post_init__(self) -> None:
         if not 1 <= self.workers <= 256:
@@ -206,8 +207,8 @@ class Settings:
 def build_scene(selection: Selection, settings: Settings, console: Console) -> None:
     """Take the shots that are not there yet, then list all that are."""
     sampling = Sampling(settings.samples, selection.scene.geometry.seed)
-    backend = chosen_backend()
-    if not backend.vectorised:
+    backend = chosen_backend(settings.renderer)
+    if not backend.vectorised and settings.renderer == "auto":
         console.print("no LLVM that Mitsuba can use (19 is known to work): scalar_rgb, 3-4x slower")
     cores = len(os.sched_getaffinity(0))
     job = RenderJob(

@@ -1,13 +1,16 @@
-"""Which Mitsuba runs here: compiled by LLVM where that works, else its slow scalar variant.
+"""Which Mitsuba runs here: CUDA's on an NVIDIA GPU, else compiled by LLVM, else the slow scalar one.
+
+CUDA's variant needs the driver alone, with its OptiX. A variant that does not work may end the
+process that tries it, and an abort is no exception, so each is tried in a process of its own.
 
 Mitsuba is told by ``DRJIT_LIBLLVM_PATH`` which LLVM to load, and the wrong one ends the process: of
 Debian's, 14 is refused, 15 and 16 abort in code generation ("Cannot select", Mitsuba 3.9.1), 19
-works. So versions below ``OLDEST_LLVM`` are passed over, and since an abort is no exception, each
-newer one is tried in a process of its own, newest first.
+works. So versions below ``OLDEST_LLVM`` are passed over, and newer ones are tried newest first.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import subprocess
@@ -16,11 +19,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from rfcore.errors import BackendUnavailable
 from rfcore.extras import needs, require
 
-__all__ = ["Backend", "chosen_backend", "load_mitsuba", "require_renderer"]
+__all__ = ["Backend", "Variant", "chosen_backend", "load_mitsuba", "require_renderer"]
+
+Variant = Literal["auto", "cuda", "llvm", "scalar"]
+"""What renders; auto: the first of the others that works."""
 
 FOLDERS = (
     "/usr/lib/x86_64-linux-gnu",
@@ -32,8 +39,9 @@ VERSION = re.compile(r"libLLVM(?:-|\.so\.)(\d+)")
 OLDEST_LLVM = 17
 PROBE_LIMIT_S = 60
 PROBE = """
+import sys
 import mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
+mi.set_variant(sys.argv[1])
 ball = {"type": "scene", "ball": {"type": "sphere"}, "light": {"type": "constant"},
         "path": {"type": "path", "max_depth": 3},
         "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}}
@@ -59,14 +67,41 @@ def require_renderer() -> None:
     require("scene", "mitsuba", "pyoidn", "scipy")
 
 
-def chosen_backend() -> Backend:
-    """Return the first LLVM that renders; without any, the scalar variant."""
+def chosen_backend(variant: Variant = "auto") -> Backend:
+    """Return the first backend that renders of those that the variant permits.
+
+    Raises ``BackendUnavailable`` where the variant named does not work here.
+    """
     require_renderer()
-    named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    for library in [named] if named else installed_llvms(FOLDERS):
-        if _renders(library):
-            return Backend("llvm_ad_rgb", library)
+    if variant in ("auto", "cuda") and _has_cuda() and _renders(CUDA):
+        return CUDA
+    if variant == "cuda":
+        raise BackendUnavailable(
+            "Mitsuba cannot render by CUDA here: it needs an NVIDIA GPU and a driver with OptiX "
+            "(libcuda.so.1 and libnvoptix.so.1); --renderer auto takes what works"
+        )
+    if variant in ("auto", "llvm"):
+        named = os.environ.get("DRJIT_LIBLLVM_PATH")
+        for library in [named] if named else installed_llvms(FOLDERS):
+            if _renders(Backend("llvm_ad_rgb", library)):
+                return Backend("llvm_ad_rgb", library)
+    if variant == "llvm":
+        raise BackendUnavailable(
+            f"Mitsuba can load no LLVM here: {OLDEST_LLVM} or newer (19 is known to work) belongs "
+            "into a folder of libraries, or DRJIT_LIBLLVM_PATH names it"
+        )
     return Backend("scalar_rgb")
+
+
+CUDA = Backend("cuda_ad_rgb")
+
+
+def _has_cuda() -> bool:
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return True
 
 
 def installed_llvms(folders: Iterable[str]) -> list[str]:
@@ -80,11 +115,11 @@ def installed_llvms(folders: Iterable[str]) -> list[str]:
     return [found[version] for version in sorted(found, reverse=True)]
 
 
-def _renders(library: str) -> bool:
-    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": library}
+def _renders(backend: Backend) -> bool:
+    environment = {**os.environ, **({"DRJIT_LIBLLVM_PATH": backend.llvm} if backend.llvm else {})}
     try:
         done = subprocess.run(
-            [sys.executable, "-c", PROBE],
+            [sys.executable, "-c", PROBE, backend.variant],
             env=environment,
             capture_output=True,
             timeout=PROBE_LIMIT_S,
