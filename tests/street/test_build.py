@@ -66,7 +66,7 @@ class QuickRenderer(SceneRenderer):
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "SceneRenderer", QuickRenderer)
-    monkeypatch.setattr(run, "chosen_backend", lambda: Backend("llvm_ad_rgb", "libLLVM.so"))
+    monkeypatch.setattr(run, "chosen_backend", lambda _: Backend("llvm_ad_rgb", "libLLVM.so"))
 
 
 def build(out: Path, scene: Scene = SCENE, splits: str = "all", frames: str | None = None) -> str:
@@ -140,7 +140,7 @@ spec.loader.exec_module(test)
 from rfedge.street.build import run, scene_renderer
 from rfedge.street.render.backend import Backend
 run.SceneRenderer = test.QuickRenderer
-run.chosen_backend = lambda: Backend("llvm_ad_rgb", "libLLVM.so")
+run.chosen_backend = lambda _: Backend("llvm_ad_rgb", "libLLVM.so")
 write, seen = scene_renderer.write_points, []
 def killing(path, points):
     write(path, points)
@@ -236,7 +236,7 @@ def test_the_cost_is_said_before_it_starts(tmp_path: Path) -> None:
 def test_the_scalar_variant_is_said_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run, "chosen_backend", lambda: Backend("scalar_rgb"))
+    monkeypatch.setattr(run, "chosen_backend", lambda _: Backend("scalar_rgb"))
     first = build(tmp_path / "s", splits="drive", frames="0:1").splitlines()[0]
     assert first == "no LLVM that Mitsuba can use (19 is known to work): scalar_rgb, 3-4x slower"
 

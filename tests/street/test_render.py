@@ -112,8 +112,7 @@ def test_what_moves_is_where_it_is_at_that_time(yard: World, fastest: Backend) -
 
 
 def test_the_probes_program_renders() -> None:
-    program = PROBE.replace("llvm_ad_rgb", "scalar_rgb")
-    subprocess.run([sys.executable, "-c", program], check=True)
+    subprocess.run([sys.executable, "-c", PROBE, "scalar_rgb"], check=True)
 
 
 @pytest.mark.parametrize("diameter_deg", [0.1, 0.53, 5.0])

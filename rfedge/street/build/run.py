@@ -2,7 +2,8 @@
 it goes.
 
 The estimate was measured on a busy 2-core x86-64 machine (AVX-512, 2.5 GHz) with Mitsuba 3.9.1 and
-LLVM 19; on other machines the progress bar's remaining time is the better figure.
+LLVM 19, and with CUDA on an H100, which leaves the processor the pixels alone; on other machines
+the progress bar's remaining time is the better figure.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from rfedge.jobs import Job, Tell, run_jobs
 from rfedge.results import as_json, provenance
 from rfedge.street.build.listing import claim_folder, list_dataset, origin_of
 from rfedge.street.build.scene_renderer import RenderJob, SceneRenderer, ShotFiles
-from rfedge.street.render.backend import Backend, Variant, chosen_backend
+from rfedge.street.render.backend import CUDA, Backend, Variant, chosen_backend
 from rfedge.street.render.renderer import Sampling
 from rfedge.street.shots import Selection, Shot
 
@@ -148,7 +149,7 @@ def cost_line(
 ) -> str:
     """Return one line: how many frames, core time, time on so many cores, room on the disk."""
     pixels = sum(s.camera.intrinsics.width_px * s.camera.intrinsics.height_px for s in shots)
-    pixel_us = sampling.samples * SAMPLE_US + PIXEL_US
+    pixel_us = PIXEL_US if backend == CUDA else sampling.samples * SAMPLE_US + PIXEL_US
     core_s = 1e-6 * pixels * pixel_us * (1.0 if backend.vectorised else SCALAR_TIMES)
     core_s += START_S * workers
     used = min(cores, workers if not backend.vectorised else cores)

@@ -1,4 +1,4 @@
-"""Which Mitsuba runs here: CUDA's on an NVIDIA GPU, else compiled by LLVM, else the slow scalar one.
+"""Which Mitsuba runs: CUDA's on an NVIDIA GPU, else LLVM's, else the slow scalar variant.
 
 CUDA's variant needs the driver alone, with its OptiX. A variant that does not work may end the
 process that tries it, and an abort is no exception, so each is tried in a process of its own.
@@ -24,7 +24,7 @@ from typing import Any, Literal
 from rfcore.errors import BackendUnavailable
 from rfcore.extras import needs, require
 
-__all__ = ["Backend", "Variant", "chosen_backend", "load_mitsuba", "require_renderer"]
+__all__ = ["CUDA", "Backend", "Variant", "chosen_backend", "load_mitsuba", "require_renderer"]
 
 Variant = Literal["auto", "cuda", "llvm", "scalar"]
 """What renders; auto: the first of the others that works."""
