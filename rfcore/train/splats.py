@@ -264,8 +264,9 @@ class SplatTrainer(FieldTrainer):
         scale = config.initial_scale
         surfaces = gaussians_from_points(start, config.gaussians, scale, rng, sh_degree=degree)
         if not config.sky:
-            return surfaces
-        return joined(surfaces, sky_gaussians(self._targets, config.sky, scale, sh_degree=degree))
+            return _within(config.density, surfaces)
+        sky = sky_gaussians(self._targets, config.sky, scale, sh_degree=degree)
+        return _within(config.density, surfaces, sky)
 
     def _rasterizer_of(self, gaussians: Gaussians) -> TrainableRasterizer:
         config = self.config
@@ -274,6 +275,19 @@ class SplatTrainer(FieldTrainer):
         )
         rasterizer.keep_scores(config.density.limit > 0 and config.density.drawn_by == "gradient")
         return rasterizer
+
+
+def _within(density: DensityControl, surfaces: Gaussians, *sky: Gaussians) -> Gaussians:
+    """Return all as one set; raise ``InvalidInput`` if it is larger than it may grow."""
+    start = joined(surfaces, *sky) if sky else surfaces
+    if 0 < density.limit < len(start):
+        beside = f", {len(sky[0])} of them sky" if sky else ""
+        raise InvalidInput(
+            "density.limit",
+            f"{density.limit} Gaussians are fewer than the {len(start)} to start with{beside}: "
+            "raise it (--limit) or start with fewer (--gaussians, --sky)",
+        )
+    return start
 
 
 def _training_digest(

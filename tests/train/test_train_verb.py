@@ -154,6 +154,20 @@ def test_the_sky_of_still_pictures_is_found_and_written(wall: Path, tmp_path: Pa
     assert np.abs(with_sky.bounds.high_m).max() < 100
 
 
+def test_a_start_larger_than_the_limit_is_refused(wall: Path, tmp_path: Path) -> None:
+    """Of the sky too, which comes beside the points and is found in the pictures."""
+    still = tmp_path / "still"
+    shutil.copytree(wall, still)
+    for i in range(VIEWS):
+        shutil.copy(wall / "0.png", still / f"{i}.png")
+    too_few = r"density\.limit: 310 Gaussians are fewer than the \d+ to start with, \d+ of them sky"
+    with pytest.raises(InvalidInput, match=too_few):
+        verb(still, tmp_path / "a.rff", iterations=1, gaussians=300, limit=310, sky=2000).run()
+    with pytest.raises(InvalidInput, match=r"299 Gaussians are fewer than the 300 to start with:"):
+        verb(still, tmp_path / "a.rff", iterations=1, gaussians=300, limit=299).run()
+    verb(still, tmp_path / "a.rff", iterations=1, gaussians=300, limit=300).run()
+
+
 def test_a_hash_grid_is_trained_by_the_same_loop(wall: Path, tmp_path: Path) -> None:
     dataset, held_out = split_every(read_dataset(wall), 4)
     model = NgpModel(L=4, log2_T=10, N_max=64, occupancy=4000)
