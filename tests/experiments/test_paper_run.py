@@ -66,6 +66,28 @@ def test_a_clip_whose_second_picture_is_no_p_picture_is_counted():
     assert mean.second_not_p == 0.25
 
 
+def intra_at(crf, db, size, **other):
+    return row("a", crf, 60.0, camera_i_psnr_db=db, camera_i_bytes=size, **other)
+
+
+def test_p_pictures_are_compared_with_i_pictures_of_their_quality():
+    """Half way from 37 to 40 dB an I picture takes the geometric mean of 2000 and 4000 bytes."""
+    points = [intra_at(18.0, 40.0, 4000), intra_at(28.0, 34.0, 1000)]
+    coded = intra_at(23.0, 37.0, 2000, psnr_db=38.5, p_bytes=1000)
+    (mean,) = means_of([*points, coded])
+    assert mean.against_intra_percent == pytest.approx(100 * (1000 / 8e6**0.5 - 1))
+    worse = replace(coded, preset="veryfast", p_bytes=4000)
+    (both,) = means_of([*points, coded, *(replace(r, preset="veryfast") for r in points), worse])
+    assert both.against_intra_percent == pytest.approx(100 * (2000 / 8e6**0.5 - 1))
+
+
+@pytest.mark.parametrize("psnr_db", [33.9, 40.1, None])
+def test_nothing_is_made_up_outside_the_i_pictures_qualities(psnr_db):
+    points = [intra_at(18.0, 40.0, 4000), intra_at(28.0, 34.0, 1000)]
+    (mean,) = means_of([*points, intra_at(23.0, 37.0, 2000, psnr_db=psnr_db)])
+    assert mean.against_intra_percent is None
+
+
 def test_tables_hold_what_the_rows_say_to_a_hundredth_of_a_decibel():
     share = 100 * 2000 / 3000
     settings = [(f, crf, size) for size in (300, 500) for f in "ab" for crf in (18.0, 23.0)]

@@ -1,6 +1,8 @@
 """What the published experiment's rows say: means, savings frame by frame, and the page's section.
 
-The savings of a frame are its mean over presets and rate factors; spreads are over frames.
+The savings of a frame are its mean over presets and rate factors; spreads are over frames. Beside
+the published metric, which compares pictures of two contents and qualities, stands what a P picture
+takes of an I picture of the same frame at its quality.
 """
 
 from __future__ import annotations
@@ -246,6 +248,8 @@ class PaperMean:
     savings_percent: float
     sd_percent: float
     ci95_percent: float
+    against_intra_percent: float | None
+    """What P pictures at the middle CRF take more than I pictures of the same frames and PSNR."""
     rf_psnr_db: float
     rf_ssim: float
     rf_flip: float | None
@@ -290,12 +294,37 @@ def _mean(group: Sequence[PaperRow]) -> PaperMean:
         savings_percent=float(np.mean(savings)),
         sd_percent=sd,
         ci95_percent=1.96 * sd / len(savings) ** 0.5,
+        against_intra_percent=_against_intra_percent(group),
         rf_psnr_db=float(np.mean(_by_frame([(row.frame, row.rf_psnr_db) for row in group]))),
         rf_ssim=float(np.mean(_by_frame([(row.frame, row.rf_ssim) for row in group]))),
         rf_flip=float(np.mean(_by_frame(flips))) if flips else None,
         bands=tuple(np.mean([row.rf_residual_bands for row in group], axis=0).tolist()),
         second_not_p=float(np.mean([row.second_type != "P" for row in group])),
     )
+
+
+def _against_intra_percent(group: Sequence[PaperRow]) -> float | None:
+    """Geometric mean over frames and presets; I pictures are interpolated between their CRFs, never
+    beyond: None where no P picture's PSNR lies within theirs."""
+    clips = dict[tuple[str, str], list[PaperRow]]()
+    for row in group:
+        clips.setdefault((row.frame, row.preset), []).append(row)
+    logs = [log for rows in clips.values() if (log := _log_against_intra(rows)) is not None]
+    return 100 * math.expm1(float(np.mean(logs))) if logs else None
+
+
+def _log_against_intra(rows: Sequence[PaperRow]) -> float | None:
+    rows = sorted(rows, key=lambda row: row.crf)
+    coded = rows[len(rows) // 2]
+    intra = sorted(
+        (row.camera_i_psnr_db, math.log(row.camera_i_bytes))
+        for row in rows
+        if row.camera_i_psnr_db is not None
+    )
+    if coded.psnr_db is None or not intra or not intra[0][0] <= coded.psnr_db <= intra[-1][0]:
+        return None
+    qualities_db, log_bytes = np.array(intra).T
+    return math.log(coded.p_bytes) - float(np.interp(coded.psnr_db, qualities_db, log_bytes))
 
 
 def _by_frame(values: Sequence[tuple[str, float]]) -> NDArray[np.float64]:
@@ -315,13 +344,14 @@ COLUMNS = (
     "100 I/(I+P) %",
     "sd",
     "95 %",
+    "P against I of its PSNR %",
     "RF dB",
     "SSIM",
     "LPIPS",
     "FLIP",
     "residual by band",
 )
-PRINTED = (*COLUMNS[:4], *COLUMNS[5:10], "FLIP")
+PRINTED = (*COLUMNS[:4], *COLUMNS[5:11], "FLIP")
 
 
 def paper_section(path: Path, result: Result) -> str:
@@ -361,6 +391,7 @@ def _cells(mean: PaperMean) -> list[str]:
         f"{mean.savings_percent:.1f}",
         f"{mean.sd_percent:.1f}",
         f"±{mean.ci95_percent:.1f}",
+        "-" if mean.against_intra_percent is None else f"{mean.against_intra_percent:+.1f}",
         f"{mean.rf_psnr_db:.2f}",
         f"{mean.rf_ssim:.3f}",
     ]
