@@ -139,12 +139,17 @@ def test_only_a_run_short_of_time_begins_with_halved_pictures(wall: Path, tmp_pa
     assert by_count.halved_until == 0
 
 
-def test_the_sky_of_still_pictures_is_found_and_written(wall: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def still(wall: Path, tmp_path: Path) -> Path:
     """One picture from eight places: all of it is at infinity."""
     still = tmp_path / "still"
     shutil.copytree(wall, still)
     for i in range(VIEWS):
         shutil.copy(wall / "0.png", still / f"{i}.png")
+    return still
+
+
+def test_the_sky_of_still_pictures_is_found_and_written(still: Path, tmp_path: Path) -> None:
     for directions in (0, 2000):
         verb(still, tmp_path / f"{directions}.rff", iterations=1, sky=directions).run()
     without, with_sky = (load_field(tmp_path / f"{n}.rff") for n in (0, 2000))
@@ -154,12 +159,8 @@ def test_the_sky_of_still_pictures_is_found_and_written(wall: Path, tmp_path: Pa
     assert np.abs(with_sky.bounds.high_m).max() < 100
 
 
-def test_a_start_larger_than_the_limit_is_refused(wall: Path, tmp_path: Path) -> None:
+def test_a_start_larger_than_the_limit_is_refused(wall: Path, still: Path, tmp_path: Path) -> None:
     """Of the sky too, which comes beside the points and is found in the pictures."""
-    still = tmp_path / "still"
-    shutil.copytree(wall, still)
-    for i in range(VIEWS):
-        shutil.copy(wall / "0.png", still / f"{i}.png")
     too_few = r"density\.limit: 310 Gaussians are fewer than the \d+ to start with, \d+ of them sky"
     with pytest.raises(InvalidInput, match=too_few):
         verb(still, tmp_path / "a.rff", iterations=1, gaussians=300, limit=310, sky=2000).run()

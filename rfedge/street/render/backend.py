@@ -15,7 +15,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -73,27 +73,31 @@ def chosen_backend(variant: Variant = "auto") -> Backend:
     Raises ``BackendUnavailable`` where the variant named does not work here.
     """
     require_renderer()
-    if variant in ("auto", "cuda") and _has_cuda() and _renders(CUDA):
-        return CUDA
-    if variant == "cuda":
-        raise BackendUnavailable(
-            "Mitsuba cannot render by CUDA here: it needs an NVIDIA GPU and a driver with OptiX "
-            "(libcuda.so.1 and libnvoptix.so.1); --renderer auto takes what works"
-        )
-    if variant in ("auto", "llvm"):
-        named = os.environ.get("DRJIT_LIBLLVM_PATH")
-        for library in [named] if named else installed_llvms(FOLDERS):
-            if _renders(Backend("llvm_ad_rgb", library)):
-                return Backend("llvm_ad_rgb", library)
-    if variant == "llvm":
-        raise BackendUnavailable(
-            f"Mitsuba can load no LLVM here: {OLDEST_LLVM} or newer (19 is known to work) belongs "
-            "into a folder of libraries, or DRJIT_LIBLLVM_PATH names it"
-        )
+    for backend in _candidates(variant):
+        if _renders(backend):
+            return backend
+    if variant in MISSING:
+        raise BackendUnavailable(MISSING[variant])
     return Backend("scalar_rgb")
 
 
 CUDA = Backend("cuda_ad_rgb")
+MISSING = {
+    "cuda": "Mitsuba cannot render by CUDA here: it needs an NVIDIA GPU and a driver with OptiX "
+    "(libcuda.so.1 and libnvoptix.so.1); --renderer auto takes what works",
+    "llvm": f"Mitsuba can load no LLVM here: {OLDEST_LLVM} or newer (19 is known to work) belongs "
+    "into a folder of libraries, or DRJIT_LIBLLVM_PATH names it",
+}
+
+
+def _candidates(variant: Variant) -> Iterator[Backend]:
+    """Yield what may be tried, best first; the scalar variant needs no trial."""
+    if variant in ("auto", "cuda") and _has_cuda():
+        yield CUDA
+    if variant in ("auto", "llvm"):
+        named = os.environ.get("DRJIT_LIBLLVM_PATH")
+        for library in [named] if named else installed_llvms(FOLDERS):
+            yield Backend("llvm_ad_rgb", library)
 
 
 def _has_cuda() -> bool:
