@@ -159,7 +159,7 @@ def test_the_sky_of_still_pictures_is_found_and_written(still: Path, tmp_path: P
     assert np.abs(with_sky.bounds.high_m).max() < 100
 
 
-def test_a_start_larger_than_the_limit_is_refused(wall: Path, still: Path, tmp_path: Path) -> None:
+def test_a_start_larger_than_the_limit_is_refused(still: Path, tmp_path: Path) -> None:
     """Of the sky too, which comes beside the points and is found in the pictures."""
     too_few = r"density\.limit: 310 Gaussians are fewer than the \d+ to start with, \d+ of them sky"
     with pytest.raises(InvalidInput, match=too_few):
