@@ -10,6 +10,7 @@ import pytest
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
+from rfedge.experiments.cells import CellStore
 from rfedge.experiments.paper import run
 from rfedge.experiments.paper.figures import write_paper_figures, write_views
 from rfedge.experiments.paper.report import (
@@ -244,6 +245,22 @@ def test_a_run_stopped_after_a_cell_goes_on_from_it(paper):
     assert again["tables"] == result["tables"]
     assert [path.stat().st_mtime_ns for path in cells[1:]] == times
     assert cells[0].exists()
+
+
+def test_what_is_left_is_told_by_a_picture_with_all_its_sizes(paper, tmp_path, monkeypatch, capsys):
+    """Not by the first size, which would be charged for the reading and the render at full size."""
+    job, _ = paper
+    clock_s = iter((0.0, 60.0))
+    monkeypatch.setattr(run, "monotonic", lambda: next(clock_s))
+    done = []
+    monkeypatch.setattr(run, "_rows", lambda piece: done.append(piece) or [])
+    pictures = run._by_picture(job, list(run._pieces(job, run._opened(job))))
+    assert [len(pieces) for pieces in pictures] == [2, 2], "of two frames at two sizes"
+    run._say_cost(pictures, CellStore(tmp_path), Console(width=100), processes=1)
+    assert done == pictures[0]
+    assert capsys.readouterr().out == "2 pictures, 2 left, about 1.0 minutes\n"
+    run._say_cost(pictures[:1], CellStore(tmp_path), Console(width=100), processes=1)
+    assert capsys.readouterr().out == "1 pictures, nothing left to do\n"
 
 
 def test_several_processes_code_the_same(paper, tmp_path):

@@ -266,10 +266,10 @@ def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
     pieces = list(_pieces(job, fields))
     store = CellStore(job.cells)
     made = provenance(path for _, path in map(named_path, (*job.fields, *job.drives)))
-    _say_cost(pieces, store, console, job.processes)
+    pictures = _by_picture(job, pieces)
+    _say_cost(pictures, store, console, job.processes)
     if job.processes > 1:
-        pictures = range(len(pieces) // _pieces_a_picture(job))
-        for _ in each_done(partial(_picture_done, job), pictures, job.processes):
+        for _ in each_done(partial(_picture_done, job), range(len(pictures)), job.processes):
             pass
     rows = [row for piece in pieces for row in store.rows(_key(piece), _maker(piece))]
     content = {
@@ -290,19 +290,23 @@ def _opened(job: PaperJob) -> list[NamedField]:
 
 def _picture_done(job: PaperJob, number: int) -> None:
     """Have the rows of the job's picture of that number among the cells."""
-    pieces, each, store = _pieces_of_process(job), _pieces_a_picture(job), CellStore(job.cells)
-    for piece in pieces[each * number : each * (number + 1)]:
+    _do(_pictures_of_process(job)[number], CellStore(job.cells))
+
+
+def _do(pieces: Sequence[Piece], store: CellStore) -> None:
+    for piece in pieces:
         store.rows(_key(piece), _maker(piece))
 
 
 @lru_cache(maxsize=1)
-def _pieces_of_process(job: PaperJob) -> list[Piece]:
-    return list(_pieces(job, _opened(job)))
+def _pictures_of_process(job: PaperJob) -> list[Sequence[Piece]]:
+    return _by_picture(job, list(_pieces(job, _opened(job))))
 
 
-def _pieces_a_picture(job: PaperJob) -> int:
-    """Return how many pieces follow one another that are of one picture."""
-    return len(job.fields) * len(job.sizes_px)
+def _by_picture(job: PaperJob, pieces: Sequence[Piece]) -> list[Sequence[Piece]]:
+    """Return the pieces of each picture, which follow one another: every field, every size."""
+    each = len(job.fields) * len(job.sizes_px)
+    return [pieces[first : first + each] for first in range(0, len(pieces), each)]
 
 
 def views_of(job: PaperJob) -> list[tuple[str, Rgb]]:
@@ -422,18 +426,18 @@ def _render(field: RadianceField, camera: Camera) -> Rgb:
     return pixels
 
 
-def _say_cost(pieces: Sequence[Piece], store: CellStore, console: Console, processes: int) -> None:
-    """Do the first piece that is not there, and say what the others will take by their pixels."""
-    left = [piece for piece in pieces if not store.has(_key(piece))]
+def _say_cost(
+    pictures: Sequence[Sequence[Piece]], store: CellStore, console: Console, processes: int
+) -> None:
+    """Do the first picture that is not whole, and say what the others will take.
+
+    A whole picture, for its sizes share what reading it and rendering it at full size take.
+    """
+    left = [pieces for pieces in pictures if not all(store.has(_key(piece)) for piece in pieces)]
     estimate = "nothing left to do"
     if left:
         began_s = monotonic()
-        store.rows(_key(left[0]), _maker(left[0]))
-        per_pixel_s = (monotonic() - began_s) / _pixels(left[0])
-        total_s = sum(map(_pixels, left[1:])) * per_pixel_s
+        _do(left[0], store)
+        total_s = (monotonic() - began_s) * (len(left) - 1)
         estimate = f"{len(left)} left, about {total_s / processes / 60:.1f} minutes"
-    console.print(f"{len(pieces)} frames and sizes, {estimate}")
-
-
-def _pixels(piece: Piece) -> int:
-    return piece.size_px[0] * piece.size_px[1]
+    console.print(f"{len(pictures)} pictures, {estimate}")
