@@ -503,6 +503,7 @@ LOSSES = [
 ]
 DISTURBED = [
     DisturbanceRow("pose noise", "1 cm", None, 27.93, 1.25, 68.3, -59.11),
+    DisturbanceRow("refined pose noise", "1 cm", None, 27.61, 0.12, 68.3, -59.58, 35),
     DisturbanceRow("light", "n/a", "no drive in another light was given"),
 ]
 
@@ -521,13 +522,14 @@ def test_loss_is_sorted_and_a_condition_that_was_not_measured_says_why() -> None
     several = LossRow("render-only", 50.0, 5.0, 0.91234, 0.8, 100, (0.9101, 0.9144))
     section = robust_section(Path("robust.json"), {**robust_result(), "rows": as_json([several])})
     assert "| render-only | 5 | 50 | 100 | 0.9123 | 0.9101..0.9144 | 0.8000 |" in section
-    assert "| pose noise | 1 cm | 27.9 | +1.2 | 68.3 | -59.1 |" in section
-    no_drive = "| light | n/a: no drive in another light was given | n/a | n/a | n/a | n/a |"
+    assert "| pose noise | 1 cm | - | 27.9 | +1.2 | 68.3 | -59.1 |" in section
+    assert "| refined pose noise | 1 cm | 35 | 27.6 | +0.1 | 68.3 | -59.6 |" in section
+    no_drive = "| light | n/a: no drive in another light was given | n/a | n/a | n/a | n/a | n/a |"
     assert no_drive in section
 
 
 def test_a_disturbance_without_figures_writes_none(tmp_path: Path) -> None:
-    assert list(robust_result()["disturbances"][1]) == ["condition", "level", "reason"]
+    assert list(robust_result()["disturbances"][2]) == ["condition", "level", "reason"]
     drawing, numbers = write_robust_figure(robust_result(), tmp_path)
     assert len(lines_of(numbers)) == 1 + len(LOSSES)
     assert ["last-acked", "20", "5", "0.89800", "0.85000"] in lines_of(numbers)

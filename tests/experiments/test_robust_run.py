@@ -172,6 +172,8 @@ def test_a_quick_run_writes_rows_a_figure_and_a_section_and_goes_on(tmp_path):
     (refined,) = (r for r in result["disturbances"] if r["condition"] == "refined pose noise")
     assert refined["level"] == noise[-1]["level"]
     assert refined["more_percent"] < noise[-1]["more_percent"] / 2
+    assert refined["frames_found"] == 8
+    assert not any("frames_found" in row for row in noise), "where they were measured"
     reasons = [r["reason"] for r in result["disturbances"] if "reason" in r]
     assert ["--lane" in reasons[0], "--dusk" in reasons[1]] == [True, True]
     assert len(write_robust_figure(result, tmp_path / "figures")) == 2

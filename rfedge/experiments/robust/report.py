@@ -69,10 +69,20 @@ class DisturbanceRow:
     """Against ours undisturbed."""
     x264_kbit: float | None = None
     against_x264_percent: float | None = None
+    frames_found: int | None = None
+    """Whose poses were refined."""
 
 
 LOSS_COLUMNS = ("method", "loss %", "RTT ms", "seeds", "SSIM", "95 %", "worst 5 % of frames")
-REST_COLUMNS = ("condition", "level", "kbit a frame", "more %", "x264", "against x264 %")
+REST_COLUMNS = (
+    "condition",
+    "level",
+    "frames found",
+    "kbit a frame",
+    "more %",
+    "x264",
+    "against x264 %",
+)
 
 
 def robust_section(path: Path, result: Result) -> str:
@@ -125,10 +135,11 @@ def _loss_cells(row: LossRow) -> list[str]:
 
 def _disturbed_cells(row: DisturbanceRow) -> list[str]:
     if row.reason is not None:
-        return [row.condition, f"n/a: {row.reason}", *["n/a"] * 4]
+        return [row.condition, f"n/a: {row.reason}", *["n/a"] * (len(REST_COLUMNS) - 2)]
     return [
         row.condition,
         row.level,
+        "-" if row.frames_found is None else str(row.frames_found),
         f"{row.kbit:.1f}",
         f"{row.more_percent:+.1f}",
         f"{row.x264_kbit:.1f}",

@@ -7,7 +7,7 @@ nothing disturbed and against x264, which no pose disturbs.
 
 Pose noise is independent from frame to frame, normal in each axis of translation and rotation, in
 the camera's own axes. Both ends render at the noisy pose, since it is the one that is sent; or the
-sender first aligns the frame with the field's render there.
+sender first finds the frame in the field, with the noisy pose as what is known.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ from rfcore.camera import Camera, Pose
 from rfcore.codec.h264.config import check_effort
 from rfcore.codec.photometric import Photometric
 from rfcore.errors import InvalidInput
-from rfcore.field import RadianceField, load_field, render_field_view
+from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
+from rfcore.localise.localiser import Localised, Localiser
+from rfcore.localise.prior import PosePrior
 from rfcore.motion import quaternion_from_vector
-from rfcore.views import FieldView
 from rfedge.experiments.cells import CellStore, check_processes, each_done, program_version
 from rfedge.experiments.clips import Clip, ClipCoder, CodedClip, Drive, read_drive
 from rfedge.experiments.field_coder import FieldCoder, render_clip
@@ -95,24 +96,21 @@ def noisy_cameras(cameras: Sequence[Camera], noise: PoseNoise, seed: int) -> lis
 
 
 def refined_cameras(
-    field: RadianceField, frames: Sequence[I420], measured: Sequence[Camera]
-) -> list[Camera]:
-    """Return where aligning each frame with the field puts its camera; measured where it fails.
+    field: RadianceField, frames: Sequence[I420], measured: Sequence[Camera], noise: PoseNoise
+) -> tuple[list[Camera], int]:
+    """Return where each frame's camera is found in the field, and of how many frames it is.
 
-    Each frame by itself, without search and track: what one alignment makes of noise.
+    Each frame by itself, without those before it; one that is lost stays where it was measured.
     """
-    from rfcore.localise.structure import Pyramid
-    from rfcore.localise.track import TrackSettings, begun
-
-    def refined(frame: I420, camera: Camera) -> Camera:
-        def render_at(pose: Pose) -> FieldView:
-            return render_field_view(field, Camera(camera.intrinsics, pose).rounded())
-
-        levels = Pyramid(frame.y)
-        track = begun(0, camera.world_from_cam, None, levels, render_at, TrackSettings())
-        return camera if track is None else track.view.camera
-
-    return [refined(frame, camera) for frame, camera in zip(frames, measured, strict=True)]
+    localiser = Localiser(field, measured[0].intrinsics)
+    cameras, found = [], 0
+    for frame, camera in zip(frames, measured, strict=True):
+        prior = PosePrior(camera.world_from_cam, noise.position_m, noise.rotation_deg)
+        answer = localiser.localise_luma(frame.y, prior)
+        if isinstance(answer, Localised):
+            camera, found = Camera(camera.intrinsics, answer.world_from_cam), found + 1
+        cameras.append(camera)
+    return cameras, found
 
 
 def kbit_at(clips: Sequence[CodedClip], quality_db: float) -> float:
@@ -331,10 +329,14 @@ class Bench:
         rows = [self._row("pose noise", str(still), kbit, None, rival)]
         for noise in noises:
             measured = noisy_cameras(drive.cameras, noise, SEED)
-            refined = refined_cameras(self.field, drive.frames, measured)
-            for condition, cameras in (("pose noise", measured), ("refined pose noise", refined)):
+            refined, found = refined_cameras(self.field, drive.frames, measured, noise)
+            for condition, cameras, frames_found in (
+                ("pose noise", measured, None),
+                ("refined pose noise", refined, found),
+            ):
                 kbit = self._own(drive, f"{condition} {noise}", cameras)
-                rows.append(self._row(condition, str(noise), kbit, rows[0], rival))
+                row = self._row(condition, str(noise), kbit, rows[0], rival)
+                rows.append(replace(row, frames_found=frames_found))
         return rows
 
     def lane_row(self) -> DisturbanceRow:
