@@ -192,11 +192,17 @@ $(SEAMS)/whole.rff: | $(SEAMS)
 	$(RFEDGE) train samples/street/transforms_train.json --points samples/street/points.ply --limit 280000 $(SEAMS_TRAIN) --out $@
 $(OUT)/seams.json: $(SEAMS)/whole.rff $(SEAMS)/split $(SEAMS)/fields
 	$(RFEDGE) eval seams $(wordlist 1,2,$^) sample-empty@10=$(EMPTY) --fields $(SEAMS)/fields --cells $(OUT)/seams/cells --out $@
-$(OUT)/localise.json: $(call drive,dusk) $(call drive,lane-1.5) | $(OUT)
-	$(RFEDGE) eval localise sample=$(EMPTY),$(SAMPLE) vehicles=$(VEHICLES),$(SAMPLE),rows=2m:3deg \
-		noise=$(EMPTY),$(SAMPLE),noise=3,rows=2m:3deg dusk=$(call drive,dusk),$(SAMPLE),rows=2m:3deg \
-		lane=$(call drive,lane-1.5),$(SAMPLE),rows=2m:3deg --tries 100 --false-starts 50 --seed 2 \
-		--cells $(OUT)/localise --out $@
+# Every kind of start and error in the empty street, here and on drives of others; elsewhere the usual start alone.
+ROWS := $(COMMA)rows=2m:3deg
+PLACES := sample=$(EMPTY),$(SAMPLE) $(if $(DATA),\
+	yardstick=$(YARD)/transforms_drive30_empty.json$(COMMA)$(OUT)/yardstick.rff$(COMMA)hz=30$(COMMA)frames=72 \
+	city=$(CITY)/transforms_drive.json$(COMMA)$(OUT)/city.rff$(COMMA)hz=5$(COMMA)frames=60$(COMMA)units=0.17 \
+	loop=$(LOOP)/transforms_second.json$(COMMA)$(OUT)/loop.rff$(COMMA)feed=$(LOOP)/official_second.txt$(COMMA)feed_map=$(LOOP)/official_first.txt$(COMMA)map=$(LOOP)/transforms_first.json)
+STRANGERS := $(if $(DATA),--strangers $(DATA)/fox/transforms.json $(DATA)/kitti/residential)
+$(OUT)/localise.json: $(call drive,dusk) $(call drive,lane-1.5) $(FIELDS) | $(OUT)
+	$(RFEDGE) eval localise $(PLACES) vehicles=$(VEHICLES),$(SAMPLE)$(ROWS) noise=$(EMPTY),$(SAMPLE),noise=3$(ROWS) \
+		dusk=$(call drive,dusk),$(SAMPLE)$(ROWS) lane=$(call drive,lane-1.5),$(SAMPLE)$(ROWS) \
+		--tries 100 --false-starts 50 --seed 2 $(STRANGERS) --cells $(OUT)/localise --out $@
 $(OUT)/rig.json: $(OUT)/rig/rig.toml $(OUT)/rig18/rig.toml
 	$(RFEDGE) eval rig --rig $(OUT)/rig --many $(OUT)/rig18 --link-bps 300000 --rate 2 --max-delay-ms 2500 --work $(OUT)/rig-work --out $@
 $(OUT)/rig/rig.toml: | $(OUT)
