@@ -172,7 +172,7 @@ soak: build-full  ## half load for MINUTES (30): memory, descriptors and threads
 soak-short: build-full  ## three minutes of it
 	$(BIN)/python -m rfedge.loadtest.soak --minutes 3
 
-sizing: build-full  ## measure the tables of `rfedge size` (half an hour of one core); then `make figures`
+sizing: build-full  ## measure the tables of `rfedge size` (ten minutes of two cores); then `make figures`
 	$(BIN)/rfedge scene build samples/sizing/drive_1080p.toml --split drive --out out/drive-1080p
 	$(BIN)/rfedge eval sizing vehicles@10=samples/street/transforms_drive_vehicles.json \
 		vehicles@30=out/drive-1080p/transforms_drive.json --out rfedge/sizing/tables.json
