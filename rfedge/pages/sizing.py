@@ -114,7 +114,7 @@ def sizing_page(result: Result) -> str:
 
 CITY_MARK = "<!-- made by: python -m rfedge.pages.sizing city -->"
 CITY_SERVERS = (10, 100, 1000)
-CITY_CORES = (4, 8)
+CITY_CORES = (2, 4)
 CITY_KIND = VehicleKind(Demand(1, 640, 360, 10.0, 34.0))
 CITY_COLUMNS = (
     "servers",

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mec_server.config import AdmissionLimits
 from rfcore.errors import InvalidData, InvalidInput
+from rfedge.results import read_result
 from rfedge.samples import sample_path
 from rfedge.sizing.city import (
     TABLES_MOVING_PERCENT,
@@ -41,6 +42,7 @@ from rfedge.sizing.tables import shipped_tables
 from rfedge.sizing.traffic import TrafficBlock
 
 SAMPLE = sample_path("sizing/city.toml")
+RESULTS = Path(__file__).parents[2] / "results"
 DEMAND = Demand(1, 640, 360, 10.0, 34.0)
 COSTS = Costs(1, 10.0, 3000.0, (0.8, 1.0, 1.2), 0.04, 0.03, 0.02, 100.0)
 
@@ -137,11 +139,30 @@ def test_a_grid_has_hexagons_of_mean_weight_one() -> None:
 
 
 def test_bytes_grow_with_what_the_field_has_never_seen() -> None:
-    factors = [VehicleKind(DEMAND, percent).bytes_factor for percent in (0.0, 9.45, 18.9)]
-    assert factors[2] == 1.0
-    assert factors[0] == pytest.approx(1562 / 3013)
-    assert factors[1] == pytest.approx((factors[0] + 1) / 2)
-    assert TABLES_MOVING_PERCENT == 18.9
+    shares = (0.0, TABLES_MOVING_PERCENT / 2, TABLES_MOVING_PERCENT)
+    factors = [VehicleKind(DEMAND, percent).bytes_factor for percent in shares]
+    assert factors == pytest.approx([factors[0], (factors[0] + 1) / 2, 1.0])
+
+
+def test_what_the_field_has_never_seen_costs_what_the_recorded_comparison_says() -> None:
+    recorded = read_result(RESULTS / "compare.json")
+    bytes_at_34_db = []
+    for scene in ("sample-empty", "sample-vehicles"):
+        (curve,) = (
+            curve
+            for curve in recorded["curves"]
+            if curve["scene"] == scene and curve["setting"].startswith("rfedge-default")
+        )
+        points = sorted(zip(curve["psnr_db"], np.log(curve["bytes_per_frame"]), strict=True))
+        bytes_at_34_db.append(math.exp(np.interp(34.0, *zip(*points, strict=True))))
+    empty, vehicles = bytes_at_34_db
+    assert VehicleKind(DEMAND, 0.0).bytes_factor == pytest.approx(empty / vehicles, abs=1e-3)
+    (moving,) = (
+        row["area_percent"]
+        for row in recorded["bits"]
+        if (row["scene"], row["shows"]) == ("sample-vehicles", "moving")
+    )
+    assert pytest.approx(moving, abs=0.05) == TABLES_MOVING_PERCENT
 
 
 # --- the flow

@@ -1,6 +1,7 @@
 """The flow model against the product's sessions on the virtual clock, and what the command does."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,11 @@ DOCS = Path(__file__).parents[2] / "docs"
 def town() -> tuple[City, Costs]:
     city = read_city(sample_path("sizing/city.toml"))
     return city, costs_of(city, shipped_tables())
+
+
+def with_cores(city: City, station: float, harbour: float = 2.0) -> City:
+    """Return the town with servers of so many cores."""
+    return replace(city, servers=replace(city.servers, cores=np.array([station, harbour])))
 
 
 def both(
@@ -71,7 +77,11 @@ def test_every_byte_that_was_sent_came_or_is_under_way() -> None:
 
 def test_a_pressed_server_lets_in_as_many_as_the_flow_says() -> None:
     city, costs = town()
-    flow, sessions = both(city, costs, SampledServer(0, {0: 15, 1: 10}, {}), 20.0)
+    crowd = SampledServer(0, {0: 15, 1: 10}, {})
+    unpressed = flow_of(with_cores(city, 64.0), costs, crowd)
+    assert unpressed.refused == 0
+    pressed = with_cores(city, math.ceil(0.6 * unpressed.cores / city.admission.limits.load))
+    flow, sessions = both(pressed, costs, crowd, 20.0)
     assert flow.refused > 5
     assert sessions.served == pytest.approx(flow.served, abs=1.5)
     assert sessions.cores == pytest.approx(flow.cores, rel=0.08)
@@ -79,8 +89,7 @@ def test_a_pressed_server_lets_in_as_many_as_the_flow_says() -> None:
 
 def test_a_saturated_uplink_is_shared_by_credits() -> None:
     city, costs = town()
-    cores = np.array([6.0, 64.0])
-    city = replace(city, servers=replace(city.servers, cores=cores))
+    city = with_cores(city, 6.0, 64.0)
     flow, sessions = both(city, costs, SampledServer(1, {2: 20}, {}))
     assert flow.served == sessions.served == 20
     assert 1e6 * flow.uplink_mbps == pytest.approx(sessions.uplink_bps, rel=0.05)
@@ -122,7 +131,11 @@ def test_too_many_streams_are_refused_by_the_ledger() -> None:
 def test_a_city_is_planned_into_a_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked = ["size", "--city", str(sample_path("sizing/city.toml")), "--out", str(tmp_path)]
+    pressed = tmp_path / "city.toml"
+    pressed.write_text(
+        sample_path("sizing/city.toml").read_text().replace("cores = 6", "cores = 1")
+    )
+    asked = ["size", "--city", str(pressed), "--out", str(tmp_path)]
     parse([*asked, "--step-s", "5", "--samples", "1", "--sample-s", "2"]).run()
     said = capsys.readouterr().out
     assert "First broken: cores that a server may promise" in said.replace("\n", " ")
