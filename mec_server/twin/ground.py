@@ -4,12 +4,12 @@ A field's depth of the road is wrong by decimetres: what stands for the surface 
 along the road depth is too short (by 1.7 of 17 m on the sample's field), and splats that float
 before a camera shorten all of its depths alike. So the field is drawn from places every ``STEP_M``
 on the way ahead, as high as the camera, looking down a little, as those looked that it was trained
-on:
-
-* the height is the median over the ground that is ``NEAR_M`` from those places: it looks neither
-  too near nor, in the mean of many views, too high,
-* the slopes are those of the ground ``FAR_M`` away, each view about its own middle, since what
-  floats before a view raises all of that; least absolute errors, by reweighting.
+on: the ground that is ``NEAR_M`` from those places looks neither too near nor, in the mean of many
+views, too high. What floats above it raises it, and nothing lowers it: so the plane is the one that
+``LOWER`` of its points lie below, by quantile regression (Koenker and Bassett, Regression
+Quantiles, 1978; iteratively reweighted least squares). Their median was up to 0.08 m too high on
+the sample's field, which is 0.8 m of road at a distance of 16 m; slopes of the ground further away,
+whose depth is too short, were 0.8 % where the street is level.
 
 The places lie on a lattice and are drawn once, for whichever camera comes there first.
 """
@@ -35,14 +35,17 @@ LOOKING_DOWN_RAD = 0.25
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 192, 128, 96.0
 """In a view of half that size the depth of a far row mixes metres of road."""
 OPAQUE = 0.9
-NEAR_M, FAR_M = (3.0, 8.0), (8.0, 20.0)
+NEAR_M = (3.0, 8.0)
 ASIDE_M = 3.5
 BELOW_M = (0.8, 3.0)
 """Lower than the camera by so much is what may be ground."""
-NEAR_NTH, FAR_NTH = 16, 4
-"""Of the points of a view so many are kept."""
+NTH = 16
+"""Of the points of a view every so-manieth is kept."""
 LEAST_POINTS = 30
-ROUNDS, LEAST_ERROR_M = 8, 0.02
+LOWER = 0.3
+"""With 0.25 to 0.4 what objects are off differs little, on the sample's drive and on two others of
+other vehicles: at the 95th percentile 0.7 to 1.0, 0.8 to 1.0 and 1.3 to 1.4 m."""
+ROUNDS, LEAST_ERROR_M = 12, 0.02
 LEVEL_WEIGHT = 1.0
 """Metres squared, of each point: where the ground ahead is short, its slope is 0."""
 MOST_VIEWS = 512
@@ -72,20 +75,12 @@ class GroundPlane:
         return np.asarray(np.where(falls < -1e-6, above_m / np.maximum(-falls, 1e-6), np.inf))
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """The ground in one view [N, 3]: near, and far less its own middle."""
-
-    near_m: F64
-    far_m: F64
-
-
 class FieldGround:
     """The ground of one field, drawn by ``render`` where it is asked for."""
 
     def __init__(self, render: Callable[[Camera], View]) -> None:
         self._render = render
-        self._views: OrderedDict[Place, _Seen] = OrderedDict()
+        self._views: OrderedDict[Place, F64] = OrderedDict()
 
     def warm_up(self, at_m: tuple[float, float, float]) -> None:
         """Draw one place, so that the next ones take no memory first and half as long again."""
@@ -98,18 +93,15 @@ class FieldGround:
         forward = np.array(pose.rotation_matrix())[:, 2]
         heading_rad = math.atan2(forward[1], forward[0])
         step_m = STEP_M * math.cos(heading_rad), STEP_M * math.sin(heading_rad)
-        seen = [
+        ahead = [
             self._seen(_place_at(x_m + n * step_m[0], y_m + n * step_m[1], z_m, heading_rad))
             for n in range(STEPS)
         ]
-        near_m = np.concatenate([each.near_m for each in seen])
-        if len(near_m) < LEAST_POINTS:
-            return None
-        slopes = _slopes(np.concatenate([each.far_m for each in seen]))
-        height_m = float(np.median(near_m[:, 2] - (near_m[:, :2] - (x_m, y_m)) @ slopes))
-        return GroundPlane((x_m, y_m), height_m, (float(slopes[0]), float(slopes[1])))
+        points_m = np.concatenate(ahead)
+        return None if len(points_m) < LEAST_POINTS else _plane_above(points_m, LOWER)
 
-    def _seen(self, place: Place) -> _Seen:
+    def _seen(self, place: Place) -> F64:
+        """Return points of the ground near a place [N, 3]."""
         seen = self._views.pop(place, None)
         if seen is None:
             seen = self._drawn(place)
@@ -118,7 +110,7 @@ class FieldGround:
         self._views[place] = seen
         return seen
 
-    def _drawn(self, place: Place) -> _Seen:
+    def _drawn(self, place: Place) -> F64:
         camera, heading_rad = _camera_at(place)
         view = self._render(camera)
         rows, columns = np.nonzero((view.opacity > OPAQUE) & (view.depth > 0))
@@ -128,11 +120,8 @@ class FieldGround:
         ground = (-away_m[:, 2] > BELOW_M[0]) & (-away_m[:, 2] < BELOW_M[1])
         ground &= np.abs(away_m[:, :2] @ across) < ASIDE_M
         range_m = np.linalg.norm(away_m[:, :2], axis=1)
-        near, far = (
-            points_m[ground & (range_m > low) & (range_m < high)] for low, high in (NEAR_M, FAR_M)
-        )
-        middle_m = np.median(far, axis=0) if len(far) else np.zeros(3)
-        return _Seen(near[::NEAR_NTH], (far - middle_m)[::FAR_NTH])
+        ground &= (range_m > NEAR_M[0]) & (range_m < NEAR_M[1])
+        return np.asarray(points_m[ground][::NTH])
 
 
 def rays_of(camera: Camera, rows: Index, columns: Index) -> F64:
@@ -149,19 +138,20 @@ def points_of(camera: Camera, rows: Index, columns: Index, z_m: F64) -> F64:
     return np.asarray(rays_of(camera, rows, columns) * z_m[:, None] + eye_m)
 
 
-def _slopes(points_m: F64) -> F64:
-    """Return the slopes [2] of points [N, 3] about their middle, by least absolute errors."""
-    slopes: F64 = np.zeros(2)
-    if not len(points_m):
-        return slopes
-    level = LEVEL_WEIGHT * len(points_m) * np.eye(2)
-    at_m, heights_m = points_m[:, :2], points_m[:, 2]
+def _plane_above(points_m: F64, share: float) -> GroundPlane:
+    """Return the plane that a share of points [N, 3] lies below."""
+    middle_m = np.median(points_m[:, :2], axis=0)
+    heights_m = points_m[:, 2]
+    at_m = np.column_stack([np.ones(len(points_m)), points_m[:, :2] - middle_m])
+    level = LEVEL_WEIGHT * len(points_m) * np.diag([0.0, 1.0, 1.0])
+    fit = np.array([np.quantile(heights_m, share), 0.0, 0.0])
     for _ in range(ROUNDS):
-        weight = 1 / np.maximum(np.abs(at_m @ slopes - heights_m), LEAST_ERROR_M)
+        error_m = heights_m - at_m @ fit
+        weight = np.where(error_m > 0, share, 1 - share) / np.maximum(abs(error_m), LEAST_ERROR_M)
         weighted = at_m * weight[:, None]
-        normal = weighted.T @ at_m + level
-        slopes = np.asarray(np.linalg.solve(normal, weighted.T @ heights_m), np.float64)
-    return slopes
+        fit = np.linalg.solve(weighted.T @ at_m + level, weighted.T @ heights_m)
+    height_m, *slopes = (float(value) for value in fit)
+    return GroundPlane((float(middle_m[0]), float(middle_m[1])), height_m, (slopes[0], slopes[1]))
 
 
 def _place_at(x_m: float, y_m: float, z_m: float, heading_rad: float) -> Place:

@@ -1,6 +1,7 @@
 """The ground ahead of a camera is a plane near the field's, whatever single views of it say."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,6 +69,19 @@ def test_one_view_through_fog_moves_it_little() -> None:
     plane = plane_of(FieldGround(Views(0.1).render), along_x())
     assert plane.height_m == pytest.approx(-CAMERA_M, abs=0.03)
     assert plane.slopes[0] == pytest.approx(0.0, abs=0.01)
+
+
+def test_what_floats_above_half_of_it_does_not_raise_it() -> None:
+    """By up to a fifth of the depth, which is 0.3 m; the median lies 0.03 m above the ground."""
+    rng = np.random.default_rng(4)
+
+    def floating(camera: Camera) -> View:
+        view = level_ground(camera)
+        shorter = np.where(rng.random(view.depth.shape) < 0.6, rng.uniform(0, 0.2), 0.0)
+        return replace(view, depth=(view.depth * (1 - shorter)).astype(np.float32))
+
+    plane = plane_of(FieldGround(floating), along_x())
+    assert plane.height_m == pytest.approx(-CAMERA_M, abs=0.02)
 
 
 def test_each_place_is_drawn_once() -> None:

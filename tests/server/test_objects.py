@@ -150,6 +150,22 @@ def test_what_hangs_on_a_wall_is_no_object() -> None:
     assert seen(joined(STREET, poster), camera_at()) == []
 
 
+def test_a_hole_in_a_thing_that_stands_on_no_level_ground_is_no_foot_of_another() -> None:
+    """Where a vehicle looks like the street behind it, below what is seen above that; its own foot
+    is before a kerb, 5.5 m away, and the hole 18 to 20 m."""
+    camera = camera_at()
+    view = FIELD.render(camera)
+    rgb = np.rint(view.colour.clip(0, 1) * 255).astype(np.uint8)
+    street = rgb.copy()
+    rgb[70:151, 150:190] = 230
+    rgb[100:104, 150:190] = street[100:104, 150:190]
+    live = live_picture(camera, rgb, view)
+    assert len(detect(live, GROUND)) == 1
+    depth = live.depth.copy()
+    depth[145:, 150:190] = 5.5
+    assert detect(replace(live, depth=depth), GROUND) == []
+
+
 def test_two_cars_are_two_and_one_without_a_foot_in_the_picture_is_none() -> None:
     both = joined(car(-2.0, 9.0), car(2.0, 12.0))
     left, right = seen(joined(STREET, both.gaussians), camera_at())
