@@ -245,10 +245,10 @@ def test_the_headline_has_the_fair_anchor_the_best_rival_and_ours_without_the_fi
     )
     assert line == (
         "| yardstick-empty, 10 Hz | -57.3 % (-60.0..-54.0) | -41.2 % (svtav1-lowdelay-p4) "
-        "| +1.2 % | 151 / 24 | 5.0 MB, 41 of 2.4 s |"
+        "| +1.2 % | 151 / 24 | 5.0 MB, 41 of 2.4 s, 185 MB |"
     )
     never = replace(PAID, passes_to_break_even=None)
-    assert headline(result_of(rows=rows, break_even=[never])).endswith("| 5.0 MB, never |")
+    assert headline(result_of(rows=rows, break_even=[never])).endswith("| 5.0 MB, never, 185 MB |")
     with pytest.raises(InvalidInput, match="yardstick-empty@10 lacks rfedge-without-field"):
         headline(result_of(rows=[fair, best], break_even=[PAID]))
     with pytest.raises(InvalidInput, match="break_even: yardstick-empty@10 lacks rfedge"):

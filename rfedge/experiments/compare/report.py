@@ -170,7 +170,7 @@ HEADLINE_COLUMNS = (
     "against the best of all rivals",
     "our coder without the field",
     "ms a frame at both ends: ours / that x264",
-    "the field, and after how many passes it is paid for",
+    "the field, after how many passes it is paid for, and what it saves an hour of one camera",
 )
 PRINTED = ("scene", "Hz", "method", "rival", "window dB", "BD-rate %", "95 %", "CPU ms")
 SAVING_AT_DB = ("31", "33", "35")
@@ -327,7 +327,8 @@ def _bits_cell(row: BitShareRow) -> str:
 def headline(result: Result) -> str:
     """Return a sentence, and a line per drive over the first window: ours against x264 with the
     same tools at preset medium and against the strongest rival of all; our coder without the
-    field; times; what the field's own bytes are, and how many passes over the street save as many.
+    field; times; what the field's own bytes are, how many passes over the street save as many, and
+    what an hour of such traffic saves.
 
     Raises ``InvalidInput`` for a comparison that lacks one of them.
     """
@@ -406,7 +407,8 @@ def _field_cell(rows: Sequence[BreakEvenRow], scene: str, hz: float) -> str:
         if (row.scene, row.hz, _without_effort(row.method)) == (scene, hz, "rfedge"):
             passes, seconds = row.passes_to_break_even, row.frames_per_pass / hz
             paid = "never" if passes is None else f"{passes} of {seconds:.1f} s"
-            return f"{row.field_bytes / 1e6:.1f} MB, {paid}"
+            saved_mb_per_h = 3600 / 1e6 * row.saved_bytes_per_pass / seconds
+            return f"{row.field_bytes / 1e6:.1f} MB, {paid}, {saved_mb_per_h:.0f} MB"
     raise InvalidInput("break_even", f"{scene}@{hz:g} lacks rfedge")
 
 
