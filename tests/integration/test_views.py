@@ -3,7 +3,7 @@
 import asyncio
 import threading
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -23,6 +23,7 @@ from rfcore.errors import LimitExceeded
 from rfcore.field import SplatField, save_field
 from rfcore.views import View
 from rfcore.wire.conventions import CONSUMER_OPTIONS
+from rfcore.wire.messages import Frame
 from rfcore.wire.publish import Ground, publish
 from rfcore.wire.tiles import Area
 from rfcore.wire.twin import PictureEncoding
@@ -179,6 +180,16 @@ async def test_a_viewpoint_outside_of_the_field_is_refused(street: Any, serve: A
     assert "pose.z_m: -40 is more than 5 m outside of the field" in details
 
 
+def a_tenth_apart(frames: Sequence[Frame]) -> list[Frame]:
+    """Return frames that were captured 0.1 s after one another, the last one now: those within
+    ``SAME_INSTANT_S`` confirm nothing, and a fast server answers sooner."""
+    now_ns = time.time_ns()
+    ages_ns = (10**8 * later for later in reversed(range(len(frames))))
+    return [
+        replace(f, capture_time_ns=now_ns - age) for f, age in zip(frames, ages_ns, strict=True)
+    ]
+
+
 async def test_a_place_of_the_world_names_its_tile_and_is_where_the_pose_is_relative_to(
     street: Any, coded: Any, serve: Any, raw_vehicle: Any, tmp_path: Path, monkeypatch: Any
 ) -> None:
@@ -202,7 +213,7 @@ async def test_a_place_of_the_world_names_its_tile_and_is_where_the_pose_is_rela
             await call.initial_metadata()
         async with raw_vehicle(server.address) as vehicle:
             await vehicle.greet(coded.hello)
-            for frame in coded.frames[:4]:
+            for frame in a_tenth_apart(coded.frames[:4]):
                 await vehicle.told(frame)
                 told = [objects_from_wire(await call.read()) for call in calls]
     assert view.field_id == street.field_id
@@ -441,7 +452,7 @@ async def test_objects_are_what_the_vehicle_sees_and_the_field_does_not_have(
         async with raw_vehicle(server.address) as vehicle:
             await vehicle.greet(coded.hello)
             told = []
-            for frame in coded.frames[:4]:
+            for frame in a_tenth_apart(coded.frames[:4]):
                 await vehicle.told(frame)
                 told.append(objects_from_wire(await call.read()))
         async with asyncio.timeout(20):
