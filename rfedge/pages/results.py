@@ -126,6 +126,7 @@ DRAWINGS: Mapping[str, Callable[[Result, Path], list[Path]]] = {
     "latency": write_latency_figures,
     "paper": lambda result, out: write_paper_figures(paper_rows(result), out),
     "robust": write_robust_figure,
+    "robust-long": lambda result, out: write_robust_figure(result, out, "loss_ssim_long"),
 }
 """Figures of the result files that have some, by their names."""
 

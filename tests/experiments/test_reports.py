@@ -532,9 +532,19 @@ def test_a_disturbance_without_figures_writes_none(tmp_path: Path) -> None:
     assert list(robust_result()["disturbances"][2]) == ["condition", "level", "reason"]
     drawing, numbers = write_robust_figure(robust_result(), tmp_path)
     assert len(lines_of(numbers)) == 1 + len(LOSSES)
-    assert ["last-acked", "20", "5", "0.89800", "0.85000"] in lines_of(numbers)
+    assert ["last-acked", "20", "5", *["0.89800"] * 3, "0.85000"] in lines_of(numbers)
     assert "round trip 100 ms" in shown_in(drawing)
     assert "SSIM at 512 kbit/s" in shown_in(drawing)
+
+
+def test_the_figure_of_several_seeds_has_their_intervals(tmp_path: Path) -> None:
+    several = LossRow("render-only", 50.0, 5.0, 0.91234, 0.8, 100, (0.9101, 0.9144))
+    result = {**robust_result(), "rows": as_json([several])}
+    drawing, numbers = write_robust_figure(result, tmp_path, "long")
+    assert (drawing.name, numbers.name) == ("long.svg", "long.csv")
+    expected = ["render-only", "50", "5", "0.91234", "0.91010", "0.91440", "0.80000"]
+    assert expected in lines_of(numbers)
+    assert drawing.read_text().count('id="LineCollection') == 2, "the interval, and in the legend"
 
 
 def test_at_80_columns_both_tables_of_robustness_are_whole() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 
 from rfcore.errors import InvalidInput
@@ -147,8 +148,9 @@ def _disturbed_cells(row: DisturbanceRow) -> list[str]:
     ]
 
 
-def write_robust_figure(result: Result, folder: Path) -> list[Path]:
-    """Write ``loss_ssim``: SSIM over loss, a line per method, a panel per round trip.
+def write_robust_figure(result: Result, folder: Path, name: str = "loss_ssim") -> list[Path]:
+    """Write figure and numbers: SSIM over loss with the 95 % intervals of several seeds, a line per
+    method, a panel per round trip.
 
     Raises ``InvalidInput`` for a result without rows.
     """
@@ -168,7 +170,8 @@ def write_robust_figure(result: Result, folder: Path) -> list[Path]:
                 chosen = [r for r in rows if (r.method, r.rtt_ms) == (method, rtt_ms)]
                 x, y = [r.loss_percent for r in chosen], [r.ssim for r in chosen]
                 style = {"color": LINES[number % 6], "marker": MARKERS[number % 6]}
-                axes.plot(x, y, label=method, linewidth=1.5, markersize=4, **style)
+                reach = np.abs(np.subtract([_interval(r) for r in chosen], np.c_[y])).T
+                axes.errorbar(x, y, reach, label=method, linewidth=1.5, markersize=4, **style)
             axes.set(xlabel="datagrams lost, %", title=f"round trip {rtt_ms:g} ms")
         panels[0][0].set_ylabel(f"SSIM at {result['equal_rate_kbps']:.0f} kbit/s")
         figure.legend(
@@ -179,8 +182,14 @@ def write_robust_figure(result: Result, folder: Path) -> list[Path]:
             bbox_to_anchor=(0.5, 0.0),
             fontsize=8,
         )
-    lines = [["method", "rtt_ms", "loss_percent", "ssim", "ssim_p5"]]
+    lines = [["method", "rtt_ms", "loss_percent", "ssim", "low", "high", "ssim_p5"]]
     for row in rows:
         numbers = (f"{row.rtt_ms:g}", f"{row.loss_percent:g}")
-        lines.append([row.method, *numbers, f"{row.ssim:.5f}", f"{row.ssim_p5:.5f}"])
-    return write_figure(folder / "loss_ssim", figure, lines)
+        values = (row.ssim, *_interval(row), row.ssim_p5)
+        lines.append([row.method, *numbers, *(f"{value:.5f}" for value in values)])
+    return write_figure(folder / name, figure, lines)
+
+
+def _interval(row: LossRow) -> Sequence[float]:
+    """Return the 95 % interval of a mean; of one seed the value itself, twice."""
+    return (row.ssim, row.ssim) if row.ssim_ci95 is None else row.ssim_ci95
