@@ -43,7 +43,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mec_server.twin.composition import LivePicture, Outline, with_things
-from mec_server.twin.ground import FieldGround, points_of, rays_of
+from mec_server.twin.ground import FieldGround, GroundPlane, points_of, rays_of
+from rfcore.camera import Camera
 
 __all__ = ["Detection", "Found", "cut_out", "detect", "find"]
 
@@ -188,7 +189,7 @@ def _contacts(picture: LivePicture, ground: FieldGround) -> Contacts:
     below_m = depth[rows + BELOW_PX, columns].astype(np.float64)
     surface_m = points_of(camera, rows + BELOW_PX, columns, below_m)
     level = _is_level(picture, rows, columns, surface_m)
-    place = partial(_ground_z_m, picture, ground)
+    place = partial(_ground_z_m, camera, ground.ahead_of(camera) if len(rows) else None)
     z_m = place(rows, columns, surface_m, below_m)
     height_m = _marked_m(marked, rows, columns, z_m, camera.intrinsics.fy_px)
     above = _above_shadow(picture, marked, rows, columns)
@@ -245,19 +246,17 @@ def _is_level(picture: LivePicture, rows: Index, columns: Index, surface_m: F64)
 
 
 def _ground_z_m(
-    picture: LivePicture,
-    ground: FieldGround,
+    camera: Camera,
+    plane: GroundPlane | None,
     rows: Index,
     columns: Index,
     surface_m: F64,
     below_m: F64,
 ) -> F64:
-    """Return depths of contacts: of the ground's plane where the field's surface is near it."""
-    plane = ground.ahead_of(picture.camera) if len(rows) else None
+    """Return depths of contacts: of the ground's ``plane`` where the field's surface is near it."""
     if plane is None:
         return below_m
-    eye_m = picture.camera.world_from_cam.translation_m
-    along_m = plane.depths_m(eye_m, rays_of(picture.camera, rows, columns))
+    along_m = plane.depths_m(camera.world_from_cam.translation_m, rays_of(camera, rows, columns))
     off_m = np.abs(surface_m[:, 2] - plane.heights_m(surface_m[:, :2]))
     return np.asarray(np.where((off_m < NEAR_GROUND_M) & np.isfinite(along_m), along_m, below_m))
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mec_server.config import AdmissionLimits
 from rfcore.errors import InvalidData, InvalidInput
+from rfedge.experiments.robust.run import kbit_between
 from rfedge.results import read_result
 from rfedge.samples import sample_path
 from rfedge.sizing.city import (
@@ -146,16 +147,12 @@ def test_bytes_grow_with_what_the_field_has_never_seen() -> None:
 
 def test_what_the_field_has_never_seen_costs_what_the_recorded_comparison_says() -> None:
     recorded = read_result(RESULTS / "compare.json")
-    bytes_at_34_db = []
-    for scene in ("sample-empty", "sample-vehicles"):
-        (curve,) = (
-            curve
-            for curve in recorded["curves"]
-            if curve["scene"] == scene and curve["setting"].startswith("rfedge-default")
-        )
-        points = sorted(zip(curve["psnr_db"], np.log(curve["bytes_per_frame"]), strict=True))
-        bytes_at_34_db.append(math.exp(np.interp(34.0, *zip(*points, strict=True))))
-    empty, vehicles = bytes_at_34_db
+    empty, vehicles = (
+        kbit_between(zip(curve["psnr_db"], curve["bytes_per_frame"], strict=True), 34.0, scene)
+        for scene in ("sample-empty", "sample-vehicles")
+        for curve in recorded["curves"]
+        if curve["scene"] == scene and curve["setting"].startswith("rfedge-default")
+    )
     assert VehicleKind(DEMAND, 0.0).bytes_factor == pytest.approx(empty / vehicles, abs=1e-3)
     (moving,) = (
         row["area_percent"]

@@ -290,10 +290,10 @@ def _opened(job: PaperJob) -> list[NamedField]:
 
 def _picture_done(job: PaperJob, number: int) -> None:
     """Have the rows of the job's picture of that number among the cells."""
-    _do(_pictures_of_process(job)[number], CellStore(job.cells))
+    _keep_rows(_pictures_of_process(job)[number], CellStore(job.cells))
 
 
-def _do(pieces: Sequence[Piece], store: CellStore) -> None:
+def _keep_rows(pieces: Sequence[Piece], store: CellStore) -> None:
     for piece in pieces:
         store.rows(_key(piece), _maker(piece))
 
@@ -437,7 +437,7 @@ def _say_cost(
     estimate = "nothing left to do"
     if left:
         began_s = monotonic()
-        _do(left[0], store)
+        _keep_rows(left[0], store)
         total_s = (monotonic() - began_s) * (len(left) - 1)
         estimate = f"{len(left)} left, about {total_s / processes / 60:.1f} minutes"
     console.print(f"{len(pictures)} pictures, {estimate}")

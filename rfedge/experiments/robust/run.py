@@ -335,8 +335,7 @@ class Bench:
                 ("refined pose noise", refined, found),
             ):
                 kbit = self._own(drive, f"{condition} {noise}", cameras)
-                row = self._row(condition, str(noise), kbit, rows[0], rival)
-                rows.append(replace(row, frames_found=frames_found))
+                rows.append(self._row(condition, str(noise), kbit, rows[0], rival, frames_found))
         return rows
 
     def lane_row(self) -> DisturbanceRow:
@@ -394,6 +393,7 @@ class Bench:
         kbit: float,
         base: DisturbanceRow | None,
         rival_kbit: float,
+        frames_found: int | None = None,
     ) -> DisturbanceRow:
         undisturbed = kbit if base is None or base.kbit is None else base.kbit
         return DisturbanceRow(
@@ -403,6 +403,7 @@ class Bench:
             more_percent=100 * (kbit / undisturbed - 1),
             x264_kbit=rival_kbit,
             against_x264_percent=100 * (kbit / rival_kbit - 1),
+            frames_found=frames_found,
         )
 
 
