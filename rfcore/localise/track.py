@@ -69,8 +69,10 @@ class TrackSettings:
     settled_of_depth: float = 0.003
     """How far a pose that was rendered at is expected to be off, one sigma."""
     settled_deg: float = 0.05
-    redraw_px: float = 0.4
+    redraw_px: float = 0.25
     """A correction that moves the pixels that were aligned by more is worth another render."""
+    first_step_px: float = 0.4
+    """The first picture after a track began must lie as near as this."""
     most_px: float = 3.0
     """A pose that is still off by more was not found."""
     first_step_renders: int = 2
@@ -343,6 +345,9 @@ def _checked(
     far away agrees and what is near was taken for something that the field does not have: it is
     settled from coarse to fine, and must stay where it is. Hypothesis found a pose 0.2 m off, whose
     finest level alone still moved it by 0.6 px; all levels move it by 2.3, to the right one.
+    A later picture that is off by enough to be drawn again is aligned from coarse to fine, too: its
+    prediction was wrong by more than the finest level reaches (cars that turn, five pictures a
+    second: two renders more still left 1.5 px).
     """
     view, renders = render_at(made.world_from_cam), made.renders + 1
     template = Template.of(view)
@@ -354,12 +359,16 @@ def _checked(
         return None
     off_px = template.moved_px(aligned.motion, effort.finest)
     if off_px > settings.redraw_px and effort.renders > 0:
+        if not made.is_first_step:
+            aligned = _settled(template, picture, settings, effort.finest, coarsely=True)
+        if aligned is None:
+            return None
         there = view.camera.world_from_cam.compose(aligned.motion.inverse())
         again = replace(made, world_from_cam=there, renders=renders)
         return _checked(
             again, picture, render_at, settings, replace(effort, renders=effort.renders - 1)
         )
-    if off_px > (settings.redraw_px if made.is_first_step else settings.most_px):
+    if off_px > (settings.first_step_px if made.is_first_step else settings.most_px):
         return None
     pose = view.camera.world_from_cam.compose(aligned.motion.inverse())
     return Track(

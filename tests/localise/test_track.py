@@ -100,3 +100,30 @@ def test_tracking_from_half_the_resolution_on_leaves_the_finest_level_out() -> N
         assert track.renders == 1
         assert 0 not in levels.made | track.template.structures.made
         assert math.dist(track.world_from_cam.translation_m, at(number).translation_m) < 0.02
+
+
+@pytest.mark.parametrize(("step_m", "share"), [(0.8, 0.7), (0.8, 1.25), (1.2, 0.8), (1.2, 1.25)])
+def test_a_picture_that_was_predicted_far_off_is_found_with_one_render_more(
+    step_m: float, share: float
+) -> None:
+    """Wrong depth leads it 0.1 m and more aside, further than the finest level reaches."""
+
+    def at(number: int) -> Pose:
+        return Pose((0.0, 0.0, step_m * number), (1.0, 0.0, 0.0, 0.0))
+
+    def render_at(pose: Pose) -> FieldView:
+        return render_field_view(Planes(), Camera(INTRINSICS, pose).rounded())
+
+    settings = TrackSettings()
+    track = begun(0, at(0), None, Pyramid(picture(at(0)).y), render_at, settings)
+    for number in range(1, 4):
+        assert track is not None
+        if number == 3:
+            view = replace(track.view, depth=track.view.depth * np.float32(share))
+            track = replace(track, view=view, template=Template.of(view))
+        levels = Pyramid(picture(at(number)).y)
+        track = followed(track, number * 10**8, levels, render_at, settings, Effort(1))
+    assert track is not None
+    assert track.renders == 2
+    sent = track.view.camera.world_from_cam
+    assert math.dist(sent.translation_m, at(3).translation_m) < 0.01
