@@ -37,13 +37,13 @@ ifneq ($(DATA),)
 YARD := $(DATA)/street
 LOOP := $(DATA)/kitti/loop
 CITY := $(DATA)/kitti/city
-trained = $(RFEDGE) train $1 --points $(dir $1)points.ply --held-out $2 --antialiased --minutes $3 --out $@
+trained = $(RFEDGE) train $1 --points $(dir $1)points.ply --held-out $2 --antialiased --minutes $3 $4 --out $@
 $(OUT)/yardstick.rff: | $(OUT)
 	$(call trained,$(YARD)/transforms_train.json,$(YARD)/transforms_drive_empty.json,5)
 $(OUT)/city.rff: | $(OUT)
 	$(call trained,$(CITY)/transforms_train.json,$(CITY)/transforms_drive.json,2.5)
 $(OUT)/loop.rff: | $(OUT)
-	$(call trained,$(LOOP)/transforms_first.json,$(LOOP)/transforms_second.json,12 --limit 400000)
+	$(call trained,$(LOOP)/transforms_first.json,$(LOOP)/transforms_second.json,12,--limit 400000)
 $(OUT)/yardstick-%k.rff: | $(OUT)
 	$(call small,$(YARD)/transforms_train.json,$(YARD)/transforms_drive_empty.json)
 FIELDS := $(patsubst %,$(OUT)/%.rff,yardstick city loop)

@@ -361,8 +361,8 @@ def _checked(
     if off_px > settings.redraw_px and effort.renders > 0:
         if not made.is_first_step:
             aligned = _settled(template, picture, settings, effort.finest, coarsely=True)
-        if aligned is None:
-            return None
+            if aligned is None:
+                return None
         there = view.camera.world_from_cam.compose(aligned.motion.inverse())
         again = replace(made, world_from_cam=there, renders=renders)
         return _checked(

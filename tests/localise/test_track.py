@@ -11,14 +11,15 @@ from hypothesis import strategies as st
 
 from localise.planes import INTRINSICS, WALL_M, Planes, picture
 from rfcore.camera import Camera, Pose
-from rfcore.field import FULL, Quality, render_field_view
+from rfcore.field import FULL, Quality, Renderer, render_field_view
 from rfcore.localise.alignment import Template
 from rfcore.localise.structure import Pyramid
-from rfcore.localise.track import Effort, TrackSettings, begun, followed
+from rfcore.localise.track import Effort, RenderAt, Track, TrackSettings, begun, followed
 from rfcore.motion import quaternion_from_vector, rotation_vector
-from rfcore.views import FieldView, View
+from rfcore.views import View
 
 TEMPLATE = Template.of(render_field_view(Planes(), Camera(INTRINSICS, Pose.identity())))
+SETTINGS = TrackSettings()
 METRES = st.floats(-0.3, 0.3)
 RADIANS = st.floats(-0.02, 0.02)
 
@@ -61,23 +62,36 @@ class Shallow:
         return replace(shown, depth=shown.depth * np.float32(self.share))
 
 
+def ahead(metres: float) -> Pose:
+    return Pose((0.0, 0.0, metres), (1.0, 0.0, 0.0, 0.0))
+
+
+def drawn_by(renderer: Renderer) -> RenderAt:
+    return lambda pose: render_field_view(renderer, Camera(INTRINSICS, pose).rounded())
+
+
+def begun_at(pose: Pose, renderer: Renderer) -> Track:
+    """Return the track that begins with the picture taken at a pose."""
+    track = begun(0, pose, None, Pyramid(picture(pose).y), drawn_by(renderer), SETTINGS)
+    assert track is not None
+    return track
+
+
+def followed_to(pose: Pose, number: int, track: Track, renderer: Renderer) -> Track:
+    """Return the track with the picture taken at a pose, the one of that number at 10 Hz."""
+    levels, time_ns = Pyramid(picture(pose).y), number * 10**8
+    further = followed(track, time_ns, levels, drawn_by(renderer), SETTINGS, Effort(1))
+    assert further is not None
+    return further
+
+
 @pytest.mark.parametrize(("share", "scale"), [(1.0, 1.0), (0.95, 1 / 0.95)])
 def test_motions_are_scaled_by_what_the_depth_is_wrong(share: float, scale: float) -> None:
     """Depth of a share makes movements look like that share of what they are."""
-
-    def at(number: int) -> Pose:
-        return Pose((0.0, 0.0, 0.4 * number), (1.0, 0.0, 0.0, 0.0))
-
-    def render_at(pose: Pose) -> FieldView:
-        return render_field_view(Shallow(share), Camera(INTRINSICS, pose).rounded())
-
-    settings = TrackSettings()
-    track = begun(0, at(0), None, Pyramid(picture(at(0)).y), render_at, settings)
+    shallow = Shallow(share)
+    track = begun_at(ahead(0.0), shallow)
     for number in range(1, 10):
-        assert track is not None
-        levels = Pyramid(picture(at(number)).y)
-        track = followed(track, number * 10**8, levels, render_at, settings, Effort(1))
-    assert track is not None
+        track = followed_to(ahead(0.4 * number), number, track, shallow)
     assert track.motion_scale == pytest.approx(scale, abs=0.012)
 
 
@@ -87,16 +101,13 @@ def test_tracking_from_half_the_resolution_on_leaves_the_finest_level_out() -> N
     def at(number: int) -> Pose:
         return Pose((0.02 * number, 0.0, 0.1 * number), (1.0, 0.0, 0.0, 0.0))
 
-    def render_at(pose: Pose) -> FieldView:
-        return render_field_view(Planes(), Camera(INTRINSICS, pose).rounded())
-
-    settings, half = TrackSettings(), Effort(0, finest=1)
-    track = begun(0, at(0), None, Pyramid(picture(at(0)).y), render_at, settings)
+    half = Effort(0, finest=1)
+    track = begun_at(at(0), Planes())
     for number in range(1, 6):
-        assert track is not None
         levels = Pyramid(picture(at(number)).y)
-        track = followed(track, number * 10**8, levels, render_at, settings, half)
-        assert track is not None
+        further = followed(track, number * 10**8, levels, drawn_by(Planes()), SETTINGS, half)
+        assert further is not None
+        track = further
         assert track.renders == 1
         assert 0 not in levels.made | track.template.structures.made
         assert math.dist(track.world_from_cam.translation_m, at(number).translation_m) < 0.02
@@ -107,23 +118,12 @@ def test_a_picture_that_was_predicted_far_off_is_found_with_one_render_more(
     step_m: float, share: float
 ) -> None:
     """Wrong depth leads it 0.1 m and more aside, further than the finest level reaches."""
-
-    def at(number: int) -> Pose:
-        return Pose((0.0, 0.0, step_m * number), (1.0, 0.0, 0.0, 0.0))
-
-    def render_at(pose: Pose) -> FieldView:
-        return render_field_view(Planes(), Camera(INTRINSICS, pose).rounded())
-
-    settings = TrackSettings()
-    track = begun(0, at(0), None, Pyramid(picture(at(0)).y), render_at, settings)
-    for number in range(1, 4):
-        assert track is not None
-        if number == 3:
-            view = replace(track.view, depth=track.view.depth * np.float32(share))
-            track = replace(track, view=view, template=Template.of(view))
-        levels = Pyramid(picture(at(number)).y)
-        track = followed(track, number * 10**8, levels, render_at, settings, Effort(1))
-    assert track is not None
+    track = begun_at(ahead(0.0), Planes())
+    for number in (1, 2):
+        track = followed_to(ahead(step_m * number), number, track, Planes())
+    wrong = replace(track.view, depth=track.view.depth * np.float32(share))
+    track = replace(track, view=wrong, template=Template.of(wrong))
+    track = followed_to(ahead(step_m * 3), 3, track, Planes())
     assert track.renders == 2
     sent = track.view.camera.world_from_cam
-    assert math.dist(sent.translation_m, at(3).translation_m) < 0.01
+    assert math.dist(sent.translation_m, ahead(step_m * 3).translation_m) < 0.01
