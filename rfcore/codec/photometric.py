@@ -23,6 +23,7 @@ left, modulo 256; what is beyond the first row or column is as its neighbour, an
 
 from __future__ import annotations
 
+import math
 import zlib
 from typing import Any
 
@@ -50,7 +51,7 @@ _FRACTION_BITS = 12
 _LEVEL_BITS = 4
 _BLACK = (16, 128, 128)
 _ROUNDS = 3
-_SAMPLES_PER_SIDE = 90
+_SAMPLES = 160 * 90
 
 MOST_LIGHT_BYTES = 1024
 LIGHT_STEPS = (4, 8, 16, 32)
@@ -97,8 +98,8 @@ def adapt(render: I420, photometric: Photometric) -> I420:
 def solve(frame: I420, render: I420) -> Photometric:
     """Return the matrix that maps ``render`` closest to ``frame``.
 
-    Least squares over about 90x90 blocks of 2x2 px, three times, each time with blocks further than
-    twice the median off left out: those show what is not in the field.
+    Least squares over evenly spread blocks of 2x2 px, about 14,400 at most, three times, each time
+    with blocks further than twice the median off left out: those show what is not in the field.
     """
     source, target = _samples(render), _samples(frame)
     keep = np.ones(len(source), bool)
@@ -185,7 +186,7 @@ def _samples(picture: I420) -> F64:
     """Return [N, 4]: Y, U, V without offsets, and 1, of evenly spread 2x2 blocks."""
     luma = _luma_at_chroma(picture.y.astype(np.int32) - _BLACK[0])
     planes = (luma, picture.u.astype(np.int32) - 128, picture.v.astype(np.int32) - 128)
-    step = max(1, min(luma.shape) // _SAMPLES_PER_SIDE)
+    step = math.ceil(math.sqrt(luma.size / _SAMPLES))
     columns = [plane[::step, ::step].ravel() for plane in planes]
     return np.stack([*columns, np.ones_like(columns[0])], axis=1).astype(np.float64)
 

@@ -141,6 +141,25 @@ def test_a_change_of_light_is_found_and_undone(
         assert np.abs(a.astype(int) - b).max() <= 3
 
 
+@pytest.mark.parametrize("size_px", [(640, 360), (828, 250), (1242, 376), (1281, 721), (64, 48)])
+def test_a_wide_picture_has_no_more_equations_than_another(
+    picture: PictureMaker, size_px: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With as many as its height let in, one of 828x250 took 72 ms instead of 3."""
+    equations = []
+    lstsq = np.linalg.lstsq
+
+    def counted(a: np.ndarray, b: np.ndarray, rcond: None) -> object:
+        equations.append(len(a))
+        return lstsq(a, b, rcond=rcond)
+
+    monkeypatch.setattr(np.linalg, "lstsq", counted)
+    render = picture(*size_px)
+    matrix = np.array(solve(shade(render, 0.8, 12.0), render)).reshape(3, 4)
+    assert 700 < max(equations) <= 1.02 * 14_400
+    assert abs(matrix[0, 0] / 4096 - 0.8) < 0.01
+
+
 def test_what_the_field_has_never_seen_does_not_bend_the_light(pair: PairMaker) -> None:
     frame, view = pair(*SIZE_PX)
     dark = shade(frame, 0.7, 0.0)

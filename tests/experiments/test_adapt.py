@@ -49,6 +49,12 @@ def test_without_a_loss_nothing_is_recovered() -> None:
     assert recovered_percent(25.0, 25.0, 20.0) is None
 
 
+def test_a_loss_of_less_than_a_tenth_is_not_shared_out() -> None:
+    """Dusk at 36 dB costs 2 % more than noon: what a field wins beside would be 4,000 % of that."""
+    assert recovered_percent(27.4, 25.0, 5.0) is None
+    assert recovered_percent(27.6, 25.0, 25.0) == pytest.approx(100.0)
+
+
 def test_a_second_vehicle_pays_for_what_is_new_as_the_first_one_or_not_at_all() -> None:
     assert second_vehicle_percent(60.0, 20.0, 60.0) == 100.0
     assert second_vehicle_percent(60.0, 20.0, 40.0) == 50.0

@@ -68,6 +68,8 @@ __all__ = [
 
 AT_DB = 33.0
 FINER_DB = 36.0
+LEAST_LOSS = 0.1
+"""Of the bits in the field's own light: shares of a smaller loss say nothing."""
 FIRST = slice(0, 1)
 POINTS = (18.0, 22.0, 26.0, 30.0, 34.0, 38.0, 42.0)
 QUICK_FRAMES = 6
@@ -233,8 +235,11 @@ def run_adapt(job: AdaptJob, console: Console) -> dict[str, Any]:
 def recovered_percent(
     off_kbit: float | None, noon_kbit: float | None, kbit: float | None
 ) -> float | None:
-    """Return which share of the loss was won back; None where bits are, or without a loss."""
-    if off_kbit is None or noon_kbit is None or kbit is None or noon_kbit >= off_kbit:
+    """Return which share of the loss was won back; None where bits are, or the loss is below
+    ``LEAST_LOSS``."""
+    if off_kbit is None or noon_kbit is None or kbit is None:
+        return None
+    if off_kbit < (1 + LEAST_LOSS) * noon_kbit:
         return None
     return 100 * (off_kbit - kbit) / (off_kbit - noon_kbit)
 
