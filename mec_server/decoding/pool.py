@@ -13,7 +13,13 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 
-from mec_server.decoding.process import DecoderLost, DecoderProcess, ForkServer, Waiting
+from mec_server.decoding.process import (
+    DecoderLost,
+    DecoderProcess,
+    ForkServer,
+    Retired,
+    Waiting,
+)
 from mec_server.decoding.protocol import INPUT_BYTES, Command
 from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import CodecError, RfedgeError
@@ -99,13 +105,19 @@ class DecoderPool:
 
     def _start(self) -> DecoderProcess:
         """Runs on the starter's thread."""
+        process: DecoderProcess | None = None
+        while process is None:
+            with suppress(Retired):  # a decoder of it was lost since it was looked at
+                process = DecoderProcess(self._usable_forks())
+        process.wait_until_ready()
+        return process
+
+    def _usable_forks(self) -> ForkServer:
         if self._forks is None or not self._forks.is_usable:
             if self._forks is not None:
                 self._forks.retire()
             self._forks = ForkServer(self._program)
-        process = DecoderProcess(self._forks)
-        process.wait_until_ready()
-        return process
+        return self._forks
 
 
 class ChildDecoder:

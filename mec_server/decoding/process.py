@@ -38,7 +38,7 @@ from mec_server.decoding.protocol import (
 from rfcore.confinement.start import ConfinedProgram
 from rfcore.errors import CodecError, RfedgeError
 
-__all__ = ["DecoderLost", "DecoderProcess", "ForkServer", "LossCause", "Waiting"]
+__all__ = ["DecoderLost", "DecoderProcess", "ForkServer", "LossCause", "Retired", "Waiting"]
 
 START_S = 20.0
 """Time limit of the fork server's start, 0.3 s on an idle machine and more on one that swaps or is
@@ -72,6 +72,10 @@ class DecoderLost(CodecError):
         super().__init__(f"decoder process {pid} {problem}")
         self.cause = cause
         self.pid = pid
+
+
+class Retired(RfedgeError):
+    """Nothing is forked from a fork server that a decoder of was lost."""
 
 
 class ForkServer:
@@ -113,9 +117,11 @@ class ForkServer:
         """Fork a decoder process with ``descriptors``: its socket, memory and file for errors.
 
         Returns the number to reap it by and its pidfd, which is the caller's to close. Raises
-        ``RfedgeError``.
+        ``Retired``, or ``RfedgeError``.
         """
         with self._lock:
+            if self._retired:
+                raise Retired("fork server of decoders: a decoder of it was lost")
             answer, received = self._ask(b" ", descriptors)
             self._in_use += 1
         (pidfd,) = received

@@ -18,7 +18,7 @@ from mec_server.decoding import process
 from mec_server.decoding.child import LIMITS
 from mec_server.decoding.decoders import Decoders, DecoderSettings, decoder_program
 from mec_server.decoding.pool import ChildDecoder, DecoderPool
-from mec_server.decoding.process import DecoderLost, LossCause
+from mec_server.decoding.process import DecoderLost, DecoderProcess, ForkServer, LossCause
 from mec_server.ledger.peer_log import LogLimiter
 from mec_server.metrics import ServerMetrics
 from mec_server.server import EdgeServer
@@ -146,6 +146,29 @@ def test_a_killed_process_costs_one_picture(decoder: ChildDecoder, units: Sequen
     decoder.reset()
     assert decoder.decode(units[0]).digest() == expected
     assert [lost.cause for lost in LOST] == [LossCause.SIGNAL]
+
+
+def test_nothing_is_forked_where_a_decoder_was_lost_since_it_was_looked_at(
+    pool: DecoderPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    retired: list[ForkServer] = []
+
+    def forked_too_late(forks: ForkServer) -> DecoderProcess:
+        if not retired:
+            retired.append(forks)
+            forks.retire()
+        return DecoderProcess(forks)
+
+    with monkeypatch.context() as late:
+        late.setattr(decoder_pool, "DecoderProcess", forked_too_late)
+        taken = [pool.take(), pool.take()]
+    try:
+        assert all(one.is_alive for one in taken)
+        assert taken[1].forks is not retired[0]
+        assert taken[1].forks.is_usable
+    finally:
+        for one in taken:
+            one.close()
 
 
 def test_a_process_that_hangs_is_killed(
