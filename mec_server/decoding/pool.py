@@ -107,7 +107,7 @@ class DecoderPool:
         """Runs on the starter's thread."""
         process: DecoderProcess | None = None
         while process is None:
-            with suppress(Retired):  # a decoder of it was lost since it was looked at
+            with suppress(Retired):  # one of its decoders was lost since it was looked at
                 process = DecoderProcess(self._usable_forks())
         process.wait_until_ready()
         return process

@@ -75,7 +75,7 @@ class DecoderLost(CodecError):
 
 
 class Retired(RfedgeError):
-    """Nothing is forked from a fork server that a decoder of was lost."""
+    """A fork server forks no more: one of its decoders was lost."""
 
 
 class ForkServer:
@@ -121,7 +121,7 @@ class ForkServer:
         """
         with self._lock:
             if self._retired:
-                raise Retired("fork server of decoders: a decoder of it was lost")
+                raise Retired("fork server of decoders: one of them was lost")
             answer, received = self._ask(b" ", descriptors)
             self._in_use += 1
         (pidfd,) = received
