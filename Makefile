@@ -39,7 +39,7 @@ test-slow: build-full test-system-packages  ## run the tests that take more than
 test-slices: build-full  ## compare a million macroblocks of the slice coder with FFmpeg; fuzz it and packets
 	$(BIN)/python -m pytest tests/codec/test_slice_conformance.py tests/bench/test_fuzz.py -m nightly --timeout 1800
 
-test-scale: build-full  ## run each case of `rfedge eval scale` once, small: Envoy, NATS, servers, their vehicles
+test-scale: build-full  ## run each case of `rfedge-lab scale` once, small: Envoy, NATS, servers, their vehicles
 	$(BIN)/python -m pytest tests/integration/test_envoy.py tests/integration/test_nats.py -m nightly --timeout 600
 
 test-aarch64: build-full test-system-packages  ## build kernels for AArch64, emulate them, compare their bytes
@@ -75,14 +75,14 @@ test-netns: build-full test-system-packages  ## compare the link with the kernel
 # RESUME=1: keep the rows that are there of this revision, and run what is missing. ONLY: of the cases
 # that its words choose (pytest -k), as ONLY="a_lossy_link and 2Mbps".
 CHOICE = $(if $(RESUME),--resume) $(if $(ONLY),-k "$(ONLY)")
-test-fault: build-full test-system-packages  ## break servers, vehicles and links; writes results/faults.json (root)
-	$(BIN)/python -m pytest tests/fault -m fault --timeout 120 --faults-json results/faults.json $(CHOICE)
-	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
+test-fault: build-full test-system-packages  ## break servers, vehicles and links; writes lab/results/faults.json (root)
+	$(BIN)/python -m pytest tests/fault -m fault --timeout 120 --faults-json lab/results/faults.json $(CHOICE)
+	$(BIN)/python -m lab.pages.faults lab/results/faults.json > docs/reliability.md.part
 	mv docs/reliability.md.part docs/reliability.md
 
-test-attack: build-full test-system-packages  ## attack a server under compose's limits; writes results/attacks.json (root)
-	$(BIN)/python -m pytest tests/attack -m attack --timeout 180 --attacks-json results/attacks.json $(CHOICE)
-	$(BIN)/python -m rfedge.pages.attacks results/attacks.json > docs/attacks.md.part
+test-attack: build-full test-system-packages  ## attack a server under compose's limits; writes lab/results/attacks.json (root)
+	$(BIN)/python -m pytest tests/attack -m attack --timeout 180 --attacks-json lab/results/attacks.json $(CHOICE)
+	$(BIN)/python -m lab.pages.attacks lab/results/attacks.json > docs/attacks.md.part
 	mv docs/attacks.md.part docs/attacks.md
 
 # The most telling ones: a server and a decoder that die, packets that are damaged, renders for nothing;
@@ -113,9 +113,9 @@ fuzz: build-full  ## SECONDS (20) of coverage-guided fuzzing of each reader (tes
 fuzz-nightly:  ## ten minutes of it for each reader
 	$(MAKE) fuzz SECONDS=600
 
-stability: build-full  ## run the hard cases; writes results/stability.json and docs/stability.md
+stability: build-full  ## run the hard cases; writes lab/results/stability.json and docs/stability.md
 	$(BIN)/python -m pytest tests/hard/test_stability.py::test_the_case_holds \
-		--stability-json results/stability.json --stability-page docs/stability.md
+		--stability-json lab/results/stability.json --stability-page docs/stability.md
 
 test-compose: images  ## start docker-compose.yml and look at it (root, docker, docker-compose)
 	$(BIN)/python -m pytest -m compose --timeout 1200
@@ -145,36 +145,36 @@ operations-figures: build-full  ## plot every panel of what `make up` started, i
 	$(BIN)/python deploy/compose/show.py
 
 RUNS ?= 3
-LOADTEST = $(BIN)/rfedge loadtest --record results/loadtest.json --runs $(RUNS)
-load: load-transport load-receiver load-full load-links load-overload  ## what two cores carry (`make -k load`, 8 min); writes results/loadtest.json
-load-transport: build-full  ## 100 streams at 30 Hz, pictures not decoded; writes results/loadtest.json
+LOADTEST = $(BIN)/rfedge loadtest --record lab/results/loadtest.json --runs $(RUNS)
+load: load-transport load-receiver load-full load-links load-overload  ## what two cores carry (`make -k load`, 8 min); writes lab/results/loadtest.json
+load-transport: build-full  ## 100 streams at 30 Hz, pictures not decoded; writes lab/results/loadtest.json
 	$(LOADTEST) --mode transport --vehicles 100 --hz 30 --out out/loadtest/transport
-load-receiver: build-full  ## 8 vehicles at 10 Hz, decoded against cached renders; writes results/loadtest.json
+load-receiver: build-full  ## 8 vehicles at 10 Hz, decoded against cached renders; writes lab/results/loadtest.json
 	$(LOADTEST) --mode receiver --vehicles 8 --hz 10 --out out/loadtest/receiver
-load-full: build-full  ## 8 vehicles at 10 Hz, rendered and decoded; writes results/loadtest.json
+load-full: build-full  ## 8 vehicles at 10 Hz, rendered and decoded; writes lab/results/loadtest.json
 	$(LOADTEST) --mode full --vehicles 8 --hz 10 --out out/loadtest/full
-load-links: build-full  ## 8 vehicles, each on a recorded link of its own; writes results/loadtest.json
+load-links: build-full  ## 8 vehicles, each on a recorded link of its own; writes lab/results/loadtest.json
 	$(LOADTEST) --mode receiver --vehicles 8 --hz 5 --link samples/links/drive.toml \
 		--out out/loadtest/links
-load-overload: build-full  ## twice of that load-full, admission on; writes results/loadtest.json
+load-overload: build-full  ## twice of that load-full, admission on; writes lab/results/loadtest.json
 	$(LOADTEST) --mode full --vehicles 16 --hz 10 --admission --out out/loadtest/overload
 
-# The revision whose figures results/loadtest.json had when the server was reworked for isolation.
+# The revision whose figures lab/results/loadtest.json had when the server was reworked for isolation.
 BASE ?= 83ce11fb3ba2
-load-ratio: build-full  ## vehicles that the full loop carries now and at BASE, in turn, 3 runs each (10 min); writes results/load-ratio.json
-	$(BIN)/python tests/loadtest/limit_ratio.py $(BASE) results/load-ratio.json
+load-ratio: build-full  ## vehicles that the full loop carries now and at BASE, in turn, 3 runs each (10 min); writes lab/results/load-ratio.json
+	$(BIN)/python tests/loadtest/limit_ratio.py $(BASE) lab/results/load-ratio.json
 
 MINUTES ?= 30
-soak: build-full  ## half load for MINUTES (30): memory, descriptors and threads must not grow; writes results/soak.json
-	$(BIN)/python -m rfedge.loadtest.soak --minutes $(MINUTES) $(ARGS); ended=$$?; \
-		cp out/soak/soak.json results/soak.json && exit $$ended
+soak: build-full  ## half load for MINUTES (30): memory, descriptors and threads must not grow; writes lab/results/soak.json
+	$(BIN)/python -m lab.soak --minutes $(MINUTES) $(ARGS); ended=$$?; \
+		cp out/soak/soak.json lab/results/soak.json && exit $$ended
 
 soak-short: build-full  ## three minutes of it
-	$(BIN)/python -m rfedge.loadtest.soak --minutes 3
+	$(BIN)/python -m lab.soak --minutes 3
 
 sizing: build-full  ## measure the tables of `rfedge size` (ten minutes of two cores); then `make figures`
-	$(BIN)/rfedge scene build samples/sizing/drive_1080p.toml --split drive --out out/drive-1080p
-	$(BIN)/rfedge eval sizing vehicles@10=samples/street/transforms_drive_vehicles.json \
+	$(BIN)/streetgen build samples/sizing/drive_1080p.toml --split drive --out out/drive-1080p
+	$(BIN)/rfedge-lab size-tables vehicles@10=samples/street/transforms_drive_vehicles.json \
 		vehicles@30=out/drive-1080p/transforms_drive.json --out rfedge/sizing/tables.json
 
 check: build-full  ## lint, types, layers, generated files
@@ -186,12 +186,12 @@ check: build-full  ## lint, types, layers, generated files
 		else echo "buf lint was not run: it needs node and its registry"; fi
 
 sample: build-full  ## render the street in samples/street anew (half an hour)
-	$(BIN)/rfedge scene build samples/street/empty.toml --split drive,train --out out/sample/empty
-	$(BIN)/rfedge scene build samples/street/vehicles.toml --split drive --out out/sample/vehicles
-	$(BIN)/python -m rfedge.demo.make_sample out/sample samples/street
+	$(BIN)/streetgen build samples/street/empty.toml --split drive,train --out out/sample/empty
+	$(BIN)/streetgen build samples/street/vehicles.toml --split drive --out out/sample/vehicles
+	$(BIN)/python -m lab.make_street out/sample samples/street
 
 drive-long: build-full  ## render 30 s of the sample's street at 10 Hz into out/drive-long (16 minutes of two cores)
-	$(BIN)/rfedge scene build samples/localise/drive_30s.toml --split drive --out out/drive-long
+	$(BIN)/streetgen build samples/localise/drive_30s.toml --split drive --out out/drive-long
 
 sample-field: build-full  ## train the field that ships in samples/fields (some minutes)
 	$(BIN)/python -m rfedge.demo.field samples/street $(ARGS)
@@ -201,23 +201,23 @@ bench: build-full  ## measure kernels and codec: correctness first, then time
 	$(BIN)/rfedge bench train
 	$(BIN)/rfedge bench codec
 
-results results-full: build-full  ## record anew what takes two hours, or everything (results/record.mk; DATA)
-	$(MAKE) -f results/record.mk $@ DATA=$(DATA) RFEDGE=$(BIN)/rfedge
+results results-full: build-full  ## record anew what takes two hours, or everything (lab/results/record.mk; DATA)
+	$(MAKE) -f lab/results/record.mk $@ DATA=$(DATA) RFEDGE=$(BIN)/rfedge
 
-results-%: build-full  ## record `rfedge eval NAME` in results/NAME.json; options in ARGS (docs/evaluation.md)
+results-%: build-full  ## record `rfedge eval NAME` in lab/results/NAME.json; options in ARGS (docs/evaluation.md)
 	$(BIN)/rfedge eval $* $(ARGS) --out results/$*.json
 
 figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.md, metrics.md, dashboards
-	$(BIN)/python -m rfedge.pages.results results docs README.md
-	$(BIN)/python -m rfedge.experiments.ladder.page results docs
-	$(BIN)/python -m rfedge.pages.faults results/faults.json > docs/reliability.md.part
+	$(BIN)/python -m lab.pages.results lab/results docs README.md
+	$(BIN)/python -m rfedge.evaluate.ladder.page lab/results docs
+	$(BIN)/python -m lab.pages.faults lab/results/faults.json > docs/reliability.md.part
 	mv docs/reliability.md.part docs/reliability.md
-	if test -f results/attacks.json; then \
-		$(BIN)/python -m rfedge.pages.attacks results/attacks.json > docs/attacks.md.part && \
+	if test -f lab/results/attacks.json; then \
+		$(BIN)/python -m lab.pages.attacks lab/results/attacks.json > docs/attacks.md.part && \
 		mv docs/attacks.md.part docs/attacks.md; fi
-	$(BIN)/python -m rfedge.pages.sizing > docs/sizing.md.part
+	$(BIN)/python -m lab.pages.sizing > docs/sizing.md.part
 	mv docs/sizing.md.part docs/sizing.md
-	$(BIN)/python -m rfedge.pages.metrics > docs/metrics.md.part
+	$(BIN)/python -m lab.pages.metrics > docs/metrics.md.part
 	mv docs/metrics.md.part docs/metrics.md
 	$(BIN)/python -m rfedge.dashboards deploy/grafana/dashboards
 

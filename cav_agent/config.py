@@ -93,7 +93,7 @@ class AgentConfig:
     deadline_ms: float | None = None
     """Milliseconds a frame may take on this machine, from the picture to the packet: the best rung
     of the ladder that keeps it is used, a lower one under load, in place of the effort."""
-    ladder: Path = Path("results/ladder.json")
+    ladder: Path = Path("lab/results/ladder.json")
     """Times and rates of the rungs, as `rfedge eval ladder` measured them."""
     steering: SteeringSettings = SteeringSettings()
     notices: Path | None = None

@@ -1,9 +1,9 @@
 """Our own coder handed in to the benchmark, by the door that is everybody's; and its decoder.
 
-rfedge eval benchmark run out/rfedge --name rfedge --points 17 20 23 26 29 32 35 38 41 \
+rfedge-lab benchmark run out/rfedge --name rfedge --points 17 20 23 26 29 32 35 38 41 \
     --prior samples/fields/street.rff \
     --method "python examples/bench_rfedge.py encode {prior}/street.rff {frames} {out} {point}"
-rfedge eval benchmark check out/rfedge \
+rfedge-lab benchmark check out/rfedge \
     --decoder "python examples/bench_rfedge.py decode {prior}/street.rff {packets} {out}"
 
 The first packet begins with what a vehicle sends once: its camera and the stream's header.

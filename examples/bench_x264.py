@@ -1,6 +1,6 @@
 """x264 handed in to the benchmark: a packet and a picture for each frame.
 
-rfedge eval benchmark run out/x264 --name x264-veryfast --points 17 20 23 26 29 32 35 38 41 \
+rfedge-lab benchmark run out/x264 --name x264-veryfast --points 17 20 23 26 29 32 35 38 41 \
     --method "python examples/bench_x264.py {frames} {hz} {point} {out}"
 """
 

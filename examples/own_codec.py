@@ -13,7 +13,7 @@ import numpy as np
 from rfcore.codec.h264.config import even_size_px
 from rfcore.codec.h264.ffmpeg import picture_of, video_frame
 from rfcore.metrics import ssim
-from rfedge.experiments.clips import CodedClip, luma_mse
+from rfedge.evaluate.clips import CodedClip, luma_mse
 
 
 class MotionJpeg:

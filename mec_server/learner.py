@@ -37,11 +37,12 @@ from mec_server.tile_learning import (
     LearningRounds,
     percent_worse,
 )
-from mec_server.twin.state import CameraKey, TwinView
+from mec_server.twin.state import TwinView
 from rfcore.camera import Camera
 from rfcore.errors import RfedgeError
 from rfcore.field import RadianceField
 from rfcore.native.yuv import rgb_from_i420
+from rfcore.perception.objects import CameraKey
 from rfcore.update.passes import Pass
 from rfcore.update.run import LearnAs
 from rfcore.views import PosedPicture

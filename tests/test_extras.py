@@ -264,8 +264,8 @@ DRIVE = f"empty@10={ROOT / 'samples/street/transforms_drive_empty.json'}"
         ("mitsuba", "scene", "scene build street-empty --out made"),
         ("pyoidn", "scene", "scene build street-empty --out made"),
         ("cv2", "scene", "scene sheet out/none --out made"),
-        ("pycolmap", "colmap", f"scene poses {ROOT}/samples/street/train --out made"),
-        ("carla", "carla", "scene record-carla --out made"),
+        ("pycolmap", "colmap", f"dataset poses {ROOT}/samples/street/train --out made"),
+        ("carla", "carla", "dataset record-carla --out made"),
     ],
 )
 def test_a_verb_says_in_one_line_which_extra_it_needs(
@@ -281,7 +281,12 @@ def test_a_verb_says_in_one_line_which_extra_it_needs(
 def test_services_demo_and_training_import_no_package_of_an_extra(tmp_path: Path) -> None:
     modules = [
         *("cav_agent.__main__", "mec_server.__main__", "mec_server.decoding.process"),
-        *("rfedge.demo.run", "rfedge.demo.report", "rfedge.demo.field", "rfedge.training.report"),
+        *(
+            "rfedge.demo.run",
+            "rfedge.demo.report",
+            "rfedge.demo.field",
+            "rfedge.training.report",
+        ),
         *("rfedge.training.run", "rfedge.training.views", "rfedge.offline", "rfedge.link.proxy"),
     ]
     listed = {name_of(line) for lines in EXTRAS.values() for line in lines}

@@ -28,8 +28,8 @@ class Mutant:
     test: str
 
 
-RIVALS = "rfedge/experiments/rivals.py"
-BENCHMARK = "rfedge/experiments/benchmark"
+RIVALS = "rfedge/evaluate/rivals.py"
+BENCHMARK = "lab/benchmark"
 BENCHMARK_TESTS = "tests/experiments/test_benchmark.py"
 MUTANTS = (
     Mutant(
@@ -49,7 +49,7 @@ MUTANTS = (
     ),
     Mutant(
         "the steady state has the first frame",
-        "rfedge/experiments/clips.py",
+        "rfedge/evaluate/clips.py",
         "STEADY = slice(1, None)",
         "STEADY = slice(0, None)",
         "tests/experiments/test_compare.py"
@@ -57,14 +57,14 @@ MUTANTS = (
     ),
     Mutant(
         "the interval draws the first frame",
-        "rfedge/experiments/rate_curve.py",
+        "rfedge/evaluate/rate_curve.py",
         "starts = rng.integers(first, count - length + 1",
         "starts = rng.integers(0, count - length + 1",
         "tests/experiments/test_rate_curve.py::test_the_first_frame_is_never_drawn",
     ),
     Mutant(
         "our processor time is that of rendering",
-        "rfedge/experiments/field_coder.py",
+        "rfedge/evaluate/field_coder.py",
         "both_ms = cpu_ms + render_cpu_ms, receiver",
         "both_ms = render_cpu_ms, receiver",
         "tests/experiments/test_field_coder.py"
@@ -72,7 +72,7 @@ MUTANTS = (
     ),
     Mutant(
         "processor time is that of the most disturbed run",
-        "rfedge/experiments/performance.py",
+        "rfedge/evaluate/performance.py",
         "float(np.median([run.cpu_ms for run in runs]))",
         "float(np.max([run.cpu_ms for run in runs]))",
         "tests/experiments/test_performance.py"
@@ -80,7 +80,7 @@ MUTANTS = (
     ),
     Mutant(
         "our frames always arrive",
-        "rfedge/experiments/robust/lossy_link.py",
+        "lab/robust/lossy_link.py",
         "yield arrival if delivered or index == 0 else None",
         "yield arrival",
         "tests/experiments/test_loss.py::test_no_frame_is_new_that_did_not_arrive",
@@ -109,14 +109,14 @@ MUTANTS = (
     ),
     Mutant(
         "our frames cost their slices alone",
-        "rfedge/experiments/field_coder.py",
+        "rfedge/evaluate/field_coder.py",
         "sizes = [message_bytes(frame.arrival, self._rendered.quality) for frame in coded]",
         "sizes = [len(frame.encoded.packet.payload) for frame in coded]",
         "tests/experiments/test_field_coder.py::test_a_frame_costs_its_slice_and_its_header",
     ),
     Mutant(
         "quality is the mean of PSNRs",
-        "rfedge/experiments/rate_curve.py",
+        "rfedge/evaluate/rate_curve.py",
         "        psnr_db = 10 * np.log10(PEAK * PEAK / mse)",
         "        psnr_db = np.array([(10 * np.log10(PEAK * PEAK / clip.luma_mse[frames])).mean() "
         "for clip in clips])",

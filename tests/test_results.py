@@ -55,7 +55,7 @@ ROW = Row("a", 1.5, (32.0, 35.0), {"render": 2.0}, None)
 def checkout(tmp_path: Path) -> Path:
     """Make a repository with a file of code and a result, both committed."""
     (tmp_path / "results").mkdir()
-    for name in ("code.py", "results/figure.json"):
+    for name in ("code.py", "lab/results/figure.json"):
         (tmp_path / name).write_text("1")
     for command in ("init -q", "add .", "commit -q -m first"):
         _git(tmp_path, command)
@@ -310,7 +310,7 @@ MUST_SHOW = (
 
 
 def test_several_servers_show_what_they_must_and_whether_it_held() -> None:
-    result = read_result(ROOT / "results/scale.json", "scale")
+    result = read_result(ROOT / "lab/results/scale.json", "scale")
     rows = {row["case"]: row for row in result["rows"]}
     assert set(MUST_SHOW) <= set(rows)
     assert {

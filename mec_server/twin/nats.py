@@ -20,9 +20,10 @@ import structlog
 from mec_server.nats import NatsLink, places_bucket, together
 from mec_server.twin.metrics import TwinMetrics
 from mec_server.twin.service import TwinPictures, picture_message
-from mec_server.twin.state import CameraKey, Twin, TwinView
+from mec_server.twin.state import Twin, TwinView
 from rfcore.errors import ProtocolError
 from rfcore.extras import needs
+from rfcore.perception.objects import CameraKey
 from rfcore.wire.nats import (
     PLACE_HEADER,
     WANTED_S,

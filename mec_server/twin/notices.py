@@ -1,6 +1,6 @@
 """Words back to vehicles: what others see ahead of one, and what changed about its tile's field.
 
-Whoever took notices in Hello is told of every confirmed object (``mec_server.twin.objects``) that
+Whoever took notices in Hello is told of every confirmed object (``rfcore.perception.objects``) that
 
 * stands within ``REACH_M`` ahead of it, in the same tile,
 * is seen by somebody else's camera, and was not seen by its own within the last second,
@@ -32,11 +32,11 @@ from typing import Protocol
 import numpy as np
 
 from mec_server.twin.metrics import TwinMetrics
-from mec_server.twin.objects import FollowedObject, ObjectTracker
 from mec_server.twin.rendering import Place, TwinViews, place_of
 from mec_server.twin.state import Twin, TwinView
 from rfcore.camera import Camera, Pose
 from rfcore.errors import LimitExceeded
+from rfcore.perception.objects import FollowedObject, ObjectTracker
 from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
 from rfcore.wire.tiles import Tile
 from rfcore.wire.twin import PictureEncoding, Subscription

@@ -27,7 +27,14 @@ import numpy as np
 from mec_server.event_loop import Workers, give_way, work_when_idle
 from mec_server.ledger.budgets import Resource
 from mec_server.ledger.ledger import Ledger
-from mec_server.twin.composition import (
+from mec_server.twin.state import Covers, Twin, TwinView
+from rfcore.camera import Camera, TileOrigin
+from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded
+from rfcore.field import RadianceField
+from rfcore.field.quality import FULL
+from rfcore.image import Rgb, jpeg_bytes, png_bytes
+from rfcore.native.yuv import i420_from_rgb
+from rfcore.perception.composition import (
     ComposedView,
     LivePicture,
     compose,
@@ -35,16 +42,9 @@ from mec_server.twin.composition import (
     nearest,
     shrunk,
 )
-from mec_server.twin.contacts import Detection, cut_out
-from mec_server.twin.ground import FieldGround
-from mec_server.twin.objects import Lacks, lacks_nothing
-from mec_server.twin.state import CameraKey, Covers, Twin, TwinView
-from rfcore.camera import Camera, TileOrigin
-from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded
-from rfcore.field import RadianceField
-from rfcore.field.quality import FULL
-from rfcore.image import Rgb, jpeg_bytes, png_bytes
-from rfcore.native.yuv import i420_from_rgb
+from rfcore.perception.contacts import Detection, cut_out
+from rfcore.perception.ground import FieldGround
+from rfcore.perception.objects import CameraKey, Lacks, lacks_nothing
 from rfcore.views import View
 from rfcore.wire.checks import check_label, shown
 from rfcore.wire.tiles import Tile

@@ -21,12 +21,12 @@ import grpc
 from mec_server.config import SessionLimits
 from mec_server.peers import Slots, abort, peer_account
 from mec_server.twin.metrics import ConsumerEnd, TwinMetrics
-from mec_server.twin.objects import ToldObjects
 from mec_server.twin.rendering import Place, TwinViews
 from mec_server.twin.state import Covers, Mailbox, Twin, TwinView
 from rfcore.errors import AccessDenied, InvalidInput, LimitExceeded, RfedgeError
 from rfcore.image import I420, jpeg_bytes, png_bytes
 from rfcore.native.yuv import rgb_from_i420
+from rfcore.perception.objects import StreetObject, ToldObjects
 from rfcore.wire.twin import (
     Departure,
     PictureEncoding,
@@ -38,7 +38,6 @@ from rfcore.wire.twin import (
 from rfcore.wire.twin_render import (
     ObjectsSeen,
     RenderedView,
-    StreetObject,
     objects_request_from_wire,
     objects_to_wire,
     rendered_view_to_wire,

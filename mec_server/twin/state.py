@@ -17,6 +17,7 @@ from threading import Lock
 from rfcore.camera import Intrinsics
 from rfcore.field.quality import FULL
 from rfcore.image import I420
+from rfcore.perception.objects import CameraKey
 from rfcore.views import View
 from rfcore.wire.messages import Frame
 from rfcore.wire.twin import Departure, Subscription
@@ -24,7 +25,6 @@ from rfcore.wire.twin_render import DEFAULT_AGE_S, MAX_AGE_S
 
 __all__ = [
     "PAST_S",
-    "CameraKey",
     "Covers",
     "KeptRenders",
     "Mailbox",
@@ -44,9 +44,6 @@ KEPT_S, KEPT_EVERY_S = PAST_S + DEFAULT_AGE_S, 0.2
 """How long pictures are kept, and how many of one camera: those that vouch for such a moment."""
 MOST_PAST_BYTES = 128 << 20
 """Of all cameras together: 18 at 640 x 360, 2 at 1920 x 1080. With more the past is shorter."""
-
-CameraKey = tuple[str, str]
-"""(vehicle id, camera id)"""
 
 Covers = Callable[[str, str], bool]
 """Whether a consumer may see the pictures of a vehicle (id) against a field (id)."""

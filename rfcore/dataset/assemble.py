@@ -171,7 +171,7 @@ def _pinhole(picture: SourcePicture, distortion: Distortion) -> Intrinsics:
     if distortion is Distortion.REFUSE:
         raise DatasetError(
             f"{picture.where}: lens distortion {lens}; train with --undistort, or write "
-            "undistorted pictures once with `rfedge scene convert`"
+            "undistorted pictures once with `rfedge dataset convert`"
         )
     try:
         return pinhole_of(picture.camera.intrinsics, lens)

@@ -150,7 +150,7 @@ def refuse_video(path: Path) -> None:
     if is_video(path):
         raise DatasetError(
             f"{path}: is a video, which has no poses; find those of its sharpest frames: "
-            f"rfedge scene poses {shlex.quote(str(path))} --out DATASET; or, "
+            f"rfedge dataset poses {shlex.quote(str(path))} --out DATASET; or, "
             "with a trajectory, describe it in a camera.toml (docs/data.md)"
         )
 

@@ -17,6 +17,7 @@ from rfcore.errors import InvalidInput, ProtocolError
 from rfcore.field.quality import FULL, Quality
 from rfcore.image import I420, Rgb, rgb_from_bytes
 from rfcore.native.yuv import rgb_from_i420
+from rfcore.perception.objects import StreetObject
 from rfcore.wire.checks import (
     check_bytes,
     check_field_id,
@@ -45,7 +46,6 @@ __all__ = [
     "ObjectsRequest",
     "ObjectsSeen",
     "RenderedView",
-    "StreetObject",
     "ViewRequest",
     "objects_from_wire",
     "objects_request_from_wire",
@@ -159,26 +159,6 @@ class ObjectsRequest:
 
     def __post_init__(self) -> None:
         _check_place(self.tile, self.field_id, self.place)
-
-
-@dataclass(frozen=True)
-class StreetObject:
-    """A thing that the field does not have: see twin.proto. ``at_m`` is the foot of the side that
-    is seen, relative to the tile's origin; ``seen_by``: (vehicle id, camera id). ``is_doubtful``:
-    only vehicles show it whose pictures fit the field badly, as with a wrong pose. ``label``: what
-    it is, empty where no detector says."""
-
-    object_id: int
-    at_m: Vec3
-    velocity_mps: Vec3
-    width_m: float
-    height_m: float
-    confidence: float
-    age_s: float
-    unseen_s: float
-    seen_by: tuple[tuple[str, str], ...]
-    is_doubtful: bool = False
-    label: str = ""
 
 
 @dataclass(frozen=True)

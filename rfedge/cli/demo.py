@@ -30,7 +30,7 @@ class Demo:
     """Instead: drive at dusk against the field of noon, let the server learn from what it decoded,
     and let a second vehicle fetch and use what it published."""
     dusk: Annotated[Path | None, DATASET] = None
-    """With --evening: a drive of the sample's street in another light, as `rfedge scene build
+    """With --evening: a drive of the sample's street in another light, as `streetgen build
     street-dusk --split drive` renders it; default: the drive `empty` under a declared light."""
     out: Annotated[Path | None, FOLDER] = None
     """Folder for report.html, result.json and reconstructed.mp4; replaced on every run. Default:

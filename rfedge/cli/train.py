@@ -48,7 +48,7 @@ class Train:
 
     dataset: Annotated[Path, Positional, DATASET]
     """A dataset's folder, or the file that describes it (transforms.json, COLMAP, KITTI, ...). Or a
-    folder that `rfedge scene split` made: then every tile is trained."""
+    folder that `rfedge dataset split` made: then every tile is trained."""
     out: Annotated[Path, arg(metavar="FILE.rff|FOLDER")]
     """The field archive to write; of tiles the folder of their archives, which keeps what is
     done."""

@@ -47,7 +47,7 @@ def class_picture_of(picture: Path) -> Path:
     if picture.parent.name != PICTURES:
         raise DatasetError(
             f"{picture}: is not in a folder `{PICTURES}`, beside which `{CLASSES}` would be; class "
-            "pictures come with `rfedge scene build`"
+            "pictures come with `streetgen build`"
         )
     return picture.parent.with_name(CLASSES) / f"{picture.stem}.png"
 

@@ -1,6 +1,6 @@
 """A drive at dusk, made of a drive at noon: the same pictures under a declared light.
 
-The sample has no pictures of an evening; ``rfedge scene build street-dusk`` renders some. Without
+The sample has no pictures of an evening; ``streetgen build street-dusk`` renders some. Without
 them, the linear light of each noon picture (sRGB's curve undone, IEC 61966-2-1) is multiplied by
 
     TINT * (SHADOW + 1 / (1 + exp(-s / WIDTH_M))) + LAMP * sum of 1 / (1 + (d / REACH_M)^4),

@@ -11,7 +11,7 @@ Server, link and vehicles are processes, as in ``rfedge.demo.run``. Two drives a
 Figures are of one round of each, the drive's first frame apart, where there is nothing to predict
 from: of the second vehicle, the first round that has the light throughout. Both see the same
 frames, so that this is the least that another drive costs; how much is left in another lane is
-measured by ``rfedge eval adapt``. The server learns from a single vehicle here, where it asks for
+measured by ``rfedge-lab adapt``. The server learns from a single vehicle here, where it asks for
 two by itself.
 """
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Annotated, Any
 
+import tyro
 from rich.console import Console
 from tyro.conf import Positional
 
@@ -26,6 +27,7 @@ from rfcore.field.store import encode_field
 from rfcore.files import write_whole
 from rfcore.train import Bands, DensityControl, SplatTrainingConfig
 from rfcore.train.levels import LevelFitConfig
+from rfedge.program import run_program
 from rfedge.results import Provenance, make_result, provenance, write_result
 from rfedge.samples import sample_path
 from rfedge.training.finish import SizeGoal, finish_field, size_goal
@@ -158,9 +160,7 @@ class MakeSampleField:
 
 def main() -> int:
     """Parse the command line and make the field; return the exit status."""
-    from rfedge.demo.make_sample import run_maker  # needs an extra, which the demo does without
-
-    return run_maker(MakeSampleField, "sample-field")
+    return run_program("sample-field", lambda: tyro.cli(MakeSampleField, prog="sample-field"))
 
 
 SEED = 1

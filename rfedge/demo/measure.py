@@ -26,8 +26,8 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420, Rgb
 from rfcore.metrics import psnr, ssim
 from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
-from rfedge.experiments.paper.savings import paper_savings_percent, slice_nals
-from rfedge.experiments.rivals import Rival, x264_for_psnr
+from rfedge.evaluate.rivals import Rival, x264_for_psnr
+from rfedge.evaluate.savings import paper_savings_percent, slice_nals
 
 __all__ = [
     "DriveFigures",

@@ -23,8 +23,8 @@ from rich.console import Console
 
 from rfcore.files import write_whole
 from rfedge.loadtest.plan import Load, Mode, Vehicles
-from rfedge.loadtest.planning import MOST, RATES_MBPS, Traffic, largest_held, vehicles_carried
 from rfedge.loadtest.run import LoadRow, Run, TestBed, run_load
+from rfedge.loadtest.uplink import MOST, RATES_MBPS, Traffic, largest_held, vehicles_carried
 from rfedge.report.charts import GRID, INK, MUTED, PAYLOAD, RENDER, STYLE, new_axes, svg
 from rfedge.report.tables import cell, heading, print_table, table
 from rfedge.results import (

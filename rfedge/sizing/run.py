@@ -1,4 +1,4 @@
-"""``rfedge eval sizing`` from its drives to the tables.
+"""``rfedge-lab size-tables`` from its drives to the tables.
 
 A cell of the tables is a clip coded by ours and by the rivals, decoded, and timed. Rivals are those
 of ``rfedge eval compare``, in the form that is fairest to them at a PSNR: x264 and x265 veryfast
@@ -25,10 +25,10 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.image import I420
 from rfcore.native.yuv import i420_from_rgb
-from rfedge.experiments.cells import CellStore, clip_key, program_version
-from rfedge.experiments.clips import STEADY, Clip, CodedClip, Drive, DriveName, psnr_of_mse
-from rfedge.experiments.field_coder import FieldCoder, RenderedClip, render_clip
-from rfedge.experiments.rivals import Rival, svtav1_lowdelay, x264_for_psnr, x265_for_psnr
+from rfedge.evaluate.cells import CellStore, clip_key, program_version
+from rfedge.evaluate.clips import STEADY, Clip, CodedClip, Drive, DriveName, psnr_of_mse
+from rfedge.evaluate.field_coder import FieldCoder, RenderedClip, render_clip
+from rfedge.evaluate.rivals import Rival, svtav1_lowdelay, x264_for_psnr, x265_for_psnr
 from rfedge.offline import FrameInput, decode_promised, encode_frames
 from rfedge.results import check_result_path, make_result, provenance, write_result
 from rfedge.sizing.estimate import Demand
@@ -186,7 +186,7 @@ SAME_RATE = 0.02
 
 @dataclass(frozen=True)
 class SizingJob:
-    """What to measure; see ``rfedge eval sizing --help``."""
+    """What to measure; see ``rfedge-lab size-tables --help``."""
 
     drives: Sequence[DriveName]
     field: Path

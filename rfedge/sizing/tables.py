@@ -3,7 +3,7 @@
 A cell's curve is bytes a frame over luma PSNR on a grid of half decibels, without the first frame,
 with the 95 % interval that resampling the frames gives. Between cells and grid points logarithms
 are interpolated. The tables that ship are the result file ``tables.json`` beside this module, made
-by ``rfedge eval sizing``.
+by ``rfedge-lab size-tables``.
 
 ``log_at`` tells bytes and times at any size, rate and quality, between and a little beyond the
 measured cells. Logarithms are interpolated linearly: over decibels within a cell, over log(Hz)
@@ -100,7 +100,7 @@ class SizingTables:
 
 
 def read_tables(path: Path) -> SizingTables:
-    """Read a result of ``rfedge eval sizing``; raise ``InvalidInput`` for another file."""
+    """Read a result of ``rfedge-lab size-tables``; raise ``InvalidInput`` for another file."""
     result = read_result(path, KIND)
     return SizingTables(tuple(rows_of(SizingCell, result["cells"])), str(result["measured_on"]))
 

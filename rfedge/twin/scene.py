@@ -14,8 +14,8 @@ from rfcore.camera import Intrinsics, Pose, TileOrigin
 from rfcore.field import RadianceField, SplatField
 from rfcore.field.spz import encode_spz
 from rfcore.localise.fix import State
+from rfcore.perception.objects import StreetObject
 from rfcore.wire.sensing import ClockKind
-from rfcore.wire.twin_render import StreetObject
 from rfedge.twin.board import Board, Message
 
 __all__ = ["CameraKey", "PlacedField", "SeenPicture", "TwinScene"]

@@ -25,12 +25,7 @@ import grpc
 import numpy as np
 from numpy.typing import NDArray
 
-from mec_server.twin.composition import LivePicture, compose, live_picture, nearest
-from mec_server.twin.contacts import cut_out
-from mec_server.twin.ground import FieldGround
-from mec_server.twin.objects import ObjectTracker
 from mec_server.twin.rendering import check_inside, check_outside_of_walls
-from mec_server.twin.state import CameraKey
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.dataset.picture_file import read_picture
 from rfcore.dataset.recorded_session import (
@@ -42,11 +37,14 @@ from rfcore.dataset.recorded_session import (
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
 from rfcore.image import Rgb
+from rfcore.perception.composition import LivePicture, compose, live_picture, nearest
+from rfcore.perception.contacts import cut_out
+from rfcore.perception.ground import FieldGround
+from rfcore.perception.objects import CameraKey, ObjectTracker, StreetObject
 from rfcore.views import PosedPicture
 from rfcore.wire.twin import PictureEncoding
 from rfcore.wire.twin_render import (
     ObjectsRequest,
-    StreetObject,
     ViewRequest,
     objects_from_wire,
     objects_request_to_wire,

@@ -1,11 +1,13 @@
-# Everything that results/adapt.json compares, and the file:
+# Everything that lab/results/adapt.json compares, and the file:
 #     make -j2 -f samples/adapt/record.mk [DATA=FOLDER] [RESULT=out/adapt/adapt.json]
 # Fields and layers are learnt from drives through the sample's street under other circumstances. With DATA, a
 # folder that has `street` and `kitti/city` (docs/evaluation.md), another street at dusk and a real one join.
 # What is there is not made again. Some seconds of a core a picture, three minutes a field: an hour on two cores.
 OUT    ?= out/adapt
-RESULT ?= results/adapt.json
+RESULT ?= lab/results/adapt.json
 RFEDGE ?= .venv/bin/rfedge
+LAB    ?= $(RFEDGE)-lab
+STREETGEN ?= $(dir $(RFEDGE))streetgen
 DATA   ?=
 SAMPLE := samples/fields/street.rff
 COMMA  := ,
@@ -15,13 +17,13 @@ NOON   := samples/street/transforms_drive_empty.json
 .SECONDARY:
 .PHONY: record cells
 record: cells
-	$(RFEDGE) eval adapt $(EVERY) --cells $(OUT)/cells --out $(RESULT)
+	$(LAB) adapt $(EVERY) --cells $(OUT)/cells --out $(RESULT)
 
 # --- drives: SCENE-NUMBER is pass NUMBER of samples/adapt/SCENE.toml
 
 drive = $(OUT)/$1/transforms_drive.json
 $(OUT)/%/transforms_drive.json:
-	$(RFEDGE) scene build samples/adapt/$(subst -,.toml:,$*) --split drive --out $(OUT)/$*
+	$(STREETGEN) build samples/adapt/$(subst -,.toml:,$*) --split drive --out $(OUT)/$*
 
 # --- fields and layers that were learnt from a drive: base, drive, all or colours
 
@@ -50,7 +52,7 @@ $(FOUND): $(OUT)/passes-5/found.tum
 	printf '%s\n' [camera] 'width_px = 640' 'height_px = 360' 'fx_px = 320.0' [pictures] 'folder = "drive/images"' \
 		'rate_hz = 10.0' [trajectory] 'file = "found.tum"' 'outside = "drop"' >$@
 
-# --- cases: NAME@HZ=DRIVE,KEY=PATH... as `rfedge eval adapt` takes them
+# --- cases: NAME@HZ=DRIVE,KEY=PATH... as `rfedge-lab adapt` takes them
 
 STREET := \
 	street-dusk@10=$(call drive,passes-5),field=$(SAMPLE),noon=$(NOON),learnt=$(OUT)/dusk-beside.rff,layer=$(OUT)/dusk-beside-layer.rff \
@@ -112,7 +114,7 @@ EVERY = $(foreach group,$(GROUPS),$($(group)))
 made  = $(filter $(OUT)/%,$(subst $(COMMA), ,$(subst =, ,$($1))))
 define coded
 $(OUT)/$1.json: $(call made,$1)
-	$(RFEDGE) eval adapt $$($1) --cells $(OUT)/cells --out $$@
+	$(LAB) adapt $$($1) --cells $(OUT)/cells --out $$@
 endef
 $(foreach group,$(GROUPS),$(eval $(call coded,$(group))))
 cells: $(GROUPS:%=$(OUT)/%.json)

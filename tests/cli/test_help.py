@@ -156,11 +156,14 @@ def test_the_help_loads_nothing_heavy() -> None:
         (("eval", "ladder", "nowhere"), "'nowhere' is no field"),
         (("bench", "ngp", "--field", "nowhere"), "'nowhere' is no field"),
         (("train", TRAIN_VIEWS, "--out", "f.rff", "--report", "r.html"), "add --holdout 8"),
-        (("scene", "convert", "nowhere", "--out", "o"), "nowhere"),
-        (("scene", "convert", "nowhere", "--out", "o", "--size", "big"), "'big' is not WIDTHx"),
-        (("scene", "poses", "nowhere", "--out", "o"), "nowhere: holds 0 pictures"),
-        (("scene", "record-carla", "--out", "o", "--cameras", "top"), "'top' is none of"),
-        (("scene", "record-carla", "--out", "o", "--port", "1", "--timeout-s", "1"), "127.0.0.1:1"),
+        (("dataset", "convert", "nowhere", "--out", "o"), "nowhere"),
+        (("dataset", "convert", "nowhere", "--out", "o", "--size", "big"), "'big' is not WIDTHx"),
+        (("dataset", "poses", "nowhere", "--out", "o"), "nowhere: holds 0 pictures"),
+        (("dataset", "record-carla", "--out", "o", "--cameras", "top"), "'top' is none of"),
+        (
+            ("dataset", "record-carla", "--out", "o", "--port", "1", "--timeout-s", "1"),
+            "127.0.0.1:1",
+        ),
     ],
 )
 def test_a_users_mistake_is_one_line_and_exit_status_2(

@@ -11,7 +11,7 @@ from rfcore.errors import InvalidInput
 from rfcore.image import I420
 from rfcore.views import FieldView
 from rfedge.demo.measure import RatePoint, intra_curve, luma_psnr_db, saving_at_equal_psnr
-from rfedge.experiments.paper.savings import PaperSavings, paper_savings, paper_savings_percent
+from rfedge.evaluate.savings import PaperSavings, paper_savings, paper_savings_percent
 
 PictureMaker = Callable[..., I420]
 PairMaker = Callable[..., tuple[I420, FieldView]]

@@ -37,7 +37,7 @@ def test_the_numbers_of_the_labels_stay() -> None:
 def test_a_class_picture_lies_beside_its_picture() -> None:
     found = class_picture_of(Path("out/drive/images/000012.png"))
     assert found == Path("out/drive/classes/000012.png")
-    with pytest.raises(DatasetError, match=r"drive_empty.*rfedge scene build"):
+    with pytest.raises(DatasetError, match=r"drive_empty.*streetgen build"):
         class_picture_of(Path("street/drive_empty/000.webp"))
 
 

@@ -26,7 +26,7 @@ from rfedge.demo.measure import (
     saving_at_equal_psnr,
 )
 from rfedge.demo.report import demo_section, figures_of, print_summary, write_report
-from rfedge.experiments.rivals import x264_for_psnr
+from rfedge.evaluate.rivals import x264_for_psnr
 from rfedge.report.charts import STAGES
 from rfedge.results import Provenance, make_result
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from lab.pages.metrics import families
 from rfcore.errors import InvalidInput
 from rfedge.dashboards.__main__ import write_dashboards
 from rfedge.dashboards.catalogue import DASHBOARDS
 from rfedge.dashboards.grafana import DATASOURCE, Panel, Query, Unit
-from rfedge.pages.metrics import families
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 FILES = sorted((DEPLOY / "grafana/dashboards").glob("*.json"))

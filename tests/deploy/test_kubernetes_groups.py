@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 from deploy.test_kubernetes import VERSIONS, documents
+from lab.servers.envoy import EnvoySetup, check_config, envoy_binary
 from rfcore.wire.conventions import TILE
 from rfedge.certs import Members, certify, write_certificates
-from rfedge.loadtest.envoy import EnvoySetup, check_config, envoy_binary
 
 pytestmark = pytest.mark.slow
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rfedge.pages.metrics import families
+from lab.pages.metrics import families
 
 DEPLOY = Path(__file__).parents[2] / "deploy/prometheus"
 RULES = (DEPLOY / "rules.yml").read_text()

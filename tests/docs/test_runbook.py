@@ -20,6 +20,7 @@ from cav_agent.config import AgentConfig, AgentLimits
 from docs.pages import Page
 from integration.conftest import serve, street, vehicle
 from integration.test_envoy import Groups, part_of_drive
+from lab.servers.envoy import CLUSTER
 from mec_server.config import ServerConfig
 from rfcore.errors import FieldFormatError, InvalidData, RfedgeError
 from rfcore.wire.conventions import VEHICLE
@@ -31,7 +32,6 @@ from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 from rfedge.cli import parse
 from rfedge.demo.processes import command_of, service
-from rfedge.loadtest.envoy import CLUSTER
 
 __all__ = ["serve", "street", "vehicle"]
 

@@ -24,12 +24,12 @@ import pytest
 
 from attack.conftest import ENVIRONMENT, ROOT
 from fault.conftest import is_exact
+from lab.pages.faults import LinkCell
 from rfcore.dataset import read_dataset
 from rfcore.dataset.recorded_session import read_recorded_part, recordings_under
 from rfcore.field import FieldStore
 from rfcore.image import read_rgb
 from rfcore.metrics import psnr
-from rfedge.pages.faults import LinkCell
 
 RATES_MBPS = (0.5, 2.0, 8.0)
 HZ = 5.0

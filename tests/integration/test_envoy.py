@@ -19,6 +19,17 @@ from grpc_health.v1 import health_pb2
 from rich.console import Console
 
 from cav_agent.config import AgentLimits, PaceKind
+from lab.servers.cases import ScaleRow
+from lab.servers.envoy import (
+    CLUSTER,
+    Envoy,
+    EnvoySetup,
+    ServerGroup,
+    check_config,
+    envoy_binary,
+    run_envoy,
+)
+from lab.servers.scale import ScaleJob, resumed_s, run_scale
 from mec_server.proxies import FORWARDED
 from rfcore.errors import RfedgeError
 from rfcore.wire.conventions import STREAM_METHOD, TILE
@@ -30,17 +41,6 @@ from rfcore.wire.tls import TlsFiles
 from rfcore.wire.v1 import field_pb2 as pb
 from rfcore.wire.v1.field_pb2_grpc import FieldServiceStub
 from rfedge.certs import Members, certify, write_certificates
-from rfedge.loadtest.cases import ScaleRow
-from rfedge.loadtest.envoy import (
-    CLUSTER,
-    Envoy,
-    EnvoySetup,
-    ServerGroup,
-    check_config,
-    envoy_binary,
-    run_envoy,
-)
-from rfedge.loadtest.scale import ScaleJob, resumed_s, run_scale
 from rfedge.results import read_result, rows_of
 
 pytestmark = pytest.mark.slow

@@ -16,6 +16,9 @@ from rich.console import Console
 from structlog.testing import capture_logs
 
 from cav_agent.config import PaceKind
+from lab.servers.cases import ScaleRow
+from lab.servers.nats import NatsServer, nats_rows
+from lab.servers.scale import ScaleJob, run_scale
 from mec_server.config import NatsSettings
 from mec_server.nats import NatsLink, fetch_object
 from mec_server.twin.nats import PlaceRecords
@@ -26,9 +29,6 @@ from rfcore.wire.tile_manifest import MANIFEST
 from rfcore.wire.tiles import Area
 from rfcore.wire.twin import Departure, PictureEncoding, Subscription, TwinPicture
 from rfedge.certs import Members, certify, write_certificates
-from rfedge.loadtest.cases import ScaleRow
-from rfedge.loadtest.nats import NatsServer, nats_rows
-from rfedge.loadtest.scale import ScaleJob, run_scale
 from rfedge.results import read_result, rows_of
 from rfedge.twin.board import Board
 from rfedge.twin.nats_source import NatsPictures, NatsReader, NatsSource, TwinMessage

@@ -15,13 +15,16 @@ import pytest
 
 from cav_agent.config import AgentConfig, PaceKind
 from cav_agent.vehicle import Vehicle
-from mec_server.twin import contacts, rendering
-from mec_server.twin.composition import LivePicture
-from mec_server.twin.ground import FieldGround
+from lab.world import EvalWorld
+from lab.world.run import _ages_told_ms
+from mec_server.twin import rendering
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.h264.config import CoderSettings
 from rfcore.codec.packet import DeltaPacket
 from rfcore.native.yuv import field_view_from_view
+from rfcore.perception import contacts
+from rfcore.perception.composition import LivePicture
+from rfcore.perception.ground import FieldGround
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.messages import Ack, Frame, Hello, Nack
 from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
@@ -30,8 +33,6 @@ from rfcore.wire.tile_manifest import VersionLabel
 from rfcore.wire.twin_render import ViewRequest, view_request_to_wire
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.loadtest.prerecorded import PrerecordedDrive
-from rfedge.loadtest.world import EvalWorld
-from rfedge.loadtest.world.run import _ages_told_ms
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 

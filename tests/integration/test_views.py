@@ -17,10 +17,11 @@ import pytest
 from mec_server.config import RenderSettings, ServerBudget, SessionLimits
 from mec_server.fields import index
 from mec_server.ledger.budgets import Limit, Resource
-from mec_server.twin import contacts, rendering
+from mec_server.twin import rendering
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.errors import LimitExceeded
 from rfcore.field import SplatField, save_field
+from rfcore.perception import contacts
 from rfcore.views import View
 from rfcore.wire.conventions import CONSUMER_OPTIONS
 from rfcore.wire.messages import Frame

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfedge.loadtest.planning import CLOSE, largest_held
+from rfedge.loadtest.uplink import CLOSE, largest_held
 
 
 @given(st.integers(1, 40), st.integers(0, 1200))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rfedge.loadtest.planning import Traffic, on_time_share, vehicles_carried
+from rfedge.loadtest.uplink import Traffic, on_time_share, vehicles_carried
 
 
 def test_evenly_spread_packets_fill_the_uplink_to_its_throughput() -> None:

@@ -20,12 +20,12 @@ from rfcore.localise.matching import Solution
 from rfcore.localise.pose_errors import PoseErrorModel
 from rfcore.motion import rotation_vector
 from rfcore.views import PosedPicture
+from rfedge.cli.dataset import DatasetConvert, DatasetFeed
 from rfedge.cli.localise import Localise
-from rfedge.cli.scene import SceneConvert, SceneFeed
 from rfedge.datasets.pose_feed import FeedPlan, feed_lines
-from rfedge.experiments.localisation.feed import RecordedFeed
-from rfedge.experiments.localisation.report import write_localise_report
-from rfedge.experiments.localisation.starts import (
+from rfedge.localisation.feed import RecordedFeed
+from rfedge.localisation.report import write_localise_report
+from rfedge.localisation.starts import (
     Attempt,
     StartError,
     attempts,
@@ -162,11 +162,11 @@ def test_the_report_shows_errors_matches_and_what_was_lost(tmp_path: Path) -> No
 @pytest.mark.sample
 def test_a_recorded_feed_says_where_to_search(tmp_path: Path) -> None:
     drive, feed = SAMPLES / "street/transforms_drive_empty.json", tmp_path / "feed.jsonl"
-    SceneFeed(drive, str(feed), form="xyz", errors="gnss,rate_hz=5", seed=2).run()
+    DatasetFeed(drive, str(feed), form="xyz", errors="gnss,rate_hz=5", seed=2).run()
     result = tmp_path / "result.json"
     pictures = 4
     short = tmp_path / "drive"
-    SceneConvert(drive, short, every=6).run()
+    DatasetConvert(drive, short, every=6).run()
     Localise(short, SAMPLES / "fields/street.rff", pose_feed=feed, json=str(result)).run()
     (row,) = json.loads(result.read_text())["rows"]
     assert row["tries"] == pictures
@@ -177,7 +177,7 @@ def test_a_recorded_feed_says_where_to_search(tmp_path: Path) -> None:
 @pytest.mark.sample
 def test_a_feed_of_another_time_is_refused(tmp_path: Path) -> None:
     drive, feed = SAMPLES / "street/transforms_drive_empty.json", tmp_path / "feed.jsonl"
-    SceneFeed(drive, str(feed), form="xyz", start_s=1.7e9).run()
+    DatasetFeed(drive, str(feed), form="xyz", start_s=1.7e9).run()
     with pytest.raises(InvalidInput, match="see --feed-offset-s"):
         Localise(drive, SAMPLES / "fields/street.rff", pose_feed=feed).run()
     feed.write_text("nothing\n")

@@ -130,7 +130,7 @@ def test_sigterm_ends_it_in_one_line_and_leaves_nothing(
 ) -> None:
     """In the middle of COLMAP's own work, which does not look for signals."""
     known, new = half_of(drive, tmp_path / "known"), others_of(drive, tmp_path / "new")
-    command = [sys.executable, "-m", "rfedge", "scene", "poses", str(new), "--register-to"]
+    command = [sys.executable, "-m", "rfedge", "dataset", "poses", str(new), "--register-to"]
     command += [str(known), "--threads", "1", "--out", str(tmp_path / "out")]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
@@ -178,7 +178,7 @@ def test_too_few_pictures_are_refused(tmp_path: Path) -> None:
 def test_a_video_is_refused_with_the_commands_that_help(tmp_path: Path, folder: bool) -> None:
     video = tmp_path / "phone.MOV"
     video.write_bytes(b"\0\0\0 ftypqt")
-    with pytest.raises(DatasetError, match=r"phone\.MOV: is a video.*rfedge scene poses"):
+    with pytest.raises(DatasetError, match=r"phone\.MOV: is a video.*rfedge dataset poses"):
         pose_dataset(tmp_path if folder else video, tmp_path / "out", None, SETTINGS)
     assert not (tmp_path / "out").exists()
 

@@ -14,7 +14,7 @@ from rfcore.errors import DatasetError, FieldFormatError, InvalidInput
 from rfcore.field import load_field
 from rfcore.image import write_png
 from rfedge.arguments import is_field_file
-from rfedge.cli.scene import ScenePoses
+from rfedge.cli.dataset import DatasetPoses
 from rfedge.fields import register
 
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -42,7 +42,7 @@ def test_pictures_are_placed_in_a_field_told_by_its_content(images, tmp_path, ca
     field, out = tmp_path / "no-suffix", tmp_path / "out"
     field.write_bytes(FIELD.read_bytes())
     assert is_field_file(field)
-    ScenePoses(images, out, register_to=field, camera_model="PINHOLE", parameters=PINHOLE).run()
+    DatasetPoses(images, out, register_to=field, camera_model="PINHOLE", parameters=PINHOLE).run()
     placed = read_dataset(out).pictures
     assert [Path(p.name).name for p in placed] == ["0.png", "1.png", "2.png"]
     for found, truth in zip(placed, drive(), strict=True):
@@ -56,7 +56,7 @@ def test_pictures_are_placed_in_a_field_told_by_its_content(images, tmp_path, ca
 @pytest.mark.sample
 def test_a_field_does_not_know_the_camera(images, tmp_path) -> None:
     with pytest.raises(InvalidInput, match="--camera-model PINHOLE"):
-        ScenePoses(images, tmp_path / "out", register_to=FIELD).run()
+        DatasetPoses(images, tmp_path / "out", register_to=FIELD).run()
     assert not (tmp_path / "out").exists()
 
 
@@ -66,13 +66,13 @@ def test_what_is_neither_field_nor_dataset_is_refused(tmp_path) -> None:
     settings = {"camera_model": "PINHOLE", "parameters": PINHOLE}
     (tmp_path / "images").mkdir()
     with pytest.raises(FieldFormatError):
-        ScenePoses(tmp_path / "images", tmp_path / "o", register_to=damaged, **settings).run()
+        DatasetPoses(tmp_path / "images", tmp_path / "o", register_to=damaged, **settings).run()
     text = tmp_path / "text.json"
     text.write_text("{}")
     with pytest.raises(DatasetError):
-        ScenePoses(tmp_path / "images", tmp_path / "o", register_to=text).run()
+        DatasetPoses(tmp_path / "images", tmp_path / "o", register_to=text).run()
     with pytest.raises(InvalidInput, match="is no field"):
-        ScenePoses(tmp_path / "images", tmp_path / "o", register_to=Path("nosuchfield")).run()
+        DatasetPoses(tmp_path / "images", tmp_path / "o", register_to=Path("nosuchfield")).run()
 
 
 @pytest.mark.sample
@@ -96,7 +96,7 @@ def test_sigterm_ends_a_search_and_leaves_nothing(tmp_path) -> None:
     images.mkdir()
     noise = np.random.default_rng(1).integers(0, 256, (360, 640, 3), np.uint8)
     write_png(images / "0.png", noise)
-    command = ["scene", "poses", str(images), "--out", str(tmp_path / "out")]
+    command = ["dataset", "poses", str(images), "--out", str(tmp_path / "out")]
     command += ["--register-to", str(FIELD), "--camera-model", "PINHOLE", "--parameters"]
     command += [str(value) for value in PINHOLE]
     with subprocess.Popen(

@@ -113,7 +113,7 @@ def test_a_video_alone_becomes_a_dataset_with_poses(tmp_path: Path) -> None:
     known = (str(value) for value in (k.fx_px, k.fy_px, k.cx_px, k.cy_px))
     options = ("--max-side-px", "640", "--features", "2048", "--threads", "1")
     camera = ("--camera-model", "PINHOLE", "--parameters", *known)
-    arguments = ("scene", "poses", str(tmp_path / "drive.mp4"), "--per-second", "10")
+    arguments = ("dataset", "poses", str(tmp_path / "drive.mp4"), "--per-second", "10")
     parse([*arguments, "--out", str(tmp_path / "out"), *options, *camera]).run()
     assert len(read_dataset(tmp_path / "out").pictures) >= 6
     assert not (tmp_path / "out.frames").exists()

@@ -78,7 +78,7 @@ def test_a_value_is_shown_short(value: object, shown: str) -> None:
 def test_a_heading_names_file_command_revision_and_host() -> None:
     host = {"cpu": "C", "cores": 2, "isa": "avx2"}
     result = {"command": "rfedge eval x", "revision": "abc-dirty", "host": host}
-    assert heading(Path("results/x-2.json"), result) == (
+    assert heading(Path("lab/results/x-2.json"), result) == (
         "## x-2\n\n`rfedge eval x` at `abc-dirty`; C, 2 cores, avx2."
     )
 

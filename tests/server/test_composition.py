@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mec_server.twin.composition import LivePicture, compose, live_picture, nearest, shrunk
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.field import SplatField
 from rfcore.native.yuv import i420_from_rgb
+from rfcore.perception.composition import LivePicture, compose, live_picture, nearest, shrunk
 from rfcore.raster.gaussians import Gaussians
 from rfcore.views import View
 

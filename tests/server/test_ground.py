@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mec_server.twin.ground import STEPS, FieldGround, GroundPlane, points_of, rays_of
 from rfcore.camera import Camera, Intrinsics, Pose
+from rfcore.perception.ground import STEPS, FieldGround, GroundPlane, points_of, rays_of
 from rfcore.views import View
 from server.test_objects import CAMERA_M, FIELD, camera_at
 

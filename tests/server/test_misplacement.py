@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from mec_server.twin.composition import MISPLACED_RAD, MISPLACED_TRUST, compose, live_picture
-from mec_server.twin.contacts import detect
-from mec_server.twin.ground import FieldGround
-from mec_server.twin.misplacement import misplacement_rad
-from mec_server.twin.objects import LEAST_TRUST, ObjectTracker
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.dataset import read_dataset
 from rfcore.field import RadianceField, load_field
+from rfcore.perception.composition import MISPLACED_RAD, MISPLACED_TRUST, compose, live_picture
+from rfcore.perception.contacts import detect
+from rfcore.perception.ground import FieldGround
+from rfcore.perception.misplacement import misplacement_rad
+from rfcore.perception.objects import LEAST_TRUST, ObjectTracker
 from rfcore.views import PosedPicture
 from rfedge.samples import sample_path
 from server.test_composition import PILLAR, WALL, at, joined

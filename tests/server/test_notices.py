@@ -19,9 +19,9 @@ from mec_server.twin.notices import (
     Whereabouts,
     field_changes,
 )
-from mec_server.twin.objects import FollowedObject
 from mec_server.twin.rendering import Glance
 from rfcore.camera import Pose
+from rfcore.perception.objects import FollowedObject
 from rfcore.wire.notices import FieldChange, FieldChangeKind, ObjectAhead, StreetNotice
 from rfcore.wire.tiles import Tile, TileLight
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mec_server.twin.composition import LivePicture, live_picture
-from mec_server.twin.contacts import Detection, detect
-from mec_server.twin.ground import FieldGround
-from mec_server.twin.objects import FORGOTTEN_S, REPEAT_S, ObjectTracker, ToldObjects
 from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.field import SplatField
+from rfcore.perception.composition import LivePicture, live_picture
+from rfcore.perception.contacts import Detection, detect
+from rfcore.perception.ground import FieldGround
+from rfcore.perception.objects import FORGOTTEN_S, REPEAT_S, ObjectTracker, ToldObjects
 from rfcore.raster.gaussians import Gaussians
 
 INTRINSICS = Intrinsics(320, 180, 260.0, 260.0, 160.0, 80.0)

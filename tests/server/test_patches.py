@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from mec_server.twin.composition import LivePicture, compose, live_picture, with_things
-from mec_server.twin.contacts import find
+from rfcore.perception.composition import LivePicture, compose, live_picture, with_things
+from rfcore.perception.contacts import find
 from server.test_objects import FIELD, GROUND, STREET, camera_at, car, joined
 
 AGE_S, MAX_S = 0.1, 2.0

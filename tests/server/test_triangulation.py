@@ -9,8 +9,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from mec_server.twin.triangulation import Sighting, placed
 from rfcore.errors import InvalidInput
+from rfcore.perception.triangulation import Sighting, placed
 
 Point = tuple[float, float]
 PLACES = st.tuples(st.floats(-40, 40), st.floats(-40, 40))

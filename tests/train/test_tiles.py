@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
+from lab.servers.ray import require_resumed, train_tiles
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.wire.tile_manifest import read_publication
 from rfedge.cli.field_tiles import FieldPublish
 from rfedge.cli.train import Train
 from rfedge.datasets.split import SplitSettings, split_dataset
-from rfedge.loadtest.ray import require_resumed, train_tiles
 
 OPTIONS = {"iterations": 60, "gaussians": 200, "threads": 1, "plain": True, "checkpoint_every": 20}
 

@@ -13,7 +13,7 @@ from rfcore.dataset import read_dataset
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.field import load_field, save_field
 from rfcore.train import NgpModel, NgpTrainingConfig
-from rfedge.cli.scene import SceneConvert
+from rfedge.cli.dataset import DatasetConvert
 from rfedge.cli.train import Train
 from rfedge.training.finish import training_result
 from rfedge.training.loop import LoopLimits
@@ -97,18 +97,18 @@ def test_a_field_too_alike_to_compress_names_the_option_that_helps(
 def test_a_video_is_no_dataset_and_the_error_says_how_to_make_one(tmp_path: Path) -> None:
     video = tmp_path / "phone.mp4"
     video.write_bytes(b"\0\0\0 ftypisom")
-    helps = r"phone\.mp4: is a video.*rfedge scene poses .*phone\.mp4.*camera\.toml"
+    helps = r"phone\.mp4: is a video.*rfedge dataset poses .*phone\.mp4.*camera\.toml"
     with pytest.raises(DatasetError, match=helps):
         verb(video, tmp_path / "a.rff").run()
     with pytest.raises(DatasetError, match=helps):
-        SceneConvert(video, tmp_path / "out").run()
+        DatasetConvert(video, tmp_path / "out").run()
 
 
 def test_the_command_for_a_video_can_be_pasted_whatever_its_name(tmp_path: Path) -> None:
     video = tmp_path / "my phone.mp4"
     video.touch()
-    with pytest.raises(DatasetError, match=r"scene poses '.*/my phone\.mp4' --out"):
-        SceneConvert(video, tmp_path / "out").run()
+    with pytest.raises(DatasetError, match=r"dataset poses '.*/my phone\.mp4' --out"):
+        DatasetConvert(video, tmp_path / "out").run()
 
 
 def test_a_picture_is_no_dataset_and_the_error_says_what_is(wall: Path, tmp_path: Path) -> None:

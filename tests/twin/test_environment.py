@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.passive_env_checker import env_render_passive_checker
 
 from rfcore.errors import InvalidInput
-from rfcore.wire.twin_render import StreetObject
+from rfcore.perception.objects import StreetObject
 from rfedge.twin.environment import (
     MOST_DEPTH_M,
     OBJECTS,

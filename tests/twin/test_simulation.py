@@ -19,8 +19,9 @@ from rfcore.dataset.recorded_session import RECORDING_NAME, RecordedCamera, Reco
 from rfcore.errors import InvalidInput
 from rfcore.field import SplatField
 from rfcore.image import write_png
+from rfcore.perception.objects import StreetObject
 from rfcore.views import PosedPicture
-from rfcore.wire.twin_render import ObjectsSeen, StreetObject, objects_to_wire
+from rfcore.wire.twin_render import ObjectsSeen, objects_to_wire
 from rfcore.wire.v1 import twin_pb2_grpc
 from rfedge.twin import simulation
 from rfedge.twin.simulation import (

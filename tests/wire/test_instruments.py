@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from prometheus_client import CollectorRegistry, Histogram, generate_latest
 
+from lab.pages.metrics import families, metrics_page
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.raster.renderers import DeviceRecord
 from rfcore.wire.conventions import FRAME_BUDGET_BUCKETS_S
 from rfcore.wire.instruments import Instruments, MetricsEndpoint
-from rfedge.pages.metrics import families, metrics_page
 
 ROOT = Path(__file__).parents[2]
 DECLARED = {family.name: family for listed in families().values() for family in listed}

@@ -1,0 +1,1 @@
+"""What proves rfedge: experiments, loads of several servers, city plans, recorded results."""

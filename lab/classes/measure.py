@@ -1,0 +1,427 @@
+"""Quality by class: what vehicles, people, signs and markings look like where averages agree.
+
+A frame's PSNR is an average in which the road, the sky and the facades outweigh what a twin is for.
+Here the squared error of the luma is summed over the pixels of each class, over all frames but the
+first. Between operating points log(MSE) is interpolated over log(bytes a frame) by a monotone cubic
+(PCHIP), at two rates: at *equal bits*, those that ours needs for a quality of the whole picture,
+and at *equal quality*, those that each coder needs for it itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from itertools import chain
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from rfcore.codec.h264.config import check_effort
+from rfcore.errors import InvalidInput
+from rfcore.extras import needs
+from rfcore.image import I420
+from rfedge.datasets.classes import Label, class_picture_of, read_classes
+from rfedge.evaluate.cells import CellStore, clip_key, program_version
+from rfedge.evaluate.clips import (
+    STEADY,
+    Clip,
+    CodedClip,
+    Drive,
+    DriveName,
+    DriveOfField,
+    luma_mse,
+    psnr_of_mse,
+)
+from rfedge.evaluate.field_coder import FieldCoder, render_clip
+from rfedge.evaluate.performance import perform, seconds_left
+from rfedge.evaluate.picture_quality import luma_ssim
+from rfedge.evaluate.rivals import CodedPictures, x264_lowdelay, x264_with_our_tools
+from rfedge.report.tables import heading, print_table, table
+from rfedge.results import (
+    Result,
+    check_result_path,
+    make_result,
+    provenance,
+    rows_of,
+    write_result,
+)
+
+with needs("eval"):
+    from scipy.interpolate import PchipInterpolator
+
+__all__ = [
+    "GROUPS",
+    "ClassCoder",
+    "ClassQuality",
+    "ClassesJob",
+    "classes_section",
+    "quality_at",
+    "read_groups",
+    "run_classes",
+]
+
+GROUPS = ("rest", "vehicle", "person", "sign", "marking")
+ALL = "all"
+"""Named as a class: the whole picture."""
+GROUP_OF = {
+    Label.VEHICLE: "vehicle",
+    Label.PERSON: "person",
+    Label.BICYCLE: "person",
+    Label.SIGN: "sign",
+    Label.MARKING: "marking",
+}
+"""A cyclist's bicycle counts with the person; all other labels are the rest."""
+LEVELS = np.array([GROUPS.index(GROUP_OF.get(label, "rest")) for label in Label], np.uint8)
+OURS = "rfedge"
+EQUAL_BITS, EQUAL_QUALITY = "bits", "quality"
+ROUNDING = 1e-9
+"""By how much an interpolated rate may miss the end of the curve that it was taken from."""
+QUICK_FRAMES = 8
+Groups = Sequence[NDArray[np.uint8]]
+"""Indices into ``GROUPS`` uint8 [H, W], one array a frame."""
+F64 = NDArray[np.float64]
+
+
+def read_groups(name: DriveName, drive: Drive) -> list[NDArray[np.uint8]]:
+    """Return the groups of every frame of a drive, from the class pictures beside its pictures.
+
+    Raises ``DatasetError`` where one is missing or no class picture, ``InvalidInput`` for one of
+    another size than its frame.
+    """
+    folder = name.dataset if name.dataset.is_dir() else name.dataset.parent
+    found = []
+    for picture, frame in zip(drive.pictures, drive.frames, strict=True):
+        path = class_picture_of(folder / picture.name)
+        labels = read_classes(path)
+        if labels.shape != frame.y.shape:
+            height, width = labels.shape
+            raise InvalidInput("classes", f"{path}: {(width, height)} px, frame {frame.size_px} px")
+        found.append(LEVELS[labels])
+    return found
+
+
+class PictureCoder(Protocol):
+    """A coder of clips that also shows the pictures that it decodes."""
+
+    @property
+    def name(self) -> str:
+        """The label, with every setting that changes the result."""
+
+    @property
+    def points(self) -> Sequence[float]:
+        """The operating points, from best to worst."""
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The points of the best and of the worst quality that there are."""
+
+    @property
+    def version(self) -> str:
+        """What the result depends on besides name, point and clip."""
+
+    def pictures(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedPictures:
+        """Code and decode ``frames`` with low delay."""
+
+
+@dataclass(frozen=True)
+class ClassCoder:
+    """A coder whose clips have the luma's squared error of each group in their notes."""
+
+    coder: PictureCoder
+    groups: Groups
+
+    @property
+    def name(self) -> str:
+        """The coder's."""
+        return self.coder.name
+
+    @property
+    def points(self) -> Sequence[float]:
+        """The coder's."""
+        return self.coder.points
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The coder's."""
+        return self.coder.limits
+
+    @property
+    def version(self) -> str:
+        """The coder's, and the groups."""
+        digest = hashlib.sha256()
+        for groups in self.groups:
+            digest.update(groups.tobytes())
+        return f"{self.coder.version}; classes {digest.hexdigest()[:16]}"
+
+    def code(self, frames: Sequence[I420], rate_hz: float, point: float) -> CodedClip:
+        """Code and decode ``frames``, which may be the beginning of those of the groups."""
+        made = self.coder.pictures(frames, rate_hz, point)
+        pairs = list(zip(made.decoded, frames, strict=True))
+        groups = self.groups[: len(frames)]
+        errors = np.array([_group_sse(*p, g) for p, g in zip(pairs, groups, strict=True)])
+        return CodedClip(
+            point,
+            np.array(made.frame_bytes, np.int64),
+            np.array([luma_mse(*pair) for pair in pairs]),
+            np.array([luma_ssim(ours.y, theirs.y) for ours, theirs in pairs]),
+            made.cpu_ms,
+            {_note(name): tuple(errors[:, i].tolist()) for i, name in enumerate(GROUPS)},
+            made.decoder_cpu_ms,
+        )
+
+
+def _note(group: str) -> str:
+    return f"{group}_sse"
+
+
+def _group_sse(decoded: I420, frame: I420, groups: NDArray[np.uint8]) -> F64:
+    """The sum of squared luma errors over the pixels of each group."""
+    difference = decoded.y.astype(np.float64) - frame.y
+    squares = (difference * difference).ravel()
+    sums = np.bincount(groups.ravel(), weights=squares, minlength=len(GROUPS))
+    return np.asarray(sums, np.float64)
+
+
+@dataclass(frozen=True)
+class ClassQuality:
+    """The luma PSNR of one class of one drive as one coder shows it."""
+
+    scene: str
+    hz: float
+    method: str
+    class_: str
+    """One of ``GROUPS``, or ``all``; ``class`` in the file."""
+    psnr_db: float
+    share_percent: float
+    """Of the pixels of all frames but the first."""
+    equal: str
+    """What is the same for all coders: ``bits``, or ``quality`` of the whole picture."""
+    at_db: float
+    """That quality; for equal bits, the one that ours has for them."""
+    bytes_per_frame: float
+
+    def row(self) -> dict[str, Any]:
+        """Return it as the file has it."""
+        return {f.name.rstrip("_"): getattr(self, f.name) for f in fields(self)}
+
+    @staticmethod
+    def of_rows(rows: Iterable[Mapping[str, Any]]) -> list[ClassQuality]:
+        """Read them back; raises ``InvalidInput`` for a row of other keys."""
+        names = {field.name.rstrip("_"): field.name for field in fields(ClassQuality)}
+        named = ({names.get(key, key): value for key, value in row.items()} for row in rows)
+        return rows_of(ClassQuality, named)
+
+
+@dataclass(frozen=True)
+class ClassCurve:
+    """One coder's clips of a drive, and how many pixels a frame each group has, [N, G]."""
+
+    method: str
+    clips: Sequence[CodedClip]
+    pixels: F64
+
+    def bytes_at(self, psnr_db: float) -> float:
+        """Return the bytes a frame at a quality of the whole picture; raises as ``quality_at``."""
+        qualities = np.array([clip.psnr_db() for clip in self.clips])
+        self._check_within(psnr_db, qualities, "dB")
+        return math.exp(_between(qualities, self._log_bytes, psnr_db))
+
+    def mse_at(self, bytes_per_frame: float) -> dict[str, float]:
+        """Return the mean squared error of each group that has pixels, and of all, at a rate."""
+        self._check_within(bytes_per_frame, np.exp(self._log_bytes), "bytes a frame")
+        steady = self.pixels[STEADY].sum(axis=0)
+        errors = np.array([_steady_sse(clip) for clip in self.clips])
+        columns = {name: errors[:, i] / steady[i] for i, name in enumerate(GROUPS) if steady[i]}
+        columns[ALL] = errors.sum(axis=1) / steady.sum()
+        at = math.log(bytes_per_frame)
+        return {
+            name: math.exp(_between(self._log_bytes, np.log(mse), at))
+            for name, mse in columns.items()
+        }
+
+    @property
+    def _log_bytes(self) -> F64:
+        return np.log([clip.bytes_per_frame() for clip in self.clips])
+
+    def _check_within(self, value: float, known: F64, unit: str) -> None:
+        low, high = float(known.min()), float(known.max())
+        if not low * (1 - ROUNDING) <= value <= high * (1 + ROUNDING):
+            raise InvalidInput(
+                "at_db",
+                f"{self.method} has {low:.2f}..{high:.2f} {unit}, not {value:.2f}; choose another "
+                "--at-db",
+            )
+
+
+def _between(x: F64, y: F64, at: float) -> float:
+    """Interpolate y over x, of which equal values count once, with the least y."""
+    order = np.lexsort((y, x))
+    known, first = np.unique(x[order], return_index=True)
+    return float(PchipInterpolator(known, y[order][first])(np.clip(at, known[0], known[-1])))
+
+
+def _steady_sse(clip: CodedClip) -> F64:
+    return np.array([sum(map(float, clip.notes[_note(name)][STEADY])) for name in GROUPS])
+
+
+def quality_at(curves: Sequence[ClassCurve], clip: Clip, at_db: float) -> Iterator[ClassQuality]:
+    """Yield every coder's classes at the bits that the first needs for a quality, and at that
+    quality. Raises ``InvalidInput`` for what a curve does not reach."""
+    same_bytes = curves[0].bytes_at(at_db)
+    rates = [(EQUAL_BITS, curve, same_bytes) for curve in curves]
+    rates += [(EQUAL_QUALITY, curve, curve.bytes_at(at_db)) for curve in curves]
+    for equal, curve, rate in rates:
+        shares = _shares(curve.pixels)
+        for name, mse in curve.mse_at(rate).items():
+            yield ClassQuality(
+                scene=clip.scene,
+                hz=clip.rate_hz,
+                method=curve.method,
+                class_=name,
+                psnr_db=psnr_of_mse(mse),
+                share_percent=shares[name],
+                equal=equal,
+                at_db=at_db,
+                bytes_per_frame=rate,
+            )
+
+
+def _shares(pixels: F64) -> dict[str, float]:
+    steady = pixels[STEADY].sum(axis=0)
+    parts = 100 * steady / steady.sum()
+    return {ALL: 100.0, **dict(zip(GROUPS, parts.tolist(), strict=True))}
+
+
+@dataclass(frozen=True)
+class ClassesJob:
+    """What to run; see ``rfedge-lab classes --help``."""
+
+    field: Path
+    drives: Sequence[str]
+    at_db: Sequence[float]
+    effort: str
+    preset: str
+    out: Path
+    cells: Path
+    quick: bool = False
+
+    def __post_init__(self) -> None:
+        check_result_path(self.out)
+        check_effort("effort", self.effort)
+        if not self.drives:
+            raise InvalidInput("drives", "there is none")
+        if not self.at_db or not all(0 < db < 100 for db in self.at_db):
+            raise InvalidInput("at_db", f"{tuple(self.at_db)} are not decibels within 0..100")
+
+
+@dataclass(frozen=True)
+class ClassComparison:
+    """One drive with ours and the rivals; the first coder is ours."""
+
+    clip: Clip
+    groups: Groups
+    coders: Mapping[str, ClassCoder]
+
+    def curves(self, store: CellStore, at_db: Sequence[float]) -> list[ClassCurve]:
+        """Code what is not there yet, at points that span the qualities and the bits asked for."""
+        pixels = np.array([np.bincount(g.ravel(), minlength=len(GROUPS)) for g in self.groups])
+        window = min(at_db), max(at_db)
+        made: list[ClassCurve] = []
+        for name, coder in self.coders.items():
+            done = perform(self.clip, coder, store, window_db=window, timed=False)
+            clips: Sequence[CodedClip] = done.clips
+            if made:
+                fewest, most = (made[0].bytes_at(db) for db in window)
+                clips = self._reaching(coder, store, clips, (fewest, most))
+            made.append(ClassCurve(name, clips, pixels.astype(np.float64)))
+        return made
+
+    def _reaching(
+        self,
+        coder: ClassCoder,
+        store: CellStore,
+        clips: Sequence[CodedClip],
+        wanted: tuple[float, float],
+    ) -> list[CodedClip]:
+        """Return the clips with more beyond either end until their bytes span those wanted, or
+        the coder's points end."""
+        best, worst = coder.limits
+        found = sorted(clips, key=lambda coded: coded.point)
+        step = found[-1].point - found[-2].point
+        while found[-1].bytes_per_frame() > wanted[0] and found[-1].point < worst:
+            found.append(self._coded(coder, store, min(found[-1].point + step, worst)))
+        while found[0].bytes_per_frame() < wanted[1] and found[0].point > best:
+            found.insert(0, self._coded(coder, store, max(found[0].point - step, best)))
+        return found
+
+    def _coded(self, coder: ClassCoder, store: CellStore, point: float) -> CodedClip:
+        clip = self.clip
+        key = clip_key(clip, coder, point)
+        return store.clip(key, lambda: coder.code(clip.frames, clip.rate_hz, point))
+
+
+def run_classes(job: ClassesJob, console: Console) -> dict[str, Any]:
+    """Code what is not there yet, write ``job.out`` and print the rows.
+
+    Raises ``InvalidInput`` or ``DatasetError`` before anything is coded if an input is wrong, and
+    ``InvalidInput`` afterwards for qualities or bits that a coder does not reach.
+    """
+    drives = [DriveOfField.parse(text, job.field) for text in job.drives]
+    made, store = provenance(list(dict.fromkeys(d.field for d in drives))), CellStore(job.cells)
+    comparisons = [_comparison(job, drive) for drive in drives]
+    left_s = sum(seconds_left(c.clip, c.coders.values(), store) for c in comparisons)
+    console.print(f"{len(comparisons)} drives, about {left_s / 60:.1f} minutes left to do")
+    found: list[ClassQuality] = []
+    for comparison in comparisons:
+        curves = comparison.curves(store, job.at_db)
+        found += chain.from_iterable(quality_at(curves, comparison.clip, db) for db in job.at_db)
+    frames = {f"{c.clip.scene}@{c.clip.rate_hz:g}": c.clip.frames_digest for c in comparisons}
+    content = {"quick": job.quick, "frames": frames, "rows": [each.row() for each in found]}
+    result = make_result("classes", made, content)
+    write_result(job.out, result)
+    print_table(console, "Luma PSNR by class", COLUMNS, _lines(found))
+    return result
+
+
+def _comparison(job: ClassesJob, given: DriveOfField) -> ClassComparison:
+    drive, field = given.read(QUICK_FRAMES if job.quick else None)
+    groups = read_groups(given.name, drive)
+    ours = FieldCoder(
+        render_clip(field, drive.cameras),
+        f"{OURS}-{job.effort}-{field.field_id[:12]}",
+        program_version(),
+        effort=job.effort,
+    )
+    rivals = (x264_with_our_tools(job.preset), x264_lowdelay(job.preset))
+    coders: dict[str, PictureCoder] = {OURS: ours, **{rival.name: rival for rival in rivals}}
+    return ClassComparison(
+        drive.clip(), groups, {name: ClassCoder(coder, groups) for name, coder in coders.items()}
+    )
+
+
+SHOWN = (ALL, *GROUPS[1:], GROUPS[0])
+COLUMNS = ("scene", "Hz", "equal", "at dB", "method", "bytes", *SHOWN)
+PIXELS = "share of the pixels, %"
+
+
+def classes_section(path: Path, result: Result) -> str:
+    """Return the table of a result: a line for each coder at equal bits or equal quality."""
+    rows = ClassQuality.of_rows(result["rows"])
+    return "\n\n".join([heading(path, result), table(COLUMNS, _lines(rows)), ""])
+
+
+def _lines(rows: Sequence[ClassQuality]) -> list[list[str]]:
+    """PSNR in dB, after a line for each drive with the classes' shares of its pixels."""
+    lines: dict[tuple[str, ...], dict[str, str]] = {}
+    for row in rows:
+        drive = row.scene, f"{row.hz:g}"
+        shares = lines.setdefault((*drive, "-", "-", PIXELS, "-"), {})
+        shares[row.class_] = f"{row.share_percent:.1f}"
+        point = row.equal, f"{row.at_db:g}", row.method, f"{row.bytes_per_frame:.0f}"
+        lines.setdefault((*drive, *point), {})[row.class_] = f"{row.psnr_db:.2f}"
+    return [[*key, *(cells.get(name, "-") for name in SHOWN)] for key, cells in lines.items()]

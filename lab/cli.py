@@ -1,0 +1,64 @@
+"""The ``rfedge-lab`` command line: one frozen dataclass an experiment (``rfedge.program``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+from tyro.conf import subcommand
+
+from lab.adapt import EvalAdapt
+from lab.benchmark import EvalBenchmark
+from lab.city import PlanCity
+from lab.classes import EvalClasses
+from lab.intra_size import EvalIntraSize
+from lab.latency import EvalLatency, EvalTail
+from lab.live import EvalLive
+from lab.localisation import EvalLocalise
+from lab.paper import EvalPaper
+from lab.rig import EvalRig
+from lab.robust import EvalRobust, EvalSeams
+from lab.servers import EvalScale
+from lab.size_tables import EvalSizing
+from lab.slice_coder import EvalSliceCoder
+from lab.world import EvalWorld
+from rfedge.program import CONFIG, run_program
+
+__all__ = ["main", "parse"]
+
+Verb = (
+    Annotated[EvalAdapt, subcommand("adapt")]
+    | Annotated[EvalBenchmark, subcommand("benchmark")]
+    | Annotated[PlanCity, subcommand("city")]
+    | Annotated[EvalClasses, subcommand("classes")]
+    | Annotated[EvalIntraSize, subcommand("intra-size")]
+    | Annotated[EvalLatency, subcommand("latency")]
+    | Annotated[EvalLive, subcommand("live")]
+    | Annotated[EvalLocalise, subcommand("localise")]
+    | Annotated[EvalPaper, subcommand("paper")]
+    | Annotated[EvalRig, subcommand("rig")]
+    | Annotated[EvalRobust, subcommand("robust")]
+    | Annotated[EvalScale, subcommand("scale")]
+    | Annotated[EvalSeams, subcommand("seams")]
+    | Annotated[EvalSizing, subcommand("size-tables")]
+    | Annotated[EvalSliceCoder, subcommand("slice-coder")]
+    | Annotated[EvalTail, subcommand("tail")]
+    | Annotated[EvalWorld, subcommand("world")]
+)
+
+
+def parse(arguments: Sequence[str] | None = None) -> Verb:
+    """Return the experiment that ``arguments`` ask for, by default those of the process."""
+    return tyro.cli(
+        Verb,
+        prog="rfedge-lab",
+        description="Experiments whose results are recorded in lab/results.",
+        args=arguments,
+        config=CONFIG,
+    )
+
+
+def main() -> int:
+    """Run one experiment and return its exit status."""
+    return run_program("rfedge-lab", parse)

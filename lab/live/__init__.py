@@ -1,0 +1,70 @@
+"""``rfedge-lab live``: how old a picture is that is shown, and what showing costs the server."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import arg
+
+from rfedge.arguments import DATASET, FIELD, FOLDER, JSON, field_path
+from rfedge.samples import sample_path
+
+__all__ = ["EvalLive"]
+
+
+@dataclass(frozen=True)
+class EvalLive:
+    """Measure the twin with a browser, and live cameras that die and come back, as processes.
+
+    Chromium and GStreamer's RTSP server must be there (`make test-system-packages`). All processes
+    share this machine, the browser at low priority: it stands for another machine.
+    """
+
+    cameras: tuple[int, ...] = (1, 4, 8)
+    """Numbers of vehicles whose pictures' ages are measured in the browser; none: not measured."""
+    hz: float = 2.0
+    """Pictures per second of each of them, and of those of --rounds."""
+    seconds: float = 30.0
+    """Counted seconds of each number of cameras, and of each half round."""
+    rounds: int = 3
+    """Rounds of four vehicles without and with consumers and a browser, in turn; 0: none."""
+    consumers: int = 10
+    """Consumers of the twin beside the browser."""
+    sources: tuple[str, ...] = ("rtsp", "rtp")
+    """Live cameras: rtsp, rtp; none: not measured."""
+    source_seconds: float = 300.0
+    """How long each is driven at 10 Hz."""
+    kill_every: Annotated[float, arg(metavar="SECONDS")] = 60.0
+    """Its sender is killed so often, and started again."""
+    field: Annotated[Path, FIELD] = sample_path("fields/street.rff")
+    """Field archive, the only one in its folder."""
+    drive: Annotated[Path, DATASET] = sample_path("street/transforms_drive_vehicles.json")
+    """Drive whose pictures are sent."""
+    work: Annotated[Path, FOLDER] = Path("out/eval/live")
+    """Folder for logs and for the drive that is coded once."""
+    out: Annotated[Path, JSON] = Path("out/eval/live.json")
+    """The result file to write."""
+
+    def run(self) -> None:
+        """Measure, print and write the rows."""
+        from rich.console import Console
+
+        from lab.live.run import LiveJob, run_live
+
+        job = LiveJob(
+            cameras=self.cameras,
+            hz=self.hz,
+            seconds=self.seconds,
+            rounds=self.rounds,
+            consumers=self.consumers,
+            sources=self.sources,
+            source_seconds=self.source_seconds,
+            kill_every_s=self.kill_every,
+            field=field_path(self.field),
+            drive=self.drive,
+            work=self.work,
+            out=self.out,
+        )
+        run_live(job, Console())

@@ -1,0 +1,294 @@
+"""The parts of the live experiment one after the other, and their result.
+
+One of them is here: a live camera that dies and comes back, into a real agent and a real server,
+for minutes.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from lab.live.report import AgeRow, IngestRow, SourceRow, print_live
+from lab.live.showing import TwinBed, agent, measure_age, measure_ingest, watching
+from rfcore.dataset import read_dataset
+from rfcore.errors import BackendUnavailable, InvalidInput, RfedgeError
+from rfcore.image import jpeg_bytes
+from rfedge.demo.processes import command_of, service
+from rfedge.loadtest.usage import Usage, Watcher, slope_per_minute
+from rfedge.results import CHECKOUT, check_result_path, make_result, provenance, write_result
+
+__all__ = ["LiveCamera", "LiveJob", "measure_source", "run_live"]
+
+SENDER = CHECKOUT / "deploy/live/gst_sender.py"
+"""Runs under the system's Python, which has GStreamer's bindings; it is no part of the package."""
+SYSTEM_PYTHON = "/usr/bin/python3"
+SDP = """v=0
+o=- 0 0 IN IP4 127.0.0.1
+s=camera
+c=IN IP4 127.0.0.1
+t=0 0
+m=video {port} RTP/AVP 96
+a=rtpmap:96 H264/90000
+"""
+KINDS = ("rtsp", "rtp")
+DOWN_S = 3.0
+"""How long a killed sender stays away: longer than the agent takes to call its source lost."""
+SETTLED = 0.2
+"""Share of the run whose memory is not judged: caches and allocators fill."""
+FIRST_PICTURE_S = 120.0
+
+
+@dataclass(frozen=True)
+class LiveCamera:
+    """What is sent and for how long: ``folder`` has pictures and a ``camera.toml``."""
+
+    kind: str
+    folder: Path
+    seconds: float
+    kill_every_s: float
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InvalidInput("sources", f"{self.kind!r} is none of {', '.join(KINDS)}")
+
+
+def write_camera(folder: Path, drive: Path) -> None:
+    """Write the drive's pictures, and its middle pose for a day, as a camera that stands."""
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = list(read_dataset(drive).pictures)
+    for i, picture in enumerate(pictures):
+        (folder / f"{i:03d}.jpg").write_bytes(jpeg_bytes(picture.read()))
+    middle = pictures[len(pictures) // 2].camera
+    k, pose = middle.intrinsics, middle.world_from_cam
+    (folder / "camera.toml").write_text(
+        f"[camera]\nwidth_px = {k.width_px}\nheight_px = {k.height_px}\nfx_px = {k.fx_px}\n\n"
+        '[trajectory]\nfile = "trajectory.txt"\nmax_gap_s = 1e6\n'
+    )
+    w, x, y, z = pose.rotation
+    now_s = time.time()
+    lines = [
+        " ".join(map(str, (f"{now_s + off_s:.6f}", *pose.translation_m, x, y, z, w)))
+        for off_s in (-86_400, 86_400)
+    ]
+    (folder / "trajectory.txt").write_text("\n".join(lines) + "\n")
+
+
+class Sender:
+    """A running sender; ``kill`` ends it as a power failure would, ``start`` begins another."""
+
+    def __init__(self, kind: str, folder: Path) -> None:
+        self.kind, self.folder = kind, folder
+        self.port = _free_pair() if kind == "rtp" else 0
+        self._process: subprocess.Popen[str] | None = None
+
+    def start(self) -> None:
+        """Start it, on the port of the one before; raise ``RfedgeError`` if it does not."""
+        if not SENDER.is_file():
+            raise BackendUnavailable(f"{SENDER} is missing: live cameras need a checkout")
+        command = [SYSTEM_PYTHON, str(SENDER), self.kind, f"{self.folder}/%03d.jpg", str(self.port)]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        said = self._process.stdout.readline().strip()
+        if not said.isdigit():
+            raise BackendUnavailable(
+                "the sender did not start; `make test-system-packages` installs GStreamer"
+            )
+        self.port = int(said)
+
+    def kill(self) -> None:
+        """End it."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGKILL)
+            self._process.wait(10)
+            if self._process.stdout is not None:
+                self._process.stdout.close()
+            self._process = None
+
+    def source(self) -> str:
+        """Return what the agent is to open."""
+        if self.kind == "rtsp":
+            return f"rtsp://127.0.0.1:{self.port}/camera"
+        path = self.folder / "camera.sdp"
+        path.write_text(SDP.format(port=self.port))
+        return str(path)
+
+
+def _free_pair() -> int:
+    """Return an even UDP port that is free with the one after it: RTP's, and RTCP's (RFC 3550)."""
+    for port in range(20_000, 60_000, 2):
+        with suppress(OSError), ExitStack() as stack:
+            for number in (port, port + 1):
+                one = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                one.bind(("127.0.0.1", number))
+            return port
+    raise RfedgeError("no two UDP ports side by side are free")
+
+
+@contextmanager
+def sending(camera: LiveCamera) -> Iterator[Sender]:
+    """Send until the block ends."""
+    sender = Sender(camera.kind, camera.folder)
+    try:
+        sender.start()
+        yield sender
+    finally:
+        sender.kill()
+
+
+def measure_source(camera: LiveCamera, drive: Path, field: Path, work: Path) -> SourceRow:
+    """Drive with a live camera at 10 Hz; return latencies, and what memory did."""
+    write_camera(camera.folder, drive)
+    report = work / f"{camera.kind}.jsonl"
+    report.unlink(missing_ok=True)
+    fields = ("--fields", str(field.parent))
+    server = [*command_of("mec-server"), *fields, "--listen", "127.0.0.1:0"]
+    with sending(camera) as sender, service("mec-server", server, work) as serving:
+        arguments = ["--server", serving.address, *fields, "--effort", "fast"]
+        arguments += ["--source", sender.source(), "--camera-file", str(camera.folder)]
+        arguments += ["--source-timeout-s", "2", "--report", str(report)]
+        with agent("live", arguments, work) as driving, watching(serving.address, 1) as consumers:
+            _await_pictures(report, consumers[0].ages_ms, driving)
+            pids = {"agent": driving.pid, "server": serving.process.pid}
+            watcher = Watcher(pids)
+            watcher.start()
+            kills = _kill_again_and_again(sender, camera)
+            usage = watcher.stop()
+            return _row(camera, kills, _lines(report), consumers[0].ages_ms, usage)
+
+
+def _await_pictures(report: Path, ages_ms: list[float], process: subprocess.Popen[bytes]) -> None:
+    """Wait for the first picture that was shown."""
+    end_s = time.monotonic() + FIRST_PICTURE_S
+    while not (ages_ms and report.exists()):
+        if process.poll() is not None or time.monotonic() > end_s:
+            raise RfedgeError(f"the agent sent no picture within {FIRST_PICTURE_S:g} s")
+        time.sleep(0.1)
+
+
+def _kill_again_and_again(sender: Sender, camera: LiveCamera) -> int:
+    end_s, kills = time.monotonic() + camera.seconds, 0
+    while (left_s := end_s - time.monotonic()) > 0:
+        time.sleep(min(left_s, camera.kill_every_s))
+        if end_s - time.monotonic() <= DOWN_S:
+            break
+        sender.kill()
+        time.sleep(DOWN_S)
+        sender.start()
+        kills += 1
+    return kills
+
+
+def _lines(report: Path) -> list[dict[str, Any]]:
+    whole = report.read_text().splitlines(keepends=True)
+    return [json.loads(line) for line in whole if line.endswith("\n")]
+
+
+def _row(
+    camera: LiveCamera,
+    kills: int,
+    lines: Sequence[dict[str, Any]],
+    ages_ms: Sequence[float],
+    usage: Any,
+) -> SourceRow:
+    acked = [line for line in lines if line["result"] == "acked"]
+    latency_ms = [line["latency_ms"] for line in acked]
+    reported = sum(line["capture_clock"] == "sender_report" for line in acked)
+    return SourceRow(
+        source=camera.kind,
+        seconds=camera.seconds,
+        kills=kills,
+        frames=len(lines),
+        acked=len(acked),
+        sender_report_percent=100 * reported / max(1, len(acked)),
+        ack_median_ms=float(np.percentile(latency_ms, 50)),
+        ack_p99_ms=float(np.percentile(latency_ms, 99)),
+        shown_median_ms=float(np.percentile(ages_ms, 50)),
+        shown_p99_ms=float(np.percentile(ages_ms, 99)),
+        agent_mb=_mean_mb(usage["agent"]),
+        agent_mb_per_minute=_slope(usage["agent"]),
+        server_mb=_mean_mb(usage["server"]),
+        server_mb_per_minute=_slope(usage["server"]),
+        threads_first=usage["agent"].samples[0].threads,
+        threads_last=usage["agent"].samples[-1].threads,
+    )
+
+
+def _settled(usage: Usage) -> Sequence[Any]:
+    return usage.samples[int(SETTLED * len(usage.samples)) :]
+
+
+def _mean_mb(usage: Usage) -> float:
+    return float(np.mean([sample.rss_mb for sample in _settled(usage)]))
+
+
+def _slope(usage: Usage) -> float:
+    return slope_per_minute(_settled(usage))
+
+
+MOST_SECONDS = 86_400.0
+
+
+@dataclass(frozen=True)
+class LiveJob:
+    """What is measured: see ``EvalLive``."""
+
+    cameras: tuple[int, ...]
+    hz: float
+    seconds: float
+    rounds: int
+    consumers: int
+    sources: tuple[str, ...]
+    source_seconds: float
+    kill_every_s: float
+    field: Path
+    drive: Path
+    work: Path
+    out: Path
+
+    def __post_init__(self) -> None:
+        check_result_path(self.out)
+        if any(not 1 <= count <= 64 for count in self.cameras):
+            raise InvalidInput("cameras", f"{self.cameras} are not all within 1..64")
+        for name in ("hz", "seconds", "source_seconds", "kill_every_s"):
+            if not 0 < getattr(self, name) <= MOST_SECONDS:
+                raise InvalidInput(name, f"{getattr(self, name):g} is outside 0..{MOST_SECONDS:g}")
+        if not 0 <= self.consumers <= 50:
+            raise InvalidInput("consumers", f"{self.consumers} is outside 0..50")
+        for kind in self.sources:
+            self.camera(kind)
+
+    def camera(self, kind: str) -> LiveCamera:
+        """Return a live camera of this job."""
+        folder = self.work / kind
+        return LiveCamera(kind, folder, self.source_seconds, self.kill_every_s)
+
+
+def run_live(job: LiveJob, console: Console) -> None:
+    """Measure every part that was asked for, print it, and write the result."""
+    bed = TwinBed(job.field, job.drive, job.work, job.hz, job.seconds)
+    ages: list[AgeRow] = []
+    for count in job.cameras:
+        ages.append(measure_age(bed, count))
+        print_live(console, ages[-1:])
+    ingest: list[IngestRow] = []
+    if job.rounds:
+        ingest.append(measure_ingest(bed, job.rounds, job.consumers))
+        print_live(console, ingest)
+    sources: list[SourceRow] = []
+    for kind in job.sources:
+        sources.append(measure_source(job.camera(kind), job.drive, job.field, job.work))
+        print_live(console, sources[-1:])
+    content = {"settings": asdict(job), "ages": ages, "ingest": ingest, "sources": sources}
+    write_result(job.out, make_result("live", provenance([job.field, job.drive]), content))

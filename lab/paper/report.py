@@ -1,0 +1,401 @@
+"""What the published experiment's rows say: means, savings frame by frame, and the page's section.
+
+The savings of a frame are its mean over presets and rate factors; spreads are over frames. Beside
+the published metric, which compares pictures of two contents and qualities, stands what a P picture
+takes of an I picture of the same frame at its quality.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from rfcore.errors import InvalidInput
+from rfedge.report.tables import heading, print_table, table
+from rfedge.results import Result, rows_of
+
+__all__ = [
+    "PaperMean",
+    "PaperRow",
+    "PaperTable",
+    "SettingColumns",
+    "means_of",
+    "paper_rows",
+    "paper_section",
+    "paper_tables",
+    "print_means",
+    "savings_by_frame",
+]
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """One frame coded after its render as the published two-frame clip, at one setting."""
+
+    field: str
+    """Name of the field; ``name:behind`` and ``name:grey`` are controls."""
+    scene: str
+    width: int
+    height: int
+    render: str
+    """``downscaled`` from the camera's size, as published, or ``native``: rendered at this one."""
+    preset: str
+    crf: float
+    frame: str
+    i_bytes: int
+    p_bytes: int
+    second_type: str
+    """``P``, unless x264 found an I picture cheaper."""
+    header_bytes: int
+    savings_percent: float
+    """100 I / (I + P)."""
+    i_psnr_db: float | None
+    """Of the I picture against the render; None where they are identical, as all PSNRs here."""
+    psnr_db: float | None
+    ssim: float
+    camera_i_bytes: int
+    """The camera frame coded by itself."""
+    camera_i_psnr_db: float | None
+    rf_psnr_db: float
+    """Of the render against the camera, as ``rf_ssim``, ``rf_residual_bands`` and ``rf_flip``."""
+    rf_ssim: float
+    rf_residual_bands: Sequence[float]
+    """Energy of the difference over the camera's, by band of spatial frequency."""
+    rf_flip: float | None = None
+    """Of neither controls nor native renders."""
+
+    @staticmethod
+    def of(row: Mapping[str, Any]) -> PaperRow:
+        """Return what ``published_rows`` yields, with None for an infinite PSNR."""
+        values = {
+            name: None if isinstance(value, float) and math.isinf(value) else value
+            for name, value in row.items()
+        }
+        (made,) = rows_of(PaperRow, [values])
+        return made
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.width, self.height
+
+    @property
+    def is_control(self) -> bool:
+        """Whether the render knows nothing of the place."""
+        return ":" in self.field
+
+
+@dataclass(frozen=True)
+class SettingColumns:
+    """What ``PaperRow`` says of each frame at one preset and CRF, in the order of the frames."""
+
+    preset: str
+    crf: float
+    i_bytes: Sequence[int]
+    p_bytes: Sequence[int]
+    second_types: str
+    """A letter a frame."""
+    header_bytes: Sequence[int]
+    i_psnr_db: Sequence[float | None]
+    psnr_db: Sequence[float | None]
+    ssim: Sequence[float]
+    camera_i_bytes: Sequence[int]
+    camera_i_psnr_db: Sequence[float | None]
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """The rows of one field, scene, size and way of rendering as the result file has them.
+
+    A row for each of 144 frames and nine settings would take ten times as much. Rounded: decibels
+    to hundredths, other shares to five decimals; savings are left out, bytes say them.
+    """
+
+    field: str
+    scene: str
+    width: int
+    height: int
+    render: str
+    frames: Sequence[str]
+    rf_psnr_db: Sequence[float]
+    rf_ssim: Sequence[float]
+    rf_residual_bands: Sequence[Sequence[float]]
+    settings: Sequence[SettingColumns]
+    rf_flip: Sequence[float] | None = None
+
+
+OF_A_SETTING = (
+    "header_bytes",
+    "i_psnr_db",
+    "psnr_db",
+    "ssim",
+    "camera_i_bytes",
+    "camera_i_psnr_db",
+)
+"""Columns whose values are those of the rows, rounded, beside bytes and types of the pictures."""
+
+
+def paper_tables(rows: Sequence[PaperRow]) -> list[PaperTable]:
+    """Return rows as tables; raise ``InvalidInput`` where a setting lacks a frame of its table."""
+    return [_table_of(group) for group in _groups(rows)]
+
+
+def paper_rows(result: Result) -> list[PaperRow]:
+    """Return the rows of a result of ``rfedge-lab paper``."""
+    if "rows" in result:  # older files
+        return rows_of(PaperRow, result["rows"])
+    return [row for table in rows_of(PaperTable, result["tables"]) for row in _rows_of_table(table)]
+
+
+def _groups(rows: Sequence[PaperRow]) -> list[list[PaperRow]]:
+    """Return rows by field, scene, size and way of rendering, in the order of the first of each."""
+    groups: dict[tuple[Any, ...], list[PaperRow]] = {}
+    for row in rows:
+        groups.setdefault((row.field, row.scene, row.size_px, row.render), []).append(row)
+    return list(groups.values())
+
+
+def _table_of(group: Sequence[PaperRow]) -> PaperTable:
+    first, by_setting = group[0], dict[tuple[str, float], list[PaperRow]]()
+    for row in group:
+        by_setting.setdefault((row.preset, row.crf), []).append(row)
+    of_frames = next(iter(by_setting.values()))
+    frames = [row.frame for row in of_frames]
+    for setting, rows in by_setting.items():
+        if [row.frame for row in rows] != frames:
+            raise InvalidInput("rows", f"{setting} of {first.field} has other frames than the rest")
+    return PaperTable(
+        field=first.field,
+        scene=first.scene,
+        width=first.width,
+        height=first.height,
+        render=first.render,
+        frames=frames,
+        rf_psnr_db=_rounded(of_frames, "rf_psnr_db"),
+        rf_ssim=_rounded(of_frames, "rf_ssim"),
+        rf_residual_bands=[[round(band, 5) for band in r.rf_residual_bands] for r in of_frames],
+        rf_flip=None if first.rf_flip is None else _rounded(of_frames, "rf_flip"),
+        settings=[_columns_of(rows) for rows in by_setting.values()],
+    )
+
+
+def _columns_of(rows: Sequence[PaperRow]) -> SettingColumns:
+    return SettingColumns(
+        preset=rows[0].preset,
+        crf=rows[0].crf,
+        i_bytes=[row.i_bytes for row in rows],
+        p_bytes=[row.p_bytes for row in rows],
+        second_types="".join(row.second_type for row in rows),
+        **{name: _rounded(rows, name) for name in OF_A_SETTING},
+    )
+
+
+def _rounded(rows: Sequence[PaperRow], name: str) -> list[Any]:
+    digits = 2 if name.endswith("_db") else 5
+    values = [getattr(row, name) for row in rows]
+    return [round(value, digits) if isinstance(value, float) else value for value in values]
+
+
+def _rows_of_table(table: PaperTable) -> list[PaperRow]:
+    rows = []
+    for setting in rows_of(SettingColumns, cast("Sequence[Mapping[str, Any]]", table.settings)):
+        for n, frame in enumerate(table.frames):
+            i_bytes, p_bytes = setting.i_bytes[n], setting.p_bytes[n]
+            rows.append(
+                PaperRow(
+                    field=table.field,
+                    scene=table.scene,
+                    width=table.width,
+                    height=table.height,
+                    render=table.render,
+                    preset=setting.preset,
+                    crf=setting.crf,
+                    frame=frame,
+                    i_bytes=i_bytes,
+                    p_bytes=p_bytes,
+                    second_type=setting.second_types[n],
+                    savings_percent=100.0 * i_bytes / (i_bytes + p_bytes),
+                    rf_psnr_db=table.rf_psnr_db[n],
+                    rf_ssim=table.rf_ssim[n],
+                    rf_residual_bands=table.rf_residual_bands[n],
+                    rf_flip=None if table.rf_flip is None else table.rf_flip[n],
+                    **{name: getattr(setting, name)[n] for name in OF_A_SETTING},
+                )
+            )
+    return rows
+
+
+@dataclass(frozen=True)
+class PaperMean:
+    """Means over frames for one field, scene, size and way of rendering.
+
+    ``ci95_percent`` is that of a normal mean. A P picture that x264 made an I picture counts as it
+    is; ``second_not_p`` is the share of such clips.
+    """
+
+    field: str
+    scene: str
+    size_px: tuple[int, int]
+    making: str
+    frames: int
+    savings_percent: float
+    sd_percent: float
+    ci95_percent: float
+    against_intra_percent: float | None
+    """What P pictures at the middle CRF take more than I pictures of the same frames and PSNR."""
+    rf_psnr_db: float
+    rf_ssim: float
+    rf_flip: float | None
+    bands: tuple[float, ...]
+    second_not_p: float
+
+
+def means_of(rows: Sequence[PaperRow]) -> list[PaperMean]:
+    """Return a mean for every combination there is, in the order of the rows."""
+    return [_mean(group) for group in _groups(rows)]
+
+
+def savings_by_frame(
+    rows: Sequence[PaperRow], field: str, scene: str
+) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """Return for each size the savings of every frame, rendered as published, in frame order.
+
+    Raises ``InvalidInput`` without rows of this field and scene.
+    """
+    wanted = (field, scene, "downscaled")
+    kept = [row for row in rows if (row.field, row.scene, row.render) == wanted]
+    if not kept:
+        raise InvalidInput("rows", f"there is none of field {field!r} in scene {scene!r}")
+    sizes = dict.fromkeys(row.size_px for row in kept)
+    return {
+        size: _by_frame([(r.frame, r.savings_percent) for r in kept if r.size_px == size])
+        for size in sizes
+    }
+
+
+def _mean(group: Sequence[PaperRow]) -> PaperMean:
+    first = group[0]
+    savings = _by_frame([(row.frame, row.savings_percent) for row in group])
+    sd = float(np.std(savings, ddof=1)) if len(savings) > 1 else 0.0
+    flips = [(row.frame, row.rf_flip) for row in group if row.rf_flip is not None]
+    return PaperMean(
+        field=first.field,
+        scene=first.scene,
+        size_px=first.size_px,
+        making=first.render,
+        frames=len(savings),
+        savings_percent=float(np.mean(savings)),
+        sd_percent=sd,
+        ci95_percent=1.96 * sd / len(savings) ** 0.5,
+        against_intra_percent=_against_intra_percent(group),
+        rf_psnr_db=float(np.mean(_by_frame([(row.frame, row.rf_psnr_db) for row in group]))),
+        rf_ssim=float(np.mean(_by_frame([(row.frame, row.rf_ssim) for row in group]))),
+        rf_flip=float(np.mean(_by_frame(flips))) if flips else None,
+        bands=tuple(np.mean([row.rf_residual_bands for row in group], axis=0).tolist()),
+        second_not_p=float(np.mean([row.second_type != "P" for row in group])),
+    )
+
+
+def _against_intra_percent(group: Sequence[PaperRow]) -> float | None:
+    """Geometric mean over frames and presets; I pictures are interpolated between their CRFs, never
+    beyond: None where no P picture's PSNR lies within theirs."""
+    clips = dict[tuple[str, str], list[PaperRow]]()
+    for row in group:
+        clips.setdefault((row.frame, row.preset), []).append(row)
+    logs = [log for rows in clips.values() if (log := _log_against_intra(rows)) is not None]
+    return 100 * math.expm1(float(np.mean(logs))) if logs else None
+
+
+def _log_against_intra(rows: Sequence[PaperRow]) -> float | None:
+    rows = sorted(rows, key=lambda row: row.crf)
+    coded = rows[len(rows) // 2]
+    intra = sorted(
+        (row.camera_i_psnr_db, math.log(row.camera_i_bytes))
+        for row in rows
+        if row.camera_i_psnr_db is not None
+    )
+    if coded.psnr_db is None or not intra or not intra[0][0] <= coded.psnr_db <= intra[-1][0]:
+        return None
+    qualities_db, log_bytes = np.array(intra).T
+    return math.log(coded.p_bytes) - float(np.interp(coded.psnr_db, qualities_db, log_bytes))
+
+
+def _by_frame(values: Sequence[tuple[str, float]]) -> NDArray[np.float64]:
+    """Return the mean of each frame's values, in the order of the frames."""
+    frames: dict[str, list[float]] = {}
+    for frame, value in values:
+        frames.setdefault(frame, []).append(value)
+    return np.array([np.mean(of_frame) for of_frame in frames.values()])
+
+
+COLUMNS = (
+    "field",
+    "scene",
+    "size",
+    "render",
+    "frames",
+    "100 I/(I+P) %",
+    "sd",
+    "95 %",
+    "P against I of its PSNR %",
+    "RF dB",
+    "SSIM",
+    "LPIPS",
+    "FLIP",
+    "residual by band",
+)
+PRINTED = (*COLUMNS[:4], *COLUMNS[5:11], "FLIP")
+
+
+def paper_section(path: Path, result: Result) -> str:
+    """Return the published experiment's table; means over presets and CRFs, then over frames."""
+    means = means_of(paper_rows(result))
+    rows = [
+        [
+            *_cells(mean)[:4],
+            str(mean.frames),
+            *_cells(mean)[4:],
+            "n/a",
+            _flip(mean),
+            " / ".join(f"{ratio:.2f}" for ratio in mean.bands),
+        ]
+        for mean in means
+    ]
+    bands = ", ".join("{:.3g}..{:.3g}".format(*band) for band in result["bands_cycles_per_px"])
+    note = (
+        "`name:behind` and `name:grey` are controls (medium, CRF 23). Residual: luma energy of "
+        f"camera - render over the camera's, by cycles a pixel {bands}. LPIPS {result['lpips']}."
+    )
+    return "\n\n".join([heading(path, result), table(COLUMNS, rows), note, ""])
+
+
+def print_means(console: Console, rows: Sequence[PaperRow]) -> None:
+    """Print the means with their spread, and the quality of the render itself."""
+    cells = [[*_cells(mean), _flip(mean)] for mean in means_of(rows)]
+    print_table(console, "Published metric, means over frames", PRINTED, cells)
+
+
+def _cells(mean: PaperMean) -> list[str]:
+    return [
+        mean.field,
+        mean.scene,
+        "{}x{}".format(*mean.size_px),
+        mean.making,
+        f"{mean.savings_percent:.1f}",
+        f"{mean.sd_percent:.1f}",
+        f"±{mean.ci95_percent:.1f}",
+        "-" if mean.against_intra_percent is None else f"{mean.against_intra_percent:+.1f}",
+        f"{mean.rf_psnr_db:.2f}",
+        f"{mean.rf_ssim:.3f}",
+    ]
+
+
+def _flip(mean: PaperMean) -> str:
+    return "-" if mean.rf_flip is None else f"{mean.rf_flip:.3f}"

@@ -1,0 +1,443 @@
+"""The published experiment over drives and fields: one result file, its figures and their numbers.
+
+Cells are one frame at one size; their rows run over presets and rate factors. Two controls stand
+beside every field, as render: ``grey`` knows nothing, ``behind`` is the field itself seen in the
+opposite direction, the right kind of picture of the wrong place. They are rendered at the size they
+are coded at, and at the largest of several sizes not at all: a hash grid takes long there.
+
+The experiment as published, frame by frame: rows as its tables need them.
+
+``published_rows`` codes the two-frame clip of ``rfedge.evaluate.savings`` at every size,
+preset and CRF; the camera frame alone, coded the same way, says what an I picture of it costs.
+Nothing here is our own coding. PSNR and SSIM are of RGB, without the encoder's padding.
+``downscaled`` renders and frames are made at the drive's size and reduced together, as published;
+``native`` renders are made at the small size, which is what a vehicle would do.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache, partial
+from pathlib import Path
+from time import monotonic
+from typing import Any, Literal
+
+import numpy as np
+from rich.console import Console
+
+from lab.paper.report import PaperRow, paper_tables
+from rfcore.camera import Camera, Pose
+from rfcore.codec.h264.config import CodecConfig, effort_of_preset
+from rfcore.codec.h264.ffmpeg import decode_clip
+from rfcore.dataset import read_dataset
+from rfcore.errors import InvalidInput
+from rfcore.extras import needs, require
+from rfcore.field import RadianceField
+from rfcore.image import I420, Rgb
+from rfcore.metrics import psnr
+from rfcore.native.yuv import i420_from_rgb, rgb_from_i420
+from rfcore.views import PosedPicture
+from rfedge.arguments import open_field
+from rfedge.evaluate.cells import (
+    CellStore,
+    Rows,
+    check_processes,
+    each_done,
+    program_version,
+)
+from rfedge.evaluate.picture_quality import (
+    BANDS,
+    RenderQuality,
+    colour_ssim,
+    flip,
+    render_quality,
+)
+from rfedge.evaluate.savings import (
+    intra_alone,
+    published_clip,
+    savings_of_clip,
+    slice_nals,
+)
+from rfedge.results import check_result_path, make_result, provenance, write_result
+
+with needs("eval"):
+    import cv2
+
+__all__ = [
+    "PUBLISHED_CRFS",
+    "PUBLISHED_PRESETS",
+    "PaperJob",
+    "PublishedFrame",
+    "Setting",
+    "named_path",
+    "published_rows",
+    "reduced",
+    "run_paper",
+    "views_of",
+]
+
+
+PUBLISHED_PRESETS = ("veryslow", "medium", "veryfast")
+PUBLISHED_CRFS = (18.0, 23.0, 28.0)
+Size = tuple[int, int]
+Making = Literal["downscaled", "native"]
+Alone = dict[tuple[Size, str, float], tuple[int, float]]
+"""Slice bytes and PSNR in dB, by size, preset and CRF."""
+
+
+@dataclass(frozen=True)
+class PublishedFrame:
+    """A camera frame, and how its render is made for a size: uint8 RGB [H, W, 3].
+
+    ``alone``: what the camera frame takes coded by itself, kept for its other fields and controls.
+    """
+
+    name: str
+    camera: Rgb
+    render: Callable[[Size, Making], Rgb]
+    alone: Alone = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One combination of what the published averages run over."""
+
+    size_px: Size
+    making: Making
+    preset: str
+    crf: float
+
+
+def published_rows(frame: PublishedFrame, settings: Sequence[Setting]) -> Iterator[dict[str, Any]]:
+    """Yield a row per setting. Raises ``InvalidInput`` for a size larger than the frame."""
+    pairs: dict[tuple[Size, Making], _Pair] = {}
+    alone = frame.alone
+    for setting in settings:
+        made = (setting.size_px, setting.making)
+        if made not in pairs:
+            pairs[made] = _pair(frame, *made)
+        camera, render, quality = pairs[made]
+        coding = (setting.size_px, setting.preset, setting.crf)
+        if coding not in alone:
+            alone[coding] = _alone(camera, setting)
+        yield {
+            "width": setting.size_px[0],
+            "height": setting.size_px[1],
+            "render": setting.making,
+            "preset": setting.preset,
+            "crf": setting.crf,
+            "frame": frame.name,
+            **_coded(camera, render, setting),
+            "camera_i_bytes": alone[coding][0],
+            "camera_i_psnr_db": alone[coding][1],
+            "rf_psnr_db": quality.psnr_db,
+            "rf_ssim": quality.ssim,
+            "rf_residual_bands": list(quality.bands),
+        }
+
+
+_Pair = tuple[Rgb, Rgb, RenderQuality]
+
+
+def _pair(frame: PublishedFrame, size_px: Size, making: Making) -> _Pair:
+    camera, render = reduced(frame.camera, size_px), frame.render(size_px, making)
+    return camera, render, render_quality(render, camera)
+
+
+def _alone(camera: Rgb, setting: Setting) -> tuple[int, float]:
+    """Return slice bytes and PSNR of the camera frame coded by itself."""
+    unit = intra_alone(i420_from_rgb(camera), setting.preset, setting.crf)
+    shown = rgb_from_i420(_decoded((unit,), setting)[0])
+    return sum(map(len, slice_nals(unit))), psnr(shown, camera)
+
+
+def reduced(picture: Rgb, size_px: Size) -> Rgb:
+    """Return the picture at a smaller size, each pixel the mean of the area it covers."""
+    height, width = picture.shape[:2]
+    if size_px == (width, height):
+        return picture
+    if size_px[0] > width or size_px[1] > height:
+        raise InvalidInput("size", f"{size_px} px is larger than the frame's {(width, height)} px")
+    smaller: Rgb = cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    return smaller
+
+
+def _coded(camera: Rgb, render: Rgb, setting: Setting) -> dict[str, Any]:
+    frame, reference = i420_from_rgb(camera), i420_from_rgb(render)
+    clip = published_clip(frame, reference, setting.preset, setting.crf)
+    sizes = savings_of_clip(clip)
+    first, second = (rgb_from_i420(picture) for picture in _decoded(clip, setting))
+    return {
+        "i_bytes": sizes.i_bytes,
+        "p_bytes": sizes.p_bytes,
+        "second_type": sizes.second_type,
+        "header_bytes": sum(map(len, clip)) - sizes.i_bytes - sizes.p_bytes,
+        "savings_percent": sizes.percent,
+        "i_psnr_db": psnr(first, render),
+        "psnr_db": psnr(second, camera),
+        "ssim": colour_ssim(second, camera),
+    }
+
+
+def _decoded(clip: Sequence[bytes], setting: Setting) -> list[I420]:
+    config = CodecConfig(*setting.size_px, effort_of_preset(setting.preset), setting.crf)
+    return [p.cropped(setting.size_px) for p in decode_clip(config.coded_size_px, clip)]
+
+
+CONTROL_PRESET, CONTROL_CRF = "medium", 23.0
+TURNED_ROUND = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+"""Half a turn about the camera's vertical axis."""
+QUICK_FRAMES = 2
+
+
+@dataclass(frozen=True)
+class PaperJob:
+    """What to run; see ``rfedge-lab paper --help``. ``fields`` and ``drives`` are NAME=PATH."""
+
+    fields: tuple[str, ...]
+    drives: tuple[str, ...]
+    sizes_px: tuple[Size, ...]
+    out: Path
+    cells: Path
+    every: int = 1
+    quick: bool = False
+    processes: int = 1
+
+    def __post_init__(self) -> None:
+        check_result_path(self.out)
+        if not (self.fields and self.drives and self.sizes_px):
+            raise InvalidInput("paper", "needs at least one field, one drive and one size")
+        check_processes(self.processes)
+        if self.every < 1:
+            raise InvalidInput("every", f"{self.every} must be at least 1")
+
+
+@dataclass(frozen=True, eq=False)
+class DriveFrame:
+    """One frame of one drive, with what its fields and sizes share."""
+
+    scene: str
+    picture: PosedPicture
+    alone: Alone = field(default_factory=dict)
+
+    @cached_property
+    def digest(self) -> str:
+        """Of pixels and camera."""
+        pose = repr(self.picture.camera).encode()
+        return hashlib.sha256(_pixels_of(self).tobytes() + pose).hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class NamedField:
+    """A field by its name in the result."""
+
+    name: str
+    field: RadianceField
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One frame of one drive, one field and one size; with controls beside it or without."""
+
+    source: DriveFrame
+    opened: NamedField
+    size_px: Size
+    controlled: bool
+
+
+def named_path(text: str) -> tuple[str, Path]:
+    """Return name and path of ``NAME=PATH``; raise ``InvalidInput`` for another form."""
+    name, equals, path = text.partition("=")
+    if not (name and equals and path):
+        raise InvalidInput("name", f"{text!r} is not NAME=PATH, as 3dgs=street.rff")
+    return name, Path(path)
+
+
+def run_paper(job: PaperJob, console: Console) -> dict[str, Any]:
+    """Run what is not there yet, write ``job.out`` and return its content.
+
+    Raises ``InvalidInput``, ``DatasetError`` or ``FieldFormatError`` before anything is coded if an
+    input is wrong.
+    """
+    require("eval", "flip_evaluator")
+    fields = _opened(job)
+    pieces = list(_pieces(job, fields))
+    store = CellStore(job.cells)
+    made = provenance(path for _, path in map(named_path, (*job.fields, *job.drives)))
+    pictures = _by_picture(job, pieces)
+    _say_cost(pictures, store, console, job.processes)
+    if job.processes > 1:
+        for _ in each_done(partial(_picture_done, job), range(len(pictures)), job.processes):
+            pass
+    rows = [row for piece in pieces for row in store.rows(_key(piece), _maker(piece))]
+    content = {
+        "quick": job.quick,
+        "field_ids": {opened.name: opened.field.field_id for opened in fields},
+        "lpips": "n/a: no weights",
+        "bands_cycles_per_px": BANDS,
+        "tables": paper_tables([PaperRow.of(row) for row in rows]),
+    }
+    result = make_result("paper", made, content)
+    write_result(job.out, result)
+    return result
+
+
+def _opened(job: PaperJob) -> list[NamedField]:
+    return [NamedField(name, open_field(path)) for name, path in map(named_path, job.fields)]
+
+
+def _picture_done(job: PaperJob, number: int) -> None:
+    """Have the rows of the job's picture of that number among the cells."""
+    _keep_rows(_pictures_of_process(job)[number], CellStore(job.cells))
+
+
+def _keep_rows(pieces: Sequence[Piece], store: CellStore) -> None:
+    for piece in pieces:
+        store.rows(_key(piece), _maker(piece))
+
+
+@lru_cache(maxsize=1)
+def _pictures_of_process(job: PaperJob) -> list[Sequence[Piece]]:
+    return _by_picture(job, list(_pieces(job, _opened(job))))
+
+
+def _by_picture(job: PaperJob, pieces: Sequence[Piece]) -> list[Sequence[Piece]]:
+    """Return the pieces of each picture, which follow one another: every field, every size."""
+    each = len(job.fields) * len(job.sizes_px)
+    return [pieces[first : first + each] for first in range(0, len(pieces), each)]
+
+
+def views_of(job: PaperJob) -> list[tuple[str, Rgb]]:
+    """Return the first frame of each drive as the camera has it and as each field renders it."""
+    views = []
+    for scene, path in map(named_path, job.drives):
+        picture = read_dataset(path).pictures[0]
+        views.append((f"{scene}: camera", picture.read()))
+        for name, field_path in map(named_path, job.fields):
+            views.append((f"{scene}: {name}", _render(open_field(field_path), picture.camera)))
+    return views
+
+
+def _pieces(job: PaperJob, fields: Sequence[NamedField]) -> Iterator[Piece]:
+    for scene, path in map(named_path, job.drives):
+        pictures = read_dataset(path).pictures[:: job.every]
+        pictures = pictures[: QUICK_FRAMES if job.quick else None]
+        for picture in pictures:
+            frame = DriveFrame(scene, picture)
+            for opened in fields:
+                for size_px in job.sizes_px:
+                    controlled = size_px != max(job.sizes_px) or len(job.sizes_px) == 1
+                    yield Piece(frame, opened, size_px, controlled)
+
+
+def _key(piece: Piece) -> dict[str, str | float | int | None]:
+    return {
+        "field": piece.opened.field.field_id,
+        "field_name": piece.opened.name,
+        "scene": piece.source.scene,
+        "frame": piece.source.picture.name,
+        "input": piece.source.digest,
+        "width": piece.size_px[0],
+        "height": piece.size_px[1],
+        "controlled": piece.controlled,
+        "program": program_version(),
+    }
+
+
+def _maker(piece: Piece) -> Any:
+    return lambda: list(_rows(piece))
+
+
+def _rows(piece: Piece) -> Iterator[dict[str, Any]]:
+    settings = [
+        Setting(piece.size_px, making, preset, crf)
+        for making in _makings(piece)
+        for preset in PUBLISHED_PRESETS
+        for crf in PUBLISHED_CRFS
+    ]
+    frame = _published_frame(piece, piece.source.picture.camera)
+    size_px = piece.size_px
+    difference = flip(frame.render(size_px, "downscaled"), reduced(frame.camera, size_px))
+    for row in _labelled(piece, piece.opened.name, frame, settings):
+        yield row if row["render"] == "native" else {**row, "rf_flip": difference}
+    if piece.controlled:
+        yield from _control_rows(piece)
+
+
+def _control_rows(piece: Piece) -> Iterator[dict[str, Any]]:
+    control = [Setting(piece.size_px, _makings(piece)[-1], CONTROL_PRESET, CONTROL_CRF)]
+    camera = piece.source.picture.camera
+    behind = Camera(camera.intrinsics, camera.world_from_cam.compose(TURNED_ROUND))
+    yield from _labelled(
+        piece, f"{piece.opened.name}:behind", _published_frame(piece, behind), control
+    )
+    grey = np.full((camera.intrinsics.height_px, camera.intrinsics.width_px, 3), 128, np.uint8)
+    without_field = PublishedFrame(
+        piece.source.picture.name,
+        _pixels_of(piece.source),
+        lambda size_px, _making: reduced(grey, size_px),
+        piece.source.alone,
+    )
+    yield from _labelled(piece, f"{piece.opened.name}:grey", without_field, control)
+
+
+def _makings(piece: Piece) -> Sequence[Making]:
+    k = piece.source.picture.camera.intrinsics
+    full = piece.size_px == (k.width_px, k.height_px)
+    return ("downscaled",) if full else ("downscaled", "native")
+
+
+def _labelled(piece: Piece, label: str, frame: PublishedFrame, settings: Sequence[Setting]) -> Rows:
+    return [
+        {"field": label, "scene": piece.source.scene, **row}
+        for row in published_rows(frame, settings)
+    ]
+
+
+def _published_frame(piece: Piece, camera: Camera) -> PublishedFrame:
+    def render(size_px: Size, making: Making) -> Rgb:
+        if making == "downscaled":
+            return reduced(_at_own_size(piece.opened, camera), size_px)
+        return _render(
+            piece.opened.field, Camera(camera.intrinsics.resized(*size_px), camera.world_from_cam)
+        )
+
+    source = piece.source
+    return PublishedFrame(source.picture.name, _pixels_of(source), render, source.alone)
+
+
+@lru_cache(maxsize=1)
+def _pixels_of(source: DriveFrame) -> Rgb:
+    """Return the camera's picture, read once for all fields and sizes that follow one another."""
+    return source.picture.read()
+
+
+@lru_cache(maxsize=1)
+def _at_own_size(opened: NamedField, camera: Camera) -> Rgb:
+    """Return the render that those at a frame's smaller sizes are made of."""
+    return _render(opened.field, camera)
+
+
+def _render(field: RadianceField, camera: Camera) -> Rgb:
+    colour = np.clip(field.render_colour(camera), 0, 1)
+    pixels: Rgb = np.floor(colour * 255 + 0.5).astype(np.uint8)
+    return pixels
+
+
+def _say_cost(
+    pictures: Sequence[Sequence[Piece]], store: CellStore, console: Console, processes: int
+) -> None:
+    """Do the first picture that is not whole, and say what the others will take.
+
+    A whole picture, for its sizes share what reading it and rendering it at full size take.
+    """
+    left = [pieces for pieces in pictures if not all(store.has(_key(piece)) for piece in pieces)]
+    estimate = "nothing left to do"
+    if left:
+        began_s = monotonic()
+        _keep_rows(left[0], store)
+        total_s = (monotonic() - began_s) * (len(left) - 1)
+        estimate = f"{len(left)} left, about {total_s / processes / 60:.1f} minutes"
+    console.print(f"{len(pictures)} pictures, {estimate}")

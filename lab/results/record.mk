@@ -1,0 +1,244 @@
+# What `rfedge eval` and `rfedge bench` record in results/, on a quiet machine from a committed revision:
+#     make results [DATA=FOLDER]         what takes two hours of two cores
+#     make results-full [DATA=FOLDER]    the rest, too, which takes days
+# DATA is a folder that has `street` (the yardstick), `kitti/city` and `kitti/loop` (docs/data.md); without it the
+# sample's drives are compared alone. What is there is not made again: a record is begun anew by deleting its file in
+# out/results. Faults, attacks and loads have targets of their own in the Makefile.
+OUT    ?= out/results
+RFEDGE ?= .venv/bin/rfedge
+LAB    ?= $(RFEDGE)-lab
+STREETGEN ?= $(dir $(RFEDGE))streetgen
+DATA   ?=
+SAMPLE := samples/fields/street.rff
+EMPTY    := samples/street/transforms_drive_empty.json
+VEHICLES := samples/street/transforms_drive_vehicles.json
+
+.DELETE_ON_ERROR:
+.SECONDARY:
+.PHONY: results results-full
+results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec slice-coder classes never-worse robust ladder latency compare compare-small)
+	cp $^ lab/results/
+results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long tail seams localise benchmark rig live world paper)
+	cp $(filter %.json,$^) lab/results/
+	$(MAKE) -f samples/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
+
+$(OUT):
+	mkdir -p $@
+
+# --- fields that do not ship
+
+# Of so many thousand splats, which few passes of a street pay for. A sky would take too many of them (docs/training.md).
+small = $(RFEDGE) train $1 --points $(dir $1)points.ply --held-out $2 --gaussians $$(($*000 * 3 / 4)) --limit $*000 --sh-degree 1 --antialiased \
+	--max-mb 1 --minutes 1.5 --out $@
+$(OUT)/sample-%k.rff: | $(OUT)
+	$(call small,samples/street/transforms_train.json,$(EMPTY))
+NGP := $(OUT)/street-ngp.rff
+$(NGP): | $(OUT)
+	$(RFEDGE) train samples/street/transforms_train.json --points samples/street/points.ply --held-out $(EMPTY) --kind ngp --minutes 10 --out $@
+ifneq ($(DATA),)
+YARD := $(DATA)/street
+LOOP := $(DATA)/kitti/loop
+CITY := $(DATA)/kitti/city
+trained = $(RFEDGE) train $1 --points $(dir $1)points.ply --held-out $2 --antialiased --minutes $3 $4 --out $@
+$(OUT)/yardstick.rff: | $(OUT)
+	$(call trained,$(YARD)/transforms_train.json,$(YARD)/transforms_drive_empty.json,5)
+$(OUT)/city.rff: | $(OUT)
+	$(call trained,$(CITY)/transforms_train.json,$(CITY)/transforms_drive.json,2.5)
+$(OUT)/loop.rff: | $(OUT)
+	$(call trained,$(LOOP)/transforms_first.json,$(LOOP)/transforms_second.json,12,--limit 400000)
+$(OUT)/yardstick-%k.rff: | $(OUT)
+	$(call small,$(YARD)/transforms_train.json,$(YARD)/transforms_drive_empty.json)
+FIELDS := $(patsubst %,$(OUT)/%.rff,yardstick city loop)
+# The second pass at poses that are found in the field of the first, the first of them without any start.
+LOOP_LENS = $$($(dir $(RFEDGE))python -c "import json; t = json.load(open('$(LOOP)/transforms_second.json')); print(*(t[k] for k in ('fl_x', 'fl_y', 'cx', 'cy')))")
+$(OUT)/loop-localised/transforms.json: $(OUT)/loop.rff
+	mkdir -p $(OUT)/loop-second && cp $(LOOP)/images/second_* $(OUT)/loop-second
+	$(RFEDGE) dataset poses $(OUT)/loop-second --register-to $< --camera-model PINHOLE --parameters $(LOOP_LENS) --up=-y --out $(@D)
+LOCALISED := kitti-loop-localised@10=$(OUT)/loop-localised/transforms.json,$(OUT)/loop.rff
+# One more drive of a single pass, of pictures alone: COLMAP poses every second one, then the others among them.
+RESIDENTIAL := $(OUT)/residential
+PINHOLE = --camera-model PINHOLE --parameters $$(awk '/^P2:/ {print $$2, $$7, $$4, $$8}' $(DATA)/kitti/residential/calib.txt)
+$(RESIDENTIAL)/map/transforms.json: | $(OUT)
+	mkdir -p $(RESIDENTIAL)/even $(RESIDENTIAL)/odd
+	cp $(DATA)/kitti/residential/image_2/*[02468].png $(RESIDENTIAL)/even
+	cp $(DATA)/kitti/residential/image_2/*[13579].png $(RESIDENTIAL)/odd
+	$(RFEDGE) dataset poses $(RESIDENTIAL)/even $(PINHOLE) --out $(@D)
+$(OUT)/residential.rff: $(RESIDENTIAL)/map/transforms.json
+	$(RFEDGE) train $< --points $(<D)/points.ply --antialiased --minutes 2.5 --out $@
+$(RESIDENTIAL)/drive/transforms.json: $(RESIDENTIAL)/map/transforms.json
+	$(RFEDGE) dataset poses $(RESIDENTIAL)/odd --register-to $(<D) --out $(@D)
+RESIDENTIAL_DRIVE := kitti-residential@5=$(RESIDENTIAL)/drive/transforms.json,$(OUT)/residential.rff
+endif
+
+# --- drives: through the sample's street under other circumstances, and of other people
+
+SCENES := $(OUT)/scenes
+drive = $(SCENES)/$1/transforms_drive.json
+COMMA := ,
+effects = (cat samples/street/empty.toml; echo; awk -v RS= -v ORS='\n\n' '/^\[effects$2/' samples/scenes/$1.toml) >$@
+lane = (cat samples/street/empty.toml; echo 'lane_offset_m = $1') >$@
+
+$(SCENES):
+	mkdir -p $@
+$(SCENES)/lane-%.toml: samples/street/empty.toml | $(SCENES)
+	$(call lane,$*)
+$(SCENES)/dusk.toml: samples/street/empty.toml | $(SCENES)
+	$(call effects,street-dusk)
+$(SCENES)/rain.toml: samples/street/empty.toml | $(SCENES)
+	$(call effects,street-rain)
+$(SCENES)/rolling-shutter.toml: samples/street/empty.toml | $(SCENES)
+	$(call effects,street-sensor,.rolling_shutter)
+$(SCENES)/exposure.toml: samples/street/empty.toml | $(SCENES)
+	$(call effects,street-sensor,.exposure)
+$(SCENES)/lens.toml: samples/street/empty.toml | $(SCENES)
+	$(call effects,street-sensor,.lens)
+$(SCENES)/people.toml: samples/street/people.toml | $(SCENES)
+	cp $< $@
+# At other rates and sizes, and no longer than latencies need.
+$(SCENES)/20hz.toml: samples/street/vehicles.toml | $(SCENES)
+	sed 's/^rate_hz.*/rate_hz = 20.0/; s/^duration_s.*/duration_s = 1.2/' $< >$@
+$(SCENES)/vehicles-30hz.toml: samples/street/vehicles.toml | $(SCENES)
+	sed 's/^rate_hz.*/rate_hz = 30.0/; s/^duration_s.*/duration_s = 0.8/' $< >$@
+$(SCENES)/vehicles-720p.toml: samples/street/vehicles.toml | $(SCENES)
+	sed 's/^size_px.*/size_px = [1280, 720]/; s/^duration_s.*/duration_s = 1.2/' $< >$@
+$(SCENES)/vehicles-720p-30hz.toml: $(SCENES)/vehicles-30hz.toml
+	sed 's/^size_px.*/size_px = [1280, 720]/; s/^duration_s.*/duration_s = 0.4/' $< >$@
+$(SCENES)/vehicles-%/transforms_drive.json: $(SCENES)/vehicles-%.toml
+	$(STREETGEN) build $< --split drive --spp 9 --out $(@D)
+$(SCENES)/%/transforms_drive.json: $(SCENES)/%.toml
+	$(STREETGEN) build $< --split drive --out $(@D)
+
+# Through a lens, as a vehicle codes it.
+UNDISTORTED := $(SCENES)/undistorted/transforms.json
+$(UNDISTORTED): $(call drive,lens)
+	$(RFEDGE) dataset convert $< --out $(@D)
+
+HARDER := lane-0.6 lane-1.5 dusk rain rolling-shutter exposure people vehicles-720p
+HARDER_DRIVES := $(foreach name,$(HARDER) 20hz,$(call drive,$(name))) $(UNDISTORTED)
+
+NOON := sample-empty@10=$(EMPTY) sample-vehicles@10=$(VEHICLES)
+REAL := $(if $(DATA),kitti-loop@10=$(LOOP)/transforms_second.json$(COMMA)$(OUT)/loop.rff \
+	kitti-city@5=$(CITY)/transforms_drive.json$(COMMA)$(OUT)/city.rff)
+YARDSTICK := $(if $(DATA),yardstick-empty@10=$(YARD)/transforms_drive_empty.json$(COMMA)$(OUT)/yardstick.rff \
+	yardstick-vehicles@10=$(YARD)/transforms_drive_vehicles.json$(COMMA)$(OUT)/yardstick.rff)
+YARDSTICK_30 := $(if $(DATA),yardstick-empty@30=$(YARD)/transforms_drive30_empty.json$(COMMA)$(OUT)/yardstick.rff \
+	yardstick-vehicles@30=$(YARD)/transforms_drive30_vehicles.json$(COMMA)$(OUT)/yardstick.rff)
+NOISY := sample-vehicles@10=$(VEHICLES)$(COMMA)noise=1.5 sample-vehicles@10=$(VEHICLES)$(COMMA)noise=3 \
+	$(if $(DATA),yardstick-vehicles@10=$(YARD)/transforms_drive_vehicles.json$(COMMA)$(OUT)/yardstick.rff$(COMMA)noise=3)
+
+# --- records
+
+$(OUT)/bench-%.json: | $(OUT)
+	$(RFEDGE) bench $* --json $@
+$(OUT)/bench-gpu.json: | $(OUT)  # on PoCL where there is no other OpenCL
+	$(RFEDGE) bench raster --rows native --isa opencl --json $@
+# What a machine with a GPU carries, with and without it: a server's vehicles, and both ends of one vehicle. Sixteen
+# workers' memory takes half a minute to settle.
+LOADTEST = $(RFEDGE) loadtest --record $@ --duration 15 --warm-up 30 --workers $(shell nproc)
+$(OUT)/load-gpu.json: $(call drive,vehicles-720p) | $(OUT)
+	for renderer in opencl cpu; do \
+		$(LOADTEST) --renderer $$renderer --vehicles 12 --find-limit --out $(OUT)/load-gpu/limit-$$renderer || exit; \
+	done
+	for hz in 10 30; do for renderer in opencl cpu; do \
+		$(LOADTEST) --renderer $$renderer --threads 4 --vehicles 1 --live --drive $< --hz $$hz --out $(OUT)/load-gpu/live-$$renderer || true; \
+	done; done
+$(OUT)/slice-coder.json: $(FIELDS) | $(OUT)
+	$(LAB) slice-coder $(NOON) sample-vehicles@10=$(VEHICLES),noise=3 $(REAL) $(wordlist 2,2,$(YARDSTICK)) \
+		$(wordlist 2,2,$(YARDSTICK_30)) --out $@
+$(OUT)/compare.json: $(FIELDS) $(if $(DATA),$(OUT)/loop-localised/transforms.json) | $(OUT)
+	$(RFEDGE) eval compare $(SAMPLE) $(NOON) $(REAL) $(LOCALISED) $(YARDSTICK) --background sample-vehicles@10=$(EMPTY) \
+		$(if $(DATA),yardstick-vehicles@10=$(YARD)/transforms_drive_empty.json) \
+		--processes $(shell nproc) --cells $(OUT)/compare --out $@
+$(OUT)/compare-harder.json: $(HARDER_DRIVES) $(FIELDS) $(if $(DATA),$(RESIDENTIAL)/drive/transforms.json $(OUT)/residential.rff) | $(OUT)
+	$(RFEDGE) eval compare $(SAMPLE) $(NOISY) $(YARDSTICK_30) \
+		sample-vehicles@20=$(call drive,20hz) sample-lens@10=$(UNDISTORTED) $(RESIDENTIAL_DRIVE) \
+		$(foreach name,$(HARDER),sample-$(name)@10=$(call drive,$(name))) \
+		--background sample-people@10=$(EMPTY) \
+		--processes $(shell nproc) --cells $(OUT)/compare --out $@
+$(OUT)/compare-small.json: $(foreach k,30 60,$(OUT)/sample-$(k)k.rff $(if $(DATA),$(OUT)/yardstick-$(k)k.rff)) | $(OUT)
+	$(RFEDGE) eval compare $(SAMPLE) --rivals x264-our-tools-medium --processes $(shell nproc) --cells $(OUT)/compare --out $@ \
+		$(foreach k,30 60,$(foreach drive,$(NOON),$(drive)$(COMMA)$(OUT)/sample-$(k)k.rff) \
+			$(if $(DATA),$(foreach of,empty vehicles,yardstick-$(of)@30=$(YARD)/transforms_drive30_$(of).json$(COMMA)$(OUT)/yardstick-$(k)k.rff)))
+$(OUT)/classes.json: $(call drive,people) | $(OUT)
+	$(LAB) classes $(SAMPLE) people@10=$< --cells $(OUT)/classes --out $@
+$(OUT)/never-worse.json: | $(OUT)
+	$(RFEDGE) eval never-worse $(SAMPLE) $(NOON) --decimated $(NOON) --cells $(OUT)/never-worse --out $@
+# Ten pictures a second do not tell apart round trips that are shorter than 100 ms.
+$(OUT)/robust.json: $(call drive,dusk) $(call drive,lane-0.6) | $(OUT)
+	$(LAB) robust --dusk dusk@10=$< --lane lane-0.6@10=$(word 2,$^) --rtts-ms 50 250 --seeds 20 --processes $(shell nproc) \
+		--cells $(OUT)/robust --out $@
+# Loss with a hundred seeds, over half a minute of the street: 300 frames, small, for it is hours of a core.
+LONG := $(SCENES)/long/transforms_drive.json
+$(LONG): samples/localise/drive_30s.toml | $(SCENES)
+	$(STREETGEN) build $< --split drive --size 320x180 --spp 9 --out $(@D)
+$(OUT)/robust-long.json: $(LONG) | $(OUT)
+	$(LAB) robust $(SAMPLE) long@10=$< --frames 300 --seeds 100 --rtts-ms 50 --processes $(shell nproc) --cells $(OUT)/robust --out $@
+$(OUT)/ladder.json: $(NGP) | $(OUT)
+	$(RFEDGE) eval ladder $(SAMPLE) $(NGP) --frames 8 --cells $(OUT)/ladder --out $@
+FASTER := vehicles-30hz vehicles-720p vehicles-720p-30hz
+$(OUT)/latency.json: $(foreach name,$(FASTER),$(call drive,$(name))) | $(OUT)
+	$(LAB) latency $(SAMPLE) $(subst sample-,,$(NOON)) vehicles@30=$(call drive,vehicles-30hz) \
+		vehicles-720p@10=$(call drive,vehicles-720p) vehicles-720p@30=$(call drive,vehicles-720p-30hz) --cells $(OUT)/latency --out $@
+$(OUT)/tail.json: | $(OUT)
+	$(LAB) tail --processes $(shell nproc) --cells $(OUT)/tail --out $@
+# The sample's street as one field, and cut into two tiles of half its splats each.
+SEAMS := $(OUT)/seams
+SEAMS_TRAIN := --iterations 4000 --sh-degree 1 --antialiased
+$(SEAMS):
+	mkdir -p $@
+$(SEAMS)/split: | $(SEAMS)
+	$(RFEDGE) dataset split samples/street/transforms_train.json --length 50 --overlap 12 --out $@
+$(SEAMS)/fields: $(SEAMS)/split
+	$(RFEDGE) train $< --limit 140000 $(SEAMS_TRAIN) --out $@
+$(SEAMS)/whole.rff: | $(SEAMS)
+	$(RFEDGE) train samples/street/transforms_train.json --points samples/street/points.ply --limit 280000 $(SEAMS_TRAIN) --out $@
+$(OUT)/seams.json: $(SEAMS)/whole.rff $(SEAMS)/split $(SEAMS)/fields
+	$(LAB) seams $(wordlist 1,2,$^) sample-empty@10=$(EMPTY) --fields $(SEAMS)/fields --cells $(OUT)/seams/cells --out $@
+# Every kind of start and error in the empty street, here and on drives of others; elsewhere the usual start alone.
+ROWS := $(COMMA)rows=2m:3deg
+PLACES := sample=$(EMPTY),$(SAMPLE) $(if $(DATA),\
+	yardstick=$(YARD)/transforms_drive30_empty.json$(COMMA)$(OUT)/yardstick.rff$(COMMA)hz=30$(COMMA)frames=72 \
+	city=$(CITY)/transforms_drive.json$(COMMA)$(OUT)/city.rff$(COMMA)hz=5$(COMMA)frames=60$(COMMA)units=0.17 \
+	loop=$(LOOP)/transforms_second.json$(COMMA)$(OUT)/loop.rff$(COMMA)feed=$(LOOP)/official_second.txt$(COMMA)feed_map=$(LOOP)/official_first.txt$(COMMA)map=$(LOOP)/transforms_first.json)
+STRANGERS := $(if $(DATA),--strangers $(DATA)/fox/transforms.json $(DATA)/kitti/residential)
+$(OUT)/localise.json: $(call drive,dusk) $(call drive,lane-1.5) $(FIELDS) | $(OUT)
+	$(LAB) localise $(PLACES) vehicles=$(VEHICLES),$(SAMPLE)$(ROWS) noise=$(EMPTY),$(SAMPLE),noise=3$(ROWS) \
+		dusk=$(call drive,dusk),$(SAMPLE)$(ROWS) lane=$(call drive,lane-1.5),$(SAMPLE)$(ROWS) \
+		--tries 100 --false-starts 50 --seed 2 $(STRANGERS) --cells $(OUT)/localise --out $@
+$(OUT)/rig.json: $(OUT)/rig/rig.toml $(OUT)/rig18/rig.toml
+	$(LAB) rig --rig $(OUT)/rig --many $(OUT)/rig18 --link-bps 300000 --rate 2 --max-delay-ms 2500 --work $(OUT)/rig-work --out $@
+$(OUT)/rig/rig.toml: | $(OUT)
+	$(STREETGEN) build samples/street/vehicles.toml --split rig --spp 9 --out $(@D)
+$(OUT)/rig18/rig.toml: | $(OUT)
+	$(STREETGEN) build samples/street/vehicles.toml --split rig --rig all --size 300x168 --spp 9 --frames 0:72 --out $(@D)
+$(OUT)/live.json: | $(OUT)
+	$(LAB) live --cameras 1 4 8 --hz 1 --rounds 2 --work $(OUT)/live --out $@
+$(OUT)/world.json: | $(OUT)
+	$(LAB) world --work $(OUT)/world --out $@
+BENCH := $(dir $(RFEDGE))python examples/bench_rfedge.py
+$(OUT)/benchmark:
+	$(LAB) benchmark run $@ --name rfedge --points 17 20 23 26 29 32 35 38 41 --prior $(SAMPLE) \
+		--method "$(BENCH) encode {prior}/street.rff {frames} {out} {point}"
+$(OUT)/benchmark.json: $(OUT)/benchmark
+	$(LAB) benchmark check $< --decoder "$(BENCH) decode {prior}/street.rff {packets} {out}" --out $@
+
+# --- the published experiment whole: 144 poses, two scenes, two fields of that very street
+# Nine samples a pixel and the denoiser: 13 to 40 s a picture of two cores, 1.1 to 3.3 hours for 288, and minutes with
+# CUDA and sixteen cores. Trained on as many views as cover the street as densely as a car's cameras do; the recorded
+# hash grid on larger ones, for 9.1 minutes of eight cores.
+
+PAPER := $(OUT)/paper-street
+$(PAPER)/street-empty.toml: samples/scenes/street-empty.toml
+	mkdir -p $(@D) && sed 's/^views.*/views = 720/' $< >$@
+$(PAPER)/train-%/transforms_train.json: $(PAPER)/street-empty.toml
+	$(STREETGEN) build $< --split train --size $* --spp 9 --out $(@D)
+$(PAPER)/%/transforms_eval.json:
+	$(STREETGEN) build street-$* --split eval --size 1920x1080 --spp 9 --out $(@D)
+$(PAPER)/3dgs.rff: $(PAPER)/train-640x360/transforms_train.json
+	$(RFEDGE) train $< --antialiased --limit 600000 --sky 60000 --minutes 14 --json $(@:.rff=.json) --out $@
+$(PAPER)/ingp.rff: $(PAPER)/train-800x450/transforms_train.json
+	$(RFEDGE) train $< --kind ngp --minutes 36 --json $(@:.rff=.json) --out $@
+$(OUT)/paper.json: $(PAPER)/3dgs.rff $(PAPER)/ingp.rff $(PAPER)/empty/transforms_eval.json $(PAPER)/parked/transforms_eval.json
+	$(LAB) paper --fields 3dgs=$(PAPER)/3dgs.rff ingp=$(PAPER)/ingp.rff --sizes 300x168 500x280 720x404 1920x1080 \
+		--drives empty=$(PAPER)/empty/transforms_eval.json parked=$(PAPER)/parked/transforms_eval.json \
+		--processes $(shell nproc) --cells $(OUT)/paper --out $@

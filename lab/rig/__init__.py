@@ -1,0 +1,73 @@
+"""``rfedge-lab rig``: several cameras in one session against a session each, on one link."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rfedge.samples import sample_path
+
+__all__ = ["EvalRig"]
+
+
+@dataclass(frozen=True)
+class EvalRig:
+    """Send a rig's cameras in one session, and in a session each, through one link.
+
+    Server, link and vehicles are processes. Two comparisons: at one CRF, every picture delivered;
+    and at the drive's rate within a delay, where one rate control stands against one a camera.
+    Bits, PSNR and CRF of each camera are in the rows, and how far apart the pictures of an instant
+    come at the server. `streetgen build street-traffic --split rig --out FOLDER` records a rig.
+    """
+
+    rig: Path
+    """Rig file of drives (rig.toml), or its folder."""
+    many: Path | None = None
+    """Rig file of many cameras, such as the published 18, which is to be accepted and served."""
+    field: Path = sample_path("fields/street.rff")
+    """The field archive (.rff) both ends hold."""
+    link_bps: float = 4e6
+    """Rate of the link, both directions, bit/s."""
+    rate: float = 2.0
+    """Instants a second of the second comparison, Hz."""
+    max_delay_ms: float = 1000.0
+    """From capture to Ack, in the second comparison."""
+    crf: float = 23.0
+    """Of the first comparison."""
+    effort: str = "fast"
+    """Of the slice coder: fast, default, thorough."""
+    threads: int = 1
+    """Of each process' renderer."""
+    out: Path = Path("out/eval/rig.json")
+    """The result file to write."""
+    work: Path = Path("out/eval/rig")
+    """Folder for logs and reports of the processes."""
+
+    def run(self) -> None:
+        """Run, write the rows, print them."""
+        from rich.console import Console
+
+        from lab.rig.report import print_rig
+        from lab.rig.run import RigJob, run_rig
+        from rfcore.dataset.rig import read_rig
+        from rfedge.arguments import field_path
+        from rfedge.results import write_result
+
+        job = RigJob(
+            rig=self.rig,
+            many=self.many,
+            field=field_path(self.field),
+            link_bps=self.link_bps,
+            rate_hz=self.rate,
+            max_delay_ms=self.max_delay_ms,
+            crf=self.crf,
+            effort=self.effort,
+            threads=self.threads,
+            work=self.work,
+        )
+        for path in filter(None, (self.rig, self.many)):
+            read_rig(path)
+        console = Console()
+        result = run_rig(job, console)
+        write_result(self.out, result)
+        print_rig(console, result)

@@ -1,0 +1,1 @@
+"""What pictures show beside a field: objects, contacts with the ground, views composed of both."""

@@ -1,0 +1,341 @@
+"""Things that cameras see and the field does not have, followed over time and over cameras.
+
+Without clock, sockets or threads, and deterministic: the same pictures in the same order give the
+same objects.
+
+A detection (``rfcore.perception.contacts``) belongs to the nearest object not further away than
+``GATE_M`` and a part of its distance from the camera, for that is how its error grows; greedy, the
+nearest pair first. Where an object is, and whether it moves, is what its sightings of the last
+``REMEMBERED_S`` say together (``rfcore.perception.triangulation``), those of all cameras alike.
+
+What counts is a vehicle at an instant, not a picture: the cameras of a rig see one moment together,
+and with one pose. Pictures of a vehicle within ``SAME_INSTANT_S`` are of one instant.
+
+One is *confirmed* by a third instant, by a second one where that is of another vehicle, and at once
+where its instants have ``LARGE_PX`` marked pixels of it. It is *missed* by a picture that should
+show it and shows the field there instead (``LivePicture.lacks``), at an instant at which no other
+picture of the vehicle shows it; its *confidence* is the share of the last ``LOOKS`` instants that
+did not miss it, less after few. It is *doubtful* while no vehicle shows it whose pictures of it are
+trusted by ``LEAST_TRUST`` in the mean, as with a wrong pose, which shows things wherever the field
+has edges. It is forgotten ``FORGOTTEN_S`` after its last.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from statistics import fmean
+
+from rfcore.perception.contacts import Detection
+from rfcore.perception.triangulation import Sighting, placed
+
+__all__ = [
+    "CameraKey",
+    "FollowedObject",
+    "Lacks",
+    "ObjectTracker",
+    "StreetObject",
+    "ToldObjects",
+    "lacks_nothing",
+]
+
+GATE_M = 1.5
+GATE_PER_M = 0.1
+REMEMBERED_S, MOST_REMEMBERED = 1.0, 12
+"""Sightings from which its place is told: of so many instants."""
+SAME_INSTANT_S = 0.01
+LOOKS = 40
+MOST_SPEED_MPS = 60.0
+SEEN_BY_S = 1.0
+FORGOTTEN_S = 1.0
+CONFIRMED_BY = 3
+LARGE_PX = 600
+"""On the sample's empty drive the largest contact of all has 248."""
+SURE_BY = 4
+"""Instants that saw an object until nothing is missing from its confidence."""
+REPEAT_S = 0.5
+LEAST_RANGE_M = 0.1
+LEAST_TRUST = 0.7
+"""Pictures of the sample's drive among parked and moving vehicles have 0.77 to 0.91, those at wrong
+poses at most ``composition.MISPLACED_TRUST``."""
+
+Vec3 = tuple[float, float, float]
+CameraKey = tuple[str, str]
+"""(vehicle id, camera id)"""
+Lacks = Callable[[Vec3, float, float], bool]
+"""Whether a picture should show a thing of a width and height (metres) at a place, and does not."""
+
+
+@dataclass(frozen=True)
+class StreetObject:
+    """A thing that the field does not have: see twin.proto. ``at_m`` is the foot of the side that
+    is seen, relative to the tile's origin; ``seen_by``: (vehicle id, camera id). ``is_doubtful``:
+    only vehicles show it whose pictures fit the field badly, as with a wrong pose. ``label``: what
+    it is, empty where no detector says."""
+
+    object_id: int
+    at_m: Vec3
+    velocity_mps: Vec3
+    width_m: float
+    height_m: float
+    confidence: float
+    age_s: float
+    unseen_s: float
+    seen_by: tuple[tuple[str, str], ...]
+    is_doubtful: bool = False
+    label: str = ""
+
+
+def lacks_nothing(_at_m: Vec3, _width_m: float, _height_m: float) -> bool:
+    """Say of nothing that it is not there."""
+    return False
+
+
+@dataclass(frozen=True)
+class _Instant:
+    """A vehicle at a moment."""
+
+    vehicle_id: str
+    time_s: float
+
+    def is_of(self, camera: CameraKey, time_s: float) -> bool:
+        """Whether a picture belongs to it."""
+        return camera[0] == self.vehicle_id and abs(time_s - self.time_s) <= SAME_INSTANT_S
+
+
+@dataclass
+class _Look:
+    """What one instant says of an object. ``marked_px``: the most in one of its pictures; none: it
+    missed it."""
+
+    instant: _Instant
+    marked_px: int = 0
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """An object in one picture."""
+
+    instant: _Instant
+    time_s: float
+    detection: Detection
+
+
+@dataclass
+class FollowedObject:
+    """A thing over time. ``seen``: instants that showed it; ``cameras``: when each saw it last;
+    ``marked_px``: of how many marked pixels it is in all of them; ``labels``: how often a detector
+    called it what."""
+
+    object_id: int
+    at_m: Vec3
+    velocity_mps: Vec3
+    width_m: float
+    height_m: float
+    first_s: float
+    last_s: float
+    seen: int = 0
+    cameras: dict[CameraKey, float] = field(default_factory=dict)
+    marked_px: int = 0
+    labels: Counter[str] = field(default_factory=Counter)
+    _sightings: list[_Seen] = field(default_factory=list, init=False)
+    _looks: deque[_Look] = field(default_factory=lambda: deque(maxlen=LOOKS), init=False)
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether enough instants showed it."""
+        agreed = len({vehicle_id for vehicle_id, _ in self.cameras}) > 1
+        return self.seen >= CONFIRMED_BY - agreed or self.marked_px >= LARGE_PX
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether only vehicles show it whose pictures fit the field badly, in the mean."""
+        trusts: dict[str, list[float]] = {}
+        for each in self._sightings:
+            trusts.setdefault(each.instant.vehicle_id, []).append(each.detection.trust)
+        best = max((fmean(each) for each in trusts.values()), default=1.0)
+        return best < LEAST_TRUST
+
+    def confidence(self, now: float) -> float:
+        """Return 0 to 1: less after few instants, by how many missed it, and while nobody sees
+        it."""
+        fresh = max(0.0, 1.0 - max(0.0, now - self.last_s) / FORGOTTEN_S)
+        missed = sum(not look.marked_px for look in self._looks)
+        agreed = 1.0 - missed / max(1, len(self._looks))
+        return fresh * agreed * min(1.0, self.seen / SURE_BY)
+
+    @property
+    def label(self) -> str:
+        """What it was called most often, empty where nobody said."""
+        return max(sorted(self.labels), key=lambda label: self.labels[label], default="")
+
+    def seen_by(self, now: float) -> list[CameraKey]:
+        """Return the cameras that saw it lately, sorted."""
+        return sorted(key for key, at_s in self.cameras.items() if now - at_s <= SEEN_BY_S)
+
+    def at(self, time_s: float) -> Vec3:
+        """Return where it is at a time, which may be before its last picture."""
+        elapsed_s = max(-FORGOTTEN_S, min(FORGOTTEN_S, time_s - self.last_s))
+        x, y, z = (
+            at_m + elapsed_s * mps for at_m, mps in zip(self.at_m, self.velocity_mps, strict=True)
+        )
+        return x, y, z
+
+    def told(self, now: float) -> StreetObject:
+        """Return what is known of it, where it is now."""
+        return StreetObject(
+            object_id=self.object_id,
+            at_m=self.at(now),
+            velocity_mps=self.velocity_mps,
+            width_m=self.width_m,
+            height_m=self.height_m,
+            confidence=self.confidence(now),
+            age_s=max(0.0, now - self.first_s),
+            unseen_s=max(0.0, now - self.last_s),
+            seen_by=tuple(self.seen_by(now)),
+            is_doubtful=self.is_doubtful,
+            label=self.label,
+        )
+
+    def take(self, detection: Detection, camera: CameraKey, time_s: float) -> None:
+        """Move to where a picture of ``camera`` and those before it show it."""
+        look = self._look(camera, time_s)
+        self.seen += not look.marked_px
+        marked_px = max(look.marked_px, detection.marked_px, 1)
+        self.marked_px += marked_px - look.marked_px
+        look.marked_px = marked_px
+        self.last_s = max(self.last_s, time_s)
+        self._remember(_Seen(look.instant, time_s, detection))
+        shared = Counter(each.instant for each in self._sightings)
+        votes = [1 / shared[each.instant] for each in self._sightings]
+        sightings = zip(self._sightings, votes, strict=True)
+        placement = placed([_sighting(each, vote) for each, vote in sightings])
+        self.at_m = (*placement.at_m, self._foot_z_m(votes))
+        speed_mps = math.hypot(*placement.velocity_mps)
+        slower = min(1.0, MOST_SPEED_MPS / speed_mps) if speed_mps else 1.0
+        vx_mps, vy_mps = placement.velocity_mps
+        self.velocity_mps = (slower * vx_mps, slower * vy_mps, 0.0)
+        self.width_m, self.height_m = detection.width_m, detection.height_m
+        self.cameras[camera] = time_s
+
+    def miss(self, camera: CameraKey, time_s: float) -> None:
+        """Take in that a picture should show it and does not."""
+        self._look(camera, time_s)
+
+    def _look(self, camera: CameraKey, time_s: float) -> _Look:
+        """Return what the instant of a picture says of it, so far."""
+        for look in reversed(self._looks):
+            if look.instant.is_of(camera, time_s):
+                return look
+        begun = _Look(_Instant(camera[0], time_s))
+        self._looks.append(begun)
+        return begun
+
+    def _remember(self, seen: _Seen) -> None:
+        """Add a sighting, and forget those that are too old or too many."""
+        self._sightings.append(seen)
+        late = [each for each in self._sightings if self.last_s - each.time_s <= REMEMBERED_S]
+        instants = list(dict.fromkeys(each.instant for each in late))[-MOST_REMEMBERED:]
+        self._sightings = [each for each in late if each.instant in instants]
+
+    def _foot_z_m(self, votes: Sequence[float]) -> float:
+        """Return the height of its foot: the mean, weighted as ranges are."""
+        seen = zip(self._sightings, votes, strict=True)
+        weights = [vote / each.detection.along_sigma_m**2 for each, vote in seen]
+        heights_m = [each.detection.at_m[2] for each in self._sightings]
+        return sum(w * z for w, z in zip(weights, heights_m, strict=True)) / sum(weights)
+
+
+def _sighting(seen: _Seen, vote: float) -> Sighting:
+    """Return on the ground what a picture says of where an object is, and how much that counts."""
+    detection = seen.detection
+    x_m, y_m = (detection.at_m[axis] - detection.eye_m[axis] for axis in (0, 1))
+    range_m = max(math.hypot(x_m, y_m), LEAST_RANGE_M)
+    return Sighting(
+        seen.time_s,
+        detection.eye_m[:2],
+        math.atan2(y_m, x_m),
+        detection.across_sigma_m / range_m,
+        range_m,
+        detection.along_sigma_m,
+        vote,
+    )
+
+
+class ObjectTracker:
+    """Follows things through the pictures of all cameras of a place."""
+
+    def __init__(self) -> None:
+        self._objects: list[FollowedObject] = []
+        self._next_id = 1
+
+    def take(
+        self,
+        detections: Sequence[Detection],
+        camera: CameraKey,
+        time_s: float,
+        lacks: Lacks = lacks_nothing,
+        labels: Sequence[str] = (),
+    ) -> None:
+        """Take in what one picture of ``camera``, captured at ``time_s``, shows, of which things it
+        says that they are not there (``lacks``), and what a detector calls each that it shows."""
+        self._objects = [each for each in self._objects if time_s - each.last_s <= FORGOTTEN_S]
+        pairs = sorted(
+            (distance_m, each.object_id, index)
+            for each in self._objects
+            for index, detection in enumerate(detections)
+            if (distance_m := math.dist(each.at(time_s), detection.at_m))
+            <= GATE_M + GATE_PER_M * detection.distance_m
+        )
+        by_id = {each.object_id: each for each in self._objects}
+        free = set(range(len(detections)))
+        for _, object_id, index in pairs:
+            if object_id in by_id and index in free:
+                each = by_id.pop(object_id)
+                each.take(detections[index], camera, time_s)
+                each.labels.update(filter(None, labels[index : index + 1]))
+                free.discard(index)
+        for each in by_id.values():
+            if lacks(each.at(time_s), each.width_m, each.height_m):
+                each.miss(camera, time_s)
+        for index in sorted(free):
+            begun = self._begin(detections[index], camera, time_s)
+            begun.labels.update(filter(None, labels[index : index + 1]))
+
+    def confirmed(self, now: float) -> list[FollowedObject]:
+        """Return the confirmed objects that are not forgotten, sorted by id."""
+        return [
+            each for each in self._objects if each.is_confirmed and now - each.last_s <= FORGOTTEN_S
+        ]
+
+    def _begin(self, detection: Detection, camera: CameraKey, time_s: float) -> FollowedObject:
+        begun = FollowedObject(
+            self._next_id,
+            detection.at_m,
+            (0.0, 0.0, 0.0),
+            detection.width_m,
+            detection.height_m,
+            time_s,
+            time_s,
+        )
+        begun.take(detection, camera, time_s)
+        self._objects.append(begun)
+        self._next_id += 1
+        return begun
+
+
+class ToldObjects:
+    """What one consumer is told of a tracker: whenever ``now`` is called, and again at ``again_s``
+    while there is anything, so that what nobody sees any more goes where no pictures come."""
+
+    def __init__(self) -> None:
+        self.tracker = ObjectTracker()
+        self.again_s = math.inf
+
+    def now(self, now: float) -> tuple[StreetObject, ...]:
+        """Return the confirmed objects, as of ``now``."""
+        objects = tuple(each.told(now) for each in self.tracker.confirmed(now))
+        self.again_s = now + REPEAT_S if objects else math.inf
+        return objects

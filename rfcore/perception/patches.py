@@ -1,0 +1,129 @@
+"""Things that stand or move in the street as textured patches at their own depth.
+
+What a picture shows of a thing that the field does not have (``rfcore.perception.contacts``) is cut
+out of it and stands upright where the thing meets the ground, parallel to the picture's plane: from
+aside it moves before what is behind it. Without patches its pixels would be carried as if painted
+on the surface behind; and that surface is hidden from the camera, which vouches for nothing there.
+
+A patch is drawn where no surface of the field and no other patch is nearer, from ahead of it
+rather than from aside (``LEAST_COSINE`` between the rays of the two cameras to its middle). Of
+several pictures' patches of one thing, their feet within ``SAME_M``, that of the camera that weighs
+most counts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.camera import Camera, Pose
+from rfcore.native.live_view import (
+    ABSOLUTE_DEPTH_M,
+    COVERED,
+    LEAST_COSINE,
+    MOST_DISTANCE_M,
+    NEAREST_M,
+    RELATIVE_DEPTH,
+    Canvas,
+    Patch,
+    draw_patch,
+)
+from rfcore.raster.gaussians import F32
+from rfcore.views import View
+
+__all__ = ["Standing", "draw_standing", "in_front_of"]
+
+SAME_M = 1.5
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """A patch of a thing whose foot is at ``foot_m`` on the tile's ground, from picture ``source``,
+    of which so much counts (``weight``) and is left to be seen (``fade``, 0 to 1)."""
+
+    patch: Patch
+    foot_m: tuple[float, float]
+    source: int = 0
+    weight: float = 1.0
+    fade: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A thing in rows and columns ``box`` of a view; ``from_view`` maps points of the view's axes
+    into those of its camera."""
+
+    thing: Standing
+    from_view: Pose
+    box: tuple[slice, slice]
+    distance_m: float
+
+
+def in_front_of(view: View) -> F32:
+    """Return up to which depth something is before the surfaces of ``view``, float32 [H, W]."""
+    reach = view.depth * np.float32(1 + RELATIVE_DEPTH) + np.float32(ABSOLUTE_DEPTH_M)
+    return np.where(view.opacity > COVERED, reach, np.float32(np.inf))
+
+
+def draw_standing(canvas: Canvas, things: Iterable[Standing]) -> None:
+    """Draw the things that are seen in the view of ``canvas``, the furthest first."""
+    world_from_view = canvas.camera.world_from_cam
+    motions: dict[int, Pose] = {}
+    seen: list[_Seen] = []
+    for each in _once(things):
+        if each.source not in motions:
+            motions[each.source] = each.patch.camera.cam_from_world().compose(world_from_view)
+        found = _place_in(canvas.camera, each, motions[each.source])
+        seen += [] if found is None else [found]
+    for one in sorted(seen, key=lambda it: -it.distance_m):
+        thing = one.thing
+        draw_patch(canvas, thing.patch, one.from_view, one.box, thing.source, thing.fade)
+
+
+def _once(things: Iterable[Standing]) -> Sequence[Standing]:
+    """Return, of several pictures' patches of one thing, that of the picture that weighs most."""
+    kept: list[Standing] = []
+    for each in sorted(things, key=lambda it: -it.weight):
+        others = (k for k in kept if k.source != each.source)
+        if all(math.dist(k.foot_m, each.foot_m) > SAME_M for k in others):
+            kept.append(each)
+    return kept
+
+
+def _place_in(camera: Camera, thing: Standing, from_view: Pose) -> _Seen | None:
+    """Return where a thing is in the view of ``camera``, None if it is not seen there."""
+    k, in_patch = camera.intrinsics, _corners(thing.patch)
+    rotation = np.array(from_view.rotation_matrix())
+    corners = (in_patch - from_view.translation_m) @ rotation
+    z_m, middle = corners[:, 2], corners.mean(axis=0)
+    if not (z_m.min() > NEAREST_M and z_m.max() < MOST_DISTANCE_M):
+        return None
+    ray, own_ray = rotation @ middle, in_patch.mean(axis=0)
+    distance_m = float(np.linalg.norm(middle))
+    if ray @ own_ray < LEAST_COSINE * distance_m * np.linalg.norm(own_ray):
+        return None
+    columns = _within(k.fx_px * corners[:, 0] / z_m + k.cx_px, k.width_px)
+    rows = _within(k.fy_px * corners[:, 1] / z_m + k.cy_px, k.height_px)
+    if columns.start == columns.stop or rows.start == rows.stop:
+        return None
+    return _Seen(thing, from_view, (rows, columns), distance_m)
+
+
+def _corners(patch: Patch) -> F64:
+    """Return the corners of a patch in the axes of its camera, metres [4, 3]."""
+    k, (height, width) = patch.camera.intrinsics, patch.samples.shape[:2]
+    u = np.array([0, width, 0, width]) + patch.left
+    v = np.array([0, 0, height, height]) + patch.top
+    x_m, y_m = (u - k.cx_px) / k.fx_px * patch.z_m, (v - k.cy_px) / k.fy_px * patch.z_m
+    return np.stack((x_m, y_m, np.full(4, patch.z_m)), axis=1)
+
+
+def _within(at_px: F64, size_px: int) -> slice:
+    low, high = math.floor(at_px.min()), math.ceil(at_px.max())
+    return slice(min(max(low, 0), size_px), min(max(high, 0), size_px))

@@ -1,0 +1,373 @@
+"""``rfedge dataset``: datasets converted, posed by structure from motion, or recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg, subcommand
+
+from rfedge.arguments import (
+    DATASET,
+    FIELD,
+    FOLDER,
+    SIZE,
+    field_path,
+    is_field_file,
+    open_field,
+    parse_size,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = [
+    "Dataset",
+    "DatasetConvert",
+    "DatasetFeed",
+    "DatasetPoses",
+    "DatasetRecordCarla",
+    "DatasetSplit",
+]
+
+
+@dataclass(frozen=True)
+class DatasetConvert:
+    """Write a dataset of any format as undistorted PNG pictures and a transforms.json, once."""
+
+    dataset: Annotated[Path, Positional, DATASET]
+    """A folder with transforms.json, a COLMAP model, a KITTI sequence, INRIA's cameras.json or a
+    recording's camera.toml; or that file itself."""
+    out: Annotated[Path, FOLDER]
+    """The folder to make."""
+    size: Annotated[str | None, SIZE] = None
+    """Reduce pictures to WIDTHxHEIGHT px by averaging areas; default: as they are."""
+    every: int = 1
+    """Take each n-th picture."""
+    offset: int = 0
+    """Leave out the first pictures, so many."""
+
+    def run(self) -> None:
+        """Convert; the folder appears when all of it is there."""
+        from rfedge.datasets.convert import convert_dataset
+
+        size_px = parse_size(self.size) if self.size is not None else None
+        chosen = slice(self.offset, None, self.every)
+        print(convert_dataset(self.dataset, self.out, size_px, chosen))
+
+
+@dataclass(frozen=True)
+class DatasetSplit:
+    """Cut a long recording into tiles of ground that overlap, for `rfedge train` to train."""
+
+    dataset: Annotated[Path, Positional, DATASET]
+    """A dataset of any format; lenses are undistorted."""
+    out: Annotated[Path, FOLDER]
+    """The folder to make: a dataset a tile, and tiles.json, which lists them."""
+    length: Annotated[float, arg(metavar="M")]
+    """Longest side of a tile's ground, m."""
+    overlap: Annotated[float, arg(metavar="M")] = 10.0
+    """How far two tiles side by side share their pictures, m."""
+    fewest: int = 8
+    """Pictures that a tile must have."""
+    points_within: Annotated[float, arg(metavar="M")] = 60.0
+    """A tile has the dataset's points on its ground and so far around, m."""
+
+    def run(self) -> None:
+        """Split; the folder appears when all of it is there."""
+        from rfedge.datasets.split import SplitSettings, split_dataset
+
+        settings = SplitSettings(self.length, self.overlap, self.fewest, self.points_within)
+        for tile in split_dataset(self.dataset, self.out, settings):
+            west, south, east, north = tile.area_m
+            ground = f"{west:.1f}, {south:.1f} to {east:.1f}, {north:.1f} m"
+            beside = ", ".join(tile.neighbours) or "no tile"
+            print(f"{self.out / tile.name}: {len(tile.pictures)} pictures, {ground}, by {beside}")
+
+
+@dataclass(frozen=True)
+class DatasetPoses:
+    """Find the poses of pictures with COLMAP, in a new world or in a dataset's own."""
+
+    images: Annotated[Path, Positional, arg(metavar="FOLDER|VIDEO")]
+    """Folder of pictures (PNG, JPEG, WebP), in order of their names; or a video, of which the
+    sharpest frames are taken. Stopped, it goes on with those that are in OUT.frames."""
+    out: Annotated[Path, FOLDER]
+    """The folder to make: pictures, points and transforms.json."""
+    register_to: Annotated[Path | None, DATASET] = None
+    """A dataset whose world the poses shall be in; its poses and cameras are held. Or a field
+    (an archive or a name), where its pictures are not at hand: the camera must be given then."""
+    camera: Literal["dataset", "estimate"] = "dataset"
+    """With --register-to: take the dataset's camera, or estimate the intrinsics."""
+    camera_model: Annotated[str, arg(metavar="MODEL")] = "SIMPLE_RADIAL"
+    """COLMAP camera model of the new pictures, where it is not the dataset's camera."""
+    parameters: Annotated[tuple[float, ...], arg(metavar="NUMBER ...")] = ()
+    """Its known parameters in COLMAP's order, which are held; default: estimated."""
+    up: Literal["z", "y", "-y"] = "z"
+    """Which axis is up in the field registered to."""
+    per_second: float = 2.0
+    """Of a video: how many pictures a second."""
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Match all pairs, or neighbours in a long drive; auto: neighbours in a video, else all."""
+    max_side_px: int = 1600
+    """Longest side at which features are looked for."""
+    features: int = 8192
+    """At most so many features a picture."""
+    threads: int = 2
+    """Threads."""
+    seed: int = 1
+    """Seed of the robust estimators."""
+
+    def run(self) -> None:
+        """Place the pictures and write the dataset; say which ones could not be placed."""
+        import shutil
+        import signal
+
+        from rfcore.dataset.read import is_video
+
+        field = self._field()
+        if field is None:
+            import rfedge.datasets.poses  # noqa: F401 (COLMAP's handler comes with its import)
+
+        # That handler would print a C++ stack and leave its folder behind.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        if not is_video(self.images):
+            self._place(self.images, field)
+            return
+        frames = self.out.with_name(f"{self.out.name}.frames")
+        self._place(self._frames(frames), field)
+        shutil.rmtree(frames)
+
+    def _frames(self, folder: Path) -> Path:
+        from rich.console import Console
+
+        from rfcore.errors import InvalidInput
+        from rfedge.datasets.video_frames import sharpest_frames
+
+        if self.out.exists():
+            raise InvalidInput("out", f"{self.out} exists already; name another folder")
+        with _shown(Console(stderr=True)) as tell:
+            count = sharpest_frames(self.images, folder, self.per_second, tell)
+            tell(f"{count} frames in {folder}")
+        return folder
+
+    def _place(self, images: Path, field: Path | None) -> None:
+        if field is None:
+            self._among_pictures(images)
+        else:
+            self._in_field(images, field)
+
+    def _field(self) -> Path | None:
+        """Return the archive to register to, told by its content; None for a dataset or none."""
+        if self.register_to is None:
+            return None
+        if self.register_to.exists():
+            return self.register_to if is_field_file(self.register_to) else None
+        return field_path(self.register_to)
+
+    def _in_field(self, images: Path, field: Path) -> None:
+        from rich.console import Console
+
+        from rfedge.fields.register import RegisterSettings, register_pictures
+
+        settings = RegisterSettings(self.camera_model, self.parameters, self.up)
+        opened = open_field(field, threads=self.threads)
+        with _shown(Console(stderr=True)) as tell:
+            line = register_pictures(images, self.out, opened, settings, tell)
+        print(line)
+
+    def _among_pictures(self, images: Path) -> None:
+        from rich.console import Console
+
+        from rfcore.dataset.read import is_video
+        from rfedge.datasets.colmap_features import Matching, PoseSettings, SharedCamera
+        from rfedge.datasets.poses import pose_dataset
+
+        matching = self.matching
+        if matching == "auto":
+            matching = "sequential" if is_video(self.images) else "exhaustive"
+        settings = PoseSettings(
+            matching=Matching(matching),
+            camera=SharedCamera(self.camera),
+            model=self.camera_model,
+            parameters=self.parameters,
+            max_side_px=self.max_side_px,
+            features=self.features,
+            threads=self.threads,
+            seed=self.seed,
+        )
+        with _shown(Console(stderr=True)) as tell:
+            line = pose_dataset(images, self.out, self.register_to, settings, tell)
+        print(line)
+
+
+@dataclass(frozen=True)
+class DatasetFeed:
+    """Write a drive's poses as a vehicle's sensors would state them: NMEA or JSON, with errors."""
+
+    drive: Annotated[Path, Positional, DATASET]
+    """Posed pictures; their poses are the truth."""
+    out: Annotated[str, arg(metavar="FILE|udp:HOST:PORT")]
+    """The file to write, or where to send it to, line by line at its own pace."""
+    field: Annotated[Path | None, FIELD] = None
+    """The field whose anchor says where on the Earth the drive is; default: the dataset's own."""
+    form: Literal["nmea", "geodetic", "xyz"] = "nmea"
+    """NMEA sentences, or JSON lines in WGS 84 or in the drive's own axes (docs/localise.md)."""
+    errors: Annotated[str, arg(metavar="NAME,KEY=VALUE,...")] = "gnss"
+    """exact, white-small, white-large, offset or gnss, and what to change of it:
+    noise_m, noise_deg, offset_m, offset_deg, walk_m, walk_s, rate_hz, latency_s, silent_from_s,
+    silent_s."""
+    camera_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The camera seen from the antenna: metres forward, left, up (cav-agent --camera-at)."""
+    start_s: float | None = None
+    """Unix time of the first picture; default: its time in the dataset, or now for udp."""
+    rate: float = 10.0
+    """Pictures a second, where the dataset has no times."""
+    seed: int = 1
+    """Seed of the errors."""
+
+    def run(self) -> None:
+        """Write the file, or send it."""
+        from time import time
+
+        from cav_agent.pose_feed.placing import CameraMount
+        from rfcore.camera import TileOrigin
+        from rfcore.dataset import read_dataset
+        from rfcore.files import write_whole
+        from rfcore.localise.pose_errors import parse_error_model
+        from rfedge.datasets.pose_feed import FeedPlan, feed_lines, times_of
+
+        errors = parse_error_model(self.errors)
+        anchor, origin = None, TileOrigin()
+        if self.field is not None:
+            metadata = open_field(self.field, threads=1).metadata
+            anchor, origin = metadata.anchor, metadata.tile_origin
+        dataset = read_dataset(self.drive, tile_origin=origin if self.field else None)
+        live = self.out.startswith("udp:")
+        stated_s = dataset.pictures[0].time_ns / 1e9
+        plan = FeedPlan(
+            form=self.form,
+            errors=errors,
+            start_s=self.start_s if self.start_s is not None else time() if live else stated_s,
+            seed=self.seed,
+            anchor=anchor or dataset.anchor,
+            origin=dataset.tile_origin,
+            mount=CameraMount(self.camera_at),
+        )
+        poses = [picture.camera.world_from_cam for picture in dataset.pictures]
+        lines = feed_lines(poses, times_of(dataset.pictures, self.rate), plan)
+        if live:
+            _send(lines, self.out)
+        else:
+            write_whole(Path(self.out), "".join(text for _, text in lines))
+        print(f"{self.out}: {len(lines)} fixes")
+
+
+def _send(lines: list[tuple[float, str]], target: str) -> None:
+    """Send each text in a datagram when it is due."""
+    import socket
+    from time import monotonic, sleep
+
+    from cav_agent.pose_feed.settings import parse_source
+
+    source, begun_s = parse_source(target), monotonic()
+    address = (source.host, source.port)
+    family = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)[0][0]
+    with socket.socket(family, socket.SOCK_DGRAM) as sender:
+        for due_s, text in lines:
+            sleep(max(0.0, begun_s + due_s - monotonic()))
+            sender.sendto(text.encode("ascii"), address)
+
+
+@contextmanager
+def _shown(console: Console) -> Iterator[Callable[[str], None]]:
+    """Show what is told: in one changing line on a terminal, line by line in a log."""
+    if not console.is_terminal:
+        yield lambda text: console.print(f"  {text}", highlight=False)
+        return
+    with console.status("reading pictures") as status:
+        yield status.update
+
+
+@dataclass(frozen=True)
+class DatasetRecordCarla:
+    """Drive 18 cameras along a street of a running CARLA server, both ways, into a dataset."""
+
+    out: Annotated[Path, FOLDER]
+    """The folder to make: pictures and transforms.json."""
+    host: Annotated[str, arg(metavar="HOST")] = "127.0.0.1"
+    """Where the server runs."""
+    port: Annotated[int, arg(metavar="PORT")] = 2000
+    """Its RPC port."""
+    town: Annotated[str | None, arg(metavar="MAP")] = None
+    """Load this map first, such as Town10HD; default: the one that is running."""
+    spawn: int = 0
+    """Start at this spawn point of the map."""
+    stations: int = 20
+    """Places along the lane where all cameras take a picture, each way."""
+    spacing_m: float = 4.0
+    """Metres between them."""
+    both_ways: bool = True
+    """Drive back on the lane of the other direction."""
+    keep_parked: bool = False
+    """Keep the map's own parked vehicles in the pictures."""
+    cameras: Annotated[str, arg(metavar="NAME,...")] = "all"
+    """`all`, or names from the rig, separated by commas; a drive is `mid_front`."""
+    size: Annotated[str, SIZE] = "1920x1080"
+    """Size of the pictures, WIDTHxHEIGHT px."""
+    fov_deg: float = 90.0
+    """Horizontal field of view, degrees."""
+    timeout_s: float = 30.0
+    """Give up when the server does not answer for so long, seconds."""
+
+    def run(self) -> None:
+        """Connect, record, and write the dataset."""
+        from rfcore.errors import RfedgeError
+        from rfcore.extras import needs
+        from rfcore.files import whole_folder
+        from rfedge.datasets.carla import Recorder, RecordSettings
+        from rfedge.datasets.rig import mounts_named
+
+        settings = RecordSettings(
+            spawn=self.spawn,
+            stations=self.stations,
+            spacing_m=self.spacing_m,
+            both_ways=self.both_ways,
+            keep_parked=self.keep_parked,
+            mounts=mounts_named(self.cameras),
+            size_px=parse_size(self.size),
+            fov_deg=self.fov_deg,
+            timeout_s=self.timeout_s,
+        )
+        with needs("carla"):
+            import carla
+        with whole_folder(self.out) as folder:
+            try:
+                client = carla.Client(self.host, self.port)
+                client.set_timeout(self.timeout_s)
+                world = client.load_world(self.town) if self.town else client.get_world()
+                count = Recorder(carla, world, settings).record(folder)
+            except RuntimeError as error:
+                raise RfedgeError(f"CARLA at {self.host}:{self.port}: {error}") from error
+        print(f"{self.out}: {count} pictures")
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Make datasets: convert, split or pose recordings, record a simulator."""
+
+    verb: Annotated[
+        Annotated[DatasetConvert, subcommand("convert")]
+        | Annotated[DatasetSplit, subcommand("split")]
+        | Annotated[DatasetPoses, subcommand("poses")]
+        | Annotated[DatasetFeed, subcommand("feed")]
+        | Annotated[DatasetRecordCarla, subcommand("record-carla")],
+        arg(name=""),
+    ]
+
+    def run(self) -> None:
+        """Run the verb."""
+        self.verb.run()

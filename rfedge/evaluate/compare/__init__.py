@@ -1,0 +1,101 @@
+"""``rfedge eval compare``: BD-rate against what a user would pick instead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from rfcore.codec.h264.config import DEFAULT_EFFORT
+
+__all__ = ["EvalCompare"]
+
+Preset = Literal["ultrafast", "superfast", "veryfast", "faster", "fast", "medium"]
+
+
+@dataclass(frozen=True)
+class EvalCompare:
+    """Compare with low-delay x264, x265 and SVT-AV1 at equal quality, and at equal processor time.
+
+    Prints what it will cost before it starts; stopped and started again, it goes on where it was.
+    """
+
+    field: Annotated[Path, Positional]
+    """The field archive (.rff) both ends hold, for the drives that name none."""
+    drives: Annotated[tuple[str, ...], Positional] = ()
+    """NAME@HZ=DATASET for each drive, such as `yardstick-empty@10=street/transforms_drive.json`;
+    NAME@HZ=DATASET,FIELD.rff for one of another field;
+    with `,noise=3` at the end: with a camera's noise of that standard deviation, in code values."""
+    decimated: tuple[str, ...] = ()
+    """The same for drives of which every fifth frame is taken, at a fifth of the rate."""
+    background: tuple[str, ...] = ()
+    """The same for the empty street of a drive, frame by frame at its poses: tells what is not in
+    the field, for the split of the bits and for a rival that sends only the foreground."""
+    effort: str = DEFAULT_EFFORT
+    """Of ours: fast, default, thorough; x264-PRESET codes ours with x264, too."""
+    preset: Preset = "veryfast"
+    """x264 preset of the anchor."""
+    out: Path = Path("out/eval/compare.json")
+    """The result file to write."""
+    cells: Path = Path("out/eval/compare")
+    """Folder of finished pieces."""
+    method: tuple[str, ...] = ()
+    """More codecs to compare with, as package.module:Class (see docs/evaluation.md)."""
+    rivals: tuple[str, ...] = ()
+    """Of the rivals these alone, by PSNR alone, as x264-our-tools-medium; x264-lowdelay-psnr, which
+    a field is paid for against, is always among them."""
+    window: tuple[float, float] | None = None
+    """Lowest and highest luma PSNR to compare over, in dB; 32 35 (and 30 35 where all reach it) if
+    not given. Curves are coded at more points until they span it."""
+    quick: bool = False
+    """Eight frames and few rivals: to see that it works, not for figures."""
+    retime: bool = False
+    """Take the processor times anew (on a quiet machine) and keep everything else."""
+    processes: int = 1
+    """How many processes code at once; processor times are taken afterwards, one coder at a time,
+    and the rows do not depend on it."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Code what is not there yet on a Ray (`local` starts one here; docs/scale.md); processor times
+    are taken here afterwards, and the rows are the same. Needs rfedge[ray]."""
+    figures: Path | None = None
+    """Folder for the curves as SVG, with their numbers as CSV."""
+
+    def run(self) -> None:
+        """Run what is not there yet and write the rows."""
+        from functools import partial
+
+        from rich.console import Console
+
+        from rfcore.extras import require
+        from rfedge.arguments import field_path
+        from rfedge.evaluate.compare.drives import CompareJob
+        from rfedge.evaluate.compare.run import code_on_ray, run_compare
+
+        job = CompareJob(
+            field=field_path(self.field),
+            drives=self.drives,
+            effort=self.effort,
+            preset=self.preset,
+            out=self.out,
+            cells=self.cells,
+            decimated=self.decimated,
+            backgrounds=self.background,
+            methods=self.method,
+            rivals=self.rivals,
+            quick=self.quick,
+            retime=self.retime,
+            window_db=self.window,
+            processes=self.processes,
+        )
+        console = Console()
+        if self.ray is not None:
+            require("ray", "ray")
+            code_on_ray(job, self.ray, partial(print, flush=True))
+        result = run_compare(job, console)
+        if self.figures is not None:
+            from rfedge.evaluate.compare.figures import write_compare_figures
+
+            for path in write_compare_figures(result, self.figures):
+                console.print(f"  {path}")

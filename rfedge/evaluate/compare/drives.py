@@ -1,0 +1,372 @@
+"""What is compared on each drive: our codec, families of rival settings, codecs a user brings.
+
+Drives are read and rendered, and users' codecs loaded, before anything is coded.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rfcore.codec.h264.config import check_effort
+from rfcore.codec.references import RENDER_ONLY, References
+from rfcore.errors import InvalidInput
+from rfcore.field import RadianceField, load_field
+from rfcore.train import mean_psnr_db
+from rfedge.evaluate.cells import check_processes, program_version
+from rfedge.evaluate.clips import (
+    DECIMATION,
+    Clip,
+    ClipCoder,
+    Drive,
+    DriveName,
+    DriveOfField,
+    read_drive,
+)
+from rfedge.evaluate.compare.foreground import ForegroundCoder, foreground_mask
+from rfedge.evaluate.compare.measure import WINDOWS_DB
+from rfedge.evaluate.field_coder import WITHOUT_FIELD, FieldCoder, RenderedClip, render_clip
+from rfedge.evaluate.rate_curve import Window
+from rfedge.evaluate.rivals import (
+    Rival,
+    svtav1_lowdelay,
+    x264_for_psnr,
+    x264_for_ssim,
+    x264_lowdelay,
+    x264_with_our_tools,
+    x265_for_psnr,
+    x265_for_ssim,
+    x265_lowdelay,
+)
+from rfedge.results import check_result_path
+
+__all__ = [
+    "PAID_AGAINST",
+    "CompareJob",
+    "DriveComparison",
+    "foreign_coder",
+    "read_drive_comparisons",
+    "rival_families",
+    "ssim_rivals",
+]
+
+
+PAID_AGAINST = "x264-lowdelay-psnr"
+"""Whose bytes must be saved before a field is paid for."""
+KEYINTS = (10, 30, 250)
+OUR_TOOLS_PRESETS = ("veryfast", "medium", "veryslow")
+
+
+def rival_families(preset: str, *, quick: bool) -> dict[str, list[ClipCoder]]:
+    """Return the rivals by codec: the anchors alone of their kind, the others at several settings.
+
+    The first anchor is x264 as it comes, which is what a user has. It spends bits on looks that a
+    PSNR does not see, and our encoder does not; the second is tuned for PSNR as ours is, and so are
+    the stronger presets. `x264-our-tools` has every tool of our slices besides, so that only the
+    field is left between the two.
+    """
+    anchors: dict[str, list[ClipCoder]] = {
+        "x264-lowdelay": [x264_lowdelay(preset)],
+        PAID_AGAINST: [x264_for_psnr(preset)],
+    }
+    if quick:
+        tools: dict[str, list[ClipCoder]] = {
+            f"x264-our-tools-{preset}": [x264_with_our_tools(preset)]
+        }
+        return {**anchors, **tools, "svtav1-lowdelay": [svtav1_lowdelay(8)]}
+    return {
+        **anchors,
+        **{f"x264-our-tools-{p}": [x264_with_our_tools(p)] for p in OUR_TOOLS_PRESETS},
+        "x265-medium": [x265_for_psnr("medium")],
+        "svtav1-p6": [svtav1_lowdelay(6)],
+        "x264-stronger": [x264_for_psnr(p) for p in ("medium", "veryslow")],
+        **{f"x264-keyint-{n}": [_with_key_frames(preset, n)] for n in KEYINTS},
+        "x264-intra-refresh": [_with_intra_refresh(preset)],
+        "x265-lowdelay": [
+            x265_lowdelay("veryfast"),
+            *(x265_for_psnr(p) for p in ("veryfast", "medium")),
+        ],
+        "svtav1-lowdelay": [svtav1_lowdelay(p) for p in (10, 8, 6, 4)],
+    }
+
+
+def ssim_rivals(*, quick: bool) -> dict[str, list[ClipCoder]]:
+    """Return the rivals of a comparison by SSIM, tuned for it; SVT-AV1 cannot be at low delay."""
+    if quick:
+        return {"x264-ssim": [x264_for_ssim("veryfast")]}
+    return {
+        "x264-ssim": [x264_for_ssim("veryfast")],
+        "x264-ssim-medium": [x264_for_ssim("medium")],
+        "x265-ssim-medium": [x265_for_ssim("medium")],
+        "svtav1-p6": [svtav1_lowdelay(6)],
+    }
+
+
+def _with_key_frames(preset: str, keyint: int) -> Rival:
+    return x264_lowdelay(preset, f"x264-keyint-{keyint}-{preset}", keyint=str(keyint))
+
+
+def _with_intra_refresh(preset: str) -> Rival:
+    """A column of intra blocks crosses the picture in ten frames; x264 waits as long before it."""
+    params = {"intra-refresh": "1", "keyint": "10"}
+    return x264_lowdelay(preset, f"x264-intra-refresh-10-{preset}", **params)
+
+
+def foreign_coder(text: str) -> ClipCoder:
+    """Return an instance of ``package.module:Class``, from the working folder or an installed
+    package; raise ``InvalidInput`` saying what was looked for if there is none."""
+    module_name, colon, class_name = text.partition(":")
+    if not (module_name and colon and class_name):
+        raise InvalidInput("method", f"{text!r} is not MODULE:CLASS, as mjpeg_rival:MotionJpeg")
+    module = _imported(text, module_name)
+    made = getattr(module, class_name, None)
+    if made is None:
+        where = getattr(module, "__file__", None) or "which is built in"
+        raise InvalidInput("method", f"{text!r}: {module_name} ({where}) has no {class_name!r}")
+    try:
+        coder: ClipCoder = made()
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InvalidInput(
+            "method", f"{text!r} cannot be called without arguments: {error}"
+        ) from error
+    missing = [key for key in ("name", "points", "version", "code") if not hasattr(coder, key)]
+    if missing:
+        raise InvalidInput("method", f"{text!r} lacks {', '.join(missing)} of a ClipCoder")
+    return coder
+
+
+def _imported(text: str, module_name: str) -> ModuleType:
+    try:
+        with _working_folder_on_path():
+            return importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and f"{module_name}.".startswith(f"{error.name}."):
+            file = f"{module_name.replace('.', '/')}.py"
+            why = f"there is neither {Path.cwd() / file} nor an installed module {module_name!r}"
+            raise InvalidInput("method", f"{text!r}: {why}") from error
+        raise InvalidInput("method", f"{text!r}: {module_name} needs {error.name!r}") from error
+    except (ImportError, ValueError, TypeError) as error:
+        raise InvalidInput("method", f"{text!r} cannot be imported: {error}") from error
+
+
+@contextmanager
+def _working_folder_on_path() -> Iterator[None]:
+    """Let modules of the working folder be found, as ``python -m`` does, and no longer."""
+    folder = str(Path.cwd())
+    sys.path.insert(0, folder)
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        sys.path.remove(folder)
+
+
+QUICK_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class Method:
+    """How ours codes a drive; ``None`` leaves references to the encoder, the effort to the job."""
+
+    references: References | None = None
+    effort: str | None = None
+
+
+METHODS = {
+    "rfedge": Method(),
+    "rfedge-thorough": Method(effort="thorough"),
+    "rfedge-render-only": Method(RENDER_ONLY),
+    "rfedge-without-field": Method(WITHOUT_FIELD),
+}
+"""Ours first, then with nearly x264 medium's time for a slice, then what is left of it without a
+past, and without a field: what each is worth."""
+
+
+@dataclass(frozen=True)
+class CompareJob:
+    """What to compare; see ``rfedge eval compare --help``."""
+
+    field: Path
+    drives: Sequence[str]
+    effort: str
+    preset: str
+    out: Path
+    cells: Path
+    decimated: Sequence[str] = ()
+    backgrounds: Sequence[str] = ()
+    methods: Sequence[str] = ()
+    rivals: Sequence[str] = ()
+    quick: bool = False
+    retime: bool = False
+    window_db: Window | None = None
+    processes: int = 1
+
+    def __post_init__(self) -> None:
+        check_result_path(self.out)
+        check_processes(self.processes)
+        check_effort("effort", self.effort)
+        if not (self.drives or self.decimated):
+            raise InvalidInput("drives", "there is none")
+        low_db, high_db = self.windows_db[0]
+        if not 0 < low_db < high_db < math.inf:
+            raise InvalidInput("window", f"{low_db:g} {high_db:g} are not two rising decibels")
+        known = rival_families(self.preset, quick=self.quick)
+        for name in self.rivals:
+            if name not in known:
+                raise InvalidInput("rivals", f"{name!r} is none of {', '.join(known)}")
+
+    def rival_families(self) -> dict[str, list[ClipCoder]]:
+        """Return those of the rivals that are asked for, and whom a field is paid for against."""
+        families = rival_families(self.preset, quick=self.quick)
+        wanted = {PAID_AGAINST, *(self.rivals or families)}
+        return {name: family for name, family in families.items() if name in wanted}
+
+    def of_each_drive(self) -> list[CompareJob]:
+        """Return a job for every drive, each with the background that stands behind it."""
+        behind = {_name(DriveName.parse(text)): text for text in self.backgrounds}
+
+        def whole(text: str) -> CompareJob:
+            background = behind.get(_name(DriveOfField.parse(text, self.field).name))
+            backgrounds = () if background is None else (background,)
+            return replace(self, drives=(text,), decimated=(), backgrounds=backgrounds)
+
+        slow = [replace(self, drives=(), decimated=(d,), backgrounds=()) for d in self.decimated]
+        return [*map(whole, self.drives), *slow]
+
+    @property
+    def windows_db(self) -> tuple[Window, ...]:
+        """The qualities asked about, the one that must be spanned first."""
+        return WINDOWS_DB if self.window_db is None else (self.window_db,)
+
+
+@dataclass(frozen=True)
+class DriveComparison:
+    """One drive with everybody who codes it, ours (``methods``) from what the field shows.
+
+    ``field``: the field's archive.
+    ``foregrounds``: bool [H, W] a frame, what differs from the empty street, if a ``background``
+    drive shows that; else nothing. ``background``: its digest.
+    """
+
+    clip: Clip
+    rendered: RenderedClip
+    field: Path
+    foregrounds: Sequence[NDArray[np.bool_]]
+    background: str | None
+    methods: Sequence[FieldCoder]
+    families: Mapping[str, Sequence[ClipCoder]]
+    for_ssim: Mapping[str, Sequence[ClipCoder]]
+    foreground_only: ForegroundCoder | None
+
+    @property
+    def field_bytes(self) -> int:
+        """Size of the field's archive."""
+        return self.field.stat().st_size
+
+    @property
+    def compared(self) -> list[ClipCoder]:
+        """Everybody who takes part in the BD-rates, ours first."""
+        rivals = [coder for family in self.families.values() for coder in family]
+        return [*self.methods, *{rival.name: rival for rival in rivals}.values()]
+
+    @property
+    def coders(self) -> list[ClipCoder]:
+        """All of them, ours first."""
+        last = [] if self.foreground_only is None else [self.foreground_only]
+        return [*self.compared, *(c for family in self.for_ssim.values() for c in family), *last]
+
+
+def read_drive_comparisons(job: CompareJob) -> list[DriveComparison]:
+    """Return a comparison per drive.
+
+    Raises ``InvalidInput`` for a background that does not fit its drive, and as ``read_drive``.
+    """
+    limit = QUICK_FRAMES if job.quick else None
+    drives, slow = (
+        [DriveOfField.parse(text, job.field) for text in texts]
+        for texts in (job.drives, job.decimated)
+    )
+    behind = {_name(name): name for name in map(DriveName.parse, job.backgrounds)}
+    unknown = behind.keys() - {_name(drive.name) for drive in drives}
+    if unknown:
+        raise InvalidInput("background", f"there is no drive {sorted(unknown)} to stand behind")
+    open_field = cache(load_field)
+    comparisons = []
+    for given in slow:
+        drive = read_drive(given.name).every(DECIMATION)
+        comparisons.append(_drive_comparison(job, given, drive, None, open_field(given.field)))
+    for given in drives:
+        drive, name = read_drive(given.name, limit), behind.get(_name(given.name))
+        background = None if name is None else read_drive(name, limit)
+        field = open_field(given.field)
+        comparisons.append(_drive_comparison(job, given, drive, background, field))
+    return comparisons
+
+
+def _name(name: DriveName) -> tuple[str, float]:
+    return name.scene, name.rate_hz
+
+
+def _drive_comparison(
+    job: CompareJob,
+    given: DriveOfField,
+    drive: Drive,
+    background: Drive | None,
+    field: RadianceField,
+) -> DriveComparison:
+    clip = drive.clip(field_psnr_db=mean_psnr_db(field, drive.pictures))
+    families = job.rival_families()
+    families |= {coder.name: [coder] for coder in map(foreign_coder, job.methods)}
+    rendered = render_clip(field, drive.cameras)
+    foregrounds = _foregrounds(drive, background)
+    behind = None if background is None else background.digest
+    stamp = program_version()
+    if behind is not None:
+        stamp += f", before {behind[:16]}"
+    coders = [
+        FieldCoder(
+            rendered,
+            f"{name}-{method.effort or job.effort}-{rendered.field_id[:12]}",
+            stamp,
+            effort=method.effort or job.effort,
+            references=method.references,
+            foregrounds=() if behind is None else foregrounds,
+        )
+        for name, method in METHODS.items()
+    ]
+    rival = None
+    if behind is not None:
+        rival_stamp = f"{stamp}, field {rendered.field_id}"
+        rival = ForegroundCoder.of(job.preset, foregrounds, rendered.renders, rival_stamp)
+    by_ssim = {} if job.rivals else ssim_rivals(quick=job.quick)
+    return DriveComparison(
+        clip,
+        rendered,
+        given.field,
+        foregrounds,
+        behind,
+        coders,
+        families,
+        by_ssim,
+        rival,
+    )
+
+
+def _foregrounds(drive: Drive, background: Drive | None) -> list[NDArray[np.bool_]]:
+    if background is None:
+        return [np.zeros(frame.y.shape, bool) for frame in drive.frames]
+    if len(background.frames) != len(drive.frames):
+        counts = f"{len(background.frames)} frames where the drive has {len(drive.frames)}"
+        raise InvalidInput("background", f"{drive.name.scene}: {counts}")
+    pairs = zip(drive.frames, background.frames, strict=True)
+    return [foreground_mask(*pair) for pair in pairs]

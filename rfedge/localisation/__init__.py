@@ -1,0 +1,1 @@
+"""Tries of the localiser on a drive whose poses are known: starts, sensors, report."""

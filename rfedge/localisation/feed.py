@@ -1,0 +1,94 @@
+"""Starts of searches from a recorded pose feed, as a vehicle with that feed would have them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cav_agent.frames import Capture
+from cav_agent.pose_feed.feed import FieldFeed, PoseFeed
+from cav_agent.pose_feed.fix import FeedProblem
+from cav_agent.pose_feed.following import FollowedFeed
+from cav_agent.pose_feed.placing import Place
+from rfcore.errors import InvalidData, RfedgeError
+from rfcore.field import Bounds
+from rfcore.localise.localiser import Localised
+from rfcore.localise.prior import PosePrior
+from rfcore.views import PosedPicture
+from rfedge.localisation.starts import Attempt, StartError, pose_difference
+
+__all__ = ["RecordedFeed", "typical_start"]
+
+
+class RecordedFeed:
+    """A feed read from a file, whose times are those of the drive plus an offset.
+
+    ``problems``: what was wrong with it, and how often.
+    """
+
+    def __init__(self, offset_s: float) -> None:
+        self.problems: Counter[FeedProblem] = Counter()
+        self._in_field: FieldFeed
+        self._followed: FollowedFeed
+        self._feed = PoseFeed(self._told, offset_s=offset_s, recorded=True)
+
+    @staticmethod
+    def read(path: Path, offset_s: float) -> RecordedFeed:
+        """Read a file; raise ``InvalidData`` where it holds no fix at all."""
+        read = RecordedFeed(offset_s)
+        read._feed.receive(path.read_bytes(), 0)
+        read._feed.end(0)
+        if not read.fixes:
+            found = ", ".join(f"{problem} {times}" for problem, times in read.problems.items())
+            raise InvalidData(f"{path}: holds no fix ({found or 'it is empty'})")
+        return read
+
+    @property
+    def fixes(self) -> int:
+        """How many fixes are used."""
+        return self._feed.count
+
+    def priors(
+        self, pictures: Sequence[PosedPicture], place: Place, bounds: Bounds, rate_hz: float
+    ) -> list[PosePrior | None]:
+        """Return what is known of each picture's pose when it is taken, None before the feed."""
+        self._in_field = FieldFeed(self._feed, place, bounds)
+        followed = self._followed = FollowedFeed(self._in_field, recorded=True, rate_hz=rate_hz)
+        found: list[PosePrior | None] = []
+        for index, picture in enumerate(pictures):
+            try:
+                found.append(followed.prior(Capture(index, picture, 0.0, 0)))
+            except RfedgeError:
+                found.append(None)
+        return found
+
+    def time_offset(self, pictures: Sequence[PosedPicture], done: Sequence[Attempt]) -> str:
+        """Return in words how late the feed is, by the poses that were found; after ``priors``."""
+        found = {id(attempt.picture): attempt.answer for attempt in done}
+        for index, picture in enumerate(pictures):
+            answer = found.get(id(picture))
+            if isinstance(answer, Localised):
+                time_ns = self._followed.time_ns(Capture(index, picture, 0.0, 0))
+                self._in_field.localised(time_ns, answer.world_from_cam.translation_m)
+        offset = self._in_field.time_offset()
+        if offset is None:
+            return "time offset not determined: too few fixes, or no change of velocity"
+        return f"add {offset.seconds:.3f} s to its times (one sigma {offset.std_s:.3f} s)"
+
+    def _told(self, problem: FeedProblem, text: str, begins: bool) -> None:  # noqa: ARG002
+        self.problems[problem] += 1
+
+
+def typical_start(
+    pictures: Sequence[PosedPicture], priors: Sequence[PosePrior | None]
+) -> StartError:
+    """Return the median error of the starts against the dataset's poses."""
+    errors = [
+        pose_difference(picture.camera.world_from_cam, prior.world_from_cam)
+        for picture, prior in zip(pictures, priors, strict=True)
+        if prior is not None
+    ]
+    return StartError(*(round(float(value), 3) for value in np.median(errors, axis=0)))

@@ -1,0 +1,86 @@
+"""What every command-line program of the project does: parse, run one verb, report errors.
+
+A verb is one frozen dataclass, its options (their docstrings are the ``--help``), with a ``run``
+method. Heavy imports happen inside ``run``, so that ``--help`` is immediate.
+A user's mistake ends in one line on stderr and exit status 2, never in a traceback.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import select
+import sys
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Protocol
+
+from tyro.conf import (
+    DisallowNone,
+    FlagCreatePairsOff,
+    OmitSubcommandPrefixes,
+    PositionalMetavarFromFieldName,
+)
+
+from rfcore.errors import RfedgeError
+
+__all__ = ["CONFIG", "SIGPIPE_STATUS", "Verb", "run_program"]
+
+CONFIG = (
+    OmitSubcommandPrefixes,
+    DisallowNone,
+    FlagCreatePairsOff,
+    PositionalMetavarFromFieldName,
+)
+"""Options are named as their fields, flags have one form, and help shows neither None nor PATH
+where a word says more."""
+
+
+SIGPIPE_STATUS = 141
+"""What shells report for a program that was ended by SIGPIPE."""
+
+
+class Verb(Protocol):
+    """One command with its options."""
+
+    def run(self) -> None:
+        """Do what was asked for."""
+
+
+def run_program(name: str, parse: Callable[[], Verb]) -> int:
+    """Parse the command line with ``parse``, run the verb, and return the exit status."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a log file gets cost and progress as they come
+        sys.stdout.reconfigure(line_buffering=True)
+    try:
+        return _run(name, parse)
+    except BrokenPipeError as error:
+        if not _nobody_reads():
+            print(f"{name}: {error}", file=sys.stderr)
+            return 2
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at the exit
+        return SIGPIPE_STATUS
+
+
+def _nobody_reads() -> bool:
+    """Return whether standard output is a pipe whose reader, like `head`, has what it wanted."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
+
+
+def _run(name: str, parse: Callable[[], Verb]) -> int:
+    if sys.argv[1:] == ["--version"]:
+        print(f"{name} {version('rfedge')}")
+        return 0
+    verb = parse()
+    try:
+        verb.run()
+    except BrokenPipeError:
+        raise
+    except (RfedgeError, OSError) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted", file=sys.stderr)
+        return 130
+    return 0

@@ -1,5 +1,0 @@
-"""The procedural street: scene files, and the effects a scene declares."""
-
-from rfedge.street.scene_file import Scene, load_scene
-
-__all__ = ["Scene", "load_scene"]

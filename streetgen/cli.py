@@ -1,0 +1,194 @@
+"""The ``streetgen`` command line: build, plan and sheet declared streets.
+
+A scene file becomes pictures, depth, classes and poses. ``plan`` says what a scene declares and
+what its effects cost, ``sheet`` puts built scenes on one page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, arg, subcommand
+
+from rfedge.arguments import FOLDER, JSON, SCENE, SIZE, parse_size
+from rfedge.program import CONFIG, run_program
+
+if TYPE_CHECKING:
+    from streetgen.scene_file import Scene
+
+__all__ = ["Build", "Plan", "Sheet", "main", "parse"]
+
+
+@dataclass(frozen=True)
+class Build:
+    """Render a scene with Mitsuba 3 (pip install 'rfedge[scene]') into a dataset.
+
+    The same command goes on where it was stopped. The same scene, size, samples and seed give the
+    same pictures, whatever the number of workers.
+    """
+
+    scene: Annotated[str, Positional, SCENE]
+    """A ready-made scene by name (samples/scenes), or a scene file (.toml)."""
+    out: Annotated[Path, FOLDER]
+    """The folder to make, or to go on with."""
+    size: Annotated[str | None, SIZE] = None
+    """WIDTHxHEIGHT px of all pictures; default: what the scene says for each split."""
+    spp: int = 16
+    """Samples a pixel, a square number."""
+    renderer: Literal["auto", "cuda", "llvm", "scalar"] = "auto"
+    """Which variant of Mitsuba renders; auto: the first that works here of CUDA on an NVIDIA GPU,
+    LLVM and scalar. Pictures of two differ by rounding, so a folder is built by one."""
+    workers: int = 1
+    """Processes. One uses all cores; more share them and take 1 to 2.5 GB each."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Render on a Ray (`local` starts one here; docs/scale.md), each job on this machine's cores
+    divided by --workers; the pictures are the same. Needs rfedge[ray]."""
+    frames: Annotated[str | None, arg(metavar="A:B")] = None
+    """Only frames a:b of the chosen splits, counted through drive, train, eval in that order."""
+    split: Annotated[str, arg(metavar="SPLIT")] = "default"
+    """drive, train, eval, a list of them with commas, or all; default: all, but without train where
+    the scene's field was trained on another scene. rig: the drive by several cameras, with rig.toml
+    for `cav-agent --rig`."""
+    rig: Annotated[str | None, arg(metavar="CAMERAS")] = None
+    """For --split rig: which cameras, with commas, of the car's 18 (low, mid or high with _front,
+    _front_left, _front_right, _left, _right, _back), or all; default: the mid row's front, left,
+    right and back."""
+
+    def run(self) -> None:
+        """Build."""
+        from rich.console import Console
+
+        from rfcore.extras import require
+        from streetgen import load_scene
+        from streetgen.render.backend import require_renderer
+        from streetgen.shots import Selection
+
+        require_renderer()
+        from streetgen.build.run import Settings, build_scene
+
+        size_px = parse_size(self.size) if self.size is not None else None
+        scene = load_scene(self.scene)
+        if self.rig is not None:
+            scene = replace(scene, drive=replace(scene.drive, rig=self.rig))
+        selection = Selection(scene, self.split, self.frames, size_px)
+        if self.ray is not None:
+            require("ray", "ray")
+        settings = Settings(self.out, self.spp, self.workers, self.ray, self.renderer)
+        build_scene(selection, settings, Console(soft_wrap=True))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Check scene files; print their pictures and the effects that will run, with measured cost."""
+
+    scenes: Annotated[tuple[str, ...], Positional, arg(metavar="SCENE ...")]
+    """Ready-made scenes by name (samples/scenes), or scene files (.toml)."""
+
+    render: bool = False
+    """Render the street small, with and without each effect, and say what share of a frame each
+    takes; needs rfedge[scene] and up to a minute for each effect."""
+    json: Annotated[Path | None, JSON] = None
+    """With --render: also write what was measured into this file."""
+    page: Annotated[Path | None, arg(metavar="FILE.md")] = None
+    """With --render: also put it as a table into this page, between its marks."""
+
+    def run(self) -> None:
+        """Print the plans."""
+        from rfcore.errors import InvalidInput
+        from streetgen import load_scene
+
+        if not self.scenes:
+            raise InvalidInput("scenes", "none is named; street-empty is one")
+        if not self.render and (self.json or self.page):
+            raise InvalidInput("json", "and page take what was rendered; add --render")
+        scenes = [load_scene(name) for name in self.scenes]
+        if self.render:
+            self._measure(scenes)
+        else:
+            _print_plans(scenes)
+
+    def _measure(self, scenes: list[Scene]) -> None:
+        from time import process_time
+
+        from streetgen.plan_table import (
+            effect_lines,
+            measured_plans,
+            scene_lines,
+            write_page,
+            write_rows,
+        )
+        from streetgen.render.backend import require_renderer
+
+        require_renderer()
+        rows = []
+        for plan in measured_plans(scenes, process_time):
+            print(*scene_lines(plan.scene), sep="\n")
+            print(*effect_lines(plan.effects, plan.cost), sep="\n", flush=True)
+            rows += plan.rows()
+        if self.json is not None:
+            write_rows(self.json, rows)
+        if self.page is not None:
+            write_page(self.page, rows)
+
+
+def _print_plans(scenes: list[Scene]) -> None:
+    from time import process_time
+
+    from streetgen.plan import planned_effects
+    from streetgen.plan_table import effect_lines, scene_lines
+
+    for scene in scenes:
+        print(*scene_lines(scene), sep="\n")
+        print(*effect_lines(planned_effects(scene, process_time), None), sep="\n")
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Write a contact sheet of built scenes; docs/scenes-contact-sheet.jpg is made with it."""
+
+    scenes: Annotated[tuple[Path, ...], Positional, arg(metavar="FOLDER ...")]
+    """Folders that `streetgen build` made."""
+    out: Annotated[Path, arg(metavar="FILE.jpg")]
+    """The picture to write."""
+    columns: int = 4
+    """Pictures of each scene, evenly chosen among those that there are."""
+    width_px: int = 1280
+    """Width of the sheet, px."""
+    max_bytes: int = 600_000
+    """The JPEG's quality is lowered until it fits."""
+
+    def run(self) -> None:
+        """Write the sheet; say how large it became."""
+        from streetgen.contact_sheet import write_contact_sheet
+
+        size = write_contact_sheet(
+            self.scenes, self.out, self.columns, self.width_px, self.max_bytes
+        )
+        print(f"{self.out}: {len(self.scenes)} scenes, {size / 1000:.0f} kB")
+
+
+Verb = (
+    Annotated[Build, subcommand("build")]
+    | Annotated[Plan, subcommand("plan")]
+    | Annotated[Sheet, subcommand("sheet")]
+)
+
+
+def parse(arguments: Sequence[str] | None = None) -> Verb:
+    """Return the verb that ``arguments`` ask for, by default those of the process."""
+    return tyro.cli(
+        Verb,
+        prog="streetgen",
+        description="Declared streets, rendered with Mitsuba 3 into datasets for rfedge.",
+        args=arguments,
+        config=CONFIG,
+    )
+
+
+def main() -> int:
+    """Run one verb and return its exit status."""
+    return run_program("streetgen", parse)

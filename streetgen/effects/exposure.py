@@ -1,0 +1,27 @@
+"""Exposure drift: a slow wave in stops, as automatic exposure makes it between sun and shade."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+
+from rfcore.tables import Range
+from streetgen.frame import LinearFrame
+
+__all__ = ["ExposureDrift"]
+
+
+@dataclass(frozen=True)
+class ExposureDrift:
+    """``stops`` up and down, once in ``period_s``."""
+
+    stops: Annotated[float, Range(0, 4)] = 0.3
+    period_s: Annotated[float, Range(0.1, 3600)] = 4.0
+
+    def apply(self, frame: LinearFrame, _rng: np.random.Generator) -> LinearFrame:
+        """Multiply the light by the gain of the frame's time."""
+        gain = 2.0 ** (self.stops * math.sin(2 * math.pi * frame.time_s / self.period_s))
+        return replace(frame, colour=frame.colour * np.float32(gain))

@@ -1,0 +1,367 @@
+"""The verb ``rfedge eval compare``, from files to a result file."""
+
+import io
+import json
+import math
+import pickle
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tyro
+from rich.console import Console
+
+from rfcore.errors import InvalidInput
+from rfcore.field import load_field
+from rfedge.evaluate.clips import DriveName, read_drive
+from rfedge.evaluate.compare import EvalCompare
+from rfedge.evaluate.compare import run as compare_run
+from rfedge.evaluate.compare.drives import CompareJob, foreign_coder, read_drive_comparisons
+from rfedge.evaluate.compare.measure import BEST, BEST_OF_ANY_CPU
+from rfedge.evaluate.compare.run import code_on_ray, run_compare
+from rfedge.evaluate.rivals import x264_lowdelay
+from rfedge.jobs import run_jobs
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+ROW_KEYS = {
+    "scene",
+    "hz",
+    "method",
+    "rival",
+    "window_db",
+    "bd_rate_percent",
+    "ci95",
+    "points",
+    "first_frame_bytes",
+    "cpu_ms",
+    "rival_cpu_ms",
+    "field_psnr_db",
+}
+
+
+class UsersCodec:
+    """What a user brings: a class that is called without arguments."""
+
+    def __new__(cls):
+        return x264_lowdelay("superfast", "users-codec")
+
+
+def test_a_drive_is_named_with_its_rate():
+    name = DriveName.parse("street-empty@29.97=a/b=c.json")
+    assert name == DriveName("street-empty", 29.97, Path("a/b=c.json"))
+
+
+@pytest.mark.parametrize("text", ["drive.json", "a@=x", "a@0=x", "@10=x", "a@ten=x"])
+def test_another_form_is_refused_by_an_example(text):
+    with pytest.raises(InvalidInput, match="NAME@HZ=DATASET"):
+        DriveName.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("json", "is not MODULE:CLASS, as mjpeg_rival:MotionJpeg"),
+        ("json:", "is not MODULE:CLASS"),
+        ("nowhere:X", r"neither .*nowhere\.py nor an installed module 'nowhere'"),
+        ("json.nowhere:X", r"neither .*json/nowhere\.py nor an installed module"),
+        ("json:Nothing", r"json \(.*\) has no 'Nothing'"),
+        ("json:JSONDecoder", "lacks name, points, version, code of a ClipCoder"),
+        ("json:load", "cannot be called without arguments"),
+        (".relative:X", "cannot be imported"),
+    ],
+)
+def test_a_method_that_is_none_is_refused_with_what_was_looked_for(text, why):
+    with pytest.raises(InvalidInput, match=f"method: .*{why}"):
+        foreign_coder(text)
+
+
+MJPEG = """
+class MotionJpeg:
+    name, points, version = "mjpeg", (2.0, 8.0), "1"
+
+    def code(self, frames, rate_hz, point):
+        raise NotImplementedError
+"""
+
+
+@pytest.fixture
+def working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    for name in ("mjpeg_rival_here", "rivals_here", "rivals_here.mjpeg", "broken_rival"):
+        sys.modules.pop(name, None)
+
+
+def test_a_method_is_found_in_the_working_folder(working_folder):
+    (working_folder / "mjpeg_rival_here.py").write_text(MJPEG)
+    before = list(sys.path)
+    assert foreign_coder("mjpeg_rival_here:MotionJpeg").name == "mjpeg"
+    assert sys.path == before
+
+
+def test_a_method_is_found_in_a_package_of_the_working_folder(working_folder):
+    (working_folder / "rivals_here").mkdir()
+    (working_folder / "rivals_here/mjpeg.py").write_text(MJPEG)
+    assert foreign_coder("rivals_here.mjpeg:MotionJpeg").points == (2.0, 8.0)
+
+
+def test_a_module_that_lacks_something_itself_is_told_from_one_that_is_not_there(working_folder):
+    (working_folder / "broken_rival.py").write_text("import not_installed_here")
+    with pytest.raises(InvalidInput, match="broken_rival needs 'not_installed_here'"):
+        foreign_coder("broken_rival:X")
+
+
+@pytest.mark.parametrize("window", [(35.0, 32.0), (32.0, 32.0), (0.0, 30.0), (30.0, math.inf)])
+def test_a_window_that_does_not_rise_is_refused(tmp_path, window):
+    with pytest.raises(InvalidInput, match="window"):
+        CompareJob(
+            Path("f.rff"),
+            ("a@1=b",),
+            "fast",
+            "veryfast",
+            tmp_path / "c.json",
+            tmp_path,
+            window_db=window,
+        )
+
+
+def job_of(thumbnail, folder, **change):
+    given = {
+        "field": thumbnail.field,
+        "drives": (thumbnail.drive,),
+        "effort": "fast",
+        "preset": "ultrafast",
+        "out": folder / "compare.json",
+        "cells": folder / "cells",
+        "quick": True,
+    }
+    return CompareJob(**given | change)
+
+
+@pytest.fixture(scope="module")
+def compared(thumbnail, tmp_path_factory):
+    """A comparison over a window that our own points do not reach down to, with a background."""
+    folder = tmp_path_factory.mktemp("compared")
+    job = job_of(thumbnail, folder, window_db=(33.0, 36.0), backgrounds=(thumbnail.empty,))
+    console = Console(record=True, quiet=False, file=io.StringIO(), width=200)
+    return job, run_compare(job, console), console.export_text()
+
+
+def test_a_comparison_says_what_it_will_do_before_it_starts(compared):
+    _, _, said = compared
+    first = said.splitlines()[0]
+    assert first.startswith("BD-rates over 33..36 dB: 83 clips to code, about ")
+    assert "Points are added where a curve does not span the window" in said
+    assert re.search(r"rfedge-fast-\w+ also at 41", said)
+
+
+def test_every_curve_spans_the_window_that_was_asked_for(compared):
+    _, result, _ = compared
+    for curve in result["curves"]:
+        assert curve["psnr_db"][0] <= 33 <= 36 <= curve["psnr_db"][-1]
+        assert curve["psnr_db"] == sorted(curve["psnr_db"])
+        assert len(curve["point"]) == len(curve["bytes_per_frame"]) == len(curve["ssim"])
+    assert {tuple(row["window_db"]) for row in result["rows"]} == {(33.0, 36.0)}
+
+
+def test_every_row_of_a_comparison_has_its_interval_around_its_figure(compared):
+    _, result, _ = compared
+    for row in result["rows"]:
+        assert set(row) >= ROW_KEYS
+        low, high = row["ci95"]
+        assert low <= row["bd_rate_percent"] <= high
+    assert {row["method"].rsplit("-", 2)[0] for row in result["rows"]} == {
+        "rfedge",
+        "rfedge-thorough",
+        "rfedge-render-only",
+        "rfedge-without-field",
+    }
+
+
+def test_shares_of_area_and_bits_are_whole(compared):
+    _, result, _ = compared
+    assert sum(row["area_percent"] for row in result["bits"]) == pytest.approx(100)
+    assert sum(row["slice_percent"] for row in result["bits"]) == pytest.approx(100)
+    moving = next(row for row in result["bits"] if row["shows"] == "moving")
+    assert moving["slice_percent"] > moving["area_percent"], "the box is not in the field"
+
+
+def test_a_finished_comparison_is_not_coded_again(compared):
+    job, result, _ = compared
+    cells = {path: path.read_bytes() for path in job.cells.iterdir()}
+    again = run_compare(job, Console(quiet=True))
+    assert again["rows"] == result["rows"]
+    assert {path: path.read_bytes() for path in job.cells.iterdir()} == cells
+    assert json.loads(job.out.read_text())["curves"] == result["curves"]
+
+
+def test_jobs_leave_all_cells_that_a_comparison_looks_for(
+    compared, thumbnail, tmp_path, monkeypatch
+):
+    here, result, _ = compared
+    addresses = []
+
+    def on_workers(jobs, tell, address):
+        addresses.append(address)
+        return run_jobs(pickle.loads(pickle.dumps(jobs)), tell)
+
+    monkeypatch.setattr(compare_run, "run_jobs", on_workers)
+    job = job_of(thumbnail, tmp_path, window_db=here.window_db, backgrounds=here.backgrounds)
+    lines = []
+    code_on_ray(job, "10.0.0.1:6379", lines.append)
+    assert addresses == ["10.0.0.1:6379"]
+    assert sum(line.endswith(": done") for line in lines) == compare_run.PARTS
+    cells = {path.name: path.read_bytes() for path in job.cells.iterdir()}
+    assert len(cells) >= 75
+    again = run_compare(job, Console(quiet=True))
+    after = {path.name: path.read_bytes() for path in job.cells.iterdir()}
+    assert {name: after[name] for name in cells} == cells
+    assert len(after) == len(cells) + 2, "processor times, and whose bits they are"
+    assert [row["bytes_per_frame"] for row in again["curves"]] == [
+        row["bytes_per_frame"] for row in result["curves"]
+    ]
+
+
+@pytest.mark.slow
+def test_processes_give_the_rows_that_one_gives(thumbnail, tmp_path):
+    only = {"rivals": ("x264-lowdelay",), "window_db": (33.0, 36.0)}
+    alone = job_of(thumbnail, tmp_path, **only)
+    shared = replace(alone, cells=tmp_path / "shared", processes=2)
+    one, two = (run_compare(job, Console(quiet=True)) for job in (alone, shared))
+    assert [row["bytes_per_frame"] for row in two["curves"]] == [
+        row["bytes_per_frame"] for row in one["curves"]
+    ]
+
+
+def test_processes_that_cannot_be_are_refused(thumbnail, tmp_path):
+    with pytest.raises(InvalidInput, match="processes: 0 is outside"):
+        job_of(thumbnail, tmp_path, processes=0)
+
+
+def test_each_drive_of_a_comparison_keeps_its_background(tmp_path):
+    job = CompareJob(
+        field=Path("wall.rff"),
+        drives=("a@10=a.json", "b@5=b.json,own.rff"),
+        decimated=("c@30=c.json",),
+        backgrounds=("b@5=nothing.json",),
+        effort="fast",
+        preset="veryfast",
+        out=tmp_path / "compare.json",
+        cells=tmp_path,
+    )
+    apart = [(one.drives, one.decimated, one.backgrounds) for one in job.of_each_drive()]
+    assert apart == [
+        (("a@10=a.json",), (), ()),
+        (("b@5=b.json,own.rff",), (), ("b@5=nothing.json",)),
+        ((), ("c@30=c.json",), ()),
+    ]
+
+
+def test_a_window_nobody_reaches_ends_the_comparison_before_its_long_part(thumbnail, tmp_path):
+    job = job_of(thumbnail, tmp_path, window_db=(15.0, 18.0))
+    with pytest.raises(InvalidInput, match=r"15\.\.18 dB is not within .*rfedge-fast.* reaches"):
+        run_compare(job, Console(quiet=True))
+    assert len(list(job.cells.iterdir())) <= 8, "our own ends alone were coded"
+    assert not job.out.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "window"), [((), None), (("--window", "30", "34.5"), (30.0, 34.5))]
+)
+def test_the_command_takes_a_window(tmp_path, monkeypatch, options, window):
+    monkeypatch.chdir(tmp_path)
+    Path("wall.rff").touch()
+    jobs = []
+    monkeypatch.setattr(compare_run, "run_compare", lambda job, _console: jobs.append(job))
+    command = tyro.cli(EvalCompare, args=["wall.rff", "wall@10=drive.json", *options])
+    command.run()
+    assert [job.window_db for job in jobs] == [window]
+    assert jobs[0].windows_db[0] == (window or (32.0, 35.0))
+
+
+def test_a_background_without_its_drive_is_refused(thumbnail, tmp_path):
+    elsewhere = thumbnail.empty.replace("wall@10", "alley@10")
+    with pytest.raises(InvalidInput, match="alley"):
+        run_compare(job_of(thumbnail, tmp_path, backgrounds=(elsewhere,)), Console(quiet=True))
+
+
+def test_a_decimated_drive_is_every_fifth_frame_at_a_fifth_of_the_rate(tmp_path):
+    job = CompareJob(
+        field=SAMPLES / "fields" / "street.rff",
+        drives=(),
+        decimated=(f"empty@10={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
+        effort="fast",
+        preset="veryfast",
+        out=tmp_path / "compare.json",
+        cells=tmp_path / "cells",
+    )
+    (comparison,) = read_drive_comparisons(job)
+    assert comparison.clip.rate_hz == 2.0
+    whole = read_drive(job.decimated[0])
+    assert [f.digest() for f in comparison.clip.frames] == [f.digest() for f in whole.frames[::5]]
+    assert [c.world_from_cam for c in comparison.rendered.cameras] == [
+        c.world_from_cam.rounded() for c in whole.cameras[::5]
+    ]
+
+
+@pytest.mark.sample
+def test_a_drive_may_name_a_field_of_its_own(thumbnail, tmp_path):
+    """The street's field at the wall's poses; the wall's is the command's."""
+    own = SAMPLES / "fields" / "street.rff"
+    drives = (thumbnail.drive, f"{thumbnail.drive.replace('wall', 'other')},{own}")
+    walls, other = read_drive_comparisons(job_of(thumbnail, tmp_path, drives=drives))
+    assert walls.rendered.field_id == load_field(thumbnail.field).field_id
+    assert other.rendered.field_id == load_field(own).field_id
+    assert other.field_bytes == own.stat().st_size
+
+
+def test_a_comparison_of_nothing_is_refused(tmp_path):
+    with pytest.raises(InvalidInput, match="there is none"):
+        CompareJob(Path("field.rff"), (), "fast", "veryfast", tmp_path / "compare.json", tmp_path)
+
+
+def test_rivals_that_are_asked_for_stand_alone_with_the_one_a_field_is_paid_for_against(
+    thumbnail, tmp_path
+):
+    job = job_of(thumbnail, tmp_path, window_db=(33.0, 36.0), rivals=("x264-our-tools-ultrafast",))
+    result = run_compare(job, Console(quiet=True))
+    assert {row["rival"] for row in result["rows"]} - {BEST, BEST_OF_ANY_CPU} == {
+        "x264-our-tools-ultrafast",
+        "x264-lowdelay-psnr",
+    }
+    assert {row["rival"] for row in result["break_even"]} == {"x264-lowdelay-psnr-ultrafast"}
+    assert result["ssim"] == []
+
+
+def test_a_rival_that_nobody_knows_is_refused_with_those_there_are(thumbnail, tmp_path):
+    with pytest.raises(InvalidInput, match="rivals: 'h264' is none of x264-lowdelay, x264-lowd"):
+        job_of(thumbnail, tmp_path, rivals=("h264",))
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_quick_comparison_writes_rows_and_goes_on_from_its_cells(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "users_module", sys.modules[__name__])
+    job = CompareJob(
+        field=SAMPLES / "fields" / "street.rff",
+        drives=(f"empty@10={SAMPLES / 'street' / 'transforms_drive_empty.json'}",),
+        effort="fast",
+        preset="veryfast",
+        out=tmp_path / "compare.json",
+        cells=tmp_path / "cells",
+        methods=("users_module:UsersCodec",),
+        quick=True,
+    )
+    first = run_compare(job, Console(quiet=True))
+    cells = {path: path.read_bytes() for path in job.cells.iterdir()}
+    again = run_compare(job, Console(quiet=True))
+    assert again["rows"] == first["rows"]
+    assert {path: path.read_bytes() for path in job.cells.iterdir()} == cells
+    assert json.loads(job.out.read_text())["rows"] == first["rows"]
+    assert all(set(row) >= ROW_KEYS for row in first["rows"])
+    rivals = {row["rival"] for row in first["rows"]}
+    assert {"x264-lowdelay", "svtav1-lowdelay", "users-codec", BEST} <= rivals
+    headline = next(r for r in first["rows"] if r["rival"] == "x264-lowdelay")
+    assert headline["bd_rate_percent"] < 0

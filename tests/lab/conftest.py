@@ -1,0 +1,3 @@
+from thumbnail import thumbnail
+
+__all__ = ["thumbnail"]

@@ -1,0 +1,113 @@
+"""What pose errors cost is measured against the same drive at its own poses."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lab.localisation import EvalLocalise
+from lab.localisation.given import GivenDrive
+from lab.localisation.measure import Piece, pieces, rows_of_pieces
+from rfcore.dataset import read_dataset
+from rfcore.errors import InvalidInput
+from rfcore.field import load_field
+from rfcore.localise.localiser import Lost
+from rfedge.localisation.starts import StartError, attempts
+
+SAMPLES = Path(__file__).parents[2] / "samples"
+
+
+@pytest.mark.sample
+@pytest.mark.slow
+def test_the_sample_gives_a_row_of_starts_and_a_row_of_bits(tmp_path: Path) -> None:
+    drive = SAMPLES / "street/transforms_drive_empty.json"
+    field = SAMPLES / "fields/street.rff"
+    EvalLocalise(
+        drives=(f"sample={drive},{field}",),
+        tries=1,
+        false_starts=1,
+        starts=("2m:3deg",),
+        errors=("offset",),
+        frames=4,
+        out=tmp_path / "out.json",
+        crfs=(25.0, 35.0),
+        processes=2,
+        cells=tmp_path / "cells",
+    ).run()
+    starts, bits = json.loads((tmp_path / "out.json").read_text())["rows"]
+    assert starts["localised_percent"] == 100
+    assert starts["false_percent"] == 0
+    assert starts["track_cpu_ms"] > 0
+    assert bits["tracked_percent"] == 100
+    assert -5 < bits["bits_percent"] < 10
+
+
+@pytest.mark.sample
+def test_a_row_that_is_there_is_not_measured_again_and_any_other_setting_is_another_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = f"a={SAMPLES / 'street/transforms_drive_empty.json'},{SAMPLES / 'fields/street.rff'}"
+    elsewhere = SAMPLES / "street/transforms_drive_vehicles.json"
+    asked = EvalLocalise(
+        drives=(text,), starts=("2m:3deg",), errors=("offset",), strangers=(elsewhere,)
+    )
+    measured = []
+
+    def rows(piece: Piece) -> list[dict[str, object]]:
+        measured.append(piece)
+        return [{"row": len(measured)}]
+
+    monkeypatch.setattr(Piece, "rows", rows)
+
+    def run(asked: EvalLocalise) -> list[int]:
+        found = pieces(asked, [GivenDrive.parse(text)])
+        return [row["row"] for row in rows_of_pieces(found, tmp_path / "cells", 1)]
+
+    assert run(asked) == [1, 2]
+    assert run(asked) == [1, 2]
+    assert run(replace(asked, tries=7)) == [3, 2]
+    assert run(replace(asked, crfs=(20.0, 30.0))) == [1, 4]
+    assert run(replace(asked, seed=2)) == [5, 6]
+    assert run(replace(asked, strangers=())) == [7, 2]
+
+
+@pytest.mark.sample
+def test_pictures_of_other_places_of_any_size_are_every_second_false_start() -> None:
+    field = load_field(SAMPLES / "fields/street.rff", threads=1)
+    picture = read_dataset(SAMPLES / "street/transforms_drive_empty.json").pictures[0]
+    reads = []
+
+    def upside_down() -> NDArray[np.uint8]:
+        reads.append(1)
+        return np.ascontiguousarray(np.repeat(picture.read()[::-1], 2, axis=0))
+
+    stranger = replace(picture, read=upside_down)
+    done = attempts(field, [picture], StartError(0.5, 1.0), (1, 3), 1, [stranger])
+    answers = [(attempt.false_start, isinstance(attempt.answer, Lost)) for attempt in done]
+    assert answers == [(False, False), (True, True), (True, True), (True, True)]
+    assert len(reads) == 1
+
+
+def test_a_drive_may_ask_for_searches_from_one_start_error_alone() -> None:
+    asked = EvalLocalise(drives=("a=d.json,f.rff",), starts=("2m:3deg", "4m:8deg"))
+    (piece,) = pieces(asked, [GivenDrive.parse("a=d.json,f.rff,rows=1m:2deg")])
+    assert (piece.start, piece.sensor) == (StartError(1, 2), None)
+
+
+def test_a_drive_without_a_field_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="NAME=DRIVE,FIELD"):
+        EvalLocalise(drives=("sample=here",)).run()
+
+
+def test_a_sensor_of_another_form_is_refused_before_any_work() -> None:
+    with pytest.raises(InvalidInput, match="whichever"):
+        EvalLocalise(drives=("a=d.json,f.rff",), errors=("whichever",)).run()
+
+
+def test_a_number_of_processes_that_cannot_be_is_refused(tmp_path: Path) -> None:
+    asked = EvalLocalise(drives=("a=b,c",), processes=0, out=tmp_path / "out.json")
+    with pytest.raises(InvalidInput, match="processes: 0 is outside"):
+        asked.run()

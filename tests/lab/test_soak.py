@@ -1,0 +1,75 @@
+"""What a soak calls growth."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lab.soak import SoakRow, soak_section, what_grew
+from rfedge.loadtest.usage import Sample
+from rfedge.results import make_result, provenance, read_result, write_result
+
+
+def looks(slope_mb: float = 0.0, **late: int) -> list[Sample]:
+    """Ten minutes of samples; ``late`` are counts of the last three."""
+    counts = {"descriptors": 40, "threads": 9, "children": 2}
+    return [
+        Sample(
+            60.0 * i, 0.0, 0.0, 200.0 + slope_mb * i, **(counts if i < 7 else {**counts, **late})
+        )
+        for i in range(10)
+    ]
+
+
+def test_nothing_grows_when_nothing_does() -> None:
+    assert what_grew(looks()) == []
+    assert what_grew(looks(slope_mb=0.9)) == []
+    assert what_grew(looks(descriptors=30, threads=8)) == []
+
+
+@pytest.mark.parametrize(
+    ("samples", "said"),
+    [
+        (looks(slope_mb=1.5), "memory grows 1.50 MB a minute"),
+        (looks(descriptors=41), "descriptors grew from 40 to 41"),
+        (looks(threads=13), "threads grew from 9 to 13"),
+        (looks(children=3), "processes grew from 2 to 3"),
+    ],
+)
+def test_what_grows_is_named(samples: list[Sample], said: str) -> None:
+    (problem,) = what_grew(samples)
+    assert said in problem
+
+
+def test_a_pool_that_starts_a_thread_late_is_no_growth_and_a_leak_of_one_thread_a_quarter_is() -> (
+    None
+):
+    assert what_grew(looks(threads=10)) == []
+    assert what_grew(looks(threads=12)) == []
+    leaking = [replace(sample, threads=9 + k // 3) for k, sample in enumerate(looks() + looks())]
+    assert what_grew(leaking) == ["threads grew from 9 to 14"]
+    slowly = [replace(sample, threads=9 + k // 2) for k, sample in enumerate(looks())]
+    assert what_grew(slowly) == ["threads grew from 9 to 12"]
+
+
+def test_a_thing_that_comes_and_goes_is_no_growth() -> None:
+    """A connection that lives for a moment, of a scrape or a check of health."""
+    samples = looks()
+    samples[9] = Sample(540.0, 0.0, 0.0, 200.0, 41, 9, 2)
+    assert what_grew(samples) == []
+
+
+def test_a_run_too_short_for_quarters_is_judged_all_the_same() -> None:
+    assert what_grew(looks()[:2]) == []
+    assert what_grew(looks(descriptors=41)[5:8]) == ["descriptors grew from 40 to 41"]
+
+
+def test_a_soak_is_a_row_of_the_results_page(tmp_path: Path) -> None:
+    row = SoakRow(
+        5.0, 2, 5.0, True, 3000, -0.25, 400.5, 15, 14, 3, 400.25, 15, 16, 3, 0.5, 40.0, None
+    )
+    path = tmp_path / "soak.json"
+    write_result(path, make_result("soak", provenance(), {"rows": [row]}))
+    section = soak_section(path, read_result(path, "soak"))
+    assert "| 5.00 | 2 | 5.00 | True | 3000 | -0.25 | 400.50 |" in section
+    assert section.rstrip().endswith("| 0.50 | 40.00 | not run |")

@@ -1,0 +1,76 @@
+"""Sizes of I pictures: of each picture alone, at a stated rate, of built scenes only."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lab.intra_size import IntraCoding, intra_bytes, sizes_of, write_sizes
+from rfcore.errors import DatasetError, InvalidInput
+from rfcore.image import write_png
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def grain() -> np.ndarray:
+    """A picture with detail everywhere."""
+    return np.random.default_rng(3).integers(60, 120, (96, 160, 3)).astype(np.uint8)
+
+
+@pytest.fixture
+def built(tmp_path: Path, grain: np.ndarray) -> Path:
+    """A scene of two pictures, one blank."""
+    folder = tmp_path / "scene"
+    (folder / "eval" / "images").mkdir(parents=True)
+    for i, rgb in enumerate((grain, np.full_like(grain, 90))):
+        write_png(folder / "eval" / "images" / f"{i:06d}.png", rgb)
+    (folder / "build.json").write_text(json.dumps({"scene": {"name": "x"}, "samples": 4}))
+    return folder
+
+
+def test_detail_takes_bytes_and_so_does_being_shown_for_longer(grain: np.ndarray) -> None:
+    coding = IntraCoding()
+    assert intra_bytes(grain, coding) > 50 * intra_bytes(np.full_like(grain, 90), coding)
+    assert intra_bytes(grain, IntraCoding(rate_hz=1)) > intra_bytes(grain, coding)
+    assert intra_bytes(grain, IntraCoding(crf=33.0)) < intra_bytes(grain, coding)
+
+
+def test_a_picture_is_measured_alone(built: Path, grain: np.ndarray) -> None:
+    (sizes,) = sizes_of([built], IntraCoding())
+    assert sizes.size_px == (160, 96)
+    assert sizes.picture_bytes[0] == intra_bytes(grain, IntraCoding())
+    assert "x: 2 I pictures of 160x96 px at 4 samples a pixel" in sizes.line()
+
+
+def test_figures_say_how_they_were_taken(built: Path, tmp_path: Path) -> None:
+    coding = IntraCoding(crf=26.0)
+    write_sizes(tmp_path / "new" / "sizes.json", list(sizes_of([built], coding)), coding)
+    result = json.loads((tmp_path / "new" / "sizes.json").read_text())
+    assert result["coding"] == {"preset": "medium", "crf": 26.0, "rate_hz": 10}
+    row = result["rows"][0]
+    assert row["mean_bytes"] == round(sum(row["picture_bytes"]) / 2)
+    assert {"command", "revision", "host"} <= result.keys()
+
+
+def test_what_cannot_be_measured_is_refused(built: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"build\.json: does not say"):
+        list(sizes_of([tmp_path], IntraCoding()))
+    write_png(built / "eval" / "images" / "000002.png", np.zeros((8, 8, 3), np.uint8))
+    with pytest.raises(DatasetError, match="pictures of 2 sizes"):
+        list(sizes_of([built], IntraCoding()))
+    for wrong in ({"crf": 60.0}, {"rate_hz": 0}):
+        with pytest.raises(InvalidInput, match="outside"):
+            IntraCoding(**wrong)
+
+
+def test_the_streets_pictures_are_as_large_as_those_of_driving_video() -> None:
+    """The committed figures, which the page quotes: 120 to 250 kB at 1920x1080, 10 Hz, CRF 23."""
+    result = json.loads((ROOT / "results" / "scenes" / "intra-size.json").read_text())
+    assert result["coding"] == {"preset": "medium", "crf": 23.0, "rate_hz": 10}
+    page = (ROOT / "docs" / "scenes.md").read_text().replace("\n", " ")
+    for row in result["rows"]:
+        assert row["size_px"] == [1920, 1080]
+        assert 120_000 <= row["mean_bytes"] <= 250_000
+        assert f"`{row['scene']}` take {row['mean_bytes'] / 1000:.0f} kB on average" in page
