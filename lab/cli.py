@@ -13,15 +13,14 @@ from lab.benchmark import EvalBenchmark
 from lab.city import PlanCity
 from lab.classes import EvalClasses
 from lab.intra_size import EvalIntraSize
-from lab.latency import EvalLatency, EvalTail
+from lab.latency import EvalLatency
 from lab.live import EvalLive
 from lab.localisation import EvalLocalise
 from lab.paper import EvalPaper
 from lab.rig import EvalRig
-from lab.robust import EvalRobust, EvalSeams
+from lab.robust import EvalRobust
 from lab.servers import EvalScale
 from lab.size_tables import EvalSizing
-from lab.slice_coder import EvalSliceCoder
 from lab.world import EvalWorld
 from rfedge.program import CONFIG, run_program
 
@@ -40,10 +39,7 @@ Verb = (
     | Annotated[EvalRig, subcommand("rig")]
     | Annotated[EvalRobust, subcommand("robust")]
     | Annotated[EvalScale, subcommand("scale")]
-    | Annotated[EvalSeams, subcommand("seams")]
     | Annotated[EvalSizing, subcommand("size-tables")]
-    | Annotated[EvalSliceCoder, subcommand("slice-coder")]
-    | Annotated[EvalTail, subcommand("tail")]
     | Annotated[EvalWorld, subcommand("world")]
 )
 

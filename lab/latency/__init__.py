@@ -1,4 +1,4 @@
-"""``rfedge-lab latency``: how long frames take over links; ``eval tail``: the largest of many."""
+"""``rfedge-lab latency``: how long frames take over links."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tyro.conf import Positional
 from rfcore.codec.h264.config import DEFAULT_EFFORT
 from rfedge.samples import sample_path
 
-__all__ = ["EvalLatency", "EvalTail"]
+__all__ = ["EvalLatency"]
 
 SAMPLES = (
     f"empty@10={sample_path('street/transforms_drive_empty.json')}",
@@ -77,79 +77,3 @@ class EvalLatency:
         print_needed(console, rows_of(NeededRow, result["needed"]))
         for path in write_latency_figures(result, self.figures):
             console.print(f"  {path}")
-
-
-@dataclass(frozen=True)
-class EvalTail:
-    """Code so many different frames, ours and low-delay x264's, that one late in 100,000 shows.
-
-    No recording is that long. So a field stands for the street: a camera sees its renders with
-    noise, from random drives along a recorded path, and both ends hold a lower level of its detail.
-    What comes out is how sizes are distributed and which constant uplink carries every frame in
-    time.
-    """
-
-    field: Annotated[Path, Positional] = sample_path("fields/street.rff")
-    """The field archive (.rff) that stands for the street; it needs levels of detail."""
-    path: Annotated[Path, Positional] = sample_path("street/transforms_drive_empty.json")
-    """The data set whose poses are driven along."""
-    frames: int = 300_000
-    """How many frames, those that begin a drive not counted."""
-    size: str = "160x90"
-    """WIDTHxHEIGHT px."""
-    hz: float = 10.0
-    """Pictures per second."""
-    detail: float = 0.25
-    """Level of the field that both ends hold."""
-    noise: float = 2.0
-    """Standard deviation of the camera's noise, in levels."""
-    quality_db: float = 33.0
-    """Luma PSNR that both are coded to, on the first drives."""
-    effort: str = DEFAULT_EFFORT
-    """Of ours: fast, default, thorough."""
-    preset: str = "veryfast"
-    """x264 preset of the other."""
-    seed: int = 1
-    """Of the drives and the noise."""
-    processes: int = 1
-    """How many work at it."""
-    out: Path = Path("out/eval/tail.json")
-    """The result file to write."""
-    cells: Path = Path("out/eval/tail")
-    """Folder of finished pieces."""
-
-    def run(self) -> None:
-        """Code what is not there yet, write the rows, print them."""
-        from rich.console import Console
-
-        from lab.latency.tail import (
-            FieldStreet,
-            TailJob,
-            TailRow,
-            print_tail,
-            run_tail,
-        )
-        from rfedge.arguments import field_path, parse_size
-        from rfedge.results import rows_of
-
-        street = FieldStreet(
-            field_path(self.field),
-            self.path,
-            parse_size(self.size),
-            self.hz,
-            self.detail,
-            self.noise,
-            self.seed,
-        )
-        job = TailJob(
-            street=street,
-            frames=self.frames,
-            quality_db=self.quality_db,
-            effort=self.effort,
-            preset=self.preset,
-            processes=self.processes,
-            out=self.out,
-            cells=self.cells,
-        )
-        console = Console()
-        print_tail(console, rows_of(TailRow, run_tail(job, console)["rows"]))

@@ -14,15 +14,12 @@ from lab.adapt.measure import adapt_section
 from lab.benchmark.definition import benchmark_section
 from lab.classes.measure import classes_section
 from lab.latency.report import latency_section, write_latency_figures
-from lab.latency.tail import tail_section
 from lab.live.report import live_section
 from lab.paper.figures import write_paper_figures
 from lab.paper.report import paper_rows, paper_section
 from lab.rig.report import rig_section
 from lab.robust.report import robust_section, write_robust_figure
-from lab.robust.seams import seams_section
 from lab.servers.cases import scale_section, world_section
-from lab.slice_coder.report import slice_coder_section
 from lab.soak import soak_section
 from rfcore.errors import InvalidInput
 from rfcore.files import write_whole
@@ -34,7 +31,7 @@ from rfedge.evaluate.ladder.page import write_ladder_figure
 from rfedge.evaluate.never_worse.measure import never_worse_section
 from rfedge.loadtest.result import load_section, ratio_section
 from rfedge.localisation.rows import localise_section
-from rfedge.report.tables import heading
+from rfedge.report.tables import heading, plain_section
 from rfedge.results import Result, read_result
 from rfedge.training.report import training_section
 
@@ -74,11 +71,11 @@ SECTIONS: Mapping[str, Callable[[Path, Result], str]] = {
     "rig": rig_section,
     "robust": robust_section,
     "scale": scale_section,
-    "seams": seams_section,
-    "slice-coder": slice_coder_section,
+    "seams": plain_section,
+    "slice-coder": plain_section,
     "soak": soak_section,
     "stability": lambda path, result: _reference(path, result, "cases", "stability"),
-    "tail": tail_section,
+    "tail": plain_section,
     "world": world_section,
 }
 """How each kind of result is shown; some have a page of their own."""

@@ -16,9 +16,9 @@ VEHICLES := samples/street/transforms_drive_vehicles.json
 .DELETE_ON_ERROR:
 .SECONDARY:
 .PHONY: results results-full
-results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec slice-coder classes never-worse robust ladder latency compare compare-small)
+results: $(patsubst %,$(OUT)/%.json,bench-raster bench-train bench-codec classes never-worse robust ladder latency compare compare-small)
 	cp $^ lab/results/
-results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long tail seams localise benchmark rig live world paper)
+results-full: results $(patsubst %,$(OUT)/%.json,bench-ngp bench-gpu compare-harder robust-long localise benchmark rig live world paper)
 	cp $(filter %.json,$^) lab/results/
 	$(MAKE) -f samples/adapt/record.mk DATA=$(DATA) RFEDGE=$(RFEDGE)
 
@@ -142,9 +142,6 @@ $(OUT)/load-gpu.json: $(call drive,vehicles-720p) | $(OUT)
 	for hz in 10 30; do for renderer in opencl cpu; do \
 		$(LOADTEST) --renderer $$renderer --threads 4 --vehicles 1 --live --drive $< --hz $$hz --out $(OUT)/load-gpu/live-$$renderer || true; \
 	done; done
-$(OUT)/slice-coder.json: $(FIELDS) | $(OUT)
-	$(LAB) slice-coder $(NOON) sample-vehicles@10=$(VEHICLES),noise=3 $(REAL) $(wordlist 2,2,$(YARDSTICK)) \
-		$(wordlist 2,2,$(YARDSTICK_30)) --out $@
 $(OUT)/compare.json: $(FIELDS) $(if $(DATA),$(OUT)/loop-localised/transforms.json) | $(OUT)
 	$(RFEDGE) eval compare $(SAMPLE) $(NOON) $(REAL) $(LOCALISED) $(YARDSTICK) --background sample-vehicles@10=$(EMPTY) \
 		$(if $(DATA),yardstick-vehicles@10=$(YARD)/transforms_drive_empty.json) \
@@ -179,21 +176,6 @@ FASTER := vehicles-30hz vehicles-720p vehicles-720p-30hz
 $(OUT)/latency.json: $(foreach name,$(FASTER),$(call drive,$(name))) | $(OUT)
 	$(LAB) latency $(SAMPLE) $(subst sample-,,$(NOON)) vehicles@30=$(call drive,vehicles-30hz) \
 		vehicles-720p@10=$(call drive,vehicles-720p) vehicles-720p@30=$(call drive,vehicles-720p-30hz) --cells $(OUT)/latency --out $@
-$(OUT)/tail.json: | $(OUT)
-	$(LAB) tail --processes $(shell nproc) --cells $(OUT)/tail --out $@
-# The sample's street as one field, and cut into two tiles of half its splats each.
-SEAMS := $(OUT)/seams
-SEAMS_TRAIN := --iterations 4000 --sh-degree 1 --antialiased
-$(SEAMS):
-	mkdir -p $@
-$(SEAMS)/split: | $(SEAMS)
-	$(RFEDGE) dataset split samples/street/transforms_train.json --length 50 --overlap 12 --out $@
-$(SEAMS)/fields: $(SEAMS)/split
-	$(RFEDGE) train $< --limit 140000 $(SEAMS_TRAIN) --out $@
-$(SEAMS)/whole.rff: | $(SEAMS)
-	$(RFEDGE) train samples/street/transforms_train.json --points samples/street/points.ply --limit 280000 $(SEAMS_TRAIN) --out $@
-$(OUT)/seams.json: $(SEAMS)/whole.rff $(SEAMS)/split $(SEAMS)/fields
-	$(LAB) seams $(wordlist 1,2,$^) sample-empty@10=$(EMPTY) --fields $(SEAMS)/fields --cells $(OUT)/seams/cells --out $@
 # Every kind of start and error in the empty street, here and on drives of others; elsewhere the usual start alone.
 ROWS := $(COMMA)rows=2m:3deg
 PLACES := sample=$(EMPTY),$(SAMPLE) $(if $(DATA),\

@@ -18,7 +18,7 @@ from rfedge.results import Result
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["cell", "escaped", "heading", "pivot", "print_table", "table"]
+__all__ = ["cell", "escaped", "heading", "pivot", "plain_section", "print_table", "table"]
 
 BORDER = 3
 """Characters a column of a terminal's table needs beside its text: two spaces and a line."""
@@ -70,6 +70,20 @@ def pivot(first: str, cells: Iterable[tuple[str, str, str]]) -> str:
     columns = list(dict.fromkeys(column for line in lines.values() for column in line))
     rows = ([name, *(line.get(each, "-") for each in columns)] for name, line in lines.items())
     return table((first, *columns), rows)
+
+
+def plain_section(path: Path, result: Result) -> str:
+    """Return every list of rows of a result as a table headed by the names of its fields.
+
+    It shows results whose experiment is no longer here.
+    """
+    parts = [heading(path, result)]
+    for name, rows in result.items():
+        if isinstance(rows, list) and rows and isinstance(rows[0], dict):
+            columns = list(dict.fromkeys(column for row in rows for column in row))
+            cells = ([cell(row.get(column)) for column in columns] for row in rows)
+            parts += [f"{name}:", table(columns, cells)]
+    return "\n\n".join([*parts, ""])
 
 
 def print_table(console: Console, title: str, columns: Sequence[str], rows: Cells) -> None:
