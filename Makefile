@@ -18,7 +18,7 @@ NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 .DEFAULT_GOAL := help
 .PHONY: help demo sample sample-field test test-slow test-slices test-scale test-aarch64 test-prometheus test-netns test-fault test-attack \
 	test-compose test-system-packages drive-long stability check build bench proto figures images up \
-	down operations-figures load load-transport load-receiver load-full load-links load-overload load-ratio soak soak-short \
+	down load load-transport load-receiver load-full load-links load-overload load-ratio soak soak-short \
 	test-wheels build-full results results-full lock wheels nightly test-asan fuzz fuzz-nightly test-fault-core sizing
 
 help:  ## show the targets
@@ -141,9 +141,6 @@ up:  ## start two roadside servers, four vehicles, Prometheus and Grafana in con
 down:  ## stop them and remove their volumes
 	$(COMPOSE) $(COMPOSE_FILES) down -v
 
-operations-figures: build-full  ## plot every panel of what `make up` started, into docs/operations.md
-	$(BIN)/python deploy/compose/show.py
-
 RUNS ?= 3
 LOADTEST = $(BIN)/rfedge loadtest --record lab/results/loadtest.json --runs $(RUNS)
 load: load-transport load-receiver load-full load-links load-overload  ## what two cores carry (`make -k load`, 8 min); writes lab/results/loadtest.json
@@ -207,7 +204,7 @@ results results-full: build-full  ## record anew what takes two hours, or everyt
 results-%: build-full  ## record `rfedge eval NAME` in lab/results/NAME.json; options in ARGS (docs/evaluation.md)
 	$(BIN)/rfedge eval $* $(ARGS) --out results/$*.json
 
-figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.md, metrics.md, dashboards
+figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.md, metrics.md
 	$(BIN)/python -m lab.pages.results lab/results docs README.md
 	$(BIN)/python -m rfedge.evaluate.ladder.page lab/results docs
 	$(BIN)/python -m lab.pages.faults lab/results/faults.json > docs/reliability.md.part
@@ -219,7 +216,6 @@ figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.
 	mv docs/sizing.md.part docs/sizing.md
 	$(BIN)/python -m lab.pages.metrics > docs/metrics.md.part
 	mv docs/metrics.md.part docs/metrics.md
-	$(BIN)/python -m rfedge.dashboards deploy/grafana/dashboards
 
 nightly:  ## what .ci/run leaves out: faults, wheels of every Python, half an hour of load, containers
 	.ci/run nightly

@@ -1,16 +1,11 @@
-"""The structure stays what ``docs/architecture.md`` says: layers, modules, top-level verbs."""
+"""The structure stays what ``docs/architecture.md`` says: the layers of its packages."""
 
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, get_args
-
-from rfedge.cli import Verb
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("rfcore", "cav_agent", "mec_server", "rfedge")
-MOST_MODULES, MOST_VERBS = 512, 16
-"""rfedge-bench took four: verbs, definition, submission, method; one was merged away for it."""
 
 
 def layered_contracts() -> list[dict[str, Any]]:
@@ -34,14 +29,3 @@ def test_layers_inside_a_package_name_every_room_of_it() -> None:
     inside = [contract for contract in layered_contracts() if "containers" in contract]
     assert {name for contract in inside for name in contract["containers"]} >= {"rfcore", "rfedge"}
     assert all(contract["exhaustive"] for contract in inside)
-
-
-def test_there_are_no_more_modules_than_a_newcomer_can_survey() -> None:
-    files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
-    modules = [path for path in files if "_pb2" not in path.name]
-    assert len(modules) > 100, "the sources are not where this test looks"
-    assert len(modules) <= MOST_MODULES
-
-
-def test_there_are_no_more_verbs_than_fit_on_a_screen() -> None:
-    assert 1 < len(get_args(Verb)) <= MOST_VERBS

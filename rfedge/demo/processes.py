@@ -9,21 +9,19 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 from rfcore.errors import RfedgeError
 
-__all__ = ["Service", "await_result", "command_of", "run_to_end", "run_until", "service"]
+__all__ = ["Service", "command_of", "run_to_end", "service"]
 
 START_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 10.0
 POLL_S = 0.02
 LOG_LINES_SHOWN = 12
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -75,48 +73,6 @@ def run_to_end(name: str, command: Sequence[str], work_dir: Path, timeout_s: flo
             ) from None
     if done.returncode != 0:
         raise RfedgeError(f"{name} ended with status {done.returncode}{_tail(log_path)}")
-
-
-def run_until(
-    name: str,
-    command: Sequence[str],
-    work_dir: Path,
-    is_done: Callable[[], bool],
-    timeout_s: float,
-) -> None:
-    """Run a command until ``is_done``, then stop it with SIGTERM.
-
-    Raises ``RfedgeError`` if it ends before, fails, or is not done in time.
-    """
-    log_path = work_dir / f"{name}.log"
-    with log_path.open("wb") as log:
-        process = subprocess.Popen(list(command), stdout=log, stderr=subprocess.STDOUT)
-        try:
-            await_result(Service(name, process, "", log_path), lambda: is_done() or None, timeout_s)
-        finally:
-            _stop(name, process, log_path)
-    if process.returncode != 0:
-        raise RfedgeError(f"{name} ended with status {process.returncode}{_tail(log_path)}")
-
-
-def await_result(of: Service, look: Callable[[], T | None], timeout_s: float) -> T:
-    """Return what ``look`` finds while a process runs, looking again until it is not None.
-
-    Raises ``RfedgeError`` with the end of its log if the process ends, or the time does.
-    """
-    deadline = time.monotonic() + timeout_s
-    while (found := look()) is None:
-        if of.process.poll() is not None:
-            raise RfedgeError(
-                f"{of.name} ended with status {of.process.returncode} before it was done"
-                f"{_tail(of.log_path)}"
-            )
-        if time.monotonic() > deadline:
-            raise RfedgeError(
-                f"{of.name} was not done within {timeout_s:.0f} s{_tail(of.log_path)}"
-            )
-        time.sleep(POLL_S)
-    return found
 
 
 def _await_ready(

@@ -16,9 +16,6 @@ from rich.console import Console
 from rich.table import Table
 
 from rfcore.files import write_whole
-from rfcore.metrics import psnr
-from rfedge.demo.dusk import LAMPS_M, SHADOW, TINT, WIDTH_M
-from rfedge.demo.evening import EveningDrive, EveningPictures, LearntLight
 from rfedge.demo.measure import DriveFigures, FrameFigures, Pictures
 from rfedge.report.charts import (
     DIFFERENCE_GAIN,
@@ -28,7 +25,7 @@ from rfedge.report.charts import (
     quality_chart,
     stages_chart,
 )
-from rfedge.report.tables import heading, print_table
+from rfedge.report.tables import heading
 from rfedge.report.tables import table as markdown_table
 from rfedge.results import Result, as_json, rows_of
 
@@ -37,9 +34,7 @@ __all__ = [
     "SUMMARY",
     "demo_section",
     "figures_of",
-    "print_evening",
     "print_summary",
-    "write_evening_report",
     "write_report",
 ]
 
@@ -201,82 +196,6 @@ def _template(name: str) -> Template:
 def _provenance(result: Result) -> str:
     keys = ("command", "revision", "dirty", "host", "settings", "field")
     return json.dumps({key: result[key] for key in keys}, indent=2)
-
-
-EVENING_COLUMNS = (
-    "at dusk",
-    "coded against",
-    "kbit a frame",
-    "against the first %",
-    "PSNR dB",
-    "render dB",
-    "bytes fetched",
-    "rounds",
-    "seconds",
-)
-
-
-def write_evening_report(path: Path, result: Result, pictures: Sequence[EveningPictures]) -> None:
-    """Write the page of one evening; ``result`` is the content of its ``result.json``."""
-    (light,) = rows_of(LearntLight, [as_json(result["light"])])
-    drives = _evening_drives(result)
-    first, second = drives["first"], drives["second"]
-    page = _template("evening.html.j2").render(
-        headline=f"The second vehicle of the evening takes {_saved(first, second)}",
-        result=result,
-        light=light,
-        columns=EVENING_COLUMNS,
-        rows=_evening_rows(result),
-        dusk={"tint": TINT, "shadow": SHADOW, "width_m": WIDTH_M, "lamps_m": LAMPS_M},
-        strips=[_evening_strip(shown) for shown in pictures],
-        provenance=_provenance(result),
-    )
-    write_whole(path, page)
-
-
-def print_evening(console: Console, result: Result, out: Path) -> None:
-    """Print the table of an evening and where the files are."""
-    print_table(console, "An evening", EVENING_COLUMNS, _evening_rows(result))
-    for name in ("report.html", "result.json"):
-        console.print(f"  {out / name}")
-
-
-def _evening_drives(result: Result) -> dict[str, EveningDrive]:
-    drives = rows_of(EveningDrive, as_json(result["drives"]))
-    return {drive.name: drive for drive in drives}
-
-
-def _saved(first: EveningDrive, second: EveningDrive) -> str:
-    percent = 100 * (second.kbit_per_frame / first.kbit_per_frame - 1)
-    return f"{abs(percent):.0f} % {'fewer' if percent < 0 else 'more'} bits a frame"
-
-
-def _evening_rows(result: Result) -> list[list[str]]:
-    drives = _evening_drives(result)
-    first = drives["first"].kbit_per_frame
-    return [
-        [
-            f"{drive.name} vehicle",
-            "the tile's own field" if drive.light is None else f"its light {drive.light}",
-            f"{drive.kbit_per_frame:.1f}",
-            f"{100 * (drive.kbit_per_frame / first - 1):+.1f}",
-            f"{drive.psnr_db:.2f}",
-            f"{drive.rf_psnr_db:.2f}",
-            f"{drive.fetched_bytes:,}",
-            f"{drive.rounds:.1f}",
-            f"{drive.seconds:.1f}",
-        ]
-        for drive in drives.values()
-    ]
-
-
-def _evening_strip(shown: EveningPictures) -> dict[str, Any]:
-    captions = (
-        ("camera", shown.camera),
-        (f"noon's field, {psnr(shown.noon, shown.camera):.1f} dB", shown.noon),
-        (f"the learnt light, {psnr(shown.learnt, shown.camera):.1f} dB", shown.learnt),
-    )
-    return {"frame": shown.name, "pictures": embedded(captions)}
 
 
 def _headline(drives: Mapping[str, DriveFigures]) -> str:

@@ -35,14 +35,8 @@ from rfedge.results import make_result, provenance, write_result
 from rfedge.video import write_mp4
 
 __all__ = [
-    "CAMERA",
-    "DRIVES",
     "DemoRun",
     "DemoSettings",
-    "empty_folder",
-    "json_lines",
-    "refuse_foreign_folder",
-    "rendered",
     "run_demo",
 ]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from rfcore.errors import RfedgeError
-from rfedge.demo.processes import await_result, run_to_end, run_until, service
+from rfedge.demo.processes import run_to_end, service
 
 LISTENS = """
 import pathlib, signal, sys
@@ -43,40 +43,3 @@ def test_a_command_that_runs_over_is_ended(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "import signal; signal.pause()"]
     with pytest.raises(RfedgeError, match="did not end within 1 s"):
         run_to_end("agent", command, tmp_path, timeout_s=1)
-
-
-WRITES = """
-import pathlib, signal, sys
-signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-pathlib.Path(sys.argv[-1]).write_text("done")
-signal.pause()
-"""
-
-
-def test_a_command_is_stopped_once_it_is_done(tmp_path: Path) -> None:
-    written = tmp_path / "written"
-    command = [sys.executable, "-c", WRITES, str(written)]
-    run_until("agent", command, tmp_path, written.exists, timeout_s=30)
-    assert written.read_text() == "done"
-
-
-def test_a_command_that_ends_before_it_is_done_is_reported(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "print('out of road')"]
-    with pytest.raises(RfedgeError, match=r"(?s)ended with status 0 before it was done.*of road"):
-        run_until("agent", command, tmp_path, lambda: False, timeout_s=30)
-
-
-def test_a_command_that_fails_when_it_is_stopped_is_reported(tmp_path: Path) -> None:
-    written = tmp_path / "written"
-    fails = WRITES.replace("sys.exit(0)", "sys.exit('frames were lost')")
-    command = [sys.executable, "-c", fails, str(written)]
-    with pytest.raises(RfedgeError, match=r"(?s)ended with status 1.*frames were lost"):
-        run_until("agent", command, tmp_path, written.exists, timeout_s=30)
-
-
-def test_what_a_service_does_not_do_in_time_is_reported(tmp_path: Path) -> None:
-    with (
-        service("server", [sys.executable, "-c", LISTENS], tmp_path) as running,
-        pytest.raises(RfedgeError, match="server was not done within 0 s"),
-    ):
-        await_result(running, lambda: None, timeout_s=0)

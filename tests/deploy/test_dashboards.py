@@ -1,4 +1,4 @@
-"""Dashboards are what their description makes, complete, and ask only for what exists."""
+"""Grafana takes the dashboards, and they ask only for metrics that exist."""
 
 import json
 import re
@@ -8,14 +8,18 @@ from typing import Any
 import pytest
 
 from lab.pages.metrics import families
-from rfcore.errors import InvalidInput
-from rfedge.dashboards.__main__ import write_dashboards
-from rfedge.dashboards.catalogue import DASHBOARDS
-from rfedge.dashboards.grafana import DATASOURCE, Panel, Query, Unit
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 FILES = sorted((DEPLOY / "grafana/dashboards").glob("*.json"))
 RECORDED = set(re.findall(r"- record: (\S+)", (DEPLOY / "prometheus/rules.yml").read_text()))
+UNITS = {"bps", "bytes", "short", "hertz", "s", "percentunit"}
+"""Those of Grafana's names of units that our metrics need."""
+DATASOURCE = {"type": "prometheus", "uid": "prometheus"}
+PANELS = [
+    pytest.param(panel, id=f"{path.stem}-{panel['title']}")
+    for path in FILES
+    for panel in json.loads(path.read_text())["panels"]
+]
 
 
 def served() -> set[str]:
@@ -27,25 +31,6 @@ def served() -> set[str]:
     return names
 
 
-def panels() -> list[Any]:
-    return [
-        pytest.param(panel, id=f"{path.stem}-{panel['title']}")
-        for path in FILES
-        for panel in json.loads(path.read_text())["panels"]
-    ]
-
-
-def test_the_files_are_what_the_description_makes(tmp_path: Path) -> None:
-    write_dashboards(tmp_path)
-    made = {path.name: path.read_text() for path in tmp_path.iterdir()}
-    assert {path.name: path.read_text() for path in FILES} == made, "run `make figures`"
-
-
-def test_there_are_the_five_dashboards_an_operator_needs() -> None:
-    names = {dashboard.uid.removeprefix("rfedge-") for dashboard in DASHBOARDS}
-    assert names == {"fleet", "vehicle", "capacity", "link", "codec"}
-
-
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_a_dashboard_is_one_that_grafana_takes(path: Path) -> None:
     dashboard = json.loads(path.read_text())
@@ -53,19 +38,18 @@ def test_a_dashboard_is_one_that_grafana_takes(path: Path) -> None:
     assert len(dashboard["uid"]) <= 40, "Grafana's limit"
     assert dashboard["schemaVersion"] == 39
     assert dashboard["title"]
-    assert dashboard["description"]
     ids = [panel["id"] for panel in dashboard["panels"]]
-    assert ids == sorted(set(ids))
+    assert len(set(ids)) == len(ids) > 0
     taken = [tuple(panel["gridPos"].values()) for panel in dashboard["panels"]]
     assert len(set(taken)) == len(taken), "no panel lies on another"
     assert all(x + w <= 24 for x, _, w, _ in taken)
 
 
-@pytest.mark.parametrize("panel", panels())
+@pytest.mark.parametrize("panel", PANELS)
 def test_a_panel_has_a_unit_a_description_and_asks_for_what_exists(panel: dict[str, Any]) -> None:
     assert panel["title"]
     assert panel["description"].endswith(".")
-    assert panel["fieldConfig"]["defaults"]["unit"] in set(Unit)
+    assert panel["fieldConfig"]["defaults"]["unit"] in UNITS
     assert panel["datasource"] == DATASOURCE
     assert panel["targets"]
     for target in panel["targets"]:
@@ -78,11 +62,6 @@ def test_the_data_source_is_the_one_that_is_provisioned() -> None:
     provisioned = (DEPLOY / "grafana/provisioning/datasources/prometheus.yaml").read_text()
     assert f"uid: {DATASOURCE['uid']}\n" in provisioned
     assert f"type: {DATASOURCE['type']}\n" in provisioned
-
-
-def test_a_panel_without_a_description_is_refused() -> None:
-    with pytest.raises(InvalidInput, match="needs a description"):
-        Panel("Bytes", "", Unit.BYTES, (Query("up"),))
 
 
 def labels_of(expr: str) -> set[str]:
@@ -99,7 +78,7 @@ def labels_of(expr: str) -> set[str]:
     return labels
 
 
-@pytest.mark.parametrize("panel", panels())
+@pytest.mark.parametrize("panel", PANELS)
 def test_a_legend_tells_the_series_of_its_panel_apart(panel: dict[str, Any]) -> None:
     """Two lines of one name cannot be read: a server's age of the twin is one line a vehicle."""
     if panel["type"] == "table":
