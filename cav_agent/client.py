@@ -200,11 +200,12 @@ class StreamClient:
             while True:
                 now = time.monotonic()
                 self._advance(now)
-                if self._is_done(now):
-                    break
                 job = self._session.job_to_start(now)
                 if job is not None:
                     encoding = asyncio.create_task(self._encode(job))
+                self._report_ended()  # also the pictures that job_to_start dropped as too late
+                if self._is_done(now):
+                    break
                 self._may_write.set()
                 await self._rest(now)
                 if encoding is not None and encoding.done():
@@ -214,7 +215,7 @@ class StreamClient:
                 encoding.cancel()
 
     def _advance(self, now: float) -> None:
-        """Let the session know the time, and report what ended."""
+        """Let the session know the time."""
         session = self._session
         session.handle_timer(now)
         if session.failed is not None:
@@ -223,7 +224,6 @@ class StreamClient:
             self._stream.cancel()
         if self._stopping_until_s is not None:
             session.stop()
-        self._report_ended()
 
     def _report_ended(self) -> None:
         for result in self._session.take_results():

@@ -1,8 +1,9 @@
 """A stream to one server, with the server in memory: what is retried, what is final, who hears."""
 
 import asyncio
+import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -22,6 +23,7 @@ from cav_agent.frames import (
     Outcome,
     RetryReason,
 )
+from cav_agent.rate_control import RateControl
 from cav_agent.session import AgentSession
 from rfcore.codec.sender.steering import SteeringSettings
 from rfcore.errors import CodecError, ProtocolError, RejectReason, RfedgeError
@@ -178,12 +180,14 @@ def open_client(
         heard: Heard,
         limits: AgentLimits | None = None,
         coder: Callable[[EncodeJob], EncodedFrame] = encode,
+        take: Callable[[int], Sequence[Capture]] | None = None,
+        rate_control: RateControl | None = None,
     ) -> StreamClient:
         pictures = tuple(make_capture(index).picture for index in range(4))
         limits = limits or AgentLimits()
-        session = AgentSession(hello, limits)
+        session = AgentSession(hello, limits, rate_control)
         drive = OneCamera("front", RecordedPictures(pictures), SteeringSettings())
-        source = CameraSource(drive.take, coder, executor)
+        source = CameraSource(take or drive.take, coder, executor)
         return StreamClient(server, session, source, heard, limits, tile="street")  # type: ignore[arg-type]
 
     return make
@@ -443,6 +447,31 @@ async def test_a_picture_that_cannot_be_coded_is_dropped_and_the_next_one_is_sen
     assert heard.outcomes == [(0, "dropped"), (1, "acked")]
     assert heard.results[0].reason is EndReason.NOT_CODED
     assert heard.results[0].problem == "x264 refused the picture"
+
+
+async def test_a_picture_that_waited_too_long_is_reported_though_nothing_else_happens(
+    open_client: OpenClient, make_capture: Callable[..., Capture]
+) -> None:
+    """A lockstep drive captures nothing before it hears how the last picture ended."""
+
+    def take(index: int) -> list[Capture]:
+        return [make_capture(index, time.monotonic() - 3600 * index)]
+
+    def acking(message: Hello | Frame) -> list[ServerMessage]:
+        if isinstance(message, Hello):
+            return welcoming(message)
+        return [Ack(message.address, StageTimes(), b"d" * 16)]
+
+    heard = Heard()
+    client = open_client(MemoryServer(acking), heard, take=take, rate_control=RateControl(60.0))
+    loop = asyncio.get_running_loop()
+    ends = iter((lambda: loop.call_soon(client.capture, 1), client.finish))
+    heard.on_result = lambda: next(ends)()
+    client.capture(0)
+    async with asyncio.timeout(10):
+        await client.run()
+    assert heard.outcomes == [(0, "acked"), (1, "dropped")]
+    assert heard.results[1].reason is EndReason.TOO_LATE
 
 
 async def test_a_client_that_is_stopped_drops_what_waits_and_ends(open_client: OpenClient) -> None:

@@ -178,8 +178,12 @@ async def test_in_realtime_what_the_link_cannot_take_is_dropped_before_it_is_enc
 
 
 async def test_over_a_narrow_link_a_bound_on_delay_costs_quality(serve: Any, travel: Any) -> None:
-    """20 kbit/s carry 0.5 kB in the 190 ms that 0.25 s leave at most; free frames here have 0.9."""
-    async with serve() as server:
+    """20 kbit/s carry 0.5 kB in the 190 ms that 0.25 s leave at most; free frames here have 0.9.
+
+    A drive that stalls goes on after a minute, when the server ends its idle stream: a bound of
+    20 s tells the two apart.
+    """
+    async with asyncio.timeout(20), serve() as server:
         proxy = LinkProxy(ProxySettings(str(server.address), uplink_bps=20e3, delay_ms=1.0))
         await proxy.start()
         free, bound = [
