@@ -60,9 +60,8 @@ class EncodeJob:
     """Code ``capture`` in ``epoch``; a new epoch numbers its packets afresh.
 
     ``base`` is the frame it may be predicted from; ``None``: nothing but the render. ``exact``:
-    whether the server's renders are ours to the bit. ``relights``: whether it takes frames whose
-    render is relit, ``takes_light``: by a light that is sent. ``budget``: the bytes it may take;
-    ``None``: the configured CRF. ``connection`` counts the streams the session has opened.
+    whether the server's renders are ours to the bit. ``budget``: the bytes it may take; ``None``:
+    the configured CRF. ``connection`` counts the streams the session has opened.
     ``started_s``: when it was taken to be coded.
     """
 
@@ -71,8 +70,6 @@ class EncodeJob:
     connection: int
     base: FrameAddress | None = None
     exact: bool = True
-    relights: bool = False
-    takes_light: bool = False
     budget: ByteBudget | None = None
     started_s: float = 0.0
 

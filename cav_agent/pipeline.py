@@ -243,8 +243,6 @@ class Pipeline:
         return FrameChoice(
             references=None if rung.references else RENDER_ONLY,
             photometric=None if changes_light else (),
-            relight=None if job.relights else False,
-            may_send_light=job.takes_light,
             max_references=max(1, rung.references),
             block_means=not job.exact,
             limit_bytes=limit_bytes,

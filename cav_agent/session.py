@@ -114,7 +114,6 @@ class AgentSession:
         self.state = LinkState.DISCONNECTED
         self.session_id = ""
         self.exact: bool | None = None
-        self.relights = self.takes_light = False
         self.is_sent_away = False
         self.rate_limit_hz = 0.0
         self.failed: RfedgeError | None = None
@@ -193,11 +192,10 @@ class AgentSession:
     def receive(self, message: ServerMessage, now: float) -> None:
         """Take one message of the server."""
         match message:
-            case Welcome(session_id, exact, rate_hz, relights, takes_light):
+            case Welcome(session_id, exact, rate_hz):
                 self.state = LinkState.STREAMING
                 self.session_id, self.exact = session_id, exact
                 self.rate_limit_hz = rate_hz
-                self.relights, self.takes_light = relights, takes_light
             case Credit(camera_id, frames) if camera_id in self._cameras:
                 camera = self._cameras[camera_id]
                 camera.granted = max(camera.granted, frames)
@@ -278,8 +276,6 @@ class AgentSession:
             self._connection,
             base,
             exact=exact,
-            relights=self.relights,
-            takes_light=self.takes_light,
             budget=budget,
             started_s=now,
         )

@@ -292,7 +292,7 @@ class ServerSession:
             self._say(self._welcome())
 
     def _welcome(self) -> Welcome:
-        return Welcome(self.session_id, self._exact, self._rate_hz, relights=True, takes_light=True)
+        return Welcome(self.session_id, self._exact, self._rate_hz)
 
     def open_failed(self, error: RfedgeError, now: float) -> None:
         """Hello named something that cannot be opened; a bad value leaves room for another."""

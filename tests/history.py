@@ -9,22 +9,9 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["ROOT", "START_OLD", "code_of", "git"]
+__all__ = ["ROOT", "code_of", "git"]
 
 ROOT = Path(__file__).parents[1]
-START_OLD = """
-import runpy, sys
-from pathlib import Path
-root = sys.argv[1]
-# the finder of an editable installation comes before every path, and knows the checkout alone
-sys.meta_path[:] = [f for f in sys.meta_path if not type(f).__module__.startswith("_editable_")]
-sys.path.insert(0, root)
-import rfcore
-assert Path(next(iter(rfcore.__path__))).parent == Path(root), rfcore.__path__
-sys.argv = sys.argv[2:]
-runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
-"""
-"""Runs module ``argv[2]`` of the checkout ``argv[1]`` with the arguments after it."""
 
 
 def git(*arguments: str) -> "subprocess.CompletedProcess[bytes]":

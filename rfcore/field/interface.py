@@ -4,9 +4,7 @@ A field is immutable, may be shared between threads, and is named by its id, the
 archive. The same field, camera and quality give the same bytes on every machine.
 
 A field's metadata lies in the JSON header of its archive, readable without its arrays.
-``bounds`` stands beside the values of ``FieldMetadata``; ``kind`` is the archive's own. Archives
-written before 0.2 lack ``held_out_ssim``, ``antialiased`` and ``bounds``: not measured, not
-antialiased, and not stated.
+``bounds`` stands beside the values of ``FieldMetadata``; ``kind`` is the archive's own.
 """
 
 from __future__ import annotations
@@ -211,7 +209,7 @@ def metadata_of_header(kind: str, stored: Mapping[str, Any]) -> FieldMetadata:
     for key in ("name", "training_digest"):
         if not isinstance(stored[key], str):
             raise InvalidInput(f"field.{key}", f"{stored[key]!r} is not text")
-    antialiased = stored.get("antialiased", False)
+    antialiased = stored["antialiased"]
     if not isinstance(antialiased, bool):
         raise InvalidInput("field.antialiased", f"{antialiased!r} is neither true nor false")
     return FieldMetadata(
@@ -239,7 +237,7 @@ def _corner(values: Any) -> tuple[float, float, float]:
 
 
 def _measured(stored: Mapping[str, Any], key: str) -> float | None:
-    value = stored.get(key)
+    value = stored[key]
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):

@@ -10,7 +10,7 @@ of splats. They are stored band by band: the first tenth, up to a quarter, up to
 each with streams of its own, ``10.means`` and so on, and behind them what the level of detail that
 ends there has of its own, ``detail_10``. So the first bytes of a file draw the lowest level, as the
 whole file does (``detail_ends``). Within a band splats lie along a Morton curve, so that neighbours
-share a block. ``grid-1``, of earlier archives, has one set of streams for all bands.
+share a block.
 
 Measured on the first sample (150k splats, SH 3, three levels): 3.03 MB, 20.2 bytes a splat, 8.1 %
 of the raw 37.4 MB, at a loss of 0.05 dB on the held-out drive.
@@ -74,7 +74,6 @@ SPLATS_AT_ONCE = 1 << 16
 """Decoded at once, so that their numbers as int32 and float64 take little; a multiple of BLOCK."""
 
 ENCODING = "grid-2"
-UNBANDED = "grid-1"
 ASCENDING = tuple(reversed(DETAILS))
 MORTON_BITS = 21
 SPREAD = (
@@ -106,7 +105,7 @@ def compressed_archive(
     own = {detail: _reordered_level(level, order) for detail, level in levels.items()}
     numbers = [
         (band, numbers_of(splats_in(sorted_splats, band.part), chosen, grain))
-        for band in _bands(len(gaussians), ENCODING)
+        for band in _bands(len(gaussians))
     ]
     coded = {name: encode_columns(part) for name, part in _stored(numbers, own, chosen)}
     means = [gaussians_of(of_band, chosen).means for _, of_band in numbers]
@@ -136,9 +135,7 @@ class _Band:
         return {f.name: f"{self.prefix}{f.name}" for f in fields(SplatNumbers)}
 
 
-def _bands(count: int, encoding: str) -> Sequence[_Band]:
-    if encoding == UNBANDED:
-        return (_Band("", slice(0, count), 1.0),)
+def _bands(count: int) -> Sequence[_Band]:
     ends = [kept_of(count, detail) for detail in ASCENDING]
     return tuple(
         _Band(f"{round(detail * 100)}.", slice(start, end), detail)
@@ -217,7 +214,7 @@ def detail_ends(ends: Mapping[str, int]) -> Mapping[float, int]:
     """Return the bytes of a file that each level of detail needs, where a beginning of it will do;
     ``ends`` as of ``archive.array_ends``."""
     needed = {}
-    for band in _bands(0, ENCODING):
+    for band in _bands(0):
         names = list(band.names.values())
         if set(names) <= set(ends):
             last = level_name(band.detail) if level_name(band.detail) in ends else names[-1]
@@ -239,13 +236,12 @@ class _Stored:
     def of(cls, archive: Archive, max_bytes: int) -> _Stored:
         """Check what the header says; raises as ``splats_of_compressed``."""
         encoding = archive.metadata["encoding"]
-        name = encoding["name"]
-        if name not in (ENCODING, UNBANDED):
-            raise InvalidInput("encoding", f"{name!r} is not '{ENCODING}' or '{UNBANDED}'")
+        if encoding["name"] != ENCODING:
+            raise InvalidInput("encoding", f"{encoding['name']!r} is not '{ENCODING}'")
         count = _whole(encoding, "count", MAX_GAUSSIANS)
         sh_degree = _whole(encoding, "sh_degree", 3)
         check_decoded_size(count, sh_degree, max_bytes)
-        bands = _bands(count, name)
+        bands = _bands(count)
         levels = {level_name(detail): (kept_of(count, detail), 4) for detail in DETAILS[1:]}
         shapes = _shapes(bands, sh_degree) | {
             level: shape for level, shape in levels.items() if level in encoding["streams"]

@@ -14,7 +14,7 @@ from typing import cast
 from google.protobuf.message import DecodeError
 
 from rfcore.camera import Intrinsics, Pose
-from rfcore.codec.h264.config import CodecConfig, Coder, effort_of_preset, preset_of
+from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
 from rfcore.codec.references import Reference, References
@@ -159,9 +159,8 @@ def _extrinsics_from_wire(field: str, camera: pb.CameraDescription) -> Pose | No
 
 
 def _codec_from_wire(header: pb.StreamHeader) -> StreamHeader:
-    effort = header.effort or effort_of_preset(check_name("codec.preset", header.preset))
     return StreamHeader(
-        CodecConfig(header.width_px, header.height_px, effort, header.crf),
+        CodecConfig(header.width_px, header.height_px, header.effort, header.crf),
         check_bytes("codec.sps", header.sps, 4, 1024),
         check_bytes("codec.pps", header.pps, 2, 1024),
     )
@@ -193,8 +192,7 @@ def _camera_to_wire(camera: CameraDescription) -> pb.CameraDescription:
         codec=pb.StreamHeader(
             width_px=config.width_px,
             height_px=config.height_px,
-            preset=preset_of(config.effort) if config.coder is Coder.X264 else "",
-            effort=config.effort if config.coder is Coder.OWN else "",
+            effort=config.effort,
             crf=config.crf,
             sps=camera.codec.sps,
             pps=camera.codec.pps,

@@ -80,14 +80,8 @@ def _response(
     message: Welcome | Ack | Nack | FieldNotice | DrainNotice | StreetNotice,
 ) -> pb.StreamResponse:
     match message:
-        case Welcome(session_id, exact, rate_hz, relights, takes_light):
-            welcome = pb.Welcome(
-                session_id=session_id,
-                exact=exact,
-                rate_hz=rate_hz,
-                relights=relights,
-                takes_light=takes_light,
-            )
+        case Welcome(session_id, exact, rate_hz):
+            welcome = pb.Welcome(session_id=session_id, exact=exact, rate_hz=rate_hz)
             return pb.StreamResponse(welcome=welcome)
         case Ack():
             response = pb.StreamResponse()
@@ -106,9 +100,7 @@ def _response(
 def _welcome_from_wire(welcome: pb.Welcome) -> Welcome:
     if not 0 <= welcome.rate_hz <= MAX_RATE_HZ:
         raise ProtocolError(f"the server granted {welcome.rate_hz} Hz; 0..{MAX_RATE_HZ:g} can be")
-    return Welcome(
-        welcome.session_id, welcome.exact, welcome.rate_hz, welcome.relights, welcome.takes_light
-    )
+    return Welcome(welcome.session_id, welcome.exact, welcome.rate_hz)
 
 
 def _ack_from_wire(ack: pb.Ack) -> Ack:

@@ -135,16 +135,12 @@ class Frame:
 class Welcome:
     """The server accepted Hello; ``exact`` says whether the renderers agree to the bit.
 
-    Each camera may send ``rate_hz`` pictures per second; 0: as many as Credit allows. ``relights``:
-    whether the server takes frames whose render is relit; ``takes_light``: also by a light that is
-    sent.
+    Each camera may send ``rate_hz`` pictures per second; 0: as many as Credit allows.
     """
 
     session_id: str
     exact: bool
     rate_hz: float = 0.0
-    relights: bool = False
-    takes_light: bool = False
 
 
 @dataclass(frozen=True)

@@ -144,16 +144,11 @@ def demo_section(path: Path, result: Result) -> str:
     settings, field = result["settings"], result["field"]
     facts = (
         f"Field of {field['gaussians']:,} Gaussians, {field['held_out_psnr_db']:.2f} dB on the "
-        f"held-out empty drive; coder {_coder(settings)}, CRF {settings['crf']:g}, "
+        f"held-out empty drive; coder {settings['effort']}, CRF {settings['crf']:g}, "
         f"{settings['rate_hz']:g} Hz, link {settings['link_bps'] / 1e6:g} Mbit/s and "
         f"{settings['link_delay_ms']:g} ms."
     )
     return "\n\n".join([heading(path, result), facts, markdown_table(["", *drives], rows), ""])
-
-
-def _coder(settings: Mapping[str, Any]) -> str:
-    """Return what coded ours; results from before the slice coder have x264's preset alone."""
-    return str(settings.get("effort") or f"x264-{settings['preset']}")
 
 
 def write_report(

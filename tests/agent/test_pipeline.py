@@ -15,7 +15,7 @@ from rfcore.codec.decoder import DeltaDecoder
 from rfcore.codec.h264.config import CodecConfig, LightChange
 from rfcore.codec.h264.qp_map import QpMap
 from rfcore.codec.references import Reference
-from rfcore.codec.sender.ladder import FULL_RUNG, Rung
+from rfcore.codec.sender.ladder import Rung
 from rfcore.codec.sender.steering import Steering
 from rfcore.errors import InvalidInput
 from rfcore.field import Quality, render_field_view
@@ -64,20 +64,9 @@ def test_block_means_are_sent_only_where_the_server_is_not_exact(noisy: Capture)
     assert lengths == [0, 64]
 
 
-@pytest.mark.parametrize(
-    ("relights", "light", "relit", "changed"),
-    [
-        (True, LightChange.AUTO, True, True),
-        (False, LightChange.AUTO, False, True),
-        (True, LightChange.OFF, False, False),
-    ],
-)
-def test_the_light_is_changed_as_the_server_and_the_settings_allow(
-    make_capture: Callable[..., Capture],
-    relights: bool,
-    light: LightChange,
-    relit: bool,
-    changed: bool,
+@pytest.mark.parametrize(("light", "changed"), [(LightChange.AUTO, True), (LightChange.OFF, False)])
+def test_the_light_is_changed_as_the_settings_allow(
+    make_capture: Callable[..., Capture], light: LightChange, changed: bool
 ) -> None:
     """The street is darker on one side than the field shows it, which no matrix says."""
     ramp = np.linspace(200, 20, 64)[None, :, None] + np.zeros((48, 64, 3))
@@ -93,14 +82,11 @@ def test_the_light_is_changed_as_the_server_and_the_settings_allow(
     ]
     options = PipelineOptions(light=light)
     pipeline = Pipeline(Grey(), CodecConfig(64, 48, effort="fast"), lambda: 0, options)
-    first = pipeline.encode(EncodeJob(seen[0], 0, 1, relights=relights))
+    first = pipeline.encode(EncodeJob(seen[0], 0, 1))
     base = FrameAddress("front", 0, first.packet.sequence)
-    second = pipeline.encode(EncodeJob(seen[1], 0, 1, base, relights=relights))
+    second = pipeline.encode(EncodeJob(seen[1], 0, 1, base))
     assert not first.packet.relit
-    assert second.packet.relit == relit
-    for takes_light in (True, False):
-        job = EncodeJob(seen[0], 1, 1, relights=relights, takes_light=takes_light)
-        assert pipeline._choice(job, FULL_RUNG).may_send_light == takes_light
+    assert second.packet.relit == changed
     assert changed or not (first.packet.photometric or second.packet.photometric)
 
 

@@ -46,16 +46,13 @@ def test_a_rung_is_named_by_what_distinguishes_it() -> None:
 
 
 def test_a_ladder_has_rungs_of_one_coder(tmp_path: Path) -> None:
-    """Those without an effort, from before there were two, are of x264."""
-    old, rough = row(80, 0, preset="medium"), row(60, 3, preset="medium", rough=True)
-    for stored in (old, rough):
-        del stored["settings"]["effort"]
-    path = write(tmp_path / "ladder.json", row(40, 0), old, rough)
+    path = write(tmp_path / "ladder.json", row(40, 0), row(80, 0, effort="x264-medium"))
     assert [r.rung.effort for r in read_ladder(path, "splats", 28)] == ["default"]
     (kept,) = read_ladder(path, "splats", 28, Coder.X264)
     assert (kept.rung.effort, kept.sender_ms) == ("x264-medium", 80)
+    other = write(tmp_path / "other.json", row(80, 0, effort="x264-medium"))
     with pytest.raises(InvalidData, match="no rungs for splats with the coder own"):
-        read_ladder(write(tmp_path / "old.json", old), "splats", 28)
+        read_ladder(other, "splats", 28)
 
 
 def test_the_front_is_faster_step_by_step_and_never_worse_than_what_it_leaves_out() -> None:
@@ -115,8 +112,7 @@ def test_a_sender_that_localises_plans_with_the_time_and_rate_of_tracking(tmp_pa
 def test_a_ladder_without_times_of_tracking_is_none_for_a_sender_that_localises(
     tmp_path: Path,
 ) -> None:
-    path = tmp_path / "ladder.json"
-    path.write_text(json.dumps({"kind": "ladder", "rows": [row(40, 0)]}))  # an older one
+    path = write(tmp_path / "ladder.json", row(40, 0))
     assert read_ladder(path, "splats", 28)
     with pytest.raises(InvalidData, match=r"ladder\.json.*no times of tracking.*eval ladder"):
         read_ladder(path, "splats", 28, tracking=True)

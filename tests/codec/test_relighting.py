@@ -66,12 +66,6 @@ def test_frames_under_another_light_are_relit_and_decode_as_promised(street: Str
         state = decoded.state
 
 
-def test_a_receiver_of_an_older_release_gets_no_light(street: Street) -> None:
-    made = coded(encoder_of(), street, FrameChoice(may_send_light=False))
-    assert [each.packet.relit for each in made] == [False] + [True] * (FRAMES - 1)
-    assert not any(each.packet.light for each in made)
-
-
 def test_no_light_is_sent_for_a_field_of_something_else(
     street: Street, noise: Callable[..., I420]
 ) -> None:

@@ -96,16 +96,13 @@ def test_a_compressed_field_survives_its_file(
     assert save_field(back, tmp_path / "b.rff") == field_id, "what was loaded is saved as it was"
 
 
-@pytest.mark.parametrize("name", ["grid-1", "grid-2"])
-def test_the_decoded_bytes_are_pinned(name: str) -> None:
-    """Both ends of a session decode for themselves; ``golden_field`` made the files, that of grid-1
-    at a revision that wrote it."""
-    path = GOLDEN / f"{name}.rff"
+def test_the_decoded_bytes_are_pinned() -> None:
+    """Both ends of a session decode for themselves; ``golden_field`` made the file."""
+    path = GOLDEN / "grid-2.rff"
     field = load_field(path)
     assert isinstance(field, SplatField)
     assert digest_of(field) == GOLDEN_SPLATS
     assert field.field_id == hashlib.sha256(path.read_bytes()).hexdigest()
-    assert field.archive().metadata["encoding"]["name"] == name
 
 
 def golden_field(gaussians: Gaussians) -> bytes:
@@ -254,8 +251,7 @@ def with_encoding(field: SplatField, change: dict[str, Any]) -> bytes:
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"name": "grid-3"}, "'grid-3' is not 'grid-2' or 'grid-1'"),
-        ({"name": "grid-1"}, "are not its streams"),
+        ({"name": "grid-3"}, "'grid-3' is not 'grid-2'"),
         ({"count": 2_000_000_000}, "count: 2000000000 is not a whole number"),
         ({"count": 50_000_000}, "raise it"),
         ({"count": 1_000_000}, "does not hold"),
@@ -397,8 +393,7 @@ def test_too_short_or_damaged_a_beginning_is_refused(make_gaussians) -> None:
 
 
 def test_other_archives_have_no_beginning(make_gaussians) -> None:
-    old = (GOLDEN / "grid-1.rff").read_bytes()
     raw = encode_field(SplatField(make_gaussians(9, 0)))
-    assert ends_of(old) == ends_of(raw) == {}
+    assert ends_of(raw) == {}
     with pytest.raises(FieldFormatError):
-        decode_beginning(old[:-1], "ab" * 32)
+        decode_beginning(raw[:-1], "ab" * 32)

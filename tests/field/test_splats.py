@@ -99,6 +99,8 @@ PLAIN = {
     "name": "",
     "training_digest": "",
     "held_out_psnr_db": None,
+    "held_out_ssim": None,
+    "antialiased": False,
     "tile_origin": {"east_m": 0, "north_m": 0, "up_m": 0},
 }
 

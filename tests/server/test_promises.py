@@ -307,10 +307,6 @@ def test_a_granted_rate_is_in_the_welcome_and_a_new_one_in_another(hello: Hello)
     (job,) = session.jobs_to_start(0.0)
     session.grant(5.0)
     session.opened(job, 0.0)  # type: ignore[arg-type]
-    assert session.messages_to_send(0.0)[0] == Welcome(
-        "s-1", exact=True, rate_hz=5.0, relights=True, takes_light=True
-    )
+    assert session.messages_to_send(0.0)[0] == Welcome("s-1", exact=True, rate_hz=5.0)
     session.grant(8.0)
-    assert session.messages_to_send(0.0) == [
-        Welcome("s-1", exact=True, rate_hz=8.0, relights=True, takes_light=True)
-    ]
+    assert session.messages_to_send(0.0) == [Welcome("s-1", exact=True, rate_hz=8.0)]

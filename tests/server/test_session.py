@@ -109,7 +109,7 @@ def test_hello_is_answered_with_welcome_and_credit_for_every_camera(hello: Hello
     assert job == OpenJob(hello, exact=True)
     session.opened(job, 0.1)
     assert session.messages_to_send(0.1) == [
-        Welcome("s-1", exact=True, relights=True, takes_light=True),
+        Welcome("s-1", exact=True),
         Credit("front", 2),
         Credit("rear", 2),
     ]

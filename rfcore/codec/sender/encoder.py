@@ -70,12 +70,9 @@ class FrameChoice:
     """The change of the render's light, see there; ``None`` leaves the light to the encoder."""
     relight: bool | None = None
     """Map the render to the light of the earlier frame; ``None`` leaves it to the encoder where
-    ``photometric`` does. Receivers of older releases cannot."""
+    ``photometric`` does."""
     light: bytes = b""
     """With ``relight``: map the render to this light instead (``rfcore.codec.photometric``)."""
-    may_send_light: bool = True
-    """Whether the encoder may send a light where it may relight and has no earlier frame. Receivers
-    of older releases do not take it."""
     pose_only: bool = False
     """Send no slice: the frame is its only reference."""
     max_references: int = DEFAULT_REFERENCES
@@ -282,7 +279,7 @@ class DeltaEncoder:
                 return relit
         photometric = choose_photometric(costs, view.render, crf)
         changed = Prediction.under_light(view, photometric, past, self._threads)
-        if past is None and choice.relight is None and choice.may_send_light:
+        if past is None and choice.relight is None:
             return self._under_sent_light(changed, view, costs, crf)
         return changed
 

@@ -24,7 +24,6 @@ from rfcore.codec.h264.config import (
     Coder,
     check_effort,
     coder_of,
-    effort_of_preset,
 )
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.field.quality import FULL, Quality
@@ -162,7 +161,7 @@ def read_ladder(
         nearest = min((row["settings"]["crf"] for row in rows), key=lambda have: abs(have - crf))
         measured = [_measured(row) for row in rows if row["settings"]["crf"] == nearest]
         if tracking:
-            tracks = [row for row in result.get("tracking", ()) if row["settings"]["kind"] == kind]
+            tracks = [row for row in result["tracking"] if row["settings"]["kind"] == kind]
             measured = _with_tracking(measured, tracks)
     except (OSError, ValueError, KeyError, TypeError, InvalidInput, InvalidData) as error:
         raise InvalidData(
@@ -172,14 +171,8 @@ def read_ladder(
 
 
 def _is_for(stored: Mapping[str, Any], kind: str, coder: Coder) -> bool:
-    """Tell whether a row is of that kind of field and coder, and of a rung that still exists."""
-    is_rough = stored.get("rough", False)  # a setting of x264 in ladders without efforts
-    return stored["kind"] == kind and coder_of(_effort(stored)) is coder and not is_rough
-
-
-def _effort(stored: Mapping[str, Any]) -> str:
-    """Return a row's effort; rows from before our slice coder have a preset of x264 instead."""
-    return str(stored["effort"]) if "effort" in stored else effort_of_preset(stored["preset"])
+    """Tell whether a row was measured for that kind of field and coder."""
+    return stored["kind"] == kind and coder_of(stored["effort"]) is coder
 
 
 def _quality(stored: Mapping[str, Any]) -> Quality:
@@ -222,6 +215,6 @@ def _measured(row: Mapping[str, Any]) -> MeasuredRung:
         _quality(stored),
         stored["references"],
         stored["photometric"],
-        _effort(stored),
+        stored["effort"],
     )
     return MeasuredRung(rung, row["sender_ms"], row["receiver_ms"], row["rate_percent"])

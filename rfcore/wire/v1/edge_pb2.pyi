@@ -359,27 +359,23 @@ class StreamHeader(_message.Message):
 
     WIDTH_PX_FIELD_NUMBER: _builtins.int
     HEIGHT_PX_FIELD_NUMBER: _builtins.int
-    PRESET_FIELD_NUMBER: _builtins.int
     CRF_FIELD_NUMBER: _builtins.int
     SPS_FIELD_NUMBER: _builtins.int
     PPS_FIELD_NUMBER: _builtins.int
     EFFORT_FIELD_NUMBER: _builtins.int
     width_px: _builtins.int
     height_px: _builtins.int
-    preset: _builtins.str
-    """x264's preset, where x264 is the coder; else empty."""
     crf: _builtins.float
     sps: _builtins.bytes
     """H.264 sequence and picture parameter sets, as the encoder made them."""
     pps: _builtins.bytes
     effort: _builtins.str
-    """How hard the slice coder of rfcore.codec.h264 tries; empty where x264 is the coder."""
+    """What codes the slices and how hard it tries: an effort of rfcore.codec.h264.config."""
     def __init__(
         self,
         *,
         width_px: _builtins.int = ...,
         height_px: _builtins.int = ...,
-        preset: _builtins.str = ...,
         crf: _builtins.float = ...,
         sps: _builtins.bytes = ...,
         pps: _builtins.bytes = ...,
@@ -387,7 +383,7 @@ class StreamHeader(_message.Message):
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["crf", b"crf", "effort", b"effort", "height_px", b"height_px", "pps", b"pps", "preset", b"preset", "sps", b"sps", "width_px", b"width_px"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["crf", b"crf", "effort", b"effort", "height_px", b"height_px", "pps", b"pps", "sps", b"sps", "width_px", b"width_px"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -552,12 +548,11 @@ class Frame(_message.Message):
     localisation: Global___Localisation.ValueType
     relit: _builtins.bool
     """Whether the render's light is mapped to that of the frame base_digest names, before it is a
-    reference (rfcore.native.warp). For servers whose Welcome says that they relight; others find a
-    wrong crc32.
+    reference (rfcore.native.warp).
     """
     light: _builtins.bytes
     """The light of a relit frame (rfcore.codec.photometric), at most 1 KiB; empty: that of the frame
-    base_digest names. For servers whose Welcome says that they take it.
+    base_digest names.
     """
     @_builtins.property
     def pose(self) -> Global___Pose:
@@ -625,8 +620,6 @@ class Welcome(_message.Message):
     SESSION_ID_FIELD_NUMBER: _builtins.int
     EXACT_FIELD_NUMBER: _builtins.int
     RATE_HZ_FIELD_NUMBER: _builtins.int
-    RELIGHTS_FIELD_NUMBER: _builtins.int
-    TAKES_LIGHT_FIELD_NUMBER: _builtins.int
     session_id: _builtins.str
     """Distinguishes this session in the logs of both ends."""
     exact: _builtins.bool
@@ -635,22 +628,16 @@ class Welcome(_message.Message):
     """Pictures per second that each camera may send; 0: as many as Credit allows. A later Welcome of
     the same session changes it.
     """
-    relights: _builtins.bool
-    """Whether the server takes frames whose render is relit."""
-    takes_light: _builtins.bool
-    """Whether the server takes a light that is sent with a relit frame."""
     def __init__(
         self,
         *,
         session_id: _builtins.str = ...,
         exact: _builtins.bool = ...,
         rate_hz: _builtins.float = ...,
-        relights: _builtins.bool = ...,
-        takes_light: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["exact", b"exact", "rate_hz", b"rate_hz", "relights", b"relights", "session_id", b"session_id", "takes_light", b"takes_light"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["exact", b"exact", "rate_hz", b"rate_hz", "session_id", b"session_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
