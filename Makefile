@@ -238,10 +238,12 @@ $(DEMO): pyproject.toml requirements/demo.txt | $(BIN)/python
 	$(call install,demo)
 	touch $@
 
-$(FULL): pyproject.toml requirements/test.txt requirements/torch.txt | $(DEMO)
+$(FULL): pyproject.toml lab/pyproject.toml streetgen/pyproject.toml requirements/test.txt \
+		requirements/torch.txt | $(DEMO)
 	$(if $(filter 1,$(LOCKED)),,$(torch))
 	$(call install,test)
 	$(torch)
+	$(BIN)/python -m pip install -q --no-build-isolation --no-deps -e streetgen -e lab
 	touch $@
 
 # An editable install does not rebuild C++ by itself; this does, incrementally, under build/.
@@ -251,7 +253,7 @@ $(BUILT): $(DEMO) $(NATIVE)
 
 build: $(BUILT)  ## set up .venv for the demo and compile the kernels
 
-build-full: $(FULL) $(BUILT)  ## the same with every extra, for tests, checks and experiments
+build-full: $(FULL) $(BUILT)  ## the same with every extra, streetgen and the lab, for tests and checks
 
 lock: $(DEMO)  ## pin versions and hashes anew in requirements/ (Python 3.11)
 	$(BIN)/python -m pip install -q "pip-tools>=7.5"

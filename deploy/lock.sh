@@ -3,6 +3,7 @@
 # PYTHON must be a 3.11 with pip-tools. `test` has every package and is compiled first; the other
 # sets are compiled under its pins and take their hashes from it. No file names an index. torch is
 # pinned without a hash, in requirements/torch.txt: each index has its own build of one version.
+# Pins stay where they still satisfy pyproject.toml; UPGRADE=1 takes the newest version of each.
 set -eu
 : "${PYTHON:=python3}"
 work=$(mktemp -d)
@@ -11,7 +12,8 @@ mkdir -p requirements
 : > "$work/pins"
 for name in test demo runtime full; do
 	"$PYTHON" deploy/requirements.py $name > "$work/$name.in"
-	[ $name = test ] || cp "$work/all.txt" "$work/locked.txt"
+	if [ $name != test ]; then cp "$work/all.txt" "$work/locked.txt"
+	elif [ "${UPGRADE:-0}" != 1 ]; then cp requirements/test.txt "$work/locked.txt"; fi
 	"$PYTHON" -m piptools compile -q --generate-hashes --unsafe-package torch --strip-extras \
 		--no-header --no-annotate --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
 		--no-emit-options -c "$work/pins" -o "$work/locked.txt" "$work/$name.in"

@@ -13,7 +13,6 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
-PYPROJECT = ROOT / "pyproject.toml"
 
 
 def script(name: str) -> ModuleType:
@@ -31,7 +30,7 @@ SETS: tuple[str, ...] = tuple(SCRIPT.SETS)
 
 def wanted(name: str) -> dict[str, Requirement]:
     """What pyproject.toml asks for, by normalised name."""
-    lines = [Requirement(line) for line in SCRIPT.requirements(name, PYPROJECT)]
+    lines = [Requirement(line) for line in SCRIPT.requirements(name, ROOT)]
     return {canonicalize_name(requirement.name): requirement for requirement in lines}
 
 
@@ -55,9 +54,16 @@ def test_the_demo_needs_no_extra_but_the_page_that_it_points_to() -> None:
     assert not {"torch", "scipy", "opencv-contrib-python-headless", "pytest"} & base
 
 
+def test_only_the_workbench_needs_what_renders_streets_drives_browsers_and_builds_itself() -> None:
+    workbench = {"mitsuba", "selenium", "libsumo", "hatchling", "editables"}
+    assert workbench <= set(wanted("test"))
+    for name in ("runtime", "full", "demo"):
+        assert not workbench & set(wanted(name))
+
+
 def test_an_unknown_set_is_refused() -> None:
     with pytest.raises(ValueError, match="'both' is none of runtime, full, demo, test"):
-        SCRIPT.requirements("both", PYPROJECT)
+        SCRIPT.requirements("both", ROOT)
 
 
 @pytest.mark.parametrize("name", SETS)
