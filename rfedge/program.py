@@ -17,6 +17,7 @@ from typing import Protocol
 
 from tyro.conf import (
     DisallowNone,
+    EnumChoicesFromValues,
     FlagCreatePairsOff,
     OmitSubcommandPrefixes,
     PositionalMetavarFromFieldName,
@@ -29,11 +30,12 @@ __all__ = ["CONFIG", "SIGPIPE_STATUS", "Verb", "run_program"]
 CONFIG = (
     OmitSubcommandPrefixes,
     DisallowNone,
+    EnumChoicesFromValues,
     FlagCreatePairsOff,
     PositionalMetavarFromFieldName,
 )
-"""Options are named as their fields, flags have one form, and help shows neither None nor PATH
-where a word says more."""
+"""Options are named as their fields, choices are written in lower case as in files and on the wire,
+flags have one form, and help shows neither None nor PATH where a word says more."""
 
 
 SIGPIPE_STATUS = 141
