@@ -16,6 +16,7 @@ from lab.intra_size import EvalIntraSize
 from lab.latency import EvalLatency
 from lab.live import EvalLive
 from lab.localisation import EvalLocalise
+from lab.localisation.pose_feed import MakeFeed
 from lab.paper import EvalPaper
 from lab.rig import EvalRig
 from lab.robust import EvalRobust
@@ -31,6 +32,7 @@ Verb = (
     | Annotated[EvalBenchmark, subcommand("benchmark")]
     | Annotated[PlanCity, subcommand("city")]
     | Annotated[EvalClasses, subcommand("classes")]
+    | Annotated[MakeFeed, subcommand("feed")]
     | Annotated[EvalIntraSize, subcommand("intra-size")]
     | Annotated[EvalLatency, subcommand("latency")]
     | Annotated[EvalLive, subcommand("live")]

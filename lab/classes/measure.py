@@ -25,7 +25,6 @@ from rfcore.codec.h264.config import check_effort
 from rfcore.errors import InvalidInput
 from rfcore.extras import needs
 from rfcore.image import I420
-from rfedge.datasets.classes import Label, class_picture_of, read_classes
 from rfedge.evaluate.cells import CellStore, clip_key, program_version
 from rfedge.evaluate.clips import (
     STEADY,
@@ -50,6 +49,7 @@ from rfedge.results import (
     rows_of,
     write_result,
 )
+from streetgen.classes import Label, class_picture_of, read_classes
 
 with needs("eval"):
     from scipy.interpolate import PchipInterpolator

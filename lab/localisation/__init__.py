@@ -1,6 +1,6 @@
 """``rfedge-lab localise``: poses found again from wrong ones, tracking, and what errors cost.
 
-Two kinds of rows: *starts* (``rfedge.localisation.starts``), searches from start errors
+Two kinds of rows: *starts* (``lab.localisation.measure``), searches from start errors
 and from false starts, with the tracker's time beside; *bits*
 (``lab.localisation.bits``). Each row is a cell (``rfedge.evaluate.cells``), kept
 as it ends: the same command goes on where it was stopped. Cells share so many processes.
@@ -39,7 +39,7 @@ class EvalLocalise:
     starts: tuple[str, ...] = STARTS
     """Start errors, METRESm:DEGREESdeg."""
     errors: tuple[str, ...] = ERRORS
-    """Sensors, models of `rfedge encode --pose-errors`; lengths are metres."""
+    """Sensors, models of lab.localisation.pose_errors; lengths are metres."""
     frames: int | None = 24
     """Frames of a drive that are coded."""
     crfs: tuple[float, ...] = CRFS

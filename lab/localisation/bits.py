@@ -15,18 +15,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lab.localisation.given import GivenDrive
+from lab.localisation.pose_errors import PoseErrorModel, observed, parse_error_model
+from lab.localisation.rows import BitsRow
 from rfcore.camera import Pose
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.sender.encoder import DeltaEncoder
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, render_field_view
 from rfcore.localise.fix import State
-from rfcore.localise.pose_errors import Observation, PoseErrorModel, parse_error_model
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.views import FieldView, PosedPicture
 from rfedge.evaluate.clips import luma_mse, psnr_of_mse
-from rfedge.localisation.rows import BitsRow
-from rfedge.located import LocatedDrive, TimedFix, times_of
+from rfedge.located import LocatedDrive, Observation, TimedFix, times_of
 from rfedge.offline import FrameInput, encode_frames
 
 __all__ = ["bits_row", "sensors_of", "tracking_times"]
@@ -54,10 +54,10 @@ def bits_row(
     own, render_cpu_ms = _own_inputs(field, clip)
     official = given.feed_poses(field.metadata.tile_origin) if sensor == OFFICIAL else None
     if official is None:
-        located = LocatedDrive(field, clip, _scaled(parse_error_model(sensor), given.units), seed)
+        feed = _simulated(clip, sensor, given.units, seed)
     else:
-        stated = _stated(clip, official, given.units)
-        located = LocatedDrive.of_observations(field, clip, stated)
+        feed = _stated(clip, official, given.units)
+    located = LocatedDrive(field, clip, feed)
     points = _points(_found_inputs(located, clip), crfs), _points(own, crfs)
     return _row(given.name, sensor, points, located.fixes, render_cpu_ms)
 
@@ -68,9 +68,7 @@ def tracking_times(given: GivenDrive, threads: int, seed: int) -> tuple[float, f
     field, pictures = given.read(threads)
     clip = pictures[:TRACKED]
     _, render_cpu_ms = _own_inputs(field, clip)
-    located = LocatedDrive(
-        field, clip, _scaled(parse_error_model("white-small"), given.units), seed
-    )
+    located = LocatedDrive(field, clip, _simulated(clip, "white-small", given.units, seed))
     _found_inputs(located, clip)
     return _track_cpu_ms(located.fixes), render_cpu_ms
 
@@ -121,6 +119,15 @@ def _scaled(model: PoseErrorModel, units: float) -> PoseErrorModel:
     """Return a model of metres in the units of a field."""
     metres = {name: getattr(model, name) * units for name in ("noise_m", "offset_m", "walk_m")}
     return replace(model, **metres)
+
+
+def _simulated(
+    clip: Sequence[PosedPicture], sensor: str, units: float, seed: int
+) -> list[Observation]:
+    """Return what a sensor of that error model observes of a clip."""
+    model = _scaled(parse_error_model(sensor), units)
+    poses = [picture.camera.world_from_cam for picture in clip]
+    return observed(times_of(clip), poses, model, np.random.default_rng(seed))
 
 
 def _stated(clip: Sequence[PosedPicture], poses: Sequence[Pose], units: float) -> list[Observation]:

@@ -29,7 +29,7 @@ from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField
 from rfcore.views import PosedPicture
 from rfedge.arguments import open_field
-from rfedge.localisation.starts import StartError, parse_start_error
+from rfedge.localisation.searches import StartError, parse_start_error
 
 __all__ = ["GivenDrive", "aligned_poses", "read_pose_lines"]
 

@@ -9,20 +9,18 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from lab.localisation.bits import bits_row, sensors_of, tracking_times
+from lab.localisation.false_starts import false_starts, row_of
 from lab.localisation.given import GivenDrive
+from lab.localisation.pose_errors import parse_error_model
+from lab.localisation.rows import LocaliseRow
 from rfcore.dataset import read_dataset
 from rfcore.extras import needs
-from rfcore.localise.pose_errors import parse_error_model
 from rfcore.views import PosedPicture
 from rfedge.evaluate.cells import CellKey, CellStore, Rows, each_done, program_version
-from rfedge.localisation.rows import LocaliseRow
-from rfedge.localisation.starts import (
-    StartError,
-    attempts,
-    parse_start_error,
-    summary,
-)
+from rfedge.localisation.searches import StartError, parse_start_error, searches_from_displaced
 from rfedge.results import as_json
 
 with needs("localise"):
@@ -126,9 +124,11 @@ def _start_row(piece: Piece, error: StartError) -> LocaliseRow:
     field, pictures = given.read(piece.threads)
     scaled = StartError(error.position_m * given.units, error.rotation_deg)
     strangers = [picture for path in piece.strangers for picture in _strangers(path)]
-    counts = (piece.tries, piece.false_starts)
-    done = list(attempts(field, pictures, scaled, counts, piece.seed, strangers))
-    row = summary(given.name, error, done)
+    rng, last = np.random.default_rng(piece.seed), piece.tries + piece.false_starts
+    tries = list(searches_from_displaced(field, pictures, scaled, piece.tries, rng))
+    numbers = range(piece.tries, last)
+    false = list(false_starts(field, pictures, scaled, numbers, rng, strangers))
+    row = row_of(given.name, error, tries, false)
     median_m, p95_m = (
         None if value is None else value / given.units for value in (row.median_m, row.p95_m)
     )

@@ -15,6 +15,7 @@ from lab.benchmark.definition import benchmark_section
 from lab.classes.measure import classes_section
 from lab.latency.report import latency_section, write_latency_figures
 from lab.live.report import live_section
+from lab.localisation.rows import localise_section
 from lab.paper.figures import write_paper_figures
 from lab.paper.report import paper_rows, paper_section
 from lab.rig.report import rig_section
@@ -30,7 +31,6 @@ from rfedge.evaluate.compare.report import compare_section, harder_sentence, hea
 from rfedge.evaluate.ladder.page import write_ladder_figure
 from rfedge.evaluate.never_worse.measure import never_worse_section
 from rfedge.loadtest.result import load_section, ratio_section
-from rfedge.localisation.rows import localise_section
 from rfedge.report.tables import heading, plain_section
 from rfedge.results import Result, read_result
 from rfedge.training.report import training_section

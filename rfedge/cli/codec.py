@@ -39,13 +39,8 @@ class Encode:
     mask_qp: int = -6
     """Added to H.264's quantiser in the mask, -24..24; -6 halves its step."""
     localise: bool = False
-    """Find the poses in the field, from the dataset's as a sensor with --pose-errors sees them;
-    frames whose pose is not found are coded without the field."""
-    pose_errors: Annotated[str, arg(metavar="MODEL")] = "exact"
-    """With --localise: exact, white-small, white-large, offset, gnss, or KEY=VALUE,... of
-    rfcore.localise.pose_errors (noise_m, offset_m, walk_m, rate_hz, latency_s, silent_s, ...)."""
-    seed: int = 1
-    """Seed of the pose errors."""
+    """Find the poses in the field, near the dataset's own; frames whose pose is not found are coded
+    without the field."""
     threads: int = 2
     """Threads of the rasterizer."""
     renderer: Annotated[str, RENDERER] = "cpu"
@@ -81,11 +76,9 @@ class Encode:
         """Return what finds the poses, if that is asked for."""
         if not self.localise:
             return None
-        from rfcore.localise.pose_errors import parse_error_model
-        from rfedge.located import LocatedDrive
+        from rfedge.located import LocatedDrive, own_poses
 
-        errors = parse_error_model(self.pose_errors)
-        return LocatedDrive(field, dataset.pictures, errors, self.seed).locate
+        return LocatedDrive(field, dataset.pictures, own_poses(dataset.pictures)).locate
 
 
 @dataclass(frozen=True)

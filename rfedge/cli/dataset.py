@@ -12,7 +12,6 @@ from tyro.conf import Positional, arg, subcommand
 
 from rfedge.arguments import (
     DATASET,
-    FIELD,
     FOLDER,
     SIZE,
     field_path,
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Dataset",
     "DatasetConvert",
-    "DatasetFeed",
     "DatasetPoses",
     "DatasetRecordCarla",
     "DatasetSplit",
@@ -204,84 +202,6 @@ class DatasetPoses:
         print(line)
 
 
-@dataclass(frozen=True)
-class DatasetFeed:
-    """Write a drive's poses as a vehicle's sensors would state them: NMEA or JSON, with errors."""
-
-    drive: Annotated[Path, Positional, DATASET]
-    """Posed pictures; their poses are the truth."""
-    out: Annotated[str, arg(metavar="FILE|udp:HOST:PORT")]
-    """The file to write, or where to send it to, line by line at its own pace."""
-    field: Annotated[Path | None, FIELD] = None
-    """The field whose anchor says where on the Earth the drive is; default: the dataset's own."""
-    form: Literal["nmea", "geodetic", "xyz"] = "nmea"
-    """NMEA sentences, or JSON lines in WGS 84 or in the drive's own axes (docs/localise.md)."""
-    errors: Annotated[str, arg(metavar="NAME,KEY=VALUE,...")] = "gnss"
-    """exact, white-small, white-large, offset or gnss, and what to change of it:
-    noise_m, noise_deg, offset_m, offset_deg, walk_m, walk_s, rate_hz, latency_s, silent_from_s,
-    silent_s."""
-    camera_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """The camera seen from the antenna: metres forward, left, up (cav-agent --camera-at)."""
-    start_s: float | None = None
-    """Unix time of the first picture; default: its time in the dataset, or now for udp."""
-    rate: float = 10.0
-    """Pictures a second, where the dataset has no times."""
-    seed: int = 1
-    """Seed of the errors."""
-
-    def run(self) -> None:
-        """Write the file, or send it."""
-        from time import time
-
-        from cav_agent.pose_feed.placing import CameraMount
-        from rfcore.camera import TileOrigin
-        from rfcore.dataset import read_dataset
-        from rfcore.files import write_whole
-        from rfcore.localise.pose_errors import parse_error_model
-        from rfedge.datasets.pose_feed import FeedPlan, feed_lines, times_of
-
-        errors = parse_error_model(self.errors)
-        anchor, origin = None, TileOrigin()
-        if self.field is not None:
-            metadata = open_field(self.field, threads=1).metadata
-            anchor, origin = metadata.anchor, metadata.tile_origin
-        dataset = read_dataset(self.drive, tile_origin=origin if self.field else None)
-        live = self.out.startswith("udp:")
-        stated_s = dataset.pictures[0].time_ns / 1e9
-        plan = FeedPlan(
-            form=self.form,
-            errors=errors,
-            start_s=self.start_s if self.start_s is not None else time() if live else stated_s,
-            seed=self.seed,
-            anchor=anchor or dataset.anchor,
-            origin=dataset.tile_origin,
-            mount=CameraMount(self.camera_at),
-        )
-        poses = [picture.camera.world_from_cam for picture in dataset.pictures]
-        lines = feed_lines(poses, times_of(dataset.pictures, self.rate), plan)
-        if live:
-            _send(lines, self.out)
-        else:
-            write_whole(Path(self.out), "".join(text for _, text in lines))
-        print(f"{self.out}: {len(lines)} fixes")
-
-
-def _send(lines: list[tuple[float, str]], target: str) -> None:
-    """Send each text in a datagram when it is due."""
-    import socket
-    from time import monotonic, sleep
-
-    from cav_agent.pose_feed.settings import parse_source
-
-    source, begun_s = parse_source(target), monotonic()
-    address = (source.host, source.port)
-    family = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)[0][0]
-    with socket.socket(family, socket.SOCK_DGRAM) as sender:
-        for due_s, text in lines:
-            sleep(max(0.0, begun_s + due_s - monotonic()))
-            sender.sendto(text.encode("ascii"), address)
-
-
 @contextmanager
 def _shown(console: Console) -> Iterator[Callable[[str], None]]:
     """Show what is told: in one changing line on a terminal, line by line in a log."""
@@ -363,7 +283,6 @@ class Dataset:
         Annotated[DatasetConvert, subcommand("convert")]
         | Annotated[DatasetSplit, subcommand("split")]
         | Annotated[DatasetPoses, subcommand("poses")]
-        | Annotated[DatasetFeed, subcommand("feed")]
         | Annotated[DatasetRecordCarla, subcommand("record-carla")],
         arg(name=""),
     ]

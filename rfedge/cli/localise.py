@@ -35,8 +35,6 @@ class Localise:
     """How far from the dataset's pose each search starts."""
     tries: int | None = None
     """Searches, over the pictures in turn; default: one a picture."""
-    false_starts: int = 0
-    """Searches with pictures the field cannot have (mirrored, turned round, noise), to be lost."""
     seed: int = 1
     """Seed of the starts."""
     out: Annotated[Path | None, arg(metavar="FILE.tum")] = None
@@ -59,41 +57,41 @@ class Localise:
 
     def run(self) -> None:
         """Search from every start and print how many poses were found, and how well."""
+        import numpy as np
         from rich.console import Console
         from rich.progress import track
 
         from rfcore.dataset import read_dataset
         from rfedge.localisation.feed import typical_start
         from rfedge.localisation.report import write_localise_report
-        from rfedge.localisation.starts import (
-            attempts,
+        from rfedge.localisation.searches import (
+            SearchSummary,
             parse_start_error,
-            result_of,
-            row_text,
             searches_from,
-            summary,
+            searches_from_displaced,
             write_poses,
         )
-        from rfedge.results import write_result
+        from rfedge.results import make_result, provenance, write_result
 
         error = parse_start_error(self.start_error)
         field = open_field(self.field, threads=self.threads)
         pictures = read_dataset(self.drive, tile_origin=field.metadata.tile_origin).pictures
-        counts = (len(pictures) if self.tries is None else self.tries, self.false_starts)
+        count = len(pictures) if self.tries is None else self.tries
         shown, feed = Console(stderr=True), None
         if self.pose_feed is None:
-            searches = attempts(field, pictures, error, counts, self.seed)
+            rng = np.random.default_rng(self.seed)
+            searches = searches_from_displaced(field, pictures, error, count, rng)
         else:
             feed = self._feed()
             priors = self._priors(feed, field, pictures, shown)
-            counts = (sum(prior is not None for prior in priors), 0)
+            count = sum(prior is not None for prior in priors)
             searches = searches_from(field, pictures, priors)
             error = typical_start(pictures, priors)
-        done = list(track(searches, "Localising", total=sum(counts), console=shown))
+        done = list(track(searches, "Localising", total=count, console=shown))
         if feed is not None:
             told = feed.time_offset(pictures, done)
             shown.print(f"{self.pose_feed}: {told}", highlight=False)
-        row = summary(str(self.drive), error, done)
+        row = SearchSummary.of(str(self.drive), error, done)
         if self.report is not None:
             write_localise_report(self.report, field, row, done)
             shown.print(f"{self.report}: errors over time and matches", highlight=False)
@@ -101,17 +99,18 @@ class Localise:
             found = write_poses(self.out, done)
             shown.print(f"{self.out}: {found} poses", highlight=False)
         if self.json is not None:
-            write_result(self.json, result_of([row], [field_path(self.field), self.drive]))
+            made = provenance([field_path(self.field), self.drive])
+            write_result(self.json, make_result("localise", made, {"rows": [row]}))
         if self.json != "-":
-            print(row_text(row))
+            print(row)
 
     def _feed(self) -> RecordedFeed:
         from rfcore.errors import InvalidInput
         from rfedge.localisation.feed import RecordedFeed
 
         assert self.pose_feed is not None
-        if self.tries is not None or self.false_starts:
-            raise InvalidInput("pose_feed", "goes without --tries and --false-starts")
+        if self.tries is not None:
+            raise InvalidInput("pose_feed", "goes without --tries")
         return RecordedFeed.read(self.pose_feed, self.feed_offset_s)
 
     def _priors(

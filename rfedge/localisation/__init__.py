@@ -1,1 +1,1 @@
-"""Tries of the localiser on a drive whose poses are known: starts, sensors, report."""
+"""Searches for the poses of a drive whose poses are known: from wrong starts or a recorded feed."""

@@ -18,7 +18,7 @@ from rfcore.field import Bounds
 from rfcore.localise.localiser import Localised
 from rfcore.localise.prior import PosePrior
 from rfcore.views import PosedPicture
-from rfedge.localisation.starts import Attempt, StartError, pose_difference
+from rfedge.localisation.searches import SearchOutcome, StartError, pose_difference
 
 __all__ = ["RecordedFeed", "typical_start"]
 
@@ -65,9 +65,9 @@ class RecordedFeed:
                 found.append(None)
         return found
 
-    def time_offset(self, pictures: Sequence[PosedPicture], done: Sequence[Attempt]) -> str:
+    def time_offset(self, pictures: Sequence[PosedPicture], done: Sequence[SearchOutcome]) -> str:
         """Return in words how late the feed is, by the poses that were found; after ``priors``."""
-        found = {id(attempt.picture): attempt.answer for attempt in done}
+        found = {id(one.picture): one.answer for one in done}
         for index, picture in enumerate(pictures):
             answer = found.get(id(picture))
             if isinstance(answer, Localised):

@@ -7,7 +7,6 @@ Matches are found anew for the pictures shown, between the picture and the rende
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,7 @@ from rfcore.files import write_whole
 from rfcore.image import Rgb
 from rfcore.localise.localiser import LocaliserSettings, Lost, Obstacle
 from rfcore.localise.matching import features, grey, lifted, matched
-from rfedge.localisation.rows import LocaliseRow
-from rfedge.localisation.starts import Attempt, pose_difference, row_text
+from rfedge.localisation.searches import SearchOutcome, SearchSummary, pose_difference
 from rfedge.report.charts import BLUE, GREY, RENDER, embedded, new_axes, svg
 from rfedge.results import provenance
 
@@ -46,31 +44,29 @@ GREEN, RED = (40, 200, 90), (230, 70, 60)
 
 
 def write_localise_report(
-    path: Path, field: Renderer, row: LocaliseRow, done: Sequence[Attempt]
+    path: Path, field: Renderer, row: SearchSummary, tries: Sequence[SearchOutcome]
 ) -> None:
-    """Write the page of the attempts of one drive."""
+    """Write the page about the searches of one drive."""
     environment = Environment(
         loader=PackageLoader("rfedge.localisation", "."),
         autoescape=True,
         undefined=StrictUndefined,
     )
-    tries = [attempt for attempt in done if not attempt.false_start]
     page = environment.get_template("report.html.j2").render(
         headline=f"{row.localised_percent:.1f} % of {row.tries} pictures found their pose",
         row=row,
-        line=row_text(row),
+        line=str(row),
         position_svg=_chart(tries, "position, m", 0, LEAST_M),
         rotation_svg=_chart(tries, "rotation, degrees", 1, LEAST_DEG),
         shown=[_shown(field, which, attempt) for which, attempt in _chosen(tries)],
         lost=_lost(tries),
-        false_starts=_false_starts(done),
         provenance=json.dumps(provenance([]), indent=2, default=str),
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, page)
 
 
-def _chart(tries: Sequence[Attempt], label: str, which: int, least: float) -> str:
+def _chart(tries: Sequence[SearchOutcome], label: str, which: int, least: float) -> str:
     """Return errors of start and of the pose found over time, or over the pictures' number."""
     times_s = [attempt.picture.time_ns / 1e9 for attempt in tries]
     timed = len(times_s) > 1 and all(np.diff(times_s) > 0)
@@ -99,7 +95,7 @@ def _chart(tries: Sequence[Attempt], label: str, which: int, least: float) -> st
     return svg(figure)
 
 
-def _chosen(tries: Sequence[Attempt]) -> list[tuple[str, Attempt]]:
+def _chosen(tries: Sequence[SearchOutcome]) -> list[tuple[str, SearchOutcome]]:
     """Return the best, the median and the worst pose found, and the first picture lost."""
     found = sorted(
         (attempt for attempt in tries if attempt.error_m is not None),
@@ -113,7 +109,7 @@ def _chosen(tries: Sequence[Attempt]) -> list[tuple[str, Attempt]]:
     return [*chosen, *(("The first one lost", attempt) for attempt in lost[:1])]
 
 
-def _shown(field: Renderer, title: str, attempt: Attempt) -> dict[str, Any]:
+def _shown(field: Renderer, title: str, attempt: SearchOutcome) -> dict[str, Any]:
     answer = attempt.answer
     if isinstance(answer, Lost):
         pose, note = attempt.start, f"lost: {WHY[answer.obstacle]}"
@@ -129,7 +125,7 @@ def _shown(field: Renderer, title: str, attempt: Attempt) -> dict[str, Any]:
     return {"title": title, "note": note, "pictures": embedded([(caption, drawn)])}
 
 
-def _drawn(field: Renderer, attempt: Attempt, pose: Pose) -> tuple[Rgb, int, int]:
+def _drawn(field: Renderer, attempt: SearchOutcome, pose: Pose) -> tuple[Rgb, int, int]:
     """Return picture and render beside each other with matches, how many agree, how many are."""
     settings, k = LocaliserSettings(), attempt.picture.camera.intrinsics
     camera = Camera(k, pose)
@@ -164,7 +160,7 @@ def _line(
         cv2.circle(canvas, end, 3, colour, 1, cv2.LINE_AA)
 
 
-def _lost(tries: Sequence[Attempt]) -> list[dict[str, Any]]:
+def _lost(tries: Sequence[SearchOutcome]) -> list[dict[str, Any]]:
     """Return the pictures that were lost, with their reason."""
     return [
         {
@@ -176,13 +172,3 @@ def _lost(tries: Sequence[Attempt]) -> list[dict[str, Any]]:
         for attempt in tries
         if isinstance(attempt.answer, Lost)
     ]
-
-
-def _false_starts(done: Sequence[Attempt]) -> dict[str, int]:
-    """Return how the searches ended with pictures the field cannot have."""
-    ends = Counter(
-        WHY[attempt.answer.obstacle] if isinstance(attempt.answer, Lost) else "a pose: false"
-        for attempt in done
-        if attempt.false_start
-    )
-    return dict(ends)

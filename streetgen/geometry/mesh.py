@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rfcore.errors import InvalidInput
-from rfedge.datasets.classes import Label
+from streetgen.classes import Label
 
 __all__ = [
     "F32",

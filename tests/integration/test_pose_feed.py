@@ -13,12 +13,12 @@ import pytest
 
 from cav_agent.config import PaceKind
 from cav_agent.pose_feed.settings import PoseFeedSettings
+from lab.localisation.pose_errors import PoseErrorModel
+from lab.localisation.pose_feed import FeedPlan, feed_lines, times_of
 from recorded import recorded
 from rfcore.dataset import read_dataset
 from rfcore.field.store import anchored_file
 from rfcore.geodesy import Anchor
-from rfcore.localise.pose_errors import PoseErrorModel
-from rfedge.datasets.pose_feed import FeedPlan, feed_lines, times_of
 
 
 def write_feed(street: Any, out: Path, errors: PoseErrorModel) -> list[Any]:

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from cav_agent.pose_feed.settings import PoseFeedSettings
+from lab.localisation.pose_feed import MakeFeed
 from recorded import recorded
 from rfcore.dataset import read_dataset
 from rfcore.field.store import anchored_file
 from rfcore.geodesy import Anchor
 from rfcore.views import PosedPicture
-from rfedge.cli.dataset import DatasetFeed
 
 pytestmark = [pytest.mark.sample, pytest.mark.slow]
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -75,7 +75,7 @@ def follow(serve: Any, travel: Any, store: tuple[Path, str], tmp_path: Path) -> 
     async def run(numbers: list[int], form: Any, errors: str, skipped: int = 0) -> Travelled:
         drive = drive_of(numbers, tmp_path / "drive")
         feed, saved = tmp_path / "feed.txt", tmp_path / "saved"
-        DatasetFeed(drive, str(feed), fields / "street.rff", form=form, errors=errors).run()
+        MakeFeed(drive, str(feed), fields / "street.rff", form=form, errors=errors).run()
         feed.write_text("".join(feed.read_text().splitlines(keepends=True)[skipped:]))
         settings = PoseFeedSettings(pose_feed=f"file:{feed}")
         async with serve(fields=fields, record=saved) as server:

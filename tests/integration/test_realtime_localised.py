@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from rfedge.cli.dataset import DatasetFeed
+from lab.localisation.pose_feed import MakeFeed
 
 pytestmark = [pytest.mark.sample, pytest.mark.slow]
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -68,7 +68,7 @@ async def test_while_the_pose_is_searched_frames_go_on_without_the_field(
     store, feed, report = (tmp_path / name for name in ("store", "feed.txt", "report.jsonl"))
     store.mkdir()
     shutil.copyfile(SAMPLES / "fields/street.rff", store / "street.rff")
-    DatasetFeed(DRIVE, str(feed), store / "street.rff", form="xyz", errors="white-large").run()
+    MakeFeed(DRIVE, str(feed), store / "street.rff", form="xyz", errors="white-large").run()
     feed.write_text("".join(feed.read_text().splitlines(keepends=True)[FIXES_MISSING:]))
     given = {"drive": DRIVE, "fields": store, "pose-feed": f"file:{feed}"}
     given |= {"rate": 10, "report": report}

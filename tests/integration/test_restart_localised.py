@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rfedge.cli.dataset import DatasetFeed
+from lab.localisation.pose_feed import MakeFeed
 
 pytestmark = [pytest.mark.sample, pytest.mark.slow]
 SAMPLES = Path(__file__).parents[2] / "samples"
@@ -66,7 +66,7 @@ async def test_killed_and_started_again_it_uses_the_field_within_three_frames(
     shutil.copyfile(SAMPLES / "fields/street.rff", store / "street.rff")
     whole = drive_from(0, tmp_path / "whole")
     rest = drive_from(RESUMED_AT, tmp_path / "rest")
-    DatasetFeed(whole, str(feed), store / "street.rff", form="xyz", errors="gnss").run()
+    MakeFeed(whole, str(feed), store / "street.rff", form="xyz", errors="gnss").run()
     reports = [tmp_path / "first.jsonl", tmp_path / "second.jsonl"]
     async with serve(fields=store) as server:
         first = await start(str(server.address), store, whole, feed, reports[0], "--loop")

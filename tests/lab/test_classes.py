@@ -26,10 +26,10 @@ from lab.classes.measure import (
 )
 from rfcore.errors import DatasetError, InvalidInput
 from rfcore.image import I420
-from rfedge.datasets.classes import Label
 from rfedge.evaluate.clips import Clip, CodedClip, DriveName, luma_mse
 from rfedge.evaluate.rivals import CodedPictures
 from rfedge.results import read_result
+from streetgen.classes import Label
 
 REST, VEHICLE, PERSON, SIGN, MARKING = range(5)
 

@@ -10,7 +10,7 @@ from lab.localisation.given import GivenDrive, aligned_poses, read_pose_lines
 from rfcore.camera import Pose
 from rfcore.errors import InvalidInput
 from rfcore.motion import quaternion_from_vector
-from rfedge.localisation.starts import StartError
+from rfedge.localisation.searches import StartError
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 

@@ -9,13 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from lab.localisation import EvalLocalise
+from lab.localisation.false_starts import false_starts, row_of
 from lab.localisation.given import GivenDrive
 from lab.localisation.measure import Piece, pieces, rows_of_pieces
 from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field
 from rfcore.localise.localiser import Lost
-from rfedge.localisation.starts import StartError, attempts
+from rfedge.localisation.searches import SearchOutcome, StartError
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 
@@ -85,10 +86,21 @@ def test_pictures_of_other_places_of_any_size_are_every_second_false_start() -> 
         return np.ascontiguousarray(np.repeat(picture.read()[::-1], 2, axis=0))
 
     stranger = replace(picture, read=upside_down)
-    done = attempts(field, [picture], StartError(0.5, 1.0), (1, 3), 1, [stranger])
-    answers = [(attempt.false_start, isinstance(attempt.answer, Lost)) for attempt in done]
-    assert answers == [(False, False), (True, True), (True, True), (True, True)]
+    rng = np.random.default_rng(1)
+    done = false_starts(field, [picture], StartError(0.5, 1.0), range(1, 4), rng, [stranger])
+    assert [isinstance(one.answer, Lost) for one in done] == [True] * 3
     assert len(reads) == 1
+
+
+def test_a_row_counts_right_poses_of_tries_and_wrong_ones_of_all() -> None:
+    def ended(error_m: float | None, right: bool = False) -> SearchOutcome:
+        return SearchOutcome(None, None, None, error_m, error_m, right, 300.0, 250.0)
+
+    tries = [ended(0.002, True), ended(0.004, True), ended(1.0), ended(None)]
+    row = row_of("drive", StartError(2, 3), tries, [ended(None)] * 3 + [ended(0.001)])
+    assert (row.tries, row.false_starts) == (4, 4)
+    assert (row.localised_percent, row.false_percent) == (50.0, 25.0)
+    assert (row.median_m, row.false_cpu_ms) == (0.004, 250.0)
 
 
 def test_a_drive_may_ask_for_searches_from_one_start_error_alone() -> None:

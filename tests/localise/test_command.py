@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from cav_agent.pose_feed.placing import Place
+from lab.localisation.pose_errors import PoseErrorModel
+from lab.localisation.pose_feed import FeedPlan, MakeFeed, feed_lines
 from rfcore.camera import Camera, Intrinsics, Pose, TileOrigin
 from rfcore.dataset import read_dataset
 from rfcore.dataset.trajectory import read_trajectory
@@ -17,22 +19,19 @@ from rfcore.errors import InvalidData, InvalidInput
 from rfcore.field import Bounds, load_field
 from rfcore.localise.localiser import Localised, Lost, Obstacle
 from rfcore.localise.matching import Solution
-from rfcore.localise.pose_errors import PoseErrorModel
 from rfcore.motion import rotation_vector
 from rfcore.views import PosedPicture
-from rfedge.cli.dataset import DatasetConvert, DatasetFeed
+from rfedge.cli.dataset import DatasetConvert
 from rfedge.cli.localise import Localise
-from rfedge.datasets.pose_feed import FeedPlan, feed_lines
 from rfedge.localisation.feed import RecordedFeed
 from rfedge.localisation.report import write_localise_report
-from rfedge.localisation.starts import (
-    Attempt,
+from rfedge.localisation.searches import (
+    SearchOutcome,
+    SearchSummary,
     StartError,
-    attempts,
     displaced,
     parse_start_error,
-    row_text,
-    summary,
+    searches_from_displaced,
     write_poses,
 )
 
@@ -49,19 +48,13 @@ def picture(number: int, time_ns: int = 0) -> PosedPicture:
     )
 
 
-def attempt(
-    number: int, error_m: float | None, *, false_start: bool = False, time_ns: int = 0
-) -> Attempt:
+def outcome(number: int, error_m: float | None, time_ns: int = 0) -> SearchOutcome:
     """A search that was lost, or found a pose; right where it is within 0.01 m."""
     if error_m is None:
-        return Attempt(
-            picture(number, time_ns), false_start, POSE, LOST, None, None, False, 100.0, 90.0
-        )
+        return SearchOutcome(picture(number, time_ns), POSE, LOST, None, None, False, 100.0, 90.0)
     found = Localised(Solution(POSE, 90, 0.5), 80.0, 1)
-    right = error_m < 0.01 and not false_start
-    return Attempt(
-        picture(number, time_ns), false_start, POSE, found, error_m, 0.02, right, 300.0, 250.0
-    )
+    right = error_m < 0.01
+    return SearchOutcome(picture(number, time_ns), POSE, found, error_m, 0.02, right, 300.0, 250.0)
 
 
 def test_a_start_is_exactly_as_far_off_as_asked_and_mostly_level() -> None:
@@ -76,31 +69,21 @@ def test_a_start_is_exactly_as_far_off_as_asked_and_mostly_level() -> None:
     assert {yaw > 0 for yaw in yaws} == {True, False}
 
 
-def test_a_summary_counts_right_poses_of_tries_and_wrong_ones_of_all() -> None:
-    done = [attempt(n, error_m) for n, error_m in enumerate((0.002, 0.004, 1.0, None))]
-    done += [attempt(9, None, false_start=True) for _ in range(3)]
-    done += [attempt(9, 0.001, false_start=True)]
-    row = summary("drive", ERROR, done)
-    assert (row.tries, row.false_starts) == (4, 4)
-    assert row.localised_percent == 50.0
-    assert row.false_percent == 25.0
+def test_a_summary_counts_right_and_wrong_poses_of_all_tries() -> None:
+    done = [outcome(n, error_m) for n, error_m in enumerate((0.002, 0.004, 1.0, None))]
+    row = SearchSummary.of("drive", ERROR, done)
+    assert (row.tries, row.localised_percent, row.false_percent) == (4, 50.0, 25.0)
     assert row.median_m == 0.004
     assert row.p95_m == pytest.approx(0.004 + 0.9 * 0.996)
-    assert row.localise_ms == 300.0
-    assert row.localise_cpu_ms == 250.0
-    assert "50.0 % of 4 localised" in row_text(row)
-
-
-def test_a_summary_without_a_pose_has_no_errors() -> None:
-    row = summary("drive", ERROR, [attempt(0, None)])
-    assert (row.median_m, row.median_deg, row.p95_m) == (None, None, None)
-    assert "no pose" in row_text(row)
+    assert (row.localise_ms, row.localise_cpu_ms) == (300.0, 250.0)
+    assert "50.0 % of 4 localised" in str(row)
+    assert "no pose" in str(SearchSummary.of("drive", ERROR, [outcome(0, None)]))
 
 
 def test_poses_are_written_once_a_picture_and_gaps_are_told(tmp_path: Path) -> None:
     out = tmp_path / "poses.tum"
-    done = [attempt(n, 0.001 if n != 1 else None, time_ns=n * 100_000_000) for n in range(3)]
-    assert write_poses(out, [*done, attempt(2, 0.001), attempt(4, 0.1, false_start=True)]) == 2
+    done = [outcome(n, 0.001 if n != 1 else None, n * 100_000_000) for n in range(3)]
+    assert write_poses(out, [*done, outcome(2, 0.001)]) == 2
     read = read_trajectory(out)
     assert read.times_ns == (0, 200_000_000)
     assert read.poses == (POSE, POSE)
@@ -109,7 +92,7 @@ def test_poses_are_written_once_a_picture_and_gaps_are_told(tmp_path: Path) -> N
 
 def test_poses_of_pictures_without_times_are_numbered(tmp_path: Path) -> None:
     out = tmp_path / "poses.tum"
-    assert write_poses(out, [attempt(n, 0.001) for n in range(3)]) == 3
+    assert write_poses(out, [outcome(n, 0.001) for n in range(3)]) == 3
     assert out.read_text().startswith("# number of the picture tx ty tz qx qy qz qw\n0 1 2 3 ")
 
 
@@ -130,7 +113,7 @@ def test_the_command_localises_the_samples_drive(
     out, result = tmp_path / "poses.tum", tmp_path / "localise.json"
     drive = SAMPLES / "street/transforms_drive_empty.json"
     field = SAMPLES / "fields/street.rff"
-    Localise(drive, field, tries=3, false_starts=1, out=out, json=str(result)).run()
+    Localise(drive, field, tries=3, out=out, json=str(result)).run()
     (row,) = json.loads(result.read_text())["rows"]
     assert (row["tries"], row["localised_percent"], row["false_percent"]) == (3, 100.0, 0.0)
     assert row["median_m"] < 0.03
@@ -142,17 +125,16 @@ def test_the_command_localises_the_samples_drive(
 def test_the_report_shows_errors_matches_and_what_was_lost(tmp_path: Path) -> None:
     field = load_field(SAMPLES / "fields/street.rff")
     pictures = read_dataset(SAMPLES / "street/transforms_drive_empty.json").pictures
-    done = list(attempts(field, pictures[:1], ERROR, (1, 1), 1))
     dark = replace(pictures[1], read=lambda: np.zeros((360, 640, 3), np.uint8))
-    done += attempts(field, [dark], ERROR, (1, 0), 1)
+    rng = np.random.default_rng(1)
+    done = list(searches_from_displaced(field, [pictures[0], dark], ERROR, 2, rng))
     out = tmp_path / "report.html"
-    write_localise_report(out, field, summary("drive", ERROR, done), done)
+    write_localise_report(out, field, SearchSummary.of("drive", ERROR, done), done)
     page = out.read_text()
     assert "50.0 % of 2 pictures found their pose" in page
     assert f"<td>{dark.name}</td><td>the picture has too few features" in page
     assert "The best pose" in page
     assert "The first one lost" in page
-    assert "Pictures the field cannot have" in page
     assert page.count("data:image/jpeg;base64,") == 4
     agree, count = re.search(r"render: (\d+) of (\d+) matches agree", page).groups()
     assert 0.5 * int(count) < int(agree) <= int(count)
@@ -162,7 +144,7 @@ def test_the_report_shows_errors_matches_and_what_was_lost(tmp_path: Path) -> No
 @pytest.mark.sample
 def test_a_recorded_feed_says_where_to_search(tmp_path: Path) -> None:
     drive, feed = SAMPLES / "street/transforms_drive_empty.json", tmp_path / "feed.jsonl"
-    DatasetFeed(drive, str(feed), form="xyz", errors="gnss,rate_hz=5", seed=2).run()
+    MakeFeed(drive, str(feed), form="xyz", errors="gnss,rate_hz=5", seed=2).run()
     result = tmp_path / "result.json"
     pictures = 4
     short = tmp_path / "drive"
@@ -177,7 +159,7 @@ def test_a_recorded_feed_says_where_to_search(tmp_path: Path) -> None:
 @pytest.mark.sample
 def test_a_feed_of_another_time_is_refused(tmp_path: Path) -> None:
     drive, feed = SAMPLES / "street/transforms_drive_empty.json", tmp_path / "feed.jsonl"
-    DatasetFeed(drive, str(feed), form="xyz", start_s=1.7e9).run()
+    MakeFeed(drive, str(feed), form="xyz", start_s=1.7e9).run()
     with pytest.raises(InvalidInput, match="see --feed-offset-s"):
         Localise(drive, SAMPLES / "fields/street.rff", pose_feed=feed).run()
     feed.write_text("nothing\n")
@@ -202,7 +184,7 @@ def test_poses_that_were_found_tell_how_late_a_feed_is(tmp_path: Path, late_s: f
     feed.priors(pictures, place, Bounds((-99, -99, -99), (99, 99, 99)), 10.0)
     done = [
         replace(
-            attempt(n, 0.001),
+            outcome(n, 0.001),
             picture=p,
             answer=Localised(Solution(p.camera.world_from_cam, 90, 0.5), 80.0, 1),
         )

@@ -15,13 +15,13 @@ from cav_agent.pose_feed.feed import FieldFeed, PoseFeed, TimeOffsetEstimator
 from cav_agent.pose_feed.fix import FeedProblem, Fix
 from cav_agent.pose_feed.placing import CameraMount, Place
 from cav_agent.pose_feed.settings import FeedSource, PoseFeedSettings, SourceKind, parse_source
+from lab.localisation.pose_errors import ERROR_MODELS, PoseErrorModel
+from lab.localisation.pose_feed import FeedPlan, feed_lines
 from rfcore.camera import Pose, TileOrigin
 from rfcore.errors import InvalidInput
 from rfcore.field import Bounds
 from rfcore.geodesy import Anchor
-from rfcore.localise.pose_errors import ERROR_MODELS, PoseErrorModel
 from rfcore.motion import quaternion_from_vector, rotation_vector
-from rfedge.datasets.pose_feed import FeedPlan, feed_lines
 
 NOW_NS = 1_700_000_000 * NS
 ANCHOR = Anchor(48.137, 11.575, 519.0)

@@ -13,7 +13,7 @@ from cav_agent.pose_feed.feed import MAX_LINE_BYTES, FeedReader
 from cav_agent.pose_feed.fix import BadReading, FeedProblem
 from cav_agent.pose_feed.json_lines import JsonParser
 from cav_agent.pose_feed.nmea import NmeaParser
-from rfedge.datasets.pose_feed import sentence
+from lab.localisation.pose_feed import sentence
 
 NOON_NS = 1_700_000_000 * 10**9
 """2023-11-14 22:13:20 UTC."""

@@ -17,8 +17,8 @@ from cav_agent.pose_feed.feed import PoseFeed
 from cav_agent.pose_feed.fix import FeedProblem
 from cav_agent.pose_feed.settings import FeedSource, SourceKind
 from cav_agent.pose_feed.sources import FeedTask
+from lab.localisation.pose_feed import sentence
 from rfcore.errors import InvalidInput
-from rfedge.datasets.pose_feed import sentence
 
 BODY = "GPGGA,2213{:02d}.0,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"
 DEADLINE_S = 20.0

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfcore.camera import Pose
-from rfcore.errors import InvalidInput
-from rfcore.localise.pose_errors import (
+from lab.localisation.pose_errors import (
     ERROR_MODELS,
     PoseErrorModel,
     observed,
     parse_error_model,
 )
+from rfcore.camera import Pose
+from rfcore.errors import InvalidInput
 from rfcore.motion import quaternion_from_vector, rotation_vector
 
 TIMES_S = [100.0 + 0.1 * n for n in range(400)]

@@ -1,7 +1,7 @@
-"""A dataset's poses as the feed of a vehicle that drove it: NMEA or JSON lines, with errors.
+"""``rfedge-lab feed``: a dataset's poses as the feed of a vehicle that drove it, with errors.
 
-Positions are those of the camera, or of an antenna where a lever arm is given, in the errors of
-``rfcore.localise.pose_errors``. NMEA states GGA, RMC, GST and HDT a fix, as a receiver with two
+Positions are those of the camera, or of an antenna where a lever arm is given, with the errors of
+``lab.localisation.pose_errors``. NMEA states GGA, RMC, GST and HDT a fix, as a receiver with two
 antennas; it knows no pitch and no roll. Deterministic by seed.
 """
 
@@ -9,23 +9,32 @@ from __future__ import annotations
 
 import json
 import math
+import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import reduce
 from itertools import pairwise
-from typing import Literal
+from pathlib import Path
+from time import monotonic, sleep, time
+from typing import Annotated, Literal
 
 import numpy as np
+from tyro.conf import Positional, arg
 
 from cav_agent.pose_feed.placing import CameraMount
+from cav_agent.pose_feed.settings import parse_source
+from lab.localisation.pose_errors import PoseErrorModel, observed, parse_error_model
 from rfcore.camera import Pose, TileOrigin
+from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
+from rfcore.files import write_whole
 from rfcore.geodesy import Anchor
-from rfcore.localise.pose_errors import Observation, PoseErrorModel, observed
 from rfcore.views import PosedPicture
+from rfedge.arguments import DATASET, FIELD, open_field
+from rfedge.located import Observation
 
-__all__ = ["FeedForm", "FeedPlan", "feed_lines", "sentence", "times_of"]
+__all__ = ["FeedForm", "FeedPlan", "MakeFeed", "feed_lines", "sentence", "times_of"]
 
 FeedForm = Literal["nmea", "geodetic", "xyz"]
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -147,3 +156,67 @@ def sentence(body: str) -> str:
     """Return an NMEA sentence with its checksum, the exclusive or of its characters."""
     checksum = reduce(lambda sum_, character: sum_ ^ ord(character), body, 0)
     return f"${body}*{checksum:02X}\r\n"
+
+
+@dataclass(frozen=True)
+class MakeFeed:
+    """Write a drive's poses as a vehicle's sensors would state them: NMEA or JSON, with errors."""
+
+    drive: Annotated[Path, Positional, DATASET]
+    """Posed pictures; their poses are the truth."""
+    out: Annotated[str, arg(metavar="FILE|udp:HOST:PORT")]
+    """The file to write, or where to send it to, line by line at its own pace."""
+    field: Annotated[Path | None, FIELD] = None
+    """The field whose anchor says where on the Earth the drive is; default: the dataset's own."""
+    form: FeedForm = "nmea"
+    """NMEA sentences, or JSON lines in WGS 84 or in the drive's own axes (docs/localise.md)."""
+    errors: Annotated[str, arg(metavar="NAME,KEY=VALUE,...")] = "gnss"
+    """exact, white-small, white-large, offset or gnss, and what to change of it:
+    noise_m, noise_deg, offset_m, offset_deg, walk_m, walk_s, rate_hz, latency_s, silent_from_s,
+    silent_s."""
+    camera_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The camera seen from the antenna: metres forward, left, up (cav-agent --camera-at)."""
+    start_s: float | None = None
+    """Unix time of the first picture; default: its time in the dataset, or now for udp."""
+    rate: float = 10.0
+    """Pictures a second, where the dataset has no times."""
+    seed: int = 1
+    """Seed of the errors."""
+
+    def run(self) -> None:
+        """Write the file, or send it."""
+        errors = parse_error_model(self.errors)
+        anchor, origin = None, TileOrigin()
+        if self.field is not None:
+            metadata = open_field(self.field, threads=1).metadata
+            anchor, origin = metadata.anchor, metadata.tile_origin
+        dataset = read_dataset(self.drive, tile_origin=origin if self.field else None)
+        live = self.out.startswith("udp:")
+        stated_s = dataset.pictures[0].time_ns / 1e9
+        plan = FeedPlan(
+            form=self.form,
+            errors=errors,
+            start_s=self.start_s if self.start_s is not None else time() if live else stated_s,
+            seed=self.seed,
+            anchor=anchor or dataset.anchor,
+            origin=dataset.tile_origin,
+            mount=CameraMount(self.camera_at),
+        )
+        poses = [picture.camera.world_from_cam for picture in dataset.pictures]
+        lines = feed_lines(poses, times_of(dataset.pictures, self.rate), plan)
+        if live:
+            _send(lines, self.out)
+        else:
+            write_whole(Path(self.out), "".join(text for _, text in lines))
+        print(f"{self.out}: {len(lines)} fixes")
+
+
+def _send(lines: list[tuple[float, str]], target: str) -> None:
+    """Send each text in a datagram when it is due."""
+    source, begun_s = parse_source(target), monotonic()
+    address = (source.host, source.port)
+    family = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)[0][0]
+    with socket.socket(family, socket.SOCK_DGRAM) as sender:
+        for due_s, text in lines:
+            sleep(max(0.0, begun_s + due_s - monotonic()))
+            sender.sendto(text.encode("ascii"), address)

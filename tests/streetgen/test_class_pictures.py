@@ -8,7 +8,7 @@ import pytest
 
 from rfcore.errors import DatasetError
 from rfcore.image import write_png
-from rfedge.datasets.classes import Label, class_picture_of, read_classes
+from streetgen.classes import Label, class_picture_of, read_classes
 
 
 def write_grey(path: Path, levels: np.ndarray) -> Path:

@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 from rfcore.camera import Pose, Vec3
 from rfcore.errors import InvalidInput
 from rfcore.motion import interpolated, quaternion_from_vector
+from rfedge.located import Observation
 
-__all__ = ["ERROR_MODELS", "Observation", "PoseErrorModel", "observed", "parse_error_model"]
+__all__ = ["ERROR_MODELS", "PoseErrorModel", "observed", "parse_error_model"]
 
 F64 = NDArray[np.float64]
 
@@ -98,20 +99,6 @@ ERROR_MODELS = {
     ),
 }
 """Sensors by name. ``gnss``: metres of slowly moving bias, one fix a second, a compass."""
-
-
-@dataclass(frozen=True)
-class Observation:
-    """The pose of the camera at ``taken_s`` as a sensor saw it, handed over at ``known_s``.
-
-    Standard deviations are per axis, metres and degrees, as the sensor states them.
-    """
-
-    taken_s: float
-    known_s: float
-    world_from_cam: Pose
-    position_sd_m: float
-    rotation_sd_deg: float
 
 
 def parse_error_model(text: str) -> PoseErrorModel:

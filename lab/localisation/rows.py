@@ -1,7 +1,4 @@
-"""The rows of a result of kind ``localise``, and its section of the results page.
-
-Needs no OpenCV.
-"""
+"""The rows of a result of kind ``localise``, and its section of the results page."""
 
 from __future__ import annotations
 
