@@ -19,7 +19,7 @@ NATIVE := $(shell find rfcore/csrc -type f 2>/dev/null) CMakeLists.txt
 .PHONY: help demo sample sample-field test test-slow test-slices test-scale test-aarch64 test-prometheus test-netns test-fault test-attack \
 	test-compose test-system-packages drive-long stability check build bench proto figures images up \
 	down load load-transport load-receiver load-full load-links load-overload load-ratio soak soak-short \
-	test-wheels build-full results results-full lock wheels nightly test-asan fuzz fuzz-nightly test-fault-core sizing
+	docs test-wheels build-full results results-full lock wheels nightly test-asan fuzz fuzz-nightly test-fault-core sizing
 
 help:  ## show the targets
 	@awk -F':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-18s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -201,7 +201,7 @@ bench: build-full  ## measure kernels and codec: correctness first, then time
 results results-full: build-full  ## record anew what takes two hours, or everything (lab/results/record.mk; DATA)
 	$(MAKE) -f lab/results/record.mk $@ DATA=$(DATA) RFEDGE=$(BIN)/rfedge
 
-results-%: build-full  ## record `rfedge eval NAME` in lab/results/NAME.json; options in ARGS (docs/evaluation.md)
+results-%: build-full  ## record `rfedge eval NAME` in lab/results/NAME.json; options in ARGS (docs/explanation/evaluation.md)
 	$(BIN)/rfedge eval $* $(ARGS) --out results/$*.json
 
 figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.md, metrics.md
@@ -216,6 +216,10 @@ figures: build-full  ## redraw docs/ from results/: figures, results.md, ladder.
 	mv docs/sizing.md.part docs/sizing.md
 	$(BIN)/python -m lab.pages.metrics > docs/metrics.md.part
 	mv docs/metrics.md.part docs/metrics.md
+
+docs: build-full  ## build the documentation site in build/site; a dead link is an error
+	$(BIN)/python -m pip install -q --no-deps --require-hashes -r requirements/docs.txt
+	NO_COLOR=1 $(BIN)/python docs/build_site.py
 
 nightly:  ## what .ci/run leaves out: faults, wheels of every Python, half an hour of load, containers
 	.ci/run nightly

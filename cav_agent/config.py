@@ -65,7 +65,7 @@ class AgentConfig:
     """Directory of field archives; a field the server has is fetched into it."""
     rig: Path | None = None
     """Instead of --drive: a rig file, several cameras in one session, each with its drive or source
-    (docs/live.md)."""
+    (docs/how-to/cameras.md)."""
     neighbours: tuple[str, ...] = ()
     """HOST:PORT of further servers along the drive: the vehicle is handed over from tile to tile,
     and to a neighbour whose tile covers it when a server is lost."""
@@ -98,10 +98,12 @@ class AgentConfig:
     steering: SteeringSettings = SteeringSettings()
     notices: Path | None = None
     """Ask servers what others see ahead and what changed about the map, and hand it on: a Unix
-    socket at this path that gives its readers a line of JSON for each notice (docs/twin.md)."""
+    socket at this path that gives its readers a line of JSON for each notice
+    (docs/how-to/twin.md)."""
     localise: bool = False
     """Find the camera's pose in the field, from what the feed or the dataset says of it, and code
-    frames without the field while it is lost; needs the extra localise (docs/localise.md)."""
+    frames without the field while it is lost; needs the extra localise
+    (docs/how-to/localise.md)."""
     feed: PoseFeedSettings = PoseFeedSettings()
     live: LiveSettings = LiveSettings()
     log: LogForm = LogForm.AUTO

@@ -23,10 +23,12 @@ for name in test demo runtime full; do
 	cp "$work/locked.txt" "$work/all.txt"
 done
 grep '^torch==' "$work/test.in" > requirements/torch.txt
-# The fuzzer, which only `make fuzz` installs, beside what is there.
-"$PYTHON" -c 'import tomllib; g = tomllib.load(open("pyproject.toml", "rb"))["dependency-groups"]
-print(*g["fuzz"], sep="\n")' > "$work/fuzz.in"
-"$PYTHON" -m piptools compile -q --generate-hashes --strip-extras --no-header --no-annotate \
-	--no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-emit-options \
-	-o "$work/fuzz.txt" "$work/fuzz.in"
-grep -v '^#' "$work/fuzz.txt" | grep . > requirements/fuzz.txt
+# The fuzzer (`make fuzz`) and what builds the site (`make docs`), installed beside what is there.
+for group in fuzz docs; do
+	"$PYTHON" -c 'import sys, tomllib; g = tomllib.load(open("pyproject.toml", "rb"))["dependency-groups"]
+print(*g[sys.argv[1]], sep="\n")' $group > "$work/$group.in"
+	"$PYTHON" -m piptools compile -q --generate-hashes --strip-extras --no-header --no-annotate \
+		--no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-emit-options \
+		-c "$work/pins" -o "$work/$group.txt" "$work/$group.in"
+	grep -v '^#' "$work/$group.txt" | grep . > "requirements/$group.txt"
+done

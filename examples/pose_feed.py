@@ -13,7 +13,7 @@ from pathlib import Path
 
 
 def feed_lines(trajectory):
-    """Yield (time_s, line): our own schema of JSON lines (docs/localise.md)."""
+    """Yield (time_s, line): our own schema of JSON lines (docs/how-to/localise.md)."""
     for text in trajectory.read_text().splitlines():
         if text.strip() and not text.startswith("#"):
             time_s, x, y, z, qx, qy, qz, qw = map(float, text.split())

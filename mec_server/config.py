@@ -169,7 +169,7 @@ class RecordSettings:
     """What is kept on disk of what vehicles send that allow it (`cav-agent --allow-recording`)."""
 
     folder: Annotated[Path | None, arg(name="record", metavar="FOLDER")] = None
-    """Keep pictures, poses and times as datasets: FOLDER/VEHICLE/CAMERA/PART (docs/data.md);
+    """Keep pictures, poses and times as datasets: FOLDER/VEHICLE/CAMERA/PART (docs/how-to/data.md);
     nothing without it."""
     max_gb: Annotated[float, arg(name="record-max-gb")] = 10.0
     """What all recordings in the folder may take, in 10^9 bytes; the tile and the vehicle with most
@@ -190,7 +190,7 @@ class LearnSettings:
 
     on: Annotated[bool, arg(name="learn")] = False
     """Learn from what is recorded (--record), in a process of its own while a processor is idle,
-    and publish what makes bits fall into the folder of fields (docs/fields.md)."""
+    and publish what makes bits fall into the folder of fields (docs/how-to/fields.md)."""
     learn_as: Annotated[LearnAs, arg(name="learn-as")] = LearnAs.COLOURS
     """Another light as colours (a layer on the tile's field), as delta (all parameters, as their
     difference to the tile's field) or as all (a field of its own)."""
@@ -220,7 +220,8 @@ class LearnSettings:
 
 @dataclass(frozen=True)
 class NatsSettings:
-    """Where the pictures of several servers come together (docs/scale.md); nowhere without it."""
+    """Where the pictures of several servers come together (docs/how-to/servers.md); nowhere without
+    it."""
 
     urls: Annotated[str | None, arg(name="nats", metavar="URL[,URL]")] = None
     """Servers of NATS, nats://HOST:PORT or tls://HOST:PORT: publish pictures of vehicles and where
@@ -290,13 +291,13 @@ class ServerConfig:
     transport: TransportSettings = TransportSettings()
     notices: bool = True
     """Tell vehicles that ask (`cav-agent --notices`) what others see ahead of them; costs nothing
-    while none does (docs/twin.md)."""
+    while none does (docs/how-to/twin.md)."""
     access: Path | None = None
     """File that says what consumers may see and which certificates are revoked (TOML, see
-    docs/operations.md); read again when it changes. Without it consumers see everything."""
+    docs/how-to/operations.md); read again when it changes. Without it consumers see everything."""
     proxy_identity: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
     """Proxies (certificates of spiffe://rfedge/proxy/NAME) whose x-forwarded-client-cert says which
-    vehicle a call is of (docs/scale.md); from everybody else the header means nothing."""
+    vehicle a call is of (docs/how-to/servers.md); from everybody else the header means nothing."""
     address_connections: int = 256
     """Connections that one address (of IPv6, one /64) may hold, whoever is behind them; newer ones
     are closed within a quarter of a second. 0: any number."""
@@ -308,8 +309,8 @@ class ServerConfig:
     0: never."""
     drain_hold_s: float = 0.0
     """When told to stop: seconds for which health checks say NOT_SERVING before vehicles are asked
-    to go to another server, long enough for a proxy to notice (docs/operations.md). 0: nobody is
-    asked, and streams end with the frames that were taken."""
+    to go to another server, long enough for a proxy to notice (docs/how-to/operations.md). 0:
+    nobody is asked, and streams end with the frames that were taken."""
     server_budget: ServerBudget = ServerBudget()
     identity_budget: IdentityBudget = IdentityBudget()
     admission: AdmissionLimits = AdmissionLimits()

@@ -57,7 +57,7 @@ __all__ = [
 FIELD = arg(metavar="FIELD")
 """An archive's path, or a field's name."""
 DATASET = arg(metavar="DATASET")
-"""A dataset's folder, or the file that describes it (docs/data.md)."""
+"""A dataset's folder, or the file that describes it (docs/how-to/data.md)."""
 SCENE = arg(metavar="SCENE")
 ADDRESS = arg(metavar="HOST:PORT")
 SIZE = arg(metavar="WIDTHxHEIGHT")

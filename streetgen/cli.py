@@ -45,8 +45,8 @@ class Build:
     workers: int = 1
     """Processes. One uses all cores; more share them and take 1 to 2.5 GB each."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Render on a Ray (`local` starts one here; docs/scale.md), each job on this machine's cores
-    divided by --workers; the pictures are the same. Needs rfedge[ray]."""
+    """Render on a Ray (`local` starts one here; docs/how-to/servers.md), each job on this machine's
+    cores divided by --workers; the pictures are the same. Needs rfedge[ray]."""
     frames: Annotated[str | None, arg(metavar="A:B")] = None
     """Only frames a:b of the chosen splits, counted through drive, train, eval in that order."""
     split: Annotated[str, arg(metavar="SPLIT")] = "default"

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-METHOD = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+METHOD = (ROOT / "docs" / "explanation" / "method.md").read_text(encoding="utf-8")
 NAME = r"`((?:rfcore|cav_agent|mec_server|rfedge)[\w.]*:[\w.]+)`"
 FUNCTIONS = sorted(set(re.findall(NAME, METHOD)))
 TESTS = sorted(set(re.findall(r"`(test_\w+)`", METHOD)))

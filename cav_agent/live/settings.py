@@ -30,7 +30,7 @@ class LiveSettings:
 
     source: str | None = None
     """Instead of --drive: /dev/videoN, rtsp://..., rtp://HOST:PORT, udp://HOST:PORT, FILE.sdp, or a
-    video file (docs/live.md)."""
+    video file (docs/how-to/cameras.md)."""
     camera_file: Path | None = None
     """The source's camera.toml: intrinsics, lens, and the trajectory if there is no --pose-feed."""
     source_timeout_s: float = 5.0

@@ -41,8 +41,8 @@ class PoseFeedSettings:
     """Where the vehicle's own poses come from, instead of the drive's."""
 
     pose_feed: str | None = None
-    """GNSS as NMEA, gpsd's JSON, or JSON lines (docs/localise.md), from file:PATH, udp:HOST:PORT,
-    serial:DEVICE:BAUD or gpsd:HOST:PORT. The drive's poses are then not used."""
+    """GNSS as NMEA, gpsd's JSON, or JSON lines (docs/how-to/localise.md), from file:PATH,
+    udp:HOST:PORT, serial:DEVICE:BAUD or gpsd:HOST:PORT. The drive's poses are then not used."""
     camera_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The camera seen from the feed's antenna: metres forward, left, up."""
     camera_turn: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -27,7 +27,7 @@ class BenchmarkRun:
     """Run anybody's codec on the benchmark's drives and write its submission.
 
     The command gets a folder of frames and a quality, and writes a packet and a decoded picture for
-    each frame (docs/evaluation.md).
+    each frame (docs/explanation/evaluation.md).
     """
 
     out: Annotated[Path, Positional, FOLDER]

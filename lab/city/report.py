@@ -111,7 +111,7 @@ def _city_page(name: str, plan: CityPlan, checks: Sequence[CheckRow], result: Re
         what=(
             f"{name}: {len(plan.city.cells)} cells, {len(plan.city.servers)} servers; each vehicle "
             f"{demand.cameras} x {demand.width_px}x{demand.height_px} at {demand.hz:g} Hz, "
-            f"{demand.psnr_db:g} dB. Steps are taken as steady; docs/scale.md says how."
+            f"{demand.psnr_db:g} dB. Steps are taken as steady; docs/how-to/servers.md says how."
         ),
         limits=plan.limits,
         servers=pressed,

@@ -29,7 +29,7 @@ class EvalLocalise:
 
     drives: Annotated[tuple[str, ...], Positional, arg(metavar="NAME=DRIVE,FIELD[,KEY=VALUE...]")]
     """A name, posed pictures, a field; then units=, hz=, frames=, noise=, rows=starts|bits|2m:3deg,
-    and feed=, feed_map=, map= (docs/localise.md)."""
+    and feed=, feed_map=, map= (docs/how-to/localise.md)."""
     tries: int = 100
     """Searches of each start error."""
     false_starts: int = 50

@@ -169,7 +169,8 @@ class MakeFeed:
     field: Annotated[Path | None, FIELD] = None
     """The field whose anchor says where on the Earth the drive is; default: the dataset's own."""
     form: FeedForm = "nmea"
-    """NMEA sentences, or JSON lines in WGS 84 or in the drive's own axes (docs/localise.md)."""
+    """NMEA sentences, or JSON lines in WGS 84 or in the drive's own axes
+    (docs/how-to/localise.md)."""
     errors: Annotated[str, arg(metavar="NAME,KEY=VALUE,...")] = "gnss"
     """exact, white-small, white-large, offset or gnss, and what to change of it:
     noise_m, noise_deg, offset_m, offset_deg, walk_m, walk_s, rate_hz, latency_s, silent_from_s,

@@ -1,7 +1,8 @@
 """``docs/sizing.md`` from the tables that ship with ``rfedge size``, and the cities of scale.md.
 
 python -m lab.pages.sizing > docs/sizing.md
-python -m lab.pages.sizing city    # the table that stands in docs/scale.md behind ``CITY_MARK``
+python -m lab.pages.sizing city    # the table that stands in docs/how-to/servers.md behind
+``CITY_MARK``
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # What `rfedge eval` and `rfedge bench` record in results/, on a quiet machine from a committed revision:
 #     make results [DATA=FOLDER]         what takes two hours of two cores
 #     make results-full [DATA=FOLDER]    the rest, too, which takes days
-# DATA is a folder that has `street` (the yardstick), `kitti/city` and `kitti/loop` (docs/data.md); without it the
+# DATA is a folder that has `street` (the yardstick), `kitti/city` and `kitti/loop` (docs/how-to/data.md); without it the
 # sample's drives are compared alone. What is there is not made again: a record is begun anew by deleting its file in
 # out/results. Faults, attacks and loads have targets of their own in the Makefile.
 OUT    ?= out/results
@@ -27,7 +27,7 @@ $(OUT):
 
 # --- fields that do not ship
 
-# Of so many thousand splats, which few passes of a street pay for. A sky would take too many of them (docs/training.md).
+# Of so many thousand splats, which few passes of a street pay for. A sky would take too many of them (docs/how-to/training.md).
 small = $(RFEDGE) train $1 --points $(dir $1)points.ply --held-out $2 --gaussians $$(($*000 * 3 / 4)) --limit $*000 --sh-degree 1 --antialiased \
 	--max-mb 1 --minutes 1.5 --out $@
 $(OUT)/sample-%k.rff: | $(OUT)

@@ -167,8 +167,8 @@ def scale_section(path: Path, result: Result) -> str:
     record = _record(result)
     parts = [
         heading(path, result),
-        "Several servers (`docs/scale.md`). *Bound*: the most that is accepted. All processes "
-        "share the host.",
+        "Several servers (`docs/how-to/servers.md`). *Bound*: the most that is accepted. All "
+        "processes share the host.",
         table(COLUMNS, [_scale_cells(row) for row in record.rows]),
     ]
     added_ms = record.envoy_added_ms

@@ -151,7 +151,7 @@ def refuse_video(path: Path) -> None:
         raise DatasetError(
             f"{path}: is a video, which has no poses; find those of its sharpest frames: "
             f"rfedge dataset poses {shlex.quote(str(path))} --out DATASET; or, "
-            "with a trajectory, describe it in a camera.toml (docs/data.md)"
+            "with a trajectory, describe it in a camera.toml (docs/how-to/data.md)"
         )
 
 

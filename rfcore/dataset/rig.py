@@ -9,7 +9,7 @@
     drive = "front"                 # a dataset in time order, beside this file
     # or, of a camera that sends now:
     # source = "rtsp://10.0.0.2/front"      # as cav-agent --source
-    # camera_file = "front/camera.toml"     # its size, intrinsics and lens (docs/data.md)
+    # camera_file = "front/camera.toml"     # its size, intrinsics and lens (docs/how-to/data.md)
     camera_from_rig = [[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, 0]]   # extrinsics, 3x4 or 4x4
     priority = 1.0                  # weight of its quality in the division of bits, 0.1..10
     mask = "front_mask.png"         # where its frames are coded finer (as cav-agent --mask)

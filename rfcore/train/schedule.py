@@ -4,7 +4,7 @@
 
 Density control: between ``start`` and ``stop`` of the run, every ``interval`` iterations, the
 Gaussians that show nothing are replaced and the set grows by ``growth``, up to ``limit``. How the
-sources are drawn and split is ``DensityStep``'s; docs/training.md compares the rules.
+sources are drawn and split is ``DensityStep``'s; docs/how-to/training.md compares the rules.
 """
 
 from __future__ import annotations

@@ -50,9 +50,9 @@ class RandomStart:
     cameras look, or, where their axes do not meet, the distance between cameras. A point counts
     when ``seen_by`` cameras have it in view.
 
-    Measured on the fox (docs/training.md): from 0.2 to 8 times with two cameras, and a tenth of the
-    points at the farthest, held-out pictures reach 19.9 dB, with these values 26.2 dB; Gaussians
-    near a camera that few others see are learned by heart.
+    Measured on the fox (docs/how-to/training.md): from 0.2 to 8 times with two cameras, and a tenth
+    of the points at the farthest, held-out pictures reach 19.9 dB, with these values 26.2 dB;
+    Gaussians near a camera that few others see are learned by heart.
     """
 
     nearest: float = 0.5

@@ -36,7 +36,7 @@ VEHICLE: Final = "rfedge-vehicle"
 
 TILE: Final = "rfedge-tile"
 """Metadata of a stream: the name of the tile it is for. A proxy may place streams by this and by
-``VEHICLE`` before it has seen a message (docs/scale.md); a server believes neither."""
+``VEHICLE`` before it has seen a message (docs/how-to/servers.md); a server believes neither."""
 
 STREAM_METHOD: Final = "/rfcore.wire.v1.EdgeService/Stream"
 
@@ -49,7 +49,7 @@ FRAME_BUDGET_BUCKETS_S: Final = (
     5.0,
 )  # fmt: skip
 """Histogram buckets at the frame budgets of 200, 100, 60, 30, 20, 15, 10, 5, 2, 1, 0.5 and 0.2 Hz,
-two below them for single stages, and 150 ms: from capture to Ack in docs/operations.md."""
+two below them for single stages, and 150 ms: from capture to Ack in docs/how-to/operations.md."""
 
 Options = tuple[tuple[str, int], ...]
 

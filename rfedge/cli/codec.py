@@ -26,7 +26,7 @@ class Encode:
     """Code a drive against a field's renders; write the vehicle's messages as a .rfv file."""
 
     drive: Annotated[Path, Positional, DATASET]
-    """Posed pictures in time order, a dataset of any format (docs/data.md)."""
+    """Posed pictures in time order, a dataset of any format (docs/how-to/data.md)."""
     field: Annotated[Path, FIELD]
     """The field: an archive (.rff), or a name."""
     out: Annotated[Path, RFV]

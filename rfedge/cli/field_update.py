@@ -33,7 +33,7 @@ class FieldUpdate:
     field: Annotated[Path, Positional, FIELD]
     """The archive (.rff), or the field's name; splats."""
     recordings: Annotated[tuple[Path, ...], arg(name="from", metavar="DATASET...")]
-    """Passes under one light, a dataset each (docs/data.md)."""
+    """Passes under one light, a dataset each (docs/how-to/data.md)."""
     out: Annotated[Path, RFF]
     """The archive to write; a layer or a delta belongs into the folder of its base."""
     learn_as: Annotated[Literal["all", "delta", "colours"], arg(name="as")] = "all"
@@ -49,8 +49,8 @@ class FieldUpdate:
     threads: int = 1
     """Threads of the renderer."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Learn on a Ray (`local` starts one here; docs/scale.md), as a job of --threads cores; the
-    archive is the same bytes. Needs rfedge[ray]."""
+    """Learn on a Ray (`local` starts one here; docs/how-to/servers.md), as a job of --threads
+    cores; the archive is the same bytes. Needs rfedge[ray]."""
 
     def run(self) -> None:
         """Learn, try, write, here or as a job."""

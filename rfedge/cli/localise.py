@@ -28,7 +28,7 @@ class Localise:
     """Find the poses of a drive's pictures in a field, each from a start that is wrong."""
 
     drive: Annotated[Path, Positional, DATASET]
-    """Posed pictures, a dataset of any format (docs/data.md)."""
+    """Posed pictures, a dataset of any format (docs/how-to/data.md)."""
     field: Annotated[Path, FIELD]
     """The field: an archive (.rff), or a name."""
     start_error: Annotated[str, arg(metavar="METRESm:DEGREESdeg")] = "2m:3deg"
@@ -40,8 +40,8 @@ class Localise:
     out: Annotated[Path | None, arg(metavar="FILE.tum")] = None
     """Write the pose found of each picture, a TUM line each; what was lost is a comment."""
     pose_feed: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Start from a recorded feed of NMEA or JSON lines (docs/localise.md) instead, one search a
-    picture; its times are the drive's. Deviations are those the feed states."""
+    """Start from a recorded feed of NMEA or JSON lines (docs/how-to/localise.md) instead, one
+    search a picture; its times are the drive's. Deviations are those the feed states."""
     feed_offset_s: float = 0.0
     """Add to the feed's times to get the drive's, seconds."""
     camera_at: tuple[float, float, float] = (0.0, 0.0, 0.0)

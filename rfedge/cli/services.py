@@ -76,7 +76,8 @@ class Watch:
     address: Annotated[str | None, Positional, ADDRESS] = None
     """Where mec-server listens."""
     nats: Annotated[str | None, arg(metavar="URL[,URL]")] = None
-    """Watch what all servers publish over this NATS (docs/scale.md), instead of one server."""
+    """Watch what all servers publish over this NATS (docs/how-to/servers.md), instead of one
+    server."""
     nats_login: Annotated[Path | None, arg(metavar="FILE")] = None
     """With --nats: file of one line, USER:PASSWORD or a token."""
     vehicle: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()

@@ -34,7 +34,8 @@ TILE_CHECKPOINT_EVERY = 500
 DEFAULT_LIMIT = 250_000
 """Gaussians of a run limited by time: about what two cores train in five minutes."""
 HALVED_UNTIL = 0.25
-"""Share of a run limited by time that looks at halved pictures: see docs/training.md, "Sooner"."""
+"""Share of a run limited by time that looks at halved pictures: see docs/how-to/training.md,
+"Sooner"."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ class Train:
     view: Annotated[str | None, arg(metavar="HOST:PORT")] = None
     """Show the splats in a browser while they are trained, and the pictures of --held-out beside
     them: 127.0.0.1:8080; elsewhere than on this machine with the environment's
-    RFEDGE_TWIN_TOKEN (docs/twin.md)."""
+    RFEDGE_TWIN_TOKEN (docs/how-to/twin.md)."""
     refine_poses: bool = False
     """Learn the pictures' poses with the field, and write them to OUT.tum; for poses of GNSS or
     odometry. Held-out pictures are measured at aligned poses as well."""

@@ -32,7 +32,8 @@ class Twin:
     target: Annotated[str | None, Positional, arg(metavar="HOST:PORT|FIELD")] = None
     """Where mec-server listens; or a field (archive, name, .ply, .spz) to look at without one."""
     nats: Annotated[str | None, arg(metavar="URL[,URL]")] = None
-    """Show what all servers publish over this NATS (docs/scale.md), instead of one server."""
+    """Show what all servers publish over this NATS (docs/how-to/servers.md), instead of one
+    server."""
     nats_login: Annotated[Path | None, arg(metavar="FILE")] = None
     """With --nats: file of one line, USER:PASSWORD or a token."""
     http: Annotated[str, ADDRESS] = "127.0.0.1:8080"

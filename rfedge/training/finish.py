@@ -91,7 +91,8 @@ SIZES = (
     FieldSize(0.2, 0.1, COARSE, Grain(1, 4)),
 )
 """From the largest to the smallest, each 0.75 to 0.9 of the bytes of the one before. The second and
-third are measured on the sample field (docs/fields.md); those with fewer splats are not yet."""
+third are measured on the sample field (docs/how-to/fields.md); those with fewer splats are not
+yet."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,5 @@
-"""The commands of docs/data.md do what the page says, on two small recordings of the sample."""
+"""The commands of docs/how-to/data.md do what the page says, on two small recordings of the
+sample."""
 
 import re
 import tomllib
@@ -19,7 +20,7 @@ from rfcore.views import PosedPicture
 from rfedge.cli import parse
 
 ROOT = Path(__file__).parents[2]
-PAGE = Page("data.md")
+PAGE = Page("how-to/data.md")
 SAMPLE = ROOT / "samples" / "street"
 SIZE_PX = (96, 54)
 OFFSET_S = 12.5

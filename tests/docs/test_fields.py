@@ -1,4 +1,5 @@
-"""The commands of docs/fields.md and docs/training.md are commands, and their options exist."""
+"""The commands of docs/how-to/fields.md and docs/how-to/training.md are commands, and their options
+exist."""
 
 import re
 
@@ -9,7 +10,7 @@ from rfedge.arguments import IMPORTED, SAMPLES
 from rfedge.cli import parse
 from rfedge.cli.train import Train
 
-FIELDS, TRAINING = Page("fields.md"), Page("training.md").text
+FIELDS, TRAINING = Page("how-to/fields.md"), Page("how-to/training.md").text
 
 
 @pytest.mark.parametrize("command", list(FIELDS.commands("sh")), ids=" ".join)

@@ -1,4 +1,4 @@
-"""The commands of docs/runbook.md, on a small field, with real servers and a vehicle."""
+"""The commands of docs/how-to/runbook.md, on a small field, with real servers and a vehicle."""
 
 import asyncio
 import itertools
@@ -35,7 +35,7 @@ from rfedge.demo.processes import command_of, service
 
 __all__ = ["serve", "street", "vehicle"]
 
-PAGE = Page("runbook.md")
+PAGE = Page("how-to/runbook.md")
 SERVE, ROLL, CANARY, PUBLISH, *SHARE, EVERYWHERE, ROLLBACK, BACKUP, RESTORE = PAGE.blocks("sh")
 PATIENT = AgentLimits(answer_s=60.0)
 """A busy machine is not a server that is lost."""

@@ -69,7 +69,7 @@ def test_the_streets_pictures_are_as_large_as_those_of_driving_video() -> None:
     """The committed figures, which the page quotes: 120 to 250 kB at 1920x1080, 10 Hz, CRF 23."""
     result = json.loads((ROOT / "results" / "scenes" / "intra-size.json").read_text())
     assert result["coding"] == {"preset": "medium", "crf": 23.0, "rate_hz": 10}
-    page = (ROOT / "docs" / "scenes.md").read_text().replace("\n", " ")
+    page = (ROOT / "docs" / "how-to" / "streets.md").read_text().replace("\n", " ")
     for row in result["rows"]:
         assert row["size_px"] == [1920, 1080]
         assert 120_000 <= row["mean_bytes"] <= 250_000

@@ -123,7 +123,7 @@ def test_a_table_replaces_the_one_before_in_its_page(plan: MeasuredPlan, tmp_pat
 
 def test_the_committed_page_shows_the_committed_plans() -> None:
     rows = json.loads((ROOT / "results" / "scenes" / "plan.json").read_text())["rows"]
-    assert plan_table(rows) in (ROOT / "docs" / "scenes.md").read_text()
+    assert plan_table(rows) in (ROOT / "docs" / "how-to" / "streets.md").read_text()
     ready_made = {path.stem for path in (ROOT / "samples" / "scenes").glob("*.toml")}
     assert {row["scene"] for row in rows} <= ready_made, "a scene that is gone has no row"
 

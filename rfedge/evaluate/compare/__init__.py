@@ -42,7 +42,7 @@ class EvalCompare:
     cells: Path = Path("out/eval/compare")
     """Folder of finished pieces."""
     method: tuple[str, ...] = ()
-    """More codecs to compare with, as package.module:Class (see docs/evaluation.md)."""
+    """More codecs to compare with, as package.module:Class (see docs/explanation/evaluation.md)."""
     rivals: tuple[str, ...] = ()
     """Of the rivals these alone, by PSNR alone, as x264-our-tools-medium; x264-lowdelay-psnr, which
     a field is paid for against, is always among them."""
@@ -57,8 +57,8 @@ class EvalCompare:
     """How many processes code at once; processor times are taken afterwards, one coder at a time,
     and the rows do not depend on it."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Code what is not there yet on a Ray (`local` starts one here; docs/scale.md); processor times
-    are taken here afterwards, and the rows are the same. Needs rfedge[ray]."""
+    """Code what is not there yet on a Ray (`local` starts one here; docs/how-to/servers.md);
+    processor times are taken here afterwards, and the rows are the same. Needs rfedge[ray]."""
     figures: Path | None = None
     """Folder for the curves as SVG, with their numbers as CSV."""
 
