@@ -50,12 +50,12 @@ class TileStream:
         self._preparing: asyncio.Task[OpenStream] | None = None
         self._current: RunningClient | None = None
         self._successor: RunningClient | None = None
-        self._left: RunningClient | None = None
+        self._closing: list[RunningClient] = []
         self._backoff = Backoff(FIRST_RETRY_S, LONGEST_RETRY_S)
 
     @property
     def client(self) -> StreamClient | None:
-        """The client that takes the pictures."""
+        """The client that takes pictures; None while none is open, or the last one is closing."""
         return None if self._current is None else self._current.client
 
     @property
@@ -84,20 +84,25 @@ class TileStream:
         self.prepare(now)
         if self._open is None or now < self.retry_at_s:
             return
+        if self._closing:
+            return
         if self._current is None:
             self._current = self._run(self._open)
-        elif self.is_sent_away and self._successor is None and self._left is None:
+        elif self.is_sent_away and self._successor is None:
             self._successor = self._run(self._open)
 
     def close(self) -> None:
         """Finish what was taken, then close the stream."""
-        for running in self._running():
+        self._closing = self._running()
+        self._current = self._successor = None
+        for running in self._closing:
             running.client.finish()
 
     def stop(self) -> None:
         """Finish the frame in flight, drop what waits, then close the stream."""
         for running in self._running():
             running.client.stop()
+        self.close()
 
     def capture(self, index: int) -> None:
         """Take picture ``index`` of the drive now."""
@@ -145,11 +150,12 @@ class TileStream:
             return
         if current is not None:
             current.client.finish()
-        self._current, self._successor, self._left = successor, None, current
+            self._closing.append(current)
+        self._current, self._successor = successor, None
 
     def _running(self) -> list[RunningClient]:
-        every = (self._current, self._successor, self._left)
-        return [running for running in every if running is not None]
+        open_clients = (self._current, self._successor)
+        return [*self._closing, *(running for running in open_clients if running is not None)]
 
     def _forget(self, ended: RunningClient) -> None:
         if ended is self._current:
@@ -157,7 +163,7 @@ class TileStream:
         elif ended is self._successor:
             self._successor = None
         else:
-            self._left = None
+            self._closing.remove(ended)
 
     def _run(self, open_stream: OpenStream) -> RunningClient:
         client = open_stream(self._observer)

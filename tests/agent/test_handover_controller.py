@@ -56,9 +56,11 @@ class MemoryClient:
         self._error = error
         self._on_capture = on_capture
         self._finishing = asyncio.Event()
+        self.may_close = asyncio.Event()
+        self.may_close.set()
 
     def capture(self, index: int) -> None:
-        if self._error is not None:
+        if self._error is not None or self._finishing.is_set():
             self.left_behind.append(self._make_capture(index))
             return
         self.captured.append(index)
@@ -85,6 +87,7 @@ class MemoryClient:
         if self._error is not None:
             raise self._error
         await self._finishing.wait()
+        await self.may_close.wait()
         if self._error is not None:
             raise self._error
 
@@ -158,10 +161,11 @@ def registry() -> CollectorRegistry:
 def drive(site: Site, registry: CollectorRegistry) -> Callable[..., HandoverController]:
     """Return a function that makes the controller of a drive in lockstep past ``tiles``."""
 
-    def make(*tiles: ServedTile, give_up_s: float = 30.0) -> HandoverController:
+    def make(*tiles: ServedTile, give_up_s: float = 30.0, loop: bool = False) -> HandoverController:
         config = AgentConfig(
             "127.0.0.1:1",
             Path("drive"),
+            loop=loop,
             pace=PaceKind.LOCKSTEP,
             limits=AgentLimits(give_up_s=give_up_s),
         )
@@ -201,6 +205,29 @@ async def test_a_handover_is_counted_and_closes_the_stream_that_was_left(
     assert site.streaming[1] == {WEST, EAST}, "opened ahead of the border"
     assert site.streaming[2] == {EAST}, "one vehicle is shown by one server at a time"
     assert not site.clients[WEST][0].withdrawn, "its server answers, so it keeps what it has taken"
+
+
+async def test_a_stream_that_is_still_closing_takes_no_picture_of_a_vehicle_that_comes_back(
+    drive: Drive, site: Site
+) -> None:
+    controller = drive(WEST, EAST, loop=True)
+    running = asyncio.create_task(controller.run())
+    while not site.captured(WEST):
+        await asyncio.sleep(0)
+    (west,) = site.clients[WEST]
+    west.may_close.clear()
+    while not site.captured(EAST):
+        await asyncio.sleep(0)
+    while controller.counts["acked"] < 4:
+        await asyncio.sleep(0)
+    assert (west.left_behind, len(site.clients[WEST])) == ([], 1), "the next picture waits"
+    west.may_close.set()
+    while len(site.captured(WEST)) < 4:
+        await asyncio.sleep(0)
+    controller.stop()
+    await running
+    assert set(controller.counts) == {"acked"}
+    assert len(site.clients[WEST]) == 2
 
 
 async def test_the_only_stream_that_fails_ends_the_drive_with_its_error(

@@ -18,7 +18,7 @@ import grpc
 import numpy as np
 import pytest
 
-from cav_agent.config import PaceKind
+from cav_agent.config import AgentLimits, PaceKind
 from mec_server.fields.shelf import read_chunk
 from recorded import recorded
 from rfcore.camera import TileOrigin
@@ -121,8 +121,10 @@ def stays_ns(seen: list[TwinPicture | Departure]) -> list[tuple[int, int]]:
 
 
 async def test_a_vehicle_crosses_without_a_late_picture_or_a_keyframe(
-    roadside: Any, vehicle: Any, tmp_path: Path
+    roadside: Any, vehicle: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A server that is slow because its machine is busy must not count as one that stalls."""
+    monkeypatch.setattr("cav_agent.frames_in_flight.STALL_S", 60.0)
     a = await roadside("west", WEST, 0.0)
     b = await roadside("east", EAST, 2.0, -1.0, 0.5)
     at_a: list[TwinPicture | Departure] = []
@@ -132,10 +134,11 @@ async def test_a_vehicle_crosses_without_a_late_picture_or_a_keyframe(
         asyncio.create_task(seen_at(b.address, at_b)),
     ]
     async with vehicle(
-        a.address, neighbours=(b.address,), fields=tmp_path / "mine", loop=True
-    ) as driving:
+        a.address, neighbours=(b.address,), fields=tmp_path / "mine", loop=True,
+        limits=AgentLimits(answer_s=60.0),
+    ) as driving:  # fmt: skip
         await driving.until(lambda: driving.handovers("tile") >= 5)
-    lines = driving.lines()
+        lines = driving.lines()  # a picture may wait when the drive is stopped, and is dropped
     late = [line for line in lines if line["result"] != "acked"]
     assert late == [], "dropped, lost or sent in vain"
     for line in lines:
