@@ -4,9 +4,7 @@ Sans-IO bookkeeping. Frames enter with ``admit``, leave to the decoder with ``st
 ``succeed``, ``fail`` or ``refuse``; each gets exactly one answer. The epoch and the next expected
 sequence move only when a frame was reconstructed, so that a damaged frame cannot move them.
 
-This is the one place where the server judges the order of frames, before any work is spent on
-them; the session checks their CRC at the same time. ``DeltaDecoder`` checks both, too: it guards
-callers that have no queue, such as the offline decoder; within the server its checks never fire.
+``check`` judges the order of frames and their CRC, before any work is spent on them.
 """
 
 from __future__ import annotations
@@ -15,6 +13,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+from rfcore.codec.packet import CheckedPacket, check_packet
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 from rfcore.wire.checks import FIELD_ID_PREFIX_BYTES, shown
 from rfcore.wire.messages import CameraDescription, Credit, Frame, FrameAddress, Hello
@@ -89,31 +88,24 @@ class CameraQueue:
         self._running = self._queue.popleft()
         return self._running
 
-    def check_order(self, frame: Frame) -> None:
-        """Raise ``PacketRejected`` if the frame cannot follow what was reconstructed last."""
-        epoch, sequence = frame.packet.epoch, frame.packet.sequence
-        current = epoch if self.epoch is None else self.epoch
-        if epoch < current:
-            raise PacketRejected(
-                RejectReason.STALE_EPOCH, f"epoch {epoch} is over, this is {current}"
-            )
-        if epoch > current + MAX_EPOCH_STEP:
+    def check(self, frame: Frame) -> CheckedPacket:
+        """Return the packet of a frame; raise ``PacketRejected`` if it is damaged or cannot follow
+        what was reconstructed last."""
+        packet = frame.packet
+        current = packet.epoch if self.epoch is None else self.epoch
+        checked = check_packet(packet, current, self._expected(current))
+        if packet.epoch > current + MAX_EPOCH_STEP:
             raise PacketRejected(
                 RejectReason.INVALID_ARGUMENT,
-                f"frame.epoch: {epoch} leads {current} by more than {MAX_EPOCH_STEP}",
+                f"frame.epoch: {packet.epoch} leads {current} by more than {MAX_EPOCH_STEP}",
             )
-        expected = self._expected(epoch)
-        if sequence < expected:
-            raise PacketRejected(
-                RejectReason.STALE_SEQUENCE,
-                f"sequence {sequence} where {expected} or later is expected",
-            )
-        if sequence > expected + MAX_GAP:
+        if checked.lost > MAX_GAP:
             raise PacketRejected(
                 RejectReason.INVALID_ARGUMENT,
-                f"frame.sequence: {sequence} skips {sequence - expected} frames, "
+                f"frame.sequence: {packet.sequence} skips {checked.lost} frames, "
                 f"at most {MAX_GAP} can be lost",
             )
+        return checked
 
     def succeed(self) -> list[SequenceGap]:
         """Note that the running frame was reconstructed.

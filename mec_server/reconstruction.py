@@ -13,7 +13,6 @@ from typing import Protocol
 from mec_server.decoding.decoders import OpenDecoder
 from mec_server.session import DecodeJob, DecodeOutcome, OpenJob
 from rfcore.codec.decoder import DeltaDecoder
-from rfcore.codec.state import DecoderState
 from rfcore.errors import CodecError, InvalidInput, PacketRejected, RejectReason
 from rfcore.field import CodecPictureRenderer, Renderer
 from rfcore.image import I420
@@ -89,7 +88,7 @@ class CameraDecoder:
         self._renderers = renderers
         self._clock_ns = tools.clock_ns
         self._decoder = DeltaDecoder(camera.codec, exact, tools.clock_ns, tools.open_decoder)
-        self._state: DecoderState | None = None
+        self._state = self._decoder.start()
 
     def close(self) -> None:
         """Close the decoder; waits for a frame that is being decoded."""
@@ -106,11 +105,7 @@ class CameraDecoder:
         started_ns = self._clock_ns()
         render, view = self._render(job)
         rendered_ns = self._clock_ns()
-        packet = job.frame.packet
-        state = self._state
-        if state is None or state.epoch != packet.epoch:
-            state = self._decoder.start(packet.epoch, after=state)
-        decoded = self._decoder.decode(state, packet, view)
+        decoded = self._decoder.decode_checked(self._state, job.packet, view)
         self._state = decoded.state
         times = StageTimes(
             render_ns=rendered_ns - started_ns,

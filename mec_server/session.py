@@ -19,6 +19,7 @@ from enum import StrEnum
 from mec_server.camera_queue import SessionCameras
 from mec_server.config import SessionLimits
 from mec_server.ledger.budgets import Limit
+from rfcore.codec.packet import CheckedPacket
 from rfcore.errors import (
     AccessDenied,
     InvalidInput,
@@ -77,9 +78,10 @@ class OpenJob:
 
 @dataclass(frozen=True)
 class DecodeJob:
-    """Reconstruct one frame of one camera."""
+    """Reconstruct one frame of one camera; ``packet`` is the frame's, once it was checked."""
 
     frame: Frame
+    packet: CheckedPacket
     field_id: str
     received_s: float
     started_s: float
@@ -247,14 +249,13 @@ class ServerSession:
         for queue, waiting in self._cameras.started():
             frame = waiting.frame
             try:
-                queue.check_order(frame)
-                frame.packet.check_crc32()
+                packet = queue.check(frame)
             except PacketRejected as error:
                 queue.fail()
                 self._refuse_unstarted(frame, error)
             else:
                 field_id = self._cameras.field_of(frame)
-                jobs.append(DecodeJob(frame, field_id, waiting.received_s, now))
+                jobs.append(DecodeJob(frame, packet, field_id, waiting.received_s, now))
         self._finish_draining()
         return jobs
 

@@ -109,7 +109,6 @@ def decode_frames(
     decoder: DeltaDecoder,
     arrivals: Iterable[Arrival | None],
     *,
-    epoch: int = EPOCH,
     skip_rejected: bool = False,
 ) -> Iterator[I420 | None]:
     """Decode one packet after another; None stands for one that was lost, and yields None.
@@ -117,7 +116,7 @@ def decode_frames(
     ``PacketRejected`` ends the loop, unless ``skip_rejected``: then a packet that the decoder
     refuses yields None and leaves its state as it was, as a receiver's that asks for another one.
     """
-    state = decoder.start(epoch)
+    state = decoder.start()
     for arrival in arrivals:
         shown = None
         if arrival is not None:
@@ -240,10 +239,9 @@ def decode_drive(
         )
         for frame in drive.frames
     )
-    epoch = drive.frames[0].packet.epoch if drive.frames else EPOCH
     decoder = DeltaDecoder(camera.codec, open_decoder=open_decoder)
     try:
-        pictures = decode_frames(decoder, arrivals, epoch=epoch)
+        pictures = decode_frames(decoder, arrivals)
         for frame, picture in zip(drive.frames, pictures, strict=True):
             assert picture is not None, "every packet of a file arrives"
             yield DecodedFrame(frame.packet.sequence, picture)

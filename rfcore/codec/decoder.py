@@ -1,10 +1,11 @@
 """The receiver: decodes slices into frames, against pictures it makes itself.
 
 A standard decoder may not notice a lost P slice or a flipped bit in one (ITU-T H.264 does not
-define what damaged streams decode to). So a packet carries digests, and the receiver checks epoch,
-sequence, CRC, that the earlier frame is kept here, the form of the payload, and at last the digests
-of its render and of the decoded picture, which together take little longer than one alone. Where
-decoding fails, a render that is not the sender's is named first: it is the likely cause.
+define what damaged streams decode to), so a packet carries digests. Its epoch, sequence and CRC are
+checked by ``check_packet``. The receiver then checks that the earlier frame is kept here, the form
+of the payload, and at last the digests of its render and of the decoded picture, which together
+take little longer than one alone. Where decoding fails, a render that is not the sender's is named
+first: it is the likely cause.
 
 With inexact renderers an error would pass on from frame to frame, so then only the render may be
 predicted from.
@@ -20,7 +21,7 @@ from rfcore.codec.h264.ffmpeg import H264Decoder
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.h264.pcm_picture import without_zeros
 from rfcore.codec.h264.splice import PictureDecoder, SpliceDecoder
-from rfcore.codec.packet import DeltaPacket
+from rfcore.codec.packet import CheckedPacket, DeltaPacket, check_packet
 from rfcore.codec.prediction import Prediction
 from rfcore.codec.state import DecoderState, Past
 from rfcore.errors import BitstreamError, CodecError, InvalidInput, PacketRejected, RejectReason
@@ -81,27 +82,30 @@ class DeltaDecoder:
         """Release the standard decoder."""
         self._splice.close()
 
-    def start(self, epoch: int, after: DecoderState | None = None) -> DecoderState:
-        """Return the state before the first packet of a (re)started stream.
-
-        The frames kept in ``after`` can still be predicted from: a new epoch numbers afresh.
-        """
-        return DecoderState(epoch, kept=() if after is None else after.kept)
+    def start(self, epoch: int = 0) -> DecoderState:
+        """Return the state before the first packet, which is of ``epoch`` or a later one."""
+        return DecoderState(epoch)
 
     def decode(self, state: DecoderState, packet: DeltaPacket, view: FieldView) -> Decoded:
-        """Decode one packet against ``view``, our own render and depth at its pose.
+        """Check one packet and decode it against ``view``, our own render and depth at its pose.
 
         Raises ``PacketRejected`` with the reason; ``state`` stays good for the next packet.
         Raises ``InvalidInput`` if the view is not of the stream's size.
         """
+        checked = check_packet(packet, state.epoch, state.next_sequence)
+        return self.decode_checked(state, checked, view)
+
+    def decode_checked(
+        self, state: DecoderState, checked: CheckedPacket, view: FieldView
+    ) -> Decoded:
+        """Decode as ``decode`` does, for a caller that checked the packet before it rendered."""
+        packet = checked.packet
         render = view.render
         if render.size_px != self._config.size_px:
             raise InvalidInput(
                 "render", f"{render.size_px} px where the stream has {self._config.size_px} px"
             )
         started_ns = self._clock_ns()
-        _check_order(state, packet)
-        packet.check_crc32()
         try:
             past = self._past(state, packet)
             self._check_payload(packet)
@@ -118,8 +122,8 @@ class DeltaDecoder:
             "splice": spliced_ns - made_ns,
             "decode": self._clock_ns() - spliced_ns,
         }
-        lost = packet.sequence - state.next_sequence
-        return Decoded(frame, state.after(packet.sequence, made), lost, same_render, stage_ns)
+        following = state.after(packet.epoch, packet.sequence, made)
+        return Decoded(frame, following, checked.lost, same_render, stage_ns)
 
     def _checked(
         self, packet: DeltaPacket, render: I420, prediction: Prediction, frame: I420
@@ -220,15 +224,3 @@ def _pictures(packet: DeltaPacket, prediction: Prediction) -> tuple[I420, ...]:
         return prediction.pictures(packet.references)
     except InvalidInput as error:
         raise PacketRejected(RejectReason.INVALID_ARGUMENT, str(error)) from error
-
-
-def _check_order(state: DecoderState, packet: DeltaPacket) -> None:
-    if packet.epoch != state.epoch:
-        raise PacketRejected(
-            RejectReason.STALE_EPOCH, f"epoch {packet.epoch} where {state.epoch} is current"
-        )
-    if packet.sequence < state.next_sequence:
-        raise PacketRejected(
-            RejectReason.STALE_SEQUENCE,
-            f"sequence {packet.sequence} where {state.next_sequence} or later is expected",
-        )

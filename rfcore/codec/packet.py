@@ -11,7 +11,7 @@ from rfcore.codec.photometric import MOST_LIGHT_BYTES, Photometric, check_photom
 from rfcore.codec.references import RENDER_ONLY, References, check_references, is_temporal
 from rfcore.errors import InvalidInput, PacketRejected, RejectReason
 
-__all__ = ["BASE_DIGEST_BYTES", "DIGEST_BYTES", "DeltaPacket"]
+__all__ = ["BASE_DIGEST_BYTES", "DIGEST_BYTES", "CheckedPacket", "DeltaPacket", "check_packet"]
 
 DIGEST_BYTES = 16
 
@@ -106,20 +106,46 @@ class DeltaPacket:
         crc = zlib.crc32(self.payload, zlib.crc32(b"".join(head)))
         return zlib.crc32(b"".join(tail), crc)
 
-    def check_crc32(self) -> None:
-        """Raise ``PacketRejected`` (CRC_MISMATCH) if the contents are not those that were sealed.
-
-        It takes microseconds: callers check before any rendering or decoding.
-        """
-        expected = self.expected_crc32()
-        if self.crc32 != expected:
-            raise PacketRejected(
-                RejectReason.CRC_MISMATCH, f"CRC {self.crc32:08x} of contents with {expected:08x}"
-            )
-
     def sealed(self) -> DeltaPacket:
         """Return the packet with the CRC its other fields call for."""
         return replace(self, crc32=self.expected_crc32())
+
+
+@dataclass(frozen=True)
+class CheckedPacket:
+    """A packet that arrived intact and in order: what ``check_packet`` returns.
+
+    Decoders take packets in this form alone, so each is checked once, before anything is rendered
+    for it. ``lost``: how many packets are missing right before it.
+    """
+
+    packet: DeltaPacket
+    lost: int
+
+
+def check_packet(packet: DeltaPacket, epoch: int, next_sequence: int) -> CheckedPacket:
+    """Check a packet where ``next_sequence`` of ``epoch`` is the lowest that may come.
+
+    A higher epoch is a new start, whose sequences count from 0. Raises ``PacketRejected`` with
+    STALE_EPOCH or STALE_SEQUENCE for a packet that comes too late, and with CRC_MISMATCH if the
+    contents are not those that were sealed. It takes microseconds.
+    """
+    if packet.epoch < epoch:
+        raise PacketRejected(
+            RejectReason.STALE_EPOCH, f"epoch {packet.epoch} where {epoch} is current"
+        )
+    lowest = next_sequence if packet.epoch == epoch else 0
+    if packet.sequence < lowest:
+        raise PacketRejected(
+            RejectReason.STALE_SEQUENCE,
+            f"sequence {packet.sequence} where {lowest} or later is expected",
+        )
+    expected = packet.expected_crc32()
+    if packet.crc32 != expected:
+        raise PacketRejected(
+            RejectReason.CRC_MISMATCH, f"CRC {packet.crc32:08x} of contents with {expected:08x}"
+        )
+    return CheckedPacket(packet, packet.sequence - lowest)
 
 
 def _require_number(name: str, value: int, limit: int) -> None:

@@ -9,7 +9,7 @@ to have been decoded. The receiver keeps the last few, so that rolling back need
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 from rfcore.errors import InvalidInput
@@ -77,10 +77,10 @@ class DecoderState:
         """Return the newest kept frame whose digest begins with ``digest``, if there is one."""
         return next((past for past in self.kept if past.digest.startswith(digest)), None)
 
-    def after(self, sequence: int, past: Past) -> DecoderState:
-        """Return the state once the packet ``sequence`` has become ``past``."""
+    def after(self, epoch: int, sequence: int, past: Past) -> DecoderState:
+        """Return the state once the packet ``sequence`` of ``epoch`` has become ``past``."""
         kept = (past, *self.kept)[:KEPT_FRAMES]
-        return replace(self, next_sequence=sequence + 1, kept=kept)
+        return DecoderState(epoch, sequence + 1, kept)
 
 
 def _require_counts(epoch: int, next_sequence: int) -> None:

@@ -1,9 +1,6 @@
-"""Write delta_packets_relit.npz: a frame of every kind as it goes over the wire, what decodes it.
+"""Write delta_packets.npz: a frame of every kind as it goes over the wire, what decodes it.
 
 python tests/data/make_delta_packets.py; only when the packet or the codec's arithmetic must change.
-This revision can read and no longer writes: delta_packets_own.npz, without relit frames;
-delta_packets.npz, whose slices are x264's; and delta_packets_long.npz, which has a field id, a pose
-in float64, block means and whole base digests in every frame besides.
 """
 
 from pathlib import Path
@@ -14,7 +11,7 @@ from rfcore.wire.convert import client_message_to_bytes
 from rfcore.wire.messages import CameraDescription, Frame, Hello, RendererContract
 from rfedge.bench.fuzz import make_stream
 
-OUT = Path(__file__).with_name("delta_packets_relit.npz")
+OUT = Path(__file__).with_name("delta_packets.npz")
 
 
 def main() -> None:

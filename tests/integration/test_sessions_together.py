@@ -18,7 +18,7 @@ from rfcore.camera import Camera, Intrinsics, Pose
 from rfcore.codec.h264.config import CodecConfig
 from rfcore.codec.h264.header import StreamHeader
 from rfcore.codec.packet import DeltaPacket
-from rfcore.errors import InvalidInput, PacketRejected, RejectReason
+from rfcore.errors import InvalidInput
 from rfcore.views import PosedPicture
 from rfcore.wire.conventions import RENDERER_CONTRACT
 from rfcore.wire.convert import client_message_from_bytes
@@ -122,10 +122,6 @@ class World:
             return
         packet = job.frame.packet
         assert (packet.epoch, packet.sequence) > self.decoded, "handed out in order"
-        if packet.crc32 != packet.expected_crc32():
-            rejected = PacketRejected(RejectReason.CRC_MISMATCH, "as the codec would")
-            self.server.rejected(job, rejected, self.now)
-            return
         self.decoded = (packet.epoch, packet.sequence)
         outcome = DecodeOutcome(packet.reconstruction_digest, StageTimes())
         self.server.decoded(job, outcome, self.now)

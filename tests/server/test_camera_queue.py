@@ -29,7 +29,7 @@ def reconstruct(queue: CameraQueue, frame: Frame) -> list[SequenceGap]:
     """Take a frame through the queue, as one that decodes."""
     queue.admit(frame, 0.0)
     assert queue.start() is not None
-    queue.check_order(frame)
+    queue.check(frame)
     return queue.succeed()
 
 
@@ -48,7 +48,7 @@ def test_each_frame_is_answered_once_and_credit_counts_the_answers(
         assert queue.start() is not None
         answers += 1
         try:
-            queue.check_order(frame)
+            queue.check(frame)
         except PacketRejected:
             queue.fail()
             assert (epoch, sequence) <= max(good), "only what came too late is out of order here"
@@ -89,7 +89,7 @@ def test_a_frame_out_of_order_is_refused_with_the_reason(
     queue = CameraQueue(WINDOW)
     reconstruct(queue, make_frame(3, epoch=5))
     with pytest.raises(PacketRejected) as caught:
-        queue.check_order(make_frame(sequence, epoch))
+        queue.check(make_frame(sequence, epoch))
     assert caught.value.reason is reason
 
 
