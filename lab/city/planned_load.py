@@ -21,7 +21,7 @@ from lab.city.plan import CityPlan, plan_city
 from lab.city.traffic import TrafficBlock
 from mec_server.config import AdmissionLimits
 from rfcore.errors import InvalidInput
-from rfcore.link.profile_file import read_link
+from rfcore.link.plan import read_link
 from rfcore.wire.convert import client_message_to_bytes
 from rfedge.loadtest.plan import Load, Mode
 from rfedge.loadtest.prerecorded import PrerecordedDrive

@@ -35,7 +35,7 @@ from rfcore.codec.sender.ladder import Rung
 from rfcore.errors import InvalidInput
 from rfcore.field import RadianceField, load_field
 from rfcore.link import DirectionPlan, LinkProfile
-from rfcore.link.trace import read_mahimahi
+from rfcore.link.traces import read_mahimahi
 from rfedge.evaluate.cells import CellStore, clip_key, program_version
 from rfedge.evaluate.clips import Clip, ClipCoder, CodedClip, Drive, DriveName, read_drive
 from rfedge.evaluate.field_coder import FieldCoder, render_clip

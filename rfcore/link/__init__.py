@@ -1,13 +1,12 @@
 """A throughput-limited link as a machine without clock or socket.
 
-``profile`` and ``plan`` say what a link is, ``shaper`` is the machine, ``plan.delivery_times``
-drives it on a virtual clock, ``profile_file`` reads a link from a file. The driver on real sockets
-is ``rfedge.link.proxy``. Impairments are separate modules that only a profile naming them imports.
+``rfcore.link.shaper`` is the machine; ``rfcore.link.plan`` says what a link is made of, reads that
+from a file and runs it on a virtual clock. The driver on real sockets is ``rfedge.link.proxy``.
+Impairments are imported only by a profile that names one.
 """
 
-from rfcore.link.plan import Arrival, DirectionPlan, LinkPlan, delivery_times
-from rfcore.link.profile import LinkProfile
-from rfcore.link.shaper import Delivery, Link
+from rfcore.link.plan import Arrival, DirectionPlan, LinkPlan, delivery_times, read_link
+from rfcore.link.shaper import Delivery, Link, LinkProfile
 
 __all__ = [
     "Arrival",
@@ -17,4 +16,5 @@ __all__ = [
     "LinkPlan",
     "LinkProfile",
     "delivery_times",
+    "read_link",
 ]

@@ -1,9 +1,23 @@
-"""What a link is made of, per direction (profile and impairments), and a run on a virtual clock.
+"""What a link is made of, per direction; how a file declares it; and a run on a virtual clock.
 
 An impairment changes how a link transmits (a trace, an outage) or adds to its delay (jitter, a
-recorded delay). Each is a module of its own that only a profile naming it imports. Randomness comes
-from a seed: every impairment of every direction draws from its own generator, so that adding one
-changes no other.
+recorded delay). Randomness comes from a seed: every impairment of every direction draws from its
+own generator, so that adding one changes no other.
+
+A profile is a TOML file with a table for each direction and, in it, for each impairment::
+
+    description = "a drive through a town with a tunnel"
+    seed = 7
+    [uplink]
+    rate_mbps = 4.0             # or a table [uplink.trace]: see rfcore.link.traces
+    delay_ms = 20.0
+    queue_kib = 64
+    [uplink.outage]             # or jitter (rfcore.link.impairments), delay_trace (.traces)
+    at_s = [[10.0, 2.0]]
+    [downlink]
+    rate_mbps = 20.0
+    [connection_loss]
+    mean_life_s = 30.0          # connections are cut at random: a TCP proxy can lose no packets
 
 ``delivery_times`` runs a plan without waiting, for experiments. Its sizes are packet bytes (pose +
 header + payload), as the paper's tau has them; the proxy on real sockets counts wire bytes instead.
@@ -11,38 +25,31 @@ header + payload), as the paper's tau has them; the proxy on real sockets counts
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import tomllib
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from random import Random
 from typing import Any, Protocol
 
-from rfcore.errors import InvalidInput
-from rfcore.link.profile import LinkProfile
-from rfcore.link.shaper import ConstantRate, Delay, Link, Transmission
+from rfcore.errors import InvalidData, InvalidInput
+from rfcore.link.shaper import (
+    MAX_DELAY_S,
+    MAX_RATE_BPS,
+    ConstantRate,
+    Link,
+    LinkParts,
+    LinkProfile,
+)
+from rfcore.tables import Range, Table
 
-__all__ = [
-    "Arrival",
-    "ConnectionLife",
-    "DirectionPlan",
-    "Impairment",
-    "LinkPlan",
-    "Parts",
-    "delivery_times",
-]
+__all__ = ["Arrival", "DirectionPlan", "Impairment", "LinkPlan", "delivery_times", "read_link"]
 
 UNBOUNDED_BYTES = 2**62
-
-
-@dataclass(frozen=True)
-class Parts:
-    """How a link transmits, and what adds to its delay."""
-
-    transmission: Transmission
-    delays: tuple[Delay, ...] = ()
-
-    def with_delay(self, delay: Delay) -> Parts:
-        """Return these parts and one more delay."""
-        return replace(self, delays=(*self.delays, delay))
+MAX_QUEUE_KIB = 1 << 20
+LIFE_S = Range(0.05, 1e6)
+IMPAIRMENTS = ("outage", "delay_trace", "jitter")
+"""In the order in which they act, whatever the order in the file; a trace is in place of a rate."""
 
 
 class Impairment(Protocol):
@@ -52,22 +59,8 @@ class Impairment(Protocol):
     def name(self) -> str:
         """Its table in a profile."""
 
-    def apply(self, parts: Parts, random: Random) -> Parts:
+    def apply(self, parts: LinkParts, random: Random) -> LinkParts:
         """Return the parts of a link with this impairment; all randomness comes from ``random``."""
-
-
-class ConnectionLife(Protocol):
-    """How long connections live."""
-
-    def lifetime_s(self) -> float:
-        """Return the seconds after which the next connection is cut."""
-
-
-class ConnectionLoss(Protocol):
-    """Cuts connections, as a profile declares it."""
-
-    def lives(self, random: Random) -> ConnectionLife:
-        """Return the machine that says how long connections live."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +73,10 @@ class DirectionPlan:
 
     def link(self, origin_s: float = 0.0) -> Link[Any]:
         """Return the machine; traces, outages and the like begin at ``origin_s``."""
-        parts = Parts(ConstantRate(self.profile.rate_bps))
+        parts = LinkParts(ConstantRate(self.profile.rate_bps))
         for impairment in self.impairments:
             parts = impairment.apply(parts, Random(f"{self.seed}/{impairment.name}"))
-        return Link(self.profile, parts.transmission, parts.delays, origin_s)
+        return Link(self.profile, parts, origin_s)
 
     def unbounded(self) -> DirectionPlan:
         """Return the plan with a queue that never fills: for schedules that nobody can hold."""
@@ -92,19 +85,24 @@ class DirectionPlan:
 
 @dataclass(frozen=True)
 class LinkPlan:
-    """A whole link. ``connection_loss`` cuts connections at random; None: never."""
+    """A whole link. Connections live for ``mean_life_s`` on average; None: for ever."""
 
     uplink: DirectionPlan
     downlink: DirectionPlan
-    connection_loss: ConnectionLoss | None = None
+    mean_life_s: float | None = None
     seed: str = ""
     description: str = ""
 
-    def connection_lives(self) -> ConnectionLife | None:
-        """Return the machine that says how long connections live, or None: for ever."""
-        if self.connection_loss is None:
+    def connection_lives_s(self) -> Iterator[float] | None:
+        """Return the seconds after which one connection after another is cut; None: never."""
+        if self.mean_life_s is None:
             return None
-        return self.connection_loss.lives(Random(f"{self.seed}/connection_loss"))
+        return _exponential(self.mean_life_s, Random(f"{self.seed}/connection_loss"))
+
+
+def _exponential(mean: float, random: Random) -> Iterator[float]:
+    while True:
+        yield mean * random.expovariate(1.0)
 
 
 @dataclass(frozen=True)
@@ -134,3 +132,67 @@ def delivery_times(link: LinkProfile | DirectionPlan, schedule: Iterable[Arrival
         times.append(machine.push(index, arrival.size_bytes, arrival.at_s).due_s)
         machine.pop_due(arrival.at_s)
     return times
+
+
+def read_link(path: Path) -> LinkPlan:
+    r"""Read a profile.
+
+    >>> from rfcore.files import write_whole
+    >>> write_whole(Path("town.toml"), "[uplink]\nrate_mbps = 4\n[downlink]\nrate_mbps = 20\n")
+    >>> read_link(Path("town.toml")).uplink.profile.rate_bps
+    4000000.0
+
+    Raises ``InvalidInput`` naming the file, the key, its value and the limit, ``InvalidData`` for a
+    file that is no TOML or a trace that is none, ``OSError`` for one that cannot be read.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InvalidData(f"{path}: not a link profile ({error})") from error
+    try:
+        return _link(Table(values, InvalidInput), path.parent)
+    except InvalidInput as error:
+        raise InvalidInput(f"{path}: {error.field}", error.problem) from error
+
+
+def _link(top: Table, folder: Path) -> LinkPlan:
+    seed = str(top.whole("seed", Range(0, 2**53), 0))
+    description = str(top.value("description", ""))
+    uplink = _direction(top.table("uplink"), folder, f"{seed}/uplink")
+    downlink = _direction(top.table("downlink"), folder, f"{seed}/downlink")
+    mean_life_s = None
+    if "connection_loss" in top:
+        loss = top.table("connection_loss")
+        mean_life_s = loss.number("mean_life_s", LIFE_S)
+        loss.finish()
+    top.finish("connection_loss")
+    return LinkPlan(uplink, downlink, mean_life_s, seed, description)
+
+
+def _direction(table: Table, folder: Path, seed: str) -> DirectionPlan:
+    impairments: list[Impairment] = []
+    if "trace" in table:
+        if "rate_mbps" in table:
+            raise table.error("rate_mbps", "is given beside a trace; give one")
+        trace = _impairment("trace", table, folder)
+        impairments.append(trace)
+        rate_bps = trace.mean_rate_bps
+    else:
+        rate_bps = 1e6 * table.number("rate_mbps", Range(1e-6, MAX_RATE_BPS / 1e6))
+    delay_ms = table.number("delay_ms", Range(0.0, 1e3 * MAX_DELAY_S), 0.0)
+    queue_kib = table.number("queue_kib", Range(1, MAX_QUEUE_KIB), 64)
+    impairments += [_impairment(name, table, folder) for name in IMPAIRMENTS if name in table]
+    table.finish("rate_mbps", "trace", *IMPAIRMENTS)
+    profile = LinkProfile(rate_bps, delay_ms / 1e3, int(queue_kib * 1024))
+    return DirectionPlan(profile, tuple(impairments), seed)
+
+
+def _impairment(name: str, table: Table, folder: Path) -> Any:
+    """Return what the table of that name declares; only what a profile names is imported."""
+    if name in ("trace", "delay_trace"):
+        from rfcore.link.traces import parse_recording
+
+        return parse_recording(name, table.table(name), folder)
+    from rfcore.link.impairments import parse_impairment
+
+    return parse_impairment(name, table.table(name))

@@ -1,39 +1,82 @@
 """A link as a queue with three verbs (``push``, ``pop_due``, ``next_event_at``), and a busy meter.
 
-NetworkTX of the paper (send, wait tau = 8 * bytes / throughput), store and forward. A packet that
-finds the link busy is transmitted from the moment the previous one is *due* to end, never from the
-moment somebody looks: late drivers cause no drift. Within a busy period every end is computed from
-the period's start and an integer number of bits, so rounding errors do not accumulate.
+This is the paper's NetworkTX (send, then wait tau = 8 * bytes / throughput), store and forward. A
+packet that finds the link busy is transmitted from the moment the previous one is *due* to end,
+never from the moment somebody looks: late drivers cause no drift. Within a busy period every end is
+computed from the period's start and an integer number of bytes, so rounding errors do not
+accumulate.
 
-The transmission and the delays beyond the profile's constant are exchangeable parts
+The transmission and the delays beyond the profile's constant one are exchangeable parts
 (``rfcore.link.plan``); whatever they do, packets keep their order. Times are seconds on any clock
 of the caller's that does not run backwards; parts see the seconds since the link's origin.
 
 ``BusyMeter`` checks a real-time driver of the link: from the moments at which packets were really
 released it computes how long the link was busy (the union of the intervals from the start of a busy
 period to the release of its last packet, without propagation). Compared with ``expected_s``, the
-time the link's own schedule gave those bytes, an excess shows late releases.
+time that the link's own schedule gave those bytes, an excess shows late releases.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
 from rfcore.errors import InvalidInput
-from rfcore.link.profile import LinkProfile
 
-__all__ = ["BusyMeter", "ConstantRate", "Delay", "Delivery", "Link", "Transmission"]
+__all__ = [
+    "MAX_DELAY_S",
+    "MAX_RATE_BPS",
+    "BusyMeter",
+    "ConstantRate",
+    "Delay",
+    "Delivery",
+    "Link",
+    "LinkParts",
+    "LinkProfile",
+    "Transmission",
+]
 
+MAX_RATE_BPS = 1e12
+"""Above a terabit per second the transmission time drowns in the clock's resolution."""
+MAX_DELAY_S = 60.0
+"""A delay longer than a minute is a unit mistake (milliseconds given as seconds)."""
 
 Item = TypeVar("Item")
+Delay = Callable[[float], float]
+"""Returns the additional seconds of a packet whose transmission ended so long after the origin."""
+
+
+@dataclass(frozen=True)
+class LinkProfile:
+    """A link of ``rate_bps`` bits per second and ``delay_s`` seconds of propagation.
+
+    ``queue_limit_bytes`` is how much may wait for transmission, beside what is in propagation.
+    Raises ``InvalidInput`` naming the value and its limit.
+    """
+
+    rate_bps: float
+    delay_s: float = 0.0
+    queue_limit_bytes: int = 64 * 1024
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rate_bps) and 1.0 <= self.rate_bps <= MAX_RATE_BPS):
+            raise InvalidInput(
+                "link.rate_bps", f"{self.rate_bps} is outside 1..{MAX_RATE_BPS:g} bits per second"
+            )
+        if not (math.isfinite(self.delay_s) and 0.0 <= self.delay_s <= MAX_DELAY_S):
+            raise InvalidInput("link.delay_s", f"{self.delay_s} is outside 0..{MAX_DELAY_S:g} s")
+        if self.queue_limit_bytes < 1:
+            raise InvalidInput(
+                "link.queue_limit_bytes", f"{self.queue_limit_bytes} must be at least 1 byte"
+            )
 
 
 @dataclass(frozen=True)
 class Delivery(Generic[Item]):
-    """One packet leaving the link: transmitted during ``start_s..end_s``, delivered ``due_s``."""
+    """One packet that leaves the link: sent during ``start_s..end_s``, delivered at ``due_s``."""
 
     item: Item
     size_bytes: int
@@ -43,25 +86,14 @@ class Delivery(Generic[Item]):
 
 
 class Transmission(Protocol):
-    """Who decides when bytes get through, first come first served; times are since the origin."""
+    """Decides when bytes get through, first come first served; times are since the origin."""
 
     def schedule(self, size_bytes: int, at_s: float) -> tuple[float, float]:
         """Take ``size_bytes`` that arrive at ``at_s``; return when they start and end."""
 
 
-class Delay(Protocol):
-    """What adds to the time in propagation."""
-
-    def delay_s(self, at_s: float) -> float:
-        """Return how much longer a packet takes that was transmitted until ``at_s``."""
-
-
 class ConstantRate:
-    """``rate_bps`` bits per second, constant.
-
-    Within a busy period every end is computed from the period's start and an integer number of
-    bytes.
-    """
+    """Transmits ``rate_bps`` bits per second."""
 
     def __init__(self, rate_bps: float) -> None:
         self._rate_bps = rate_bps
@@ -79,19 +111,35 @@ class ConstantRate:
         return start_s, self._busy_until_s
 
 
+@dataclass(frozen=True)
+class LinkParts:
+    """What transmits on a link, and what adds to its delay."""
+
+    transmission: Transmission
+    delays: tuple[Delay, ...] = ()
+
+    def with_delay(self, delay: Delay) -> LinkParts:
+        """Return these parts and one more delay."""
+        return replace(self, delays=(*self.delays, delay))
+
+
 class Link(Generic[Item]):
-    """A first-in first-out link; loses and reorders nothing. Constant rate and delay by default."""
+    """A first-in first-out link that loses and reorders nothing.
+
+    ``parts`` are a constant rate unless given. 1000 bytes take 1 s at 8 kbit/s, and 0.5 s more:
+
+    >>> link = Link(LinkProfile(rate_bps=8000, delay_s=0.5))
+    >>> link.push("a frame", 1000, now=10.0).due_s
+    11.5
+    >>> link.pop_due(now=11.4), [delivery.item for delivery in link.pop_due(now=11.5)]
+    ([], ['a frame'])
+    """
 
     def __init__(
-        self,
-        profile: LinkProfile,
-        transmission: Transmission | None = None,
-        delays: Sequence[Delay] = (),
-        origin_s: float = 0.0,
+        self, profile: LinkProfile, parts: LinkParts | None = None, origin_s: float = 0.0
     ) -> None:
         self.profile = profile
-        self._transmission = transmission or ConstantRate(profile.rate_bps)
-        self._delays = tuple(delays)
+        self._parts = parts or LinkParts(ConstantRate(profile.rate_bps))
         self._origin_s = origin_s
         self._queue: deque[Delivery[Item]] = deque()
         self._sending: deque[Delivery[Item]] = deque()
@@ -141,8 +189,8 @@ class Link(Generic[Item]):
         return delivery
 
     def _schedule(self, item: Item, size_bytes: int, now: float) -> Delivery[Item]:
-        start, end = self._transmission.schedule(size_bytes, now - self._origin_s)
-        more_s = sum(delay.delay_s(end) for delay in self._delays)
+        start, end = self._parts.transmission.schedule(size_bytes, now - self._origin_s)
+        more_s = sum(delay(end) for delay in self._parts.delays)
         start_s, end_s = self._origin_s + start, self._origin_s + end
         due_s = max(end_s + self.profile.delay_s + more_s, self._last_due_s)
         self._last_due_s = due_s
@@ -166,7 +214,7 @@ class Link(Generic[Item]):
 
 
 class BusyMeter:
-    """Measures one link; tell it of every release, in order.
+    """Measures how long one link was busy; it is told of every release, in order.
 
     ``expected_s`` is how long the machine said the link would be busy.
     """
@@ -182,7 +230,7 @@ class BusyMeter:
         self.largest_lateness_s = 0.0
 
     def released(self, delivery: Delivery[Any], at_s: float) -> None:
-        """``delivery`` left the link at ``at_s``."""
+        """Take note that ``delivery`` left the link at ``at_s``."""
         if delivery.start_s > self._scheduled_end_s:
             self.periods += 1
             self._closed_s = self.busy_s
@@ -203,7 +251,7 @@ class BusyMeter:
 
     @property
     def tau_error_percent(self) -> float | None:
-        """How much longer (+) or shorter (-) than it should; None before the first byte."""
+        """Share of ``expected_s`` by which the link was busy longer; None before the first byte."""
         if not self.expected_s:
             return None
         return 100.0 * (self.busy_s / self.expected_s - 1.0)

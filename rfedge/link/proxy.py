@@ -32,8 +32,7 @@ from prometheus_client import CollectorRegistry
 
 from rfcore.errors import InvalidInput, RfedgeError
 from rfcore.files import write_whole
-from rfcore.link import DirectionPlan, LinkPlan, LinkProfile
-from rfcore.link.profile_file import read_link
+from rfcore.link import DirectionPlan, LinkPlan, LinkProfile, read_link
 from rfcore.wire.address import Address
 from rfcore.wire.instruments import MetricsEndpoint
 from rfedge.link.direction import SPIN_S, Direction
@@ -216,7 +215,7 @@ class LinkProxy:
         self.addresses = [listen for listen, _ in settings.paths()]
         self._settings = settings
         plan = settings.plan()
-        self._lives = plan.connection_lives()
+        self._lives = plan.connection_lives_s()
         self.registry = CollectorRegistry()
         self._metrics = LinkMetrics(self.registry)
         self._up = Direction(plan.uplink, self._metrics.transit("up"), settings.spin_s)
@@ -308,7 +307,7 @@ class LinkProxy:
         near.join(far)
         far.join(near)
         if self._lives is not None:
-            await asyncio.sleep(self._lives.lifetime_s())
+            await asyncio.sleep(next(self._lives))
             self._cut(near, far)
 
     def _cut(self, *sides: Side) -> None:

@@ -24,9 +24,9 @@ from rfcore.dataset import read_dataset
 from rfcore.errors import InvalidInput
 from rfcore.field import load_field, render_field_view
 from rfcore.link import LinkProfile
-from rfcore.link.profile_file import read_link
-from rfcore.link.shaper import Link
-from rfcore.link.trace import TraceTransmission, read_mahimahi
+from rfcore.link.plan import read_link
+from rfcore.link.shaper import Link, LinkParts
+from rfcore.link.traces import TraceTransmission, read_mahimahi
 from rfcore.native.yuv import i420_from_rgb
 from rfcore.wire.messages import (
     Ack,
@@ -198,7 +198,7 @@ def drive_over(
 
 def link(*rates: tuple[float, float]) -> Link[FrameAddress]:
     profile = LinkProfile(1e6, 0.02, 2**40)
-    return Link(profile, Steps(*rates))
+    return Link(profile, LinkParts(Steps(*rates)))
 
 
 def kept(pictures: list[Picture], limit_s: float) -> float:
@@ -322,7 +322,7 @@ def test_an_lte_uplink_is_kept_within_a_fifth_of_a_second(
     drive_over: Callable[..., list[Picture]],
 ) -> None:
     uplink = Link[FrameAddress](
-        LinkProfile(1e6, 0.02, 2**40), TraceTransmission(read_mahimahi(LTE))
+        LinkProfile(1e6, 0.02, 2**40), LinkParts(TraceTransmission(read_mahimahi(LTE)))
     )
     pictures = drive_over(uplink, 0.2, seconds=120)
     assert kept(between(pictures, SETTLING_S, 120), 0.2) >= 0.99

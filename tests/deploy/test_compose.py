@@ -19,7 +19,7 @@ from tyro.conf import OmitSubcommandPrefixes
 import cav_agent.__main__ as agent_command
 import mec_server.__main__ as server_command
 from rfcore.dataset import read_dataset
-from rfcore.link.profile_file import read_link
+from rfcore.link.plan import read_link
 from rfcore.wire.address import Address
 from rfcore.wire.tls import TlsFiles
 from rfedge.cli import Verb

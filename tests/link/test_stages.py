@@ -11,13 +11,10 @@ from hypothesis import strategies as st
 
 from rfcore.errors import InvalidData, InvalidInput
 from rfcore.link import Arrival, DirectionPlan, LinkPlan, LinkProfile, delivery_times
-from rfcore.link.connection_loss import ConnectionLoss
-from rfcore.link.delay_trace import DelayTrace, read_cicv5g
-from rfcore.link.jitter import Distribution, Jitter
-from rfcore.link.outage import Outage, RandomOutage
-from rfcore.link.plan import Impairment, Parts
-from rfcore.link.shaper import ConstantRate
-from rfcore.link.trace import Trace
+from rfcore.link.impairments import Jitter, JitterDistribution, Outage, RandomOutage
+from rfcore.link.plan import Impairment
+from rfcore.link.shaper import ConstantRate, LinkParts
+from rfcore.link.traces import CapacityTrace, DelayTrace, read_cicv5g
 
 SAMPLES = Path(__file__).parents[2] / "samples" / "links"
 RECORDED = Path(__file__).parents[3] / "shared" / "data" / "traces" / "cicv5g"
@@ -28,12 +25,12 @@ schedules = st.lists(
     st.builds(Arrival, at_s=MS, size_bytes=st.integers(1, 9_000)), min_size=1, max_size=30
 ).map(lambda arrivals: sorted(arrivals, key=lambda a: a.at_s))
 impairments: st.SearchStrategy[Impairment] = st.one_of(
-    st.builds(Jitter, st.floats(0, 1), st.sampled_from(Distribution)),
+    st.builds(Jitter, st.floats(0, 1), st.sampled_from(JitterDistribution)),
     st.builds(RandomOutage, st.floats(0.01, 2), st.floats(0.01, 2)),
     st.just(Outage(((0.0, 0.1), (0.5, 1.5)), repeat_s=2.0)),
     st.just(Outage(((1.0, 3.0),))),
     st.just(DelayTrace((0.0, 0.5, 1.0), (0.5, 0.0, 0.1))),
-    st.just(Trace((5, 5, 100, 400))),
+    st.just(CapacityTrace((5, 5, 100, 400))),
 )
 
 
@@ -126,19 +123,21 @@ def test_random_outages_take_the_share_of_time_that_their_means_say(
 
 def test_an_outage_after_hours_costs_no_memory() -> None:
     outage = Outage(((0.5, 1.0),), repeat_s=1.0)
-    transmission = outage.apply(Parts(ConstantRate(1e6)), Random(0)).transmission
+    transmission = outage.apply(LinkParts(ConstantRate(1e6)), Random(0)).transmission
     for second in range(20_000):
         transmission.schedule(1, float(second))
     assert len(transmission._ahead) <= 3  # type: ignore[attr-defined]
 
 
-@given(st.integers(0, 100), st.sampled_from(Distribution))
-def test_jitter_has_the_mean_of_its_distribution(seed: int, distribution: Distribution) -> None:
+@given(st.integers(0, 100), st.sampled_from(JitterDistribution))
+def test_jitter_has_the_mean_of_its_distribution(
+    seed: int, distribution: JitterDistribution
+) -> None:
     """Packets far apart, so that none waits for another."""
     plan = DirectionPlan(LinkProfile(1e12), (Jitter(0.1, distribution),), str(seed))
     schedule = [Arrival(10.0 * i, 1) for i in range(1000)]
     extra = [d - a.at_s for d, a in zip(delivery_times(plan, schedule), schedule, strict=True)]
-    mean_s, spread_s = (0.05, 0.029) if distribution is Distribution.UNIFORM else (0.1, 0.1)
+    mean_s, spread_s = (0.05, 0.029) if distribution is JitterDistribution.UNIFORM else (0.1, 0.1)
     assert sum(extra) / 1000 == pytest.approx(mean_s, abs=6 * spread_s / math.sqrt(1000))
     assert min(extra) >= -within(10_000.0)
 
@@ -187,8 +186,10 @@ def test_recorded_delays_are_read(path: Path) -> None:
 
 
 def test_connections_live_as_long_as_they_should_on_average() -> None:
-    lives = ConnectionLoss(5.0).lives(Random(1))
-    drawn = [lives.lifetime_s() for _ in range(4000)]
+    direction = DirectionPlan(PROFILE)
+    lives_s = LinkPlan(direction, direction, mean_life_s=5.0).connection_lives_s()
+    assert lives_s is not None
+    drawn = [next(lives_s) for _ in range(4000)]
     assert sum(drawn) / 4000 == pytest.approx(5.0, rel=6 / math.sqrt(4000))
     assert min(drawn) > 0
 
@@ -211,8 +212,6 @@ def test_adding_a_stage_changes_no_other_stages_chance(read: Callable[..., LinkP
         lambda: Outage(((float("nan"), 2.0),)),
         lambda: Jitter(-1.0),
         lambda: Jitter(float("nan")),
-        lambda: ConnectionLoss(0.0),
-        lambda: ConnectionLoss(float("inf")),
     ],
 )
 def test_a_value_that_makes_no_sense_is_refused(make: Callable[[], object]) -> None:

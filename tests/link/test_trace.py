@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from rfcore.errors import InvalidData
 from rfcore.link import Arrival, DirectionPlan, LinkProfile, delivery_times
-from rfcore.link.trace import Trace, TraceTransmission, read_mahimahi
+from rfcore.link.traces import CapacityTrace, TraceTransmission, read_mahimahi
 
 SAMPLES = Path(__file__).parents[2] / "samples" / "links"
 RECORDED = Path(__file__).parents[3] / "shared" / "data" / "traces" / "mahimahi"
 
 traces = (
     st.lists(st.integers(0, 300), min_size=1, max_size=30)
-    .map(lambda times: Trace(tuple(sorted([*times, 300]))))
+    .map(lambda times: CapacityTrace(tuple(sorted([*times, 300]))))
 )  # fmt: skip
 schedules = st.lists(
     st.builds(
@@ -30,19 +30,19 @@ schedules = st.lists(
 ).map(lambda arrivals: sorted(arrivals, key=lambda a: a.at_s))
 
 
-def through(trace: Trace, schedule: list[Arrival]) -> list[float]:
+def through(trace: CapacityTrace, schedule: list[Arrival]) -> list[float]:
     plan = DirectionPlan(LinkProfile(trace.mean_rate_bps), (trace,))
     return delivery_times(plan, schedule)
 
 
-def opportunities(trace: Trace, until_s: float) -> list[float]:
+def opportunities(trace: CapacityTrace, until_s: float) -> list[float]:
     """Every opportunity of the repeated trace up to ``until_s``, in seconds."""
     period_ms = trace.times_ms[-1]
     rounds = range(int(until_s * 1e3 // period_ms) + 1)
     return [(number * period_ms + t) / 1e3 for number in rounds for t in trace.times_ms]
 
 
-def by_a_loop(trace: Trace, schedule: list[Arrival]) -> list[float]:
+def by_a_loop(trace: CapacityTrace, schedule: list[Arrival]) -> list[float]:
     """Mahimahi as it works: at each opportunity, 1500 bytes of what waits leave."""
     waiting = [[a.at_s, a.size_bytes, None] for a in schedule]
     needed_s = schedule[-1].at_s + trace.period_s * (
@@ -61,13 +61,15 @@ def by_a_loop(trace: Trace, schedule: list[Arrival]) -> list[float]:
 
 
 @given(traces, schedules)
-def test_a_trace_delivers_when_a_plain_loop_does(trace: Trace, schedule: list[Arrival]) -> None:
+def test_a_trace_delivers_when_a_plain_loop_does(
+    trace: CapacityTrace, schedule: list[Arrival]
+) -> None:
     assert through(trace, schedule) == by_a_loop(trace, schedule)
 
 
 @given(traces, schedules)
 def test_no_window_of_time_lets_more_through_than_its_opportunities(
-    trace: Trace, schedule: list[Arrival]
+    trace: CapacityTrace, schedule: list[Arrival]
 ) -> None:
     times = through(trace, schedule)
     chances = opportunities(trace, times[-1])
@@ -80,27 +82,27 @@ def test_no_window_of_time_lets_more_through_than_its_opportunities(
 
 
 def test_small_packets_share_an_opportunity_and_a_large_one_takes_several() -> None:
-    trace = Trace((10, 10, 20, 30))
+    trace = CapacityTrace((10, 10, 20, 30))
     packets = [Arrival(0.0, 700), Arrival(0.0, 800), Arrival(0.0, 3001)]
     assert through(trace, packets) == [0.010, 0.010, 0.030]
 
 
 def test_an_opportunity_nobody_waits_for_is_lost() -> None:
-    assert through(Trace((10, 20, 90)), [Arrival(0.015, 1500), Arrival(0.021, 1500)]) == [
+    assert through(CapacityTrace((10, 20, 90)), [Arrival(0.015, 1500), Arrival(0.021, 1500)]) == [
         0.02,
         0.09,
     ]
 
 
 def test_the_trace_begins_again_at_its_last_line() -> None:
-    trace = Trace((10, 100))
+    trace = CapacityTrace((10, 100))
     packets = [Arrival(0.0, 1500)] * 5
     assert through(trace, packets) == [0.010, 0.100, 0.110, 0.200, 0.210]
 
 
 def test_a_long_rest_is_skipped_at_once() -> None:
     """Nine years of wraps in one step, since the position is computed and not walked."""
-    transmission = TraceTransmission(Trace((1, 1000)))
+    transmission = TraceTransmission(CapacityTrace((1, 1000)))
     assert transmission.schedule(100, 3e8 + 0.5) == (3e8 + 0.5, 3e8 + 1.0)
 
 

@@ -1,11 +1,14 @@
-"""Times during which nothing gets through: a tunnel, a handover, a dead spot.
+"""Impairments of a link that are computed: outages and jitter.
 
-While a link is out its transmission stands still, and so does a trace; what is in propagation
-arrives. Afterwards it goes on where it was. Declared by times, repeated if wanted, or at random
-with exponential lengths of being up and down.
+*Outage*: nothing gets through, as in a tunnel, during a handover or in a dead spot. The
+transmission stands still, and so does a trace; what is in propagation arrives. Afterwards it goes
+on where it was. In a profile: ``[uplink.outage]`` with ``at_s = [[from, for], ...]`` and
+``repeat_s``, or with ``mean_up_s`` and ``mean_down_s`` for exponentially distributed lengths.
 
-In a profile: ``[uplink.outage]`` with ``at_s = [[from, for], ...]`` and ``repeat_s``, or with
-``mean_up_s`` and ``mean_down_s``.
+*Jitter*: a random delay on top of the constant one. Packets keep their order: one that draws little
+waits behind one that drew much, as with a radio link that retransmits. In a profile:
+``[uplink.jitter]`` with ``spread_ms`` and ``distribution``, which is ``uniform`` (between 0 and the
+spread) or ``exponential`` (the spread is the mean, cut off at ten times that).
 """
 
 from __future__ import annotations
@@ -14,25 +17,35 @@ import itertools
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from random import Random
 
 from rfcore.errors import InvalidInput
-from rfcore.link.plan import Parts
-from rfcore.link.shaper import Transmission
+from rfcore.link.shaper import LinkParts, Transmission
 from rfcore.tables import Range, Table, shortened
 
-__all__ = ["Outage", "OutageTransmission", "RandomOutage", "parse"]
+__all__ = [
+    "Jitter",
+    "JitterDistribution",
+    "Outage",
+    "OutageTransmission",
+    "RandomOutage",
+    "parse_impairment",
+]
 
 Window = tuple[float, float]
 """(first second without the link, first second with it)"""
 
 MAX_S = 1e6
 LENGTH_S = Range(1e-3, MAX_S)
+MAX_SPREAD_S = 5.0
+LONGEST = 10.0
+"""Cut of the exponential distribution, in means: one packet in 22 000 is beyond it."""
 
 
 @dataclass(frozen=True)
 class Outage:
-    """Out during ``windows_s``, ascending and apart; again every ``repeat_s`` seconds if given."""
+    """The link is out during ``windows_s``, ascending and apart, and again every ``repeat_s``."""
 
     windows_s: tuple[Window, ...]
     repeat_s: float | None = None
@@ -56,7 +69,7 @@ class Outage:
             shift_s = number * self.repeat_s
             yield from ((begin + shift_s, end + shift_s) for begin, end in self.windows_s)
 
-    def apply(self, parts: Parts, random: Random) -> Parts:  # noqa: ARG002
+    def apply(self, parts: LinkParts, random: Random) -> LinkParts:  # noqa: ARG002
         """Interrupt the transmission."""
         outages = OutageTransmission(parts.transmission, self.windows())
         return replace(parts, transmission=outages)
@@ -64,7 +77,7 @@ class Outage:
 
 @dataclass(frozen=True)
 class RandomOutage:
-    """Up and down in turn, for exponentially distributed times of these means."""
+    """The link is up and down in turn, for exponentially distributed times of these means."""
 
     mean_up_s: float
     mean_down_s: float
@@ -79,7 +92,7 @@ class RandomOutage:
             if now_s > begin_s:
                 yield begin_s, now_s
 
-    def apply(self, parts: Parts, random: Random) -> Parts:
+    def apply(self, parts: LinkParts, random: Random) -> LinkParts:
         """Interrupt the transmission."""
         outages = OutageTransmission(parts.transmission, self.windows(random))
         return replace(parts, transmission=outages)
@@ -128,8 +141,47 @@ class OutageTransmission:
             yield window
 
 
-def parse(table: Table) -> Outage | RandomOutage:
-    """Return the impairment that a profile's table declares."""
+class JitterDistribution(StrEnum):
+    """How the delay is drawn."""
+
+    UNIFORM = "uniform"
+    EXPONENTIAL = "exponential"
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """``spread_s`` is the longest delay if uniform, the mean if exponential."""
+
+    spread_s: float
+    distribution: JitterDistribution = JitterDistribution.UNIFORM
+    name: str = "jitter"
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.spread_s <= MAX_SPREAD_S:
+            raise InvalidInput("jitter", f"{self.spread_s} s is outside 0..{MAX_SPREAD_S:g} s")
+
+    def apply(self, parts: LinkParts, random: Random) -> LinkParts:
+        """Add this delay."""
+
+        def delay_s(at_s: float) -> float:  # noqa: ARG001
+            if self.distribution is JitterDistribution.UNIFORM:
+                return random.uniform(0.0, self.spread_s)
+            return self.spread_s * min(LONGEST, random.expovariate(1.0))
+
+        return parts.with_delay(delay_s)
+
+
+def parse_impairment(name: str, table: Table) -> Outage | RandomOutage | Jitter:
+    """Return the impairment that a profile's table of that name declares."""
+    if name == "outage":
+        return _outage(table)
+    spread_s = table.number("spread_ms", Range(0.0, 1e3 * MAX_SPREAD_S)) / 1e3
+    named = table.choice("distribution", JitterDistribution, "uniform")
+    table.finish()
+    return Jitter(spread_s, JitterDistribution(named))
+
+
+def _outage(table: Table) -> Outage | RandomOutage:
     if "at_s" not in table:
         up_s, down_s = (table.number(f"mean_{name}_s", LENGTH_S) for name in ("up", "down"))
         table.finish("at_s")
