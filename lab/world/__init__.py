@@ -46,8 +46,8 @@ class EvalWorld:
     rounds: int = 3
     """How often ingest is measured without and with a live view, in turn."""
     only: tuple[str, ...] = ()
-    """Of objects, dusk, views, simulation, cost, notices, ingest: those; all without it. Rows of
-    the others are kept if the result file is of this revision."""
+    """Measure only these parts: objects, dusk, views, cost, notices, ingest. Rows of the others are
+    kept if the result file is of this revision."""
     work: Path = Path("out/eval/world")
     """Folder of logs, prerecorded drives and the pictures of dusk, which take minutes to render."""
     out: Path = Path("out/eval/world.json")
